@@ -1,0 +1,333 @@
+"""EnvMimic: the residual-force policy's Markov decision process (paper, section "Residual Dynamics Learning").
+
+The actuators replay a recording's commands; the policy pushes on the balloon; the reward is high while the simulated
+balloon follows the recorded one. What the policy learns is the part of the physics that the simulator lacks.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from brax.envs.base import Env, State
+from jaxtyping import Array, Float, Int
+from mujoco import mjx
+
+from ballu_mjx import robot as ballu
+from ballu_mjx import simulation
+from ballu_mjx.reconstruction import Motion
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvMimicConfig:
+    """The residual-force task. Defaults of the reward are the paper's; the rest was chosen by ablation (README)."""
+
+    position_weight: float = 0.7
+    """Weight of the position term (paper: 0.7)."""
+    orientation_weight: float = 0.3
+    """Weight of the orientation term (paper: 0.3)."""
+    position_scale: float = 10.0
+    """Sharpness of the position term, 1/m^2 (paper: 10)."""
+    orientation_scale: float = 2.0
+    """Sharpness of the orientation term, 1/rad^2 (paper: 2)."""
+    orientation_axes: tuple[float, float, float] = (0.2, 0.4, 0.4)
+    """Diagonal of W: roll, pitch, yaw (paper: 0.2, 0.4, 0.4)."""
+    force_limit: float = 1.0
+    """Largest force along each axis, N (paper: 1)."""
+    force_cost: float = 0.0
+    """Reward lost per N^2 of force."""
+    episode_seconds: float = 5.0
+    """Length of an episode, s; a recording's end cuts it short."""
+    observe_command: bool = False
+    """Let the policy see the commands (now and the last two), which the paper's state leaves out."""
+    start_noise: float = 1.0
+    """Perturbation of the starting state, in multiples of what reconstruction from motion capture leaves uncertain
+    (1 mm and 0.5 deg; 1 cm/s, 2 deg/s for base and 5 deg/s for joints)."""
+
+
+class Reference(NamedTuple):
+    """Recorded motions, stacked and padded to the longest: what an episode starts from and is compared with."""
+
+    qpos: Float[Array, "recordings states nq"]
+    qvel: Float[Array, "recordings states nv"]
+    features: Float[Array, "recordings states features"]
+    command: Float[Array, "recordings steps 2"]
+    steps: Int[Array, " recordings"]
+    """Control steps of each recording."""
+
+
+HISTORY = 3
+"""Control steps that the policy sees: the current one and the last two (paper)."""
+_FEATURES = 27
+
+
+def features(data: mjx.Data, sites: Int[np.ndarray, " 4"], bodies: Int[np.ndarray, " 4"]) -> Float[Array, " 27"]:
+    """What motion capture sees of a state, in the world frame.
+
+    Balloon position, velocity and Euler angles (roll, pitch, yaw), base position and velocity, positions and
+    velocities of the left and right foot; m, m/s, rad. `data` must hold current `com_vel`.
+    """
+    position = data.site_xpos[sites]
+    offset = position - data.subtree_com[1]
+    # cvel is the spatial velocity (angular, linear) about the whole robot's centre of mass.
+    velocity = data.cvel[bodies, 3:] + jnp.cross(data.cvel[bodies, :3], offset)
+    euler = euler_angles(data.xquat[bodies[0]])
+    kinematics = jnp.concatenate([position, velocity], axis=1)
+    return jnp.concatenate([kinematics[0], euler, kinematics[1:].ravel()])
+
+
+def euler_angles(quaternion: Float[Array, " 4"]) -> Float[Array, " 3"]:
+    """Roll, pitch and yaw (rad; intrinsic z-y-x) of a unit quaternion (w, x, y, z)."""
+    w, x, y, z = quaternion
+    roll = jnp.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = jnp.arcsin(jnp.clip(2 * (w * y - z * x), -1.0, 1.0))
+    yaw = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return jnp.stack([roll, pitch, yaw])
+
+
+def wrap_angle(angle: Array) -> Array:
+    """The same angle in (-pi, pi]."""
+    return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
+
+
+def heading_rotation(yaw: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Rotation about z that takes vectors in the balloon's heading frame to the world."""
+    c, s = jnp.cos(yaw), jnp.sin(yaw)
+    return jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def observation(history: Float[Array, "3 27"]) -> Float[Array, " observations"]:
+    """The policy's state, from the features of three control steps (the current one last).
+
+    The paper's state, made independent of place and heading: horizontal positions are taken from the current
+    balloon's, and positions, velocities and yaw from its heading. A force that depends on where in the room the
+    robot stands would fit the recordings and nothing else. Heights stay absolute, for the floor is.
+    """
+    now = history[-1]
+    origin = now[:3] * jnp.array([1.0, 1.0, 0.0])
+    to_heading = heading_rotation(now[8]).T
+
+    def relative(frame: Float[Array, " 27"]) -> Array:
+        vectors = jnp.concatenate([frame[:6], frame[9:]]).reshape(-1, 3)
+        is_position = jnp.tile(jnp.array([True, False]), 4)
+        vectors = jnp.where(is_position[:, None], vectors - origin, vectors) @ to_heading.T
+        return jnp.concatenate([vectors.ravel(), frame[6:8], wrap_angle(frame[8:9] - now[8])])
+
+    return jax.vmap(relative)(history).ravel()
+
+
+def reward_terms(
+    balloon: Float[Array, " 27"], target: Float[Array, " 27"], config: EnvMimicConfig
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The paper's `r_pos` and `r_orn` for the simulated and the recorded features."""
+    position_error = jnp.sum((target[:3] - balloon[:3]) ** 2)
+    angles = wrap_angle(target[6:9] - balloon[6:9])
+    orientation_error = jnp.sum(jnp.array(config.orientation_axes) * angles**2)
+    return (
+        jnp.exp(-config.position_scale * position_error),
+        jnp.exp(-config.orientation_scale * orientation_error),
+    )
+
+
+class Simulator:
+    """The MJX robot between control steps: states in, states and features out.
+
+    A state is (qpos, qvel, qacc_warmstart); all else in `mjx.Data` follows from it.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.nq, self.nv = model.nq, model.nv
+        self.model = mjx.put_model(model)
+        self._template = mjx.make_data(model)
+        self._balloon = simulation.balloon_id(model)
+        self._count = simulation.substeps(model)
+        names = ("balloon", "base", "foot_left", "foot_right")
+        self._sites = np.array([model.site(name).id for name in names])
+        self._bodies = model.site_bodyid[self._sites]
+
+    def load(self, qpos: Array, qvel: Array, warmstart: Array) -> mjx.Data:
+        return self._template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)  # pyright: ignore
+
+    def observe(self, data: mjx.Data) -> tuple[Float[Array, " 27"], Float[Array, " 3"]]:
+        """Features and centre of mass (m, world) of a state."""
+        data = mjx.com_vel(self.model, mjx.com_pos(self.model, mjx.kinematics(self.model, data)))
+        return features(data, self._sites, self._bodies), data.subtree_com[1]
+
+    def step(self, data: mjx.Data, command: Float[Array, " 2"], force: Float[Array, " 3"]) -> mjx.Data:
+        """One control step; see `simulation.control_step`."""
+        return simulation.control_step(
+            self.model, data, command, force, balloon=self._balloon, count=self._count
+        )
+
+
+def stack(simulator: Simulator, motions: Sequence[Motion]) -> tuple[Reference, Float[Array, "recordings states 3"]]:
+    """Motions as one `Reference`, and their centres of mass (m, world)."""
+    longest = max(len(motion.qpos) for motion in motions)
+
+    def pad(arrays: list[np.ndarray], length: int) -> Array:
+        return jnp.asarray(
+            np.stack([np.pad(a, [(0, length - len(a)), (0, 0)], mode="edge") for a in arrays]), jnp.float32
+        )
+
+    qpos = pad([motion.qpos for motion in motions], longest)
+    qvel = pad([motion.qvel for motion in motions], longest)
+    command = pad([motion.command for motion in motions], longest - 1)
+    steps = jnp.array([len(motion.command) for motion in motions])
+
+    @jax.jit
+    def observe_all(qpos: Array, qvel: Array) -> tuple[Array, Array]:
+        one = lambda q, v: simulator.observe(simulator.load(q, v, jnp.zeros(simulator.nv)))  # noqa: E731
+        return jax.vmap(jax.vmap(one))(qpos, qvel)
+
+    feature, com = observe_all(qpos, qvel)
+    return Reference(qpos, qvel, feature, command, steps), com
+
+
+def policy_input(
+    history: Float[Array, "3 27"], commands: Float[Array, "3 2"], config: EnvMimicConfig
+) -> Float[Array, " inputs"]:
+    """`observation`, with the commands (the coming one last) where the configuration asks for them."""
+    seen = observation(history)
+    return jnp.concatenate([seen, commands.ravel()]) if config.observe_command else seen
+
+
+def world_force(
+    action: Float[Array, " 3"], yaw: Float[Array, ""], config: EnvMimicConfig
+) -> Float[Array, " 3"]:
+    """The force (N, world) that an action in [-1, 1] stands for.
+
+    Actions are in the balloon's heading frame, like the observation: the same situation met in another direction
+    calls for the same force, turned.
+    """
+    return heading_rotation(yaw) @ (config.force_limit * jnp.clip(action, -1.0, 1.0))
+
+
+class EnvMimicEnv(Env):
+    """Tracking of recorded motions by a force on the balloon; Brax's environment interface, one robot, unbatched."""
+
+    def __init__(self, model: mujoco.MjModel, motions: Sequence[Motion], config: EnvMimicConfig) -> None:
+        self.config = config
+        self.simulator = Simulator(model)
+        self.reference, _ = stack(self.simulator, motions)
+        self.episode_length = round(config.episode_seconds / ballu.CONTROL_TIMESTEP)
+        inputs = jax.eval_shape(
+            lambda h, c: policy_input(h, c, config), jnp.zeros((HISTORY, _FEATURES)), jnp.zeros((HISTORY, 2))
+        )
+        self._observation_size = inputs.shape[0]
+
+    def reset(self, rng: Array) -> State:
+        """Reference state initialization: a uniformly drawn time of a uniformly drawn recording, history included."""
+        key_recording, key_time, key_noise = jax.random.split(rng, 3)
+        reference = self.reference
+        recording = jax.random.randint(key_recording, (), 0, len(reference.steps))
+        time = jax.random.randint(key_time, (), HISTORY - 1, reference.steps[recording])
+        qpos, qvel = _perturb(
+            key_noise, reference.qpos[recording, time], reference.qvel[recording, time], self.config.start_noise
+        )
+        history = jax.lax.dynamic_slice_in_dim(reference.features[recording], time - HISTORY + 1, HISTORY)
+        simulation_state = {
+            "qpos": qpos,
+            "qvel": qvel,
+            "warmstart": jnp.zeros(self.simulator.nv),
+            "history": history,
+            "recording": recording,
+            "time": time,
+            "elapsed": jnp.zeros((), jnp.int32),
+        }
+        zero = jnp.zeros(())
+        metrics = {"reward_position": zero, "reward_orientation": zero, "force": zero, "diverged": zero}
+        return State(
+            pipeline_state=simulation_state,  # pyright: ignore[reportArgumentType]
+            obs=self._observe(simulation_state),
+            reward=zero,
+            done=zero,
+            metrics=metrics,
+            info={"truncation": zero},
+        )
+
+    def step(self, state: State, action: Array) -> State:
+        """Advance one control step under the recording's command and the policy's force."""
+        s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
+        recording, time = s["recording"], s["time"]
+        force = world_force(action, s["history"][-1, 8], self.config)
+        data = self.simulator.load(s["qpos"], s["qvel"], s["warmstart"])
+        data = self.simulator.step(data, self.reference.command[recording, time], force)
+        seen, _ = self.simulator.observe(data)
+
+        target = self.reference.features[recording, time + 1]
+        finite = jnp.all(jnp.isfinite(seen)) & jnp.all(jnp.isfinite(data.qvel))
+        seen = jnp.where(finite, seen, target)
+        r_position, r_orientation = reward_terms(seen, target, self.config)
+        reward = self.config.position_weight * r_position + self.config.orientation_weight * r_orientation
+        reward = jnp.where(finite, reward - self.config.force_cost * jnp.sum(force**2), 0.0)
+
+        elapsed = s["elapsed"] + 1
+        timed_out = (elapsed >= self.episode_length) | (time + 1 >= self.reference.steps[recording])
+        s = s | {
+            "qpos": jnp.where(finite, data.qpos, s["qpos"]),
+            "qvel": jnp.where(finite, data.qvel, s["qvel"]),
+            "warmstart": jnp.where(finite, data.qacc_warmstart, 0.0),
+            "history": jnp.concatenate([s["history"][1:], seen[None]]),
+            "time": time + 1,
+            "elapsed": elapsed,
+        }
+        metrics = {
+            "reward_position": r_position,
+            "reward_orientation": r_orientation,
+            "force": jnp.linalg.norm(force),
+            "diverged": 1.0 - finite,
+        }
+        return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            pipeline_state=s,
+            obs=self._observe(s),
+            reward=reward,
+            done=jnp.asarray(timed_out | ~finite, jnp.float32),
+            metrics=state.metrics | metrics,
+            info=state.info | {"truncation": jnp.asarray(timed_out & finite, jnp.float32)},
+        )
+
+    @property
+    def observation_size(self) -> int:
+        return self._observation_size
+
+    @property
+    def action_size(self) -> int:
+        return 3
+
+    @property
+    def backend(self) -> str:
+        return "mjx"
+
+    def _observe(self, s: dict[str, Any]) -> Array:
+        commands = commands_seen(self.reference.command[s["recording"]], s["time"])
+        return policy_input(s["history"], commands, self.config)
+
+
+def commands_seen(commands: Float[Array, "steps 2"], time: Int[Array, ""]) -> Float[Array, "3 2"]:
+    """The commands of the last two control steps and the coming one."""
+    start = jnp.clip(time - HISTORY + 1, 0, commands.shape[0] - HISTORY)
+    return jax.lax.dynamic_slice_in_dim(commands, start, HISTORY)
+
+
+def _perturb(
+    key: Array, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], scale: float
+) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
+    """A state within the reconstruction's uncertainty of the recorded one."""
+    key_base, key_turn, key_hinge, key_velocity = jax.random.split(key, 4)
+    degree = np.pi / 180
+    base = qpos[:3] + scale * 1e-3 * jax.random.normal(key_base, (3,))
+    turn = scale * 0.5 * degree * jax.random.normal(key_turn, (3,))
+    # A small rotation in the body frame: q (1, turn / 2), normalized.
+    w, v = qpos[3], qpos[4:7]
+    quaternion = jnp.concatenate([(w - v @ turn / 2)[None], v + (w * turn + jnp.cross(v, turn)) / 2])
+    hinges = qpos[7:] + scale * 0.5 * degree * jax.random.normal(key_hinge, (qpos.shape[0] - 7,))
+    # Motors stay: the cable makes a degree of theirs a push on the knee that no reconstruction error is.
+    hinges = hinges.at[ballu.MOTORS].set(qpos[7:][ballu.MOTORS])
+    spread = np.concatenate([np.full(3, 0.01), np.full(3, 2 * degree), np.full(qvel.shape[0] - 6, 5 * degree)])
+    qvel = qvel + scale * spread * jax.random.normal(key_velocity, qvel.shape)
+    return jnp.concatenate([base, quaternion / jnp.linalg.norm(quaternion), hinges]), qvel

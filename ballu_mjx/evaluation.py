@@ -1,0 +1,289 @@
+"""How well a simulator predicts recordings: open-loop replay of recorded commands from recorded states.
+
+Every recording is started afresh every second and simulated to its end; errors are taken over horizons, for over
+a whole recording small errors only compound. The paper's whole-recording figures are reported beside them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ballu_mjx import envmimic
+from ballu_mjx import robot as ballu
+from ballu_mjx.envmimic import EnvMimicConfig
+from ballu_mjx.reconstruction import Motion
+
+HORIZONS = (1.0, 2.0, 5.0, 10.0, 20.0)
+"""Seconds over which errors are taken."""
+START_INTERVAL = 1.0
+"""Seconds between two starts in the same recording."""
+SCORE_HORIZONS = (5.0, 10.0)
+"""Horizons (s) that the validation score looks at."""
+_BALLOON_YAW = 8
+
+Policy = Callable[[Any, Array], Array]
+"""(parameters, observation) to action, deterministic."""
+
+
+class Replay(NamedTuple):
+    """Simulated runs from recorded states, time first point included."""
+
+    position: Float[np.ndarray, "runs states 3"]
+    """Balloon (m, world)."""
+    yaw: Float[np.ndarray, "runs states"]
+    """Balloon (rad), not unwrapped."""
+    com: Float[np.ndarray, "runs states 3"]
+    """Centre of mass (m, world)."""
+    force: Float[np.ndarray, "runs steps 3"]
+    """Residual force (N, world)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Errors:
+    """Errors of one simulator on one recording; spread is the standard deviation over starts."""
+
+    recording: str
+    group: str
+    """`near` or `far` where the recording's name begins so, else `all`."""
+    position: dict[float, tuple[float, float]]
+    """Horizon (s) to mean and spread of the balloon position's RMSE (m)."""
+    yaw: dict[float, tuple[float, float]]
+    """Horizon (s) to mean and spread of the yaw's RMSE (deg)."""
+    mean_com_error: float
+    """Mean distance (m) of the centres of mass over the whole recording (paper, Table I, open loop)."""
+    final_yaw_error: float
+    """Simulated less recorded yaw (deg) at the end of the recording (paper, Table II, open loop)."""
+    mean_force: float
+    """Mean magnitude of the residual force (N)."""
+
+
+def group_of(name: str) -> str:
+    """The group a recording is reported in."""
+    head = name.split("-")[0]
+    return head if head in ("near", "far") else "all"
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """A simulator's errors beside vanilla's, on the same recordings and starts."""
+
+    vanilla: tuple[Errors, ...]
+    residual: tuple[Errors, ...]
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(errors.group for errors in self.vanilla))
+
+    def ratio(self, group: str, quantity: str, horizon: float) -> float:
+        """Error with the residual over error without, each averaged over the group's recordings."""
+        return _group_mean(self.residual, group, quantity, horizon) / _group_mean(self.vanilla, group, quantity, horizon)
+
+    @property
+    def score(self) -> float:
+        """What training minimizes on validation recordings: the mean ratio to vanilla, position and yaw alike.
+
+        Averaged over groups and over `SCORE_HORIZONS` (those that the recordings are long enough for).
+        """
+        ratios = [
+            self.ratio(group, quantity, horizon)
+            for group in self.groups
+            for quantity in ("position", "yaw")
+            for horizon in SCORE_HORIZONS
+            if any(horizon in e.position for e in self.vanilla if e.group == group)
+        ]
+        return float(np.mean(ratios))
+
+    def excess(self) -> tuple[float, str]:
+        """Worst case over recordings and horizons of the residual's error beyond 1.2 vanilla + (2 cm or 3 deg).
+
+        Given in units of that bound (0.1: ten per cent beyond it; negative: within), with where it is.
+        """
+        worst, place = -np.inf, ""
+        for base, mimic in zip(self.vanilla, self.residual, strict=True):
+            for quantity, allowance, unit in (("position", 0.02, "m"), ("yaw", 3.0, "deg")):
+                for horizon, (value, _) in getattr(mimic, quantity).items():
+                    bound = 1.2 * getattr(base, quantity)[horizon][0] + allowance
+                    if value / bound - 1 > worst:
+                        worst = value / bound - 1
+                        place = f"{quantity} of {mimic.recording} at {horizon:g} s: {value:.3f} {unit}, bound {bound:.3f}"
+        return float(worst), place
+
+    def table(self) -> str:
+        """Errors by group and horizon, vanilla and EnvMimic, with the spread over starts; then the whole recordings."""
+        lines = [
+            f"{'':7}{'horizon':>8} |{'position RMSE (m)':^39}| {'yaw RMSE (deg)':^38}",
+            f"{'':7}{'(s)':>8} |{'vanilla':>14}{'EnvMimic':>16}{'ratio':>8} | {'vanilla':>13}{'EnvMimic':>16}{'ratio':>8}",
+        ]
+        for group in self.groups:
+            for horizon in HORIZONS:
+                if not any(horizon in e.position for e in self.vanilla if e.group == group):
+                    continue
+                cells = []
+                for quantity, digits in (("position", 3), ("yaw", 1)):
+                    for errors in (self.vanilla, self.residual):
+                        mean = _group_mean(errors, group, quantity, horizon)
+                        spread = _group_mean(errors, group, quantity, horizon, place=1)
+                        cells.append(f"{mean:.{digits}f} ± {spread:.{digits}f}")
+                    cells.append(f"{self.ratio(group, quantity, horizon):.2f}")
+                lines.append(
+                    f"{group:7}{horizon:>8g} |{cells[0]:>14}{cells[1]:>16}{cells[2]:>8} | "
+                    f"{cells[3]:>13}{cells[4]:>16}{cells[5]:>8}"
+                )
+        lines += ["", f"{'whole recording':24}{'mean CoM error (m)':>28}{'final yaw error (deg)':>28}"]
+        lines.append(f"{'':24}{'vanilla':>15}{'EnvMimic':>13}{'vanilla':>15}{'EnvMimic':>13}")
+        for base, mimic in zip(self.vanilla, self.residual, strict=True):
+            lines.append(
+                f"{base.recording:24}{base.mean_com_error:>15.3f}{mimic.mean_com_error:>13.3f}"
+                f"{base.final_yaw_error:>15.1f}{mimic.final_yaw_error:>13.1f}"
+            )
+        return "\n".join(lines)
+
+    def to_json(self) -> dict[str, Any]:
+        """All figures, as plain lists and numbers."""
+        worst, place = self.excess()
+        return {
+            "score": self.score,
+            "worst_beyond_bound": {"relative": worst, "where": place},
+            "vanilla": [dataclasses.asdict(errors) for errors in self.vanilla],
+            "envmimic": [dataclasses.asdict(errors) for errors in self.residual],
+        }
+
+
+class OpenLoopEvaluator:
+    """Replays a set of recordings; compiles once, for any parameters of the policy."""
+
+    def __init__(
+        self, model: mujoco.MjModel, motions: Sequence[Motion], config: EnvMimicConfig, policy: Policy
+    ) -> None:
+        self.motions = tuple(motions)
+        self._simulator = envmimic.Simulator(model)
+        self._reference, com = envmimic.stack(self._simulator, motions)
+        self._recorded_com = np.asarray(com)
+        self._recorded = np.asarray(self._reference.features)
+        interval = round(START_INTERVAL / ballu.CONTROL_TIMESTEP)
+        self.starts = [
+            (index, start)
+            for index, motion in enumerate(self.motions)
+            for start in range(envmimic.HISTORY - 1, len(motion.command) - interval + 1, interval)
+        ]
+        self._vanilla: tuple[Errors, ...] | None = None
+        length = max(len(motion.command) for motion in motions) - (envmimic.HISTORY - 1)
+        # Pad the batch to the devices, and let XLA split it: one core a device.
+        devices = jax.local_devices()
+        padded = self.starts + [self.starts[0]] * (-len(self.starts) % len(devices))
+        mesh = jax.sharding.Mesh(np.array(devices), ("batch",))
+        sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("batch"))
+        self._batch = jax.device_put(jnp.array(padded, jnp.int32), sharding)
+
+        def replay(params: Any, scale: Array, batch: Int[Array, "runs 2"]) -> Any:
+            return jax.vmap(lambda run: self._replay_one(policy, config, params, scale, run[0], run[1], length))(batch)
+
+        spec = jax.sharding.PartitionSpec
+        self._replay = jax.jit(
+            jax.shard_map(
+                replay, mesh=mesh, in_specs=(spec(), spec(), spec("batch")), out_specs=spec("batch"), check_vma=False
+            )
+        )
+
+    def replay(self, params: Any, *, scale: float = 1.0) -> Replay:
+        """Simulate every start to the end; `scale` multiplies the force (0 is vanilla)."""
+        params = jax.device_get(params)  # they may live on one device; the batch is spread over all
+        features, com, force = jax.device_get(self._replay(params, np.float32(scale), self._batch))
+        runs = len(self.starts)
+        return Replay(features[:runs, :, :3], features[:runs, :, _BALLOON_YAW], com[:runs], force[:runs])
+
+    def recorded(self, run: int) -> tuple[Float[np.ndarray, "states 3"], Float[np.ndarray, " states"]]:
+        """Recorded balloon position (m) and yaw (rad) from the start of `run` to the recording's end."""
+        recording, start = self.starts[run]
+        states = self._recorded[recording, start : len(self.motions[recording].qpos)]
+        return states[:, :3], states[:, _BALLOON_YAW]
+
+    def __call__(self, params: Any) -> Evaluation:
+        """Errors of the simulator with the policy, beside vanilla's."""
+        if self._vanilla is None:
+            self._vanilla = self._errors(self.replay(params, scale=0.0))
+        return Evaluation(self._vanilla, self._errors(self.replay(params)))
+
+    def _replay_one(
+        self, policy: Policy, config: EnvMimicConfig, params: Any, scale: Array, recording: Array, start: Array, length: int
+    ) -> tuple[Array, Array, Array]:
+        reference, simulator = self._reference, self._simulator
+        history = jax.lax.dynamic_slice_in_dim(
+            reference.features[recording], start - envmimic.HISTORY + 1, envmimic.HISTORY
+        )
+
+        def step(carry: tuple, time: Array) -> tuple[tuple, tuple]:
+            qpos, qvel, warmstart, history = carry
+            commands = envmimic.commands_seen(reference.command[recording], time)
+            action = policy(params, envmimic.policy_input(history, commands, config))
+            force = scale * envmimic.world_force(action, history[-1, _BALLOON_YAW], config)
+            data = simulator.load(qpos, qvel, warmstart)
+            data = simulator.step(data, reference.command[recording, time], force)
+            seen, com = simulator.observe(data)
+            history = jnp.concatenate([history[1:], seen[None]])
+            return (data.qpos, data.qvel, data.qacc_warmstart, history), (seen, com, force)
+
+        qpos, qvel = reference.qpos[recording, start], reference.qvel[recording, start]
+        first, first_com = simulator.observe(simulator.load(qpos, qvel, jnp.zeros(simulator.nv)))
+        _, (features, com, force) = jax.lax.scan(
+            step, (qpos, qvel, jnp.zeros(simulator.nv), history), start + jnp.arange(length)
+        )
+        return jnp.concatenate([first[None], features]), jnp.concatenate([first_com[None], com]), force
+
+    def _errors(self, replay: Replay) -> tuple[Errors, ...]:
+        results = []
+        for index, motion in enumerate(self.motions):
+            runs = [run for run, (recording, _) in enumerate(self.starts) if recording == index]
+            position: dict[float, list[float]] = {h: [] for h in HORIZONS}
+            yaw: dict[float, list[float]] = {h: [] for h in HORIZONS}
+            com_error, final_yaw, forces = float("nan"), float("nan"), []
+            for run in runs:
+                recorded_position, recorded_yaw = self.recorded(run)
+                states = len(recorded_yaw)
+                distance = np.linalg.norm(replay.position[run, :states] - recorded_position, axis=-1)
+                turn = replay.yaw[run, :states] - recorded_yaw
+                turn = np.rad2deg(np.arctan2(np.sin(turn), np.cos(turn)))
+                forces.append(np.linalg.norm(replay.force[run, : states - 1], axis=-1).mean())
+                for horizon in HORIZONS:
+                    steps = round(horizon / ballu.CONTROL_TIMESTEP)
+                    if steps < states:
+                        position[horizon].append(_rms(distance[1 : steps + 1]))
+                        yaw[horizon].append(_rms(turn[1 : steps + 1]))
+                if run == runs[0]:
+                    start = self.starts[run][1]
+                    recorded_com = self._recorded_com[index, start : start + states]
+                    com_error = float(np.linalg.norm(replay.com[run, :states] - recorded_com, axis=-1).mean())
+                    final_yaw = float(turn[-1])
+            results.append(
+                Errors(
+                    recording=motion.name,
+                    group=group_of(motion.name),
+                    position={h: _mean_spread(v) for h, v in position.items() if v},
+                    yaw={h: _mean_spread(v) for h, v in yaw.items() if v},
+                    mean_com_error=com_error,
+                    final_yaw_error=final_yaw,
+                    mean_force=float(np.mean(forces)),
+                )
+            )
+        return tuple(results)
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
+
+
+def _mean_spread(values: list[float]) -> tuple[float, float]:
+    return float(np.mean(values)), float(np.std(values))
+
+
+def _group_mean(errors: Sequence[Errors], group: str, quantity: str, horizon: float, place: int = 0) -> float:
+    values = [getattr(e, quantity)[horizon][place] for e in errors if e.group == group and horizon in e.position]
+    return float(np.mean(values))

@@ -1,0 +1,166 @@
+"""The robot: names, model files, and the parameters that identification and randomization move.
+
+Frames: world z up; the robot's x forward, y left. SI units and radians throughout. Arrays with a pair of entries
+are ordered (left, right).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+from mujoco import mjx
+
+SIDES = ("left", "right")
+JOINTS = ("neck", "hip_left", "knee_left", "motor_left", "hip_right", "knee_right", "motor_right")
+"""Hinges in the order of `qpos[7:]` and `qvel[6:]`; the first seven (six) entries are the base's free joint."""
+HIPS, KNEES, MOTORS = (slice(1, None, 3), slice(2, None, 3), slice(3, None, 3))
+"""Places of the left and right hip, knee and motor within `JOINTS`."""
+
+CONTROL_TIMESTEP = 0.05
+"""Seconds between two commands (20 Hz)."""
+CABLE_SLACK = 1e-4
+"""Slack of the cable (m) with the motor at 0 and the knee at its stop."""
+SERVO_RANGE = np.pi / 2
+"""Motor angle (rad) that a command of 1 asks for."""
+
+
+def assets() -> Path:
+    """Folder with the model and the bundled recordings, from a wheel or from a checkout."""
+    packaged = Path(str(resources.files("ballu_mjx"))) / "assets"
+    return packaged if packaged.is_dir() else packaged.parents[1] / "assets"
+
+
+def load_model() -> mujoco.MjModel:
+    """The nominal ("vanilla") robot for C MuJoCo."""
+    return mujoco.MjModel.from_xml_path(str(assets() / "ballu.xml"))
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ActuatorParameters:
+    """The paper's eight free parameters (section "System Identification"), each as (left, right).
+
+    What each moves in the model:
+
+    - `knee_spring_stiffness` (N m/rad): `jnt_stiffness` of the knees; the spring's zero, -45 deg, stays.
+    - `motor_gain` (N m/rad): the servo's position gain, in `actuator_gainprm` and `actuator_biasprm`.
+    - `default_motor_angle` (rad): the motor angle that command 0 asks for, `actuator_biasprm[:, 0]`.
+    - `default_knee_angle` (rad): the knee's stop, `jnt_range[:, 0]`; the cable's rest length follows, so that
+      `CABLE_SLACK` is left with the motor at 0 and the knee at this angle.
+    """
+
+    knee_spring_stiffness: Float[Array, " 2"]
+    motor_gain: Float[Array, " 2"]
+    default_motor_angle: Float[Array, " 2"]
+    default_knee_angle: Float[Array, " 2"]
+
+    @staticmethod
+    def nominal(model: mujoco.MjModel) -> ActuatorParameters:
+        """The values that stand in `model`."""
+        knees, servos = _knee_ids(model), _servo_ids(model)
+        gain = -model.actuator_biasprm[servos, 1]
+        return ActuatorParameters(
+            knee_spring_stiffness=jnp.asarray(model.jnt_stiffness[knees], jnp.float32),
+            motor_gain=jnp.asarray(gain, jnp.float32),
+            default_motor_angle=jnp.asarray(model.actuator_biasprm[servos, 0] / gain, jnp.float32),
+            default_knee_angle=jnp.asarray(model.jnt_range[knees, 0], jnp.float32),
+        )
+
+
+def cable_length(
+    model: mujoco.MjModel, knee: Float[Array, " 2"], motor: Float[Array, " 2"]
+) -> Float[Array, " 2"]:
+    """Distance (m) between the cable's ends at the given knee and motor angles (rad).
+
+    The same planar geometry as the model's spatial tendon, written out because the rest length must be known, and
+    differentiable, before any state is.
+    """
+    knee, motor = jnp.asarray(knee), jnp.asarray(motor)
+    lengths = []
+    for i, side in enumerate(SIDES):
+        anchor = model.site(f"cable_femur_{side}").pos - model.body(f"tibia_{side}").pos
+        arm = model.body(f"arm_{side}").pos
+        radius = model.site(f"cable_arm_{side}").pos[2]
+        x = arm[0] - radius * jnp.sin(motor[i])
+        z = arm[2] + radius * jnp.cos(motor[i])
+        dx = jnp.cos(knee[i]) * x + jnp.sin(knee[i]) * z - anchor[0]
+        dz = -jnp.sin(knee[i]) * x + jnp.cos(knee[i]) * z - anchor[2]
+        lengths.append(jnp.sqrt(dx**2 + dz**2 + (arm[1] - anchor[1]) ** 2))
+    return jnp.stack(lengths)
+
+
+def actuator_fields(model: mujoco.MjModel, parameters: ActuatorParameters) -> dict[str, Array]:
+    """Model fields that carry `parameters`, by name; for `mjx.Model.replace` or, as NumPy, for an `MjModel`."""
+    knees, servos = _knee_ids(model), _servo_ids(model)
+    gain = parameters.motor_gain
+    rest = cable_length(model, parameters.default_knee_angle, jnp.zeros(2)) + CABLE_SLACK
+    return {
+        "jnt_stiffness": jnp.asarray(model.jnt_stiffness).at[knees].set(parameters.knee_spring_stiffness),
+        "jnt_range": jnp.asarray(model.jnt_range).at[knees, 0].set(parameters.default_knee_angle),
+        "actuator_gainprm": jnp.asarray(model.actuator_gainprm).at[servos, 0].set(gain * SERVO_RANGE),
+        "actuator_biasprm": jnp.asarray(model.actuator_biasprm)
+        .at[servos, 0]
+        .set(gain * parameters.default_motor_angle)
+        .at[servos, 1]
+        .set(-gain),
+        "tendon_lengthspring": jnp.asarray(model.tendon_lengthspring).at[_cable_ids(model), 1].set(rest),
+    }
+
+
+def buoyancy_fields(model: mujoco.MjModel, ratio: Float[Array, ""] | float) -> dict[str, Array]:
+    """Model fields that carry the lift: `ratio` is lift over the whole robot's weight."""
+    balloon = model.body("balloon").id
+    gravcomp = ratio * model.body_mass.sum() / model.body_mass[balloon]
+    return {"body_gravcomp": jnp.asarray(model.body_gravcomp).at[balloon].set(gravcomp)}
+
+
+def buoyancy_ratio(model: mujoco.MjModel) -> float:
+    """Lift over the whole robot's weight, as it stands in `model`."""
+    balloon = model.body("balloon").id
+    return float(model.body_gravcomp[balloon] * model.body_mass[balloon] / model.body_mass.sum())
+
+
+def with_fields(model: mjx.Model, fields: dict[str, Array]) -> mjx.Model:
+    """`model` with `fields` in place of its own, in its own dtypes."""
+    return model.replace(**{k: jnp.asarray(v, getattr(model, k).dtype) for k, v in fields.items()})  # pyright: ignore
+
+
+def set_fields(model: mujoco.MjModel, fields: dict[str, Any]) -> None:
+    """Write `fields` into a C model, in place."""
+    for name, value in fields.items():
+        getattr(model, name)[:] = np.asarray(value)
+
+
+def standing_qpos(model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:
+    """Generalized position with the knees at their stops, the hips at -14 deg and the feet on the floor."""
+    qpos = model.qpos0.copy()
+    hinges = qpos[7:]
+    hinges[HIPS] = np.deg2rad(-14.0)
+    hinges[KNEES] = model.jnt_range[_knee_ids(model), 0]
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    feet = [data.site(f"foot_{side}").xpos[2] for side in SIDES]
+    radius = model.geom("foot_left").size[0]
+    qpos[2] += radius - min(feet)
+    return qpos
+
+
+def _knee_ids(model: mujoco.MjModel) -> np.ndarray:
+    return np.array([model.joint(f"knee_{side}").id for side in SIDES])
+
+
+def _servo_ids(model: mujoco.MjModel) -> np.ndarray:
+    return np.array([model.actuator(f"servo_{side}").id for side in SIDES])
+
+
+def _cable_ids(model: mujoco.MjModel) -> np.ndarray:
+    return np.array([model.tendon(f"cable_{side}").id for side in SIDES])

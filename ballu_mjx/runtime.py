@@ -1,0 +1,134 @@
+"""Start-up of the commands: what must be settled before JAX is imported.
+
+This module imports neither JAX nor anything that does, so that a command's `main` can call `prepare` first.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib
+import importlib.metadata
+import io
+import os
+import platform
+import re
+import sys
+from pathlib import Path
+
+from ballu_mjx.errors import InputError
+
+_DEVICE_COUNT_FLAG = "--xla_force_host_platform_device_count"
+_MIN_COMPILE_SECONDS = 1.0
+"""Programs that compile faster than this are not worth a file in the cache."""
+
+
+def prepare() -> None:
+    """Settle JAX's environment for this process, then import MJX; call it before anything else imports JAX.
+
+    - The CPU is split into one host device per core: XLA does not spread these small operations over cores, a batch
+      sharded over host devices does. A count in the user's own `XLA_FLAGS` stays, and so do all other flags there.
+    - Compiled programs are kept in `cache_dir()`, unless `JAX_COMPILATION_CACHE_DIR` says where.
+    - XLA's log is quietened on machines without an accelerator, unless `TF_CPP_MIN_LOG_LEVEL` is set: every program
+      loaded from the cache otherwise prints pages about tuning flags that are no fault. Failures still arrive as exceptions.
+    - A JAX that would hang is refused (`check_jax`), and MJX's report that Warp is not installed kept off the screen.
+
+    Where JAX is imported already (a notebook, say), its settings stay as they are.
+
+    **Raises**
+
+    `InputError` from `check_jax`.
+    """
+    if "jax" not in sys.modules:
+        os.environ["XLA_FLAGS"] = _with_host_devices(os.environ.get("XLA_FLAGS", ""), _cores())
+        if not _accelerated():
+            os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+        if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+            # Without a writable cache there is none: slower to start, no less right.
+            with contextlib.suppress(OSError):
+                cache_dir().mkdir(parents=True, exist_ok=True)
+                os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache_dir())
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(_MIN_COMPILE_SECONDS))
+    check_jax()
+    _import_mjx()
+
+
+def check_jax() -> None:
+    """Refuse a JAX that is known to deadlock on the backend in use.
+
+    JAX 0.10 never returns from `vmap(mjx.step)` at batch 512 on the CPU; its accelerator backends work.
+
+    **Raises**
+
+    `InputError` with the mend.
+    """
+    version = importlib.metadata.version("jax")
+    if version.split(".")[:2] != ["0", "10"]:
+        return
+    import jax  # only now: asking for the backend starts it
+
+    if jax.default_backend() == "cpu":
+        raise InputError(
+            f"jax {version} deadlocks on the CPU in this workload: run "
+            '`pip install "jax>=0.9.2,<0.10" "jaxlib>=0.9.2,<0.10"` (constraints.txt pins a version that works).'
+        )
+
+
+def cache_dir() -> Path:
+    """Folder for compiled programs: in the user's cache, one for each jaxlib and each kind of CPU.
+
+    A program compiled on another CPU may die of an illegal instruction.
+    """
+    if root := os.environ.get("XDG_CACHE_HOME"):
+        base = Path(root)
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = Path.home() / ".cache"
+    cpu = hashlib.sha256(_cpu_description().encode()).hexdigest()[:12]
+    return base / "ballu_mjx" / f"jaxlib-{importlib.metadata.version('jaxlib')}-{cpu}"
+
+
+def _with_host_devices(flags: str, count: int) -> str:
+    """XLA's `flags` with `count` host devices added, unless they name a count."""
+    if _DEVICE_COUNT_FLAG in flags:
+        return flags
+    return f"{flags} {_DEVICE_COUNT_FLAG}={count}".strip()
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _accelerated() -> bool:
+    """Whether JAX may find an accelerator: a plugin for one is installed, and the user has not asked for the CPU."""
+    if os.environ.get("JAX_PLATFORMS") == "cpu":
+        return False
+    return bool(importlib.metadata.entry_points(group="jax_plugins"))
+
+
+def _cpu_description() -> str:
+    """Model and instruction sets of the CPU, as far as the system tells."""
+    with contextlib.suppress(OSError):
+        text = Path("/proc/cpuinfo").read_text()
+        fields = re.findall(r"^(?:model name|flags|CPU part|Features)\s*:.*$", text.split("\n\n")[0], re.MULTILINE)
+        if fields:
+            return platform.machine() + "".join(fields)
+    return platform.machine() + platform.processor()
+
+
+def _import_mjx() -> None:
+    """Import MJX without the lines it prints where Warp, which this package does not use, is not installed."""
+    if "mujoco.mjx" in sys.modules:
+        return
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said):
+            importlib.import_module("mujoco.mjx")
+    finally:
+        for line in said.getvalue().splitlines():
+            if not line.startswith(("Failed to import warp:", "Failed to import mujoco_warp:")):
+                print(line)

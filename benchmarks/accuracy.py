@@ -1,0 +1,283 @@
+"""How accurate and how fast the simulation is for each setting of solver, integrator, cone and time step.
+
+    python benchmarks/accuracy.py            # the table behind the <option> line of assets/ballu.xml
+    python benchmarks/accuracy.py --quick    # the chosen setting alone, fewer sequences
+
+The judge is C MuJoCo in double precision. Random bang-bang commands (each leg 0 or 1, for 0.15 to 0.8 s at a time) drive
+the robot from rest for 2 s; the figure is how far the balloon ends from where the judge has it, in millimetres, as
+median and 95th percentile over the sequences:
+
+- `tight`: against the same model and time step with the solver run to convergence;
+- `quarter`: against that at a quarter of the time step.
+
+The columns `C` judge C MuJoCo with the setting, the columns `MJX` the float32 rollouts in MJX that training uses.
+Speed is in simulated seconds per second for MJX, the batch sharded over all devices: `wall` by the clock, `cpu` from the
+processor time used, which a busy machine disturbs less.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Annotated
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.rollout
+import numpy as np
+import tyro
+from jax.sharding import PartitionSpec
+from jaxtyping import Array, Float
+from mujoco import mjx
+
+from ballu_mjx import robot, simulation
+
+INTEGRATORS = {"implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST, "Euler": mujoco.mjtIntegrator.mjINT_EULER}
+SOLVERS = {"Newton": mujoco.mjtSolver.mjSOL_NEWTON, "CG": mujoco.mjtSolver.mjSOL_CG}
+CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
+
+DURATION = 2.0
+"""Seconds of a sequence."""
+TARGETS_MM = {"tight median": 5.0, "tight 95 %": 20.0, "quarter median": 20.0}
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """One line of the table; `timestep` in seconds."""
+
+    timestep: float
+    integrator: str
+    solver: str
+    iterations: int
+    ls_iterations: int
+    cone: str
+
+    def __str__(self) -> str:
+        solver = f"{self.solver} {self.iterations}/{self.ls_iterations}"
+        return f"{self.timestep * 1e3:5.2f} ms {self.integrator:12} {solver:12} {self.cone:9}"
+
+    @staticmethod
+    def of(model: mujoco.MjModel) -> Setting:
+        """The setting that stands in `model`."""
+        option = model.opt
+
+        def name(names: dict, value: int) -> str:
+            return next(name for name, number in names.items() if number == value)
+
+        return Setting(
+            option.timestep,
+            name(INTEGRATORS, option.integrator),
+            name(SOLVERS, option.solver),
+            option.iterations,
+            option.ls_iterations,
+            name(CONES, option.cone),
+        )
+
+    def model(self) -> mujoco.MjModel:
+        """The robot with this setting."""
+        model = robot.load_model()
+        model.opt.timestep = self.timestep
+        model.opt.integrator = INTEGRATORS[self.integrator]
+        model.opt.solver = SOLVERS[self.solver]
+        model.opt.iterations = self.iterations
+        model.opt.ls_iterations = self.ls_iterations
+        model.opt.cone = CONES[self.cone]
+        return model
+
+    def tight(self, divide: int = 1) -> mujoco.MjModel:
+        """The robot with the solver run to convergence, at the time step over `divide`."""
+        model = dataclasses.replace(self, timestep=self.timestep / divide, solver="Newton").model()
+        model.opt.iterations, model.opt.tolerance = 100, 1e-10
+        model.opt.ls_iterations, model.opt.ls_tolerance = 50, 1e-3
+        return model
+
+
+def table(chosen: Setting) -> list[Setting]:
+    """The settings compared: the chosen one, then one change at a time, then the fast ones that tempt."""
+
+    def vary(**changes) -> Setting:
+        return dataclasses.replace(chosen, **changes)
+
+    settings = [
+        chosen,
+        *(vary(iterations=n) for n in (1, 2, 3, 4, 6)),
+        *(vary(ls_iterations=n) for n in (4, 6, 10, 20)),
+        vary(solver="CG"),
+        vary(solver="CG", iterations=8),
+        vary(cone="elliptic"),
+        vary(integrator="Euler"),
+        *(vary(timestep=step) for step in (0.005, 0.01, 0.0125, 0.05 / 3, 0.025)),
+        vary(timestep=0.005, integrator="Euler", iterations=1),
+        vary(timestep=0.005, integrator="Euler", iterations=2),
+    ]
+    return list(dict.fromkeys(settings))
+
+
+def bang_bang(key: int, count: int, steps: int) -> Float[np.ndarray, "count steps 2"]:
+    """Commands that jump between 0 and 1, each leg by itself, after 3 to 16 control steps."""
+    rng = np.random.default_rng(key)
+    level = rng.integers(0, 2, (count, 2)).astype(float)
+    left = rng.integers(3, 17, (count, 2))
+    commands = np.empty((count, steps, 2))
+    for step in range(steps):
+        jump = left == 0
+        level = np.where(jump, 1 - level, level)
+        left = np.where(jump, rng.integers(3, 17, (count, 2)), left) - 1
+        commands[:, step] = level
+    return commands
+
+
+def settled(setting: Setting) -> Float[np.ndarray, " nq"]:
+    """The robot standing still with both commands at 0: generalized position after 4 s of damped motion."""
+    model = setting.tight(4)
+    data = mujoco.MjData(model)
+    data.qpos[:] = robot.standing_qpos(model)
+    while data.time < 4.0:
+        mujoco.mj_step(model, data)
+        data.qvel *= 0.98
+    return data.qpos.copy()
+
+
+def balloon_positions(
+    model: mujoco.MjModel, qpos: Float[np.ndarray, "count nq"]
+) -> Float[np.ndarray, "count 3"]:
+    """World position (m) of the balloon's site for each generalized position."""
+    data = mujoco.MjData(model)
+    site = data.site("balloon")
+    positions = []
+    for q in qpos:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        positions.append(site.xpos.copy())
+    return np.array(positions)
+
+
+def c_rollout(
+    model: mujoco.MjModel,
+    qpos: Float[np.ndarray, " nq"],
+    commands: Float[np.ndarray, "count steps 2"],
+    threads: int,
+) -> Float[np.ndarray, "count 3"]:
+    """Balloon positions (m) at the end, by C MuJoCo on `threads` threads."""
+    control = commands.repeat(simulation.substeps(model), axis=1)
+    data = [mujoco.MjData(model) for _ in range(threads)]
+    data[0].qpos[:] = qpos
+    kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    state = np.empty(mujoco.mj_stateSize(model, kind))
+    mujoco.mj_getState(model, data[0], state, kind)
+    states, _ = mujoco.rollout.rollout(model, data, np.tile(state, (len(commands), 1)), control)
+    return balloon_positions(model, np.asarray(states)[:, -1, 1 : 1 + model.nq])
+
+
+@dataclasses.dataclass(frozen=True)
+class MjxResult:
+    """Balloon positions (m) at the end, simulated seconds per second by the clock and by the processor time."""
+
+    positions: Float[np.ndarray, "count 3"]
+    wall: float
+    cpu: float
+
+
+def mjx_rollout(
+    model: mujoco.MjModel, qpos: Float[np.ndarray, " nq"], commands: Float[np.ndarray, "count steps 2"], batch: int
+) -> MjxResult:
+    """The same by MJX in float32, the sequences repeated to fill `batch` and sharded over all devices."""
+    devices = jax.device_count()
+    batch = -(-batch // devices) * devices
+    step_count, balloon = simulation.substeps(model), simulation.balloon_id(model)
+    mjx_model, start = mjx.put_model(model), simulation.make_data(model).replace(qpos=jnp.asarray(qpos))  # pyright: ignore
+
+    def one(command: Float[Array, "steps 2"]) -> Float[Array, " nq"]:
+        def step(data: mjx.Data, command: Float[Array, " 2"]) -> tuple[mjx.Data, None]:
+            data = simulation.control_step(
+                mjx_model, data, command, jnp.zeros(3), balloon=balloon, count=step_count
+            )
+            return data, None
+
+        return jax.lax.scan(step, start, command)[0].qpos
+
+    mesh = jax.make_mesh((devices,), ("batch",), axis_types=(jax.sharding.AxisType.Auto,))
+    spec = PartitionSpec("batch")
+    # Sharded by hand: left to the compiler, the solver's loops would wait for all devices at every iteration.
+    rollout = jax.jit(jax.shard_map(jax.vmap(one), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
+    inputs = jnp.asarray(np.resize(commands, (batch, *commands.shape[1:])), jnp.float32)
+    final = np.asarray(rollout(inputs))
+    clock, processor = [], []
+    for _ in range(3):
+        start_clock, start_processor = time.perf_counter(), time.process_time()
+        rollout(inputs).block_until_ready()
+        clock.append(time.perf_counter() - start_clock)
+        processor.append(time.process_time() - start_processor)
+    simulated = batch * commands.shape[1] * robot.CONTROL_TIMESTEP
+    return MjxResult(
+        positions=balloon_positions(model, final[: len(commands)]),
+        wall=simulated / min(clock),
+        cpu=simulated / min(processor) * devices,
+    )
+
+
+def distances(a: Float[np.ndarray, "count 3"], b: Float[np.ndarray, "count 3"]) -> tuple[float, float]:
+    """Median and 95th percentile of the distance, in millimetres; a diverged end counts as infinitely far."""
+    distance = np.linalg.norm(a - b, axis=1) * 1e3
+    distance = np.where(np.isfinite(distance), distance, np.inf)
+    return float(np.median(distance)), float(np.percentile(distance, 95, method="higher"))
+
+
+def main(
+    quick: bool = False,
+    sequences: int = 64,
+    batch: int = 512,
+    seed: int = 0,
+    mjx_too: Annotated[bool, tyro.conf.arg(name="mjx")] = True,
+) -> None:
+    """Table of accuracy against speed.
+
+    Args:
+        quick: only the chosen setting, 16 sequences and a small batch: its numbers mean little.
+        sequences: number of random command sequences.
+        batch: number of environments in MJX for the measurement of speed.
+        seed: of the commands.
+        mjx_too: judge and time MJX as well; without it only C MuJoCo is judged, in seconds.
+    """
+    if quick:
+        sequences, batch = 16, 32
+    chosen = Setting.of(robot.load_model())
+    settings = [chosen] if quick else table(chosen)
+    steps = round(DURATION / robot.CONTROL_TIMESTEP)
+    commands, qpos = bang_bang(seed, sequences, steps), settled(chosen)
+    threads = jax.device_count()
+
+    print(f"{sequences} sequences of {DURATION} s, seed {seed}; millimetres as median / 95 %; the first line is chosen")
+    if quick:
+        print("--quick: these numbers mean little")
+    head = f"{'setting':42}{'C tight':>16}{'C quarter':>16}"
+    print(head + (f"{'MJX tight':>16}{'MJX quarter':>16}{'wall':>7}{'cpu':>7}" if mjx_too else ""))
+    for setting in settings:
+        tight = c_rollout(setting.tight(), qpos, commands, threads)
+        quarter = c_rollout(setting.tight(4), qpos, commands, threads)
+        ends = [c_rollout(setting.model(), qpos, commands, threads)]
+        speed = ""
+        if mjx_too:
+            result = mjx_rollout(setting.model(), qpos, commands, batch)
+            ends.append(result.positions)
+            speed = f"{result.wall:7.0f}{result.cpu:7.0f}"
+        cells = [distances(end, judge) for end in ends for judge in (tight, quarter)]
+        text = "".join(f"{f'{median:.1f} / {high:.1f}':>16}" for median, high in cells)
+        print(f"{setting!s:42}{text}{speed}", flush=True)
+        if setting == chosen:
+            for kind, ((median, high), (step_median, _)) in zip(("C", "MJX"), zip(*[iter(cells)] * 2), strict=False):
+                met = (
+                    median < TARGETS_MM["tight median"]
+                    and high < TARGETS_MM["tight 95 %"]
+                    and step_median < TARGETS_MM["quarter median"]
+                )
+                print(f"    targets {TARGETS_MM} mm, {kind}: {'met' if met else 'MISSED'}")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

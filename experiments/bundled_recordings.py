@@ -1,0 +1,166 @@
+"""Record the bundled data set on the virtual robot, bit for bit: `python experiments/bundled_recordings.py`.
+
+Training: ten gaits of 20 s by hand (bang-bang commands of differing period, phase, duty and asymmetry), two of them
+three times, in different draughts. Validation and test: two near recordings (the same family of gaits, parameters
+between those trained on) and two far ones (commands unlike any gait) each. And one suspended actuator sweep.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import multiprocessing
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ballu_mjx import virtual_robot
+from ballu_mjx.recording import write_recording
+from ballu_mjx.robot import CONTROL_TIMESTEP, assets
+
+ROBOT_SEED = 0
+DECIMALS = 4
+"""Of positions and quaternions: rounding by 0.05 mm at most, a tenth of the noise, keeps the set under 2 MB."""
+SECONDS = {"training": 20.0, "validation": 21.0, "test": 21.0}
+"""A second more for validation and test: a horizon of 20 s starts after the policy's history has filled."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Gait:
+    """Bang-bang commands: each leg is at `high` for a fraction `duty` of every period, else at 0."""
+
+    period: float
+    """s."""
+    phase: float
+    """Right leg behind the left, in periods."""
+    duty: tuple[float, float]
+    high: tuple[float, float]
+
+    def commands(self, seconds: float) -> Float[np.ndarray, "steps 2"]:
+        time = np.arange(round(seconds / CONTROL_TIMESTEP)) * CONTROL_TIMESTEP
+        phases = time[:, None] / self.period + np.array([0.0, self.phase])
+        return np.where(phases % 1.0 < np.array(self.duty) - 1e-9, np.array(self.high), 0.0)
+
+
+TRAINING = (
+    Gait(0.70, 0.50, (0.40, 0.40), (1.00, 1.00)),
+    Gait(0.90, 0.50, (0.35, 0.35), (0.90, 0.90)),
+    Gait(1.10, 0.50, (0.45, 0.45), (0.80, 0.80)),
+    Gait(1.30, 0.50, (0.40, 0.40), (1.00, 1.00)),
+    Gait(1.60, 0.50, (0.30, 0.30), (0.80, 0.80)),
+    Gait(1.90, 0.50, (0.40, 0.40), (0.70, 0.70)),
+    Gait(1.00, 0.40, (0.40, 0.50), (1.00, 0.70)),
+    Gait(1.20, 0.60, (0.50, 0.35), (0.70, 1.00)),
+    Gait(1.50, 0.45, (0.35, 0.45), (0.90, 0.80)),
+    Gait(0.80, 0.55, (0.45, 0.35), (0.80, 1.00)),
+)
+REPEATED = (1, 3)
+"""Gaits that are recorded three times."""
+NEAR = {
+    "validation": (
+        Gait(1.00, 0.50, (0.40, 0.40), (0.90, 0.90)),
+        Gait(1.40, 0.45, (0.40, 0.35), (0.85, 0.95)),
+    ),
+    "test": (
+        Gait(1.20, 0.50, (0.40, 0.40), (0.90, 0.90)),
+        Gait(0.95, 0.55, (0.40, 0.45), (0.95, 0.80)),
+    ),
+}
+
+
+def hopping(seconds: float) -> Float[np.ndarray, "steps 2"]:
+    """Both legs together, a period of 1.4 s."""
+    return Gait(1.4, 0.0, (0.4, 0.4), (0.9, 0.9)).commands(seconds)
+
+
+def one_legged(seconds: float) -> Float[np.ndarray, "steps 2"]:
+    """Two strides on one leg, then two on the other."""
+    time = np.arange(round(seconds / CONTROL_TIMESTEP)) * CONTROL_TIMESTEP
+    left = Gait(1.0, 0.0, (0.45, 0.45), (1.0, 1.0)).commands(seconds)
+    return np.where(np.stack([time % 4.0 < 2.0, time % 4.0 >= 2.0], axis=1), left, 0.0)
+
+
+def telegraph(seconds: float) -> Float[np.ndarray, "steps 2"]:
+    """Each leg jumps to another random level after another random wait."""
+    rng = np.random.default_rng(11)
+    commands = np.zeros((round(seconds / CONTROL_TIMESTEP), 2))
+    for leg in range(2):
+        step = 0
+        while step < len(commands):
+            wait = rng.integers(5, 20)
+            commands[step : step + wait, leg] = rng.uniform(0.0, 1.0)
+            step += wait
+    return np.round(commands, 3)
+
+
+def waves(seconds: float) -> Float[np.ndarray, "steps 2"]:
+    """Smooth waves whose period drifts from 0.8 to 1.8 s."""
+    time = np.arange(round(seconds / CONTROL_TIMESTEP)) * CONTROL_TIMESTEP
+    phase = 2 * np.pi * np.cumsum(CONTROL_TIMESTEP / np.linspace(0.8, 1.8, len(time)))
+    return np.round(0.5 - 0.5 * np.cos(np.stack([phase, phase + np.pi], axis=1)), 3)
+
+
+FAR = {"validation": (hopping, one_legged), "test": (telegraph, waves)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """One recording to make."""
+
+    split: str
+    name: str
+    commands: Float[np.ndarray, "steps 2"]
+    trial: int
+    notes: str
+
+
+def jobs() -> list[Job]:
+    """All free recordings of the data set, each in a draught of its own."""
+    found: list[tuple[str, str, Float[np.ndarray, "steps 2"], str]] = []
+    for index, gait in enumerate(TRAINING):
+        for take in range(3 if index in REPEATED else 1):
+            name = f"gait-{index:02d}-take-{take + 1}"
+            found.append(("training", name, gait.commands(SECONDS["training"]), str(gait)))
+    for split in ("validation", "test"):
+        for index, gait in enumerate(NEAR[split]):
+            found.append((split, f"near-{index + 1}", gait.commands(SECONDS[split]), str(gait)))
+        for index, make in enumerate(FAR[split]):
+            found.append((split, f"far-{index + 1}", make(SECONDS[split]), f"{make.__name__}: {make.__doc__}"))
+    return [Job(*entry[:3], trial=100 + number, notes=entry[3]) for number, entry in enumerate(found)]
+
+
+def make(job: Job, robot_seed: int, output: Path) -> Path:
+    """Record one job and write it."""
+    robot = virtual_robot.draw_robot(robot_seed)
+    recording = virtual_robot.record(
+        robot,
+        virtual_robot.draw_trial(job.trial),
+        virtual_robot.open_loop(job.commands),
+        len(job.commands) * CONTROL_TIMESTEP,
+        job.name,
+        job.notes,
+    )
+    path = output / job.split / f"{job.name}.csv.gz"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_recording(recording, path, decimals=DECIMALS)
+    return path
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, default=assets() / "recordings", help="folder to write to")
+    parser.add_argument("--robot", type=int, default=ROBOT_SEED, help="seed of the virtual robot (bundled: 0)")
+    arguments = parser.parse_args()
+    with multiprocessing.get_context("spawn").Pool() as pool:
+        for path in pool.starmap(make, [(job, arguments.robot, arguments.output) for job in jobs()]):
+            print(path)
+    robot = virtual_robot.draw_robot(arguments.robot)
+    path = arguments.output / "suspended" / "sweep.csv.gz"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_recording(virtual_robot.record_sweep(robot, seed=arguments.robot, name="sweep"), path, decimals=DECIMALS)
+    print(path)
+
+
+if __name__ == "__main__":
+    main()
