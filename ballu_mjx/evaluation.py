@@ -88,17 +88,15 @@ class Evaluation:
 
     @property
     def score(self) -> float:
-        """What training minimizes on validation recordings: the mean ratio to vanilla, position and yaw alike.
+        """What choices are made by, on validation recordings: the mean ratio to vanilla, position and yaw alike.
 
-        Averaged over groups and over `SCORE_HORIZONS` (those that the recordings are long enough for).
+        Averaged over groups and over `SCORE_HORIZONS`, or over the longest horizon where recordings are shorter.
         """
-        ratios = [
-            self.ratio(group, quantity, horizon)
-            for group in self.groups
-            for quantity in ("position", "yaw")
-            for horizon in SCORE_HORIZONS
-            if any(horizon in e.position for e in self.vanilla if e.group == group)
-        ]
+        ratios = []
+        for group in self.groups:
+            reached = {horizon for e in self.vanilla if e.group == group for horizon in e.position}
+            for horizon in reached.intersection(SCORE_HORIZONS) or {max(reached)}:
+                ratios += [self.ratio(group, quantity, horizon) for quantity in ("position", "yaw")]
         return float(np.mean(ratios))
 
     def excess(self) -> tuple[float, str]:

@@ -76,7 +76,7 @@ class ActuatorParameters:
 
 
 def cable_length(
-    model: mujoco.MjModel, knee: Float[Array, " 2"], motor: Float[Array, " 2"]
+    model: mujoco.MjModel, knee: Float[Array | np.ndarray, " 2"], motor: Float[Array | np.ndarray, " 2"]
 ) -> Float[Array, " 2"]:
     """Distance (m) between the cable's ends at the given knee and motor angles (rad).
 

@@ -30,7 +30,8 @@ def prepare() -> None:
       sharded over host devices does. A count in the user's own `XLA_FLAGS` stays, and so do all other flags there.
     - Compiled programs are kept in `cache_dir()`, unless `JAX_COMPILATION_CACHE_DIR` says where.
     - XLA's log is quietened on machines without an accelerator, unless `TF_CPP_MIN_LOG_LEVEL` is set: every program
-      loaded from the cache otherwise prints pages about tuning flags that are no fault. Failures still arrive as exceptions.
+      loaded from the cache otherwise prints pages about tuning flags that are no fault. Failures still arrive as
+      exceptions.
     - A JAX that would hang is refused (`check_jax`), and MJX's report that Warp is not installed kept off the screen.
 
     Where JAX is imported already (a notebook, say), its settings stay as they are.

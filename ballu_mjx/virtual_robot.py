@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Float
@@ -163,10 +164,10 @@ def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
 
     nominal = ballu.load_model()
     parameters = ballu.ActuatorParameters(
-        knee_spring_stiffness=np.array(virtual.knee_spring_stiffness),  # pyright: ignore
-        motor_gain=np.array(virtual.motor_gain),  # pyright: ignore
-        default_motor_angle=np.array(virtual.default_motor_angle),  # pyright: ignore
-        default_knee_angle=np.array(virtual.default_knee_angle),  # pyright: ignore
+        knee_spring_stiffness=jnp.array(virtual.knee_spring_stiffness),
+        motor_gain=jnp.array(virtual.motor_gain),
+        default_motor_angle=jnp.array(virtual.default_motor_angle),
+        default_knee_angle=jnp.array(virtual.default_knee_angle),
     )
     ballu.set_fields(model, ballu.actuator_fields(model, parameters))
     model.tendon_lengthspring[:, 1] += np.array(virtual.cable_slack) - ballu.CABLE_SLACK
@@ -282,7 +283,7 @@ def _simulate(
     return capture, qpos, qvel
 
 
-def record_sweep(virtual: VirtualRobot, seed: int, name: str, *, commands: int = 20, hold: float = 1.5) -> Recording:
+def record_sweep(virtual: VirtualRobot, seed: int, name: str, *, commands: int = 20, hold: float = 2.0) -> Recording:
     """A suspended actuator sweep: `commands` levels spread uniformly over [0, 1], each held for `hold` seconds."""
     model = build(virtual, suspended=True)
     data = mujoco.MjData(model)
@@ -357,11 +358,11 @@ def _hidden(rng: np.random.Generator, frames: int) -> np.ndarray:
 def _capture_frame(
     data: mujoco.MjData, rng: np.random.Generator, hidden: np.ndarray, time: float, capture: Capture
 ) -> None:
-    def position(site: str, is_hidden: bool) -> np.ndarray:
+    def position(site: str, is_hidden: np.bool) -> np.ndarray:
         noisy = data.site(site).xpos + rng.normal(0, POSITION_NOISE, 3)
         return np.full(3, np.nan) if is_hidden else noisy
 
-    def quaternion(body: str, is_hidden: bool) -> np.ndarray:
+    def quaternion(body: str, is_hidden: np.bool) -> np.ndarray:
         noise = Rotation.from_rotvec(rng.normal(0, ORIENTATION_NOISE, 3))
         noisy = noise * Rotation.from_quat(data.body(body).xquat, scalar_first=True)
         return np.full(4, np.nan) if is_hidden else noisy.as_quat(scalar_first=True, canonical=True)

@@ -1,0 +1,154 @@
+"""Evaluation from the command line: `python -m ballu_mjx.evaluate RUN`.
+
+JAX, and all that needs it, is imported inside functions: `runtime.prepare` has to come first.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import tyro
+
+from ballu_mjx import runtime
+from ballu_mjx.errors import InputError
+
+if TYPE_CHECKING:
+    from ballu_mjx.evaluation import Evaluation, OpenLoopEvaluator
+    from ballu_mjx.ppo import Params
+    from ballu_mjx.recording import Recording
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Replay recordings open loop, without and with a run's residual forces, and print the errors of both."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    recordings: tuple[Path, ...] = ()
+    """Recordings to replay, files or folders. Without this option: the run's own for the test."""
+    last: bool = False
+    """Take the last checkpoint instead of the best by validation error."""
+    output: Path | None = None
+    """Folder for evaluation.txt, evaluation.json and tracking.png. Without this option: the table is only printed."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
+    try:
+        runtime.prepare()
+        options = tyro.cli(
+            Options, args=arguments, prog="python -m ballu_mjx.evaluate", config=(tyro.conf.FlagCreatePairsOff,)
+        )
+        _evaluate(options)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _evaluate(options: Options) -> None:
+    from ballu_mjx import evaluation, residual, robot, runs
+    from ballu_mjx.reconstruction import reconstruct
+    from ballu_mjx.recording import read_recording
+    from ballu_mjx.recording import recordings as expand
+
+    config = runs.read_config(options.run, "envmimic")
+    which = "last" if options.last else "best"
+    policy = residual.Residual.load(options.run, which)
+    paths = expand(options.recordings) or runs.find_recordings(config, "test", options.run)
+    recordings = [read_recording(path) for path in paths]
+    for path, recording in zip(paths, recordings, strict=True):
+        check_recording(path, recording, long_enough=True)
+    if options.output is not None:
+        options.output.mkdir(parents=True, exist_ok=True)
+
+    print(f"The {which} checkpoint of {options.run}: step {policy.step:,}.", flush=True)
+    model = robot.load_model()
+    motions = [reconstruct(recording, model) for recording in recordings]
+    evaluator = evaluation.OpenLoopEvaluator(model, motions, policy.config, policy.infer)
+    result = evaluator(policy.params) if options.output is None else report(evaluator, policy.params, options.output)
+    print(result.table())
+
+
+def check_recording(path: Path, recording: Recording, *, long_enough: bool) -> None:
+    """Refuse, with an `InputError`, a recording that EnvMimic cannot use: `long_enough` for an evaluation or not."""
+    from ballu_mjx.evaluation import SCORE_HORIZONS
+
+    if recording.kind != "free":
+        raise InputError(f"{path}: is a {recording.kind} recording; EnvMimic takes free ones only, leave it out.")
+    shortest = min(SCORE_HORIZONS) + 0.5
+    duration = recording.time[-1] - recording.time[0]
+    if long_enough and duration < shortest:
+        raise InputError(
+            f"{path}: lasts {duration:.1f} s; validation and test need {shortest:g} s or more, use it for training."
+        )
+
+
+def load_params(folder: Path, which: Literal["best", "last"]) -> tuple[int, Params]:
+    """Step and parameters of a run's checkpoint; `InputError` where there is none."""
+    from ballu_mjx import ppo, runs
+
+    step, tree = runs.restore(folder, which)
+    return step, ppo.from_tree(tree)
+
+
+def report(evaluator: OpenLoopEvaluator, params: Params, folder: Path) -> Evaluation:
+    """Evaluate, and write `evaluation.txt`, `evaluation.json` and `tracking.png` into `folder`."""
+    result = evaluator(params)
+    (folder / "evaluation.txt").write_text(result.table() + "\n", encoding="utf-8")
+    (folder / "evaluation.json").write_text(json.dumps(result.to_json(), indent=2) + "\n", encoding="utf-8")
+    tracking(evaluator, params, folder / "tracking.png")
+    return result
+
+
+def tracking(evaluator: OpenLoopEvaluator, params: Params, path: Path) -> None:
+    """Draw whole-recording replays: of the first recording of each group."""
+    from ballu_mjx import plots, robot
+    from ballu_mjx.evaluation import group_of
+
+    replays = {"vanilla": evaluator.replay(params, scale=0.0), "envmimic": evaluator.replay(params)}
+    shown: dict[str, plots.TrackingPanel] = {}
+    for run, (recording, _) in enumerate(evaluator.starts):
+        name = evaluator.motions[recording].name
+        if group_of(name) in shown:
+            continue
+        position, yaw = evaluator.recorded(run)
+        states = len(yaw)
+        simulations = {
+            simulator: np.column_stack([replay.position[run, :states, :2], replay.yaw[run, :states]])
+            for simulator, replay in replays.items()
+        }
+        shown[group_of(name)] = plots.TrackingPanel(
+            title=name,
+            time=np.arange(states) * robot.CONTROL_TIMESTEP,
+            recording=np.column_stack([position[:, :2], yaw]),
+            simulations=simulations,
+        )
+    plots.tracking(path, list(shown.values()))
+
+
+def learning_curve(folder: Path, best_step: int) -> None:
+    """Draw `learning_curve.png` from the run's `metrics.jsonl`."""
+    from ballu_mjx import plots, runs
+
+    def column(name: str) -> tuple[np.ndarray, np.ndarray]:
+        pairs = [(row["step"], row[name]) for row in runs.read_metrics(folder) if row.get(name) is not None]
+        steps, values = np.array(pairs, float).reshape(-1, 2).T
+        return steps, values
+
+    plots.learning_curve(
+        folder / "learning_curve.png", *column("reward"), *column("validation_error"), best_step=best_step
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

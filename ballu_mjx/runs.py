@@ -1,0 +1,298 @@
+"""A run: its folder, and what it shows of itself on the terminal.
+
+config.json         all it takes to repeat the run
+metrics.jsonl       one JSON object a line: `step` (control steps) and what was measured there
+tensorboard/        the same for TensorBoard
+checkpoints/STEP/   parameters (orbax): the last three, and the best by validation error
+evaluation.txt, evaluation.json, learning_curve.png, tracking.png
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import hashlib
+import importlib.metadata
+import json
+import math
+import sys
+import time
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, TextIO, TypeVar
+
+import orbax.checkpoint as ocp
+from orbax.checkpoint import checkpoint_managers as policies
+from tensorboardX import SummaryWriter
+from tqdm import tqdm
+
+from ballu_mjx import robot
+from ballu_mjx.errors import InputError
+
+FORMAT = "ballu-run/1"
+KEPT = 3
+"""Latest checkpoints that are kept."""
+
+_CONFIG, _METRICS = "config.json", "metrics.jsonl"
+_BUNDLED = "bundled:"
+_NO_SCORE = 1e30
+_PACKAGES = ("ballu-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "numpy")
+
+Which = Literal["best", "last"]
+Config = TypeVar("Config")
+
+
+def new_folder(output: Path | None, task: str) -> Path:
+    """The folder of a new run, empty or not there yet: `output`, or one under `runs/` named after task and time.
+
+    **Raises** `InputError` where `output` holds something.
+    """
+    if output is None:
+        stem = f"{task}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+        names = (stem if not number else f"{stem}-{number + 1}" for number in range(1000))
+        return next(folder for name in names if not (folder := Path("runs") / name).exists())
+    if output.exists() and not output.is_dir():
+        raise InputError(f"{output}: is a file; give --output a folder that is new or empty.")
+    if output.exists() and any(output.iterdir()):
+        mend = f"--resume {output} goes on with it, or give --output another folder"
+        if not (output / _CONFIG).exists():
+            mend = "give --output a folder that is new or empty"
+        raise InputError(f"{output}: the folder is not empty; {mend}.")
+    return output
+
+
+def read_config(folder: Path, task: str) -> dict[str, Any]:
+    """The content of a run's `config.json`.
+
+    **Raises** `InputError` where `folder` is no run of `task`.
+    """
+    path = folder / _CONFIG
+    if not path.is_file():
+        raise InputError(f"{folder}: there is no run ({_CONFIG} is missing); check the path.")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); restore it or start a new run.") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise InputError(f"{path}: is not of the format {FORMAT}; use the version of ballu_mjx that wrote it.")
+    if content.get("task") != task:
+        raise InputError(f"{folder}: is a run of {content.get('task')!r}; one of {task!r} is needed here.")
+    return content
+
+
+def typed(cls: type[Config], values: Mapping[str, Any], path: Path) -> Config:
+    """The configuration of class `cls`, a dataclass, from its JSON; fields that are missing take their default.
+
+    **Raises** `InputError` naming `path` and the field for fields that `cls` does not have.
+    """
+    fields = {field.name: field for field in dataclasses.fields(cls)}  # pyright: ignore[reportArgumentType]
+    hints = typing.get_type_hints(cls)
+    for name in values:
+        if name not in fields:
+            raise InputError(
+                f"{path / _CONFIG}: {cls.__name__} has no field {name!r}; use the version of ballu_mjx that wrote it."
+            )
+    return cls(**{name: _as_type(hints[name], value) for name, value in values.items()})
+
+
+def describe(
+    task: str, sections: Mapping[str, Any], recordings: Mapping[str, Sequence[Path]], devices: Sequence[str]
+) -> dict[str, Any]:
+    """What `config.json` holds: `sections` are configurations (dataclasses) by name, `recordings` files by use."""
+    return {
+        "format": FORMAT,
+        "task": task,
+        **{name: dataclasses.asdict(section) for name, section in sections.items()},
+        "recordings": {use: [describe_recording(path) for path in paths] for use, paths in recordings.items()},
+        "starts": [
+            {
+                "time": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
+                "command": list(sys.argv),
+                "python": sys.version.split()[0],
+                "versions": {name: _version(name) for name in _PACKAGES},
+                "devices": list(devices),
+            }
+        ],
+    }
+
+
+def describe_recording(path: Path) -> dict[str, str]:
+    """Where a recording lies (bundled ones independently of the installation), and the SHA-256 of its content."""
+    bundled = (robot.assets() / "recordings").resolve()
+    absolute = path.resolve()
+    inside = absolute.is_relative_to(bundled)
+    place = _BUNDLED + absolute.relative_to(bundled).as_posix() if inside else str(absolute)
+    return {"path": place, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+
+
+def find_recordings(config: Mapping[str, Any], use: str, folder: Path) -> list[Path]:
+    """The files that `describe_recording` described under `use`.
+
+    **Raises** `InputError` where one is missing or has changed.
+    """
+    paths = []
+    for entry in config["recordings"][use]:
+        place = entry["path"]
+        path = Path(place)
+        if place.startswith(_BUNDLED):
+            path = robot.assets() / "recordings" / place.removeprefix(_BUNDLED)
+        if not path.is_file():
+            raise InputError(f"{path}: the recording that {folder} used is gone; restore it or give --recordings.")
+        if describe_recording(path)["sha256"] != entry["sha256"]:
+            raise InputError(
+                f"{path}: the recording has changed since {folder} used it; restore it, or give it by --recordings to "
+                "use it as it is."
+            )
+        paths.append(path)
+    return paths
+
+
+class Run:
+    """An open run folder, for writing. A context manager: leaving it closes the files."""
+
+    def __init__(self, folder: Path, config: Mapping[str, Any], *, resumed_at: int | None = None) -> None:
+        """Open `folder`, new unless `resumed_at` says at which control step an old run goes on.
+
+        What an old run measured after that step is dropped: it will be measured again.
+        """
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+        if resumed_at is not None:
+            kept = [row for row in read_metrics(folder) if row["step"] <= resumed_at]
+            _write(folder / _METRICS, "".join(json.dumps(row) + "\n" for row in kept))
+            config = {**config, "starts": read_config(folder, config["task"])["starts"] + list(config["starts"])}
+        _write(folder / _CONFIG, json.dumps(config, indent=2, default=str) + "\n")
+        self._metrics = (folder / _METRICS).open("a", encoding="utf-8")
+        purge = None if resumed_at is None else resumed_at + 1
+        self._tensorboard = SummaryWriter(str(folder / "tensorboard"), purge_step=purge)
+        self._checkpoints = _manager(folder)
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._metrics.close()
+        self._tensorboard.close()
+        self._checkpoints.close()
+
+    def log(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Add a line of measurements at `step`."""
+        row = {"step": step, **{name: value if math.isfinite(value) else None for name, value in metrics.items()}}
+        self._metrics.write(json.dumps(row) + "\n")
+        self._metrics.flush()
+        for name, value in metrics.items():
+            self._tensorboard.add_scalar(name, value, step)
+        self._tensorboard.flush()
+
+    def save(self, step: int, tree: Mapping[str, Any], score: float | None) -> None:
+        """Write a checkpoint of nested dictionaries of arrays, unless that of `step` stands there already.
+
+        `score`: validation error, the smallest is the best; None where there is none.
+        """
+        if step in self._checkpoints.all_steps():
+            return
+        metrics = None if score is None else {"score": score if math.isfinite(score) else _NO_SCORE}
+        self._checkpoints.save(step, args=ocp.args.StandardSave(dict(tree)), metrics=metrics)
+        self._checkpoints.wait_until_finished()
+
+    def write(self, name: str, text: str) -> None:
+        """Write a text file into the folder."""
+        _write(self.folder / name, text)
+
+
+def restore(folder: Path, which: Which) -> tuple[int, dict[str, Any]]:
+    """Step and content of a run's best or last checkpoint.
+
+    **Raises** `InputError` where there is none.
+    """
+    if (folder / "checkpoints").is_dir():
+        with _manager(folder) as manager:
+            step = manager.latest_step() if which == "last" else manager.best_step()
+            if step is not None:
+                return step, manager.restore(step, args=ocp.args.StandardRestore())
+    kind = "validated checkpoint" if which == "best" else "checkpoint"
+    raise InputError(f"{folder}: the run has no {kind}; train for longer.")
+
+
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    """The rows of a run's `metrics.jsonl`; a last line cut off in the middle is left out."""
+    path = folder / _METRICS
+    lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
+    return [json.loads(line) for line in lines]
+
+
+class Progress:
+    """What a training run says while it runs: a bar on a terminal, a line every ten seconds elsewhere."""
+
+    interval = 10.0
+
+    def __init__(self, total: int, first: int = 0, stream: TextIO | None = None) -> None:
+        """`total` and `first`: control steps at the run's end and at its start."""
+        self._total = total
+        self._stream = stream or sys.stderr
+        self._bar = None
+        if self._stream.isatty():
+            layout = "{percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} steps{postfix}"
+            self._bar = tqdm(
+                total=total, initial=first, file=self._stream, bar_format=layout, unit_scale=True, dynamic_ncols=True
+            )
+        self._marks: list[tuple[float, int]] = []
+        self._said = -math.inf
+
+    def update(self, step: int, rate: float, reward: float, score: float | None) -> None:
+        """Show where training is: control step, steps/s, mean reward per step, validation error (None: none yet)."""
+        now = time.perf_counter()
+        # The time left is judged by the last minute's pace, validation included, compiling not.
+        self._marks = [mark for mark in self._marks if now - mark[0] < 60.0] + [(now, step)]
+        (then, before), left = self._marks[0], "?"
+        if step > before:
+            seconds = round((self._total - step) * (now - then) / (step - before))
+            left = str(datetime.timedelta(seconds=max(seconds, 0)))
+        error = "-" if score is None else f"{score:.3f}"
+        text = f"{rate:,.0f} steps/s, {left} left, reward {reward:.3f}, validation error {error}"
+        if self._bar is not None:
+            self._bar.update(min(step, self._total) - self._bar.n)
+            self._bar.set_postfix_str(text)
+        elif now - self._said >= self.interval or step >= self._total:
+            self._said = now
+            print(f"{step:,} of {self._total:,} steps, {text}", file=self._stream, flush=True)
+
+    def close(self) -> None:
+        """Leave the bar as it stands."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+def _manager(folder: Path) -> ocp.CheckpointManager:
+    best = policies.BestN(get_metric_fn=_score, reverse=True, n=1, keep_checkpoints_without_metrics=False)
+    options = ocp.CheckpointManagerOptions(
+        best_fn=_score,
+        best_mode="min",
+        preservation_policy=policies.AnyPreservationPolicy([policies.LatestN(KEPT), best]),
+        enable_async_checkpointing=False,
+    )
+    return ocp.CheckpointManager((folder / "checkpoints").resolve(), options=options)
+
+
+def _score(metrics: Any) -> float:
+    return metrics["score"]
+
+
+def _write(path: Path, text: str) -> None:
+    """Write all of a file or nothing."""
+    draft = path.with_name(path.name + ".tmp")
+    draft.write_text(text, encoding="utf-8")
+    draft.replace(path)
+
+
+def _as_type(hint: Any, value: Any) -> Any:
+    """JSON has no tuples."""
+    return tuple(value) if typing.get_origin(hint) is tuple and isinstance(value, list) else value
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None

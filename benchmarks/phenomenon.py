@@ -1,0 +1,155 @@
+"""Is there a gap to close? What the virtual robot does that the vanilla simulator does not.
+
+1. Yaw after 20 s, averaged over a gait and its left-right mirrored twin: a simulator without a side turns by nothing
+   on average, the robot turns.
+2. Vanilla started from recorded states: RMSE over a horizon of 10 s, recording by recording; and the same with the
+   robot's true actuator parameters, which the best identification could find, to see what is left to the air, the
+   balloon's offset, friction, backlash and latency.
+
+`python benchmarks/phenomenon.py`
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+import jax.numpy as jnp  # noqa: E402
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+from jaxtyping import Float  # noqa: E402
+from mujoco import rollout  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
+
+from ballu_mjx import recording, reconstruction, robot, simulation, virtual_robot  # noqa: E402
+
+SECONDS = 20.0
+GAITS = ((0.7, 0.40, 1.0), (0.9, 0.35, 0.9), (1.1, 0.45, 0.8), (1.3, 0.40, 1.0), (1.6, 0.30, 0.8), (1.9, 0.40, 0.7))
+"""Period (s), duty and height of bang-bang gaits, legs half a period apart."""
+HORIZON = 10.0
+
+
+def gait_commands(gait: tuple[float, float, float]) -> Float[np.ndarray, "steps 2"]:
+    """Commands at the control rate."""
+    period, duty, high = gait
+    phase = np.arange(round(SECONDS / robot.CONTROL_TIMESTEP))[:, None] * robot.CONTROL_TIMESTEP / period
+    return np.where((phase + np.array([0.0, 0.5])) % 1.0 < duty - 1e-9, high, 0.0)
+
+
+def yaw(qpos: Float[np.ndarray, "states nq"]) -> Float[np.ndarray, " states"]:
+    """Unwrapped yaw of the base, deg."""
+    rotation = Rotation.from_quat(qpos[:, 3:7], scalar_first=True)
+    return np.rad2deg(np.unwrap(rotation.as_euler("ZYX")[:, 0]))
+
+
+def robot_yaw(seed: int, trial: int, commands: Float[np.ndarray, "steps 2"]) -> float:
+    """Yaw (deg) that the virtual robot gains over the commands."""
+    virtual, circumstances = virtual_robot.draw_robot(seed), virtual_robot.draw_trial(trial)
+    qpos, _ = virtual_robot.record_truth(virtual, circumstances, virtual_robot.open_loop(commands), SECONDS)
+    turned = yaw(qpos)
+    return float(turned[-1] - turned[0])
+
+
+def replay(
+    model: mujoco.MjModel, starts: list[tuple[np.ndarray, np.ndarray]], commands: Float[np.ndarray, "runs steps 2"]
+) -> Float[np.ndarray, "runs steps nq"]:
+    """Generalized positions at the end of every control step, in C MuJoCo."""
+    spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    data = mujoco.MjData(model)
+    states = np.zeros((len(starts), mujoco.mj_stateSize(model, spec)))
+    for row, (qpos, qvel) in enumerate(starts):
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        mujoco.mj_getState(model, data, states[row], spec)
+    count = simulation.substeps(model)
+    states, _ = rollout.rollout(
+        model, [mujoco.MjData(model) for _ in range(2)], states, np.repeat(commands, count, axis=1)
+    )
+    return states[:, count - 1 :: count, 1 : 1 + model.nq]
+
+
+def standing(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """The state after two seconds of standing still."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = robot.standing_qpos(model)
+    mujoco.mj_step(model, data, round(2.0 / model.opt.timestep))
+    return data.qpos.copy(), data.qvel.copy()
+
+
+def identified(virtual: virtual_robot.VirtualRobot) -> mujoco.MjModel:
+    """The training simulator with the robot's own actuator parameters: more than identification can hope for."""
+    model = robot.load_model()
+    parameters = robot.ActuatorParameters(
+        *(
+            jnp.array(getattr(virtual, name))
+            for name in ("knee_spring_stiffness", "motor_gain", "default_motor_angle", "default_knee_angle")
+        )
+    )
+    robot.set_fields(model, robot.actuator_fields(model, parameters))
+    return model
+
+
+def horizon_errors(model: mujoco.MjModel, motion: reconstruction.Motion) -> tuple[float, float]:
+    """Mean over starts a second apart of the base's position RMSE (m) and yaw RMSE (deg) over the horizon."""
+    steps, interval = round(HORIZON / robot.CONTROL_TIMESTEP), round(1.0 / robot.CONTROL_TIMESTEP)
+    firsts = range(2, len(motion.command) - steps + 1, interval)
+    commands = np.stack([motion.command[first : first + steps] for first in firsts])
+    runs = replay(model, [(motion.qpos[first], motion.qvel[first]) for first in firsts], commands)
+    position, turn = [], []
+    for first, run in zip(firsts, runs, strict=True):
+        recorded = motion.qpos[first + 1 : first + steps + 1]
+        position.append(np.sqrt(np.mean(np.sum((run[:, :3] - recorded[:, :3]) ** 2, axis=1))))
+        difference = np.deg2rad(yaw(run) - yaw(recorded))
+        turn.append(np.rad2deg(np.sqrt(np.mean(np.arctan2(np.sin(difference), np.cos(difference)) ** 2))))
+    return float(np.mean(position)), float(np.mean(turn))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--robot", type=int, default=0, help="seed of the virtual robot (the bundled one: 0)")
+    parser.add_argument("--quick", action="store_true", help="two gaits and two recordings")
+    arguments = parser.parse_args()
+    gaits = GAITS[:2] if arguments.quick else GAITS
+
+    jobs = []
+    for trial, gait in enumerate(gaits):
+        commands = gait_commands(gait)
+        jobs += [(arguments.robot, 1000 + 2 * trial, commands), (arguments.robot, 1001 + 2 * trial, commands[:, ::-1])]
+    with multiprocessing.get_context("spawn").Pool() as pool:
+        turned = np.reshape(pool.starmap(robot_yaw, jobs), (-1, 2)).mean(axis=1)
+    vanilla = robot.load_model()
+    both = np.stack([job[2] for job in jobs])
+    simulated = replay(vanilla, [standing(vanilla)] * len(both), both)
+    vanilla_turned = np.reshape([yaw(run)[-1] for run in simulated], (-1, 2)).mean(axis=1)
+    print(f"Yaw after {SECONDS:g} s, mean of a gait and its mirrored twin (deg)")
+    print(f"{'period (s)':>12}{'duty':>8}{'height':>8}{'robot':>10}{'vanilla':>10}")
+    for gait, ours, theirs in zip(gaits, turned, vanilla_turned, strict=True):
+        print(f"{gait[0]:>12g}{gait[1]:>8g}{gait[2]:>8g}{ours:>10.1f}{theirs:>10.1f}")
+    print(f"robot at 30 deg or more: {np.sum(np.abs(turned) >= 30)} of {len(gaits)}; ", end="")
+    print(f"vanilla at 5 deg or less: {np.sum(np.abs(vanilla_turned) <= 5)} of {len(gaits)}\n")
+
+    if arguments.robot != 0:
+        return
+    known = identified(virtual_robot.draw_robot(arguments.robot))
+    print(f"RMSE over {HORIZON:g} s from recorded states, mean over starts: position (m) and yaw (deg)")
+    print(f"{'recording':>26}{'vanilla':>18}{'true actuators':>20}")
+    wide = []
+    for split in ("validation", "test", "training"):
+        paths = recording.bundled(split)
+        for path in paths[:1] if arguments.quick else paths:
+            motion = reconstruction.reconstruct(recording.read_recording(path), vanilla)
+            (p, y), (q, z) = horizon_errors(vanilla, motion), horizon_errors(known, motion)
+            wide.append((p >= 0.2, y >= 10.0, q / p, z / y))
+            print(f"{split + ' ' + motion.name:>26}{p:>10.3f} m{y:>6.1f}{q:>12.3f} m{z:>6.1f}")
+    table = np.array(wide, float)
+    print(f"vanilla at 0.2 m or more: {table[:, 0].sum():.0f} of {len(table)}, ", end="")
+    print(f"at 10 deg or more: {table[:, 1].sum():.0f} of {len(table)}")
+    print(f"left with the true actuators (median): {np.median(table[:, 2]):.2f} of the position error, ", end="")
+    print(f"{np.median(table[:, 3]):.2f} of the yaw error")
+
+
+if __name__ == "__main__":
+    main()

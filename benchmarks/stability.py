@@ -1,0 +1,97 @@
+"""Whether the simulation stays sane under abuse: random commands and random forces on the balloon.
+
+    python benchmarks/stability.py           # 2,000 environments for 20 s
+    python benchmarks/stability.py --quick
+
+Every environment gets new commands, uniform in [0, 1], and a new force on the balloon, uniform within 1 N on each
+axis, at every control step. Exit status 1 where a state is not finite or a joint is faster than 100 rad/s, looked at
+after every physics step.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jax import Array
+from jax.sharding import PartitionSpec
+from mujoco import mjx
+
+from ballu_mjx import robot, simulation
+
+MAX_JOINT_SPEED = 100.0
+"""rad/s"""
+
+
+def main(
+    quick: bool = False, environments: int = 2000, duration: float = 20.0, force: float = 1.0, seed: int = 0
+) -> None:
+    """Random commands and forces on many environments.
+
+    Args:
+        quick: 100 environments for 5 s: its numbers mean little.
+        environments: simulated side by side.
+        duration: simulated time, s.
+        force: largest force on each axis, N.
+        seed: of the commands and forces.
+    """
+    if quick:
+        environments, duration = 100, 5.0
+        print("--quick: these numbers mean little")
+    model = robot.load_model()
+    substeps, balloon, devices = simulation.substeps(model), simulation.balloon_id(model), jax.device_count()
+    steps = round(duration / robot.CONTROL_TIMESTEP)
+    mjx_model = mjx.put_model(model)
+    start = simulation.make_data(model).replace(qpos=jnp.asarray(robot.standing_qpos(model)))  # pyright: ignore
+
+    def worst(key: Array) -> tuple[Array, Array]:
+        """Number of physics steps with a state that is not finite; each hinge's greatest speed (rad/s) before that."""
+
+        def control(data: mjx.Data, key: Array) -> tuple[mjx.Data, tuple[Array, Array]]:
+            command_key, force_key = jax.random.split(key)
+            command = jax.random.uniform(command_key, (2,))
+            push = jax.random.uniform(force_key, (3,), minval=-force, maxval=force)
+
+            def physics(data: mjx.Data, _: None) -> tuple[mjx.Data, tuple[Array, Array]]:
+                data = simulation.control_step(mjx_model, data, command, push, balloon=balloon, count=1)
+                finite = jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all()
+                return data, (finite, jnp.abs(data.qvel[6:]))
+
+            data, (finite, speed) = jax.lax.scan(physics, data, None, length=substeps)
+            return data, ((~finite).sum(), jnp.nanmax(speed, axis=0))
+
+        _, (bad, speed) = jax.lax.scan(control, start, jax.random.split(key, steps))
+        return bad.sum(), jnp.nanmax(speed, axis=0)
+
+    count = -(-environments // devices) * devices
+    keys = jax.random.split(jax.random.key(seed), count)
+    mesh = jax.make_mesh((devices,), ("batch",), axis_types=(jax.sharding.AxisType.Auto,))
+    spec = PartitionSpec("batch")
+    run = jax.jit(jax.shard_map(jax.vmap(worst), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
+    compiled = run.lower(keys).compile()
+    clock = time.perf_counter()
+    bad, speed = (np.asarray(x) for x in compiled(keys))
+    clock = time.perf_counter() - clock
+
+    diverged = int((bad > 0).sum())
+    fastest = speed.max(axis=1)
+    print(f"{count} environments x {duration} s, forces to {force} N, {model.opt.timestep * 1e3:.2f} ms: {clock:.0f} s")
+    print(f"diverged: {diverged}")
+    print(f"greatest joint speed: {fastest.max():.1f} rad/s, in the median environment {np.median(fastest):.1f}")
+    for name, value in zip(robot.JOINTS, speed.max(axis=0), strict=True):
+        print(f"    {name:12} {value:6.1f}")
+    if diverged or not fastest.max() <= MAX_JOINT_SPEED:
+        print(f"FAILED: wanted no divergence and no joint faster than {MAX_JOINT_SPEED:.0f} rad/s")
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,218 @@
+"""The residual-force task: its equations, its frames, its resets."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ballu_mjx import envmimic, evaluation, robot
+from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv
+from ballu_mjx.reconstruction import Motion
+
+STEPS = 30
+
+
+def make_motion(force: np.ndarray, name: str = "made", steps: int = STEPS) -> Motion:
+    """Nominal robot in C MuJoCo at the training time step, stepping, with a constant force on the balloon."""
+    model = robot.load_model()
+    data = mujoco.MjData(model)
+    data.qpos[:] = robot.standing_qpos(model)
+    balloon = model.body("balloon").id
+    substeps = round(robot.CONTROL_TIMESTEP / model.opt.timestep)
+    mujoco.mj_step(model, data, 100)
+    time = np.arange(steps) * robot.CONTROL_TIMESTEP
+    command = np.stack([(time % 1.2 < 0.5), ((time + 0.6) % 1.2 < 0.5)], axis=1) * 0.9
+    qpos, qvel = [data.qpos.copy()], [data.qvel.copy()]
+    data.xfrc_applied[balloon, :3] = force
+    for step in range(steps):
+        data.ctrl[:] = command[step]
+        mujoco.mj_step(model, data, substeps)
+        qpos.append(data.qpos.copy())
+        qvel.append(data.qvel.copy())
+    return Motion(
+        name=name,
+        time=np.arange(steps + 1) * robot.CONTROL_TIMESTEP,
+        command=command,
+        qpos=np.array(qpos),
+        qvel=np.array(qvel),
+        **{f.name: _EMPTY[f.name] for f in dataclasses.fields(Motion) if f.name in _EMPTY},
+    )
+
+
+_EMPTY = {"residual_mm": {}, "pitch_deviation": 0.0, "interpolated": {}}
+
+
+@pytest.fixture(scope="module")
+def still() -> Motion:
+    return make_motion(np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def pushed() -> Motion:
+    return make_motion(np.array([0.04, 0.0, 0.02]))
+
+
+def test_reward_is_the_papers():
+    config = EnvMimicConfig(fine_weight=0.0)
+    seen, target = np.zeros(27, np.float32), np.zeros(27, np.float32)
+    seen[:3] = [0.1, -0.2, 0.05]
+    seen[6:9] = [0.1, 0.2, np.pi - 0.05]
+    target[6:9] = [0.0, 0.0, -np.pi + 0.05]
+    terms = envmimic.reward_terms(jnp.array(seen), jnp.array(target), config)
+    assert float(terms["position"]) == pytest.approx(np.exp(-10 * (0.1**2 + 0.2**2 + 0.05**2)), rel=1e-5)
+    # The yaw difference is 0.1 rad across the wrap, not 2 pi - 0.1.
+    weighted = 0.2 * 0.1**2 + 0.4 * 0.2**2 + 0.4 * 0.1**2
+    assert float(terms["orientation"]) == pytest.approx(np.exp(-2 * weighted), rel=1e-4)
+    assert float(terms["tracking"]) == pytest.approx(0.7 * float(terms["position"]) + 0.3 * float(terms["orientation"]))
+
+
+def test_euler_angles_are_intrinsic_zyx():
+    for seed in range(20):
+        rotation = Rotation.random(rng=np.random.default_rng(seed))
+        ours = envmimic.euler_angles(jnp.array(rotation.as_quat(scalar_first=True), jnp.float32))
+        np.testing.assert_allclose(ours, rotation.as_euler("ZYX")[::-1], atol=2e-3)
+
+
+def test_features_agree_with_c_mujoco(still: Motion):
+    model = robot.load_model()
+    data = mujoco.MjData(model)
+    simulator = envmimic.Simulator(model)
+    rng = np.random.default_rng(0)
+    data.qpos[:] = still.qpos[17]
+    data.qvel[:] = rng.normal(0, 1.0, model.nv)
+    mujoco.mj_forward(model, data)
+    loaded = simulator.load(*(jnp.array(x, jnp.float32) for x in (data.qpos, data.qvel, np.zeros(model.nv))))
+    ours, com = jax.jit(simulator.observe)(loaded)
+    frames = []
+    for site in ("balloon", "base", "foot_left", "foot_right"):
+        velocity = np.zeros(6)
+        index = model.site(site).id
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, index, velocity, 0)
+        frames += [data.site(site).xpos, velocity[3:]]
+    euler = Rotation.from_quat(data.body("balloon").xquat, scalar_first=True).as_euler("ZYX")[::-1]
+    np.testing.assert_allclose(ours, np.concatenate([*frames[:2], euler, *frames[2:]]), atol=1e-4)
+    np.testing.assert_allclose(com, data.subtree_com[1], atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_observation_and_force_turn_with_the_robot(still: Motion, seed: int):
+    """The same motion elsewhere in the room, in another direction: same observation, force turned along."""
+    rng = np.random.default_rng(seed)
+    simulator = envmimic.Simulator(robot.load_model())
+    reference, _ = envmimic.stack(simulator, [still])
+    turn = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi))
+    moved_qpos, moved_qvel = still.qpos.copy(), still.qvel.copy()
+    moved_qpos[:, :3] = turn.apply(still.qpos[:, :3]) + [rng.normal(), rng.normal(), 0]
+    start = Rotation.from_quat(still.qpos[:, 3:7], scalar_first=True)
+    moved_qpos[:, 3:7] = (turn * start).as_quat(scalar_first=True)
+    moved_qvel[:, :3] = turn.apply(still.qvel[:, :3])
+    moved, _ = envmimic.stack(simulator, [dataclasses.replace(still, qpos=moved_qpos, qvel=moved_qvel)])
+    here, there = reference.features[0, 10:13], moved.features[0, 10:13]
+    np.testing.assert_allclose(envmimic.observation(here), envmimic.observation(there), atol=2e-4)
+    config, action = EnvMimicConfig(), jnp.array([1.0, -0.5, 0.3])
+    np.testing.assert_allclose(
+        turn.apply(envmimic.world_force(action, here[-1, 8], config)),
+        envmimic.world_force(action, there[-1, 8], config),
+        atol=1e-5,
+    )
+
+
+def test_force_stays_within_its_limit():
+    config = EnvMimicConfig()
+    force = envmimic.world_force(jnp.array([1e6, -1e6, 0.0]), jnp.zeros(()), config)
+    np.testing.assert_allclose(force, [1.0, -1.0, 0.0])
+
+
+def test_reset_starts_at_recorded_states_with_their_history(still: Motion, pushed: Motion):
+    env = EnvMimicEnv(robot.load_model(), [still, pushed], EnvMimicConfig(start_noise=0.0))
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 256))
+    s = states.pipeline_state
+    recording, time = np.asarray(s["recording"]), np.asarray(s["time"])
+    assert set(recording) == {0, 1}
+    assert set(time) == set(range(envmimic.HISTORY - 1, STEPS))
+    motions = [still, pushed]
+    for run in range(0, 256, 16):
+        np.testing.assert_allclose(s["qpos"][run], motions[recording[run]].qpos[time[run]], atol=1e-6)
+        expected = env.reference.features[recording[run], time[run] - 2 : time[run] + 1]
+        np.testing.assert_array_equal(s["history"][run], expected)
+
+
+def test_start_noise_stays_small_and_keeps_the_quaternion_a_unit(still: Motion):
+    env = EnvMimicEnv(robot.load_model(), [still], EnvMimicConfig(start_noise=1.0))
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 256)).pipeline_state
+    recorded = np.asarray(env.reference.qpos)[0, np.asarray(states["time"])]
+    np.testing.assert_allclose(np.linalg.norm(states["qpos"][:, 3:7], axis=1), 1.0, atol=1e-5)
+    angle = 2 * np.arccos(np.clip(np.abs(np.sum(states["qpos"][:, 3:7] * recorded[:, 3:7], axis=1)), 0, 1))
+    assert 0.3 < np.rad2deg(angle).mean() < 1.5
+    hinges = np.rad2deg(np.asarray(states["qpos"][:, 7:]) - recorded[:, 7:])
+    assert 0.4 < hinges[:, 0].std() < 0.6
+    assert np.abs(hinges[:, 3]).max() == 0.0  # motors stay
+
+
+def test_time_limits_truncate_and_divergence_terminates(still: Motion):
+    env = EnvMimicEnv(robot.load_model(), [still], EnvMimicConfig(episode_seconds=0.1, start_noise=0.0))
+    step = jax.jit(env.step)
+    state = jax.jit(env.reset)(jax.random.key(3))
+    state = step(state, jnp.zeros(3))
+    assert (float(state.done), float(state.info["truncation"])) == (0.0, 0.0)
+    state = step(state, jnp.zeros(3))
+    assert (float(state.done), float(state.info["truncation"])) == (1.0, 1.0)
+
+    state = jax.jit(env.reset)(jax.random.key(3))
+    s = state.pipeline_state
+    broken = state.replace(pipeline_state=s | {"qvel": s["qvel"].at[3].set(jnp.nan)})
+    state = step(broken, jnp.zeros(3))
+    assert (float(state.done), float(state.info["truncation"])) == (1.0, 0.0)
+    assert float(state.metrics["diverged"]) == 1.0
+    assert all(np.isfinite(x).all() for x in state.obs.values()) and np.isfinite(float(state.reward))
+
+
+def test_the_missing_force_earns_more_than_none_and_its_opposite_less(pushed: Motion):
+    """A constant force on the reference robot: would catch a sign or frame error."""
+    env = EnvMimicEnv(robot.load_model(), [pushed], EnvMimicConfig(start_noise=0.0))
+    state = jax.jit(env.reset)(jax.random.key(5))
+    s = state.pipeline_state
+    start = 2
+    state = state.replace(
+        pipeline_state=s
+        | {
+            "qpos": env.reference.qpos[0, start],
+            "qvel": env.reference.qvel[0, start],
+            "history": env.reference.features[0, start - 2 : start + 1],
+            "time": jnp.asarray(start, s["time"].dtype),
+        }
+    )
+    step = jax.jit(env.step)
+
+    def total(force: np.ndarray) -> float:
+        run, reward = state, 0.0
+        for _ in range(20):
+            heading = np.asarray(envmimic.heading_rotation(run.pipeline_state["history"][-1, 8]))
+            run = step(run, jnp.asarray(heading.T @ force / env.config.force_scale, jnp.float32))
+            reward += float(run.reward)
+        return reward
+
+    force = np.array([0.04, 0.0, 0.02])
+    assert total(force) > total(np.zeros(3)) + 0.05 > total(-force) + 0.1
+    assert total(force) > 20 * 0.999
+
+
+def test_evaluator_finds_no_error_in_its_own_physics_and_some_in_pushed_ones():
+    config = EnvMimicConfig()
+    motions = [make_motion(np.zeros(3), "near-own", 60), make_motion(np.array([0.04, 0, 0.02]), "far-pushed", 60)]
+    constant = lambda params, _: params / config.force_scale  # noqa: E731
+    evaluator = evaluation.OpenLoopEvaluator(robot.load_model(), motions, config, constant)
+    force = jnp.array([0.04, 0.0, 0.02])
+    result = evaluator(force)
+    own, pushed = result.vanilla
+    assert own.group == "near" and pushed.group == "far"
+    assert own.position[1.0][0] < 1e-3 and own.yaw[1.0][0] < 0.1
+    assert pushed.position[2.0][0] > 0.03
+    # The force that made the recording explains it; on the other recording it does harm, and the bound says so.
+    assert result.ratio("far", "position", 2.0) < 0.1
+    assert result.excess()[0] > 0 and "near-own" in result.excess()[1]
+    assert result.score < 1

@@ -1,0 +1,187 @@
+"""The stand-in for the hardware: its air, its actuators, its motion capture, and the wall around it."""
+
+import ast
+import dataclasses
+import gzip
+import importlib.util
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+import ballu_mjx
+from ballu_mjx import recording, robot, virtual_robot
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def virtual() -> virtual_robot.VirtualRobot:
+    return virtual_robot.draw_robot(0)
+
+
+def test_one_newton_accelerates_the_balloon_and_its_air(virtual: virtual_robot.VirtualRobot):
+    """From rest: MuJoCo's own fluid model has no added mass, and would let the balloon go at 1 N / 0.159 kg."""
+    model = virtual_robot.build(virtual)
+    data = mujoco.MjData(model)
+    data.qpos[2] = 2.0
+    mujoco.mj_forward(model, data)
+    before = _balloon_acceleration(model, data)
+    data.xfrc_applied[model.body("balloon").id, 2] = 1.0
+    mujoco.mj_forward(model, data)
+    gained = _balloon_acceleration(model, data)[2] - before[2]
+    # Pushed upwards, balloon and base rise together; the legs hang from free hips.
+    whole = model.body_mass.sum()
+    assert 1 / whole < gained <= 1 / (0.15898 + virtual.added_mass)
+
+
+def _balloon_acceleration(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    acceleration = np.zeros(6)
+    mujoco.mj_rnePostConstraint(model, data)
+    mujoco.mj_objectAcceleration(model, data, mujoco.mjtObj.mjOBJ_BODY, model.body("balloon").id, acceleration, 0)
+    return acceleration[3:] + model.opt.gravity
+
+
+def test_lift_is_the_stated_share_of_the_robots_weight(virtual: virtual_robot.VirtualRobot):
+    """Standing still in still air, the floor carries what lift does not; the added mass of air weighs nothing."""
+    model = virtual_robot.build(virtual)
+    data = mujoco.MjData(model)
+    data.qpos[:] = robot.standing_qpos(model)
+    mujoco.mj_step(model, data, 6000)
+    load = 0.0
+    for contact in range(data.ncon):
+        force = np.zeros(6)
+        mujoco.mj_contactForce(model, data, contact, force)
+        load += force[0]
+    weight = robot.load_model().body_mass.sum() * 9.81
+    assert load / weight == pytest.approx(1 - virtual.buoyancy, abs=0.01)
+
+
+def test_drag_slows_a_flying_balloon_and_a_draught_carries_it(virtual: virtual_robot.VirtualRobot):
+    still = virtual_robot.build(virtual)
+    still.opt.gravity[:] = 0.0
+    blown = virtual_robot.build(virtual)
+    blown.opt.gravity[:] = 0.0
+    blown.opt.wind[0] = 1.0
+    ends = []
+    for model, speed in ((still, 1.0), (blown, 0.0)):
+        data = mujoco.MjData(model)
+        data.qpos[2] = 3.0
+        data.qvel[0] = speed
+        mujoco.mj_step(model, data, 2000)
+        ends.append(data.qvel[0])
+    assert 0.2 < ends[0] < 0.98
+    assert 0.02 < ends[1] < 0.8
+
+
+def test_commands_arrive_late_and_through_play():
+    servos = virtual_robot._Servos(0.05, np.deg2rad([4.0, 0.0]), [], np.zeros(2))
+    servos.send(0.0, np.array([0.5, 0.5]))
+    assert servos.at(0.049).tolist() == [0.0, 0.0]
+    up = servos.at(0.050)
+    assert up[1] == 0.5 and up[0] == pytest.approx(0.5 - 2 / 90)
+    servos.send(0.1, np.array([0.48, 0.48]))
+    # Turning back by less than the play's width leaves the arm where it is.
+    assert servos.at(0.2)[0] == up[0] and servos.at(0.2)[1] == 0.48
+
+
+def test_capture_is_as_noisy_and_as_patchy_as_stated(virtual: virtual_robot.VirtualRobot):
+    commands = np.zeros((400, 2))
+    trial = virtual_robot.draw_trial(7)
+    seen = virtual_robot.record(virtual, trial, virtual_robot.open_loop(commands), 20.0, "standing")
+    qpos, _ = virtual_robot.record_truth(virtual, trial, virtual_robot.open_loop(commands), 20.0)
+    assert seen.base_position is not None and seen.foot_position is not None
+    noise = seen.base_position - qpos[:, :3]
+    assert np.nanstd(noise, axis=0) == pytest.approx(np.full(3, 5e-4), rel=0.1)
+    hidden = np.isnan(np.concatenate([seen.base_position, seen.foot_position.reshape(-1, 6)], axis=1))
+    assert 0.0 < hidden.mean() < 0.05
+
+
+def test_a_controller_sees_only_what_was_captured_before(virtual: virtual_robot.VirtualRobot):
+    """Closed loop: frames so far and nothing else; what it answers is what the robot is sent."""
+    lengths = []
+
+    def controller(capture: virtual_robot.Capture) -> np.ndarray:
+        lengths.append(len(capture.time))
+        assert len(capture.balloon_position) == len(capture.time) == len(capture.command) + 1
+        return np.array([0.1, 0.2]) * (len(lengths) % 2)
+
+    seen = virtual_robot.record(virtual, virtual_robot.draw_trial(1), controller, 1.0, "closed")
+    assert lengths == list(range(1, 101, 5))
+    assert seen.command[:5].tolist() == [[0.1, 0.2]] * 5 and seen.command[5].tolist() == [0.0, 0.0]
+
+
+def test_the_nominal_member_has_no_side():
+    """With the two sides alike and the balloon centred, mirrored commands give the mirrored walk."""
+    virtual = dataclasses.replace(
+        virtual_robot.draw_robot(0),
+        balloon_offset=(0.0, 0.0, 0.0),
+        **{
+            field: (getattr(virtual_robot.draw_robot(0), field)[0],) * 2
+            for field in (
+                "knee_spring_stiffness default_knee_angle knee_friction motor_gain default_motor_angle torque_limit "
+                "motor_friction backlash cable_slack foot_friction"
+            ).split()
+        },
+    )
+    trial = virtual_robot.Trial((0.0, 0.0, 0.0), (0.0, 10.0), (0.0, 0.0, 0.0), 0)
+    commands = np.zeros((20, 2))
+    commands[:10, 0] = commands[10:, 1] = 0.8
+    left, _ = virtual_robot.record_truth(virtual, trial, virtual_robot.open_loop(commands), 1.0)
+    right, _ = virtual_robot.record_truth(virtual, trial, virtual_robot.open_loop(commands[:, ::-1]), 1.0)
+    np.testing.assert_allclose(left[:, [0, 2]], right[:, [0, 2]], atol=1e-5)
+    np.testing.assert_allclose(left[:, 1], -right[:, 1], atol=1e-5)
+    assert np.abs(left[-1, 0] - left[0, 0]) > 0.01
+
+
+def test_a_bundled_recording_is_made_again_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    spec = importlib.util.spec_from_file_location("bundle", ROOT / "experiments" / "bundled_recordings.py")
+    assert spec is not None and spec.loader is not None
+    bundle = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "bundle", bundle)
+    spec.loader.exec_module(bundle)
+    job = bundle.jobs()[0]
+    again = bundle.make(job, bundle.ROBOT_SEED, tmp_path)
+    shipped = robot.assets() / "recordings" / job.split / again.name
+    # The text, not the compressed bytes: those depend on the zlib at hand.
+    assert gzip.decompress(again.read_bytes()) == gzip.decompress(shipped.read_bytes())
+
+
+def test_the_sweep_holds_twenty_levels_until_the_joints_settle():
+    (path,) = recording.bundled("suspended")
+    sweep = recording.read_recording(path)
+    assert sweep.kind == "suspended" and sweep.motor is not None and sweep.knee is not None
+    levels, first = np.unique(sweep.command[:, 0], return_index=True)
+    assert len(levels) == 20 and (levels[0], levels[-1]) == (0.0, 1.0)
+    for start, end in zip(first, [*first[1:], len(sweep.time)], strict=True):
+        settled = np.rad2deg(sweep.knee[end - (end - start) // 3 : end])
+        assert np.abs(np.polyfit(np.arange(len(settled)) * 0.01, settled, 1)[0]).max() < 1.0  # deg/s; noise alone gives 0.6
+    assert np.rad2deg(sweep.knee[-1] - sweep.knee[0]).min() > 25
+
+
+def test_bundled_free_recordings_show_no_motors_and_weigh_two_megabytes_at_most():
+    for split in ("training", "validation", "test"):
+        for path in recording.bundled(split):
+            seen = recording.read_recording(path)
+            assert seen.motor is None and seen.knee is None
+            assert seen.time[-1] - seen.time[0] >= 19.9
+    assert sum(path.stat().st_size for path in (robot.assets() / "recordings").rglob("*.*")) < 2 * 2**20
+
+
+def test_nothing_that_trains_knows_the_virtual_robot():
+    """Its parameters reach training through recordings alone."""
+    package = Path(ballu_mjx.__file__).parent
+    for path in package.glob("*.py"):
+        if path.name == "virtual_robot.py":
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [f"{node.module}.{alias.name}" for alias in node.names]
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                names = [node.value] if node.value.endswith("virtual_robot") else []
+            assert not any("virtual_robot" in name for name in names), f"{path.name} imports the virtual robot"
