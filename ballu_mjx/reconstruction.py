@@ -4,8 +4,8 @@
 2. Positions: a batched least-squares inverse kinematics, one small problem a sample.
 3. The base's pitch: with the neck's lever of 15 mm, markers show it to some 7 deg a sample. Unless the base's
    orientation is recorded, it is fitted over the whole recording at once to markers and the base's torque balance.
-4. Velocities: a centred (hence lag-free) Savitzky-Golay differentiator, wide for the balloon that is slow and whose
-   rates matter most to what a simulator does next, narrow for the legs.
+4. Velocities: a centred (hence lag-free) Savitzky-Golay differentiator, widest for the balloon's rotation: it is slow,
+   and its rates matter most to what a simulator does next.
 5. Motor angles: the model's own servo, driven by the recorded commands and held back by the cable at the knee angles
    found, so that motor, cable and knee agree. A recording's motor columns, where there are any, are taken instead.
 """
@@ -65,12 +65,13 @@ class ReconstructionParameters:
     """Standard deviation (rad) of the base's pitch about the balloon's: keeps a single sample's problem well posed."""
     torque_noise: float = 1e-3
     """Standard deviation (N m) of the base's torque balance, a sample at 100 Hz; 1 deg of pitch is 2e-4 N m."""
-    position_window: float = 0.17
-    """Width (s) of the Savitzky-Golay filter for the base's position."""
+    position_window: float = 0.09
+    """Width (s) of the Savitzky-Golay filter for the base's place and all hinges."""
+    rate_window: float = 0.19
+    """The same for their velocities. One width for base and legs, so that a standing foot's velocity comes out as 0.
+    Wider than what follows a knee's sudden stops best: noise in a velocity does the simulator more harm."""
     rotation_window: float = 0.31
-    """The same for the balloon's orientation."""
-    leg_window: float = 0.09
-    """The same for the neck and the legs. Knees stop within 20 ms when a foot lands or the cable goes taut."""
+    """The same for the balloon's orientation and its rate."""
     force_window: float = 0.15
     """The same for the accelerations in the base's torque balance."""
     order: int = 3
@@ -125,11 +126,13 @@ def reconstruct(
         held, pitch_deviation = _base_pitch(model, skeleton, grid, fitted, parameters)
         fitted = _inverse_kinematics(skeleton, grid, parameters, held)
     else:
-        window = _window(parameters.leg_window, grid.step, parameters.order, len(fitted))
+        window = _window(parameters.position_window, grid.step, parameters.order, len(fitted))
         shrinkage = np.linalg.norm(savgol_coeffs(window, parameters.order))
         pitch_deviation = float(parameters.rotation_noise * shrinkage)
 
     qpos, qvel = _differentiate(fitted, grid.step, parameters)
+    # A semi-implicit integrator's velocity is the mean over the time step that led to the position.
+    qvel -= np.gradient(qvel, grid.step, axis=0) * model.opt.timestep / 2
     knees = qpos[:, 7:][:, KNEES]
     stops = np.array([model.joint(f"knee_{side}").range for side in SIDES])
     knees[:] = np.clip(knees, stops[:, 0] - _STOP_GIVE, stops[:, 1])
@@ -484,7 +487,10 @@ def _base_pitch(
 
     hinges = qpos[:, 7:]
     others = measured[:, None] + np.column_stack([hinges[:, 0], hinges[:, HIPS]])
-    drive = smooth(others, parameters.leg_window, 2) @ armature + smooth(others, parameters.leg_window, 1) @ damping
+    drive = (
+        smooth(others, parameters.position_window, 2) @ armature
+        + smooth(others, parameters.position_window, 1) @ damping
+    )
     center = model.body_ipos[base]
     inertia = model.body_inertia[base][1] + model.body_mass[base] * (center[0] ** 2 + center[2] ** 2) + armature.sum()
 
@@ -575,29 +581,31 @@ def _filter(values: np.ndarray, width: float, step: float, order: int, derivativ
 def _differentiate(
     qpos: Float[np.ndarray, "T nq"], step: float, parameters: ReconstructionParameters
 ) -> tuple[Float[np.ndarray, "T nq"], Float[np.ndarray, "T nv"]]:
-    """Smoothed generalized positions and their velocities, in MuJoCo's conventions.
+    """Smoothed generalized positions and their velocities at the same instants, in MuJoCo's conventions.
 
     Filtered are the base's position, the balloon's orientation, the neck, the femurs' angles to the balloon, the knees
     and the motors. The base, light and loosely tied, follows from balloon and neck.
     """
 
-    def smooth(values: np.ndarray, width: float) -> _Smoothing:
-        return tuple(_filter(values, width, step, parameters.order, k) for k in (0, 1))  # pyright: ignore
+    def smooth(values: np.ndarray, width: float, rate_width: float) -> _Smoothing:
+        order = parameters.order
+        return _filter(values, width, step, order, 0), _filter(values, rate_width, step, order, 1)
 
+    narrow, wide, rotation = parameters.position_window, parameters.rate_window, parameters.rotation_window
     hinges = qpos[:, 7:]
     y = np.array([0.0, 1.0, 0.0])
     base = Rotation.from_quat(qpos[:, 3:7], scalar_first=True)
     balloon = (base * Rotation.from_rotvec(np.outer(hinges[:, 0], y))).as_quat(scalar_first=True)
 
-    position, linear = smooth(qpos[:, :3], parameters.position_window)
+    position, linear = smooth(qpos[:, :3], narrow, wide)
     # Components of a quaternion are as smooth as the motion; the norm is restored after, and drops out of the rate.
-    quaternion, rate = smooth(_sign_continuous(balloon), parameters.rotation_window)
+    quaternion, rate = smooth(_sign_continuous(balloon), rotation, rotation)
     w, v, w_rate, v_rate = quaternion[:, :1], quaternion[:, 1:], rate[:, :1], rate[:, 1:]
     angular = 2 * (w * v_rate - w_rate * v - np.cross(v, v_rate)) / np.sum(quaternion**2, axis=1, keepdims=True)
 
     to_balloon = hinges.copy()
     to_balloon[:, HIPS] -= hinges[:, :1]
-    angles, rates = smooth(to_balloon, parameters.leg_window)
+    angles, rates = smooth(to_balloon, narrow, wide)
     angles[:, HIPS] += angles[:, :1]
     rates[:, HIPS] += rates[:, :1]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import os
 import signal
@@ -83,36 +84,32 @@ def test_evaluate_repeats_the_same_numbers(trained: Path):
     assert first == second
 
 
-def test_resume_goes_on_where_the_run_stopped(trained: Path):
-    before = runs.read_metrics(trained)
-    refused = command("train", "envmimic", "--resume", "run", folder=trained.parent)
-    assert refused.returncode == 2
-    assert refused.stderr == "run: is at step 240 already; give a --num-timesteps above that to train for longer.\n"
-    done = command("train", "envmimic", "--resume", "run", "--num-timesteps", 5 * STEPS, folder=trained.parent)
-    assert done.returncode == 0, done.stderr
-    after = runs.read_metrics(trained)
-    assert after[: len(before)] == before
-    assert [row["step"] for row in after if "reward" in row] == [n * STEPS for n in (1, 2, 3, 4, 5)]
-    config = json.loads((trained / "config.json").read_text())
-    assert config["ppo"]["seed"] == 3 and config["ppo"]["num_envs"] == 8  # given once, kept
-    assert len(config["starts"]) == 2
-    steps = sorted(int(path.name) for path in (trained / "checkpoints").iterdir())
-    assert set(steps) >= {3 * STEPS, 5 * STEPS} and len(steps) <= runs.KEPT + 1
-
-
-def test_interrupted_run_can_go_on(trained: Path):
+def test_interrupted_run_goes_on_where_it_stopped(trained: Path):
+    folder = trained.parent
     line = [sys.executable, "-m", "ballu_mjx.train", "envmimic", "--recordings", "data", "--output", "stopped"]
-    line += ["--num-timesteps", str(400 * STEPS), "--validate-every", str(400 * STEPS), *SIZES]
-    with subprocess.Popen(line, cwd=trained.parent, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
-        metrics = trained.parent / "stopped" / "metrics.jsonl"
+    line += ["--num-timesteps", str(400 * STEPS), "--validate-every", str(400 * STEPS), "--seed", "5", *SIZES]
+    metrics = folder / "stopped" / "metrics.jsonl"
+    with subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
         while process.poll() is None and not (metrics.exists() and '"reward"' in metrics.read_text()):
-            time.sleep(0.2)
+            time.sleep(0.1)
         os.kill(process.pid, signal.SIGINT)
         error = process.communicate()[1].decode()
     assert process.returncode == 130, error
     assert "--resume stopped" in error and "Traceback" not in error
-    step = runs.restore(trained.parent / "stopped", "last")[0]
-    assert step == runs.read_metrics(trained.parent / "stopped")[-1]["step"] > 0
+    stop = runs.restore(folder / "stopped", "last")[0]
+    before = runs.read_metrics(folder / "stopped")
+    assert stop == before[-1]["step"] > 0
+
+    total = stop + 2 * STEPS
+    done = command("train", "envmimic", "--resume", "stopped", "--num-timesteps", total, folder=folder)
+    assert done.returncode == 0, done.stderr
+    after = runs.read_metrics(folder / "stopped")
+    assert after[: len(before)] == before
+    assert [row["step"] for row in after if "reward" in row] == list(range(STEPS, total + STEPS, STEPS))
+    config = json.loads((folder / "stopped" / "config.json").read_text())
+    assert config["ppo"]["seed"] == 5 and config["ppo"]["num_envs"] == 8  # given once, kept
+    assert len(config["starts"]) == 2
+    assert runs.restore(folder / "stopped", "last")[0] == total
 
 
 def test_help_explains_every_option(folder: Path):
@@ -140,6 +137,7 @@ def test_wrong_path_is_refused_in_one_sentence(folder: Path):
         (["--recordings", "{suspended}"], "EnvMimic takes free ones only"),
         (["--recordings", "data", "--output", "data"], "data: the folder is not empty"),
         (["--resume", "data"], "data: there is no run"),
+        (["--resume", "run"], "run: is at step 240 already"),
         (["--resume", "run", "--quick"], "--quick does not go with --resume"),
         (["--resume", "run", "--policy-layers", "8"], "--policy-layers does not go with --resume"),
         (["--recordings", "short.csv"], "lasts 3.0 s; validation and test need"),
@@ -165,3 +163,29 @@ def test_changed_recording_is_noticed(trained, monkeypatch, capsys):
     finally:
         path.write_bytes(content)
     assert "has changed since run used it" in capsys.readouterr().err
+
+
+def test_last_three_checkpoints_and_the_best_are_kept(tmp_path: Path):
+    with runs.Run(tmp_path / "run", {"format": runs.FORMAT, "task": "envmimic", "starts": []}) as run:
+        for step, score in enumerate([0.9, 0.5, 0.7, 0.8, float("nan"), 0.6]):
+            run.save(step, {"x": np.full(3, step)}, score)
+        run.save(6, {"x": np.full(3, 6)}, None)
+    assert sorted(int(path.name) for path in (tmp_path / "run" / "checkpoints").iterdir()) == [1, 4, 5, 6]
+    for (step, tree), expected in (
+        (runs.restore(tmp_path / "run", "best"), 1),
+        (runs.restore(tmp_path / "run", "last"), 6),
+    ):
+        assert step == expected
+        np.testing.assert_array_equal(tree["x"], np.full(3, expected))
+
+
+def test_progress_is_readable_in_a_file(monkeypatch):
+    clock = iter(np.arange(0.0, 1000.0, 4.0))
+    monkeypatch.setattr(time, "perf_counter", lambda: float(next(clock)))
+    stream = io.StringIO()
+    progress = runs.Progress(1000, stream=stream)
+    for step in range(100, 1100, 100):
+        progress.update(step, 25.0, 0.5, None if step < 300 else 0.9)
+    lines = stream.getvalue().splitlines()
+    assert [line.split()[0] for line in lines] == ["100", "400", "700", "1,000"]
+    assert lines[1] == "400 of 1,000 steps, 25 steps/s, 0:00:24 left, reward 0.500, validation error 0.900"

@@ -1,0 +1,296 @@
+"""How well states are reconstructed from recordings.
+
+    python benchmarks/inverse_kinematics.py            # three gaits of 20 s
+    python benchmarks/inverse_kinematics.py --quick
+
+The nominal robot walks in C MuJoCo under bang-bang commands and is seen as motion capture would see it, at 100 Hz with
+noise. Errors are printed as median / 95th percentile over all control steps, of velocities as root mean square:
+
+- `recorded base` has the base's orientation in the recording, `no base` has not, `exact` is `no base` without noise;
+- `stand-in` is the virtual robot of the family that the bundled recordings come from, seen without its base's
+  orientation, its states judged against its own; its motors, unlike the model's, show how far its servos differ.
+
+Divergence is what the states are for: C MuJoCo, started from them ten times a second, against the recorded walk, by how
+far the balloon's place and heading have gone astray after 0.25, 1 and 2 s. `crude` are the same positions
+with velocities from differences of neighbouring samples.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+import time
+from pathlib import Path
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+import mujoco
+import numpy as np
+import tyro
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from ballu_mjx import robot, virtual_robot
+from ballu_mjx.reconstruction import Motion, ReconstructionParameters, reconstruct
+from ballu_mjx.recording import Recording, read_recording, write_recording
+
+CAPTURE_STEP = 0.01
+HORIZONS = (0.25, 1.0, 2.0)
+"""s"""
+GAITS = ((1.2, 0.4, 0.5), (1.6, 0.5, 0.4), (0.8, 0.45, 0.5))
+"""Period (s), duty, phase of the right leg."""
+SITES = ("balloon", "base", "foot_left", "foot_right")
+HIPS, KNEES, MOTORS = [8, 11], [9, 12], [10, 13]
+"""Places in qpos."""
+
+TARGETS = {"knees deg": 1.0, "femurs deg": 1.0, "tibias deg": 1.0, "base mm": 2.0}
+"""Largest median errors on noisy recordings of the nominal robot; with the base's orientation also of `hips deg`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Walk:
+    """True states at 100 Hz, and the commands held from each to the next."""
+
+    command: Float[np.ndarray, "T 2"]
+    qpos: Float[np.ndarray, "T nq"]
+    qvel: Float[np.ndarray, "T nv"]
+
+
+def walk(model: mujoco.MjModel, gait: tuple[float, float, float], duration: float) -> Walk:
+    """The nominal robot from standing."""
+    period, duty, phase = gait
+    moment = np.arange(round(duration / CAPTURE_STEP) + 1) * CAPTURE_STEP
+    turns = moment[:, None] / period + np.array([0.0, phase]) + 1e-9
+    command = np.where(turns % 1.0 < duty, 1.0, 0.0)
+    data = mujoco.MjData(model)
+    data.qpos[:] = robot.standing_qpos(model)
+    qpos, qvel = [], []
+    for row in command:
+        qpos.append(data.qpos.copy())
+        qvel.append(data.qvel.copy())
+        data.ctrl[:] = row
+        mujoco.mj_step(model, data, round(CAPTURE_STEP / model.opt.timestep))
+    return Walk(command, np.array(qpos), np.array(qvel))
+
+
+def capture(
+    model: mujoco.MjModel, walked: Walk, noise: ReconstructionParameters | None, base: bool, seed: int
+) -> Recording:
+    """What motion capture sees, with the noise that the reconstruction assumes, or without any."""
+    rng = np.random.default_rng(seed)
+    data = mujoco.MjData(model)
+    places, balloon = [], []
+    for row in walked.qpos:
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        places.append([data.site(name).xpos.copy() for name in SITES])
+        balloon.append(data.body("balloon").xquat.copy())
+    sites = np.array(places)
+    sites += rng.normal(size=sites.shape) * (noise.position_noise if noise else 0.0)
+
+    def orientation(exact: np.ndarray) -> np.ndarray:
+        error = rng.normal(size=(len(exact), 3)) * (noise.rotation_noise if noise else 0.0)
+        seen = (Rotation.from_quat(exact, scalar_first=True) * Rotation.from_rotvec(error)).as_quat(scalar_first=True)
+        flips = np.sum(seen[1:] * seen[:-1], axis=1) < 0
+        return seen * np.concatenate([[1.0], np.cumprod(np.where(flips, -1.0, 1.0))])[:, None]
+
+    return Recording(
+        name="walk",
+        kind="free",
+        robot="nominal",
+        time=np.arange(len(sites)) * CAPTURE_STEP,
+        command=walked.command,
+        balloon_position=sites[:, 0],
+        balloon_quaternion=orientation(np.array(balloon)),
+        base_position=sites[:, 1],
+        base_quaternion=orientation(walked.qpos[:, 3:7]) if base else None,
+        foot_position=sites[:, 2:],
+    )
+
+
+def errors(walked: Walk, motion: Motion) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Absolute errors of the positions, and errors of the velocities, by name."""
+    every = round(robot.CONTROL_TIMESTEP / CAPTURE_STEP)
+    qpos, qvel = walked.qpos[::every][: len(motion.qpos)], walked.qvel[::every][: len(motion.qpos)]
+    turn = Rotation.from_quat(qpos[:, 3:7], scalar_first=True).inv() * Rotation.from_quat(
+        motion.qpos[:, 3:7], scalar_first=True
+    )
+    x, pitch, z = turn.as_rotvec(degrees=True).T
+    degrees = np.rad2deg(motion.qpos - qpos)
+    # About the common axis of hips and knees; what is left of a direction's error is the base's roll and yaw.
+    femur = degrees[:, HIPS] + pitch[:, None]
+    tibia = femur + degrees[:, KNEES]
+    rate = motion.qvel - qvel
+    positions = {
+        "base mm": 1e3 * np.linalg.norm(motion.qpos[:, :3] - qpos[:, :3], axis=1),
+        "base pitch deg": pitch,
+        "base roll, yaw deg": np.stack([x, z]),
+        "knees deg": degrees[:, KNEES],
+        "femurs deg": np.hypot(femur, x[:, None]),
+        "tibias deg": np.hypot(tibia, x[:, None]),
+        "hips deg": degrees[:, HIPS],
+        "neck deg": degrees[:, 7],
+        "motors deg": degrees[:, MOTORS],
+    }
+    velocities = {
+        "base mm/s": 1e3 * rate[:, :3],
+        "base roll, yaw rad/s": rate[:, [3, 5]],
+        "base pitch rad/s": rate[:, 4],
+        "hips rad/s": rate[:, [7, 10]],
+        "knees rad/s": rate[:, [8, 11]],
+        "motors rad/s": rate[:, [9, 12]],
+    }
+    return {name: np.abs(value).ravel() for name, value in positions.items()}, velocities
+
+
+def replay(
+    model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, commands: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Balloon's place and heading at each horizon, the commands held over their control steps."""
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    substeps = round(robot.CONTROL_TIMESTEP / model.opt.timestep)
+    ends = [round(horizon / robot.CONTROL_TIMESTEP) for horizon in HORIZONS]
+    place, heading = [], []
+    for step, command in enumerate(commands[: ends[-1]], start=1):
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data, substeps)
+        if step in ends:
+            mujoco.mj_kinematics(model, data)
+            place.append(data.site("balloon").xpos.copy())
+            x = data.body("balloon").xmat.reshape(3, 3)[:, 0]
+            heading.append(np.arctan2(x[1], x[0]))
+    return np.array(place), np.array(heading)
+
+
+def divergence(model: mujoco.MjModel, walked: Walk, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """Distance (mm) and heading (deg) between starts from `motion` and from the truth, [starts, horizons]."""
+    every = round(robot.CONTROL_TIMESTEP / CAPTURE_STEP)
+    distance, turn = [], []
+    for k in range(0, len(motion.command) - round(HORIZONS[-1] / robot.CONTROL_TIMESTEP), 2):
+        commands = motion.command[k:]
+        place, heading = replay(model, motion.qpos[k], motion.qvel[k], commands)
+        true_place, true_heading = replay(model, walked.qpos[every * k], walked.qvel[every * k], commands)
+        distance.append(1e3 * np.linalg.norm(place - true_place, axis=1))
+        turn.append(np.abs(np.rad2deg(np.angle(np.exp(1j * (heading - true_heading))))))
+    return np.array(distance), np.array(turn)
+
+
+def crude(model: mujoco.MjModel, motion: Motion, recording: Recording) -> Motion:
+    """`motion` with velocities from neighbouring samples, at the recording's rate, of unfiltered positions."""
+    unfiltered = ReconstructionParameters(position_window=0.05, rate_window=0.05, rotation_window=0.05)
+    return dataclasses.replace(motion, qvel=reconstruct(recording, model, unfiltered).qvel)
+
+
+def spread(values: np.ndarray, digits: int = 2) -> str:
+    """Median / 95 %."""
+    return f"{np.median(values):.{digits}f} / {np.percentile(values, 95):.{digits}f}"
+
+
+def table(columns: dict[str, dict[str, str]]) -> None:
+    """Rows by name, a column a case."""
+    rows = list(dict.fromkeys(name for column in columns.values() for name in column))
+    width = max(16, *(len(cell) + 2 for column in columns.values() for cell in column.values()))
+    print(f"{'':24}" + "".join(f"{case:>{width}}" for case in columns))
+    for row in rows:
+        print(f"{row:24}" + "".join(f"{column.get(row, ''):>{width}}" for column in columns.values()))
+
+
+def gather(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def main(quick: bool = False, duration: float = 20.0, seed: int = 0) -> None:
+    """Table of errors of the reconstructed states.
+
+    Args:
+        quick: one gait of 6 s: its numbers mean little.
+        duration: seconds a gait.
+        seed: of the noise.
+    """
+    gaits = GAITS[:1] if quick else GAITS
+    duration = 6.0 if quick else duration
+    model, noise = robot.load_model(), ReconstructionParameters()
+    walks = [walk(model, gait, duration) for gait in gaits]
+    print(
+        f"{len(gaits)} gaits of {duration} s, {noise.position_noise * 1e3} mm and "
+        f"{np.rad2deg(noise.rotation_noise):.1f} deg of noise, seed {seed}; median / 95 %"
+    )
+    if quick:
+        print("--quick: these numbers mean little")
+
+    columns: dict[str, dict[str, str]] = {}
+    medians: dict[str, dict[str, float]] = {}
+    runs: dict[str, tuple[list[Walk], list[Motion]]] = {}
+    crudes: list[Motion] = []
+    for case, level, base in (("recorded base", noise, True), ("no base", noise, False), ("exact", None, False)):
+        recordings = [capture(model, walked, level, base, seed + i) for i, walked in enumerate(walks)]
+        start = time.perf_counter()
+        motions = [reconstruct(recordings[0], model)]
+        first = time.perf_counter() - start
+        start = time.perf_counter()
+        motions = [reconstruct(recording, model) for recording in recordings]
+        each = (time.perf_counter() - start) / len(recordings)
+        print(f"{case}: {first:.1f} s for the first recording, {each:.1f} s for each after", flush=True)
+        runs[case] = walks, motions
+        if case == "no base":
+            crudes = [crude(model, *pair) for pair in zip(motions, recordings, strict=True)]
+
+    trials = [virtual_robot.draw_trial(seed + i) for i in range(len(gaits))]
+    stand_in = virtual_robot.draw_robot(seed)
+    seen, true = [], []
+    for walked, trial in zip(walks, trials, strict=True):
+        every = round(robot.CONTROL_TIMESTEP / CAPTURE_STEP)
+        commands = walked.command[:-1:every]
+        recording = virtual_robot.record(stand_in, trial, virtual_robot.open_loop(commands), duration, "stand-in")
+        filled = fill(dataclasses.replace(recording, base_quaternion=None))
+        qpos, qvel = virtual_robot.record_truth(stand_in, trial, virtual_robot.open_loop(commands), duration)
+        seen.append(reconstruct(filled, model))
+        true.append(Walk(walked.command, qpos, qvel))
+    runs["stand-in"] = true, seen
+
+    for case, (truths, motions) in runs.items():
+        pairs = [errors(truth, motion) for truth, motion in zip(truths, motions, strict=True)]
+        positions, velocities = gather([p for p, _ in pairs]), gather([v for _, v in pairs])
+        medians[case] = {name: float(np.median(value)) for name, value in positions.items()}
+        said = np.rad2deg(np.mean([motion.pitch_deviation for motion in motions]))
+        residuals = {name: np.mean([m.residual_mm[name] for m in motions]) for name in motions[0].residual_mm}
+        columns[case] = {
+            **{name: spread(value) for name, value in positions.items()},
+            "pitch, as reported deg": f"{said:.2f}",
+            **{f"{name} rms": f"{np.sqrt(np.mean(value**2)):.3f}" for name, value in velocities.items()},
+            **{f"residual {name} mm": f"{value:.2f}" for name, value in residuals.items()},
+        }
+    table(columns)
+
+    print("\ndivergence of the simulator from the truth, started from the states found")
+    columns = {}
+    starts = {case: run[1] for case, run in runs.items() if case != "stand-in"} | {"crude": crudes}
+    for case, motions in starts.items():
+        results = [divergence(model, truth, motion) for truth, motion in zip(walks, motions, strict=True)]
+        distance, turn = (np.concatenate(part) for part in zip(*results, strict=True))
+        columns[case] = {
+            **{f"balloon {h} s, mm": spread(distance[:, i], 1) for i, h in enumerate(HORIZONS)},
+            **{f"heading {h} s, deg": spread(turn[:, i], 1) for i, h in enumerate(HORIZONS)},
+        }
+    table(columns)
+
+    print()
+    for case in ("recorded base", "no base"):
+        limits = TARGETS | ({"hips deg": 1.0} if case == "recorded base" else {})
+        missed = [name for name, limit in limits.items() if medians[case][name] > limit]
+        print(f"targets (medians) {limits}, {case}: {'MISSED: ' + ', '.join(missed) if missed else 'met'}")
+
+
+def fill(recording: Recording) -> Recording:
+    """Hidden markers interpolated, by way of a file, as users' recordings come."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "recording.csv"
+        write_recording(recording, path)
+        return read_recording(path)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

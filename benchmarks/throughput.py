@@ -1,0 +1,108 @@
+"""How fast is training? Control steps per second of PPO on EnvMimic, learning included, beside bare physics.
+
+In one run, on the same machine: PPO on the bundled recordings with the command's own sizes; the same environments
+stepped without learning; and C MuJoCo's `rollout` of the same model at the same time step, with as many threads as
+there are devices. Speeds are given in control steps and in simulated seconds per second; the first, compiling call of
+everything is left out.
+
+`python benchmarks/throughput.py`
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+from mujoco import rollout  # noqa: E402
+
+from ballu_mjx import ppo, recording, reconstruction, robot, simulation  # noqa: E402
+from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv  # noqa: E402
+
+
+def training_rates(env: EnvMimicEnv, config: ppo.PPOConfig) -> list[float]:
+    """Control steps per second of each training step but the first, which compiles."""
+    rates: list[float] = []
+
+    def note(step: int, params: ppo.Params, metrics: dict[str, float]) -> None:
+        if metrics:
+            rates.append(metrics["steps_per_second"])
+
+    ppo.train(env, config, note)
+    return rates[1:]
+
+
+def stepping_rates(env: EnvMimicEnv, num_envs: int, repeats: int, length: int = 20) -> list[float]:
+    """Control steps per second of the environments alone, sharded over all devices."""
+    wrapped = ppo.wrap_for_training(env)
+    devices = jax.local_device_count()
+    keys = jax.random.split(jax.random.key(0), num_envs).reshape(devices, -1)
+    action = jnp.zeros((num_envs // devices, env.action_size))
+    state = jax.pmap(wrapped.reset)(keys)
+    unroll = jax.pmap(lambda s: jax.lax.scan(lambda s, _: (wrapped.step(s, action), None), s, None, length=length)[0])
+    state = jax.block_until_ready(unroll(state))
+    rates = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        state = jax.block_until_ready(unroll(state))
+        rates.append(num_envs * length / (time.perf_counter() - began))
+    return rates
+
+
+def rollout_rates(model: mujoco.MjModel, threads: int, repeats: int, runs: int = 64, seconds: float = 2.0) -> list[float]:
+    """Control steps per second of C MuJoCo under random bang-bang commands."""
+    count = simulation.substeps(model)
+    steps = round(seconds / robot.CONTROL_TIMESTEP)
+    commands = np.random.default_rng(0).integers(0, 2, (runs, steps, 2)).astype(float)
+    data = mujoco.MjData(model)
+    data.qpos[:] = robot.standing_qpos(model)
+    state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    states, controls = np.tile(state, (runs, 1)), np.repeat(commands, count, axis=1)
+    rates = []
+    with rollout.Rollout(nthread=threads) as pool:
+        workers = [mujoco.MjData(model) for _ in range(threads)]
+        for _ in range(repeats + 1):
+            began = time.perf_counter()
+            pool.rollout(model, workers, states, controls)
+            rates.append(runs * steps / (time.perf_counter() - began))
+    return rates[1:]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="fewer repeats")
+    parser.add_argument("--num-envs", type=int, default=ppo.PPOConfig().num_envs, help="environments side by side")
+    arguments = parser.parse_args()
+    repeats = 3 if arguments.quick else 10
+
+    model = robot.load_model()
+    motions = [reconstruction.reconstruct(recording.read_recording(p), model) for p in recording.bundled("training")]
+    env = EnvMimicEnv(model, motions, EnvMimicConfig())
+    config = ppo.PPOConfig(num_envs=arguments.num_envs)
+    step_size = config.batch_size * config.num_minibatches * config.unroll_length
+    config = ppo.PPOConfig(num_envs=arguments.num_envs, num_timesteps=(repeats + 1) * step_size)
+
+    devices = jax.local_device_count()
+    rows = {
+        "PPO training, learning included": training_rates(env, config),
+        "MJX environments alone": stepping_rates(env, config.num_envs, repeats),
+        f"C MuJoCo rollout, {devices} threads": rollout_rates(model, devices, repeats),
+    }
+    print(f"{devices} {jax.default_backend()} devices, {config.num_envs} environments, time step {model.opt.timestep} s")
+    print(f"{'median (least to most) of ' + str(repeats):36}{'control steps/s':>30}{'simulated s/s':>16}")
+    for name, rates in rows.items():
+        middle = float(np.median(rates))
+        cell = f"{middle:,.0f} ({min(rates):,.0f} to {max(rates):,.0f})"
+        print(f"{name:36}{cell:>30}{middle * robot.CONTROL_TIMESTEP:>16,.0f}")
+
+
+if __name__ == "__main__":
+    main()
