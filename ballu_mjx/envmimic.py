@@ -37,9 +37,11 @@ class EnvMimicConfig:
     """Sharpness of the orientation term, 1/rad^2 (paper: 2)."""
     orientation_axes: tuple[float, float, float] = (0.2, 0.4, 0.4)
     """Diagonal of W: roll, pitch, yaw (paper: 0.2, 0.4, 0.4)."""
-    fine_weight: float = 1.0
-    """Weight of a second pair of the same terms with sharper kernels, added to the paper's reward; 0 is the paper's
-    alone, which pays 0.97 for 5 cm of error and so cannot tell a good force from none within a second or two."""
+    fine_position_weight: float = 0.5
+    """Weight of a sharper position term, added to the paper's reward. The paper's own pays 0.97 for 5 cm of error, and
+    so cannot tell a good force from none within a second or two; with both fine weights 0 it stands alone."""
+    fine_orientation_weight: float = 1.0
+    """Weight of a sharper orientation term, likewise."""
     fine_position_scale: float = 100.0
     """Sharpness of the added position term, 1/m^2."""
     fine_orientation_scale: float = 200.0
@@ -143,14 +145,17 @@ def reward_terms(
     angles = wrap_angle(target[6:9] - seen[6:9])
     orientation_error = jnp.sum(jnp.array(config.orientation_axes) * angles**2)
 
-    def both(position_scale: float, orientation_scale: float) -> tuple[Array, Array, Array]:
-        position = jnp.exp(-position_scale * position_error)
-        orientation = jnp.exp(-orientation_scale * orientation_error)
-        return position, orientation, config.position_weight * position + config.orientation_weight * orientation
-
-    position, orientation, paper = both(config.position_scale, config.orientation_scale)
-    *_, fine = both(config.fine_position_scale, config.fine_orientation_scale)
-    return {"position": position, "orientation": orientation, "tracking": paper + config.fine_weight * fine}
+    position = jnp.exp(-config.position_scale * position_error)
+    orientation = jnp.exp(-config.orientation_scale * orientation_error)
+    fine_position = jnp.exp(-config.fine_position_scale * position_error)
+    fine_orientation = jnp.exp(-config.fine_orientation_scale * orientation_error)
+    tracking = (
+        config.position_weight * position
+        + config.orientation_weight * orientation
+        + config.fine_position_weight * fine_position
+        + config.fine_orientation_weight * fine_orientation
+    )
+    return {"position": position, "orientation": orientation, "tracking": tracking}
 
 
 class Simulator:
@@ -179,9 +184,7 @@ class Simulator:
 
     def step(self, data: mjx.Data, command: Float[Array, " 2"], force: Float[Array, " 3"]) -> mjx.Data:
         """One control step; see `simulation.control_step`."""
-        return simulation.control_step(
-            self.model, data, command, force, balloon=self._balloon, count=self._count
-        )
+        return simulation.control_step(self.model, data, command, force, balloon=self._balloon, count=self._count)
 
 
 def stack(simulator: Simulator, motions: Sequence[Motion]) -> tuple[Reference, Float[Array, "recordings states 3"]]:
@@ -215,9 +218,7 @@ def policy_input(
     return jnp.concatenate([seen, commands.ravel()]) if config.observe_command else seen
 
 
-def world_force(
-    action: Float[Array, " 3"], yaw: Float[Array, ""], config: EnvMimicConfig
-) -> Float[Array, " 3"]:
+def world_force(action: Float[Array, " 3"], yaw: Float[Array, ""], config: EnvMimicConfig) -> Float[Array, " 3"]:
     """The force (N, world) that an action stands for, within the limit along each axis.
 
     Actions are in the balloon's heading frame, like the observation: the same situation met in another direction

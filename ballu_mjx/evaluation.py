@@ -84,7 +84,9 @@ class Evaluation:
 
     def ratio(self, group: str, quantity: str, horizon: float) -> float:
         """Error with the residual over error without, each averaged over the group's recordings."""
-        return _group_mean(self.residual, group, quantity, horizon) / _group_mean(self.vanilla, group, quantity, horizon)
+        return _group_mean(self.residual, group, quantity, horizon) / _group_mean(
+            self.vanilla, group, quantity, horizon
+        )
 
     @property
     def score(self) -> float:
@@ -110,7 +112,9 @@ class Evaluation:
                     bound = 1.2 * getattr(base, quantity)[horizon][0] + allowance
                     if value / bound - 1 > worst:
                         worst = value / bound - 1
-                        place = f"{quantity} of {mimic.recording} at {horizon:g} s: {value:.3f} {unit}, bound {bound:.3f}"
+                        place = (
+                            f"{quantity} of {mimic.recording} at {horizon:g} s: {value:.3f} {unit}, bound {bound:.3f}"
+                        )
         return float(worst), place
 
     def table(self) -> str:
@@ -210,7 +214,14 @@ class OpenLoopEvaluator:
         return Evaluation(self._vanilla, self._errors(self.replay(params)))
 
     def _replay_one(
-        self, policy: Policy, config: EnvMimicConfig, params: Any, scale: Array, recording: Array, start: Array, length: int
+        self,
+        policy: Policy,
+        config: EnvMimicConfig,
+        params: Any,
+        scale: Array,
+        recording: Array,
+        start: Array,
+        length: int,
     ) -> tuple[Array, Array, Array]:
         reference, simulator = self._reference, self._simulator
         history = jax.lax.dynamic_slice_in_dim(

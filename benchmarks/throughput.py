@@ -56,7 +56,9 @@ def stepping_rates(env: EnvMimicEnv, num_envs: int, repeats: int, length: int = 
     return rates
 
 
-def rollout_rates(model: mujoco.MjModel, threads: int, repeats: int, runs: int = 64, seconds: float = 2.0) -> list[float]:
+def rollout_rates(
+    model: mujoco.MjModel, threads: int, repeats: int, runs: int = 64, seconds: float = 2.0
+) -> list[float]:
     """Control steps per second of C MuJoCo under random bang-bang commands."""
     count = simulation.substeps(model)
     steps = round(seconds / robot.CONTROL_TIMESTEP)
@@ -96,7 +98,9 @@ def main() -> None:
         "MJX environments alone": stepping_rates(env, config.num_envs, repeats),
         f"C MuJoCo rollout, {devices} threads": rollout_rates(model, devices, repeats),
     }
-    print(f"{devices} {jax.default_backend()} devices, {config.num_envs} environments, time step {model.opt.timestep} s")
+    print(
+        f"{devices} {jax.default_backend()} devices, {config.num_envs} environments, time step {model.opt.timestep} s"
+    )
     print(f"{'median (least to most) of ' + str(repeats):36}{'control steps/s':>30}{'simulated s/s':>16}")
     for name, rates in rows.items():
         middle = float(np.median(rates))

@@ -81,7 +81,10 @@ def table(runs: list[evaluation.Evaluation]) -> str:
                 cells.append(spread([float(pair[1]) for pair in mean], digits))
                 cells.append("**" + spread([run.ratio(group, quantity, horizon) for run in runs]) + "**")
             lines.append(f"| {group} | {horizon:g} | " + " | ".join(cells) + " |")
-    lines += ["", "| whole recording | CoM error, vanilla (m) | EnvMimic (m) | final yaw error, vanilla (deg) | EnvMimic (deg) |"]
+    lines += [
+        "",
+        "| whole recording | CoM error, vanilla (m) | EnvMimic (m) | final yaw error, vanilla (deg) | EnvMimic (deg) |",
+    ]
     lines.append("| --- | --- | --- | --- | --- |")
     for index, base in enumerate(runs[0].vanilla):
         ours = [run.residual[index] for run in runs]

@@ -57,7 +57,7 @@ def pushed() -> Motion:
 
 
 def test_reward_is_the_papers():
-    config = EnvMimicConfig(fine_weight=0.0)
+    config = EnvMimicConfig(fine_position_weight=0.0, fine_orientation_weight=0.0)
     seen, target = np.zeros(27, np.float32), np.zeros(27, np.float32)
     seen[:3] = [0.1, -0.2, 0.05]
     seen[6:9] = [0.1, 0.2, np.pi - 0.05]
@@ -198,7 +198,9 @@ def test_the_missing_force_earns_more_than_none_and_its_opposite_less(pushed: Mo
 
     force = np.array([0.04, 0.0, 0.02])
     assert total(force) > total(np.zeros(3)) + 0.05 > total(-force) + 0.1
-    assert total(force) > 20 * 0.999
+    best = env.config.position_weight + env.config.orientation_weight
+    best += env.config.fine_position_weight + env.config.fine_orientation_weight
+    assert total(force) > 20 * 0.99 * best
 
 
 def test_evaluator_finds_no_error_in_its_own_physics_and_some_in_pushed_ones():
