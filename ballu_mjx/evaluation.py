@@ -121,7 +121,8 @@ class Evaluation:
         """Errors by group and horizon, vanilla and EnvMimic, with the spread over starts; then the whole recordings."""
         lines = [
             f"{'':7}{'horizon':>8} |{'position RMSE (m)':^39}| {'yaw RMSE (deg)':^38}",
-            f"{'':7}{'(s)':>8} |{'vanilla':>14}{'EnvMimic':>16}{'ratio':>8} | {'vanilla':>13}{'EnvMimic':>16}{'ratio':>8}",
+            f"{'':7}{'(s)':>8} |{'vanilla':>14}{'EnvMimic':>16}{'ratio':>8} | "
+            f"{'vanilla':>13}{'EnvMimic':>16}{'ratio':>8}",
         ]
         for group in self.groups:
             for horizon in HORIZONS:

@@ -183,7 +183,7 @@ def check(config: PPOConfig, devices: int) -> None:
         "num_updates_per_batch",
         "averaging",
     )
-    for name in sizes:
+    for name in (*sizes, "averaging"):
         if getattr(config, name) < 1:
             raise InputError(f"{_option(name)} is {getattr(config, name)}: it must be 1 or more.")
     for name in ("learning_rate", "initial_std", "reward_scaling", "max_grad_norm", "observation_clip"):

@@ -25,7 +25,7 @@ from jaxtyping import Float  # noqa: E402
 from mujoco import rollout  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
-from ballu_mjx import recording, reconstruction, robot, simulation, virtual_robot  # noqa: E402
+from ballu_mjx import reconstruction, recording, robot, simulation, virtual_robot  # noqa: E402
 
 SECONDS = 20.0
 GAITS = ((0.7, 0.40, 1.0), (0.9, 0.35, 0.9), (1.1, 0.45, 0.8), (1.3, 0.40, 1.0), (1.6, 0.30, 0.8), (1.9, 0.40, 0.7))
@@ -65,10 +65,9 @@ def replay(
         data.qpos[:], data.qvel[:] = qpos, qvel
         mujoco.mj_getState(model, data, states[row], spec)
     count = simulation.substeps(model)
-    states, _ = rollout.rollout(
-        model, [mujoco.MjData(model) for _ in range(2)], states, np.repeat(commands, count, axis=1)
-    )
-    return states[:, count - 1 :: count, 1 : 1 + model.nq]
+    workers = [mujoco.MjData(model) for _ in range(2)]
+    simulated = np.asarray(rollout.rollout(model, workers, states, np.repeat(commands, count, axis=1))[0])
+    return simulated[:, count - 1 :: count, 1 : 1 + model.nq]
 
 
 def standing(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

@@ -23,7 +23,7 @@ import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 from mujoco import rollout  # noqa: E402
 
-from ballu_mjx import ppo, recording, reconstruction, robot, simulation  # noqa: E402
+from ballu_mjx import ppo, reconstruction, recording, robot, simulation  # noqa: E402
 from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv  # noqa: E402
 
 

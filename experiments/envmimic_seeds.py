@@ -23,7 +23,7 @@ runtime.prepare()
 
 import numpy as np  # noqa: E402
 
-from ballu_mjx import evaluation, plots, recording, reconstruction, residual, robot  # noqa: E402
+from ballu_mjx import evaluation, plots, reconstruction, recording, residual, robot  # noqa: E402
 
 # %% [markdown]
 # ## Train
@@ -43,7 +43,9 @@ def errors(rows: list[dict]) -> tuple[evaluation.Errors, ...]:
     def table(values: dict[str, list[float]]) -> dict[float, tuple[float, float]]:
         return {float(horizon): (mean, spread) for horizon, (mean, spread) in values.items()}
 
-    return tuple(evaluation.Errors(**row | {key: table(row[key]) for key in ("position", "yaw")}) for row in rows)
+    return tuple(
+        evaluation.Errors(**{**row, "position": table(row["position"]), "yaw": table(row["yaw"])}) for row in rows
+    )
 
 
 def load(folder: Path) -> evaluation.Evaluation:

@@ -156,10 +156,9 @@ def test_the_sweep_holds_twenty_levels_until_the_joints_settle():
     levels, first = np.unique(sweep.command[:, 0], return_index=True)
     assert len(levels) == 20 and (levels[0], levels[-1]) == (0.0, 1.0)
     for start, end in zip(first, [*first[1:], len(sweep.time)], strict=True):
+        # In deg/s; noise alone gives 0.6.
         settled = np.rad2deg(sweep.knee[end - (end - start) // 3 : end])
-        assert (
-            np.abs(np.polyfit(np.arange(len(settled)) * 0.01, settled, 1)[0]).max() < 1.0
-        )  # deg/s; noise alone gives 0.6
+        assert np.abs(np.polyfit(np.arange(len(settled)) * 0.01, settled, 1)[0]).max() < 1.0
     assert np.rad2deg(sweep.knee[-1] - sweep.knee[0]).min() > 25
 
 
