@@ -37,7 +37,7 @@ class EnvMimicConfig:
     """Sharpness of the orientation term, 1/rad^2 (paper: 2)."""
     orientation_axes: tuple[float, float, float] = (0.2, 0.4, 0.4)
     """Diagonal of W: roll, pitch, yaw (paper: 0.2, 0.4, 0.4)."""
-    fine_position_weight: float = 0.5
+    fine_position_weight: float = 0.3
     """Weight of a sharper position term, added to the paper's reward. The paper's own pays 0.97 for 5 cm of error, and
     so cannot tell a good force from none within a second or two; with both fine weights 0 it stands alone."""
     fine_orientation_weight: float = 1.0
@@ -54,7 +54,8 @@ class EnvMimicConfig:
     force_cost: float = 20.0
     """Reward lost per N^2 of force."""
     episode_seconds: float = 3.0
-    """Length of an episode, s; a recording's end cuts it short."""
+    """Mean length of an episode, s; each lasts between half and one and a half times as long (robots reset together
+    would stay in step, and every batch show one phase of the episode), and a recording's end cuts it short."""
     observe_command: bool = True
     """Let the policy see the commands (now and the last two), which the paper's state leaves out."""
     observation_noise: float = 0.3
@@ -241,7 +242,7 @@ class EnvMimicEnv(Env):
 
     def reset(self, rng: Array) -> State:
         """Reference state initialization: a uniformly drawn time of a uniformly drawn recording, history included."""
-        key_recording, key_time, key_noise, key_sensor = jax.random.split(rng, 4)
+        key_recording, key_time, key_noise, key_sensor, key_length = jax.random.split(rng, 5)
         reference = self.reference
         recording = jax.random.randint(key_recording, (), 0, len(reference.steps))
         time = jax.random.randint(key_time, (), HISTORY - 1, reference.steps[recording])
@@ -256,7 +257,9 @@ class EnvMimicEnv(Env):
             "history": history,
             "recording": recording,
             "time": time,
-            "elapsed": jnp.zeros((), jnp.int32),
+            "remaining": jax.random.randint(
+                key_length, (), max(self.episode_length // 2, 1), self.episode_length + self.episode_length // 2 + 1
+            ),
             "key": key_sensor,
         }
         zero = jnp.zeros(())
@@ -285,15 +288,15 @@ class EnvMimicEnv(Env):
         terms = reward_terms(seen, target, self.config)
         reward = jnp.where(finite, terms["tracking"] - self.config.force_cost * jnp.sum(force**2), 0.0)
 
-        elapsed = s["elapsed"] + 1
-        timed_out = (elapsed >= self.episode_length) | (time + 1 >= self.reference.steps[recording])
+        remaining = s["remaining"] - 1
+        timed_out = (remaining <= 0) | (time + 1 >= self.reference.steps[recording])
         s = s | {
             "qpos": jnp.where(finite, data.qpos, s["qpos"]),
             "qvel": jnp.where(finite, data.qvel, s["qvel"]),
             "warmstart": jnp.where(finite, data.qacc_warmstart, 0.0),
             "history": jnp.concatenate([s["history"][1:], seen[None]]),
             "time": time + 1,
-            "elapsed": elapsed,
+            "remaining": remaining,
             "key": jax.random.split(s["key"], 1)[0],
         }
         metrics = {

@@ -154,13 +154,16 @@ def test_start_noise_stays_small_and_keeps_the_quaternion_a_unit(still: Motion):
 
 
 def test_time_limits_truncate_and_divergence_terminates(still: Motion):
-    env = EnvMimicEnv(robot.load_model(), [still], EnvMimicConfig(episode_seconds=0.1, start_noise=0.0))
+    env = EnvMimicEnv(robot.load_model(), [still], EnvMimicConfig(episode_seconds=0.4, start_noise=0.0))
     step = jax.jit(env.step)
+    lengths = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 200)).pipeline_state["remaining"]
+    assert (lengths.min(), lengths.max()) == (4, 12)
     state = jax.jit(env.reset)(jax.random.key(3))
-    state = step(state, jnp.zeros(3))
-    assert (float(state.done), float(state.info["truncation"])) == (0.0, 0.0)
-    state = step(state, jnp.zeros(3))
-    assert (float(state.done), float(state.info["truncation"])) == (1.0, 1.0)
+    time, remaining = (int(state.pipeline_state[name]) for name in ("time", "remaining"))
+    for elapsed in range(1, min(remaining, STEPS - time) + 1):
+        state = step(state, jnp.zeros(3))
+        over = float(elapsed == remaining or time + elapsed == STEPS)
+        assert (float(state.done), float(state.info["truncation"])) == (over, over)
 
     state = jax.jit(env.reset)(jax.random.key(3))
     s = state.pipeline_state
