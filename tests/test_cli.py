@@ -117,7 +117,7 @@ def test_help_explains_every_option(folder: Path):
     assert done.returncode == 0
     for option in ("--quick", "--recordings", "--validation", "--test", "--seed", "--output", "--num-timesteps"):
         assert option in done.stdout
-    for option in ("--num-envs", "--resume", "--force-limit", "--learning-rate", "Adam's."):
+    for option in ("--num-envs", "--resume", "--force-limit", "--learning-rate", "Adam's"):
         assert option in done.stdout
 
 
