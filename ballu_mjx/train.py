@@ -9,7 +9,6 @@ import dataclasses
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -261,25 +260,17 @@ class _Session:
         self._every, self._validated_at = validate_every, validated_at
         self._score: float | None = None
         self._last: tuple[int, Any] | None = None
-        self._first: tuple[int, Any, Future[float]] | None = None
         self._started = time.perf_counter()
 
     def step_done(self, step: int, params: "Params", metrics: dict[str, float]) -> None:
         """What PPO calls."""
         self._last = (step, params)
-        if not metrics:
-            # The evaluator compiles beside the training program, which PPO compiles next: each takes one core.
-            if self._validated_at is None:
-                executor = ThreadPoolExecutor(1)
-                self._first = (step, params, executor.submit(self._measure, params))
-                executor.shutdown(wait=False)
-                self._validated_at = step
-            return
-        self._finish_first()
-        self._run.log(step, metrics | {"seconds": time.perf_counter() - self._started})
+        if metrics:
+            self._run.log(step, metrics | {"seconds": time.perf_counter() - self._started})
         if self._validated_at is None or step - self._validated_at >= self._every:
             self._validate(step, params)
-        self._progress.update(step, metrics["steps_per_second"], metrics["reward"], self._score)
+        if metrics:
+            self._progress.update(step, metrics["steps_per_second"], metrics["reward"], self._score)
 
     def finish(self) -> None:
         """Validate the last parameters."""
@@ -296,24 +287,12 @@ class _Session:
         self._run.save(self._last[0], ppo.as_tree(self._last[1]), None)
         return self._last[0]
 
-    def _measure(self, params: "Params") -> float:
-        return self._evaluator(params).score
-
     def _validate(self, step: int, params: "Params") -> None:
-        self._record(step, params, self._measure(params))
-
-    def _finish_first(self) -> None:
-        if self._first is not None:
-            step, params, score = self._first
-            self._first = None
-            self._record(step, params, score.result())
-
-    def _record(self, step: int, params: "Params", score: float) -> None:
         from ballu_mjx import ppo
 
-        self._score, self._validated_at = score, step
-        self._run.log(step, {"validation_error": score})
-        self._run.save(step, ppo.as_tree(params), score)
+        self._score, self._validated_at = self._evaluator(params).score, step
+        self._run.log(step, {"validation_error": self._score})
+        self._run.save(step, ppo.as_tree(params), self._score)
 
 
 if __name__ == "__main__":

@@ -89,7 +89,13 @@ def test_interrupted_run_goes_on_where_it_stopped(trained: Path):
     line = [sys.executable, "-m", "ballu_mjx.train", "envmimic", "--recordings", "data", "--output", "stopped"]
     line += ["--num-timesteps", str(400 * STEPS), "--validate-every", str(400 * STEPS), "--seed", "5", *SIZES]
     metrics = folder / "stopped" / "metrics.jsonl"
-    with subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+
+    def heed() -> None:
+        """A shell's background jobs ignore SIGINT, and so would the tests' children there."""
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    with subprocess.Popen(line, cwd=folder, preexec_fn=heed, **streams) as process:
         while process.poll() is None and not (metrics.exists() and '"reward"' in metrics.read_text()):
             time.sleep(0.1)
         os.kill(process.pid, signal.SIGINT)

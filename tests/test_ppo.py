@@ -82,6 +82,7 @@ SMALL = ppo.PPOConfig(
     num_minibatches=4,
     learning_rate=3e-3,
     activation="tanh",
+    averaging=1,
     policy_layers=(16,),
     value_layers=(16,),
 )

@@ -159,7 +159,8 @@ def test_the_sweep_holds_twenty_levels_until_the_joints_settle():
         # In deg/s; noise alone gives 0.6.
         settled = np.rad2deg(sweep.knee[end - (end - start) // 3 : end])
         assert np.abs(np.polyfit(np.arange(len(settled)) * 0.01, settled, 1)[0]).max() < 1.0
-    assert np.rad2deg(sweep.knee[-1] - sweep.knee[0]).min() > 25
+    lifted = np.rad2deg(sweep.knee[-1] - sweep.knee[0])
+    assert lifted.min() > 15 and lifted.max() < 44  # weak servos: the nominal robot's knees gain 45 deg
 
 
 def test_bundled_free_recordings_show_no_motors_and_weigh_two_megabytes_at_most():
