@@ -94,8 +94,9 @@ def test_interrupted_run_goes_on_where_it_stopped(trained: Path):
         """A shell's background jobs ignore SIGINT, and so would the tests' children there."""
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
-    streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    with subprocess.Popen(line, cwd=folder, preexec_fn=heed, **streams) as process:
+    with subprocess.Popen(
+        line, cwd=folder, preexec_fn=heed, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    ) as process:
         while process.poll() is None and not (metrics.exists() and '"reward"' in metrics.read_text()):
             time.sleep(0.1)
         os.kill(process.pid, signal.SIGINT)

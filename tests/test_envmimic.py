@@ -156,7 +156,8 @@ def test_start_noise_stays_small_and_keeps_the_quaternion_a_unit(still: Motion):
 def test_time_limits_truncate_and_divergence_terminates(still: Motion):
     env = EnvMimicEnv(robot.load_model(), [still], EnvMimicConfig(episode_seconds=0.4, start_noise=0.0))
     step = jax.jit(env.step)
-    lengths = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 200)).pipeline_state["remaining"]
+    many = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 200))
+    lengths = many.pipeline_state["remaining"]  # pyright: ignore
     assert (lengths.min(), lengths.max()) == (4, 12)
     state = jax.jit(env.reset)(jax.random.key(3))
     time, remaining = (int(state.pipeline_state[name]) for name in ("time", "remaining"))
