@@ -5,10 +5,12 @@ JAX, and all that needs it, is imported inside functions: `runtime.prepare` has 
 
 # Not postponed here: tyro reads the annotations of functions whose names exist only inside `_commands`.
 import argparse
+import contextlib
 import dataclasses
+import signal
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -154,8 +156,9 @@ def _envmimic(data: Data, env_config: "EnvMimicConfig", ppo_config: "PPOConfig")
         progress = runs.Progress(first_step + ppo.total_timesteps(remaining), first_step)
         session = _Session(run, progress, validation, data.validate_every, resumed_at)
         try:
-            ppo.train(env, remaining, session.step_done, restore=restored, first_step=first_step)
-            session.finish()
+            with _interrupts_noted(session):
+                ppo.train(env, remaining, session.step_done, restore=restored, first_step=first_step)
+                session.finish()
         except KeyboardInterrupt:
             step = session.keep()
             progress.close()
@@ -245,8 +248,34 @@ def _read(files: Mapping[str, Sequence[Path]]) -> "dict[str, list[Recording]]":
     return {use: [read[path] for path in paths] for use, paths in files.items()}
 
 
+@contextlib.contextmanager
+def _interrupts_noted(session: "_Session") -> Iterator[None]:
+    """Let the first Ctrl-C end training after its current step; the second interrupts at once, as ever.
+
+    An exception raised wherever Python happens to be can land in a callback of JAX's that swallows it.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    if before != signal.default_int_handler:
+        yield  # somebody else's, or ignored in the background of a shell
+        return
+
+    def note(*_: Any) -> None:
+        if session.interrupted:
+            raise KeyboardInterrupt
+        session.interrupted = True
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 class _Session:
     """Between PPO and the run's folder: measurements, validations, checkpoints, progress."""
+
+    interrupted = False
+    """Set by a signal handler: the next finished training step is the last."""
 
     def __init__(
         self,
@@ -271,6 +300,8 @@ class _Session:
             self._validate(step, params)
         if metrics:
             self._progress.update(step, metrics["steps_per_second"], metrics["reward"], self._score)
+        if self.interrupted:
+            raise KeyboardInterrupt
 
     def finish(self) -> None:
         """Validate the last parameters."""

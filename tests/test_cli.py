@@ -90,13 +90,10 @@ def test_interrupted_run_goes_on_where_it_stopped(trained: Path):
     line += ["--num-timesteps", str(400 * STEPS), "--validate-every", str(400 * STEPS), "--seed", "5", *SIZES]
     metrics = folder / "stopped" / "metrics.jsonl"
 
-    def heed() -> None:
-        """A shell's background jobs ignore SIGINT, and so would the tests' children there."""
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-    with subprocess.Popen(
-        line, cwd=folder, preexec_fn=heed, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
-    ) as process:
+    # A shell's background jobs ignore SIGINT, and so would the tests' children there.
+    heed = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
+    line = [sys.executable, "-c", heed, *line]
+    with subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
         while process.poll() is None and not (metrics.exists() and '"reward"' in metrics.read_text()):
             time.sleep(0.1)
         os.kill(process.pid, signal.SIGINT)
