@@ -95,7 +95,8 @@ def table(runs: list[evaluation.Evaluation]) -> str:
             f"{base.final_yaw_error:.0f} | {spread([e.final_yaw_error for e in ours], 0)} |"
         )
     worst = [run.excess() for run in runs]
-    lines += ["", "Worst case against 1.2 times vanilla plus 2 cm and 3 deg, over recordings and horizons, by seed (negative: within):"]
+    bound = "1.2 times vanilla plus 2 cm and 3 deg"
+    lines += ["", f"Worst case against {bound}, over recordings and horizons, by seed (negative: within):"]
     lines += [f"- {relative:+.0%} of the bound, {place}" for relative, place in worst]
     return "\n".join(lines)
 
