@@ -56,6 +56,8 @@ class EnvMimicConfig:
     episode_seconds: float = 3.0
     """Mean length of an episode, s; each lasts between half and one and a half times as long (robots reset together
     would stay in step, and every batch show one phase of the episode), and a recording's end cuts it short."""
+    critic_sees_error: bool = True
+    """Let the value function (never the policy) see how far off the recording the robot is."""
     observe_command: bool = True
     """Let the policy see the commands (now and the last two), which the paper's state leaves out."""
     observation_noise: float = 0.3
@@ -329,18 +331,19 @@ class EnvMimicEnv(Env):
     def _observe(self, s: dict[str, Any]) -> dict[str, Array]:
         """The policy's state, and for the value function also what the policy must not see: how far off it is.
 
-        An error once made lowers the reward for the rest of the episode whatever the policy does now. A value
+        Why (`critic_sees_error`): an error once made lowers the reward for the rest of the episode whatever the policy does now. A value
         function blind to it leaves that in the advantages, where it drowns the force's own effect.
         """
         recording, time = s["recording"], s["time"]
         commands = commands_seen(self.reference.command[recording], time)
         seen = policy_input(s["history"], commands, self.config)
         noise = self.config.observation_noise * self._spread * jax.random.normal(s["key"], seen.shape)
-        error = self.reference.features[recording, time] - s["history"][-1]
-        to_heading = heading_rotation(s["history"][-1, 8]).T
-        angles = wrap_angle(error[6:9])
-        critic = [seen, to_heading @ error[:3], to_heading @ error[3:6], angles, commands.ravel()]
-        return {"state": seen + noise, "critic": jnp.concatenate(critic)}
+        critic = [seen]
+        if self.config.critic_sees_error:
+            error = self.reference.features[recording, time] - s["history"][-1]
+            to_heading = heading_rotation(s["history"][-1, 8]).T
+            critic += [to_heading @ error[:3], to_heading @ error[3:6], wrap_angle(error[6:9])]
+        return {"state": seen + noise, "critic": jnp.concatenate([*critic, commands.ravel()])}
 
     def _input_spread(self) -> Float[Array, " inputs"]:
         """Standard deviation of each of the policy's inputs over the recorded states."""

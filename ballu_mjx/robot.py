@@ -43,10 +43,31 @@ def load_model() -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_path(str(assets() / "ballu.xml"))
 
 
+def suspend(spec: mujoco.MjSpec) -> None:
+    """Weld the base to the world, upright and with the feet off the ground, as in an actuator sweep; in place."""
+    spec.body("base").pos = [0, 0, 1.5]
+    spec.delete(spec.joint("root"))
+    spec.delete(spec.joint("neck"))
+
+
+def load_suspended_leg(side: str) -> mujoco.MjModel:
+    """The nominal robot's leg on one side, alone, hanging from a base that is held still: what the other leg does
+    changes nothing for it."""
+    spec = mujoco.MjSpec.from_file(str(assets() / "ballu.xml"))
+    suspend(spec)
+    for other in SIDES:
+        if other != side:
+            spec.delete(spec.body(f"femur_{other}"))
+    spec.delete(spec.body("balloon"))
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    return spec.compile()
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ActuatorParameters:
-    """The paper's eight free parameters (section "System Identification"), each as (left, right).
+    """What differs from one servo, cable and knee to the next, each as (left, right), or for one leg alone: the first
+    four are the paper's eight free parameters (section "System Identification").
 
     What each moves in the model:
 
@@ -55,12 +76,15 @@ class ActuatorParameters:
     - `default_motor_angle` (rad): the motor angle that command 0 asks for, `actuator_biasprm[:, 0]`.
     - `default_knee_angle` (rad): the knee's stop, `jnt_range[:, 0]`; the cable's rest length follows, so that
       `CABLE_SLACK` is left with the motor at 0 and the knee at this angle.
+    - `torque_limit` (N m): where the servo saturates, `actuator_forcerange`. Not among the paper's eight; a servo weaker
+      than nominal can otherwise be told only by a spring that is stiffer than the robot's.
     """
 
-    knee_spring_stiffness: Float[Array, " 2"]
-    motor_gain: Float[Array, " 2"]
-    default_motor_angle: Float[Array, " 2"]
-    default_knee_angle: Float[Array, " 2"]
+    knee_spring_stiffness: Float[Array, " sides"]
+    motor_gain: Float[Array, " sides"]
+    default_motor_angle: Float[Array, " sides"]
+    default_knee_angle: Float[Array, " sides"]
+    torque_limit: Float[Array, " sides"]
 
     @staticmethod
     def nominal(model: mujoco.MjModel) -> ActuatorParameters:
@@ -72,12 +96,13 @@ class ActuatorParameters:
             motor_gain=jnp.asarray(gain, jnp.float32),
             default_motor_angle=jnp.asarray(model.actuator_biasprm[servos, 0] / gain, jnp.float32),
             default_knee_angle=jnp.asarray(model.jnt_range[knees, 0], jnp.float32),
+            torque_limit=jnp.asarray(model.actuator_forcerange[servos, 1], jnp.float32),
         )
 
 
 def cable_length(
-    model: mujoco.MjModel, knee: Float[Array | np.ndarray, " 2"], motor: Float[Array | np.ndarray, " 2"]
-) -> Float[Array, " 2"]:
+    model: mujoco.MjModel, knee: Float[Array | np.ndarray, " sides"], motor: Float[Array | np.ndarray, " sides"]
+) -> Float[Array, " sides"]:
     """Distance (m) between the cable's ends at the given knee and motor angles (rad).
 
     The same planar geometry as the model's spatial tendon, written out because the rest length must be known, and
@@ -85,7 +110,7 @@ def cable_length(
     """
     knee, motor = jnp.asarray(knee), jnp.asarray(motor)
     lengths = []
-    for i, side in enumerate(SIDES):
+    for i, side in enumerate(_sides(model)):
         anchor = model.site(f"cable_femur_{side}").pos - model.body(f"tibia_{side}").pos
         arm = model.body(f"arm_{side}").pos
         radius = model.site(f"cable_arm_{side}").pos[2]
@@ -101,7 +126,7 @@ def actuator_fields(model: mujoco.MjModel, parameters: ActuatorParameters) -> di
     """Model fields that carry `parameters`, by name; for `mjx.Model.replace` or, as NumPy, for an `MjModel`."""
     knees, servos = _knee_ids(model), _servo_ids(model)
     gain = parameters.motor_gain
-    rest = cable_length(model, parameters.default_knee_angle, jnp.zeros(2)) + CABLE_SLACK
+    rest = cable_length(model, parameters.default_knee_angle, jnp.zeros_like(gain)) + CABLE_SLACK
     return {
         "jnt_stiffness": jnp.asarray(model.jnt_stiffness).at[knees].set(parameters.knee_spring_stiffness),
         "jnt_range": jnp.asarray(model.jnt_range).at[knees, 0].set(parameters.default_knee_angle),
@@ -111,6 +136,9 @@ def actuator_fields(model: mujoco.MjModel, parameters: ActuatorParameters) -> di
         .set(gain * parameters.default_motor_angle)
         .at[servos, 1]
         .set(-gain),
+        "actuator_forcerange": jnp.asarray(model.actuator_forcerange)
+        .at[servos]
+        .set(parameters.torque_limit[:, None] * jnp.array([-1.0, 1.0])),
         "tendon_lengthspring": jnp.asarray(model.tendon_lengthspring).at[_cable_ids(model), 1].set(rest),
     }
 
@@ -154,13 +182,18 @@ def standing_qpos(model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:
     return qpos
 
 
+def _sides(model: mujoco.MjModel) -> tuple[str, ...]:
+    """The legs that `model` has."""
+    return tuple(side for side in SIDES if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, f"knee_{side}") >= 0)
+
+
 def _knee_ids(model: mujoco.MjModel) -> np.ndarray:
-    return np.array([model.joint(f"knee_{side}").id for side in SIDES])
+    return np.array([model.joint(f"knee_{side}").id for side in _sides(model)])
 
 
 def _servo_ids(model: mujoco.MjModel) -> np.ndarray:
-    return np.array([model.actuator(f"servo_{side}").id for side in SIDES])
+    return np.array([model.actuator(f"servo_{side}").id for side in _sides(model)])
 
 
 def _cable_ids(model: mujoco.MjModel) -> np.ndarray:
-    return np.array([model.tendon(f"cable_{side}").id for side in SIDES])
+    return np.array([model.tendon(f"cable_{side}").id for side in _sides(model)])

@@ -154,12 +154,8 @@ def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
         spec.joint(f"knee_{side}").frictionloss = virtual.knee_friction[index]
         spec.joint(f"motor_{side}").frictionloss = virtual.motor_friction[index]
         spec.geom(f"foot_{side}").friction[0] = virtual.foot_friction[index]
-        limit = virtual.torque_limit[index]
-        spec.actuator(f"servo_{side}").forcerange = [-limit, limit]
     if suspended:
-        spec.body("base").pos = [0, 0, 1.5]
-        spec.delete(spec.joint("root"))
-        spec.delete(spec.joint("neck"))
+        ballu.suspend(spec)
     model = spec.compile()
 
     nominal = ballu.load_model()
@@ -168,8 +164,10 @@ def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
         motor_gain=jnp.array(virtual.motor_gain),
         default_motor_angle=jnp.array(virtual.default_motor_angle),
         default_knee_angle=jnp.array(virtual.default_knee_angle),
+        torque_limit=jnp.array(virtual.torque_limit),
     )
     ballu.set_fields(model, ballu.actuator_fields(model, parameters))
+    model.actuator_forcerange[:] = np.outer(virtual.torque_limit, [-1.0, 1.0])  # in full precision
     model.tendon_lengthspring[:, 1] += np.array(virtual.cable_slack) - ballu.CABLE_SLACK
 
     index = model.body("balloon").id

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import multiprocessing
 
 from ballu_mjx import runtime
@@ -82,10 +83,12 @@ def identified(virtual: virtual_robot.VirtualRobot) -> mujoco.MjModel:
     """The training simulator with the robot's own actuator parameters: more than identification can hope for."""
     model = robot.load_model()
     parameters = robot.ActuatorParameters(
-        *(
-            jnp.array(getattr(virtual, name))
-            for name in ("knee_spring_stiffness", "motor_gain", "default_motor_angle", "default_knee_angle")
-        )
+        **{
+            field.name: jnp.array(getattr(virtual, field.name))
+            for field in dataclasses.fields(robot.ActuatorParameters)
+            if field.name != "torque_limit"  # not among the paper's eight
+        },
+        torque_limit=robot.ActuatorParameters.nominal(model).torque_limit,
     )
     robot.set_fields(model, robot.actuator_fields(model, parameters))
     return model

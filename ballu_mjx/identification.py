@@ -1,0 +1,717 @@
+"""Identification of the actuators from a suspended sweep (paper, section "System Identification", Algorithm 1).
+
+The legs hang from a base held still, so that each is identified by itself, both at once by `vmap`. Settled angles under
+a command are the root of MJX's inverse dynamics at rest, differentiated as an implicit function: no derivative through
+a simulation to rest. Transients between commands are simulated, and differentiated forwards.
+
+All functions compute in double precision and are to be called inside `jax.enable_x64(True)`, but for `identify`, which
+sees to it itself. A leg's parameters are a vector in the order of `NAMES`; a pair of angles is (motor, knee).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float, Int
+from mujoco import mjx
+
+from ballu_mjx import robot as ballu
+from ballu_mjx.errors import InputError
+from ballu_mjx.robot import SIDES, ActuatorParameters
+from ballu_mjx.sweep import SAMPLE_TIMESTEP, Sweep
+
+CURVE_SAMPLES = 200
+"""Points at which the curves are compared (paper)."""
+NAMES = tuple(field.name for field in dataclasses.fields(ActuatorParameters))
+"""A leg's parameters, in the order of a vector."""
+_DEGREE = float(np.pi / 180)
+
+
+@dataclasses.dataclass(frozen=True)
+class IdentificationConfig:
+    """How actuators are identified. The defaults were chosen by measurement (README)."""
+
+    torque_limit: bool = True
+    """Identify the servos' torque limits too. The paper's eight parameters alone can tell a weak servo only by a spring
+    stiffer than the robot's."""
+    transients: bool = True
+    """Learn from the motion between two commands too, not from settled angles alone; the delay from a command to its
+    motion is then a further unknown."""
+    objective: Literal["pointwise", "hausdorff"] = "pointwise"
+    """`pointwise`: least squares over all angles (Levenberg-Marquardt). `hausdorff`: the paper's distance between curves
+    (L-BFGS), started from the pointwise solution; transients have no part in it."""
+    degree: int = 7
+    """Degree of the polynomials fitted to the curves of angle over command."""
+    draws: int = 128
+    """Parameters drawn at random for each leg, beside the nominal ones, to find good starts."""
+    starts: int = 8
+    """Searches for each leg, from the best draws."""
+    steps: int = 25
+    """Most iterations of a search."""
+    seed: int = 0
+    """Seeds the draws."""
+
+
+class _Range(NamedTuple):
+    """What is known of a parameter beforehand."""
+
+    factor: float | None
+    """Bounds are the nominal value divided and multiplied by this; or else:"""
+    reach: float
+    """Bounds (rad) are the nominal value less and plus this."""
+    prior: float
+    """How much robots differ (standard deviation): relative to the nominal value, or rad."""
+
+
+RANGES: dict[str, _Range] = {
+    "knee_spring_stiffness": _Range(4.0, 0.0, 0.3),
+    "motor_gain": _Range(4.0, 0.0, 0.3),
+    "default_motor_angle": _Range(None, 20 * _DEGREE, 5 * _DEGREE),
+    "default_knee_angle": _Range(None, 15 * _DEGREE, 3 * _DEGREE),
+    "torque_limit": _Range(4.0, 0.0, 0.3),
+}
+
+_State = tuple[Array, Array, Array]
+"""qpos, qvel, qacc_warmstart."""
+
+
+class SuspendedLeg:
+    """The nominal robot's leg in MJX, hanging from a base held still, for any actuator parameters.
+
+    The left leg, which serves for both: the right one is its mirror image, and moves alike.
+    """
+
+    def __init__(self) -> None:
+        self.model = ballu.load_suspended_leg(SIDES[0])
+        # Every iteration of the solver carries the derivative on: it must not stop early where the value is right
+        # already (a warm start at rest), for the derivative is not.
+        self.model.opt.tolerance = 0.0
+        self._mjx = mjx.put_model(self.model)
+        self._data = mjx.make_data(self.model)
+        names = [f"{kind}_{SIDES[0]}" for kind in ("motor", "knee")]
+        self.angles = np.array([self.model.joint(name).qposadr[0] for name in names])
+        self._relaxation_damping = np.zeros(self.model.nv)
+        for kind, damping in _RELAXATION_DAMPING.items():
+            self._relaxation_damping[self.model.joint(f"{kind}_{SIDES[0]}").dofadr[0]] = damping
+
+    def settled_qpos(self, vector: Float[Array, " parameters"], command: Float[Array, ""]) -> Float[Array, " nq"]:
+        """Generalized position at rest under a command; `[self.angles]` are motor and knee (rad). Differentiable, in both
+        modes."""
+
+        def residual(qpos: Array, arguments: tuple[Array, Array]) -> Array:
+            return self.residual_torque(qpos, *arguments)
+
+        close = self._relaxed_qpos(*jax.lax.stop_gradient((vector, command)))
+        return _implicit_root(residual, close, (vector, command))
+
+    def transient(
+        self,
+        vector: Float[Array, " parameters"],
+        qpos: Float[Array, " nq"],
+        command: Float[Array, ""],
+        delay: Float[Array, ""],
+        times: int,
+    ) -> Float[Array, "times 2"]:
+        """Motor and knee angle (rad) every `SAMPLE_TIMESTEP` from the moment at which the command changes, from rest in
+        `qpos`; the motion starts `delay` (s) later. Differentiable forwards."""
+        model = self._with(vector)
+
+        def step(state: _State, _: None) -> tuple[_State, Array]:
+            state = self._step(model, state, command)
+            return state, state[0][self.angles]
+
+        rest = jnp.zeros(self.model.nv)
+        timestep = float(self.model.opt.timestep)
+        count = int(np.ceil((times - 1) * SAMPLE_TIMESTEP / timestep))
+        _, path = jax.lax.scan(step, (qpos, rest, rest), length=count)
+        path = jnp.concatenate([qpos[self.angles][None], path])
+        seen = SAMPLE_TIMESTEP * jnp.arange(times) - delay
+        return jax.vmap(lambda column: jnp.interp(seen, timestep * jnp.arange(count + 1), column), 1, 1)(path)
+
+    def residual_torque(
+        self, qpos: Float[Array, " nq"], vector: Float[Array, " parameters"], command: Float[Array, ""]
+    ) -> Float[Array, " nv"]:
+        """Generalized force (N m) that nothing balances, at rest in `qpos`: zero where the leg hangs still."""
+        model = self._with(vector)
+        rest = jnp.zeros(self.model.nv)
+        data = self._data.replace(qpos=qpos, qvel=rest, qacc=rest, ctrl=command[None])  # pyright: ignore
+        data = mjx.fwd_actuation(model, mjx.inverse(model, data))
+        return data.qfrc_actuator - data.qfrc_inverse
+
+    def _with(self, vector: Float[Array, " parameters"]) -> mjx.Model:
+        return ballu.with_fields(self._mjx, ballu.actuator_fields(self.model, ActuatorParameters(*vector[:, None])))
+
+    def _relaxed_qpos(self, vector: Float[Array, " parameters"], command: Float[Array, ""]) -> Float[Array, " nq"]:
+        """Close to rest, by simulating the way there from command 0, heavily damped and in long steps: whether the
+        cable is taut, the stop holds and the servo saturates is then settled."""
+        model = self._with(vector)
+        # One iteration will do here: what is not exact is Newton's to mend.
+        option = model.opt.replace(timestep=jnp.asarray(_RELAXATION_TIMESTEP), iterations=1, ls_iterations=4)
+        model = model.replace(dof_damping=jnp.asarray(self._relaxation_damping), opt=option)  # pyright: ignore
+        rest = [vector[NAMES.index(name)] for name in ("default_motor_angle", "default_knee_angle")]
+        qpos = jnp.zeros(self.model.nq).at[self.angles].set(jnp.stack(rest))
+        still = jnp.zeros(self.model.nv)
+        step = lambda _, state: self._step(model, state, command)  # noqa: E731
+        return jax.lax.fori_loop(0, _RELAXATION_STEPS, step, (qpos, still, still))[0]
+
+    def _step(self, model: mjx.Model, state: _State, command: Float[Array, ""]) -> _State:
+        """One physics step. Only what a step needs is carried from one to the next: MJX in double precision changes the
+        integer types of some other fields."""
+        qpos, qvel, warmstart = state
+        data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=command[None])  # pyright: ignore
+        data = mjx.step(model, data)
+        return data.qpos, data.qvel, data.qacc_warmstart
+
+
+_RELAXATION_TIMESTEP = 0.05
+_RELAXATION_STEPS = 150
+_RELAXATION_DAMPING = {"hip": 0.1, "knee": 0.03, "motor": 0.05}
+"""N m s/rad: more than half the time step times the stiffness of each joint, which keeps such long steps stable."""
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _implicit_root(residual: Callable[[Array, Any], Array], guess: Array, arguments: Any) -> Array:
+    """The root of `residual(x, arguments)` near `guess`, differentiable in `arguments` by the implicit function theorem."""
+    return _root(residual, guess, arguments)[0]
+
+
+@_implicit_root.defjvp
+def _implicit_root_jvp(
+    residual: Callable[[Array, Any], Array], primals: tuple[Array, Any], tangents: tuple[Array, Any]
+) -> tuple[Array, Array]:
+    guess, arguments = primals
+    root, jacobian = _root(residual, guess, arguments)
+    _, change = jax.jvp(lambda a: residual(root, a), (arguments,), (tangents[1],))
+    return root, -jnp.linalg.solve(jacobian, change)
+
+
+def _root(residual: Callable[[Array, Any], Array], guess: Array, arguments: Any) -> tuple[Array, Array]:
+    """Root and Jacobian there, by Newton's method with Levenberg's damping from a guess that is close.
+
+    Optimistix has such solvers; each holds MJX's program, 10 s to compile, several times over, this one once.
+    """
+
+    def body(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        x, value, jacobian, damping, trial, count = state
+        trial_jacobian, trial_value = jax.jacfwd(lambda x: (residual(x, arguments),) * 2, has_aux=True)(trial)
+        better = jnp.sum(trial_value**2) < jnp.sum(value**2)
+        x, value, jacobian = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old), (trial, trial_value, trial_jacobian), (x, value, jacobian)
+        )
+        damping = jnp.where(better, damping / 100, damping * 10)
+        normal = jacobian.T @ jacobian
+        step = jnp.linalg.solve(normal + damping * jnp.diag(jnp.diag(normal)), jacobian.T @ value)
+        return x, value, jacobian, damping, x - step, count + 1
+
+    def unfinished(state: tuple[Array, ...]) -> Array:
+        x, _, _, _, trial, count = state
+        return (count < _ROOT_STEPS) & ((count == 0) | (jnp.max(jnp.abs(trial - x)) > _ROOT_TOLERANCE))
+
+    size = guess.shape[0]
+    start = (guess, jnp.full(size, jnp.inf), jnp.eye(size), jnp.asarray(1e-4), guess, jnp.asarray(0))
+    x, _, jacobian, *_ = jax.lax.while_loop(unfinished, body, start)
+    return x, jacobian
+
+
+_ROOT_STEPS = 40
+_ROOT_TOLERANCE = 1e-9
+"""rad: the next step would be lost in rounding."""
+
+
+def polynomial_curve(
+    command: Float[Array | np.ndarray, " holds"], angles: Float[Array | np.ndarray, " holds"], degree: int
+) -> Float[Array, "200 2"]:
+    """The polynomial fitted to angles (rad) over commands, at `CURVE_SAMPLES` commands in [0, 1]: points (command, angle
+    over 90 deg), the plane in which the paper's curves are compared. Linear in the angles."""
+    samples = np.linspace(0.0, 1.0, CURVE_SAMPLES)
+    # In Chebyshev polynomials: powers of the command would be close to dependent.
+    basis = lambda x: jnp.cos(jnp.arange(degree + 1) * jnp.arccos(jnp.clip(2 * x - 1, -1.0, 1.0))[:, None])  # noqa: E731
+    coefficients = jnp.linalg.lstsq(basis(jnp.asarray(command)), jnp.asarray(angles))[0]
+    return jnp.stack([jnp.asarray(samples), basis(jnp.asarray(samples)) @ coefficients / ballu.SERVO_RANGE], axis=1)
+
+
+def directed_hausdorff(from_points: Float[Array, "n d"], to_points: Float[Array, "m d"]) -> Float[Array, ""]:
+    """The largest distance of a point in `from_points` to the nearest of `to_points`.
+
+    Not smooth: its gradient is that of the one pair of points that decides (a subgradient, where several do), and 0
+    where that pair coincides.
+    """
+    squared = jnp.sum((from_points[:, None] - to_points[None]) ** 2, axis=-1)
+    decisive = jnp.max(jnp.min(squared, axis=1))
+    return jnp.where(decisive > 0, jnp.sqrt(jnp.where(decisive > 0, decisive, 1.0)), 0.0)
+
+
+def curve_distances(
+    command: Float[np.ndarray | Array, " holds"],
+    simulated: Float[Array, "holds 2"],
+    measured: Float[Array | np.ndarray, "holds 2"],
+    degree: int,
+) -> Float[Array, "2 2"]:
+    """Directed Hausdorff distances between a leg's simulated and measured curves: (simulated to measured, measured to
+    simulated) by (motor, knee). The paper's objective is the sum of the first row over both legs."""
+    pairs = [
+        [polynomial_curve(command, angles[:, joint], degree) for angles in (simulated, measured)] for joint in range(2)
+    ]
+    return jnp.stack([jnp.stack([directed_hausdorff(*pair[::way]) for pair in pairs]) for way in (1, -1)])
+
+
+class Space:
+    """Between a leg's parameters in their units and the unbounded coordinates that are searched.
+
+    A coordinate runs through a logistic function from the lower to the upper bound: of the logarithm for stiffness,
+    gain and torque limit, of the angle itself for angles. Parameters that are not free keep their nominal value.
+    """
+
+    def __init__(self, nominal: Float[np.ndarray, " parameters"], config: IdentificationConfig) -> None:
+        ranges = [RANGES[name] for name in NAMES]
+        factors = np.array([r.factor or 1.0 for r in ranges])
+        reaches = np.array([r.reach for r in ranges])
+        self.nominal = nominal
+        self.relative = np.array([r.factor is not None for r in ranges])
+        self.lower, self.upper = nominal / factors - reaches, nominal * factors + reaches
+        self.prior = np.array([r.prior for r in ranges]) * np.where(self.relative, nominal, 1.0)
+        """Standard deviation of each parameter among robots, in its units."""
+        self.free = np.array([config.torque_limit or name != "torque_limit" for name in NAMES])
+
+    def vector(self, coordinates: Float[Array, " free"]) -> Float[Array, " parameters"]:
+        """A leg's parameters, in their units."""
+        free, relative = self.free, self.relative[self.free]
+        lower, upper = self.lower[free], self.upper[free]
+        ratio = np.where(relative, upper / np.where(relative, lower, 1.0), 1.0)
+        share = jax.nn.sigmoid(coordinates)
+        values = jnp.where(relative, lower * ratio**share, lower + share * (upper - lower))
+        return jnp.asarray(self.nominal).at[np.flatnonzero(free)].set(values)
+
+    def coordinates(self, vector: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " free"]:
+        """The inverse of `vector`, for values within the bounds."""
+        share = (vector - self.lower) / (self.upper - self.lower)
+        logs = [np.log(np.where(self.relative, x, 1.0)) for x in (vector, self.lower, self.upper)]
+        span = np.where(self.relative, logs[2] - logs[1], 1.0)
+        share = np.where(self.relative, (logs[0] - logs[1]) / span, share)[self.free]
+        return np.log(share / (1 - share))
+
+    def draw(self, seed: int, count: int) -> Float[np.ndarray, "count+1 free"]:
+        """Coordinates: of the nominal values, then of uniform draws from the middle half of the bounds' span."""
+        shares = np.random.default_rng(seed).uniform(0.25, 0.75, (count, int(self.free.sum())))
+        return np.concatenate([self.coordinates(self.nominal)[None], np.log(shares / (1 - shares))])
+
+
+class _Data(NamedTuple):
+    """A `Sweep` with the legs (left, right) first and (motor, knee) last; rad."""
+
+    command: Float[np.ndarray, "legs holds"]
+    settled: Float[np.ndarray, "legs holds 2"]
+    weights: Float[np.ndarray, " holds"]
+    """Root of the samples in each mean: a mean of n samples counts as n of them."""
+    previous: Int[np.ndarray, " holds"]
+    transient: Float[np.ndarray, "legs holds times 2"]
+
+
+def nominal_leg() -> Float[np.ndarray, " parameters"]:
+    """A leg's nominal parameters."""
+    nominal = ActuatorParameters.nominal(ballu.load_suspended_leg(SIDES[0]))
+    return np.concatenate([np.asarray(getattr(nominal, name), float) for name in NAMES])
+
+
+def _data(sweep: Sweep) -> _Data:
+    return _Data(
+        command=sweep.command.T,
+        settled=np.moveaxis(sweep.settled, -1, 0),
+        weights=np.sqrt(sweep.samples),
+        previous=sweep.previous,
+        transient=np.moveaxis(sweep.transient, -1, 0),
+    )
+
+
+DELAY_UNIT = 0.01
+"""Seconds of delay that a coordinate of 1 stands for."""
+_FIRST_DELAY = 3.0
+
+
+class _Physics:
+    """The two programs that hold MJX: values and Jacobians in a `Space`'s coordinates, for batches of fixed sizes."""
+
+    def __init__(self, space: Space, batch: int, data: _Data) -> None:
+        self.leg, self.space, self.batch = SuspendedLeg(), space, batch
+        size, (legs, holds) = int(space.free.sum()), data.command.shape
+        times = data.transient.shape[2]
+
+        def settled(coordinates: Array, command: Array) -> tuple[Array, Array]:
+            def qpos(y: Array) -> tuple[Array, Array]:
+                return (self.leg.settled_qpos(space.vector(y), command),) * 2
+
+            slope, value = jax.jacfwd(qpos, has_aux=True)(coordinates)
+            return value, slope
+
+        def transient(coordinates: Array, start: Array, slope: Array, command: Array) -> tuple[Array, Array]:
+            def path(y: Array, qpos: Array) -> Array:
+                return self.leg.transient(space.vector(y[:-1]), qpos, command, y[-1] * DELAY_UNIT, times)
+
+            tangents = (jnp.eye(size + 1), jnp.concatenate([slope.T, jnp.zeros((1, self.leg.model.nq))]))
+            push = lambda *tangent: jax.jvp(path, (coordinates, start), tangent)  # noqa: E731
+            values, slopes = jax.vmap(push, out_axes=(None, -1))(*tangents)
+            return values, slopes
+
+        over_holds = jax.vmap(settled, (None, 0))
+        self._settled = jax.jit(jax.vmap(over_holds)).lower(jnp.zeros((batch, size)), jnp.zeros((batch, holds)))
+        nq = self.leg.model.nq
+        over_holds = jax.vmap(transient, (None, 0, 0, 0))
+        shapes = ((legs, size + 1), (legs, holds, nq), (legs, holds, nq, size), (legs, holds))
+        self._transient = jax.jit(jax.vmap(over_holds)).lower(*(jnp.zeros(shape) for shape in shapes))
+
+    def compile(self, transients: bool) -> None:
+        """Compile both programs at once, or the first alone."""
+        programs = [self._settled, self._transient] if transients else [self._settled]
+        with ThreadPoolExecutor() as pool:
+            self._compiled = list(pool.map(lambda program: program.compile(), programs))
+
+    def settled(
+        self, coordinates: Float[np.ndarray, "n size"], command: Float[np.ndarray, "n holds"]
+    ) -> tuple[Float[np.ndarray, "n holds nq"], Float[np.ndarray, "n holds nq size"]]:
+        """Positions at rest and their derivatives, for any number of coordinates."""
+        values, slopes = [], []
+        for first in range(0, len(coordinates), self.batch):
+            count = min(self.batch, len(coordinates) - first)
+            rows = np.minimum(first + np.arange(self.batch), first + count - 1)
+            value, slope = self._compiled[0](jnp.asarray(coordinates[rows]), jnp.asarray(command[rows]))
+            values.append(np.asarray(value)[:count])
+            slopes.append(np.asarray(slope)[:count])
+        return np.concatenate(values), np.concatenate(slopes)
+
+    def transient(
+        self, coordinates: np.ndarray, start: np.ndarray, slope: np.ndarray, command: np.ndarray
+    ) -> tuple[Float[np.ndarray, "legs holds times 2"], Float[np.ndarray, "legs holds times 2 size"]]:
+        """Transients of both legs and their derivatives; `start` and `slope` from `settled`."""
+        value, jacobian = self._compiled[1](*map(jnp.asarray, (coordinates, start, slope, command)))
+        return np.asarray(value), np.asarray(jacobian)
+
+
+class Direction(NamedTuple):
+    """A combination of a leg's parameters, in units of what robots differ by (`RANGES`)."""
+
+    weights: Float[np.ndarray, " free"]
+    """Unit vector; entries in the order of the free parameters."""
+    standard_error: float
+    """Of the combination: below 1, the data know more than is known without them."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Fit:
+    """One leg, identified."""
+
+    vector: Float[np.ndarray, " parameters"]
+    standard_errors: Float[np.ndarray, " parameters"]
+    """In the parameters' units, from the Jacobian and the scatter of the residuals taken as white noise; 0 for those that
+    were not free, and of the prior's size at most along open directions."""
+    correlations: Float[np.ndarray, "free free"]
+    directions: tuple[Direction, ...]
+    """From the best to the least determined."""
+    delay: float | None
+    """Seconds from a command to the motion's start."""
+    residual: float
+    """Root mean square (rad) of all residuals, each sample counted once."""
+    losses: Float[np.ndarray, " starts"]
+    """Sums of squares (rad^2, settled angles) that the starts ended at, in ascending order."""
+
+    @property
+    def open_directions(self) -> tuple[Direction, ...]:
+        """Those that the data leave open: held near the nominal values."""
+        return tuple(d for d in self.directions if d.standard_error > 1.0)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Identification:
+    """Both legs (left, right)."""
+
+    fits: tuple[Fit, Fit]
+    settled: Float[np.ndarray, "holds 2 2"]
+    """Settled angles (rad) of the identified robot; (motor, knee), (left, right) last, as in `Sweep`."""
+    nominal_settled: Float[np.ndarray, "holds 2 2"]
+    """The same of the nominal robot."""
+    config: IdentificationConfig
+
+    @property
+    def parameters(self) -> ActuatorParameters:
+        return ActuatorParameters(
+            *(jnp.asarray(row, jnp.float32) for row in np.stack([f.vector for f in self.fits], 1))
+        )
+
+
+Report = Callable[[str, int, int, float], None]
+"""(stage, iteration, most iterations, the lowest loss among the searches)."""
+
+
+def identify(
+    sweep: Sweep, config: IdentificationConfig = IdentificationConfig(), report: Report | None = None
+) -> Identification:
+    """Fit both legs' parameters to a sweep.
+
+    1. Settled angles alone, from several starts side by side, the best of many draws: searches that start with a servo
+       that never saturates, say, end in a valley of their own.
+    2. From the best of these, transients too.
+    3. Directions that the data leave open, if any, are drawn to the nominal values, and to nothing else.
+    4. With `objective="hausdorff"`, the paper's distance between curves, from there.
+
+    **Raises** `InputError` from `IdentificationConfig`'s check.
+    """
+    check(config)
+    report = report or (lambda stage, iteration, steps, value: None)
+    with jax.enable_x64(True):
+        return _Identifier(config, sweep, report).run(sweep, report)
+
+
+def check(config: IdentificationConfig) -> None:
+    """Refuse sizes that make no sense.
+
+    **Raises** `InputError` naming the option.
+    """
+    for name in ("draws", "starts", "steps", "degree"):
+        if getattr(config, name) < 1:
+            raise InputError(f"--{name} is {getattr(config, name)}: it must be 1 or more.")
+    if config.seed < 0:
+        raise InputError(f"--seed is {config.seed}: it must be 0 or more.")
+
+
+class _Identifier:
+    """The stages of `identify`, compiled once for sweeps of the same sizes."""
+
+    def __init__(self, config: IdentificationConfig, sweep: Sweep, report: Report) -> None:
+        self.config = config
+        data = _data(sweep)
+        starts = min(config.starts, config.draws + 1)
+        report("compiling", 0, 1, float("nan"))
+        self.space = Space(nominal_leg(), config)
+        self.physics = _Physics(self.space, starts * len(SIDES), data)
+        self.physics.compile(config.transients)
+        report("compiling", 1, 1, float("nan"))
+        self._starts, self._size = starts, int(self.space.free.sum())
+        tolerance = {"rtol": 1e-5, "atol": 1e-5}
+        self._squares = _Search(optx.LevenbergMarquardt(**tolerance))
+        self._shape = _Search(optx.LBFGS(**tolerance))
+
+    def run(self, sweep: Sweep, report: Report) -> Identification:
+        config, size, data = self.config, self._size, _data(sweep)
+        legs = np.arange(len(SIDES))
+
+        draws = self.space.draw(config.seed, config.draws)
+        coordinates, leg = np.tile(draws, (len(legs), 1)), np.repeat(legs, len(draws))
+        report("draws", 0, 1, float("nan"))
+        losses = np.sum(self._settled_residuals(coordinates, leg, data)[0] ** 2, axis=1).reshape(len(legs), -1)
+        report("draws", 1, 1, float(losses.min()))
+        best = np.argsort(losses, axis=1)[:, : self._starts]
+        starts, leg = draws[best].reshape(-1, size), np.repeat(legs, self._starts)
+        found, ended = self._squares(
+            lambda y: self._settled_residuals(y, leg, data), starts, config.steps, partial(report, "settled angles")
+        )
+        ended = ended.reshape(len(legs), -1)
+        coordinates = found.reshape(len(legs), -1, size)[legs, np.argmin(ended, axis=1)]
+
+        if config.transients:
+            coordinates = np.concatenate([coordinates, np.full((len(legs), 1), _FIRST_DELAY)], axis=1)
+            coordinates, _ = self._squares(
+                lambda y: self._residuals(y, data), coordinates, config.steps, partial(report, "transients")
+            )
+        analyses = self._analyse(coordinates, data)
+        if any(direction.standard_error > 1 for a in analyses for direction in a.directions):
+            coordinates, _ = self._squares(
+                lambda y: self._drawn(y, data, analyses), coordinates, config.steps, partial(report, "open directions")
+            )
+            analyses = self._analyse(coordinates, data)
+        if config.objective == "hausdorff":
+            shaped, _ = self._shape(
+                lambda y: self._distance(y, data), coordinates[:, :size], config.steps, partial(report, "curves")
+            )
+            coordinates = np.concatenate([shaped, coordinates[:, size:]], axis=1)
+            analyses = self._analyse(coordinates, data)
+
+        before = np.tile(self.space.coordinates(self.space.nominal), (len(legs), 1))
+        settled = [self._angles(y, data.command)[0] for y in (coordinates[:, :size], before)]
+        fits = [
+            Fit(
+                vector=np.asarray(self.space.vector(jnp.asarray(coordinates[leg, :size]))),
+                standard_errors=analysis.standard_errors,
+                correlations=analysis.correlations,
+                directions=analysis.directions,
+                delay=float(coordinates[leg, -1]) * DELAY_UNIT if config.transients else None,
+                residual=analysis.scatter,
+                losses=np.sort(ended[leg]),
+            )
+            for leg, analysis in enumerate(analyses)
+        ]
+        after, nominal = (np.moveaxis(angles, 0, -1) for angles in settled)
+        return Identification((fits[0], fits[1]), after, nominal, config)
+
+    def _angles(
+        self, coordinates: Float[np.ndarray, "n size"], command: Float[np.ndarray, "n holds"]
+    ) -> tuple[Float[np.ndarray, "n holds 2"], Float[np.ndarray, "n holds 2 size"]]:
+        """Simulated settled angles (rad) and their derivatives."""
+        qpos, slope = self.physics.settled(coordinates, command)
+        return qpos[:, :, self.physics.leg.angles], slope[:, :, self.physics.leg.angles]
+
+    def _settled_residuals(
+        self, coordinates: Float[np.ndarray, "n size"], leg: Int[np.ndarray, " n"], data: _Data
+    ) -> tuple[Float[np.ndarray, "n residuals"], Float[np.ndarray, "n residuals size"]]:
+        """Simulated less measured settled angles, weighted, and their Jacobians."""
+        angles, slope = self._angles(coordinates, data.command[leg])
+        weights = data.weights[:, None]
+        count = len(coordinates)
+        return (
+            (weights * (angles - data.settled[leg])).reshape(count, -1),
+            (weights[..., None] * slope).reshape(count, -1, self._size),
+        )
+
+    def _residuals(
+        self, coordinates: Float[np.ndarray, "legs size"], data: _Data
+    ) -> tuple[Float[np.ndarray, "legs residuals"], Float[np.ndarray, "legs residuals size"]]:
+        """The same for both legs, followed by the transients' (0 where the command did not change)."""
+        legs, size = len(coordinates), self._size
+        if not self.config.transients:
+            return self._settled_residuals(coordinates, np.arange(legs), data)
+        qpos, slope = self.physics.settled(coordinates[:, :size], data.command)
+        paths, path_slopes = self.physics.transient(
+            coordinates, qpos[:, data.previous], slope[:, data.previous], data.command
+        )
+        moved = (data.previous != np.arange(len(data.previous)))[:, None, None]
+        weights, angles = data.weights[:, None], self.physics.leg.angles
+        values = (weights * (qpos[:, :, angles] - data.settled), moved * (paths - data.transient))
+        still = np.pad(weights[..., None] * slope[:, :, angles], [(0, 0)] * 3 + [(0, 1)])
+        jacobians = (still, moved[..., None] * path_slopes)
+        return (
+            np.concatenate([value.reshape(legs, -1) for value in values], axis=1),
+            np.concatenate([jacobian.reshape(legs, -1, size + 1) for jacobian in jacobians], axis=1),
+        )
+
+    def _drawn(
+        self, coordinates: Float[np.ndarray, "legs size"], data: _Data, analyses: list[_Analysis]
+    ) -> tuple[Float[np.ndarray, "legs residuals"], Float[np.ndarray, "legs residuals size"]]:
+        """All residuals over their scatter, then how far from nominal along open directions, in units of the prior."""
+        values, jacobians = self._residuals(coordinates, data)
+        space, size = self.space, self._size
+        rows, row_slopes = [], []
+        for y, analysis in zip(coordinates, analyses, strict=True):
+            directions = np.array([d.weights if d.standard_error > 1 else np.zeros(size) for d in analysis.directions])
+            vector, slope = self._parameters(y[:size])
+            directions = directions / space.prior[space.free]
+            rows.append(directions @ (vector - space.nominal)[space.free])
+            row_slopes.append(np.pad(directions @ slope, [(0, 0), (0, len(y) - size)]))
+        scatter = np.array([analysis.scatter for analysis in analyses])
+        return (
+            np.concatenate([values / scatter[:, None], np.array(rows)], axis=1),
+            np.concatenate([jacobians / scatter[:, None, None], np.array(row_slopes)], axis=1),
+        )
+
+    def _distance(
+        self, coordinates: Float[np.ndarray, "legs size"], data: _Data
+    ) -> tuple[Float[np.ndarray, "legs 1"], Float[np.ndarray, "legs 1 size"]]:
+        """Each leg's part of the paper's objective."""
+        angles, slope = self._angles(coordinates, data.command)
+        values, jacobians = [], []
+        for leg, command in enumerate(data.command):
+            value, gradient = self._curve_gradient(command, angles[leg], data.settled[leg])
+            values.append([float(value)])
+            jacobians.append(np.einsum("ha,has->s", gradient, slope[leg])[None])
+        return np.array(values), np.array(jacobians)
+
+    def _curve_gradient(
+        self, command: np.ndarray, angles: np.ndarray, measured: np.ndarray
+    ) -> tuple[Array, np.ndarray]:
+        objective = lambda angles: jnp.sum(curve_distances(command, angles, measured, self.config.degree)[0])  # noqa: E731
+        value, gradient = jax.value_and_grad(objective)(jnp.asarray(angles))
+        return value, np.asarray(gradient)
+
+    def _parameters(self, coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A leg's parameters, and the free ones' derivatives in the coordinates."""
+        vector = self.space.vector(jnp.asarray(coordinates))
+        return np.asarray(vector), np.asarray(jax.jacfwd(self.space.vector)(jnp.asarray(coordinates)))[self.space.free]
+
+    def _analyse(self, coordinates: Float[np.ndarray, "legs size"], data: _Data) -> list[_Analysis]:
+        space, size = self.space, self._size
+        results = []
+        for y, value, jacobian in zip(coordinates, *self._residuals(coordinates, data), strict=True):
+            scatter = float(np.sqrt(np.sum(value**2) / max(np.count_nonzero(value) - len(y), 1)))
+            prior = space.prior[space.free]
+            # In units of the prior, whatever the coordinates; the delay, of which nobody knows anything, projected out.
+            known = jacobian[:, :size] / np.diag(self._parameters(y[:size])[1]) * prior / scatter
+            for nuisance in jacobian[:, size:].T:
+                unit = nuisance / np.linalg.norm(nuisance)
+                known = known - np.outer(unit, unit @ known)
+            _, singular, right = np.linalg.svd(known, full_matrices=False)
+            errors = 1 / np.maximum(singular, 1e-12)
+            variances = np.where(errors > 1, 1 / (1 + singular**2), errors**2)
+            covariance = right.T @ np.diag(variances) @ right
+            deviation = np.sqrt(np.diag(covariance))
+            standard_errors = np.zeros(len(NAMES))
+            standard_errors[space.free] = deviation * prior
+            signed = [w * np.sign(w[np.argmax(np.abs(w))]) for w in right]
+            directions = tuple(Direction(w, float(e)) for w, e in zip(signed, errors, strict=True))
+            correlations = covariance / np.outer(deviation, deviation)
+            results.append(_Analysis(scatter, standard_errors, correlations, directions))
+        return results
+
+
+class _Analysis(NamedTuple):
+    scatter: float
+    standard_errors: Float[np.ndarray, " parameters"]
+    correlations: Float[np.ndarray, "free free"]
+    directions: tuple[Direction, ...]
+
+
+_Evaluate = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Coordinates (batch, size) to values (batch, n) and Jacobians (batch, n, size)."""
+
+
+class _Search:
+    """An Optimistix solver, for several starts side by side, one iteration at a time.
+
+    The solver's program holds no physics: values and Jacobians at the points that it tries next are computed outside and
+    handed in. MJX, which takes by far the longest to compile, then stands in one program for all solvers and stages.
+    """
+
+    def __init__(self, solver: Any) -> None:
+        least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
+
+        @jax.custom_jvp
+        def known(y: Array, value: Array, jacobian: Array) -> Array:
+            return value
+
+        @known.defjvp
+        def _(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
+            return primals[1], primals[2] @ tangents[0]
+
+        def function(y: Array, evaluated: tuple[Array, Array]) -> tuple[Array, Array]:
+            value = known(y, *evaluated)
+            return (value, jnp.sum(value**2)) if least_squares else (value[0], value[0])
+
+        def init(y: Array, evaluated: tuple[Array, Array]) -> Any:
+            return solver.init(function, y, evaluated, {}, *jax.eval_shape(function, y, evaluated), frozenset())
+
+        def step(y: Array, evaluated: tuple[Array, Array], state: Any) -> tuple[Array, Any, Array, Array]:
+            y, state, loss = solver.step(function, y, evaluated, {}, state, frozenset())
+            done, _ = solver.terminate(function, y, evaluated, {}, state, frozenset())
+            return y, state, loss, done
+
+        self._init = eqx.filter_jit(eqx.filter_vmap(init))
+        self._step = eqx.filter_jit(eqx.filter_vmap(step))
+
+    def __call__(
+        self, evaluate: _Evaluate, start: np.ndarray, steps: int, report: Callable[[int, int, float], None]
+    ) -> tuple[Float[np.ndarray, "batch size"], Float[np.ndarray, " batch"]]:
+        """Coordinates and losses at the end of each search: sums of squares, or the minimized function itself."""
+        evaluated = tuple(map(jnp.asarray, evaluate(start)))
+        y, state, loss = jnp.asarray(start), self._init(jnp.asarray(start), evaluated), np.zeros(len(start))
+        for iteration in range(steps):
+            y, state, loss, done = self._step(y, evaluated, state)
+            report(iteration + 1, steps, float(jnp.min(loss)))
+            if bool(jnp.all(done)):
+                break
+            evaluated = tuple(map(jnp.asarray, evaluate(np.asarray(state.y_eval))))
+        return np.asarray(y), np.asarray(loss)

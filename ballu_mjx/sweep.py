@@ -1,0 +1,157 @@
+"""Actuator sweeps: what a suspended recording says about the way from commands to joint angles.
+
+A sweep holds one pair of commands after the other, each until the joints have settled. Identification reads from it
+the settled angles (the paper's data, section "System Identification") and the transients on the way there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ballu_mjx.errors import InputError
+from ballu_mjx.recording import Recording
+from ballu_mjx.robot import SIDES
+
+LEVELS = 20
+"""Command levels of a sweep (paper)."""
+SAMPLE_TIMESTEP = 0.01
+"""Seconds between two samples of a transient."""
+SHORTEST_HOLD = 0.6
+"""Seconds for which each command must be held at least."""
+_TRANSIENT_SECONDS = 0.8
+_SETTLED_SECONDS = 0.5
+_SETTLED_WITHIN = float(np.deg2rad(2.0))
+"""Drift (rad) within the settled window above which the joints were still moving."""
+_SAME_LEVEL = 0.005
+_REACHES = (0.1, 0.9)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sweep:
+    """Angles (rad) of one or more suspended recordings of a robot, by hold; the last two axes are (motor, knee) and
+    (left, right)."""
+
+    robot: str
+    command: Float[np.ndarray, "holds 2"]
+    """Commands held (left, right)."""
+    previous: Int[np.ndarray, " holds"]
+    """Index of the hold before; for the first of a recording, its own."""
+    settled: Float[np.ndarray, "holds 2 2"]
+    """Means over the last stretch of each hold."""
+    samples: Int[np.ndarray, " holds"]
+    """Samples in each of those means."""
+    transient: Float[np.ndarray, "holds times 2 2"]
+    """Angles after the command changed, at multiples of `SAMPLE_TIMESTEP` from 0 on."""
+
+    def without(self, left_out: Sequence[int]) -> Sweep:
+        """The same without some of its holds."""
+        kept = np.setdiff1d(np.arange(len(self.command)), left_out)
+        # A hold whose predecessor is gone keeps its settled angles, and loses its transient.
+        place = np.full(len(self.command), -1)
+        place[kept] = np.arange(len(kept))
+        previous = np.where(place[self.previous[kept]] < 0, np.arange(len(kept)), place[self.previous[kept]])
+        fields = (self.settled, self.samples, self.transient)
+        return Sweep(self.robot, self.command[kept], previous, *(field[kept] for field in fields))
+
+
+def read_sweep(recordings: Mapping[Path, Recording], *, levels: int = LEVELS) -> Sweep:
+    """The sweep in one or more suspended recordings of one robot.
+
+    Legs may have been swept together or one after the other.
+
+    **Arguments**
+
+    - `recordings`: by the file that messages name.
+    - `levels`: fewest command levels a leg.
+
+    **Raises** `InputError` for recordings that are sound but no such sweep: of another kind or of several robots, with
+    a leg whose command never moves, with too few levels or levels that do not span [0, 1], with holds too short or
+    joints still moving at their end.
+    """
+    names = ", ".join(str(path) for path in recordings)
+    robots = sorted({recording.robot for recording in recordings.values()})
+    if len(robots) > 1:
+        raise InputError(f"{names}: recordings of several robots ({', '.join(robots)}); identify one at a time.")
+    parts: list[tuple[np.ndarray, ...]] = []
+    for path, recording in recordings.items():
+        if recording.kind != "suspended":
+            raise InputError(
+                f"{path}: is a {recording.kind} recording; actuators are identified from suspended ones (feet off the "
+                'ground, "kind": "suspended").'
+            )
+        parts.append(_holds(path, recording))
+    length = min(part[4].shape[1] for part in parts)
+    firsts = np.cumsum([0] + [len(part[0]) for part in parts])
+    previous = np.concatenate([part[1] + first for part, first in zip(parts, firsts, strict=False)])
+    command, settled, samples = (np.concatenate([part[i] for part in parts]) for i in (0, 2, 3))
+    transient = np.concatenate([part[4][:, :length] for part in parts])
+    for index, side in enumerate(SIDES):
+        _check_levels(names, side, command[:, index], levels)
+    return Sweep(robots[0], command, previous, settled, samples, transient)
+
+
+def _check_levels(names: str, side: str, command: Float[np.ndarray, " holds"], levels: int) -> None:
+    ordered = np.sort(command)
+    count = 1 + int(np.sum(np.diff(ordered) > _SAME_LEVEL))
+    if count == 1:
+        raise InputError(
+            f"{names}: command_{side} stays at {ordered[0]:g}: the {side} leg was not swept; add a recording in which "
+            "it was."
+        )
+    if count < levels:
+        raise InputError(
+            f"{names}: holds {count} levels of command_{side}; {levels} spread over [0, 1] are needed (--levels {count} "
+            "accepts these, at the price of larger standard errors)."
+        )
+    if ordered[0] > _REACHES[0] or ordered[-1] < _REACHES[1]:
+        raise InputError(
+            f"{names}: command_{side} goes from {ordered[0]:.2f} to {ordered[-1]:.2f}; spread the levels over [0, 1]."
+        )
+
+
+def _holds(path: Path, recording: Recording) -> tuple[np.ndarray, ...]:
+    """Command, index of the hold before, settled angles, samples and transient of each hold of one recording."""
+    assert recording.motor is not None and recording.knee is not None  # mandatory in suspended recordings
+    time, angles = recording.time, np.stack([recording.motor, recording.knee], axis=1)
+    changes = 1 + np.flatnonzero(np.any(np.abs(np.diff(recording.command, axis=0)) > 1e-9, axis=1))
+    starts, ends = np.concatenate([[0], changes]), np.concatenate([changes, [len(time)]])
+    durations = time[ends - 1] - time[starts]
+    if durations.min() < SHORTEST_HOLD:
+        place = int(np.argmin(durations))
+        raise InputError(
+            f"{path}: the command at {time[starts[place]]:.2f} s is held for {durations[place]:.2f} s only; hold each "
+            f"until the joints settle, {SHORTEST_HOLD:g} s or more (2 s is good)."
+        )
+    settled_seconds = min(_SETTLED_SECONDS, durations.min() / 3)
+    transient_seconds = min(_TRANSIENT_SECONDS, durations.min() - settled_seconds)
+    grid = SAMPLE_TIMESTEP * np.arange(int(transient_seconds / SAMPLE_TIMESTEP + 1e-9))
+
+    settled, samples, transient = [], [], []
+    for start, end in zip(starts, ends, strict=True):
+        window = angles[start:end][time[start:end] > time[end - 1] - settled_seconds]
+        half = len(window) // 2
+        drift = np.abs(window[half:].mean(axis=0) - window[:half].mean(axis=0)).max()
+        if drift > _SETTLED_WITHIN:
+            raise InputError(
+                f"{path}: a joint still moves by {np.rad2deg(drift):.1f} deg at the end of the hold from "
+                f"{time[start]:.2f} s; hold each command for longer."
+            )
+        settled.append(window.mean(axis=0))
+        samples.append(len(window))
+        flat = angles.reshape(len(time), 4)
+        transient.append(
+            np.stack([np.interp(time[start] + grid, time, column) for column in flat.T], axis=1).reshape(-1, 2, 2)
+        )
+    command = recording.command[starts]
+    return (
+        command,
+        np.maximum(np.arange(len(starts)) - 1, 0),
+        np.array(settled),
+        np.array(samples),
+        np.array(transient),
+    )

@@ -1,0 +1,179 @@
+# %% [markdown]
+# # What EnvMimic's options are worth
+#
+# Each row of the README's ablation table is the default configuration with one thing changed, trained over seeds and
+# measured on the validation recordings (the test recordings have no part in choices).
+#
+# `python experiments/ablation.py` takes about three minutes a row and seed on two cores; what is there already is not
+# trained again. `--quick` shows that it works.
+
+# %%
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+import numpy as np  # noqa: E402
+
+from ballu_mjx import evaluation, ppo, recording, robot  # noqa: E402
+from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv  # noqa: E402
+from ballu_mjx.ppo import PPOConfig  # noqa: E402
+from ballu_mjx.reconstruction import Motion, reconstruct  # noqa: E402
+
+# %% [markdown]
+# ## The rows
+
+
+# %%
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """Changes to the defaults."""
+
+    env: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    ppo: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+PAPER_REWARD = {"fine_position_weight": 0.0, "fine_orientation_weight": 0.0}
+ROWS: Mapping[str, Row] = {
+    "defaults": Row(),
+    "paper's reward alone": Row(PAPER_REWARD),
+    "critic blind to the error": Row({"critic_sees_error": False}),
+    "1 N a unit of output": Row({"force_scale": 1.0}),
+    "commands not observed": Row({"observe_command": False}),
+    "no noise on observations": Row({"observation_noise": 0.0}),
+    "no noise on starts": Row({"start_noise": 0.0}),
+    "no cost on force": Row({"force_cost": 0.0}),
+    "blunter yaw term (20 instead of 200 per rad^2)": Row({"fine_orientation_scale": 20.0}),
+    "episodes of 6 s": Row({"episode_seconds": 6.0}),
+    "constant learning rate": Row(ppo={"desired_kl": 0.0}),
+    "discount 0.98": Row(ppo={"discounting": 0.98}),
+    "last iterate instead of the average": Row(ppo={"averaging": 1}),
+    "none of these (the paper's method to the letter)": Row(
+        PAPER_REWARD
+        | {"critic_sees_error": False, "force_scale": 1.0, "observe_command": False, "observation_noise": 0.0}
+        | {"start_noise": 0.0, "force_cost": 0.0},
+        {"desired_kl": 0.0, "averaging": 1},
+    ),
+}
+
+# %% [markdown]
+# ## One training
+
+
+# %%
+@dataclasses.dataclass(frozen=True)
+class Sizes:
+    """How long to train, and how often to look."""
+
+    steps: int
+    validate_every: int
+    ppo: Mapping[str, Any]
+
+
+def train(row: Row, seed: int, sizes: Sizes, motions: Mapping[str, Sequence[Motion]]) -> list[dict[str, Any]]:
+    """Validations of one training: step, score, and the ratios to vanilla by group, quantity and horizon."""
+    model = robot.load_model()
+    env_config = EnvMimicConfig(**row.env)
+    ppo_config = PPOConfig(**{**sizes.ppo, "num_timesteps": sizes.steps, "seed": seed, **row.ppo})
+    env = EnvMimicEnv(model, motions["training"], env_config)
+    policy = ppo.make_inference(env.observation_size, env.action_size, ppo_config)
+    evaluator = evaluation.OpenLoopEvaluator(model, motions["validation"], env_config, policy)
+    last = ppo.total_timesteps(ppo_config)
+    history: list[dict[str, Any]] = []
+    due = sizes.validate_every
+
+    def look(step: int, params: ppo.Params, metrics: dict[str, float]) -> None:
+        nonlocal due
+        if step < due and step < last:
+            return
+        due = step + sizes.validate_every
+        result = evaluator(params)
+        ratios = {
+            f"{group} {quantity} {horizon:g}": result.ratio(group, quantity, horizon)
+            for group in result.groups
+            for quantity in ("position", "yaw")
+            for horizon in evaluation.SCORE_HORIZONS
+        }
+        history.append({"step": step, "score": result.score, "reward": metrics["reward"], "ratios": ratios})
+
+    ppo.train(env, ppo_config, look)
+    return history
+
+
+# %% [markdown]
+# ## Table: mean over seeds, with the lowest and the highest
+
+
+# %%
+def table(results: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> str:
+    """Markdown: at the best validation, as the main job chooses it, and the score at the end of training."""
+    names = list(next(iter(results.values()))[0][0]["ratios"])
+    lines = ["| | seeds | best score | last score | " + " | ".join(f"{name} s" for name in names) + " |"]
+    lines.append("| --- " * (4 + len(names)) + "|")
+    for label, histories in results.items():
+        best = [min(history, key=lambda entry: entry["score"]) for history in histories]
+        cells = [_spread([entry["score"] for entry in best]), _spread([history[-1]["score"] for history in histories])]
+        cells += [f"{np.mean([entry['ratios'][name] for entry in best]):.2f}" for name in names]
+        lines.append(f"| {label} | {len(histories)} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _spread(values: Sequence[float]) -> str:
+    return f"{np.mean(values):.2f} ({min(values):.2f} to {max(values):.2f})"
+
+
+# %% [markdown]
+# ## All of it
+
+
+# %%
+def main() -> None:
+    parser = argparse.ArgumentParser(description="EnvMimic's options, one changed at a time, over seeds.")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="trainings of each row")
+    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS), help="which rows", metavar="ROW")
+    parser.add_argument("--steps", type=int, default=2_000_000, help="control steps of each training")
+    parser.add_argument(
+        "--validation", type=Path, nargs="+", default=[], help="recordings to measure on (bundled ones otherwise)"
+    )
+    parser.add_argument("--output", type=Path, default=Path("runs/ablation"), help="folder of the results")
+    parser.add_argument("--quick", action="store_true", help="two rows, trained for seconds; the numbers mean nothing")
+    options = parser.parse_args()
+
+    training = recording.bundled("training")
+    validation = recording.recordings(options.validation) or recording.bundled("validation")
+    rows, seeds, sizes = options.rows, options.seeds, Sizes(options.steps, 200_000, {})
+    if options.quick:
+        rows, seeds, training = rows[:2], seeds[:1], training[:2]
+        sizes = Sizes(20_000, 20_000, {"num_envs": 256, "batch_size": 128})
+    model = robot.load_model()
+    read = {"training": training, "validation": validation}
+    motions = {
+        use: [reconstruct(recording.read_recording(path), model) for path in paths] for use, paths in read.items()
+    }
+    options.output.mkdir(parents=True, exist_ok=True)
+    results: dict[str, list[list[dict[str, Any]]]] = {}
+    for seed in seeds:
+        for label in rows:
+            path = options.output / f"{list(ROWS).index(label):02d}-seed-{seed}.json"
+            if not path.exists():
+                started = time.perf_counter()
+                history = train(ROWS[label], seed, sizes, motions)
+                path.write_text(json.dumps({"row": label, "seed": seed, "validations": history}, indent=1) + "\n")
+                print(f"{label}, seed {seed}: {history[-1]['score']:.2f} ({time.perf_counter() - started:.0f} s)", flush=True)
+            results.setdefault(label, []).append(json.loads(path.read_text())["validations"])
+    text = table(results)
+    (options.output / "table.md").write_text(text + "\n")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
