@@ -331,8 +331,8 @@ class EnvMimicEnv(Env):
     def _observe(self, s: dict[str, Any]) -> dict[str, Array]:
         """The policy's state, and for the value function also what the policy must not see: how far off it is.
 
-        Why (`critic_sees_error`): an error once made lowers the reward for the rest of the episode whatever the policy does now. A value
-        function blind to it leaves that in the advantages, where it drowns the force's own effect.
+        Why (`critic_sees_error`): an error once made lowers the reward for the rest of the episode whatever the policy
+        does now. A value function blind to it leaves that in the advantages, where it drowns the force's own effect.
         """
         recording, time = s["recording"], s["time"]
         commands = commands_seen(self.reference.command[recording], time)

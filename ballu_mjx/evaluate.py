@@ -72,11 +72,11 @@ def _evaluate(options: Options) -> None:
         options.output.mkdir(parents=True, exist_ok=True)
 
     print(f"The {which} checkpoint of {options.run}: step {policy.step:,}.", flush=True)
-    model = robot.load_model()
+    model = robot.load_model(policy.actuators)
     motions = [reconstruct(recording, model) for recording in recordings]
     evaluator = evaluation.OpenLoopEvaluator(model, motions, policy.config, policy.infer)
     result = evaluator(policy.params) if options.output is None else report(evaluator, policy.params, options.output)
-    print(result.table())
+    print(result.table(evaluation.base_name(policy.actuators is not None)))
 
 
 def check_recording(path: Path, recording: Recording, *, long_enough: bool) -> None:
@@ -101,10 +101,11 @@ def load_params(folder: Path, which: Literal["best", "last"]) -> tuple[int, Para
     return step, ppo.from_tree(tree)
 
 
-def report(evaluator: OpenLoopEvaluator, params: Params, folder: Path) -> Evaluation:
-    """Evaluate, and write `evaluation.txt`, `evaluation.json` and `tracking.png` into `folder`."""
+def report(evaluator: OpenLoopEvaluator, params: Params, folder: Path, base: str) -> Evaluation:
+    """Evaluate, and write `evaluation.txt`, `evaluation.json` and `tracking.png` into `folder`; `base` names the
+    simulator without the residual."""
     result = evaluator(params)
-    (folder / "evaluation.txt").write_text(result.table() + "\n", encoding="utf-8")
+    (folder / "evaluation.txt").write_text(result.table(base) + "\n", encoding="utf-8")
     (folder / "evaluation.json").write_text(json.dumps(result.to_json(), indent=2) + "\n", encoding="utf-8")
     tracking(evaluator, params, folder / "tracking.png")
     return result

@@ -71,6 +71,11 @@ def group_of(name: str) -> str:
     return head if head in ("near", "far") else "all"
 
 
+def base_name(identified: bool) -> str:
+    """What the simulator without residual forces is called, with identified or nominal actuators."""
+    return "vanilla+sysid" if identified else "vanilla"
+
+
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
     """A simulator's errors beside vanilla's, on the same recordings and starts."""
@@ -119,12 +124,12 @@ class Evaluation:
                         )
         return float(worst), place
 
-    def table(self) -> str:
-        """Errors by group and horizon, vanilla and EnvMimic, with the spread over starts; then the whole recordings."""
+    def table(self, base: str = "vanilla") -> str:
+        """Errors by group and horizon, without and with the residual, with the spread over starts; then the whole
+        recordings. `base` is what the simulator without the residual is called."""
         lines = [
             f"{'':7}{'horizon':>8} |{'position RMSE (m)':^39}| {'yaw RMSE (deg)':^38}",
-            f"{'':7}{'(s)':>8} |{'vanilla':>14}{'EnvMimic':>16}{'ratio':>8} | "
-            f"{'vanilla':>13}{'EnvMimic':>16}{'ratio':>8}",
+            f"{'':7}{'(s)':>8} |{base:>14}{'EnvMimic':>16}{'ratio':>8} | {base:>13}{'EnvMimic':>16}{'ratio':>8}",
         ]
         for group in self.groups:
             for horizon in HORIZONS:
@@ -142,7 +147,7 @@ class Evaluation:
                     f"{cells[3]:>13}{cells[4]:>16}{cells[5]:>8}"
                 )
         lines += ["", f"{'whole recording':24}{'mean CoM error (m)':>28}{'final yaw error (deg)':>28}"]
-        lines.append(f"{'':24}{'vanilla':>15}{'EnvMimic':>13}{'vanilla':>15}{'EnvMimic':>13}")
+        lines.append(f"{'':24}{base:>15}{'EnvMimic':>13}{base:>15}{'EnvMimic':>13}")
         for base, mimic in zip(self.vanilla, self.residual, strict=True):
             lines.append(
                 f"{base.recording:24}{base.mean_com_error:>15.3f}{mimic.mean_com_error:>13.3f}"

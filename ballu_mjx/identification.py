@@ -47,8 +47,8 @@ class IdentificationConfig:
     """Learn from the motion between two commands too, not from settled angles alone; the delay from a command to its
     motion is then a further unknown."""
     objective: Literal["pointwise", "hausdorff"] = "pointwise"
-    """`pointwise`: least squares over all angles (Levenberg-Marquardt). `hausdorff`: the paper's distance between curves
-    (L-BFGS), started from the pointwise solution; transients have no part in it."""
+    """`pointwise`: least squares over all angles (Levenberg-Marquardt). `hausdorff`: the paper's distance between
+    curves (L-BFGS), started from the pointwise solution; transients have no part in it."""
     degree: int = 7
     """Degree of the polynomials fitted to the curves of angle over command."""
     draws: int = 128
@@ -104,8 +104,8 @@ class SuspendedLeg:
             self._relaxation_damping[self.model.joint(f"{kind}_{SIDES[0]}").dofadr[0]] = damping
 
     def settled_qpos(self, vector: Float[Array, " parameters"], command: Float[Array, ""]) -> Float[Array, " nq"]:
-        """Generalized position at rest under a command; `[self.angles]` are motor and knee (rad). Differentiable, in both
-        modes."""
+        """Generalized position at rest under a command; `[self.angles]` are motor and knee (rad). Differentiable, in
+        both modes."""
 
         def residual(qpos: Array, arguments: tuple[Array, Array]) -> Array:
             return self.residual_torque(qpos, *arguments)
@@ -180,7 +180,7 @@ _RELAXATION_DAMPING = {"hip": 0.1, "knee": 0.03, "motor": 0.05}
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _implicit_root(residual: Callable[[Array, Any], Array], guess: Array, arguments: Any) -> Array:
-    """The root of `residual(x, arguments)` near `guess`, differentiable in `arguments` by the implicit function theorem."""
+    """The root of `residual(x, arguments)` near `guess`, differentiable in `arguments` as an implicit function."""
     return _root(residual, guess, arguments)[0]
 
 
@@ -230,8 +230,9 @@ _ROOT_TOLERANCE = 1e-9
 def polynomial_curve(
     command: Float[Array | np.ndarray, " holds"], angles: Float[Array | np.ndarray, " holds"], degree: int
 ) -> Float[Array, "200 2"]:
-    """The polynomial fitted to angles (rad) over commands, at `CURVE_SAMPLES` commands in [0, 1]: points (command, angle
-    over 90 deg), the plane in which the paper's curves are compared. Linear in the angles."""
+    """The polynomial fitted to angles (rad) over commands, at `CURVE_SAMPLES` commands in [0, 1].
+
+    Points (command, angle over 90 deg): the plane in which the paper's curves are compared. Linear in the angles."""
     samples = np.linspace(0.0, 1.0, CURVE_SAMPLES)
     # In Chebyshev polynomials: powers of the command would be close to dependent.
     basis = lambda x: jnp.cos(jnp.arange(degree + 1) * jnp.arccos(jnp.clip(2 * x - 1, -1.0, 1.0))[:, None])  # noqa: E731
@@ -410,8 +411,8 @@ class Fit:
 
     vector: Float[np.ndarray, " parameters"]
     standard_errors: Float[np.ndarray, " parameters"]
-    """In the parameters' units, from the Jacobian and the scatter of the residuals taken as white noise; 0 for those that
-    were not free, and of the prior's size at most along open directions."""
+    """In the parameters' units, from the Jacobian and the scatter of the residuals taken as white noise; 0 for those
+    that were not free, and of the prior's size at most along open directions."""
     correlations: Float[np.ndarray, "free free"]
     directions: tuple[Direction, ...]
     """From the best to the least determined."""
@@ -672,8 +673,9 @@ _Evaluate = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 class _Search:
     """An Optimistix solver, for several starts side by side, one iteration at a time.
 
-    The solver's program holds no physics: values and Jacobians at the points that it tries next are computed outside and
-    handed in. MJX, which takes by far the longest to compile, then stands in one program for all solvers and stages.
+    The solver's program holds no physics: values and Jacobians at the points that it tries next are computed outside
+    and handed in. MJX, which takes by far the longest to compile, then stands in one program for all solvers and
+    stages.
     """
 
     def __init__(self, solver: Any) -> None:
@@ -715,3 +717,80 @@ class _Search:
                 break
             evaluated = tuple(map(jnp.asarray, evaluate(np.asarray(state.y_eval))))
         return np.asarray(y), np.asarray(loss)
+
+
+_UNITS = {
+    "knee_spring_stiffness": ("N m/rad", 1.0),
+    "motor_gain": ("N m/rad", 1.0),
+    "default_motor_angle": ("deg", 1 / _DEGREE),
+    "default_knee_angle": ("deg", 1 / _DEGREE),
+    "torque_limit": ("N m", 1.0),
+}
+
+
+def mean_error(simulated: Float[np.ndarray, "holds 2 2"], sweep: Sweep) -> float:
+    """Mean absolute error (deg) of the settled angles."""
+    return float(np.mean(np.abs(simulated - sweep.settled)) / _DEGREE)
+
+
+def table(sweep: Sweep, result: Identification) -> str:
+    """For the terminal: nominal and identified values with standard errors, errors before and after, and what the data
+    leave open."""
+    nominal = nominal_leg()
+    lines = [f"{'':33}{'nominal':>10}{'identified':>12}{'standard error':>16}"]
+    for index, name in enumerate(NAMES):
+        unit, scale = _UNITS[name]
+        for side, fit in zip(SIDES, result.fits, strict=True):
+            label = f"{name.replace('_', ' ')}, {side}"
+            error = f"{fit.standard_errors[index] * scale:.2g}" if fit.standard_errors[index] else "(held)"
+            value = f"{fit.vector[index] * scale:.4g}"
+            lines.append(f"{label:33}{nominal[index] * scale:>10.4g}{value:>12}{error:>16} {unit}")
+    for side, fit in zip(SIDES, result.fits, strict=True):
+        if fit.delay is not None:
+            lines.append(f"{'delay of the command, ' + side:33}{'':10}{fit.delay:>12.3f}{'':16} s (reported only)")
+    before, after = (mean_error(angles, sweep) for angles in (result.nominal_settled, result.settled))
+    lines += ["", f"Mean error of the settled angles: {before:.2f} deg before, {after:.2f} deg after."]
+    with jax.enable_x64(True):
+        for label, angles in (("before", result.nominal_settled), ("after", result.settled)):
+            distances = np.zeros((2, 2))
+            for side in range(len(SIDES)):
+                pair = angles[:, :, side], sweep.settled[:, :, side]
+                distances += np.asarray(curve_distances(sweep.command[:, side], *pair, result.config.degree))
+            there, back = distances.sum(axis=1)
+            lines.append(f"Curves {label}: Hausdorff distance {there:.4f} simulated to measured, {back:.4f} back.")
+    lines.append(
+        "Standard errors take the residuals for white noise; what the model lacks (backlash, friction) is none."
+    )
+    for side, fit in zip(SIDES, result.fits, strict=True):
+        singular = ", ".join(f"{1 / d.standard_error:.3g}" for d in fit.directions)
+        lines.append(f"Singular values, {side} (Jacobian over noise, in units of what robots differ by): {singular}")
+        lines += [
+            f"Left open, {side}, and held near nominal: {_in_words(d, result.config)}" for d in fit.open_directions
+        ]
+        weakest = fit.directions[-1]
+        if not fit.open_directions:
+            lines.append(
+                f"Least determined, {side}: {_in_words(weakest, result.config)}, to {weakest.standard_error:.0%} of what "
+                "robots differ by."
+            )
+    return "\n".join(lines)
+
+
+def details(result: Identification, source: Any) -> dict[str, Any]:
+    """What stands beside the parameters in `actuators.json`."""
+    return {
+        "standard_errors": {
+            name: [float(f"{fit.standard_errors[index]:.3g}") for fit in result.fits]
+            for index, name in enumerate(NAMES)
+        },
+        "delay": [None if fit.delay is None else round(fit.delay, 4) for fit in result.fits],
+        "source": source,
+    }
+
+
+def _in_words(direction: Direction, config: IdentificationConfig) -> str:
+    """The parameters that make up most of a direction, with their signs."""
+    free = [name for name in NAMES if config.torque_limit or name != "torque_limit"]
+    parts = [(w, n) for w, n in zip(direction.weights, free, strict=True) if abs(w) > 0.3]
+    ordered = sorted(parts, key=lambda part: -abs(part[0]))
+    return " ".join(f"{w:+.2f} {name.replace('_', ' ')}" for w, name in ordered)

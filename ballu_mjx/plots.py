@@ -11,9 +11,14 @@ from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from ballu_mjx.identification import Identification
+from ballu_mjx.robot import SIDES
+from ballu_mjx.sweep import Sweep
+
 COLOURS: Mapping[str, str] = {
     "recording": "black",
     "vanilla": "#d55e00",
+    "vanilla+sysid": "#0072b2",
     "supervised": "#56b4e9",
     "envmimic": "#009e73",
 }
@@ -22,6 +27,7 @@ COLOURS: Mapping[str, str] = {
 LABELS: Mapping[str, str] = {
     "recording": "recording",
     "vanilla": "vanilla",
+    "vanilla+sysid": "vanilla+sysid",
     "supervised": "supervised",
     "envmimic": "EnvMimic",
 }
@@ -93,6 +99,30 @@ def learning_curve(
     lower.legend()
     for axis in (upper, lower):
         axis.grid(alpha=0.3)
+    _save(figure, path)
+
+
+def actuator_curves(path: Path, sweep: Sweep, result: Identification) -> None:
+    """Settled angles over commands, a panel for each joint: measured, nominal and identified (the paper's figure of the
+    actuators)."""
+    figure = Figure(figsize=(9.0, 6.5), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True, sharey="row")
+    simulations = {"vanilla": result.nominal_settled, "vanilla+sysid": result.settled}
+    for row, joint in enumerate(("motor", "knee")):
+        for column, side in enumerate(SIDES):
+            axis, order = axes[row, column], np.argsort(sweep.command[:, column])
+            command = sweep.command[order, column]
+            for name, angles in simulations.items():
+                curve = np.rad2deg(angles[order, row, column])
+                axis.plot(command, curve, color=COLOURS[name], label=LABELS[name], linewidth=1.5)
+            measured = np.rad2deg(sweep.settled[order, row, column])
+            axis.plot(command, measured, "o", color=COLOURS["recording"], label="measured", markersize=3.5)
+            axis.set_title(f"{joint}, {side}")
+            axis.grid(alpha=0.3)
+        axes[row, 0].set_ylabel("angle (deg)")
+    for axis in axes[-1]:
+        axis.set_xlabel("command")
+    axes[0, 0].legend()
     _save(figure, path)
 
 

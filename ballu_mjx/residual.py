@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from ballu_mjx import envmimic, ppo, runs
 from ballu_mjx.envmimic import EnvMimicConfig
 from ballu_mjx.ppo import Inference, Params, PPOConfig
+from ballu_mjx.robot import ActuatorParameters
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,12 +24,14 @@ class Residual:
     - `params`: as `ppo.train` returned them.
     - `infer`: (parameters, observation) to action.
     - `step`: control steps of training behind it.
+    - `actuators`: of the simulator that the force belongs to; None for the nominal ones.
     """
 
     config: EnvMimicConfig
     params: Params
     infer: Inference
     step: int
+    actuators: ActuatorParameters | None
 
     @staticmethod
     def load(folder: Path | str, which: Literal["best", "last"] = "best") -> Residual:
@@ -43,7 +46,8 @@ class Residual:
         infer = ppo.make_inference(
             params.normalizer.mean["state"].shape[0], ACTIONS, runs.typed(PPOConfig, stored["ppo"], folder)
         )
-        return Residual(runs.typed(EnvMimicConfig, stored["env"], folder), params, infer, step)
+        config = runs.typed(EnvMimicConfig, stored["env"], folder)
+        return Residual(config, params, infer, step, runs.actuators(stored, folder))
 
     def force(self, history: Float[Array, "steps features"], commands: Float[Array, "steps 2"]) -> Float[Array, " 3"]:
         """Force (N, world) on the balloon's centre of mass over the coming control step.

@@ -38,9 +38,12 @@ def assets() -> Path:
     return packaged if packaged.is_dir() else packaged.parents[1] / "assets"
 
 
-def load_model() -> mujoco.MjModel:
-    """The nominal ("vanilla") robot for C MuJoCo."""
-    return mujoco.MjModel.from_xml_path(str(assets() / "ballu.xml"))
+def load_model(actuators: ActuatorParameters | None = None) -> mujoco.MjModel:
+    """The robot for C MuJoCo: the nominal one ("vanilla"), or with identified actuators ("vanilla+sysid")."""
+    model = mujoco.MjModel.from_xml_path(str(assets() / "ballu.xml"))
+    if actuators is not None:
+        set_fields(model, actuator_fields(model, actuators))
+    return model
 
 
 def suspend(spec: mujoco.MjSpec) -> None:
@@ -76,8 +79,8 @@ class ActuatorParameters:
     - `default_motor_angle` (rad): the motor angle that command 0 asks for, `actuator_biasprm[:, 0]`.
     - `default_knee_angle` (rad): the knee's stop, `jnt_range[:, 0]`; the cable's rest length follows, so that
       `CABLE_SLACK` is left with the motor at 0 and the knee at this angle.
-    - `torque_limit` (N m): where the servo saturates, `actuator_forcerange`. Not among the paper's eight; a servo weaker
-      than nominal can otherwise be told only by a spring that is stiffer than the robot's.
+    - `torque_limit` (N m): where the servo saturates, `actuator_forcerange`. Not among the paper's eight, by which a servo
+      weaker than nominal can be told only by a spring stiffer than the robot's.
     """
 
     knee_spring_stiffness: Float[Array, " sides"]

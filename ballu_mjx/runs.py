@@ -27,8 +27,10 @@ from orbax.checkpoint import checkpoint_managers as policies
 from tensorboardX import SummaryWriter
 from tqdm import tqdm
 
+from ballu_mjx import actuators as actuator_files
 from ballu_mjx import robot
 from ballu_mjx.errors import InputError
+from ballu_mjx.robot import ActuatorParameters
 
 FORMAT = "ballu-run/1"
 KEPT = 3
@@ -37,7 +39,7 @@ KEPT = 3
 _CONFIG, _METRICS = "config.json", "metrics.jsonl"
 _BUNDLED = "bundled:"
 _NO_SCORE = 1e30
-_PACKAGES = ("ballu-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "numpy")
+_PACKAGES = ("ballu-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "optimistix", "numpy")
 
 Which = Literal["best", "last"]
 Config = TypeVar("Config")
@@ -96,14 +98,29 @@ def typed(cls: type[Config], values: Mapping[str, Any], path: Path) -> Config:
     return cls(**{name: _as_type(hints[name], value) for name, value in values.items()})
 
 
+def actuators(config: Mapping[str, Any], folder: Path) -> ActuatorParameters | None:
+    """The actuators of a run's simulator; None for the nominal ones.
+
+    **Raises** `InputError` where they are damaged.
+    """
+    stored = config.get("actuators")
+    return None if stored is None else actuator_files.from_json(stored, folder / _CONFIG)
+
+
 def describe(
-    task: str, sections: Mapping[str, Any], recordings: Mapping[str, Sequence[Path]], devices: Sequence[str]
+    task: str,
+    sections: Mapping[str, Any],
+    recordings: Mapping[str, Sequence[Path]],
+    devices: Sequence[str],
+    identified: ActuatorParameters | None = None,
 ) -> dict[str, Any]:
-    """What `config.json` holds: `sections` are configurations (dataclasses) by name, `recordings` files by use."""
+    """What `config.json` holds: `sections` are configurations (dataclasses) by name, `recordings` files by use,
+    `identified` the simulator's actuators where they are not the nominal ones."""
     return {
         "format": FORMAT,
         "task": task,
         **{name: dataclasses.asdict(section) for name, section in sections.items()},
+        "actuators": None if identified is None else actuator_files.as_json(identified),
         "recordings": {use: [describe_recording(path) for path in paths] for use, paths in recordings.items()},
         "starts": [
             {
@@ -260,6 +277,33 @@ class Progress:
 
     def close(self) -> None:
         """Leave the bar as it stands."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+class Stages:
+    """What a fit says while it runs: a line when a stage begins, and a bar for its iterations on a terminal."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        self._stream = stream or sys.stderr
+        self._stage, self._count = "", 0
+        self._bar: tqdm | None = None
+
+    def update(self, stage: str, iteration: int, steps: int, loss: float) -> int:
+        """Show an iteration of a stage; returns how many there were in all."""
+        self._count += 1
+        if stage != self._stage:
+            self.close()
+            self._stage = stage
+            self._bar = tqdm(total=steps, desc=f"{stage:15}", file=self._stream, dynamic_ncols=True, leave=True)
+        if self._bar is not None:
+            self._bar.update(iteration - self._bar.n)
+            if math.isfinite(loss):
+                self._bar.set_postfix_str(f"loss {loss:.5g}")
+        return self._count
+
+    def close(self) -> None:
+        """Leave the last bar as it stands."""
         if self._bar is not None:
             self._bar.close()
 

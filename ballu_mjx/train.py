@@ -1,4 +1,4 @@
-"""Training from the command line: `python -m ballu_mjx.train envmimic`.
+"""Training from the command line: `python -m ballu_mjx.train sysid`, `... envmimic`.
 
 JAX, and all that needs it, is imported inside functions: `runtime.prepare` has to come first.
 """
@@ -23,15 +23,34 @@ if TYPE_CHECKING:
     from ballu_mjx.envmimic import EnvMimicConfig
     from ballu_mjx.evaluation import OpenLoopEvaluator
     from ballu_mjx.ppo import Params, PPOConfig
+    from ballu_mjx.identification import IdentificationConfig
     from ballu_mjx.recording import Recording
+    from ballu_mjx.robot import ActuatorParameters
     from ballu_mjx.runs import Progress, Run
 
 USES = ("training", "validation", "test")
 QUICK_PPO: Mapping[str, Any] = {"num_timesteps": 120_000, "num_envs": 256, "batch_size": 128}
 """Defaults of `PPOConfig` under `--quick`."""
+QUICK_FIT: Mapping[str, Any] = {"transients": False, "draws": 32, "starts": 4, "steps": 12}
+"""Defaults of `IdentificationConfig` under `--quick`."""
 QUICK_RECORDINGS = 2
 """Recordings of each kind that `--quick` reads."""
 _PROGRAM = "python -m ballu_mjx.train"
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepData:
+    """Sweeps and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
+
+    recordings: tuple[Path, ...] = ()
+    """Suspended recordings of one robot, its legs swept together or one after the other. Without this option: the
+    bundled sweep."""
+    levels: int = 20
+    """Fewest command levels for each leg (paper: 20)."""
+    output: Path | None = None
+    """Folder of the run, new or empty. Without this option: one under runs/, named after the time."""
+    quick: bool = False
+    """Settled angles alone, from fewer starts: within two minutes, compiling included."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +64,9 @@ class Data:
     your own: those."""
     test: tuple[Path, ...] = ()
     """Recordings for the final table. Without this option, where --recordings are your own: those for validation."""
+    actuators: Path | None = None
+    """File of identified actuators (`train sysid` writes it), or the word nominal. Without this option: actuators.json
+    beside the recordings or in the folder above, if it names their robot; else nominal."""
     output: Path | None = None
     """Folder of the run, new or empty. Without this option: one under runs/, named after the time."""
     resume: Path | None = None
@@ -79,15 +101,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _commands(arguments: Sequence[str]) -> dict[str, Callable[..., int]]:
     """Subcommands by name. A function's parameters are its options, their defaults depend on --resume and --quick."""
     from ballu_mjx.envmimic import EnvMimicConfig
+    from ballu_mjx.identification import IdentificationConfig
     from ballu_mjx.ppo import PPOConfig
 
     env_defaults, ppo_defaults = _defaults(arguments)
+    fit_defaults = IdentificationConfig(**QUICK_FIT if "--quick" in arguments else {})
 
     def envmimic(data: Data = Data(), env: EnvMimicConfig = env_defaults, ppo: PPOConfig = ppo_defaults) -> int:  # noqa: B008
         """Learn residual forces from recordings, and measure them on recordings that training never saw."""
         return _envmimic(data, env, ppo)
 
-    return {"envmimic": envmimic}
+    def sysid(data: SweepData = SweepData(), fit: IdentificationConfig = fit_defaults) -> int:  # noqa: B008
+        """Identify the actuators from a suspended sweep: what `--actuators` of the other commands takes."""
+        return _sysid(data, fit)
+
+    return {"envmimic": envmimic, "sysid": sysid}
 
 
 def _defaults(arguments: Sequence[str]) -> "tuple[EnvMimicConfig, PPOConfig]":
@@ -125,17 +153,19 @@ def _envmimic(data: Data, env_config: "EnvMimicConfig", ppo_config: "PPOConfig")
     first_step, restored = _restored(data, ppo_config)
     files = _choose(data)
     recordings = _read(files)
+    identified, where = _actuators(data, files["training"], recordings["training"])
     folder = data.resume or runs.new_folder(data.output, "envmimic")
 
     print(f"Run folder: {folder}")
     for use in USES:
         print(f"  {use}: {', '.join(recording.name for recording in recordings[use])}")
+    print(f"  actuators: {where}")
     if files["validation"] == files["training"]:
         print("  Validation is on the training recordings: it will not show how well the forces generalize.")
     if data.quick:
         print("  --quick: sizes so small that the numbers mean little.")
     print("Reconstructing the recorded states ...", flush=True)
-    model = robot.load_model()
+    model = robot.load_model(identified)
     motions = {use: [reconstruct(recording, model) for recording in recordings[use]] for use in USES}
     env = EnvMimicEnv(model, motions["training"], env_config)
     if restored is not None and restored.normalizer.mean["state"].shape != env.observation_size["state"]:
@@ -147,7 +177,7 @@ def _envmimic(data: Data, env_config: "EnvMimicConfig", ppo_config: "PPOConfig")
     def evaluator(use: str) -> "OpenLoopEvaluator":
         return evaluation.OpenLoopEvaluator(model, motions[use], env_config, policy)
 
-    config = runs.describe("envmimic", {"env": env_config, "ppo": ppo_config, "data": data}, files, devices)
+    config = runs.describe("envmimic", {"env": env_config, "ppo": ppo_config, "data": data}, files, devices, identified)
     resumed_at = None if restored is None else first_step
     validation = evaluator("validation")
     with runs.Run(folder, config, resumed_at=resumed_at) as run:
@@ -170,11 +200,43 @@ def _envmimic(data: Data, env_config: "EnvMimicConfig", ppo_config: "PPOConfig")
     evaluate.learning_curve(folder, best_step)
     test = validation if files["test"] == files["validation"] else evaluator("test")
     print(f"Best checkpoint: step {best_step:,}. Open-loop replay of the test recordings:\n")
-    result = evaluate.report(test, params, folder)
-    print(result.table())
+    base = evaluation.base_name(identified is not None)
+    print(evaluate.report(test, params, folder, base).table(base))
     if data.quick:
         print("\nThese numbers mean little: --quick trains for seconds.")
     print(f"\nWritten to {folder}. {time.perf_counter() - started:.0f} s in all.")
+    return 0
+
+
+def _sysid(data: SweepData, config: "IdentificationConfig") -> int:
+    """Read and check the sweep, identify, write; returns the exit status."""
+    from ballu_mjx import actuators, identification, plots, runs
+    from ballu_mjx.recording import bundled, read_recording
+    from ballu_mjx.recording import recordings as expand
+    from ballu_mjx.sweep import read_sweep
+
+    started = time.perf_counter()
+    identification.check(config)
+    paths = expand(data.recordings) if data.recordings else bundled("suspended")
+    sweep = read_sweep({path: read_recording(path) for path in paths}, levels=data.levels)
+    folder = runs.new_folder(data.output, "sysid")
+    print(
+        f"Run folder: {folder}\n  sweep of {sweep.robot}: {len(sweep.command)} holds, {', '.join(p.name for p in paths)}"
+    )
+    with runs.Run(folder, runs.describe("sysid", {"fit": config, "data": data}, {"suspended": paths}, [])) as run:
+        stages = runs.Stages()
+
+        def report(stage: str, iteration: int, steps: int, loss: float) -> None:
+            run.log(stages.update(stage, iteration, steps, loss), {stage: loss})
+
+        result = identification.identify(sweep, config, report)
+        stages.close()
+        text = identification.table(sweep, result)
+        run.write("identification.txt", text + "\n")
+        source = [runs.describe_recording(path) for path in paths]
+        actuators.write(folder / actuators.NAME, sweep.robot, result.parameters, identification.details(result, source))
+        plots.actuator_curves(folder / "actuator_curves.png", sweep, result)
+    print(f"\n{text}\n\nWritten to {folder}. {time.perf_counter() - started:.0f} s in all.")
     return 0
 
 
@@ -223,6 +285,32 @@ def _choose(data: Data) -> dict[str, list[Path]]:
         files = {"training": files["training"][:QUICK_RECORDINGS], "validation": _one_a_group(files["validation"])}
         files["test"] = files["validation"]  # a second set would be a second program to compile
     return files
+
+
+def _actuators(
+    data: Data, files: Sequence[Path], recordings: "Sequence[Recording]"
+) -> "tuple[ActuatorParameters | None, str]":
+    """The simulator's actuators (None: nominal), and where they come from, for the user to read."""
+    from ballu_mjx import actuators, runs
+
+    if data.actuators is None and data.resume is not None:
+        identified = runs.actuators(runs.read_config(data.resume, "envmimic"), data.resume)
+        return identified, f"{'nominal' if identified is None else 'identified'}, as before"
+    if data.actuators == Path("nominal"):
+        return None, "nominal"
+    robots = {recording.robot for recording in recordings}
+    path = data.actuators
+    if path is None and len(robots) == 1:
+        path = actuators.find(files, next(iter(robots)))
+    if path is None:
+        return None, "nominal (the recordings' robot has no actuators.json; `train sysid` identifies one from a sweep)"
+    robot, identified = actuators.read(path)
+    if robots != {robot}:
+        raise InputError(
+            f"{path}: these are the actuators of {robot!r}, the recordings are of {', '.join(sorted(robots))}; give "
+            "the file of the same robot, or --actuators nominal."
+        )
+    return identified, str(path)
 
 
 def _one_a_group(paths: Sequence[Path]) -> list[Path]:
