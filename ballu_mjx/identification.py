@@ -300,7 +300,7 @@ class Space:
         share = np.where(self.relative, (logs[0] - logs[1]) / span, share)[self.free]
         return np.log(share / (1 - share))
 
-    def draw(self, seed: int, count: int) -> Float[np.ndarray, "count+1 free"]:
+    def draw(self, seed: int, count: int) -> Float[np.ndarray, "draws free"]:
         """Coordinates: of the nominal values, then of uniform draws from the middle half of the bounds' span."""
         shares = np.random.default_rng(seed).uniform(0.25, 0.75, (count, int(self.free.sum())))
         return np.concatenate([self.coordinates(self.nominal)[None], np.log(shares / (1 - shares))])
@@ -770,8 +770,8 @@ def table(sweep: Sweep, result: Identification) -> str:
         weakest = fit.directions[-1]
         if not fit.open_directions:
             lines.append(
-                f"Least determined, {side}: {_in_words(weakest, result.config)}, to {weakest.standard_error:.0%} of what "
-                "robots differ by."
+                f"Least determined, {side}: {_in_words(weakest, result.config)}, to {weakest.standard_error:.0%} of "
+                "what robots differ by."
             )
     return "\n".join(lines)
 

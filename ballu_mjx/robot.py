@@ -79,8 +79,8 @@ class ActuatorParameters:
     - `default_motor_angle` (rad): the motor angle that command 0 asks for, `actuator_biasprm[:, 0]`.
     - `default_knee_angle` (rad): the knee's stop, `jnt_range[:, 0]`; the cable's rest length follows, so that
       `CABLE_SLACK` is left with the motor at 0 and the knee at this angle.
-    - `torque_limit` (N m): where the servo saturates, `actuator_forcerange`. Not among the paper's eight, by which a servo
-      weaker than nominal can be told only by a spring stiffer than the robot's.
+    - `torque_limit` (N m): where the servo saturates, `actuator_forcerange`. Not among the paper's eight, by which a
+      servo weaker than nominal can be told only by a spring stiffer than the robot's.
     """
 
     knee_spring_stiffness: Float[Array, " sides"]

@@ -105,8 +105,8 @@ def _check_levels(names: str, side: str, command: Float[np.ndarray, " holds"], l
         )
     if count < levels:
         raise InputError(
-            f"{names}: holds {count} levels of command_{side}; {levels} spread over [0, 1] are needed (--levels {count} "
-            "accepts these, at the price of larger standard errors)."
+            f"{names}: holds {count} levels of command_{side}; {levels} spread over [0, 1] are needed (--levels "
+            f"{count} accepts these, at the price of larger standard errors)."
         )
     if ordered[0] > _REACHES[0] or ordered[-1] < _REACHES[1]:
         raise InputError(

@@ -22,8 +22,8 @@ from ballu_mjx.errors import InputError
 if TYPE_CHECKING:
     from ballu_mjx.envmimic import EnvMimicConfig
     from ballu_mjx.evaluation import OpenLoopEvaluator
-    from ballu_mjx.ppo import Params, PPOConfig
     from ballu_mjx.identification import IdentificationConfig
+    from ballu_mjx.ppo import Params, PPOConfig
     from ballu_mjx.recording import Recording
     from ballu_mjx.robot import ActuatorParameters
     from ballu_mjx.runs import Progress, Run
@@ -220,9 +220,8 @@ def _sysid(data: SweepData, config: "IdentificationConfig") -> int:
     paths = expand(data.recordings) if data.recordings else bundled("suspended")
     sweep = read_sweep({path: read_recording(path) for path in paths}, levels=data.levels)
     folder = runs.new_folder(data.output, "sysid")
-    print(
-        f"Run folder: {folder}\n  sweep of {sweep.robot}: {len(sweep.command)} holds, {', '.join(p.name for p in paths)}"
-    )
+    print(f"Run folder: {folder}")
+    print(f"  sweep of {sweep.robot}: {len(sweep.command)} holds, {', '.join(path.name for path in paths)}")
     with runs.Run(folder, runs.describe("sysid", {"fit": config, "data": data}, {"suspended": paths}, [])) as run:
         stages = runs.Stages()
 

@@ -80,15 +80,13 @@ def standing(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def identified(virtual: virtual_robot.VirtualRobot) -> mujoco.MjModel:
-    """The training simulator with the robot's own actuator parameters: more than identification can hope for."""
+    """The training simulator with the robot's own actuator parameters: what identification can hope for."""
     model = robot.load_model()
     parameters = robot.ActuatorParameters(
         **{
             field.name: jnp.array(getattr(virtual, field.name))
             for field in dataclasses.fields(robot.ActuatorParameters)
-            if field.name != "torque_limit"  # not among the paper's eight
-        },
-        torque_limit=robot.ActuatorParameters.nominal(model).torque_limit,
+        }
     )
     robot.set_fields(model, robot.actuator_fields(model, parameters))
     return model

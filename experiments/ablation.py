@@ -168,7 +168,8 @@ def main() -> None:
                 started = time.perf_counter()
                 history = train(ROWS[label], seed, sizes, motions)
                 path.write_text(json.dumps({"row": label, "seed": seed, "validations": history}, indent=1) + "\n")
-                print(f"{label}, seed {seed}: {history[-1]['score']:.2f} ({time.perf_counter() - started:.0f} s)", flush=True)
+                seconds = time.perf_counter() - started
+                print(f"{label}, seed {seed}: {history[-1]['score']:.2f} ({seconds:.0f} s)", flush=True)
             results.setdefault(label, []).append(json.loads(path.read_text())["validations"])
     text = table(results)
     (options.output / "table.md").write_text(text + "\n")
