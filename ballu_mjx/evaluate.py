@@ -75,8 +75,12 @@ def _evaluate(options: Options) -> None:
     model = robot.load_model(policy.actuators)
     motions = [reconstruct(recording, model) for recording in recordings]
     evaluator = evaluation.OpenLoopEvaluator(model, motions, policy.config, policy.infer)
-    result = evaluator(policy.params) if options.output is None else report(evaluator, policy.params, options.output)
-    print(result.table(evaluation.base_name(policy.actuators is not None)))
+    base = evaluation.base_name(policy.actuators is not None)
+    if options.output is None:
+        result = evaluator(policy.params)
+    else:
+        result = report(evaluator, policy.params, options.output, base)
+    print(result.table(base))
 
 
 def check_recording(path: Path, recording: Recording, *, long_enough: bool) -> None:

@@ -148,10 +148,10 @@ class Evaluation:
                 )
         lines += ["", f"{'whole recording':24}{'mean CoM error (m)':>28}{'final yaw error (deg)':>28}"]
         lines.append(f"{'':24}{base:>15}{'EnvMimic':>13}{base:>15}{'EnvMimic':>13}")
-        for base, mimic in zip(self.vanilla, self.residual, strict=True):
+        for without, mimic in zip(self.vanilla, self.residual, strict=True):
             lines.append(
-                f"{base.recording:24}{base.mean_com_error:>15.3f}{mimic.mean_com_error:>13.3f}"
-                f"{base.final_yaw_error:>15.1f}{mimic.final_yaw_error:>13.1f}"
+                f"{without.recording:24}{without.mean_com_error:>15.3f}{mimic.mean_com_error:>13.3f}"
+                f"{without.final_yaw_error:>15.1f}{mimic.final_yaw_error:>13.1f}"
             )
         return "\n".join(lines)
 

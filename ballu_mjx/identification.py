@@ -253,7 +253,7 @@ def directed_hausdorff(from_points: Float[Array, "n d"], to_points: Float[Array,
 
 def curve_distances(
     command: Float[np.ndarray | Array, " holds"],
-    simulated: Float[Array, "holds 2"],
+    simulated: Float[Array | np.ndarray, "holds 2"],
     measured: Float[Array | np.ndarray, "holds 2"],
     degree: int,
 ) -> Float[Array, "2 2"]:
@@ -348,7 +348,8 @@ class _Physics:
 
         def settled(coordinates: Array, command: Array) -> tuple[Array, Array]:
             def qpos(y: Array) -> tuple[Array, Array]:
-                return (self.leg.settled_qpos(space.vector(y), command),) * 2
+                at_rest = self.leg.settled_qpos(space.vector(y), command)
+                return at_rest, at_rest
 
             slope, value = jax.jacfwd(qpos, has_aux=True)(coordinates)
             return value, slope
@@ -495,9 +496,8 @@ class _Identifier:
         self.physics.compile(config.transients)
         report("compiling", 1, 1, float("nan"))
         self._starts, self._size = starts, int(self.space.free.sum())
-        tolerance = {"rtol": 1e-5, "atol": 1e-5}
-        self._squares = _Search(optx.LevenbergMarquardt(**tolerance))
-        self._shape = _Search(optx.LBFGS(**tolerance))
+        self._squares = _Search(optx.LevenbergMarquardt(rtol=1e-5, atol=1e-5))
+        self._shape = _Search(optx.LBFGS(rtol=1e-5, atol=1e-5))
 
     def run(self, sweep: Sweep, report: Report) -> Identification:
         config, size, data = self.config, self._size, _data(sweep)

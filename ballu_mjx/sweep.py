@@ -25,7 +25,7 @@ SHORTEST_HOLD = 0.6
 """Seconds for which each command must be held at least."""
 _TRANSIENT_SECONDS = 0.8
 _SETTLED_SECONDS = 0.5
-_SETTLED_WITHIN = float(np.deg2rad(2.0))
+_SETTLED_WITHIN = float(np.deg2rad(0.5))
 """Drift (rad) within the settled window above which the joints were still moving."""
 _SAME_LEVEL = 0.005
 _REACHES = (0.1, 0.9)

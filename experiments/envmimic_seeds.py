@@ -1,11 +1,12 @@
 # %% [markdown]
-# # EnvMimic over seeds: the README's table and figure
+# # EnvMimic over seeds: the README's tables and figure
 #
 # Section "Improved Simulation Fidelity" of the paper, open loop: recorded commands are replayed from recorded states in
-# the vanilla simulator and in the one with EnvMimic's forces, on recordings that training never saw. One run of
-# `python -m ballu_mjx.train envmimic` a seed; runs that are there already are not repeated.
+# four simulators, on recordings that training never saw: vanilla, vanilla with identified actuators (vanilla+sysid),
+# and either with EnvMimic's forces. One run of `python -m ballu_mjx.train envmimic` a seed, on identified actuators and on
+# nominal ones; runs that are there already are not repeated.
 #
-# `python experiments/envmimic_seeds.py` takes about half an hour on two cores; `--quick` shows that it works.
+# `python experiments/envmimic_seeds.py` takes about forty minutes on two cores; `--quick` shows that it works.
 
 # %%
 from __future__ import annotations
@@ -30,6 +31,10 @@ from ballu_mjx import evaluation, plots, reconstruction, recording, residual, ro
 
 
 # %%
+KINDS = {"identified": [], "nominal": ["--actuators", "nominal"]}
+"""Options of the runs, by the actuators of their simulator."""
+
+
 def train(seed: int, folder: Path, options: list[str]) -> None:
     """Run the main job for one seed, unless its evaluation is there."""
     if not (folder / "evaluation.json").exists():
@@ -64,10 +69,36 @@ def spread(values: list[float], digits: int = 2) -> str:
     return f"{np.mean(values):.{digits}f} ({min(values):.{digits}f} to {max(values):.{digits}f})"
 
 
-def table(runs: list[evaluation.Evaluation]) -> str:
-    """Markdown: RMSE of vanilla and EnvMimic and their ratio, by group and horizon."""
+def comparison(nominal: list[evaluation.Evaluation], identified: list[evaluation.Evaluation]) -> str:
+    """Markdown: RMSE of the four simulators, and in brackets what that leaves of vanilla's."""
+    columns = [(group, horizon) for group in nominal[0].groups for horizon in evaluation.SCORE_HORIZONS]
+    head = [f"{group}, {horizon:g} s: m, deg" for group, horizon in columns]
+    lines = ["| simulator | " + " | ".join(head) + " |", "| --- " * (1 + len(columns)) + "|"]
+    rows = {
+        "vanilla": [run.vanilla for run in nominal],
+        "vanilla+sysid": [run.vanilla for run in identified],
+        "EnvMimic": [run.residual for run in nominal],
+        "EnvMimic on identified actuators": [run.residual for run in identified],
+    }
+    for label, runs in rows.items():
+        cells = []
+        for group, horizon in columns:
+            parts = []
+            for quantity, digits in (("position", 3), ("yaw", 1)):
+                values, base = (
+                    [np.mean([getattr(e, quantity)[horizon][0] for e in run if e.group == group]) for run in side]
+                    for side in (runs, rows["vanilla"])
+                )
+                parts.append(f"{np.mean(values):.{digits}f} ({np.mean(values) / np.mean(base):.2f})")
+            cells.append(", ".join(parts))
+        lines.append(f"| {label} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def table(runs: list[evaluation.Evaluation], base: str) -> str:
+    """Markdown: RMSE of the simulator `base` and of EnvMimic on it, and their ratio, by group and horizon."""
     lines = [
-        "| test recordings | horizon (s) | position, vanilla (m) | EnvMimic (m) | ratio | yaw, vanilla (deg) | "
+        f"| test recordings | horizon (s) | position, {base} (m) | EnvMimic (m) | ratio | yaw, {base} (deg) | "
         "EnvMimic (deg) | ratio |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
@@ -85,17 +116,17 @@ def table(runs: list[evaluation.Evaluation]) -> str:
             lines.append(f"| {group} | {horizon:g} | " + " | ".join(cells) + " |")
     lines += [
         "",
-        "| whole recording | CoM error, vanilla (m) | EnvMimic (m) | final yaw error, vanilla (deg) | EnvMimic (deg) |",
+        f"| whole recording | CoM error, {base} (m) | EnvMimic (m) | final yaw error, {base} (deg) | EnvMimic (deg) |",
     ]
     lines.append("| --- | --- | --- | --- | --- |")
-    for index, base in enumerate(runs[0].vanilla):
+    for index, without in enumerate(runs[0].vanilla):
         ours = [run.residual[index] for run in runs]
         lines.append(
-            f"| {base.recording} | {base.mean_com_error:.2f} | {spread([e.mean_com_error for e in ours])} | "
-            f"{base.final_yaw_error:.0f} | {spread([e.final_yaw_error for e in ours], 0)} |"
+            f"| {without.recording} | {without.mean_com_error:.2f} | {spread([e.mean_com_error for e in ours])} | "
+            f"{without.final_yaw_error:.0f} | {spread([e.final_yaw_error for e in ours], 0)} |"
         )
     worst = [run.excess() for run in runs]
-    bound = "1.2 times vanilla plus 2 cm and 3 deg"
+    bound = f"1.2 times {base} plus 2 cm and 3 deg"
     lines += ["", f"Worst case against {bound}, over recordings and horizons, by seed (negative: within):"]
     lines += [f"- {relative:+.0%} of the bound, {place}" for relative, place in worst]
     return "\n".join(lines)
@@ -107,13 +138,19 @@ def table(runs: list[evaluation.Evaluation]) -> str:
 
 # %%
 def figure(folders: list[Path], path: Path) -> None:
-    """Replay one near and one far test recording with every seed's forces."""
-    model = robot.load_model()
-    motions = [reconstruction.reconstruct(recording.read_recording(p), model) for p in recording.bundled("test")]
+    """Replay the test recordings in vanilla, with identified actuators, and with every seed's forces beside these."""
     policies = [residual.Residual.load(folder) for folder in folders]
-    evaluator = evaluation.OpenLoopEvaluator(model, motions, policies[0].config, policies[0].infer)
+
+    def simulator(actuators: robot.ActuatorParameters | None) -> evaluation.OpenLoopEvaluator:
+        model = robot.load_model(actuators)
+        motions = [reconstruction.reconstruct(recording.read_recording(p), model) for p in recording.bundled("test")]
+        return evaluation.OpenLoopEvaluator(model, motions, policies[0].config, policies[0].infer)
+
+    evaluator = simulator(policies[0].actuators)
+    motions = evaluator.motions
     replays = [evaluator.replay(policy.params) for policy in policies]
-    vanilla = evaluator.replay(policies[0].params, scale=0.0)
+    identified = evaluator.replay(policies[0].params, scale=0.0)
+    vanilla = simulator(None).replay(policies[0].params, scale=0.0)
     firsts: dict[str, int] = {}
     for run, (index, _) in enumerate(evaluator.starts):
         firsts.setdefault(motions[index].name, run)
@@ -130,7 +167,11 @@ def figure(folders: list[Path], path: Path) -> None:
                 title=name,
                 time=np.arange(states) * robot.CONTROL_TIMESTEP,
                 recording=np.column_stack([position[:, :2], yaw]),
-                simulations={"vanilla": curve(vanilla), "envmimic": np.stack([curve(replay) for replay in replays])},
+                simulations={
+                    "vanilla": curve(vanilla),
+                    "vanilla+sysid": curve(identified),
+                    "envmimic": np.stack([curve(replay) for replay in replays]),
+                },
             )
         )
     plots.tracking(path, panels)
@@ -161,13 +202,17 @@ def parse() -> Options:
 
 def main() -> None:
     options = parse()
-    folders = [options.output / f"seed-{seed}" for seed in options.seeds]
     extra = ["--quick", "--test", str(robot.assets() / "recordings" / "test")] if options.quick else []
-    for seed, folder in zip(options.seeds, folders, strict=True):
-        train(seed, folder, extra)
-    text = table([load(folder) for folder in folders])
+    folders = {kind: [options.output / f"{kind}-seed-{seed}" for seed in options.seeds] for kind in KINDS}
+    for kind, arguments in KINDS.items():
+        for seed, folder in zip(options.seeds, folders[kind], strict=True):
+            train(seed, folder, [*extra, *arguments])
+    runs = {kind: [load(folder) for folder in folders[kind]] for kind in KINDS}
+    parts = [comparison(runs["nominal"], runs["identified"])]
+    parts += [table(runs["identified"], "vanilla+sysid"), table(runs["nominal"], "vanilla")]
+    text = "\n\n".join(parts)
     (options.output / "table.md").write_text(text + "\n")
-    figure(folders, options.output / "tracking.png")
+    figure(folders["identified"], options.output / "tracking.png")
     print(text)
     print(f"\nWritten to {options.output}.")
 

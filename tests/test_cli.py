@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,8 +18,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballu_mjx import evaluate, runs, train
+from ballu_mjx import actuators, evaluate, residual, robot, runs, train
 from ballu_mjx.recording import Recording, bundled, read_recording, write_recording
+from ballu_mjx.sweep import read_sweep
 
 SIZES = ("--num-envs 8 --batch-size 8 --num-minibatches 2 --unroll-length 5 --num-updates-per-batch 1").split()
 STEPS = 80
@@ -114,6 +118,81 @@ def test_interrupted_run_goes_on_where_it_stopped(trained: Path):
     assert config["ppo"]["seed"] == 5 and config["ppo"]["num_envs"] == 8  # given once, kept
     assert len(config["starts"]) == 2
     assert runs.restore(folder / "stopped", "last")[0] == total
+
+
+@pytest.fixture(scope="module")
+def identified(folder: Path) -> Path:
+    """A quick run of sysid on the bundled sweep."""
+    done = command("train", "sysid", "--quick", "--output", "identified", folder=folder)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert (folder / "identified" / "identification.txt").read_text().strip() in done.stdout
+    return folder / "identified"
+
+
+def test_sysid_explains_the_sweep_and_writes_what_it_found(identified: Path):
+    assert (identified / "actuator_curves.png").stat().st_size > 10_000
+    name, parameters = actuators.read(identified / actuators.NAME)
+    assert name == "virtual-ballu-0"
+    # Plain to see in the sweep: the knees' stops, and the motors' angles at command 0.
+    assert np.rad2deg(parameters.default_knee_angle) == pytest.approx([32.2, 26.0], abs=1.0)
+    assert np.rad2deg(parameters.default_motor_angle) == pytest.approx([1.4, -5.9], abs=2.5)
+    text = (identified / "identification.txt").read_text()
+    before, after = (float(x) for x in re.findall(r"([0-9.]+) deg (?:before|after)", text))
+    assert after < before / 4
+
+
+def test_bundled_actuators_come_from_the_bundled_sweep():
+    path = robot.assets() / "recordings" / actuators.NAME
+    sweep = read_sweep({p: read_recording(p) for p in bundled("suspended")})
+    name, _ = actuators.read(path)
+    assert name == sweep.robot
+    sources = json.loads(path.read_text())["source"]
+    assert sources == [runs.describe_recording(p) for p in bundled("suspended")]
+
+
+def test_envmimic_takes_identified_actuators_from_beside_the_recordings(trained: Path, identified: Path):
+    config = json.loads((trained / "config.json").read_text())
+    assert config["actuators"] is None, "the recordings were given as files of their own, without actuators.json"
+    (trained.parent / "beside").mkdir()
+    for path in (trained.parent / "data").iterdir():
+        shutil.copy(path, trained.parent / "beside")
+    shutil.copy(identified / actuators.NAME, trained.parent / "beside")
+    done = command(
+        "train", "envmimic", "--recordings", "beside", "--num-timesteps", STEPS, "--output", "onidentified", *SIZES,
+        folder=trained.parent,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "vanilla+sysid" in done.stdout
+    stored = json.loads((trained.parent / "onidentified" / "config.json").read_text())["actuators"]
+    assert stored == json.loads((identified / actuators.NAME).read_text())["parameters"]
+    loaded = residual.Residual.load(trained.parent / "onidentified", "last").actuators
+    assert loaded is not None and np.asarray(loaded.motor_gain) == pytest.approx(stored["motor_gain"])
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"format": "other"}, '"format" is not'),
+        ({"robot": "virtual-ballu-9"}, "are the actuators of 'virtual-ballu-9'"),
+        ({"parameters": None}, '"parameters" is missing'),
+        ({"motor_gain": [0.5]}, "motor_gain must be two numbers"),
+        ({"motor_gain": [0.5, -0.5]}, "must be greater than 0"),
+        ({"default_knee_angle": [27.0, 27.0]}, "give it in radians"),
+        ({"gain": [1.0, 1.0]}, "there is no parameter 'gain'"),
+    ],
+)
+def test_damaged_actuators_are_refused(tmp_path: Path, folder: Path, change: dict, says: str):
+    content = json.loads((robot.assets() / "recordings" / actuators.NAME).read_text())
+    for key, value in change.items():
+        (content if key in content else content["parameters"])[key] = value
+    (tmp_path / "bad.json").write_text(json.dumps(content))
+    arguments = ["envmimic", "--recordings", str(folder / "data"), "--actuators", str(tmp_path / "bad.json")]
+    errors = io.StringIO()
+    with contextlib.redirect_stderr(errors):
+        assert train.main([*arguments, "--output", str(tmp_path / "run")]) == 2
+    assert says in errors.getvalue() and "bad.json" in errors.getvalue() and errors.getvalue().count("\n") == 1
+    assert not (tmp_path / "run").exists()
 
 
 def test_help_explains_every_option(folder: Path):

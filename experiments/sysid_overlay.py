@@ -1,0 +1,123 @@
+# %% [markdown]
+# # What identified actuators change
+#
+# Section "Actuator System Identification" of the paper, its check: the same periodic bang-bang commands with and
+# without identification. The paper found the final centres of mass 0.23 m apart, and joint angles 10.15 deg apart on average.
+# Here for the bundled robot's `actuators.json`, over several gaits; and both robots at the end of one, side by side.
+#
+# `python experiments/sysid_overlay.py` takes seconds: C MuJoCo suffices.
+
+# %%
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+from jaxtyping import Float  # noqa: E402
+from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+
+from ballu_mjx import actuators, plots, robot  # noqa: E402
+
+PERIODS = (0.8, 1.0, 1.2, 1.4, 1.6)
+"""Seconds; the legs half a period apart, each at full command for 0.4 of it."""
+SECONDS = 10.0
+
+# %% [markdown]
+# ## The same commands in both simulators
+
+
+# %%
+def simulate(
+    model: mujoco.MjModel, period: float
+) -> tuple[Float[np.ndarray, "steps 3"], Float[np.ndarray, "steps nq"]]:
+    """Centre of mass (m, world) and generalized positions every physics step, after two seconds of standing."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = robot.standing_qpos(model)
+    mujoco.mj_step(model, data, round(2.0 / model.opt.timestep))
+    com, qpos = [], []
+    for step in range(round(SECONDS / model.opt.timestep)):
+        phases = (step * model.opt.timestep / period + np.array([0.0, 0.5])) % 1.0
+        data.ctrl[:] = phases < 0.4
+        mujoco.mj_step(model, data)
+        com.append(data.subtree_com[1].copy())
+        qpos.append(data.qpos.copy())
+    return np.array(com), np.array(qpos)
+
+
+def compare(models: dict[str, mujoco.MjModel]) -> str:
+    """Differences between the two simulators, by period and on average."""
+    lines = ["period (s)  final CoM (m)  knees and motors (deg)"]
+    rows = []
+    for period in PERIODS:
+        (com, qpos), (other_com, other_qpos) = (simulate(model, period) for model in models.values())
+        joints = np.concatenate([np.arange(7, qpos.shape[1])[part] for part in (robot.KNEES, robot.MOTORS)])
+        start, other_start = com[0], other_com[0]
+        apart = np.linalg.norm((com[-1] - start) - (other_com[-1] - other_start))
+        angles = np.rad2deg(np.abs(qpos[:, joints] - other_qpos[:, joints])).mean()
+        rows.append((apart, angles))
+        lines.append(f"{period:10.1f}{apart:15.2f}{angles:24.1f}")
+    apart, angles = np.mean(rows, axis=0)
+    lines.append(f"{'mean':>10}{apart:15.2f}{angles:24.1f}    (paper: 0.23 m, 10.15 deg)")
+    return "\n".join(lines)
+
+
+# %% [markdown]
+# ## Both robots in one picture, from the side: a stick drawing needs no renderer
+
+
+# %%
+def draw(models: dict[str, mujoco.MjModel], period: float, path: Path) -> None:
+    """The paths of the centres of mass seen from above, and both robots at the end, seen from the side."""
+    figure = Figure(figsize=(10.0, 5.0), layout="constrained")
+    side, above = figure.subplots(1, 2, width_ratios=[1, 2])
+    for name, model in models.items():
+        com, qpos = simulate(model, period)
+        data = mujoco.MjData(model)
+        data.qpos[:] = qpos[-1]
+        mujoco.mj_kinematics(model, data)
+        colour = plots.COLOURS[name]
+        for leg, style in zip(robot.SIDES, ("-", "--"), strict=True):
+            points = [data.body("base").xpos, data.body(f"tibia_{leg}").xpos, data.site(f"foot_{leg}").xpos]
+            label = f"{plots.LABELS[name]}, {leg} leg"
+            side.plot(*np.array(points)[:, [0, 2]].T, style, color=colour, linewidth=2, marker="o", label=label)
+        neck, balloon = data.body("base").xpos, data.site("balloon").xpos
+        side.plot(*np.array([neck, balloon])[:, [0, 2]].T, ":", color=colour)
+        side.plot(balloon[0], balloon[2], "o", markersize=22, color=colour, alpha=0.3)
+        above.plot(*(com - com[0])[:, :2].T, color=colour, label=plots.LABELS[name])
+    side.axhline(0, color="grey", linewidth=0.8)
+    for axis, title, second in ((side, f"after {SECONDS:g} s, from the side", "z (m)"), (above, "from above", "y (m)")):
+        axis.set(title=title, xlabel="x (m)", ylabel=second)
+        axis.grid(alpha=0.3)
+    side.set_aspect("equal")
+    figure.legend(*side.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=120)
+
+
+# %% [markdown]
+# ## All of it
+
+
+# %%
+def main() -> None:
+    parser = argparse.ArgumentParser(description="The same commands with nominal and with identified actuators.")
+    bundled = robot.assets() / "recordings" / actuators.NAME
+    parser.add_argument("--actuators", type=Path, default=bundled, help="identified actuators (the bundled robot's)")
+    parser.add_argument("--output", type=Path, default=Path("sysid_overlay.png"), help="picture to write")
+    options = parser.parse_args()
+    _, identified = actuators.read(options.actuators)
+    models = {"vanilla": robot.load_model(), "vanilla+sysid": robot.load_model(identified)}
+    print(compare(models))
+    draw(models, PERIODS[2], options.output)
+    print(f"Written to {options.output}.")
+
+
+if __name__ == "__main__":
+    main()
