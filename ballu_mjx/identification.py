@@ -339,9 +339,10 @@ _FIRST_DELAY = 3.0
 
 
 class _Physics:
-    """The two programs that hold MJX: values and Jacobians in a `Space`'s coordinates, for batches of fixed sizes."""
+    """The two programs that hold MJX, compiled side by side: values and Jacobians in a `Space`'s coordinates, for
+    batches of fixed sizes. The second, of the transients, only where it is wanted."""
 
-    def __init__(self, space: Space, batch: int, data: _Data) -> None:
+    def __init__(self, space: Space, batch: int, data: _Data, *, transients: bool) -> None:
         self.leg, self.space, self.batch = SuspendedLeg(), space, batch
         size, (legs, holds) = int(space.free.sum()), data.command.shape
         times = data.transient.shape[2]
@@ -364,15 +365,13 @@ class _Physics:
             return values, slopes
 
         over_holds = jax.vmap(settled, (None, 0))
-        self._settled = jax.jit(jax.vmap(over_holds)).lower(jnp.zeros((batch, size)), jnp.zeros((batch, holds)))
+        settled_program = jax.jit(jax.vmap(over_holds)).lower(jnp.zeros((batch, size)), jnp.zeros((batch, holds)))
         nq = self.leg.model.nq
-        over_holds = jax.vmap(transient, (None, 0, 0, 0))
-        shapes = ((legs, size + 1), (legs, holds, nq), (legs, holds, nq, size), (legs, holds))
-        self._transient = jax.jit(jax.vmap(over_holds)).lower(*(jnp.zeros(shape) for shape in shapes))
-
-    def compile(self, transients: bool) -> None:
-        """Compile both programs at once, or the first alone."""
-        programs = [self._settled, self._transient] if transients else [self._settled]
+        programs = [settled_program]
+        if transients:
+            over_holds = jax.vmap(transient, (None, 0, 0, 0))
+            shapes = ((legs, size + 1), (legs, holds, nq), (legs, holds, nq, size), (legs, holds))
+            programs.append(jax.jit(jax.vmap(over_holds)).lower(*(jnp.zeros(shape) for shape in shapes)))
         with ThreadPoolExecutor() as pool:
             self._compiled = list(pool.map(lambda program: program.compile(), programs))
 
@@ -492,12 +491,17 @@ class _Identifier:
         starts = min(config.starts, config.draws + 1)
         report("compiling", 0, 1, float("nan"))
         self.space = Space(nominal_leg(), config)
-        self.physics = _Physics(self.space, starts * len(SIDES), data)
-        self.physics.compile(config.transients)
+        self.physics = _Physics(self.space, starts * len(SIDES), data, transients=config.transients)
         report("compiling", 1, 1, float("nan"))
         self._starts, self._size = starts, int(self.space.free.sum())
         self._squares = _Search(optx.LevenbergMarquardt(rtol=1e-5, atol=1e-5))
         self._shape = _Search(optx.LBFGS(rtol=1e-5, atol=1e-5))
+
+        def objective(angles: Array, command: Array, measured: Array) -> Array:
+            return jnp.sum(curve_distances(command, angles, measured, config.degree)[0])
+
+        gradient = jax.value_and_grad(objective)
+        self._curve_gradients = jax.jit(jax.vmap(lambda command, angles, measured: gradient(angles, command, measured)))
 
     def run(self, sweep: Sweep, report: Report) -> Identification:
         config, size, data = self.config, self._size, _data(sweep)
@@ -528,9 +532,16 @@ class _Identifier:
             )
             analyses = self._analyse(coordinates, data)
         if config.objective == "hausdorff":
-            shaped, _ = self._shape(
-                lambda y: self._distance(y, data), coordinates[:, :size], config.steps, partial(report, "curves")
+            # From every search's end: a maximum over points and a sum over joints has more valleys still.
+            starts = np.concatenate([coordinates[:, None, :size], found.reshape(len(legs), -1, size)[:, 1:]], axis=1)
+            shaped, distances = self._shape(
+                lambda y: self._distance(y, leg, data),
+                starts.reshape(-1, size),
+                config.steps,
+                partial(report, "curves"),
             )
+            best = np.argmin(distances.reshape(len(legs), -1), axis=1)
+            shaped = shaped.reshape(len(legs), -1, size)[legs, best]
             coordinates = np.concatenate([shaped, coordinates[:, size:]], axis=1)
             analyses = self._analyse(coordinates, data)
 
@@ -611,23 +622,12 @@ class _Identifier:
         )
 
     def _distance(
-        self, coordinates: Float[np.ndarray, "legs size"], data: _Data
-    ) -> tuple[Float[np.ndarray, "legs 1"], Float[np.ndarray, "legs 1 size"]]:
-        """Each leg's part of the paper's objective."""
-        angles, slope = self._angles(coordinates, data.command)
-        values, jacobians = [], []
-        for leg, command in enumerate(data.command):
-            value, gradient = self._curve_gradient(command, angles[leg], data.settled[leg])
-            values.append([float(value)])
-            jacobians.append(np.einsum("ha,has->s", gradient, slope[leg])[None])
-        return np.array(values), np.array(jacobians)
-
-    def _curve_gradient(
-        self, command: np.ndarray, angles: np.ndarray, measured: np.ndarray
-    ) -> tuple[Array, np.ndarray]:
-        objective = lambda angles: jnp.sum(curve_distances(command, angles, measured, self.config.degree)[0])  # noqa: E731
-        value, gradient = jax.value_and_grad(objective)(jnp.asarray(angles))
-        return value, np.asarray(gradient)
+        self, coordinates: Float[np.ndarray, "n size"], leg: Int[np.ndarray, " n"], data: _Data
+    ) -> tuple[Float[np.ndarray, "n 1"], Float[np.ndarray, "n 1 size"]]:
+        """The legs' parts of the paper's objective."""
+        angles, slope = self._angles(coordinates, data.command[leg])
+        values, gradients = self._curve_gradients(data.command[leg], angles, data.settled[leg])
+        return np.asarray(values)[:, None], np.einsum("nha,nhas->ns", gradients, slope)[:, None]
 
     def _parameters(self, coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A leg's parameters, and the free ones' derivatives in the coordinates."""

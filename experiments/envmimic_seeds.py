@@ -3,8 +3,8 @@
 #
 # Section "Improved Simulation Fidelity" of the paper, open loop: recorded commands are replayed from recorded states in
 # four simulators, on recordings that training never saw: vanilla, vanilla with identified actuators (vanilla+sysid),
-# and either with EnvMimic's forces. One run of `python -m ballu_mjx.train envmimic` a seed, on identified actuators and on
-# nominal ones; runs that are there already are not repeated.
+# and either with EnvMimic's forces. One run of `python -m ballu_mjx.train envmimic` a seed, on identified actuators and
+# on nominal ones; runs that are there already are not repeated.
 #
 # `python experiments/envmimic_seeds.py` takes about forty minutes on two cores; `--quick` shows that it works.
 

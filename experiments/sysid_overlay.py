@@ -2,8 +2,9 @@
 # # What identified actuators change
 #
 # Section "Actuator System Identification" of the paper, its check: the same periodic bang-bang commands with and
-# without identification. The paper found the final centres of mass 0.23 m apart, and joint angles 10.15 deg apart on average.
-# Here for the bundled robot's `actuators.json`, over several gaits; and both robots at the end of one, side by side.
+# without identification. The paper found the final centres of mass 0.23 m apart, and joint angles 10.15 deg apart on
+# average. Here for the bundled robot's `actuators.json`, over several gaits; and both robots at the end of one, side by
+# side.
 #
 # `python experiments/sysid_overlay.py` takes seconds: C MuJoCo suffices.
 

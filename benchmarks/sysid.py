@@ -1,0 +1,455 @@
+"""How good and how fast is identification? Three ways, on the bundled sweep, by the paper's objective, in one run.
+
+The objective is the sum over both legs of the directed Hausdorff distances from simulated to measured curves, for motor
+and knee, of settled angles. All three know the same bounds, for the paper's eight parameters and for ten (with the
+torque limits):
+
+- ours: `ballu_mjx.identification` from settled angles alone, with either objective. The time is a second run's;
+  compiling, once for each size of sweep, stands apart.
+- the paper's way: scipy's L-BFGS-B from the nominal values, finite differences through C MuJoCo. Two favours: the
+  parameters of both legs are perturbed at once, as neither leg feels the other, and the joints are damped so that they
+  settle soon.
+- MuJoCo's toolbox `mujoco.sysid` (`pip install "mujoco[sysid]"`), which fits time series: the whole recording is played
+  to it, and judged at the end of each hold. Its own optimizer and residual, from the nominal values.
+
+One judge for all: C MuJoCo, simulated until nothing moves. Mean angle errors are over all holds after a fit to all, and
+over every fourth hold after a fit to the others.
+
+    python benchmarks/sysid.py
+    python benchmarks/sysid.py --quick                  # ten parameters, fewer draws and iterations, nothing left out
+    python benchmarks/sysid.py --output FOLDER          # numbers and traces as FOLDER/sysid.json too
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import copy
+import dataclasses
+import importlib.metadata
+import io
+import json
+import os
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import scipy.optimize
+from jaxtyping import Float
+from mujoco import rollout
+
+from ballu_mjx import identification, recording, robot, sweep
+from ballu_mjx.identification import NAMES, IdentificationConfig, Space
+from ballu_mjx.robot import SIDES, ActuatorParameters
+from ballu_mjx.sweep import Sweep
+
+THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+LEFT_OUT_EVERY = 4
+DEGREE = IdentificationConfig().degree
+OBJECTIVES = ("pointwise", "hausdorff")
+
+DAMPING = {"hip": 0.12, "knee": 0.01, "motor": 0.0114}
+"""N m s/rad: the hip close to critical; more at knee or motor would be slower."""
+SEARCH_STEPS, JUDGE_STEPS = 500, 3000
+"""Steps of the robot's own time step until settled, to 1e-3 rad at worst, and to rounding. A longer time step would
+soften the knee's stop and so move the angles."""
+DIFFERENCE = 1e-6
+"""Finite difference, as a share of the span between the bounds."""
+
+Vectors = Float[np.ndarray, "2 parameters"]
+"""Parameters of both legs, in the order of `NAMES`."""
+Trace = list[tuple[float, float]]
+"""Seconds since the start, and the lowest objective so far (as the method itself settles the legs)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One way with one set of parameters, judged."""
+
+    way: str
+    parameters: int
+    seconds: float
+    compile_seconds: float | None
+    objective: float
+    backward: float
+    """The same from measured to simulated."""
+    error: float
+    error_left_out: float | None
+    """deg."""
+    vectors: list[list[float]]
+    trace: Trace
+
+
+class Legs:
+    """Settled angles by C MuJoCo, of many sets of parameters side by side."""
+
+    def __init__(self, steps: int, *, exact: bool = False) -> None:
+        self.steps = steps
+        self.models, self.fields, self.places = [], [], []
+        for side in SIDES:
+            model = robot.load_suspended_leg(side)
+            for kind, damping in DAMPING.items():
+                model.dof_damping[model.joint(f"{kind}_{side}").dofadr[0]] = damping
+            if exact:
+                model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 50, 50, 0.0
+            self.models.append(model)
+            self.fields.append(_fields_of(model))
+            self.places.append([model.joint(f"{kind}_{side}").qposadr[0] for kind in ("motor", "knee")])
+        self.pool = rollout.Rollout(nthread=THREADS)
+        self.data = [mujoco.MjData(self.models[0]) for _ in range(THREADS)]
+
+    def settled(
+        self, vectors: Float[np.ndarray, "n 2 parameters"], command: Float[np.ndarray, "holds 2"]
+    ) -> Float[np.ndarray, "n holds 2 2"]:
+        holds, kind = len(command), mujoco.mjtState.mjSTATE_FULLPHYSICS
+        models, states, controls = [], [], []
+        for pair in vectors:
+            for leg, vector in enumerate(pair):
+                model = copy.copy(self.models[leg])
+                robot.set_fields(model, self.fields[leg](vector[:, None]))
+                data = self.data[0]
+                mujoco.mj_resetData(model, data)
+                data.qpos[self.places[leg]] = [vector[NAMES.index(f"default_{k}_angle")] for k in ("motor", "knee")]
+                state = np.zeros(mujoco.mj_stateSize(model, kind))
+                mujoco.mj_getState(model, data, state, kind)
+                models += [model] * holds
+                states += [state] * holds
+                controls.append(np.repeat(command[:, leg, None, None], self.steps, axis=1))
+        path, _ = self.pool.rollout(models, self.data, np.stack(states), np.concatenate(controls))
+        qpos = np.asarray(path)[:, -1, 1 : 1 + self.models[0].nq].reshape(len(vectors), len(SIDES), holds, -1)
+        angles = [qpos[:, leg][:, :, place] for leg, place in enumerate(self.places)]
+        return np.stack(angles, axis=-1)
+
+
+def _fields_of(model: mujoco.MjModel) -> Callable[[np.ndarray], dict[str, np.ndarray]]:
+    """`robot.actuator_fields` from rows of parameters, compiled: else the finite differences would wait for it."""
+    compiled = jax.jit(lambda rows: robot.actuator_fields(model, ActuatorParameters(*rows)))
+    return lambda rows: {name: np.asarray(value) for name, value in compiled(rows).items()}
+
+
+def distances(data: Sweep) -> Callable[[Float[np.ndarray, "n holds 2 2"]], Float[np.ndarray, "n 2"]]:
+    """The paper's objective and its reverse, of settled angles."""
+
+    def both(angles: jax.Array) -> jax.Array:
+        return sum(
+            jnp.sum(
+                identification.curve_distances(
+                    data.command[:, leg], angles[:, :, leg], data.settled[:, :, leg], DEGREE
+                ),
+                axis=1,
+            )
+            for leg in range(len(SIDES))
+        )  # pyright: ignore
+
+    compiled = jax.jit(jax.vmap(both))
+    return lambda angles: np.asarray(compiled(angles))
+
+
+def _lowest_so_far(trace: Trace) -> Trace:
+    values = np.minimum.accumulate([value for _, value in trace])
+    return [(seconds, float(value)) for (seconds, _), value in zip(trace, values, strict=True)]
+
+
+# ---- ours ----
+
+
+def ours(
+    data: Sweep, config: IdentificationConfig, repeats: int
+) -> tuple[float, dict[str, tuple[Vectors, float, identification.Identification]]]:
+    """Seconds of compiling; for each objective vectors, seconds of the last run, and the result."""
+    marks: list[float] = []
+
+    def report(stage: str, iteration: int, steps: int, value: float) -> None:
+        if stage == "compiling":
+            marks.append(time.perf_counter())
+
+    results = {}
+    identifier = identification._Identifier(config, data, report)
+    for objective in OBJECTIVES:
+        # Both share the programs that take long to compile.
+        identifier.config = dataclasses.replace(config, objective=objective)
+        for _ in range(repeats):
+            began = time.perf_counter()
+            found = identifier.run(data, report)
+            seconds = time.perf_counter() - began
+        results[objective] = np.stack([fit.vector for fit in found.fits]), seconds, found
+    return marks[1] - marks[0], results
+
+
+# ---- the paper's way ----
+
+
+def papers_way(data: Sweep, space: Space, iterations: int) -> tuple[Vectors, float, Trace]:
+    """L-BFGS-B over C MuJoCo: vectors, seconds, trace.
+
+    Coordinates are shares of the span between the bounds, of the logarithm where ours is: units that differ by a factor
+    of 30 would make the search worse.
+    """
+    legs, judge, free = Legs(SEARCH_STEPS), distances(data), np.flatnonzero(space.free)
+    low, high = (
+        np.where(space.relative, np.log(np.where(space.relative, x, 1)), x) for x in (space.lower, space.upper)
+    )
+
+    def vectors(shares: np.ndarray) -> Vectors:
+        pair = np.tile(space.nominal, (len(SIDES), 1))
+        values = low[free] + shares.reshape(len(SIDES), -1) * (high - low)[free]
+        pair[:, free] = np.where(space.relative[free], np.exp(values), values)
+        return pair
+
+    def parts(shares: np.ndarray) -> Float[np.ndarray, "n 2"]:
+        angles = legs.settled(np.stack([vectors(x) for x in shares]), data.command)
+        # By leg: the other's angles as measured add nothing.
+        alone = np.repeat(angles[:, None], len(SIDES), axis=1)
+        for leg in range(len(SIDES)):
+            alone[:, leg, :, :, 1 - leg] = data.settled[:, :, 1 - leg]
+        return judge(alone.reshape(-1, *angles.shape[1:]))[:, 0].reshape(len(shares), -1)
+
+    trace: Trace = []
+
+    def function(shares: np.ndarray) -> tuple[float, np.ndarray]:
+        steps = np.where(shares.reshape(len(SIDES), -1) + DIFFERENCE > 1, -DIFFERENCE, DIFFERENCE)
+        moves = np.stack(
+            [np.zeros_like(steps)] + [np.where(np.arange(len(free)) == i, steps, 0) for i in range(len(free))]
+        )
+        values = parts(shares + moves.reshape(len(moves), -1))
+        trace.append((time.perf_counter() - began, float(values[0].sum())))
+        return float(values[0].sum()), ((values[1:] - values[0]) / steps.T).T.ravel()
+
+    nominal = np.where(space.relative, np.log(np.where(space.relative, space.nominal, 1)), space.nominal)
+    start = np.tile(((nominal - low) / np.where(high > low, high - low, 1))[free], len(SIDES))
+    began = time.perf_counter()
+    function(start)  # compiles
+    trace.clear()
+    began = time.perf_counter()
+    options = {"maxiter": iterations}
+    found = scipy.optimize.minimize(
+        function, start, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(start), options=options
+    )
+    return vectors(found.x), time.perf_counter() - began, _lowest_so_far(trace)
+
+
+# ---- MuJoCo's toolbox ----
+
+
+def missing_for_toolbox() -> list[str]:
+    """Distributions that `mujoco.sysid` needs and that are not installed, if it cannot be used for want of them."""
+    from mujoco import sysid
+
+    if hasattr(sysid, "optimize"):
+        return []
+    missing = []
+    for requirement in importlib.metadata.requires("mujoco") or []:
+        name = re.split(r"[^\w.-]", requirement)[0]
+        if 'extra == "sysid"' in requirement:
+            try:
+                importlib.metadata.version(name)
+            except importlib.metadata.PackageNotFoundError:
+                missing.append(name)
+    return missing or ["mujoco.sysid itself"]
+
+
+def _toolbox_spec() -> mujoco.MjSpec:
+    """Both legs, hanging, with the sensors that the recording has; hips damped as for the others."""
+    spec = mujoco.MjSpec.from_file(str(robot.assets() / "ballu.xml"))
+    robot.suspend(spec)
+    spec.delete(spec.body("balloon"))
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    for kind in ("motor", "knee"):
+        for side in SIDES:
+            name = f"{kind}_{side}"
+            spec.add_sensor(
+                name=name, type=mujoco.mjtSensor.mjSENS_JOINTPOS, objtype=mujoco.mjtObj.mjOBJ_JOINT, objname=name
+            )
+    return spec
+
+
+def toolbox(
+    data: Sweep, kept: np.ndarray, source: recording.Recording, space: Space, iterations: int
+) -> tuple[Vectors, float, Trace]:
+    """`mujoco.sysid.optimize`: vectors, seconds, trace. `data` is the whole sweep, of which `kept` is fitted."""
+    from mujoco import sysid
+
+    spec, free = _toolbox_spec(), np.flatnonzero(space.free)
+    model = spec.compile()
+    fields = _fields_of(model)
+    hips = [model.joint(f"hip_{side}").dofadr[0] for side in SIDES]
+
+    def as_vectors(x: np.ndarray) -> Vectors:
+        pair = np.tile(space.nominal, (len(SIDES), 1))
+        pair[:, free] = x.reshape(len(free), len(SIDES)).T
+        return pair
+
+    def build(parameters: Any, spec: mujoco.MjSpec) -> mujoco.MjModel:
+        built = copy.copy(model)
+        built.dof_damping[hips] = DAMPING["hip"]
+        robot.set_fields(built, fields(as_vectors(parameters.as_vector()).T))
+        return built
+
+    seconds = source.time - source.time[0]
+    ends = np.append(np.flatnonzero(np.any(np.diff(source.command, axis=0) != 0, axis=1)), len(seconds) - 1)
+    grid = np.arange(int(np.ceil(seconds[-1] / model.opt.timestep)) + 2) * model.opt.timestep
+    command = source.command[np.searchsorted(seconds, grid + 1e-9, side="right") - 1]
+    data0 = mujoco.MjData(model)
+    for k, kind in enumerate(("motor", "knee")):
+        for s, side in enumerate(SIDES):
+            data0.qpos[model.joint(f"{kind}_{side}").qposadr[0]] = data.settled[0, k, s]
+    sequences = sysid.ModelSequences(
+        "suspended",
+        spec,
+        "sweep",
+        sysid.create_initial_state(model, data0.qpos),
+        sysid.TimeSeries(grid, command),
+        sysid.TimeSeries.from_names(seconds[ends][kept], data.settled[kept].reshape(len(kept), -1), model),
+    )
+    residual = sysid.build_residual_fn(models_sequences=[sequences], build_model=build, n_threads=THREADS)
+    visited: list[tuple[float, np.ndarray]] = []
+
+    def noting(x: np.ndarray, parameters: Any, **options: Any) -> Any:
+        result = residual(x, parameters, **options)
+        if x.ndim == 1 or x.shape[1] == 1:
+            visited.append((time.perf_counter() - began, x.ravel().copy()))
+        return result
+
+    parameters = sysid.ParameterDict()
+    for index in free:
+        low, high = (np.full(len(SIDES), bound[index]) for bound in (space.lower, space.upper))
+        parameters.add(sysid.Parameter(NAMES[index], np.full(len(SIDES), space.nominal[index]), low, high))
+    fields(as_vectors(parameters.as_vector()).T)  # compiles
+    began = time.perf_counter()
+    # Parameters in their own units: the toolbox's advice for those is to scale by the Jacobian.
+    with contextlib.redirect_stdout(io.StringIO()):
+        found, _ = sysid.optimize(
+            initial_params=parameters, residual_fn=noting, verbose=False, max_iters=iterations, x_scale="jac"
+        )
+    elapsed = time.perf_counter() - began
+    fitted = data.without(np.setdiff1d(np.arange(len(data.command)), kept).tolist())
+    angles = Legs(SEARCH_STEPS).settled(np.stack([as_vectors(x) for _, x in visited]), fitted.command)
+    trace = [(when, float(value)) for (when, _), value in zip(visited, distances(fitted)(angles)[:, 0], strict=True)]
+    return as_vectors(found.as_vector()), elapsed, _lowest_so_far(trace)
+
+
+# ---- comparison ----
+
+
+def _reached(row: Row, objective: float) -> float:
+    """Seconds until the row's objective was no larger; ours are known at the end only."""
+    if row.trace:
+        return next((seconds for seconds, value in row.trace if value <= objective), row.seconds)
+    return row.seconds
+
+
+def compare(one: list[Row], other: Row) -> str:
+    """How much sooner the first way, of which there are variants, or the other gets to the same objective."""
+    best = min(one, key=lambda row: row.objective)
+    target = max(best.objective, other.objective) * (1 + 1e-3)  # the judge settles further than the searches do
+    ours_at, row = min((_reached(r, target), r) for r in one if r.objective <= target)
+    compiled = ours_at + (row.compile_seconds or 0.0)
+    there = _reached(other, target)
+    ends = "the lower of the two" if best.objective < other.objective else "the higher of the two"
+    how = f"{there / ours_at:.2g} times sooner" if ours_at < there else f"{ours_at / there:.2g} times later"
+    return (
+        f"{other.parameters} parameters: ours ends at {best.objective:.4f} ({ends}), {other.way} at "
+        f"{other.objective:.4f}. {target:.4f} is reached by {row.way} in {ours_at:.1f} s ({compiled:.0f} s with "
+        f"compiling), by {other.way} in {there:.1f} s: ours {how}."
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="ten parameters only, fewer draws and iterations")
+    parser.add_argument("--output", type=Path, help="folder for sysid.json")
+    arguments = parser.parse_args()
+    with jax.enable_x64(True):
+        rows = measure(arguments.quick)
+    if arguments.output is not None:
+        arguments.output.mkdir(parents=True, exist_ok=True)
+        path = arguments.output / "sysid.json"
+        path.write_text(json.dumps([dataclasses.asdict(row) for row in rows], indent=1) + "\n")
+
+
+def measure(quick: bool) -> list[Row]:
+    (path,) = recording.bundled("suspended")
+    source = recording.read_recording(path)
+    whole = sweep.read_sweep({path: source})
+    everything = np.arange(len(whole.command))
+    out = everything[LEFT_OUT_EVERY - 1 :: LEFT_OUT_EVERY]
+    kept = np.setdiff1d(everything, out)
+    part, left_out = whole.without(out.tolist()), whole.without(kept.tolist())
+
+    judge, distance = Legs(JUDGE_STEPS, exact=True), distances(whole)
+    iterations = 10 if quick else 60
+    missing = missing_for_toolbox()
+    rows: list[Row] = []
+    print(f"{THREADS} threads, {len(everything)} holds, {len(out)} of them left out in turn")
+    head = ("time", 9), ("compiling", 11), ("Hausdorff", 11), ("back", 9), ("error", 11), ("left out", 11)
+    print(f"{'':27}{'parameters':>10}" + "".join(f"{name:>{width}}" for name, width in head))
+
+    def add(
+        way: str,
+        free: int,
+        vectors: Vectors,
+        seconds: float,
+        compiling: float | None,
+        held: Vectors | None,
+        trace: Trace,
+    ) -> None:
+        angles = judge.settled(vectors[None], whole.command)
+        there, back = distance(angles)[0]
+        unseen = None
+        if held is not None:
+            unseen = identification.mean_error(judge.settled(held[None], left_out.command)[0], left_out)
+        error = identification.mean_error(angles[0], whole)
+        row = Row(way, free, seconds, compiling, float(there), float(back), error, unseen, vectors.tolist(), trace)
+        rows.append(row)
+        shown = "" if compiling is None else f"{compiling:.0f} s"
+        numbers = f"{there:>11.4f}{back:>9.4f}{error:>7.2f} deg" + ("" if unseen is None else f"{unseen:>7.2f} deg")
+        print(f"{way:27}{free or '':>10}{seconds:>7.1f} s{shown:>11}{numbers}", flush=True)
+
+    nominal = np.tile(identification.nominal_leg(), (len(SIDES), 1))
+    add("nominal", 0, nominal, 0.0, None, nominal, [])
+    comparisons = []
+    for limit in (True,) if quick else (False, True):
+        # As many starts as by default: the compiled program's size depends on them.
+        config = IdentificationConfig(transients=False, torque_limit=limit)
+        if quick:
+            config = dataclasses.replace(config, draws=15, steps=8)
+        space = Space(identification.nominal_leg(), config)
+        free = len(SIDES) * int(space.free.sum())
+
+        compiling, fits = ours(whole, config, repeats=2)
+        held = {} if quick else ours(part, config, repeats=1)[1]
+        for objective, (vectors, seconds, found) in fits.items():
+            add(f"ours, {objective}", free, vectors, seconds, compiling, held[objective][0] if held else None, [])
+            apart = np.abs(judge.settled(vectors[None], whole.command)[0] - found.settled).max()
+            if np.rad2deg(apart) > 0.01:
+                print(f"  MJX's settled angles and the judge's are up to {np.rad2deg(apart):.3f} deg apart")
+        mine = rows[-len(OBJECTIVES) :]
+
+        vectors, seconds, trace = papers_way(whole, space, iterations)
+        held_vectors = None if quick else papers_way(part, space, iterations)[0]
+        add("the paper's way", free, vectors, seconds, None, held_vectors, trace)
+        comparisons.append(compare(mine, rows[-1]))
+        if not missing:
+            vectors, seconds, trace = toolbox(whole, everything, source, space, 20 if quick else 200)
+            held_vectors = None if quick else toolbox(whole, kept, source, space, 200)[0]
+            add("mujoco.sysid", free, vectors, seconds, None, held_vectors, trace)
+            comparisons.append(compare(mine, rows[-1]))
+    print()
+    print("\n".join(comparisons))
+    if missing:
+        print(f'mujoco.sysid was left out: {", ".join(missing)} not installed (pip install "mujoco[sysid]").')
+    return rows
+
+
+if __name__ == "__main__":
+    main()
