@@ -338,7 +338,7 @@ DELAY_UNIT = 0.01
 _FIRST_DELAY = 3.0
 
 
-class _Physics:
+class Physics:
     """The two programs that hold MJX, compiled side by side: values and Jacobians in a `Space`'s coordinates, for
     batches of fixed sizes. The second, of the transients, only where it is wanted."""
 
@@ -467,7 +467,7 @@ def identify(
     check(config)
     report = report or (lambda stage, iteration, steps, value: None)
     with jax.enable_x64(True):
-        return _Identifier(config, sweep, report).run(sweep, report)
+        return Identifier(config, sweep, report).run(sweep, report)
 
 
 def check(config: IdentificationConfig) -> None:
@@ -482,7 +482,7 @@ def check(config: IdentificationConfig) -> None:
         raise InputError(f"--seed is {config.seed}: it must be 0 or more.")
 
 
-class _Identifier:
+class Identifier:
     """The stages of `identify`, compiled once for sweeps of the same sizes."""
 
     def __init__(self, config: IdentificationConfig, sweep: Sweep, report: Report) -> None:
@@ -491,7 +491,7 @@ class _Identifier:
         starts = min(config.starts, config.draws + 1)
         report("compiling", 0, 1, float("nan"))
         self.space = Space(nominal_leg(), config)
-        self.physics = _Physics(self.space, starts * len(SIDES), data, transients=config.transients)
+        self.physics = Physics(self.space, starts * len(SIDES), data, transients=config.transients)
         report("compiling", 1, 1, float("nan"))
         self._starts, self._size = starts, int(self.space.free.sum())
         self._squares = _Search(optx.LevenbergMarquardt(rtol=1e-5, atol=1e-5))

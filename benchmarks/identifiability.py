@@ -35,7 +35,7 @@ def truth() -> np.ndarray:
     return np.stack([np.where(relative, nominal * change, nominal + change) for change in np.array(CHANGES)])
 
 
-def simulate(identifier: identification._Identifier, vectors: np.ndarray) -> Sweep:
+def simulate(identifier: identification.Identifier, vectors: np.ndarray) -> Sweep:
     """A sweep of the model itself, without noise."""
     physics = identifier.physics
     command, previous = np.linspace(0, 1, LEVELS), np.maximum(np.arange(LEVELS) - 1, 0)
@@ -72,7 +72,7 @@ def main() -> None:
     seeds, draws = (1, 5) if parser.parse_args().quick else (10, 50)
     vectors, silent = truth(), lambda *_: None
     with jax.enable_x64(True):
-        identifier = identification._Identifier(IdentificationConfig(), blank(), silent)
+        identifier = identification.Identifier(IdentificationConfig(), blank(), silent)
         clean = simulate(identifier, vectors)
 
         worst = np.zeros(len(NAMES))

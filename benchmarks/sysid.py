@@ -174,7 +174,7 @@ def ours(
             marks.append(time.perf_counter())
 
     results = {}
-    identifier = identification._Identifier(config, data, report)
+    identifier = identification.Identifier(config, data, report)
     for objective in OBJECTIVES:
         # Both share the programs that take long to compile.
         identifier.config = dataclasses.replace(config, objective=objective)

@@ -46,12 +46,12 @@ def blank() -> Sweep:
 
 
 @pytest.fixture(scope="module")
-def identifier() -> identification._Identifier:
-    return identification._Identifier(IdentificationConfig(), blank(), lambda *_: None)
+def identifier() -> identification.Identifier:
+    return identification.Identifier(IdentificationConfig(), blank(), lambda *_: None)
 
 
 @pytest.fixture(scope="module")
-def physics(identifier: identification._Identifier) -> identification._Physics:
+def physics(identifier: identification.Identifier) -> identification.Physics:
     return identifier.physics
 
 
@@ -59,12 +59,12 @@ def coordinates(*vectors: np.ndarray) -> np.ndarray:
     return np.stack([SPACE.coordinates(vector) for vector in vectors])
 
 
-def rest(physics: identification._Physics, *vectors: np.ndarray) -> np.ndarray:
+def rest(physics: identification.Physics, *vectors: np.ndarray) -> np.ndarray:
     """Positions at rest under COMMANDS."""
     return physics.settled(coordinates(*vectors), np.tile(COMMANDS, (len(vectors), 1)))[0]
 
 
-def moving(physics: identification._Physics, *vectors: np.ndarray) -> np.ndarray:
+def moving(physics: identification.Physics, *vectors: np.ndarray) -> np.ndarray:
     """Transients of a left and a right leg from rest under each command's predecessor."""
     start, slope = physics.settled(coordinates(*vectors), np.tile(COMMANDS, (2, 1)))
     y = np.concatenate([coordinates(*vectors), np.full((2, 1), DELAY / identification.DELAY_UNIT)], axis=1)
@@ -85,7 +85,7 @@ def c_model(side: str, values: np.ndarray) -> mujoco.MjModel:
 @pytest.mark.parametrize("change", [HIGH, LOW])
 @pytest.mark.parametrize("side", robot.SIDES)
 def test_settled_angles_are_those_c_mujoco_comes_to_rest_at(
-    physics: identification._Physics, change: list[float], side: str
+    physics: identification.Physics, change: list[float], side: str
 ) -> None:
     model = c_model(side, vector(change))
     model.dof_damping[:] = np.maximum(model.dof_damping, 0.05)  # rests sooner, at the same place
@@ -99,7 +99,7 @@ def test_settled_angles_are_those_c_mujoco_comes_to_rest_at(
     assert np.rad2deg(ours) == pytest.approx(np.rad2deg(expected), abs=0.02)
 
 
-def test_transients_are_those_of_c_mujoco(physics: identification._Physics) -> None:
+def test_transients_are_those_of_c_mujoco(physics: identification.Physics) -> None:
     values, angles = vector(HIGH), physics.leg.angles
     start, paths = rest(physics, values)[0], moving(physics, values, values)[1]
     model = c_model("left", values)
@@ -117,7 +117,7 @@ def test_transients_are_those_of_c_mujoco(physics: identification._Physics) -> N
 
 @pytest.mark.parametrize("change", [HIGH, LOW])
 def test_derivatives_of_settled_angles_agree_with_differences(
-    physics: identification._Physics, change: list[float]
+    physics: identification.Physics, change: list[float]
 ) -> None:
     """Cable slack and knee at its stop at low commands, cable taut at high ones, servo saturated in the weak leg."""
     y, command, angles = coordinates(vector(change))[0], COMMANDS[None], physics.leg.angles
@@ -134,7 +134,7 @@ def test_derivatives_of_settled_angles_agree_with_differences(
         assert slope[..., index] == pytest.approx(difference[..., index], abs=1e-4 * scale + 1e-6), name
 
 
-def test_derivatives_of_transients_agree_with_differences(physics: identification._Physics) -> None:
+def test_derivatives_of_transients_agree_with_differences(physics: identification.Physics) -> None:
     """Both legs at once: one that never saturates, and one that does."""
     y = np.concatenate([coordinates(vector(HIGH), vector(LOW)), np.full((2, 1), 3.3)], axis=1)
     command = np.tile(COMMANDS, (2, 1))
@@ -154,7 +154,7 @@ def test_derivatives_of_transients_agree_with_differences(physics: identificatio
         assert off.mean() < 0.02, index
 
 
-def test_every_leg_within_the_bounds_comes_to_rest(physics: identification._Physics) -> None:
+def test_every_leg_within_the_bounds_comes_to_rest(physics: identification.Physics) -> None:
     draws = SPACE.draw(1, 40)
     qpos, _ = physics.settled(draws, np.tile(COMMANDS, (len(draws), 1)))
     torque = jax.jit(jax.vmap(lambda q, y, c: physics.leg.residual_torque(q, SPACE.vector(y), c), (0, None, 0)))
@@ -212,7 +212,7 @@ TRUTH = (vector([1.3, 0.7, 0.05, 0.06, 0.75]), vector([0.8, 1.2, -0.08, -0.03, 0
 
 
 @pytest.fixture(scope="module")
-def noiseless(physics: identification._Physics) -> Sweep:
+def noiseless(physics: identification.Physics) -> Sweep:
     """A sweep of the model itself, with the parameters TRUTH."""
     settled = np.moveaxis(rest(physics, *TRUTH)[:, :, physics.leg.angles], 0, -1)
     return dataclasses.replace(blank(), settled=settled, transient=np.moveaxis(moving(physics, *TRUTH), 0, -1))
@@ -229,7 +229,7 @@ def noisy(sweep: Sweep, seed: int, noise: float = np.deg2rad(0.5)) -> Sweep:
 
 
 def test_known_parameters_are_recovered_whatever_the_draws(
-    noiseless: Sweep, identifier: identification._Identifier
+    noiseless: Sweep, identifier: identification.Identifier
 ) -> None:
     for seed in range(3):
         identifier.config = IdentificationConfig(seed=seed)
@@ -242,7 +242,7 @@ def test_known_parameters_are_recovered_whatever_the_draws(
             assert not fit.open_directions
 
 
-def test_standard_errors_are_honest(noiseless: Sweep, identifier: identification._Identifier) -> None:
+def test_standard_errors_are_honest(noiseless: Sweep, identifier: identification.Identifier) -> None:
     """With 0.5 deg of noise, nine in ten estimates within two standard errors."""
     identifier.config = IdentificationConfig(draws=32, steps=12)
     within = []
@@ -253,7 +253,7 @@ def test_standard_errors_are_honest(noiseless: Sweep, identifier: identification
     assert np.mean(within) > 0.85
 
 
-def test_transients_make_more_known(noiseless: Sweep, identifier: identification._Identifier) -> None:
+def test_transients_make_more_known(noiseless: Sweep, identifier: identification.Identifier) -> None:
     fits = []
     for transients in (True, False):
         identifier.config = IdentificationConfig(transients=transients, draws=32, steps=12)
