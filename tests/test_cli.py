@@ -41,12 +41,13 @@ def first_seconds(recording: Recording, duration: float) -> Recording:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two short recordings, with room for runs beside them."""
+    """Two short recordings and their robot's actuators, with room for runs beside them."""
     folder = tmp_path_factory.mktemp("cli")
     (folder / "data").mkdir()
     for path in bundled("validation")[1:3]:
         recording = first_seconds(read_recording(path), 6.0)
         write_recording(recording, folder / "data" / f"{recording.name}.csv")
+    shutil.copy(robot.assets() / "recordings" / actuators.NAME, folder / "data")
     return folder
 
 
@@ -91,6 +92,7 @@ def test_evaluate_repeats_the_same_numbers(trained: Path):
 def test_interrupted_run_goes_on_where_it_stopped(trained: Path):
     folder = trained.parent
     line = [sys.executable, "-m", "ballu_mjx.train", "envmimic", "--recordings", "data", "--output", "stopped"]
+    line += ["--actuators", "nominal"]
     line += ["--num-timesteps", str(400 * STEPS), "--validate-every", str(400 * STEPS), "--seed", "5", *SIZES]
     metrics = folder / "stopped" / "metrics.jsonl"
 
@@ -116,6 +118,7 @@ def test_interrupted_run_goes_on_where_it_stopped(trained: Path):
     assert [row["step"] for row in after if "reward" in row] == list(range(STEPS, total + STEPS, STEPS))
     config = json.loads((folder / "stopped" / "config.json").read_text())
     assert config["ppo"]["seed"] == 5 and config["ppo"]["num_envs"] == 8  # given once, kept
+    assert config["actuators"] is None  # likewise
     assert len(config["starts"]) == 2
     assert runs.restore(folder / "stopped", "last")[0] == total
 
@@ -151,23 +154,12 @@ def test_bundled_actuators_come_from_the_bundled_sweep():
     assert sources == [runs.describe_recording(p) for p in bundled("suspended")]
 
 
-def test_envmimic_takes_identified_actuators_from_beside_the_recordings(trained: Path, identified: Path):
-    config = json.loads((trained / "config.json").read_text())
-    assert config["actuators"] is None, "the recordings were given as files of their own, without actuators.json"
-    (trained.parent / "beside").mkdir()
-    for path in (trained.parent / "data").iterdir():
-        shutil.copy(path, trained.parent / "beside")
-    shutil.copy(identified / actuators.NAME, trained.parent / "beside")
-    done = command(
-        "train", "envmimic", "--recordings", "beside", "--num-timesteps", STEPS, "--output", "onidentified", *SIZES,
-        folder=trained.parent,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert "vanilla+sysid" in done.stdout
-    stored = json.loads((trained.parent / "onidentified" / "config.json").read_text())["actuators"]
-    assert stored == json.loads((identified / actuators.NAME).read_text())["parameters"]
-    loaded = residual.Residual.load(trained.parent / "onidentified", "last").actuators
+def test_envmimic_takes_identified_actuators_from_beside_the_recordings(trained: Path):
+    stored = json.loads((trained / "config.json").read_text())["actuators"]
+    assert stored == json.loads((trained.parent / "data" / actuators.NAME).read_text())["parameters"]
+    loaded = residual.Residual.load(trained, "last").actuators
     assert loaded is not None and np.asarray(loaded.motor_gain) == pytest.approx(stored["motor_gain"])
+    assert "vanilla+sysid" in (trained / "evaluation.txt").read_text()
 
 
 @pytest.mark.parametrize(
