@@ -4,8 +4,8 @@
 # Each row of the README's ablation table is the default configuration with one thing changed, trained over seeds and
 # measured on the validation recordings (the test recordings have no part in choices).
 #
-# `python experiments/ablation.py` takes about three minutes a row and seed on two cores (nominal actuators); what is there already is not
-# trained again. `--quick` shows that it works.
+# `python experiments/ablation.py` takes about three minutes a row and seed on two cores; what is there already is not
+# trained again. Actuators are the nominal ones. `--quick` shows that it works.
 
 # %%
 from __future__ import annotations
