@@ -343,7 +343,7 @@ class Physics:
     batches of fixed sizes. The second, of the transients, only where it is wanted."""
 
     def __init__(self, space: Space, batch: int, data: _Data, *, transients: bool) -> None:
-        self.leg, self.space, self.batch = SuspendedLeg(), space, batch
+        self.leg, self.batch = SuspendedLeg(), batch
         size, (legs, holds) = int(space.free.sum()), data.command.shape
         times = data.transient.shape[2]
 
