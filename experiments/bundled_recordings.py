@@ -81,9 +81,9 @@ def one_legged(seconds: float) -> Float[np.ndarray, "steps 2"]:
     return np.where(np.stack([time % 4.0 < 2.0, time % 4.0 >= 2.0], axis=1), left, 0.0)
 
 
-def telegraph(seconds: float) -> Float[np.ndarray, "steps 2"]:
+def telegraph(seconds: float, seed: int = 11) -> Float[np.ndarray, "steps 2"]:
     """Each leg jumps to another random level after another random wait."""
-    rng = np.random.default_rng(11)
+    rng = np.random.default_rng(seed)
     commands = np.zeros((round(seconds / CONTROL_TIMESTEP), 2))
     for leg in range(2):
         step = 0
@@ -128,6 +128,45 @@ def jobs() -> list[Job]:
         for index, make in enumerate(FAR[split]):
             found.append((split, f"far-{index + 1}", make(SECONDS[split]), f"{make.__name__}: {make.__doc__}"))
     return [Job(*entry[:3], trial=100 + number, notes=entry[3]) for number, entry in enumerate(found)]
+
+
+def fresh_jobs(seed: int, each: int = 6) -> list[Job]:
+    """A larger test set than the bundled one, drawn at random: `each` near and `each` far recordings.
+
+    Near: gaits with period, phase, duty and height drawn from the range of the training gaits. Far: random jumps, both
+    legs together, smooth waves (a phase apart, or of two periods) and one leg at a time, in turn.
+    """
+    rng = np.random.default_rng([seed, 4])
+    seconds = SECONDS["test"]
+    time = np.arange(round(seconds / CONTROL_TIMESTEP))[:, None] * CONTROL_TIMESTEP
+
+    def pair(low: float, high: float) -> tuple[float, float]:
+        left, right = np.round(rng.uniform(low, high, 2), 2)
+        return float(left), float(right)
+
+    def far(kind: int) -> Float[np.ndarray, "steps 2"]:
+        period, phase, high = rng.uniform(0.8, 1.6), rng.uniform(0.2, 0.8), rng.uniform(0.75, 1.0)
+        if kind == 0:
+            return telegraph(seconds, int(rng.integers(2**31)))
+        if kind == 1:
+            return Gait(period, 0.0, (0.4, 0.4), (high, high)).commands(seconds)
+        if kind == 2:
+            return 0.5 - 0.5 * np.cos(2 * np.pi * (time / period + np.array([0.0, phase])))
+        if kind == 3:
+            return 0.5 - 0.5 * np.cos(2 * np.pi * time / rng.uniform(0.8, 1.8, 2))
+        both = Gait(period, 0.0, (0.4, 0.4), (high, high)).commands(seconds)
+        return np.where(np.hstack([time % 6 < 3, time % 6 >= 3]), both, 0.0)
+
+    near = [
+        Gait(round(rng.uniform(0.8, 1.6), 2), round(rng.uniform(0.3, 0.7), 2), pair(0.35, 0.5), pair(0.75, 1.0))
+        for _ in range(each)
+    ]
+    found = [(f"near-{i + 1}", gait.commands(seconds), str(gait)) for i, gait in enumerate(near)]
+    found += [(f"far-{i + 1}", np.round(far(i % 5), 3), f"far, kind {i % 5}") for i in range(each)]
+    return [
+        Job("fresh", name, commands, trial=10_000 * (seed + 1) + number, notes=notes)
+        for number, (name, commands, notes) in enumerate(found)
+    ]
 
 
 def make(job: Job, robot_seed: int, output: Path) -> Path:
