@@ -6,8 +6,9 @@ balloon follows the recorded one. What the policy learns is the part of the phys
 
 from __future__ import annotations
 
+import copy
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -119,8 +120,8 @@ def heading_rotation(yaw: Float[Array, ""]) -> Float[Array, "3 3"]:
     return jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def observation(history: Float[Array, "3 27"]) -> Float[Array, " observations"]:
-    """The policy's state, from the features of three control steps (the current one last).
+def observation(history: Float[Array, "steps 27"]) -> Float[Array, " observations"]:
+    """The policy's state, from the features of the last control steps (three in the paper; the current one last).
 
     The paper's state, made independent of place and heading: horizontal positions are taken from the current
     balloon's, and positions, velocities and yaw from its heading. A force that depends on where in the room the
@@ -176,6 +177,12 @@ class Simulator:
         names = ("balloon", "base", "foot_left", "foot_right")
         self._sites = np.array([model.site(name).id for name in names])
         self._bodies = model.site_bodyid[self._sites]
+
+    def altered(self, fields: Mapping[str, Array]) -> Simulator:
+        """The same with other model fields, which may be traced."""
+        other = copy.copy(self)
+        other.model = ballu.with_fields(self.model, dict(fields))
+        return other
 
     def load(self, qpos: Array, qvel: Array, warmstart: Array) -> mjx.Data:
         return self._template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)  # pyright: ignore
@@ -238,7 +245,7 @@ class EnvMimicEnv(Env):
         self.simulator = Simulator(model)
         self.reference, _ = stack(self.simulator, motions)
         self.episode_length = round(config.episode_seconds / ballu.CONTROL_TIMESTEP)
-        self._spread = self._input_spread()
+        self._spread = jnp.std(self.recorded_inputs(), axis=0)
         shapes = jax.eval_shape(self.reset, jax.random.key(0)).obs
         self._observation_size = {name: shape.shape for name, shape in shapes.items()}
 
@@ -345,8 +352,8 @@ class EnvMimicEnv(Env):
             critic += [to_heading @ error[:3], to_heading @ error[3:6], wrap_angle(error[6:9])]
         return {"state": seen + noise, "critic": jnp.concatenate([*critic, commands.ravel()])}
 
-    def _input_spread(self) -> Float[Array, " inputs"]:
-        """Standard deviation of each of the policy's inputs over the recorded states."""
+    def recorded_inputs(self) -> Float[Array, "states inputs"]:
+        """What the policy would see of every recorded state."""
         reference, config = self.reference, self.config
 
         def inputs(recording: Array, time: Array) -> Array:
@@ -355,7 +362,7 @@ class EnvMimicEnv(Env):
 
         steps = np.asarray(reference.steps)
         pairs = np.array([(r, k) for r, count in enumerate(steps) for k in range(HISTORY - 1, count)])
-        return jnp.std(jax.jit(jax.vmap(inputs))(*jnp.array(pairs).T), axis=0)
+        return jax.jit(jax.vmap(inputs))(*jnp.array(pairs).T)
 
 
 def commands_seen(commands: Float[Array, "steps 2"], time: Int[Array, ""]) -> Float[Array, "3 2"]:

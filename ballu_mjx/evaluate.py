@@ -145,13 +145,11 @@ def learning_curve(folder: Path, best_step: int) -> None:
     """Draw `learning_curve.png` from the run's `metrics.jsonl`."""
     from ballu_mjx import plots, runs
 
-    def column(name: str) -> tuple[np.ndarray, np.ndarray]:
-        pairs = [(row["step"], row[name]) for row in runs.read_metrics(folder) if row.get(name) is not None]
-        steps, values = np.array(pairs, float).reshape(-1, 2).T
-        return steps, values
-
     plots.learning_curve(
-        folder / "learning_curve.png", *column("reward"), *column("validation_error"), best_step=best_step
+        folder / "learning_curve.png",
+        *runs.column(folder, "reward"),
+        *runs.column(folder, "validation_error"),
+        best_step=best_step,
     )
 
 

@@ -6,11 +6,13 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import mujoco
 import numpy as np
 from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from ballu_mjx import robot
 from ballu_mjx.identification import Identification
 from ballu_mjx.robot import SIDES
 from ballu_mjx.sweep import Sweep
@@ -18,7 +20,9 @@ from ballu_mjx.sweep import Sweep
 COLOURS: Mapping[str, str] = {
     "recording": "black",
     "vanilla": "#d55e00",
+    "vanilla+dr": "#cc79a7",
     "vanilla+sysid": "#0072b2",
+    "vanilla+sysid+dr": "#e69f00",
     "supervised": "#56b4e9",
     "envmimic": "#009e73",
 }
@@ -27,12 +31,17 @@ COLOURS: Mapping[str, str] = {
 LABELS: Mapping[str, str] = {
     "recording": "recording",
     "vanilla": "vanilla",
+    "vanilla+dr": "vanilla+DR",
     "vanilla+sysid": "vanilla+sysid",
+    "vanilla+sysid+dr": "vanilla+sysid+DR",
     "supervised": "supervised",
     "envmimic": "EnvMimic",
 }
 _QUANTITIES = ("x (m)", "y (m)", "yaw (deg)")
 _DOTS_PER_INCH = 120
+_SIDE_COLOURS = ("#1f77b4", "#d64d1f")
+"""Left and right, as in the model."""
+_STANCE_HEIGHT = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,6 +109,105 @@ def learning_curve(
     for axis in (upper, lower):
         axis.grid(alpha=0.3)
     _save(figure, path)
+
+
+def reward_curve(path: Path, steps: Float[np.ndarray, " n"], reward: Float[np.ndarray, " n"], simulator: str) -> None:
+    """Mean reward per control step (m/s) against control steps, in the simulator's colour."""
+    figure = Figure(figsize=(7.0, 3.5), layout="constrained")
+    axis = figure.subplots()
+    axis.plot(steps / 1e6, reward, color=COLOURS[simulator], label=LABELS[simulator])
+    axis.set_xlabel("control steps (millions)")
+    axis.set_ylabel("reward per control step (m/s)")
+    axis.grid(alpha=0.3)
+    axis.legend()
+    _save(figure, path)
+
+
+def gait(
+    path: Path, qpos: Float[np.ndarray, "states nq"], command: Float[np.ndarray, "steps 2"], *, start: float = 6.0
+) -> None:
+    """What a gait looks like: a strip of stick figures from the side, one every quarter of a second; the feet's heights
+    and the commands over time, stance (foot within a centimetre of the floor) marked; the way from above.
+
+    Strip and time plots show eight seconds from `start` (s) on; all are at the control rate.
+    """
+    period = robot.CONTROL_TIMESTEP
+    sticks, feet, com = _sticks(qpos)
+    first = min(round(start / period), max(len(qpos) - 2, 0))
+    shown = slice(first, min(first + round(8.0 / period), len(command)))
+    time = np.arange(len(qpos)) * period
+    figure = Figure(figsize=(12.0, 10.0), layout="constrained")
+    strip, heights, commands, above = figure.subplots(4, 1, height_ratios=(1.6, 1.0, 1.0, 1.4))
+    for state in range(shown.start, shown.stop, round(0.25 / period)):
+        for part, colour in (("body", "grey"), (SIDES[0], _SIDE_COLOURS[0]), (SIDES[1], _SIDE_COLOURS[1])):
+            strip.plot(sticks[part][state, :, 0], sticks[part][state, :, 2], color=colour, linewidth=1.0)
+        strip.plot(*sticks["body"][state, -1, [0, 2]], "o", color="lightgrey", markersize=9)
+    strip.axhline(0.0, color="black", linewidth=0.8)
+    strip.set_aspect("equal", adjustable="datalim")
+    strip.set_xlabel("x (m)")
+    strip.set_ylabel("z (m)")
+    for leg, side in enumerate(SIDES):
+        height = feet[shown, leg, 2]
+        heights.plot(time[shown], height, color=_SIDE_COLOURS[leg], label=side)
+        stance = np.where(height < _STANCE_HEIGHT, -0.01 - 0.01 * leg, np.nan)
+        heights.plot(time[shown], stance, color=_SIDE_COLOURS[leg], linewidth=3)
+        commands.plot(time[shown], command[shown, leg], color=_SIDE_COLOURS[leg])
+    heights.set_ylabel("height of foot (m)")
+    heights.legend(loc="upper right")
+    commands.set_ylabel("command")
+    commands.set_xlabel("time (s)")
+    above.plot(com[:, 0], com[:, 1], color="black", label="centre of mass")
+    for leg, side in enumerate(SIDES):
+        down = feet[feet[:, leg, 2] < _STANCE_HEIGHT, leg]
+        above.plot(down[:, 0], down[:, 1], ".", color=_SIDE_COLOURS[leg], markersize=3, label=f"{side} foot, stance")
+    above.set_aspect("equal", adjustable="datalim")
+    above.set_xlabel("x (m)")
+    above.set_ylabel("y (m)")
+    above.legend(loc="upper right")
+    for axis in (heights, commands, above):
+        axis.grid(alpha=0.3)
+    _save(figure, path)
+
+
+def ways(
+    path: Path,
+    hardware: Sequence[Float[np.ndarray, "states 3"]],
+    simulated: Sequence[Float[np.ndarray, "states 3"]],
+    simulator: str,
+) -> None:
+    """The centre of mass from above in each trial (m): on the robot, and in the policy's own simulator."""
+    figure = Figure(figsize=(7.0, 6.0), layout="constrained")
+    axis = figure.subplots()
+    for name, runs in ((simulator, simulated), ("recording", hardware)):
+        for index, com in enumerate(runs):
+            label = {"recording": "robot"}.get(name, f"{LABELS[name]} (simulated)") if not index else None
+            axis.plot(com[:, 0], com[:, 1], color=COLOURS[name], label=label, linewidth=1.2)
+            axis.plot(com[-1, 0], com[-1, 1], "o", color=COLOURS[name], markersize=4)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x (m)")
+    axis.set_ylabel("y (m)")
+    axis.grid(alpha=0.3)
+    axis.legend()
+    _save(figure, path)
+
+
+def _sticks(qpos: Float[np.ndarray, "states nq"]) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+    """Polylines (m, world) of body and legs, positions of the feet, and the centre of mass, for each state."""
+    model = robot.load_model()
+    data = mujoco.MjData(model)
+    lines: dict[str, list[np.ndarray]] = {"body": [], **{side: [] for side in SIDES}}
+    com = []
+    for state in qpos:
+        data.qpos[:] = state
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        lines["body"].append(np.stack([data.site("base").xpos, data.site("balloon").xpos]))
+        for side in SIDES:
+            leg = [data.body(f"femur_{side}").xpos, data.body(f"tibia_{side}").xpos, data.site(f"foot_{side}").xpos]
+            lines[side].append(np.stack(leg))
+        com.append(data.subtree_com[1].copy())
+    sticks = {part: np.stack(line) for part, line in lines.items()}
+    return sticks, np.stack([sticks[side][:, -1] for side in SIDES], axis=1), np.stack(com)
 
 
 def actuator_curves(path: Path, sweep: Sweep, result: Identification) -> None:

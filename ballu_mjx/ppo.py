@@ -98,6 +98,7 @@ class Params(NamedTuple):
 
 ObservationSize = int | Mapping[str, tuple[int, ...] | int]
 Inference = Callable[[Params, Float[Array, " observations"]], Float[Array, " actions"]]
+Sampler = Callable[[Params, Float[Array, " observations"], Array], Float[Array, " actions"]]
 Callback = Callable[[int, Params, dict[str, float]], None]
 """(control steps done, parameters, means since the last call: empty before the first training step)."""
 
@@ -118,7 +119,8 @@ class _Training(Wrapper):
         keys = jax.vmap(jax.random.split)(state.info["reset_key"])
         before = dataclasses.replace(state, done=jnp.zeros_like(state.done))
         after = jax.vmap(self.env.step)(before, action)
-        fresh = jax.vmap(self.env.reset)(keys[:, 0])
+        renew = getattr(self.env, "renew", lambda state, key: self.env.reset(key))
+        fresh = jax.vmap(renew)(before, keys[:, 0])
         done = after.done.astype(bool)
 
         def select(new: Array, old: Array) -> Array:
@@ -149,6 +151,9 @@ def wrap_for_training(
 
     Brax's own auto-reset goes back to a cached first state for ever. Here all environments are reset in every step,
     and the finished ones take the result: for environments whose reset costs nothing beside their step.
+
+    An `env` with a method `renew(state, key)` is reset by it: what tells one variant of an environment from another can
+    then be handed on from state to state, instead of being a constant of the compiled program.
 
     `env` ends its episodes itself, by time also: it sets `done` and, where only time ran out,
     `info["truncation"]`, in both `reset` and `step`. What Brax's `compute_gae` makes of a truncated transition
@@ -303,6 +308,17 @@ def make_inference(observation_size: ObservationSize, action_size: int, config: 
         return networks.parametric_action_distribution.mode(logits)
 
     return infer
+
+
+def make_sampler(observation_size: ObservationSize, action_size: int, config: PPOConfig) -> Sampler:
+    """The policy as it explores: (parameters, the policy's observation, key) to a drawn action."""
+    networks = _networks(observation_size, action_size, config=config)
+
+    def sample(params: Params, observation: Float[Array, " observations"], key: Array) -> Float[Array, " actions"]:
+        logits = networks.policy_network.apply(params.normalizer, params.policy, {_STATE: observation})
+        return networks.parametric_action_distribution.sample(logits, key)
+
+    return sample
 
 
 def as_tree(params: Params) -> dict[str, Any]:

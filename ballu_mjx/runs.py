@@ -22,6 +22,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TextIO, TypeVar
 
+import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 from tensorboardX import SummaryWriter
@@ -41,7 +42,7 @@ _BUNDLED = "bundled:"
 _NO_SCORE = 1e30
 _PACKAGES = ("ballu-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "optimistix", "numpy")
 
-Which = Literal["best", "last"]
+Which = Literal["best", "last"] | int
 Config = TypeVar("Config")
 
 
@@ -64,10 +65,10 @@ def new_folder(output: Path | None, task: str) -> Path:
     return output
 
 
-def read_config(folder: Path, task: str) -> dict[str, Any]:
+def read_config(folder: Path, *tasks: str) -> dict[str, Any]:
     """The content of a run's `config.json`.
 
-    **Raises** `InputError` where `folder` is no run of `task`.
+    **Raises** `InputError` where `folder` is no run of one of `tasks`.
     """
     path = folder / _CONFIG
     if not path.is_file():
@@ -78,8 +79,9 @@ def read_config(folder: Path, task: str) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be read ({error}); restore it or start a new run.") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f"{path}: is not of the format {FORMAT}; use the version of ballu_mjx that wrote it.")
-    if content.get("task") != task:
-        raise InputError(f"{folder}: is a run of {content.get('task')!r}; one of {task!r} is needed here.")
+    if content.get("task") not in tasks:
+        needed = " or ".join(repr(task) for task in tasks)
+        raise InputError(f"{folder}: is a run of {content.get('task')!r}; one of {needed} is needed here.")
     return content
 
 
@@ -199,7 +201,8 @@ class Run:
         self._metrics.write(json.dumps(row) + "\n")
         self._metrics.flush()
         for name, value in metrics.items():
-            self._tensorboard.add_scalar(name, value, step)
+            if math.isfinite(value):
+                self._tensorboard.add_scalar(name, value, step)
         self._tensorboard.flush()
 
     def save(self, step: int, tree: Mapping[str, Any], score: float | None) -> None:
@@ -219,17 +222,25 @@ class Run:
 
 
 def restore(folder: Path, which: Which) -> tuple[int, dict[str, Any]]:
-    """Step and content of a run's best or last checkpoint.
+    """Step and content of a run's best or last checkpoint, or of that of a step.
 
     **Raises** `InputError` where there is none.
     """
     if (folder / "checkpoints").is_dir():
         with _manager(folder) as manager:
-            step = manager.latest_step() if which == "last" else manager.best_step()
-            if step is not None:
+            step = {"last": manager.latest_step, "best": manager.best_step}.get(str(which), lambda: which)()
+            if step in manager.all_steps():
                 return step, manager.restore(step, args=ocp.args.StandardRestore())
     kind = "validated checkpoint" if which == "best" else "checkpoint"
     raise InputError(f"{folder}: the run has no {kind}; train for longer.")
+
+
+def checkpoints(folder: Path) -> list[int]:
+    """Steps of the checkpoints that a run has kept, in order."""
+    if not (folder / "checkpoints").is_dir():
+        return []
+    with _manager(folder) as manager:
+        return sorted(manager.all_steps())
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
@@ -237,6 +248,13 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
     path = folder / _METRICS
     lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
     return [json.loads(line) for line in lines]
+
+
+def column(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Control steps, and what was measured there under `name`."""
+    pairs = [(row["step"], row[name]) for row in read_metrics(folder) if row.get(name) is not None]
+    steps, values = np.array(pairs, float).reshape(-1, 2).T
+    return steps, values
 
 
 class Progress:
@@ -257,8 +275,8 @@ class Progress:
         self._marks: list[tuple[float, int]] = []
         self._said = -math.inf
 
-    def update(self, step: int, rate: float, reward: float, score: float | None) -> None:
-        """Show where training is: control step, steps/s, mean reward per step, validation error (None: none yet)."""
+    def update(self, step: int, rate: float, metric: str) -> None:
+        """Show where training is: control step, steps/s, and the metric that matters, in words."""
         now = time.perf_counter()
         # The time left is judged by the last minute's pace, validation included, compiling not.
         self._marks = [mark for mark in self._marks if now - mark[0] < 60.0] + [(now, step)]
@@ -266,8 +284,7 @@ class Progress:
         if step > before:
             seconds = round((self._total - step) * (now - then) / (step - before))
             left = str(datetime.timedelta(seconds=max(seconds, 0)))
-        error = "-" if score is None else f"{score:.3f}"
-        text = f"{rate:,.0f} steps/s, {left} left, reward {reward:.3f}, validation error {error}"
+        text = f"{rate:,.0f} steps/s, {left} left, {metric}"
         if self._bar is not None:
             self._bar.update(min(step, self._total) - self._bar.n)
             self._bar.set_postfix_str(text)
@@ -295,7 +312,10 @@ class Stages:
         if stage != self._stage:
             self.close()
             self._stage = stage
-            self._bar = tqdm(total=steps, desc=f"{stage:15}", file=self._stream, dynamic_ncols=True, leave=True)
+            interval = 0.1 if self._stream.isatty() else Progress.interval
+            self._bar = tqdm(
+                total=steps, desc=f"{stage:15}", file=self._stream, dynamic_ncols=True, mininterval=interval
+            )
         if self._bar is not None:
             self._bar.update(iteration - self._bar.n)
             if math.isfinite(loss):

@@ -12,7 +12,6 @@ Nothing that trains may import this module's robots: they are known by their rec
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 
 import jax.numpy as jnp
 import mujoco
@@ -21,6 +20,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx import robot as ballu
+from ballu_mjx.deployment import Capture, Controller
 from ballu_mjx.recording import Recording
 
 PHYSICS_TIMESTEP = 5e-4
@@ -200,23 +200,6 @@ class _Servos:
             half = self.backlash / ballu.SERVO_RANGE / 2
             self.target = np.clip(self.target, command - half, command + half)
         return np.clip(self.target, 0.0, 1.0)
-
-
-@dataclasses.dataclass
-class Capture:
-    """Motion capture frames as they come: time (s), noisy poses; NaN where a marker is hidden."""
-
-    time: list[float]
-    command: list[np.ndarray]
-    balloon_position: list[np.ndarray]
-    balloon_quaternion: list[np.ndarray]
-    base_position: list[np.ndarray]
-    base_quaternion: list[np.ndarray]
-    foot_position: list[np.ndarray]
-
-
-Controller = Callable[[Capture], Float[np.ndarray, " 2"]]
-"""Sees all frames so far, returns the next commands (left, right)."""
 
 
 def open_loop(commands: Float[np.ndarray, "steps 2"]) -> Controller:

@@ -260,7 +260,7 @@ def test_progress_is_readable_in_a_file(monkeypatch):
     stream = io.StringIO()
     progress = runs.Progress(1000, stream=stream)
     for step in range(100, 1100, 100):
-        progress.update(step, 25.0, 0.5, None if step < 300 else 0.9)
+        progress.update(step, 25.0, f"reward {step / 1000:.3f}")
     lines = stream.getvalue().splitlines()
     assert [line.split()[0] for line in lines] == ["100", "400", "700", "1,000"]
-    assert lines[1] == "400 of 1,000 steps, 25 steps/s, 0:00:24 left, reward 0.500, validation error 0.900"
+    assert lines[1] == "400 of 1,000 steps, 25 steps/s, 0:00:24 left, reward 0.400"

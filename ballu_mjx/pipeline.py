@@ -1,0 +1,303 @@
+"""The whole story in one command, on a virtual robot: `python -m ballu_mjx.train all`.
+
+Stages, in the paper's order: an actuator sweep and its identification; vanilla policies; their actions replayed on the
+robot, several times each; one EnvMimic a task; policies in the four simulators; trials on the robot; tables. Every
+stage is a folder, and beside it stands the key of what it was made from (options, and the keys of the stages it needs):
+an interrupted run goes on where it was, and a changed option redoes what depends on it and nothing else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ballu_mjx import (
+    actuator_fit,
+    actuators,
+    policy_training,
+    residual_training,
+    robot,
+    runs,
+    trials,
+    virtual_robot,
+)
+from ballu_mjx.envmimic import EnvMimicConfig
+from ballu_mjx.errors import InputError
+from ballu_mjx.identification import IdentificationConfig
+from ballu_mjx.locomotion import LocomotionConfig, Setting
+from ballu_mjx.policy import ClosedLoop, Policy
+from ballu_mjx.ppo import PPOConfig
+from ballu_mjx.recording import write_recording
+from ballu_mjx.tasks import TASKS
+from ballu_mjx.transfer import Transfer, turning_table, walking_table
+
+TABLES = {"walk": walking_table, "turn": turning_table}
+"""The paper's tables, by task."""
+SETTINGS = ("vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic")
+"""The paper's four simulators."""
+_DECIMALS = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What to run, and how long to train."""
+
+    output: Path = Path("runs/all")
+    """Folder of all stages. What is there already and was made with the same options is kept."""
+    robot: int = 0
+    """Which virtual robot of the family stands in for the hardware."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds of the trainings: each trains every policy and residual anew."""
+    tasks: tuple[Literal["walk", "turn"], ...] = ("walk", "turn")
+    """The paper's two tasks."""
+    trials: int = 5
+    """Trials on the robot for each policy, each in a draught of its own."""
+    takes: int = 2
+    """Recordings of each sequence of actions, each in a draught of its own."""
+    policy_steps: int = 1_500_000
+    """Control steps to train each policy for."""
+    residual_steps: int = 2_000_000
+    """Control steps to train each EnvMimic for."""
+    quick: bool = False
+    """Every stage within five minutes in all, for one task and two simulators; the tables mean nothing."""
+
+
+def run(options: Options) -> int:
+    """Run what is missing, print the tables; returns the exit status."""
+    started = time.perf_counter()
+    _check(options)
+    settings = SETTINGS
+    if options.quick:
+        settings = ("vanilla+dr", "envmimic")
+        options = dataclasses.replace(options, trials=min(options.trials, 2), takes=1, tasks=options.tasks[:1])
+    results: dict[str, dict[str, list[list[Transfer]]]] = {
+        task: {setting: [] for setting in settings} for task in options.tasks
+    }
+    for seed in options.seeds:
+        story = Story(options, seed)
+        for task in options.tasks:
+            for setting in settings:
+                results[task][setting].append(story.transfers(task, setting))
+    text = "\n\n".join(f"### {task}\n\n{TABLES[task](results[task])}" for task in options.tasks)
+    (options.output / "tables.md").write_text(text + "\n", encoding="utf-8")
+    print(f"\n{text}\n")
+    if options.quick:
+        print("These numbers mean nothing: --quick trains for seconds.")
+    print(f"Written to {options.output}. {time.perf_counter() - started:.0f} s in all.")
+    return 0
+
+
+class Story:
+    """The stages of one seed. Each method makes its stage, and the ones before, unless they are there."""
+
+    def __init__(self, options: Options, seed: int) -> None:
+        self.options, self.seed = options, seed
+        self._robot = virtual_robot.draw_robot(options.robot)
+        self._loop: ClosedLoop | None = None
+        self._shared, self._own = options.output, options.output / f"seed-{seed}"
+
+    def sweep(self) -> Path:
+        """An actuator sweep of the robot."""
+
+        def make(folder: Path) -> None:
+            sweep = virtual_robot.record_sweep(self._robot, seed=self.options.robot, name="sweep")
+            write_recording(sweep, folder / "sweep.csv.gz", decimals=_DECIMALS)
+
+        return _stage(self._shared / "sweep", {"robot": self.options.robot}, [], make)
+
+    def identified(self) -> Path:
+        """The run of the identification."""
+        sweep = self.sweep()
+        config = IdentificationConfig(**actuator_fit.QUICK if self.options.quick else {})
+
+        def make(folder: Path) -> None:
+            data = actuator_fit.SweepData(recordings=(sweep / "sweep.csv.gz",), output=folder)
+            actuator_fit.fit(data, config)
+
+        return _stage(self._shared / "sysid", config, [sweep], make)
+
+    def policy(self, task: str, setting: str) -> Path:
+        """The run of a policy's training."""
+        config = LocomotionConfig(domain_randomization=setting == "envmimic" or setting.endswith("+dr"))
+        quick = policy_training.QUICK if self.options.quick else {"num_timesteps": self.options.policy_steps}
+        ppo = policy_training.defaults(seed=self.seed, **quick)
+        needs = []
+        # Six checkpoints in all, or one a training step: the last three are what is replayed on the robot.
+        data = policy_training.Data(keep_every=max(ppo.num_timesteps // 6, 1))
+        if setting == "envmimic":
+            needs = [self.residual(task)]
+            data = dataclasses.replace(data, residual=needs[0])
+        elif "+sysid" in setting:
+            needs = [self.identified()]
+            data = dataclasses.replace(data, actuators=needs[0] / actuators.NAME)
+
+        def make(folder: Path) -> None:
+            started = runs.checkpoints(folder)
+            where = policy_training.Data(resume=folder, keep_every=data.keep_every)
+            where = where if started else dataclasses.replace(data, output=folder)
+            _stop_unless_done(policy_training.train(TASKS[task], where, config, ppo))
+
+        return _stage(self._own / f"{task}-{setting}", (config, ppo), needs, make)
+
+    def recordings(self, task: str) -> Path:
+        """The robot's motion under the actions of vanilla policies, replayed open loop (paper: several of them, several
+        times each): those of the last checkpoints of two trainings, without and with domain randomization."""
+        settings = ("vanilla+dr",) if self.options.quick else ("vanilla", "vanilla+dr")
+        sources = [self.policy(task, setting) for setting in settings]
+        takes, seconds = self.options.takes, 6.0 if self.options.quick else 20.0
+
+        def make(folder: Path) -> None:
+            sequences = [commands for source in sources for commands in self._actions(source, seconds + 5.0)]
+            jobs = []
+            for index, commands in enumerate(sequences):
+                # The last of the randomized training's sequences validates, a little longer than the others.
+                use = "validation" if index == len(sequences) - 1 else "training"
+                played = commands if use == "validation" else commands[: round(seconds / robot.CONTROL_TIMESTEP)]
+                for take in range(takes):
+                    jobs.append((use, f"actions-{index}-take-{take + 1}", played))
+            for number, (use, name, commands) in enumerate(jobs):
+                recording = virtual_robot.record(
+                    self._robot,
+                    virtual_robot.draw_trial(_draw(self.seed, task, "recordings", number)),
+                    virtual_robot.open_loop(commands),
+                    len(commands) * robot.CONTROL_TIMESTEP,
+                    name,
+                    f"Actions of a vanilla policy for {task}, open loop.",
+                )
+                (folder / use).mkdir(exist_ok=True)
+                write_recording(recording, folder / use / f"{name}.csv.gz", decimals=_DECIMALS)
+                print(f"Recorded {name} ({use}), {number + 1} of {len(jobs)}", flush=True)
+
+        options = {"robot": self.options.robot, "seed": self.seed, "takes": takes, "seconds": seconds}
+        return _stage(self._own / f"recordings-{task}", options, sources, make)
+
+    def residual(self, task: str) -> Path:
+        """The run of EnvMimic's training."""
+        recordings, identified = self.recordings(task), self.identified()
+        config = EnvMimicConfig()
+        quick = residual_training.QUICK if self.options.quick else {"num_timesteps": self.options.residual_steps}
+        ppo = PPOConfig(seed=self.seed, **quick)
+
+        def make(folder: Path) -> None:
+            data = residual_training.Data(
+                recordings=(recordings / "training",),
+                validation=(recordings / "validation",),
+                actuators=identified / actuators.NAME,
+                output=folder,
+            )
+            if runs.checkpoints(folder):
+                data = residual_training.Data(resume=folder)
+            _stop_unless_done(residual_training.train(data, config, ppo))
+
+        return _stage(self._own / f"envmimic-{task}", (config, ppo), [recordings, identified], make)
+
+    def transfers(self, task: str, setting: str) -> list[Transfer]:
+        """How the policy's trials on the robot compare with its own simulator."""
+        source = self.policy(task, setting)
+        count = self.options.trials
+
+        def make(folder: Path) -> None:
+            policy = Policy.load(source)
+            draws = [virtual_robot.draw_trial(_draw(self.seed, task, "trials", number)) for number in range(count)]
+            found = trials.run(policy, self._robot, draws, folder, *self._simulator(policy))
+            (folder / "transfer.json").write_text(json.dumps([t.to_json() for t in found], indent=2) + "\n")
+
+        options = {"robot": self.options.robot, "seed": self.seed, "trials": count}
+        folder = _stage(self._own / f"trials-{task}-{setting}", options, [source], make)
+        return [Transfer.from_json(entry) for entry in json.loads((folder / "transfer.json").read_text())]
+
+    def _actions(self, run: Path, seconds: float) -> list[np.ndarray]:
+        """Commands of each of a policy's kept checkpoints over `seconds`, in its own simulator from standing."""
+        policies = [Policy.load(run, step) for step in runs.checkpoints(run) if step > 0]
+        loop, setting = self._simulator(policies[0])
+        start, count = loop.standing(), round(seconds / robot.CONTROL_TIMESTEP)
+        return [np.round(loop(p.params, *start, count, setting).command[0], 3).astype(float) for p in policies]
+
+    def _simulator(self, policy: Policy) -> tuple[ClosedLoop, Setting]:
+        """A policy's own simulator; those without residual share one program, whatever the task."""
+        env = policy.environment()
+        if policy.residual is not None:
+            return ClosedLoop(env, policy.infer), env.setting
+        if self._loop is None:
+            self._loop = ClosedLoop(env, policy.infer)
+        return self._loop, env.setting
+
+
+def _draw(seed: int, task: str, use: str, number: int) -> int:
+    """The seed of a trial's circumstances. The same for all settings, which so meet the same draughts."""
+    digest = hashlib.sha256(f"{seed} {task} {use} {number}".encode()).digest()
+    return int.from_bytes(digest[:4], "big")
+
+
+def _stage(folder: Path, options: Any, needs: Sequence[Path], make: Callable[[Path], None]) -> Path:
+    """`folder` as `make` leaves it, made unless it is there with the key of `options` and `needs`.
+
+    A folder with another key is set aside. One with the same key that was not finished is handed to `make` as it is.
+    """
+    content = {
+        "options": options if isinstance(options, dict) else _plain(options),
+        "needs": [json.loads(_mark(need).read_text())["key"] for need in needs],
+    }
+    key = hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
+    mark = _mark(folder)
+    found = json.loads(mark.read_text()) if mark.exists() else None
+    if found is not None and found["key"] == key and found["done"]:
+        return folder
+    if found is not None and found["key"] != key:
+        aside = folder.with_name(f"{folder.name}.{found['key']}")
+        shutil.rmtree(aside, ignore_errors=True)
+        if folder.exists():
+            folder.rename(aside)
+        print(f"{folder}: made with other options; set aside as {aside.name}.")
+        found = None
+    print(f"\n== {folder.name}" + (" (goes on)" if found is not None else ""), flush=True)
+    if folder.exists() and not (found is not None and runs.checkpoints(folder)):
+        shutil.rmtree(folder)  # a beginning of nothing
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_mark(mark, key, content, done=False)
+    make(folder)
+    _write_mark(mark, key, content, done=True)
+    return folder
+
+
+def _mark(folder: Path) -> Path:
+    """Where a stage's key stands: beside its folder, which is its maker's."""
+    return folder.with_name(folder.name + ".stage.json")
+
+
+def _write_mark(path: Path, key: str, content: dict[str, Any], *, done: bool) -> None:
+    draft = path.with_suffix(".tmp")
+    draft.write_text(json.dumps({"key": key, "done": done, **content}, indent=2, default=str) + "\n", encoding="utf-8")
+    draft.replace(path)
+
+
+def _plain(options: Any) -> Any:
+    if isinstance(options, tuple):
+        return [_plain(option) for option in options]
+    return dataclasses.asdict(options) | {"kind": type(options).__name__}
+
+
+def _stop_unless_done(status: int) -> None:
+    """What a training's exit status means for the story."""
+    if status:
+        raise KeyboardInterrupt
+
+
+def _check(options: Options) -> None:
+    for name in ("trials", "takes", "policy_steps", "residual_steps"):
+        if getattr(options, name) < 1:
+            raise InputError(f"--{name.replace('_', '-')} is {getattr(options, name)}: it must be 1 or more.")
+    if not options.seeds or min(options.seeds) < 0 or options.robot < 0:
+        raise InputError("--seeds and --robot take numbers of 0 or more; give at least one seed.")
+    if not options.tasks:
+        raise InputError("--tasks is empty; name walk, turn, or both.")
+    if options.output.exists() and not options.output.is_dir():
+        raise InputError(f"{options.output}: is a file; give --output a folder.")

@@ -1,0 +1,189 @@
+"""A trained locomotion policy: its commands, and its own simulator in closed loop."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import State
+from jaxtyping import Array, Float
+
+from ballu_mjx import locomotion, ppo, robot, runs
+from ballu_mjx.errors import InputError
+from ballu_mjx.locomotion import LocomotionConfig, LocomotionEnv, Setting
+from ballu_mjx.ppo import Inference, Params, PPOConfig
+from ballu_mjx.residual import Residual
+from ballu_mjx.robot import ActuatorParameters
+from ballu_mjx.tasks import TASKS, Task
+
+ACTIONS = 2
+"""One command a servo."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Policy:
+    """The deterministic policy of a run, and what it was trained in.
+
+    **Fields**
+
+    - `task`, `config`, `actuators` (None: nominal), `residual` (the run's folder; None: none): its simulator.
+    - `params`: as `ppo.train` returned them.
+    - `infer`: (parameters, observation) to action.
+    - `step`: control steps of training behind it.
+    """
+
+    task: Task
+    config: LocomotionConfig
+    actuators: ActuatorParameters | None
+    residual: Path | None
+    params: Params
+    infer: Inference
+    step: int
+
+    @staticmethod
+    def load(folder: Path | str, which: Literal["last"] | int = "last") -> Policy:
+        """The policy in a run's last checkpoint, or in that of a step.
+
+        **Raises** `InputError` where `folder` is no run of a locomotion task, or has no such checkpoint.
+        """
+        folder = Path(folder)
+        stored = runs.read_config(folder, *TASKS)
+        step, tree = runs.restore(folder, which)
+        residual = stored["residual"]
+        return Policy(
+            task=TASKS[stored["task"]],
+            config=runs.typed(LocomotionConfig, stored["env"], folder),
+            actuators=runs.actuators(stored, folder),
+            residual=None if residual is None else Path(residual),
+            params=ppo.from_tree(tree),
+            infer=ppo.make_inference(locomotion.OBSERVATIONS, ACTIONS, runs.typed(PPOConfig, stored["ppo"], folder)),
+            step=step,
+        )
+
+    @property
+    def setting(self) -> str:
+        """The paper's name of the simulator; see `locomotion.setting_name`."""
+        return locomotion.setting_name(self.config, self.actuators is not None, self.residual is not None)
+
+    def environment(self) -> LocomotionEnv:
+        """The simulator that the policy was trained in."""
+        return environment(self.task, self.config, self.actuators, self.residual)
+
+    def act(self) -> Callable[[Float[np.ndarray, " 27"]], Float[np.ndarray, " 2"]]:
+        """`envmimic.features` to servo commands, for use outside of JAX, step by step."""
+
+        @jax.jit
+        def command(features: Array) -> Array:
+            return locomotion.command_of(self.infer(self.params, locomotion.policy_input(features)))
+
+        return lambda features: np.asarray(command(jnp.asarray(features, jnp.float32)), np.float64)
+
+
+def environment(
+    task: Task, config: LocomotionConfig, actuators: ActuatorParameters | None, residual: Path | None
+) -> LocomotionEnv:
+    """A task's simulator.
+
+    **Raises** `InputError` where `residual` is no EnvMimic run, or one that belongs to other actuators.
+    """
+    force = None if residual is None else Residual.load(residual)
+    if force is not None and not same_actuators(force.actuators, actuators):
+        raise InputError(
+            f"{residual}: its forces were learned beside other actuators; give --actuators the same file, or leave it "
+            "out to take the residual's."
+        )
+    return LocomotionEnv(robot.load_model(), task, config, actuators=actuators, residual=force)
+
+
+def same_actuators(one: ActuatorParameters | None, other: ActuatorParameters | None) -> bool:
+    """Whether two simulators have equal actuators (None: nominal)."""
+    if one is None or other is None:
+        return one is other
+    return all(
+        np.array_equal(np.float32(getattr(one, f.name)), np.float32(getattr(other, f.name)))
+        for f in dataclasses.fields(one)
+    )
+
+
+class Rollout(NamedTuple):
+    """Closed-loop simulations at the control rate, the starting state first."""
+
+    qpos: Float[np.ndarray, "runs states nq"]
+    features: Float[np.ndarray, "runs states 27"]
+    """`envmimic.features`."""
+    com: Float[np.ndarray, "runs states 3"]
+    """Centre of mass (m, world)."""
+    command: Float[np.ndarray, "runs steps 2"]
+    """Servo commands."""
+    outside: Float[np.ndarray, "runs steps"]
+    """1 where the residual's observation lay outside of what its training had seen."""
+
+    @property
+    def yaw(self) -> Float[np.ndarray, "runs states"]:
+        """Of the balloon (rad), not unwrapped."""
+        return self.features[..., 8]
+
+
+_CHUNK = 100
+"""Control steps that the compiled program does at a time."""
+_BATCH = 8
+"""Runs that it does side by side; others are filled up to a multiple."""
+
+
+class ClosedLoop:
+    """Runs policies in closed loop; one compiled program for any number of runs and steps, any parameters, and all
+    simulators that differ in their setting alone."""
+
+    def __init__(self, env: LocomotionEnv, infer: Inference) -> None:
+        self._setting = env.setting
+
+        def look(state: State) -> tuple[Array, ...]:
+            s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
+            return s["qpos"], s["history"][-1], s["com"]
+
+        def run(params: Params, state: State) -> Any:
+            def advance(state: State, _: None) -> tuple[State, Any]:
+                action = infer(params, state.obs)  # pyright: ignore[reportArgumentType]
+                after = env.step(state, action)
+                return after, (*look(after), locomotion.command_of(action), after.metrics["outside"])
+
+            return jax.lax.scan(advance, state, None, _CHUNK)
+
+        self._run = jax.jit(jax.vmap(run, in_axes=(None, 0)))
+        self._at = jax.jit(jax.vmap(env.at, in_axes=(None, 0, 0, 0)))
+        self._look = jax.vmap(look)
+        self._reset = jax.jit(jax.vmap(env.reset))
+
+    def __call__(
+        self,
+        params: Params,
+        qpos: Float[np.ndarray, "runs nq"],
+        qvel: Float[np.ndarray, "runs nv"],
+        steps: int,
+        setting: Setting | None = None,
+    ) -> Rollout:
+        """Simulate `steps` control steps from each of the given states, in `setting` (None: the environment's own)."""
+        runs = len(qpos)
+        filled = np.arange(-(-runs // _BATCH) * _BATCH) % runs
+        keys = jax.random.split(jax.random.key(0), len(filled))
+        start = (jnp.asarray(x[filled], jnp.float32) for x in (qpos, qvel))
+        state = self._at(self._setting if setting is None else setting, *start, keys)
+        pieces = [tuple(np.asarray(x)[:, None] for x in self._look(state))]
+        outcomes = []
+        for _ in range(-(-steps // _CHUNK)):
+            state, (*seen, command, outside) = self._run(params, state)
+            pieces.append(tuple(np.asarray(x) for x in seen))
+            outcomes.append((np.asarray(command), np.asarray(outside)))
+        joined = (np.concatenate(parts, axis=1)[:runs, : steps + 1] for parts in zip(*pieces, strict=True))
+        command, outside = (np.concatenate(p, axis=1)[:runs, :steps] for p in zip(*outcomes, strict=True))
+        return Rollout(*joined, command, outside)  # pyright: ignore[reportCallIssue]
+
+    def standing(self, count: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """`count` starting states, (qpos, qvel), as training draws them."""
+        state: Any = self._reset(jax.random.split(jax.random.key(seed), count)).pipeline_state
+        return np.asarray(state["qpos"]), np.asarray(state["qvel"])

@@ -1,0 +1,149 @@
+"""Training a locomotion policy: `python -m ballu_mjx.train walk` and the other tasks."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from ballu_mjx import actuators, locomotion, plots, policy, ppo, residual, robot, runs
+from ballu_mjx.errors import InputError
+from ballu_mjx.locomotion import LocomotionConfig
+from ballu_mjx.policy import ClosedLoop, Policy, Rollout
+from ballu_mjx.ppo import PPOConfig
+from ballu_mjx.robot import ActuatorParameters
+from ballu_mjx.session import Session, restored_from
+from ballu_mjx.tasks import Task
+
+defaults = functools.partial(
+    PPOConfig,
+    **{
+        "num_timesteps": 1_500_000,
+        "learning_rate": 3e-4,
+        "discounting": 0.97,
+        "reward_scaling": 10.0,
+        "initial_std": 0.7,
+        "entropy_cost": 1e-3,
+        "averaging": 5,
+    },
+)
+"""`PPOConfig` for locomotion: rewards are of the order of 0.1 m/s, and a stride lasts a second."""
+QUICK: Mapping[str, Any] = {"num_timesteps": 60_000, "num_envs": 256, "batch_size": 128}
+"""Defaults of `PPOConfig` under `--quick`."""
+NOMINAL = Path("nominal")
+"""What `--actuators` takes beside a file."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Data:
+    """The simulator's parts, and folders."""
+
+    actuators: Path | None = None
+    """File of identified actuators (`train sysid` writes it), or the word nominal. Without this option: the residual's
+    if there is one, else nominal."""
+    residual: Path | None = None
+    """Folder of an EnvMimic run, whose forces act in every control step. Without this option: none."""
+    output: Path | None = None
+    """Folder of the run, new or empty. Without this option: one under runs/, named after task and time."""
+    resume: Path | None = None
+    """Go on with the run in this folder, from its last checkpoint's parameters, in its simulator; options of env and
+    ppo given beside it change these. --num-timesteps counts from the run's start."""
+    quick: bool = False
+    """See everything work within two minutes; the policy will not walk."""
+    keep_every: int = 300_000
+    """Control steps between two checkpoints; the last three are kept."""
+
+
+def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfig) -> int:
+    """Check everything, train, show the gait; returns the exit status."""
+    started = time.perf_counter()
+    devices = [str(device) for device in jax.local_devices()]
+    ppo.check(ppo_config, len(devices))
+    check(config)
+    if data.keep_every < 1:
+        raise InputError(f"--keep-every is {data.keep_every}: it must be 1 or more.")
+    first_step, restored = restored_from(task.name, data, ppo_config)
+    identified, forces = _simulator(task, data)
+    env = policy.environment(task, config, identified, forces)
+    folder = data.resume or runs.new_folder(data.output, task.name)
+    setting = locomotion.setting_name(config, identified is not None, forces is not None)
+
+    print(f"Run folder: {folder}")
+    print(f"  task: {task.name}; simulator: {setting}" + (f", residual {forces}" if forces is not None else ""))
+    if data.quick:
+        print("  --quick: sizes so small that the policy will not walk.")
+    content = runs.describe(task.name, {"env": config, "ppo": ppo_config, "data": data}, {}, devices, identified)
+    content["residual"] = None if forces is None else str(forces.resolve())
+    resumed_at = None if restored is None else first_step
+    with runs.Run(folder, content, resumed_at=resumed_at) as run:
+        print("Compiling: about a minute the first time ...", flush=True)
+        remaining = dataclasses.replace(ppo_config, num_timesteps=ppo_config.num_timesteps - first_step)
+        progress = runs.Progress(first_step + ppo.total_timesteps(remaining), first_step)
+        session = Session(run, progress, data.keep_every, resumed_at)
+        try:
+            session.train(env, remaining, restored, first_step)
+        except KeyboardInterrupt:
+            print(f"To go on: python -m ballu_mjx.train {task.name} --resume {folder}", file=sys.stderr)
+            return 130
+
+    steps, rewards = runs.column(folder, "reward")
+    plots.reward_curve(folder / "learning_curve.png", steps, rewards, setting)
+    trained = Policy.load(folder)
+    loop = ClosedLoop(env, trained.infer)
+    rollout = loop(trained.params, *loop.standing(), round(task.trial_seconds / robot.CONTROL_TIMESTEP))
+    plots.gait(folder / "gait.png", rollout.qpos[0], rollout.command[0])
+    print(summary(task, rollout, forces is not None))
+    print(f"\nWritten to {folder}. {time.perf_counter() - started:.0f} s in all.")
+    return 0
+
+
+def check(config: LocomotionConfig) -> None:
+    """**Raises** `InputError` for options out of range, naming the option and the mend."""
+    low, high = config.friction
+    if not 0 < low <= high:
+        raise InputError(f"--friction is {low:g} {high:g}: give two numbers above 0, the smaller first.")
+    if not config.episode_seconds >= 2 * robot.CONTROL_TIMESTEP:
+        raise InputError(
+            f"--episode-seconds is {config.episode_seconds:g}: it must be {2 * robot.CONTROL_TIMESTEP:g} or more."
+        )
+    for name in ("start_yaw", "start_tilt", "start_angle", "start_velocity", "residual_decay"):
+        if not getattr(config, name) >= 0:
+            raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name):g}: it must be 0 or more.")
+
+
+def summary(task: Task, rollout: Rollout, with_residual: bool) -> str:
+    """What the first of some runs did, in words."""
+    way = rollout.com[0, -1] - rollout.com[0, 0]
+    yaw = np.rad2deg(np.unwrap(rollout.yaw[0]))
+    text = (
+        f"In its own simulator, from standing, {task.trial_seconds:g} s: x {way[0]:.2f} m, y {way[1]:.2f} m, "
+        f"yaw {yaw[-1] - yaw[0]:.0f} deg."
+    )
+    if with_residual:
+        text += (
+            f" The residual left the range seen in its training in {rollout.outside.mean():.0%} of the control steps."
+        )
+    return text
+
+
+def _simulator(task: Task, data: Data) -> tuple[ActuatorParameters | None, Path | None]:
+    """Actuators (None: nominal) and residual (None: none)."""
+    if data.resume is not None:
+        for option, given in (("--actuators", data.actuators), ("--residual", data.residual)):
+            if given is not None:
+                raise InputError(f"{option} does not go with --resume, which keeps the simulator; leave one out.")
+        stored = runs.read_config(data.resume, task.name)
+        forces = stored["residual"]
+        return runs.actuators(stored, data.resume), None if forces is None else Path(forces)
+    if data.actuators == NOMINAL:
+        return None, data.residual
+    if data.actuators is not None:
+        return actuators.read(data.actuators)[1], data.residual
+    return None if data.residual is None else residual.Residual.load(data.residual).actuators, data.residual

@@ -1,0 +1,181 @@
+"""Locomotion tasks: what they reward, what their simulators are made of, and the residual's place in them."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from ballu_mjx import envmimic, locomotion, ppo, robot
+from ballu_mjx.envmimic import HISTORY, EnvMimicConfig
+from ballu_mjx.locomotion import LocomotionConfig, LocomotionEnv
+from ballu_mjx.policy import ClosedLoop
+from ballu_mjx.residual import MARGIN, Residual
+from ballu_mjx.robot import ActuatorParameters
+from ballu_mjx.tasks import TASKS, Step
+
+MODEL = robot.load_model()
+INPUTS = 87
+"""Of the residual: three steps of 27 features, and three commands."""
+
+
+def make_residual(action: np.ndarray, width: float = 1e6) -> Residual:
+    """A residual whose policy always answers `action`, and that has seen inputs within plus and minus `width`."""
+    bound = np.full(INPUTS, width, np.float32)
+    return Residual(
+        config=EnvMimicConfig(),
+        params=ppo.Params(ppo.Normalizer(np.zeros(()), {}, {}, {}), None, None),
+        infer=lambda params, seen: jnp.asarray(action, jnp.float32),
+        sample=lambda params, seen, key: jnp.asarray(action, jnp.float32) + jax.random.normal(key, (3,)),
+        observed=(-bound, bound),
+        step=0,
+        actuators=None,
+    )
+
+
+def inner(state) -> Any:
+    return state.pipeline_state
+
+
+PLAIN = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig())
+STEP = jax.jit(PLAIN.step)
+"""Compiled once: what tells one simulator from another travels in the state."""
+
+
+def test_rewards_are_velocities_of_the_task_s_direction():
+    step = Step(jnp.array([0.3, -0.2, 0.1]), jnp.zeros(27), jnp.zeros(2))
+    rewards = {name: float(task.reward(step)) for name, task in TASKS.items()}
+    assert rewards == pytest.approx({"walk": 0.3, "turn": -0.2, "turn-right": 0.2, "walk-backward": -0.3})
+
+
+def test_reward_is_the_mean_velocity_of_the_robot_in_c_mujoco():
+    state = PLAIN.reset(jax.random.key(0))
+    data = mujoco.MjData(MODEL)
+    data.qpos[:] = robot.standing_qpos(MODEL)
+    mujoco.mj_forward(MODEL, data)
+    for number in range(20):
+        before = data.subtree_com[1].copy()
+        action = np.array([1.0, -1.0]) if number % 10 < 5 else np.array([-1.0, 0.2])
+        state = STEP(state, jnp.asarray(action, jnp.float32))
+        data.ctrl[:] = (action + 1) / 2
+        mujoco.mj_step(MODEL, data, round(robot.CONTROL_TIMESTEP / MODEL.opt.timestep))
+        mujoco.mj_forward(MODEL, data)
+        speed = (data.subtree_com[1] - before) / robot.CONTROL_TIMESTEP
+        assert float(state.reward) == pytest.approx(speed[0], abs=0.01)
+    assert np.abs(speed[0]) > 0.02
+
+
+def test_policy_sees_neither_place_nor_direction_but_the_heading():
+    rng = np.random.default_rng(0)
+    seen = rng.normal(size=27).astype(np.float32)
+    yaw, shift = 0.7, np.array([3.0, -2.0, 0.0])
+    turn = np.array(envmimic.heading_rotation(jnp.array(yaw)))
+    vectors = np.concatenate([seen[:6], seen[9:]]).reshape(-1, 3) @ turn.T
+    vectors[::2] += shift
+    moved = np.concatenate([vectors[:2].ravel(), seen[6:9] + [0, 0, yaw], vectors[2:].ravel()]).astype(np.float32)
+    one, other = (np.asarray(locomotion.policy_input(jnp.asarray(x))) for x in (seen, moved))
+    np.testing.assert_allclose(other[:-2], one[:-2], atol=1e-5)
+    np.testing.assert_allclose(other[-2:], [np.cos(seen[8] + yaw), np.sin(seen[8] + yaw)], atol=1e-6)
+
+
+def test_randomization_draws_friction_and_start_and_is_off_by_default():
+    keys = jax.random.split(jax.random.key(1), 200)
+    plain = inner(jax.vmap(PLAIN.reset)(keys))
+    assert np.unique(plain["friction"]).tolist() == pytest.approx([0.9])
+    assert np.ptp(plain["qpos"], axis=0).max() == 0 and np.abs(plain["qvel"]).max() == 0
+
+    config = LocomotionConfig(domain_randomization=True)
+    drawn = inner(jax.vmap(LocomotionEnv(MODEL, TASKS["walk"], config).reset)(keys))
+    low, high = config.friction
+    assert low <= drawn["friction"].min() < low + 0.05 and high - 0.05 < drawn["friction"].max() <= high
+    yaw = np.rad2deg(np.asarray(drawn["history"])[:, -1, 8])
+    assert config.start_yaw * 0.9 < yaw.max() <= config.start_yaw + 1 and yaw.min() < -config.start_yaw * 0.9
+    knees = np.asarray(drawn["qpos"])[:, 7:][:, robot.KNEES]
+    assert (knees >= robot.standing_qpos(MODEL)[7:][robot.KNEES] - 1e-6).all()
+
+
+def test_friction_drawn_is_friction_felt():
+    """A robot thrown along the floor slides further on a smoother one."""
+    state = PLAIN.reset(jax.random.key(0))
+    way = []
+    for friction in (0.2, 1.0):
+        pushed = inner(state) | {"friction": jnp.array(friction), "qvel": inner(state)["qvel"].at[0].set(1.0)}
+        now = dataclasses.replace(state, pipeline_state=pushed)
+        for _ in range(10):
+            now = STEP(now, -jnp.ones(2))
+        way.append(float(inner(now)["history"][-1, 15]))
+    assert way[0] > way[1] + 0.02
+
+
+def test_identified_actuators_are_in_the_simulator_and_pass_from_episode_to_episode():
+    nominal = ActuatorParameters.nominal(MODEL)
+    weak = dataclasses.replace(nominal, torque_limit=nominal.torque_limit * jnp.array([0.1, 1.0]))
+    improved = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(), actuators=weak)
+    reached = []
+    for env in (PLAIN, improved):
+        # Both in the program of one simulator, also after the reset.
+        state = STEP(env.reset(jax.random.key(0)), jnp.ones(2))
+        state = PLAIN.renew(state, jax.random.key(1))
+        for _ in range(20):
+            state = STEP(state, jnp.ones(2))
+        reached.append(np.asarray(inner(state)["qpos"])[7:][robot.MOTORS])
+    left, right = np.rad2deg(reached[0] - reached[1])
+    assert left > 15 and abs(right) < left / 3
+
+
+def test_residual_pushes_in_the_balloon_s_heading_and_only_so_hard():
+    action = np.array([0.5, 0.2, -0.1])
+    env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(), residual=make_residual(action))
+    simulator, config = env.simulator, EnvMimicConfig()
+    qpos = robot.standing_qpos(MODEL)
+    yaw = 2.0
+    qpos[3:7] = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+    state = env.step(
+        env.at(env.setting, jnp.asarray(qpos, jnp.float32), jnp.zeros(12 + 1), jax.random.key(0)), -jnp.ones(2)
+    )
+    force = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]) @ (
+        config.force_scale * action
+    )
+    data = simulator.load(jnp.asarray(qpos, jnp.float32), jnp.zeros(13), jnp.zeros(13))
+    expected = simulator.step(data, jnp.zeros(2), jnp.asarray(force, jnp.float32))
+    np.testing.assert_allclose(inner(state)["qpos"], expected.qpos, atol=1e-6)
+    assert float(state.metrics["force"]) == pytest.approx(np.linalg.norm(force), rel=1e-5)
+
+
+def test_force_fades_outside_of_what_the_residual_has_seen():
+    history = jnp.zeros((HISTORY, 27)).at[-1, 2].set(2.0)  # the balloon's height, alone outside
+    history = history.at[:-1].set(history[-1])
+    commands = jnp.zeros((HISTORY, 2))
+    width = 1.0
+    residual = make_residual(np.array([1.0, 0.0, 0.0]), width)
+    expected = (2.0 - width) / (2 * width) - MARGIN
+    assert float(residual.excess(history, commands)) == pytest.approx(expected, rel=1e-5)
+    assert float(residual.excess(jnp.zeros((HISTORY, 27)), commands)) == 0.0
+
+    forces = []
+    for decay in (0.0, 3.0):
+        config = LocomotionConfig(residual_decay=decay)
+        env = LocomotionEnv(MODEL, TASKS["walk"], config, residual=make_residual(np.array([1.0, 0, 0]), 0.2))
+        qpos = jnp.asarray(robot.standing_qpos(MODEL), jnp.float32)
+        state = env.step(env.at(env.setting, qpos, jnp.zeros(MODEL.nv), jax.random.key(0)), jnp.zeros(2))
+        assert float(state.metrics["outside"]) == 1.0
+        forces.append(float(state.metrics["force"]))
+    assert forces[0] == pytest.approx(EnvMimicConfig().force_scale, rel=1e-5) and forces[1] < 0.5 * forces[0]
+
+
+def test_closed_loop_is_the_environment_step_by_step():
+    env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(domain_randomization=True))
+    infer = lambda gain, seen: gain * jnp.sin(10 * seen[:2])  # noqa: E731
+    loop = ClosedLoop(env, infer)  # pyright: ignore[reportArgumentType]
+    qpos, qvel = loop.standing(2)
+    rollout = loop(jnp.array(0.8), qpos, qvel, 5)  # pyright: ignore[reportArgumentType]
+    state = env.at(env.setting, jnp.asarray(qpos[1]), jnp.asarray(qvel[1]), jax.random.key(0))
+    for number in range(5):
+        action = 0.8 * jnp.sin(10 * jnp.asarray(state.obs)[:2])
+        np.testing.assert_allclose(rollout.command[1, number], (action + 1) / 2, atol=1e-5)
+        state = env.step(state, action)
+        np.testing.assert_allclose(rollout.com[1, number + 1], inner(state)["com"], atol=1e-4)
+    assert rollout.qpos.shape == (2, 6, MODEL.nq)
