@@ -223,12 +223,17 @@ class Story:
 
     def _simulator(self, policy: Policy) -> tuple[ClosedLoop, Setting]:
         """A policy's own simulator; those without residual share one program, whatever the task."""
-        env = policy.environment()
         if policy.residual is not None:
-            return ClosedLoop(env, policy.infer), env.setting
+            return simulator(policy)
         if self._loop is None:
-            self._loop = ClosedLoop(env, policy.infer)
-        return self._loop, env.setting
+            self._loop = simulator(policy)[0]
+        return self._loop, policy.environment().setting
+
+
+def simulator(policy: Policy) -> tuple[ClosedLoop, Setting]:
+    """A policy's own simulator, in closed loop."""
+    env = policy.environment()
+    return ClosedLoop(env, policy.infer), env.setting
 
 
 def _draw(seed: int, task: str, use: str, number: int) -> int:

@@ -69,7 +69,7 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
     check(config)
     if data.keep_every < 1:
         raise InputError(f"--keep-every is {data.keep_every}: it must be 1 or more.")
-    first_step, restored = restored_from(task.name, data, ppo_config)
+    first_step, restored = restored_from(task.name, data.resume, ppo_config, output=data.output, quick=data.quick)
     identified, forces = _simulator(task, data)
     env = policy.environment(task, config, identified, forces)
     folder = data.resume or runs.new_folder(data.output, task.name)

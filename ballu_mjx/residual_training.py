@@ -61,7 +61,7 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     ppo.check(ppo_config, len(devices))
     if data.validate_every < 1:
         raise InputError(f"--validate-every is {data.validate_every}: it must be 1 or more.")
-    first_step, restored = restored_from("envmimic", data, ppo_config)
+    first_step, restored = restored_from("envmimic", data.resume, ppo_config, output=data.output, quick=data.quick)
     files = _choose(data)
     recordings = _read(files)
     identified, where = _actuators(data, files["training"], recordings["training"])

@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from brax.envs.base import Env
 
@@ -19,26 +19,16 @@ from ballu_mjx.ppo import Params, PPOConfig
 from ballu_mjx.runs import Progress, Run
 
 
-class Folders(Protocol):
-    """Options that say where a run goes."""
-
-    @property
-    def output(self) -> Path | None: ...
-    @property
-    def resume(self) -> Path | None: ...
-    @property
-    def quick(self) -> bool: ...
-
-
-def restored_from(task: str, folders: Folders, config: PPOConfig) -> tuple[int, Params | None]:
-    """Step and parameters that training starts from: 0 and None for a new run.
+def restored_from(
+    task: str, folder: Path | None, config: PPOConfig, *, output: Path | None, quick: bool
+) -> tuple[int, Params | None]:
+    """Step and parameters that training starts from: 0 and None for a new run, which `folder` None is.
 
     **Raises** `InputError` where the run to go on with is none, has ended, or does not go with the options.
     """
-    folder = folders.resume
     if folder is None:
         return 0, None
-    for option, given in (("--output", folders.output is not None), ("--quick", folders.quick)):
+    for option, given in (("--output", output is not None), ("--quick", quick)):
         if given:
             raise InputError(f"{option} does not go with --resume, which keeps folder and sizes; leave one out.")
     stored = runs.typed(PPOConfig, runs.read_config(folder, task)["ppo"], folder)

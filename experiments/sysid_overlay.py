@@ -11,8 +11,20 @@
 # %%
 from __future__ import annotations
 
-import argparse
+import subprocess
+import sys
 from pathlib import Path
+
+if "google.colab" in sys.modules:  # install, from a checkout in the current folder
+    if not Path("constraints.txt").exists():
+        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
+    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
+if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
+    sys.argv[1:] = []
+    sys.path[:0] = [".", "experiments"]
+
+# %%
+import argparse
 
 from ballu_mjx import runtime
 

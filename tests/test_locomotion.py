@@ -41,7 +41,7 @@ def inner(state) -> Any:
 
 
 PLAIN = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig())
-STEP = jax.jit(PLAIN.step)
+RESET, STEP = jax.jit(lambda setting, key: PLAIN._start(setting, key)), jax.jit(PLAIN.step)
 """Compiled once: what tells one simulator from another travels in the state."""
 
 
@@ -52,7 +52,7 @@ def test_rewards_are_velocities_of_the_task_s_direction():
 
 
 def test_reward_is_the_mean_velocity_of_the_robot_in_c_mujoco():
-    state = PLAIN.reset(jax.random.key(0))
+    state = RESET(PLAIN.setting, jax.random.key(0))
     data = mujoco.MjData(MODEL)
     data.qpos[:] = robot.standing_qpos(MODEL)
     mujoco.mj_forward(MODEL, data)
@@ -83,12 +83,13 @@ def test_policy_sees_neither_place_nor_direction_but_the_heading():
 
 def test_randomization_draws_friction_and_start_and_is_off_by_default():
     keys = jax.random.split(jax.random.key(1), 200)
-    plain = inner(jax.vmap(PLAIN.reset)(keys))
+    draw = jax.jit(jax.vmap(PLAIN._start, in_axes=(None, 0)))
+    plain = inner(draw(PLAIN.setting, keys))
     assert np.unique(plain["friction"]).tolist() == pytest.approx([0.9])
     assert np.ptp(plain["qpos"], axis=0).max() == 0 and np.abs(plain["qvel"]).max() == 0
 
     config = LocomotionConfig(domain_randomization=True)
-    drawn = inner(jax.vmap(LocomotionEnv(MODEL, TASKS["walk"], config).reset)(keys))
+    drawn = inner(draw(locomotion.setting_of(MODEL, config, None), keys))
     low, high = config.friction
     assert low <= drawn["friction"].min() < low + 0.05 and high - 0.05 < drawn["friction"].max() <= high
     yaw = np.rad2deg(np.asarray(drawn["history"])[:, -1, 8])
@@ -99,10 +100,10 @@ def test_randomization_draws_friction_and_start_and_is_off_by_default():
 
 def test_friction_drawn_is_friction_felt():
     """A robot thrown along the floor slides further on a smoother one."""
-    state = PLAIN.reset(jax.random.key(0))
+    state = RESET(PLAIN.setting, jax.random.key(0))
     way = []
     for friction in (0.2, 1.0):
-        pushed = inner(state) | {"friction": jnp.array(friction), "qvel": inner(state)["qvel"].at[0].set(1.0)}
+        pushed = inner(state) | {"friction": jnp.float32(friction), "qvel": inner(state)["qvel"].at[0].set(1.0)}
         now = dataclasses.replace(state, pipeline_state=pushed)
         for _ in range(10):
             now = STEP(now, -jnp.ones(2))
@@ -113,12 +114,10 @@ def test_friction_drawn_is_friction_felt():
 def test_identified_actuators_are_in_the_simulator_and_pass_from_episode_to_episode():
     nominal = ActuatorParameters.nominal(MODEL)
     weak = dataclasses.replace(nominal, torque_limit=nominal.torque_limit * jnp.array([0.1, 1.0]))
-    improved = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(), actuators=weak)
     reached = []
-    for env in (PLAIN, improved):
-        # Both in the program of one simulator, also after the reset.
-        state = STEP(env.reset(jax.random.key(0)), jnp.ones(2))
-        state = PLAIN.renew(state, jax.random.key(1))
+    for setting in (PLAIN.setting, locomotion.setting_of(MODEL, LocomotionConfig(), weak)):
+        state = STEP(RESET(setting, jax.random.key(0)), jnp.ones(2))
+        state = RESET(inner(state)["setting"], jax.random.key(1))
         for _ in range(20):
             state = STEP(state, jnp.ones(2))
         reached.append(np.asarray(inner(state)["qpos"])[7:][robot.MOTORS])
@@ -155,27 +154,29 @@ def test_force_fades_outside_of_what_the_residual_has_seen():
     assert float(residual.excess(history, commands)) == pytest.approx(expected, rel=1e-5)
     assert float(residual.excess(jnp.zeros((HISTORY, 27)), commands)) == 0.0
 
+    far, key = history, jax.random.key(0)
     forces = []
     for decay in (0.0, 3.0):
-        config = LocomotionConfig(residual_decay=decay)
-        env = LocomotionEnv(MODEL, TASKS["walk"], config, residual=make_residual(np.array([1.0, 0, 0]), 0.2))
-        qpos = jnp.asarray(robot.standing_qpos(MODEL), jnp.float32)
-        state = env.step(env.at(env.setting, qpos, jnp.zeros(MODEL.nv), jax.random.key(0)), jnp.zeros(2))
-        assert float(state.metrics["outside"]) == 1.0
-        forces.append(float(state.metrics["force"]))
-    assert forces[0] == pytest.approx(EnvMimicConfig().force_scale, rel=1e-5) and forces[1] < 0.5 * forces[0]
+        env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(residual_decay=decay), residual=residual)
+        force, excess = env._force(far, commands, key)
+        assert float(excess) == pytest.approx(expected, rel=1e-5)
+        forces.append(float(jnp.linalg.norm(force)))
+    assert forces[0] == pytest.approx(EnvMimicConfig().force_scale, rel=1e-5)
+    assert forces[1] == pytest.approx(forces[0] * np.exp(-3.0 * expected), rel=1e-5)
 
 
 def test_closed_loop_is_the_environment_step_by_step():
-    env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(domain_randomization=True))
-    infer = lambda gain, seen: gain * jnp.sin(10 * seen[:2])  # noqa: E731
-    loop = ClosedLoop(env, infer)  # pyright: ignore[reportArgumentType]
-    qpos, qvel = loop.standing(2)
-    rollout = loop(jnp.array(0.8), qpos, qvel, 5)  # pyright: ignore[reportArgumentType]
-    state = env.at(env.setting, jnp.asarray(qpos[1]), jnp.asarray(qvel[1]), jax.random.key(0))
+    infer = lambda params, seen: params.value * jnp.sin(10 * seen[:2])  # noqa: E731
+    params = ppo.Params(ppo.Normalizer(np.zeros(()), {}, {}, {}), None, np.float32(0.8))
+    loop = ClosedLoop(PLAIN, infer)
+    setting = locomotion.setting_of(MODEL, LocomotionConfig(domain_randomization=True), None)
+    start = inner(RESET(setting, jax.random.key(3)))
+    qpos, qvel = (np.stack([np.asarray(inner(PLAIN.reset(jax.random.key(0)))[x]), start[x]]) for x in ("qpos", "qvel"))
+    rollout = loop(params, qpos, qvel, 5, setting)
+    state = jax.jit(PLAIN.at)(setting, jnp.asarray(qpos[1]), jnp.asarray(qvel[1]), jax.random.key(0))
     for number in range(5):
         action = 0.8 * jnp.sin(10 * jnp.asarray(state.obs)[:2])
         np.testing.assert_allclose(rollout.command[1, number], (action + 1) / 2, atol=1e-5)
-        state = env.step(state, action)
+        state = STEP(state, action)
         np.testing.assert_allclose(rollout.com[1, number + 1], inner(state)["com"], atol=1e-4)
     assert rollout.qpos.shape == (2, 6, MODEL.nq)

@@ -1,0 +1,97 @@
+# %% [markdown]
+# # Actuators: identified, non-linear, another one on each side
+#
+# Section "Actuator System Identification" of the paper. Commands reach BALLU's knees through a servo, a cable and a
+# spring; friction, saturation and slack make of this a curve that the ideal simulator does not have. The paper holds 20
+# commands spread over [0, 1], measures the angles of both motors and both knees, and moves eight parameters of the
+# simulator until its four curves lie on the measured ones: directed Hausdorff distance between fitted polynomials,
+# L-BFGS-B. Its figure shows the four curves against the command.
+#
+# Here on the bundled sweep of the virtual robot, hung up by its base, with ten parameters (a torque limit a leg is
+# added) and least squares over all angles; the README tells why, and what the paper's objective gives instead.
+#
+# `python experiments/actuator_curves.py` takes about two minutes, most of it compiling; `--quick` fits settled angles
+# alone, from fewer starts.
+
+# %%
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+if "google.colab" in sys.modules:  # install, from a checkout in the current folder
+    if not Path("constraints.txt").exists():
+        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
+    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
+if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
+    sys.argv[1:] = []
+    sys.path[:0] = [".", "experiments"]
+
+# %%
+import argparse
+import dataclasses
+import json
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+from ballu_mjx import actuator_fit, runs  # noqa: E402
+from ballu_mjx.errors import InputError  # noqa: E402
+from ballu_mjx.identification import IdentificationConfig  # noqa: E402
+
+OUTPUT, QUICK_OUTPUT = Path("runs/actuator-curves"), Path("runs/actuator-curves-quick")
+FIGURE = "actuator_curves.png"
+"""The last file that an identification writes."""
+
+# %% [markdown]
+# ## Identify
+#
+# The work is the package's: `python -m ballu_mjx.train sysid` does the same, with every option at hand.
+
+
+# %%
+def identify(folder: Path, config: IdentificationConfig) -> None:
+    """Identify from the bundled sweep and print the table; where `folder` has the result already, print that one.
+
+    **Raises** `InputError` where `folder` holds something else.
+    """
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        actuator_fit.fit(actuator_fit.SweepData(output=folder), config)
+        return
+    found = runs.read_config(folder, "sysid")["fit"]
+    mend = "delete it, or give --output another folder"
+    if found != json.loads(json.dumps(dataclasses.asdict(config))):
+        raise InputError(f"{folder}: was made with other options (--quick, or not); {mend}.")
+    if not (folder / FIGURE).exists():
+        raise InputError(f"{folder}: its identification was interrupted; {mend}.")
+    print((folder / "identification.txt").read_text())
+
+
+# %% [markdown]
+# ## All of it: table and figure
+#
+# Dots are measured, lines are the nominal and the identified simulator. A command lifts the motor's arm and bends the
+# knee; where the servo is at its limit, curves flatten.
+
+
+# %%
+def main() -> None:
+    parser = argparse.ArgumentParser(description="The paper's figure of the actuators, from the bundled sweep.")
+    parser.add_argument(
+        "--output", type=Path, help=f"folder of the identification ({OUTPUT}, or {QUICK_OUTPUT} under --quick)"
+    )
+    parser.add_argument("--quick", action="store_true", help="settled angles alone, from fewer starts")
+    options = parser.parse_args()
+    folder = options.output or (QUICK_OUTPUT if options.quick else OUTPUT)
+    identify(folder, IdentificationConfig(**actuator_fit.QUICK if options.quick else {}))
+    print(f"Figure: {folder / FIGURE}")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,156 @@
+# %% [markdown]
+# # Which of the robot's effects cost a policy its way?
+#
+# The virtual robot differs from the training simulators in several ways at once: air (drag, lift, added mass), a
+# balloon cluster off centre, actuators that differ left to right, latency, draughts. Here policies of a finished
+# `python -m ballu_mjx.train all` walk on robots that lack one of these effects at a time, and on robots that have that
+# one alone. What a setting gains where an effect is missing is what this effect costs it.
+#
+# `python experiments/robot_effects.py --output runs/all` takes a few minutes; stages that are missing are made first.
+
+# %%
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+import numpy as np  # noqa: E402
+
+from ballu_mjx import pipeline, robot, trials, virtual_robot  # noqa: E402
+from ballu_mjx.policy import Policy  # noqa: E402
+from ballu_mjx.transfer import Transfer  # noqa: E402
+from ballu_mjx.virtual_robot import Trial, VirtualRobot  # noqa: E402
+
+# %% [markdown]
+# ## The effects, each as what takes it away
+
+# %%
+NOMINAL = robot.ActuatorParameters.nominal(robot.load_model())
+
+
+def pair(values: object) -> tuple[float, float]:
+    """Left and right."""
+    left, right = np.asarray(values, float)
+    return float(left), float(right)
+
+
+def without_actuators(full: VirtualRobot) -> VirtualRobot:
+    """Nominal springs, stops and servos, without friction, backlash or slack."""
+    return dataclasses.replace(
+        full,
+        knee_spring_stiffness=pair(NOMINAL.knee_spring_stiffness),
+        default_knee_angle=pair(NOMINAL.default_knee_angle),
+        motor_gain=pair(NOMINAL.motor_gain),
+        default_motor_angle=pair(NOMINAL.default_motor_angle),
+        torque_limit=pair(NOMINAL.torque_limit),
+        knee_friction=(0.0, 0.0),
+        motor_friction=(0.0, 0.0),
+        backlash=(0.0, 0.0),
+        cable_slack=(robot.CABLE_SLACK, robot.CABLE_SLACK),
+    )
+
+
+def without_drag(full: VirtualRobot) -> VirtualRobot:
+    """No fluid forces but added mass: the ellipsoid that the air sees shrinks to nothing."""
+    return dataclasses.replace(full, balloon_semi_axes=(1e-3, 1e-3, 1e-3))
+
+
+EFFECTS: dict[str, Callable[[VirtualRobot], VirtualRobot]] = {
+    "added mass": lambda full: dataclasses.replace(full, added_mass=0.0, added_inertia=0.0),
+    "drag and lift": without_drag,
+    "balloon offset": lambda full: dataclasses.replace(full, balloon_offset=(0.0, 0.0, 0.0)),
+    "actuators": without_actuators,
+    "latency": lambda full: dataclasses.replace(full, latency=0.0),
+    "floor": lambda full: dataclasses.replace(full, foot_friction=(0.9, 0.9), buoyancy=0.84),
+}
+"""By what they are called: a robot, to the same robot without the effect. The floor's friction and the exact lift,
+which differ little, go together."""
+
+
+def variants(full: VirtualRobot) -> dict[str, VirtualRobot]:
+    """The whole robot, each effect taken away, each effect alone, and none."""
+    none = full
+    for remove in EFFECTS.values():
+        none = remove(none)
+    found = {"all effects": full}
+    found |= {f"without {name}": remove(full) for name, remove in EFFECTS.items()}
+    for name in EFFECTS:
+        alone = full
+        for other, remove in EFFECTS.items():
+            alone = alone if other == name else remove(alone)
+        found[f"{name} alone"] = alone
+    return found | {"none": none}
+
+
+# %% [markdown]
+# ## Trials
+
+
+# %%
+def still(trial: Trial) -> Trial:
+    """The same trial without a draught: it would blur what the effects do."""
+    return dataclasses.replace(trial, draught=(0.0, 0.0, 0.0), draught_swing=(0.0, trial.draught_swing[1]))
+
+
+def measure(policy: Policy, robots: dict[str, VirtualRobot], count: int, folder: Path) -> dict[str, list[Transfer]]:
+    """Trials of a policy on every variant."""
+    loop, setting = pipeline.simulator(policy)
+    draws = [still(virtual_robot.draw_trial(5_000_000 + number)) for number in range(count)]
+    results = {}
+    for name, variant in robots.items():
+        place = folder / name.replace(" ", "-")
+        place.mkdir(parents=True, exist_ok=True)
+        results[name] = trials.run(policy, variant, draws, place, loop, setting)
+    return results
+
+
+def table(results: dict[str, dict[str, list[Transfer]]], quantity: str, label: str) -> str:
+    """Markdown: means over trials, and the spread."""
+    lines = [f"| {label} | " + " | ".join(results) + " |", "| --- " + "| ---: " * len(results) + "|"]
+    for name in next(iter(results.values())):
+        cells = []
+        for transfers in results.values():
+            values = [getattr(t, quantity) for t in transfers[name]]
+            cells.append(f"{np.mean(values):.2f} ± {np.std(values):.2f}")
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+# %% [markdown]
+# ## All of it
+
+
+# %%
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Which of the virtual robot's effects cost a policy its way.")
+    parser.add_argument("--output", type=Path, default=Path("runs/all"), help="folder of `train all`")
+    parser.add_argument("--robot", type=int, default=0, help="the robot that `train all` ran on")
+    parser.add_argument("--seed", type=int, default=0, help="whose policies")
+    parser.add_argument("--task", default="walk", choices=("walk", "turn"))
+    parser.add_argument("--settings", nargs="+", default=list(pipeline.SETTINGS), choices=pipeline.SETTINGS)
+    parser.add_argument("--trials", type=int, default=3, help="trials of each policy on each robot")
+    arguments = parser.parse_args()
+    story = pipeline.Story(pipeline.Options(output=arguments.output, robot=arguments.robot), arguments.seed)
+    robots = variants(virtual_robot.draw_robot(arguments.robot))
+    folder = arguments.output / f"effects-{arguments.task}-seed-{arguments.seed}"
+    results = {}
+    for setting in arguments.settings:
+        policy = Policy.load(story.policy(arguments.task, setting))
+        results[setting] = measure(policy, robots, arguments.trials, folder / setting)
+    distance, label = ("x_distance", "x-distance (m)") if arguments.task == "walk" else ("y_distance", "y-distance (m)")
+    text = table(results, distance, label) + "\n\n" + table(results, "com_error", "mean CoM error (m)")
+    plain = {s: {n: [t.to_json() for t in found] for n, found in by.items()} for s, by in results.items()}
+    (folder / "effects.json").write_text(json.dumps(plain, indent=2) + "\n")
+    (folder / "effects.md").write_text(text + "\n")
+    print(f"\n{text}\n\nWritten to {folder}.")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,249 @@
+# %% [markdown]
+# # Snapshots of the robot: without and with residual physics
+#
+# Section "Improved Sim-to-real Transfer" of the paper, its last two figures: photographs of one trial of a policy on
+# the robot, walking forward (at 0, 5, 11, 16 and 24 s) and turning left (at 0, 4, 10, 18 and 22 s). The policy in the
+# top row was trained with identified actuators and domain randomization, that in the bottom row with EnvMimic's forces
+# besides. In the paper the first turns away and the second walks twice as far.
+#
+# Here the virtual robot's recordings take the camera's place: each is reconstructed into states of the model, and the
+# model is drawn from one fixed place, so that all pictures of a task have the same scale.
+#
+# `python experiments/snapshots.py` needs the trials of `python -m ballu_mjx.train all` (or of
+# `experiments/table_walking.py` and `experiments/table_turning.py`, which run it); drawing takes a minute.
+
+# %%
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+if "google.colab" in sys.modules:  # install, from a checkout in the current folder
+    if not Path("constraints.txt").exists():
+        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
+    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
+if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
+    sys.argv[1:] = []
+    sys.path[:0] = [".", "experiments"]
+
+# %%
+import argparse
+import dataclasses
+from collections.abc import Sequence
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+from jaxtyping import Float  # noqa: E402
+from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+from mpl_toolkits.mplot3d.axes3d import Axes3D  # noqa: E402
+
+from ballu_mjx import pipeline, plots, reconstruction, recording, robot  # noqa: E402
+from ballu_mjx.errors import InputError  # noqa: E402
+
+TIMES = {"walk": (0.0, 5.0, 11.0, 16.0, 24.0), "turn": (0.0, 4.0, 10.0, 18.0, 22.0)}
+"""When the paper's pictures were taken (s)."""
+SETTINGS = ("vanilla+sysid+dr", "envmimic")
+"""Rows, from top to bottom."""
+COLOURS = {"left": "#1f77b4", "right": "#d64d1f", "frame": "#26262b", "balloon": "#b9bdc6"}
+"""Legs as in the model."""
+VIEW = {"walk": (14.0, -72.0), "turn": (14.0, -38.0)}
+"""Where the camera stands: elevation and azimuth (deg). Walking goes to the right, turning to the back."""
+
+# %% [markdown]
+# ## One trial, as states
+#
+# Inverse kinematics on the recorded markers gives the model's pose at every control step. The path is the centre of
+# mass's; the yaw is the balloons', without jumps.
+
+
+# %%
+@dataclasses.dataclass(frozen=True)
+class Shown:
+    """A trial on the robot."""
+
+    setting: str
+    qpos: Float[np.ndarray, "states nq"]
+    com: Float[np.ndarray, "states 3"]
+    """m, world."""
+    yaw: Float[np.ndarray, " states"]
+    """rad, world."""
+
+    def state(self, time: float) -> int:
+        """The state nearest to `time` (s), which may be after the last by the samples that a recording's end loses."""
+        return min(round(time / robot.CONTROL_TIMESTEP), len(self.qpos) - 1)
+
+
+def read_trial(run: Path, task: str, setting: str, seed: int, trial: int, until: float) -> Shown:
+    """A trial in the folder `run` of `train all`.
+
+    **Raises** `InputError` where it is not there, or ends before `until` (s).
+    """
+    path = run / f"seed-{seed}" / f"trials-{task}-{setting}" / f"trial-{trial}.csv.gz"
+    if not path.exists():
+        raise InputError(
+            f"{path}: there is no such trial; make it with `python -m ballu_mjx.train all --output {run} --tasks "
+            f"{task} --seeds {seed}`, or name one that is there by --run, --tasks, --settings, --seed and --trial."
+        )
+    model = robot.load_model()
+    motion = reconstruction.reconstruct(recording.read_recording(path), model)
+    if motion.time[-1] < until - 0.5:
+        raise InputError(f"{path}: ends at {motion.time[-1]:.1f} s, before {until:g} s; name earlier --times.")
+    data = mujoco.MjData(model)
+    com, yaw = [], []
+    for state in motion.qpos:
+        place(model, data, state)
+        com.append(data.subtree_com[1].copy())
+        yaw.append(np.arctan2(data.body("balloon").xmat[3], data.body("balloon").xmat[0]))
+    return Shown(setting, motion.qpos, np.array(com), np.unwrap(yaw))
+
+
+def place(model: mujoco.MjModel, data: mujoco.MjData, qpos: Float[np.ndarray, " nq"]) -> None:
+    """Bring `data` to `qpos`, as far as drawing needs it."""
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+
+
+# %% [markdown]
+# ## The drawing: sticks for legs, the model's own ellipsoids for balloons
+
+
+# %%
+def draw_robot(axis: Axes3D, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """The robot in `data`; a shadow of the balloons on the floor tells where it stands."""
+    for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_ELLIPSOID):
+        surface = ellipsoid(data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom])
+        axis.plot_surface(
+            *surface, color=COLOURS["balloon"], alpha=0.22, linewidth=0, rcount=14, ccount=22, shade=True, zorder=3
+        )
+        angle = np.linspace(0, 2 * np.pi, 30)
+        x, y = data.geom_xpos[geom, :2, None] + 0.15 * np.array([np.cos(angle), np.sin(angle)])
+        axis.plot(x, y, 0.0, color="grey", linewidth=0.5, alpha=0.35, zorder=1)
+    hips = [data.body(f"femur_{side}").xpos for side in robot.SIDES]
+    stick(axis, hips, COLOURS["frame"], 3.0)
+    stick(axis, [data.site("base").xpos, data.site("balloon").xpos], COLOURS["frame"], 0.9)
+    for side, hip in zip(robot.SIDES, hips, strict=True):
+        foot = data.site(f"foot_{side}").xpos
+        stick(axis, [hip, data.body(f"tibia_{side}").xpos, foot], COLOURS[side], 2.2)
+        axis.plot(*foot[:, None], "o", color=COLOURS[side], markersize=3.5, zorder=6)
+
+
+def stick(axis: Axes3D, points: Sequence[Float[np.ndarray, " 3"]], colour: str, width: float) -> None:
+    """A line through `points`, with round joints."""
+    axis.plot(*np.array(points).T, color=colour, linewidth=width, solid_capstyle="round", zorder=5)
+
+
+def ellipsoid(
+    centre: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"], radii: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, "3 n m"]:
+    """Points of its surface on a grid of longitude and latitude."""
+    longitude, latitude = np.meshgrid(np.linspace(0, 2 * np.pi, 23), np.linspace(0, np.pi, 15))
+    sphere = [np.cos(longitude) * np.sin(latitude), np.sin(longitude) * np.sin(latitude), np.cos(latitude)]
+    return centre[:, None, None] + np.einsum("ij,jnm->inm", rotation * radii, np.array(sphere))
+
+
+def draw(trials: Sequence[Shown], times: Sequence[float], view: tuple[float, float], path: Path) -> None:
+    """A row a trial, a column a time; the way so far in the setting's colour, the whole of it in grey.
+
+    Titles: x, y and yaw since the start, as in the paper's tables.
+    """
+    model = robot.load_model()
+    data = mujoco.MjData(model)
+    low, high = limits(trials, times)
+    figure = Figure(figsize=(3.2 * len(times), 4.0 * len(trials)))
+    axes = figure.subplots(len(trials), len(times), subplot_kw={"projection": "3d"}, squeeze=False)
+    figure.subplots_adjust(left=0.02, right=1.0, bottom=0.01, top=0.93, wspace=0.0, hspace=0.12)
+    for row, trial in zip(axes, trials, strict=True):
+        for axis, time in zip(row, times, strict=True):
+            state = trial.state(time)
+            place(model, data, trial.qpos[state])
+            stage(axis, low, high, view)
+            floor = np.column_stack([trial.com[:, :2], np.zeros(len(trial.com))])
+            axis.plot(*floor.T, color="grey", linewidth=0.8, alpha=0.6, zorder=2)
+            axis.plot(*floor[: state + 1].T, color=plots.COLOURS[trial.setting], linewidth=1.8, zorder=2)
+            draw_robot(axis, model, data)
+            x, y, _ = trial.com[state] - trial.com[0]
+            turned = np.rad2deg(trial.yaw[state] - trial.yaw[0])
+            axis.set_title(f"t = {time:g} s\nx {x:+.2f} m, y {y:+.2f} m, yaw {turned:+.0f} deg", fontsize=9.5, y=0.97)
+        box = row[0].get_position()
+        label, colour = plots.LABELS[trial.setting], plots.COLOURS[trial.setting]
+        middle = (box.y0 + box.y1) / 2
+        figure.text(0.008, middle, label, rotation=90, va="center", color=colour, fontsize=13, fontweight="bold")
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=120)
+
+
+def limits(trials: Sequence[Shown], times: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a box on the floor that holds every way and all of the robot beside it (m)."""
+    ways = np.concatenate([trial.com[: trial.state(max(times)) + 1, :2] for trial in trials])
+    margin = 0.35  # half a robot's width
+    low, high = np.floor(10 * (ways.min(axis=0) - margin)) / 10, np.ceil(10 * (ways.max(axis=0) + margin)) / 10
+    return np.array([*low, 0.0]), np.array([*high, 1.5])
+
+
+def stage(axis: Axes3D, low: Float[np.ndarray, " 3"], high: Float[np.ndarray, " 3"], view: tuple[float, float]) -> None:
+    """The floor with a grid of half a metre, seen from `view`; one scale along all axes."""
+    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axis.set_box_aspect(tuple(high - low), zoom=1.25)
+    axis.view_init(*view)
+    axis.set_proj_type("persp", focal_length=0.6)
+    axis.set_axis_off()
+    axis.computed_zorder = False
+    corners = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]], [low[0], low[1]]])
+    axis.plot(*corners.T, 0.0, color="grey", linewidth=0.8, zorder=0)
+    for coordinate in range(2):
+        for value in np.arange(np.ceil(2 * low[coordinate]) / 2, high[coordinate], 0.5):
+            line = np.zeros((2, 3))
+            line[:, coordinate] = value
+            line[:, 1 - coordinate] = low[1 - coordinate], high[1 - coordinate]
+            strong = abs(value) < 1e-9
+            axis.plot(*line.T, color="grey", linewidth=0.8 if strong else 0.5, alpha=0.9 if strong else 0.4, zorder=0)
+
+
+# %% [markdown]
+# ## All of it
+
+
+# %%
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description="The paper's snapshots, from a finished folder of `train all`.")
+    parser.add_argument("--run", type=Path, default=Path("runs/all"), help="folder of `train all` (runs/all)")
+    parser.add_argument("--tasks", nargs="+", choices=list(TIMES), default=list(TIMES), help="a figure each (both)")
+    parser.add_argument(
+        "--settings", nargs="+", choices=pipeline.SETTINGS, default=list(SETTINGS), help="a row each (the paper's two)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="which training (0)")
+    parser.add_argument("--trial", type=int, default=1, help="which trial of it (1, the first)")
+    parser.add_argument("--times", type=float, nargs="+", help="s, a column each (the paper's)")
+    parser.add_argument("--output", type=Path, help="folder for snapshots_TASK.png (that of --run)")
+    return parser.parse_args()
+
+
+def main() -> None:
+    options = parse()
+    if options.times and min(options.times) < 0:
+        raise InputError(f"--times has {min(options.times):g}: give seconds from the start, 0 or more.")
+    folder = options.output or options.run
+    for task in options.tasks:
+        times = options.times or TIMES[task]
+        trials = [
+            read_trial(options.run, task, setting, options.seed, options.trial, max(times))
+            for setting in options.settings
+        ]
+        folder.mkdir(parents=True, exist_ok=True)
+        draw(trials, times, VIEW[task], folder / f"snapshots_{task}.png")
+        print(f"Written to {folder / f'snapshots_{task}.png'}.")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,121 @@
+"""What Tables I and II share: the options of both scripts, and the figure of the robot's ways from above."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ballu_mjx import pipeline, plots, recording
+from ballu_mjx.errors import InputError
+
+OUTPUT, QUICK_OUTPUT = Path("runs/all"), Path("runs/all-quick")
+"""Folders of the stages. Two, so that trying `--quick` sets no training of hours aside."""
+_SEED_STYLES = ("-", "--", ":", "-.")
+_SMALLEST_EXTENT = 0.4
+"""Least width and height (m) of a panel."""
+
+Way = Float[np.ndarray, "samples 2"]
+
+
+def options(description: str, task: str) -> tuple[pipeline.Options, bool]:
+    """The command line of a table's script, and whether nothing but the figure is asked for."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="trainings of every policy (0 1 2)")
+    parser.add_argument("--robot", type=int, default=0, help="which virtual robot stands in for the hardware (0)")
+    parser.add_argument(
+        "--output", type=Path, help=f"folder of `train all`'s stages ({OUTPUT}, or {QUICK_OUTPUT} under --quick)"
+    )
+    parser.add_argument("--quick", action="store_true", help="train for seconds; the numbers mean nothing")
+    parser.add_argument("--figure-only", action="store_true", help="draw from the trials that are there; run nothing")
+    given = parser.parse_args()
+    output = given.output or (QUICK_OUTPUT if given.quick else OUTPUT)
+    chosen = pipeline.Options(
+        output=output,
+        robot=given.robot,
+        seeds=tuple(given.seeds),
+        tasks=(task,),  # pyright: ignore[reportArgumentType]  # a literal at every call
+        quick=given.quick,
+    )
+    return chosen, given.figure_only
+
+
+def read_ways(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[list[Way]]]:
+    """The base's way from above (m), `[setting][seed][trial]`, from where it started; settings that all seeds have.
+
+    **Raises** `InputError` where `folder` holds no such trials.
+    """
+    found = {}
+    for setting in pipeline.SETTINGS:
+        trials = [folder / f"seed-{seed}" / f"trials-{task}-{setting}" for seed in seeds]
+        if all(_finished(trial) for trial in trials):
+            found[setting] = [[_way(path) for path in sorted(trial.glob("trial-*.csv.gz"))] for trial in trials]
+    if not found:
+        numbers = " ".join(map(str, seeds))
+        raise InputError(
+            f"{folder}: no setting has finished trials of {task!r} for all of the seeds {numbers}; make them with "
+            f"`python -m ballu_mjx.train all --output {folder} --tasks {task} --seeds {numbers}`."
+        )
+    return found
+
+
+def _finished(trials: Path) -> bool:
+    """Whether `trials` is a stage that came to its end."""
+    mark = trials.with_name(trials.name + ".stage.json")
+    return mark.is_file() and bool(json.loads(mark.read_text())["done"])
+
+
+def _way(path: Path) -> Way:
+    base = recording.read_recording(path).base_position
+    if base is None:  # only in suspended recordings
+        raise InputError(f"{path}: has no base position; it is no recording of a trial, take it out of the folder.")
+    return base[:, :2] - base[0, :2]
+
+
+def draw(ways: dict[str, list[list[Way]]], seeds: Sequence[int], path: Path) -> None:
+    """One panel a setting, all to one scale: a line a trial, a dash pattern a seed, a dot where the robot ends."""
+    low, high = _limits(np.concatenate([way for runs in ways.values() for trials in runs for way in trials]))
+    width, height = high - low
+    columns = 2 if len(ways) > 2 and width > 1.3 * height else len(ways)
+    rows = -(-len(ways) // columns)
+    panel = 12.0 / max(columns, 2)
+    figure = Figure(figsize=(panel * columns, panel * rows * height / width + 0.7 * rows + 0.4), layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for axis in axes.flat[len(ways) :]:
+        axis.set_axis_off()
+    for axis, (setting, runs) in zip(axes.flat, ways.items(), strict=False):
+        axis.axhline(0.0, color="grey", linewidth=0.8)
+        axis.axvline(0.0, color="grey", linewidth=0.8)
+        for index, (seed, trials) in enumerate(zip(seeds, runs, strict=True)):
+            for trial, way in enumerate(trials):
+                style = _SEED_STYLES[index % len(_SEED_STYLES)]
+                label = f"seed {seed}" if not trial else None
+                axis.plot(*way.T, style, color=plots.COLOURS[setting], linewidth=1.2, alpha=0.85, label=label)
+                axis.plot(*way[-1], "o", color=plots.COLOURS[setting], markersize=4)
+        axis.plot(0.0, 0.0, "o", color="black", markersize=5)
+        axis.set(title=plots.LABELS[setting], xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        axis.set_aspect("equal")
+        axis.grid(alpha=0.3)
+        if len(seeds) > 1:
+            axis.legend(fontsize="small")
+    for axis in axes[-1]:
+        axis.set_xlabel("x (m)")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("y (m)")
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=120)
+
+
+def _limits(points: Way) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
+    """Corners of what is shown: all points and a margin, no narrower or flatter than is good to look at."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = np.maximum(1.1 * (high - low), _SMALLEST_EXTENT)
+    size = np.maximum(size, 0.4 * size.max())
+    middle = (low + high) / 2
+    return middle - size / 2, middle + size / 2

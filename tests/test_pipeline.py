@@ -1,0 +1,88 @@
+"""Stages of the whole story: kept, found again, redone where something changed."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ballu_mjx import pipeline
+from ballu_mjx.errors import InputError
+from ballu_mjx.pipeline import Options
+
+
+class Interrupted(Exception):
+    pass
+
+
+def story(root: Path, options: dict[str, int], stop_at: str | None = None) -> list[str]:
+    """Three stages in a row, each needing the one before; returns which of them were made."""
+    made: list[str] = []
+
+    def make(name: str) -> Path:
+        def write(folder: Path) -> None:
+            (folder / "begun").touch()
+            if name == stop_at:
+                raise Interrupted
+            made.append(name)
+            (folder / "result").write_text(str(options[name]))
+
+        needs = [] if name == "a" else [make(chr(ord(name) - 1))]
+        return pipeline._stage(root / name, {"value": options[name]}, needs, write)
+
+    make("c")
+    return made
+
+
+def test_finished_stages_are_found_again(tmp_path):
+    assert story(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["a", "b", "c"]
+    assert story(tmp_path, {"a": 1, "b": 2, "c": 3}) == []
+
+
+def test_an_interrupted_story_goes_on_where_it_was(tmp_path):
+    with pytest.raises(Interrupted):
+        story(tmp_path, {"a": 1, "b": 2, "c": 3}, stop_at="b")
+    assert (tmp_path / "b" / "begun").exists()
+    assert story(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["b", "c"]
+
+
+def test_a_changed_option_redoes_what_depends_on_it_and_loses_nothing(tmp_path):
+    story(tmp_path, {"a": 1, "b": 2, "c": 3})
+    assert story(tmp_path, {"a": 1, "b": 20, "c": 3}) == ["b", "c"]
+    assert (tmp_path / "b" / "result").read_text() == "20"
+    aside = [path for path in tmp_path.glob("b.*") if path.is_dir()]
+    assert [(path / "result").read_text() for path in aside] == ["2"]
+
+
+def test_stages_without_a_key_are_never_taken_for_finished(tmp_path):
+    story(tmp_path, {"a": 1, "b": 2, "c": 3})
+    mark = tmp_path / "b.stage.json"
+    content = json.loads(mark.read_text())
+    mark.write_text(json.dumps(content | {"done": False}))
+    assert story(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["b"]
+
+
+def test_trials_of_all_settings_meet_the_same_draughts_and_no_two_are_alike():
+    draws = [
+        pipeline._draw(seed, task, use, number)
+        for seed in (0, 1)
+        for task in ("walk", "turn")
+        for use in ("recordings", "trials")
+        for number in range(10)
+    ]
+    assert len(set(draws)) == len(draws)
+    assert pipeline._draw(0, "walk", "trials", 3) == pipeline._draw(0, "walk", "trials", 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"trials": 0}, "--trials is 0"),
+        ({"policy_steps": -5}, "--policy-steps is -5"),
+        ({"seeds": ()}, "at least one seed"),
+        ({"tasks": ()}, "--tasks is empty"),
+    ],
+)
+def test_options_out_of_range_are_refused_before_anything_is_written(options, words, tmp_path):
+    with pytest.raises(InputError, match=words):
+        pipeline.run(Options(output=tmp_path / "out", **options))
+    assert not (tmp_path / "out").exists()
