@@ -41,7 +41,8 @@ _QUANTITIES = ("x (m)", "y (m)", "yaw (deg)")
 _DOTS_PER_INCH = 120
 _SIDE_COLOURS = ("#1f77b4", "#d64d1f")
 """Left and right, as in the model."""
-_STANCE_HEIGHT = 0.01
+_STANCE_HEIGHT, _STANCE_SPEED = 0.012, 0.1
+"""A planted foot's greatest height (m) and horizontal speed (m/s)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,7 +128,8 @@ def gait(
     path: Path, qpos: Float[np.ndarray, "states nq"], command: Float[np.ndarray, "steps 2"], *, start: float = 6.0
 ) -> None:
     """What a gait looks like: a strip of stick figures from the side, one every quarter of a second; the feet's heights
-    and the commands over time, stance (foot within a centimetre of the floor) marked; the way from above.
+    and the commands over time, stance marked (a foot near the floor and at rest; a swinging foot may graze the floor);
+    the way from above.
 
     Strip and time plots show eight seconds from `start` (s) on; all are at the control rate.
     """
@@ -136,6 +138,8 @@ def gait(
     first = min(round(start / period), max(len(qpos) - 2, 0))
     shown = slice(first, min(first + round(8.0 / period), len(command)))
     time = np.arange(len(qpos)) * period
+    speed = np.linalg.norm(np.gradient(feet[..., :2], period, axis=0), axis=-1)
+    planted = (feet[..., 2] < _STANCE_HEIGHT) & (speed < _STANCE_SPEED)
     figure = Figure(figsize=(12.0, 10.0), layout="constrained")
     strip, heights, commands, above = figure.subplots(4, 1, height_ratios=(1.6, 1.0, 1.0, 1.4))
     for state in range(shown.start, shown.stop, round(0.25 / period)):
@@ -149,7 +153,7 @@ def gait(
     for leg, side in enumerate(SIDES):
         height = feet[shown, leg, 2]
         heights.plot(time[shown], height, color=_SIDE_COLOURS[leg], label=side)
-        stance = np.where(height < _STANCE_HEIGHT, -0.01 - 0.01 * leg, np.nan)
+        stance = np.where(planted[shown, leg], -0.01 - 0.01 * leg, np.nan)
         heights.plot(time[shown], stance, color=_SIDE_COLOURS[leg], linewidth=3)
         commands.plot(time[shown], command[shown, leg], color=_SIDE_COLOURS[leg])
     heights.set_ylabel("height of foot (m)")
@@ -158,7 +162,7 @@ def gait(
     commands.set_xlabel("time (s)")
     above.plot(com[:, 0], com[:, 1], color="black", label="centre of mass")
     for leg, side in enumerate(SIDES):
-        down = feet[feet[:, leg, 2] < _STANCE_HEIGHT, leg]
+        down = feet[planted[:, leg], leg]
         above.plot(down[:, 0], down[:, 1], ".", color=_SIDE_COLOURS[leg], markersize=3, label=f"{side} foot, stance")
     above.set_aspect("equal", adjustable="datalim")
     above.set_xlabel("x (m)")

@@ -41,6 +41,8 @@ import numpy as np  # noqa: E402
 from jaxtyping import Float  # noqa: E402
 from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
+from mpl_toolkits.mplot3d import proj3d  # noqa: E402
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # noqa: E402
 from mpl_toolkits.mplot3d.axes3d import Axes3D  # noqa: E402
 
 from ballu_mjx import pipeline, plots, reconstruction, recording, robot  # noqa: E402
@@ -54,6 +56,11 @@ COLOURS = {"left": "#1f77b4", "right": "#d64d1f", "frame": "#26262b", "balloon":
 """Legs as in the model."""
 VIEW = {"walk": (14.0, -72.0), "turn": (14.0, -38.0)}
 """Where the camera stands: elevation and azimuth (deg). Walking goes to the right, turning to the back."""
+
+WIDTH, HEIGHT = 4.0, 3.6
+"""Largest size of a picture (inches)."""
+TOP = 1.5
+"""Height (m) that the balloons do not reach."""
 
 # %% [markdown]
 # ## One trial, as states
@@ -122,9 +129,11 @@ def draw_robot(axis: Axes3D, model: mujoco.MjModel, data: mujoco.MjData) -> None
         axis.plot_surface(
             *surface, color=COLOURS["balloon"], alpha=0.22, linewidth=0, rcount=14, ccount=22, shade=True, zorder=3
         )
-        angle = np.linspace(0, 2 * np.pi, 30)
-        x, y = data.geom_xpos[geom, :2, None] + 0.15 * np.array([np.cos(angle), np.sin(angle)])
-        axis.plot(x, y, 0.0, color="grey", linewidth=0.5, alpha=0.35, zorder=1)
+        angle = np.linspace(0, 2 * np.pi, 40)
+        x, y = data.geom_xpos[geom, :2, None] + model.geom_size[geom, 0] * np.array([np.cos(angle), np.sin(angle)])
+        shadow = Poly3DCollection([np.column_stack([x, y, np.zeros(len(angle))])], facecolor="black", alpha=0.05)
+        axis.add_collection3d(shadow)
+        shadow.set_zorder(1)
     hips = [data.body(f"femur_{side}").xpos for side in robot.SIDES]
     stick(axis, hips, COLOURS["frame"], 3.0)
     stick(axis, [data.site("base").xpos, data.site("balloon").xpos], COLOURS["frame"], 0.9)
@@ -156,27 +165,56 @@ def draw(trials: Sequence[Shown], times: Sequence[float], view: tuple[float, flo
     model = robot.load_model()
     data = mujoco.MjData(model)
     low, high = limits(trials, times)
-    figure = Figure(figsize=(3.2 * len(times), 4.0 * len(trials)))
-    axes = figure.subplots(len(trials), len(times), subplot_kw={"projection": "3d"}, squeeze=False)
-    figure.subplots_adjust(left=0.02, right=1.0, bottom=0.01, top=0.93, wspace=0.0, hspace=0.12)
-    for row, trial in zip(axes, trials, strict=True):
-        for axis, time in zip(row, times, strict=True):
+    corners = [(x, y, 0.0) for x in (low[0], high[0]) for y in (low[1], high[1])]
+    balloons = [trial.com[trial.state(time)] * (1, 1, 0) + (0, 0, TOP) for trial in trials for time in times]
+    left, right, bottom, top = extent(low, high, view, np.array(corners + balloons))
+    side = min(WIDTH / (right - left), HEIGHT / (top - bottom))
+    cell = np.array([max(side * (right - left), 2.6) + 0.1, side * (top - bottom) + 0.7])
+    size = cell * (len(times), len(trials)) + (0.4, 0.1)
+    figure = Figure(figsize=(size[0], size[1]))
+    for row, trial in enumerate(trials):
+        corner = np.array([0.4, size[1] - cell[1] * (row + 1)])
+        label, colour = plots.LABELS[trial.setting], plots.COLOURS[trial.setting]
+        middle = (corner[1] + (cell[1] - 0.5) / 2) / size[1]
+        figure.text(
+            0.2 / size[0], middle, label, rotation=90, ha="center", va="center", color=colour, size=13, weight="bold"
+        )
+        for column, time in enumerate(times):
+            centre = corner + (cell[0] * (column + 0.5), (cell[1] - 0.5) / 2)
+            origin = (centre - side * np.array([left + right, bottom + top]) / 2) / size
+            axis = figure.add_axes((*origin, *(side / size)), projection="3d")
+            assert isinstance(axis, Axes3D)
             state = trial.state(time)
             place(model, data, trial.qpos[state])
             stage(axis, low, high, view)
             floor = np.column_stack([trial.com[:, :2], np.zeros(len(trial.com))])
             axis.plot(*floor.T, color="grey", linewidth=0.8, alpha=0.6, zorder=2)
-            axis.plot(*floor[: state + 1].T, color=plots.COLOURS[trial.setting], linewidth=1.8, zorder=2)
+            axis.plot(*floor[: state + 1].T, color=colour, linewidth=1.8, zorder=2)
             draw_robot(axis, model, data)
             x, y, _ = trial.com[state] - trial.com[0]
             turned = np.rad2deg(trial.yaw[state] - trial.yaw[0])
-            axis.set_title(f"t = {time:g} s\nx {x:+.2f} m, y {y:+.2f} m, yaw {turned:+.0f} deg", fontsize=9.5, y=0.97)
-        box = row[0].get_position()
-        label, colour = plots.LABELS[trial.setting], plots.COLOURS[trial.setting]
-        middle = (box.y0 + box.y1) / 2
-        figure.text(0.008, middle, label, rotation=90, va="center", color=colour, fontsize=13, fontweight="bold")
+            title = f"t = {time:g} s\nx {x:.2f} m, y {y:.2f} m, yaw {turned:.0f} deg"
+            place_x, place_y = np.array([centre[0], corner[1] + cell[1] - 0.08]) / size
+            figure.text(place_x, place_y, title, ha="center", va="top", size=9.5)
     FigureCanvasAgg(figure)
     figure.savefig(path, dpi=120)
+
+
+def extent(
+    low: Float[np.ndarray, " 3"],
+    high: Float[np.ndarray, " 3"],
+    view: tuple[float, float],
+    points: Float[np.ndarray, "n 3"],
+) -> tuple[float, float, float, float]:
+    """Left, right, bottom and top of `points` on the stage from `low` to `high`, in sides of the (square) axes."""
+    figure = Figure(figsize=(1.0, 1.0))
+    axis = figure.add_axes((0.0, 0.0, 1.0, 1.0), projection="3d")
+    assert isinstance(axis, Axes3D)
+    stage(axis, low, high, view)
+    xs, ys, zs = points.T
+    x, y, _ = proj3d.proj_transform(xs, ys, zs, axis.get_proj())
+    seen = axis.transData.transform(np.column_stack([x, y])) / axis.bbox.width
+    return seen[:, 0].min(), seen[:, 0].max(), seen[:, 1].min(), seen[:, 1].max()
 
 
 def limits(trials: Sequence[Shown], times: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
@@ -184,16 +222,18 @@ def limits(trials: Sequence[Shown], times: Sequence[float]) -> tuple[np.ndarray,
     ways = np.concatenate([trial.com[: trial.state(max(times)) + 1, :2] for trial in trials])
     margin = 0.35  # half a robot's width
     low, high = np.floor(10 * (ways.min(axis=0) - margin)) / 10, np.ceil(10 * (ways.max(axis=0) + margin)) / 10
-    return np.array([*low, 0.0]), np.array([*high, 1.5])
+    return np.array([*low, 0.0]), np.array([*high, TOP])
 
 
 def stage(axis: Axes3D, low: Float[np.ndarray, " 3"], high: Float[np.ndarray, " 3"], view: tuple[float, float]) -> None:
     """The floor with a grid of half a metre, seen from `view`; one scale along all axes."""
     axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axis.set_box_aspect(tuple(high - low), zoom=1.25)
+    # Small enough that nothing is cut off at the axes' edges. (Pyright takes zoom for the int that its default is.)
+    axis.set_box_aspect(tuple(high - low), zoom=0.85)  # pyright: ignore[reportArgumentType]
     axis.view_init(*view)
-    axis.set_proj_type("persp", focal_length=0.6)
+    axis.set_proj_type("persp", focal_length=1.0)
     axis.set_axis_off()
+    axis.patch.set_visible(False)  # it would hide the neighbour
     axis.computed_zorder = False
     corners = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]], [low[0], low[1]]])
     axis.plot(*corners.T, 0.0, color="grey", linewidth=0.8, zorder=0)

@@ -84,30 +84,32 @@ def draw(ways: dict[str, list[list[Way]]], seeds: Sequence[int], path: Path) -> 
     width, height = high - low
     columns = 2 if len(ways) > 2 and width > 1.3 * height else len(ways)
     rows = -(-len(ways) // columns)
-    panel = 12.0 / max(columns, 2)
-    figure = Figure(figsize=(panel * columns, panel * rows * height / width + 0.7 * rows + 0.4), layout="constrained")
+    panel = 12.0 / max(columns, 3)
+    size = (panel * columns + 0.4, ((panel - 0.2) * height / width + 0.35) * rows + (0.75 if len(seeds) > 1 else 0.4))
+    figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    styles = [_SEED_STYLES[index % len(_SEED_STYLES)] for index in range(len(seeds))]
     for axis in axes.flat[len(ways) :]:
         axis.set_axis_off()
     for axis, (setting, runs) in zip(axes.flat, ways.items(), strict=False):
         axis.axhline(0.0, color="grey", linewidth=0.8)
         axis.axvline(0.0, color="grey", linewidth=0.8)
-        for index, (seed, trials) in enumerate(zip(seeds, runs, strict=True)):
-            for trial, way in enumerate(trials):
-                style = _SEED_STYLES[index % len(_SEED_STYLES)]
-                label = f"seed {seed}" if not trial else None
-                axis.plot(*way.T, style, color=plots.COLOURS[setting], linewidth=1.2, alpha=0.85, label=label)
+        for style, trials in zip(styles, runs, strict=True):
+            for way in trials:
+                axis.plot(*way.T, style, color=plots.COLOURS[setting], linewidth=1.2, alpha=0.85)
                 axis.plot(*way[-1], "o", color=plots.COLOURS[setting], markersize=4)
         axis.plot(0.0, 0.0, "o", color="black", markersize=5)
         axis.set(title=plots.LABELS[setting], xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axis.set_aspect("equal")
         axis.grid(alpha=0.3)
-        if len(seeds) > 1:
-            axis.legend(fontsize="small")
     for axis in axes[-1]:
         axis.set_xlabel("x (m)")
     for axis in axes[:, 0]:
         axis.set_ylabel("y (m)")
+    if len(seeds) > 1:
+        for seed, style in zip(seeds, styles, strict=True):
+            axes[0, 0].plot([], [], style, color="black", label=f"seed {seed}")
+        figure.legend(loc="outside lower center", ncols=len(seeds))
     FigureCanvasAgg(figure)
     figure.savefig(path, dpi=120)
 

@@ -92,7 +92,6 @@ def test_evaluate_repeats_the_same_numbers(trained: Path):
 def test_interrupted_run_goes_on_where_it_stopped(trained: Path):
     folder = trained.parent
     line = [sys.executable, "-m", "ballu_mjx.train", "envmimic", "--recordings", "data", "--output", "stopped"]
-    line += ["--actuators", "nominal"]
     line += ["--num-timesteps", str(400 * STEPS), "--validate-every", str(400 * STEPS), "--seed", "5", *SIZES]
     metrics = folder / "stopped" / "metrics.jsonl"
 
@@ -111,14 +110,17 @@ def test_interrupted_run_goes_on_where_it_stopped(trained: Path):
     assert stop == before[-1]["step"] > 0
 
     total = stop + 2 * STEPS
+    beside = folder / "data" / actuators.NAME
+    hidden = beside.rename(beside.with_suffix(".hidden"))  # a run keeps the actuators it began with
     done = command("train", "envmimic", "--resume", "stopped", "--num-timesteps", total, folder=folder)
+    hidden.rename(beside)
     assert done.returncode == 0, done.stderr
     after = runs.read_metrics(folder / "stopped")
     assert after[: len(before)] == before
     assert [row["step"] for row in after if "reward" in row] == list(range(STEPS, total + STEPS, STEPS))
     config = json.loads((folder / "stopped" / "config.json").read_text())
     assert config["ppo"]["seed"] == 5 and config["ppo"]["num_envs"] == 8  # given once, kept
-    assert config["actuators"] is None  # likewise
+    assert config["actuators"] == json.loads(beside.read_text())["parameters"]  # likewise
     assert len(config["starts"]) == 2
     assert runs.restore(folder / "stopped", "last")[0] == total
 
