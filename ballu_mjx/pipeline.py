@@ -86,13 +86,19 @@ def run(options: Options) -> int:
         for task in options.tasks:
             for setting in settings:
                 results[task][setting].append(story.transfers(task, setting))
-    text = "\n\n".join(f"### {task}\n\n{TABLES[task](results[task])}" for task in options.tasks)
-    (options.output / "tables.md").write_text(text + "\n", encoding="utf-8")
-    print(f"\n{text}\n")
+    for task in options.tasks:
+        text = TABLES[task](results[task])
+        table_file(options.output, task).write_text(text + "\n", encoding="utf-8")
+        print(f"\n### {task}\n\n{text}\n")
     if options.quick:
         print("These numbers mean nothing: --quick trains for seconds.")
     print(f"Written to {options.output}. {time.perf_counter() - started:.0f} s in all.")
     return 0
+
+
+def table_file(output: Path, task: str) -> Path:
+    """Where the table of a task is written."""
+    return output / f"table-{task}.md"
 
 
 class Story:

@@ -58,9 +58,9 @@ def new_folder(output: Path | None, task: str) -> Path:
     if output.exists() and not output.is_dir():
         raise InputError(f"{output}: is a file; give --output a folder that is new or empty.")
     if output.exists() and any(output.iterdir()):
-        mend = f"--resume {output} goes on with it, or give --output another folder"
-        if not (output / _CONFIG).exists():
-            mend = "give --output a folder that is new or empty"
+        mend = "give --output a folder that is new or empty"
+        if (output / "checkpoints").is_dir():
+            mend = f"--resume {output} goes on with it, or give --output another folder"
         raise InputError(f"{output}: the folder is not empty; {mend}.")
     return output
 
@@ -185,7 +185,7 @@ class Run:
         self._metrics = (folder / _METRICS).open("a", encoding="utf-8")
         purge = None if resumed_at is None else resumed_at + 1
         self._tensorboard = SummaryWriter(str(folder / "tensorboard"), purge_step=purge)
-        self._checkpoints = _manager(folder)
+        self._manager: ocp.CheckpointManager | None = None
 
     def __enter__(self) -> Run:
         return self
@@ -193,7 +193,8 @@ class Run:
     def __exit__(self, *exception: object) -> None:
         self._metrics.close()
         self._tensorboard.close()
-        self._checkpoints.close()
+        if self._manager is not None:
+            self._manager.close()
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
         """Add a line of measurements at `step`."""
@@ -210,11 +211,13 @@ class Run:
 
         `score`: validation error, the smallest is the best; None where there is none.
         """
-        if step in self._checkpoints.all_steps():
+        if self._manager is None:
+            self._manager = _manager(self.folder)
+        if step in self._manager.all_steps():
             return
         metrics = None if score is None else {"score": score if math.isfinite(score) else _NO_SCORE}
-        self._checkpoints.save(step, args=ocp.args.StandardSave(dict(tree)), metrics=metrics)
-        self._checkpoints.wait_until_finished()
+        self._manager.save(step, args=ocp.args.StandardSave(dict(tree)), metrics=metrics)
+        self._manager.wait_until_finished()
 
     def write(self, name: str, text: str) -> None:
         """Write a text file into the folder."""

@@ -34,8 +34,6 @@ if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a co
     sys.path[:0] = [".", "experiments"]
 
 # %%
-import shutil
-
 from ballu_mjx import runtime
 
 runtime.prepare()
@@ -55,10 +53,8 @@ from ballu_mjx.errors import InputError  # noqa: E402
 # %%
 def table(options: pipeline.Options) -> Path:
     """Run what is missing, print the table; the file that holds it."""
-    path = options.output / "table_turning.md"
     pipeline.run(options)
-    shutil.copyfile(options.output / "tables.md", path)  # which the next task writes over
-    return path
+    return pipeline.table_file(options.output, "turn")
 
 
 # %% [markdown]

@@ -263,3 +263,44 @@ def test_transients_make_more_known(noiseless: Sweep, identifier: identification
         assert max(d.standard_error for d in moving_fit.directions) < max(
             d.standard_error for d in still_fit.directions
         )
+
+
+def test_what_a_sweep_leaves_open_is_named_and_held_near_nominal(
+    physics: identification.Physics, identifier: identification.Identifier
+) -> None:
+    """Servos that never saturate say nothing about where they would."""
+    strong = [vector(HIGH), vector(HIGH)]
+    settled = np.moveaxis(rest(physics, *strong)[:, :, physics.leg.angles], 0, -1)
+    sweep = dataclasses.replace(blank(), settled=settled, transient=np.moveaxis(moving(physics, *strong), 0, -1))
+    identifier.config = IdentificationConfig(draws=32)
+    limit = NAMES.index("torque_limit")
+    for fit in identifier.run(noisy(sweep, 0, np.deg2rad(0.1)), lambda *_: None).fits:
+        assert len(fit.open_directions) == 1
+        assert abs(fit.open_directions[0].weights[limit]) > 0.95
+        nominal = identification.nominal_leg()[limit]
+        assert fit.vector[limit] == pytest.approx(nominal, rel=0.2)
+        # What is known is found all the same.
+        for index in set(range(len(NAMES))) - {limit}:
+            assert fit.vector[index] == pytest.approx(strong[0][index], rel=0.05, abs=np.deg2rad(0.5)), NAMES[index]
+
+
+def test_the_papers_objective_is_lower_where_it_is_what_is_minimized(
+    noiseless: Sweep, identifier: identification.Identifier
+) -> None:
+    sweep = dataclasses.replace(
+        noiseless, settled=noiseless.settled + np.random.default_rng(0).normal(size=(20, 2, 2)) * np.deg2rad(1.0)
+    )
+    distances = {}
+    for objective in ("pointwise", "hausdorff"):
+        identifier.config = IdentificationConfig(objective=objective, transients=False, draws=32)
+        result = identifier.run(sweep, lambda *_: None)
+        assert result.config.objective == objective
+        distances[objective] = sum(
+            float(
+                np.sum(
+                    identification.curve_distances(COMMANDS, result.settled[..., leg], sweep.settled[..., leg], 7)[0]
+                )
+            )
+            for leg in range(2)
+        )
+    assert distances["hausdorff"] < 0.98 * distances["pointwise"]
