@@ -246,7 +246,7 @@ def test_standard_errors_are_honest(noiseless: Sweep, identifier: identification
     """With 0.5 deg of noise, nine in ten estimates within two standard errors."""
     identifier.config = IdentificationConfig(draws=32, steps=12)
     within = []
-    for seed in range(6):
+    for seed in range(4):
         result = identifier.run(noisy(noiseless, seed), lambda *_: None)
         for fit, truth in zip(result.fits, TRUTH, strict=True):
             within += list(np.abs(fit.vector - truth) < 2 * fit.standard_errors)
@@ -268,11 +268,11 @@ def test_transients_make_more_known(noiseless: Sweep, identifier: identification
 def test_what_a_sweep_leaves_open_is_named_and_held_near_nominal(
     physics: identification.Physics, identifier: identification.Identifier
 ) -> None:
-    """Servos that never saturate say nothing about where they would."""
+    """At rest, servos that never saturate say nothing about where they would (moving, they do)."""
     strong = [vector(HIGH), vector(HIGH)]
     settled = np.moveaxis(rest(physics, *strong)[:, :, physics.leg.angles], 0, -1)
     sweep = dataclasses.replace(blank(), settled=settled, transient=np.moveaxis(moving(physics, *strong), 0, -1))
-    identifier.config = IdentificationConfig(draws=32)
+    identifier.config = IdentificationConfig(transients=False, draws=16, steps=12)
     limit = NAMES.index("torque_limit")
     for fit in identifier.run(noisy(sweep, 0, np.deg2rad(0.1)), lambda *_: None).fits:
         assert len(fit.open_directions) == 1
@@ -292,7 +292,7 @@ def test_the_papers_objective_is_lower_where_it_is_what_is_minimized(
     )
     distances = {}
     for objective in ("pointwise", "hausdorff"):
-        identifier.config = IdentificationConfig(objective=objective, transients=False, draws=32)
+        identifier.config = IdentificationConfig(objective=objective, transients=False, draws=16, steps=15)
         result = identifier.run(sweep, lambda *_: None)
         assert result.config.objective == objective
         distances[objective] = sum(
