@@ -64,7 +64,7 @@ class Options:
     """Recordings of each sequence of actions, each in a draught of its own."""
     policy_steps: int = 1_500_000
     """Control steps to train each policy for."""
-    residual_steps: int = 2_000_000
+    residual_steps: int = 1_500_000
     """Control steps to train each EnvMimic for."""
     quick: bool = False
     """Every stage within five minutes in all, for one task and two simulators; the tables mean nothing."""

@@ -25,16 +25,18 @@ from ballu_mjx.tasks import Task
 defaults = functools.partial(
     PPOConfig,
     **{
-        "num_timesteps": 1_500_000,
+        "num_timesteps": 3_000_000,
         "learning_rate": 3e-4,
-        "discounting": 0.97,
-        "reward_scaling": 10.0,
+        "desired_kl": 0.02,
+        "discounting": 0.985,
+        "gae_lambda": 0.97,
+        "reward_scaling": 7.0,
         "initial_std": 0.7,
         "entropy_cost": 1e-3,
         "averaging": 5,
     },
 )
-"""`PPOConfig` for locomotion: rewards are of the order of 0.1 m/s, and a stride lasts a second."""
+"""`PPOConfig` for locomotion: rewards are of the order of 0.1 m/s, and a turn pays only after seconds."""
 QUICK: Mapping[str, Any] = {"num_timesteps": 60_000, "num_envs": 256, "batch_size": 128}
 """Defaults of `PPOConfig` under `--quick`."""
 NOMINAL = Path("nominal")
@@ -57,7 +59,7 @@ class Data:
     ppo given beside it change these. --num-timesteps counts from the run's start."""
     quick: bool = False
     """See everything work within two minutes; the policy will not walk."""
-    keep_every: int = 300_000
+    keep_every: int = 500_000
     """Control steps between two checkpoints; the last three are kept."""
 
 
