@@ -33,6 +33,8 @@ CURVE_SAMPLES = 200
 """Points at which the curves are compared (paper)."""
 NAMES = tuple(field.name for field in dataclasses.fields(ActuatorParameters))
 """A leg's parameters, in the order of a vector."""
+_STRONG = 0.9
+"""Correlations beyond this are named."""
 _DEGREE = float(np.pi / 180)
 
 
@@ -773,6 +775,13 @@ def table(sweep: Sweep, result: Identification) -> str:
                 f"Least determined, {side}: {_in_words(weakest, result.config)}, to {weakest.standard_error:.0%} of "
                 "what robots differ by."
             )
+        names = _free_names(result.config)
+        pairs = [(fit.correlations[i, j], i, j) for i in range(len(names)) for j in range(i)]
+        strong = [f"{names[j]} with {names[i]} {r:+.2f}" for r, i, j in pairs if abs(r) > _STRONG]
+        if strong:
+            lines.append(f"Strongly correlated, {side}: {', '.join(strong).replace('_', ' ')}.")
+        same = int(np.sum(fit.losses < 1.01 * fit.losses[0] + 1e-12))
+        lines.append(f"Starts, {side}: {same} of {len(fit.losses)} ended within 1 % of the best sum of squares.")
     return "\n".join(lines)
 
 
@@ -783,14 +792,21 @@ def details(result: Identification, source: Any) -> dict[str, Any]:
             name: [float(f"{fit.standard_errors[index]:.3g}") for fit in result.fits]
             for index, name in enumerate(NAMES)
         },
+        "correlations": {
+            "parameters": list(_free_names(result.config)),
+            **{side: np.round(fit.correlations, 3).tolist() for side, fit in zip(SIDES, result.fits, strict=True)},
+        },
         "delay": [None if fit.delay is None else round(fit.delay, 4) for fit in result.fits],
         "source": source,
     }
 
 
+def _free_names(config: IdentificationConfig) -> tuple[str, ...]:
+    return tuple(name for name in NAMES if config.torque_limit or name != "torque_limit")
+
+
 def _in_words(direction: Direction, config: IdentificationConfig) -> str:
     """The parameters that make up most of a direction, with their signs."""
-    free = [name for name in NAMES if config.torque_limit or name != "torque_limit"]
-    parts = [(w, n) for w, n in zip(direction.weights, free, strict=True) if abs(w) > 0.3]
+    parts = [(w, n) for w, n in zip(direction.weights, _free_names(config), strict=True) if abs(w) > 0.3]
     ordered = sorted(parts, key=lambda part: -abs(part[0]))
     return " ".join(f"{w:+.2f} {name.replace('_', ' ')}" for w, name in ordered)

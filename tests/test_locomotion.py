@@ -126,21 +126,20 @@ def test_identified_actuators_are_in_the_simulator_and_pass_from_episode_to_epis
 
 
 def test_residual_pushes_in_the_balloon_s_heading_and_only_so_hard():
-    action = np.array([0.5, 0.2, -0.1])
+    action, yaw = np.array([0.5, 0.2, -0.1]), 2.0
     env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(), residual=make_residual(action))
-    simulator, config = env.simulator, EnvMimicConfig()
+    simulator, zeros = env.simulator, jnp.zeros(MODEL.nv)
     qpos = robot.standing_qpos(MODEL)
-    yaw = 2.0
     qpos[3:7] = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
-    state = env.step(
-        env.at(env.setting, jnp.asarray(qpos, jnp.float32), jnp.zeros(12 + 1), jax.random.key(0)), -jnp.ones(2)
-    )
-    force = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]) @ (
-        config.force_scale * action
-    )
-    data = simulator.load(jnp.asarray(qpos, jnp.float32), jnp.zeros(13), jnp.zeros(13))
-    expected = simulator.step(data, jnp.zeros(2), jnp.asarray(force, jnp.float32))
-    np.testing.assert_allclose(inner(state)["qpos"], expected.qpos, atol=1e-6)
+    qpos = jnp.asarray(qpos, jnp.float32)
+    state = jax.jit(lambda qpos: env.step(env.at(env.setting, qpos, zeros, jax.random.key(0)), -jnp.ones(2)))(qpos)
+
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    force = turn @ (EnvMimicConfig().force_scale * action)
+    pushed = jax.jit(lambda force: simulator.step(simulator.load(qpos, zeros, zeros), jnp.zeros(2), force))
+    expected = pushed(jnp.asarray(force, jnp.float32))
+    np.testing.assert_allclose(inner(state)["qvel"], expected.qvel, atol=1e-5)
+    assert np.abs(np.asarray(expected.qvel - pushed(jnp.zeros(3)).qvel)).max() > 1e-3
     assert float(state.metrics["force"]) == pytest.approx(np.linalg.norm(force), rel=1e-5)
 
 
