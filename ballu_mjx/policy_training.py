@@ -93,7 +93,7 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
             session.train(env, remaining, restored, first_step)
         except KeyboardInterrupt:
             print(f"To go on: python -m ballu_mjx.train {task.name} --resume {folder}", file=sys.stderr)
-            return 130
+            return session.exit_status
 
     steps, rewards = runs.column(folder, "reward")
     plots.reward_curve(folder / "learning_curve.png", steps, rewards, setting)

@@ -101,7 +101,7 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
             session.train(env, remaining, restored, first_step)
         except KeyboardInterrupt:
             print(f"To go on: python -m ballu_mjx.train envmimic --resume {folder}", file=sys.stderr)
-            return 130
+            return session.exit_status
 
     best_step, params = evaluate.load_params(folder, "best")
     evaluate.learning_curve(folder, best_step)

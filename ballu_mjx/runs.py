@@ -20,13 +20,18 @@ import time
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TextIO, TypeVar
+from typing import IO, Any, Literal, TextIO, TypeVar
 
 import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 from tensorboardX import SummaryWriter
 from tqdm import tqdm
+
+try:
+    import fcntl
+except ImportError:  # Windows, where runs are not locked
+    fcntl = None
 
 from ballu_mjx import actuators as actuator_files
 from ballu_mjx import robot
@@ -37,7 +42,7 @@ FORMAT = "ballu-run/1"
 KEPT = 3
 """Latest checkpoints that are kept."""
 
-_CONFIG, _METRICS = "config.json", "metrics.jsonl"
+_CONFIG, _METRICS, _LOCK = "config.json", "metrics.jsonl", ".lock"
 _BUNDLED = "bundled:"
 _NO_SCORE = 1e30
 _PACKAGES = ("ballu-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "optimistix", "numpy")
@@ -173,10 +178,13 @@ class Run:
     def __init__(self, folder: Path, config: Mapping[str, Any], *, resumed_at: int | None = None) -> None:
         """Open `folder`, new unless `resumed_at` says at which control step an old run goes on.
 
+        **Raises** `InputError` where another process has it open.
+
         What an old run measured after that step is dropped: it will be measured again.
         """
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
+        self._lock = _locked(folder / _LOCK)
         if resumed_at is not None:
             kept = [row for row in read_metrics(folder) if row["step"] <= resumed_at]
             _write(folder / _METRICS, "".join(json.dumps(row) + "\n" for row in kept))
@@ -193,6 +201,7 @@ class Run:
     def __exit__(self, *exception: object) -> None:
         self._metrics.close()
         self._tensorboard.close()
+        self._lock.close()
         if self._manager is not None:
             self._manager.close()
 
@@ -329,6 +338,20 @@ class Stages:
         """Leave the last bar as it stands."""
         if self._bar is not None:
             self._bar.close()
+
+
+def _locked(path: Path) -> IO[str]:
+    """The file at `path`, open and locked; the system gives the lock up with its owner, however that ends."""
+    file = path.open("a", encoding="utf-8")
+    if fcntl is not None:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.close()
+            raise InputError(
+                f"{path.parent}: another process is writing to this run; wait for it, or give --output another folder."
+            ) from error
+    return file
 
 
 def _manager(folder: Path) -> ocp.CheckpointManager:

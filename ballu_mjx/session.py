@@ -18,6 +18,9 @@ from ballu_mjx.errors import InputError
 from ballu_mjx.ppo import Params, PPOConfig
 from ballu_mjx.runs import Progress, Run
 
+_DIVERGED = 1e-3
+"""Share of control steps in which physics may break down before the user is told."""
+
 
 def restored_from(
     task: str, folder: Path | None, config: PPOConfig, *, output: Path | None, quick: bool
@@ -49,8 +52,8 @@ def restored_from(
 class Session:
     """One stretch of training."""
 
-    interrupted = False
-    """Set by a signal handler: the next finished training step is the last."""
+    interrupted: int | None = None
+    """The signal that came, set by its handler: the next finished training step is the last."""
 
     def __init__(
         self,
@@ -66,12 +69,14 @@ class Session:
         self._every, self._kept_at = keep_every, kept_at
         self._score: float | None = None
         self._last: tuple[int, Params, Mapping[str, float]] | None = None
+        self._warned = False
         self._started = time.perf_counter()
 
     def train(self, env: Env, config: PPOConfig, restored: Params | None, first_step: int) -> None:
         """Train `env`, from `restored` parameters at `first_step` on where there are any.
 
-        **Raises** `KeyboardInterrupt` after Ctrl-C, the last parameters saved.
+        **Raises** `KeyboardInterrupt` after SIGINT (Ctrl-C) or SIGTERM, the last parameters saved, and `InputError`
+        where learning broke down, with the last good checkpoint named.
         """
         try:
             with self._interrupts_noted():
@@ -89,7 +94,27 @@ class Session:
             raise
         self._progress.close()
 
+    @property
+    def exit_status(self) -> int:
+        """A shell's for the signal that ended the training."""
+        return 128 + (self.interrupted or signal.SIGINT)
+
     def _step_done(self, step: int, params: Params, metrics: dict[str, float]) -> None:
+        if not all(math.isfinite(value) for value in metrics.values()):
+            self._progress.close()
+            broken = ", ".join(name for name, value in metrics.items() if not math.isfinite(value))
+            raise InputError(
+                f"Learning broke down before step {step:,}: {broken} is not a number any more. The last good "
+                f"checkpoint is that of step {self._kept_at:,}; go on from it with --resume and a smaller "
+                "--learning-rate, or look for recordings or options that throw the robot about."
+            )
+        if metrics.get("diverged", 0.0) > _DIVERGED and not self._warned:
+            self._warned = True
+            print(
+                f"Physics diverged in {metrics['diverged']:.2%} of the control steps (these robots were reset); the "
+                "forces or starting states are too violent for the simulator's time step.",
+                file=sys.stderr,
+            )
         self._last = (step, params, metrics)
         if metrics:
             self._run.log(step, metrics | {"seconds": time.perf_counter() - self._started})
@@ -113,22 +138,23 @@ class Session:
 
     @contextlib.contextmanager
     def _interrupts_noted(self) -> Iterator[None]:
-        """Let the first Ctrl-C end training after its current step; the second interrupts at once, as ever.
+        """Let the first SIGINT or SIGTERM end training after its current step; the second interrupts at once.
 
-        An exception raised wherever Python happens to be can land in a callback of JAX's that swallows it.
+        An exception raised wherever Python happens to be can land in a callback of JAX's that swallows it. Handlers
+        that are somebody else's stay, and so do signals that are ignored, as in the background of a shell.
         """
-        before = signal.getsignal(signal.SIGINT)
-        if before != signal.default_int_handler:
-            yield  # somebody else's, or ignored in the background of a shell
-            return
 
-        def note(*_: Any) -> None:
+        def note(number: int, frame: Any) -> None:
             if self.interrupted:
                 raise KeyboardInterrupt
-            self.interrupted = True
+            self.interrupted = number
 
-        signal.signal(signal.SIGINT, note)
+        standard = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+        ours = {number: old for number, old in standard.items() if signal.getsignal(number) == old}
+        for number in ours:
+            signal.signal(number, note)
         try:
             yield
         finally:
-            signal.signal(signal.SIGINT, before)
+            for number, old in ours.items():
+                signal.signal(number, old)
