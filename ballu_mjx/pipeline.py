@@ -9,6 +9,7 @@ an interrupted run goes on where it was, and a changed option redoes what depend
 from __future__ import annotations
 
 import dataclasses
+import gc
 import hashlib
 import json
 import shutil
@@ -17,6 +18,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
 import numpy as np
 
 from ballu_mjx import (
@@ -276,6 +278,9 @@ def _stage(folder: Path, options: Any, needs: Sequence[Path], make: Callable[[Pa
     _write_mark(mark, key, content, done=False)
     make(folder)
     _write_mark(mark, key, content, done=True)
+    # Programs of a stage stay mapped otherwise, until the process has no map left.
+    jax.clear_caches()
+    gc.collect()
     return folder
 
 
