@@ -49,6 +49,9 @@ class LocomotionConfig:
     residual_decay: float = 0.0
     """How fast the residual's force fades where its observation leaves the range seen in its training: it is
     multiplied by exp(-decay x excess), the excess in widths of that range. 0: not at all."""
+    outside_cost: float = 0.0
+    """Reward (m/s) lost per width of that range by which the residual's observation leaves it: keeps the policy where
+    the residual knows what it does, which a policy paid for speed otherwise leaves. 0: nothing."""
 
 
 def setting_name(config: LocomotionConfig, identified: bool, residual: bool) -> str:
@@ -61,7 +64,7 @@ def setting_name(config: LocomotionConfig, identified: bool, residual: bool) -> 
 Setting = dict[str, Any]
 """What tells one simulator from another, as arrays; see `setting_of`."""
 OBSERVATIONS = 28
-_METRICS = ("velocity_x", "velocity_y", "force", "outside", "diverged")
+_METRICS = ("velocity_x", "velocity_y", "force", "outside", "excess", "diverged")
 
 
 def policy_input(features: Float[Array, " 27"]) -> Float[Array, " 28"]:
@@ -135,7 +138,8 @@ class LocomotionEnv(Env):
         last: Array = s["history"][-1]
         features, com = jnp.where(finite, features, last), jnp.where(finite, com, before)
         velocity = (com - before) / ballu.CONTROL_TIMESTEP
-        reward = jnp.where(finite, self.task.reward(Step(velocity, features, command)), 0.0)
+        earned = self.task.reward(Step(velocity, features, command)) - self.config.outside_cost * excess
+        reward = jnp.where(finite, earned, 0.0)
         remaining = s["remaining"] - 1
         s = s | {
             "qpos": jnp.where(finite, data.qpos, s["qpos"]),
@@ -152,6 +156,7 @@ class LocomotionEnv(Env):
             "velocity_y": velocity[1],
             "force": jnp.linalg.norm(force),
             "outside": jnp.asarray(excess > 0.0, jnp.float32),
+            "excess": excess,
             "diverged": 1.0 - finite,
         }
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]

@@ -115,7 +115,7 @@ def check(config: LocomotionConfig) -> None:
         raise InputError(
             f"--episode-seconds is {config.episode_seconds:g}: it must be {2 * robot.CONTROL_TIMESTEP:g} or more."
         )
-    for name in ("start_yaw", "start_tilt", "start_angle", "start_velocity", "residual_decay"):
+    for name in ("start_yaw", "start_tilt", "start_angle", "start_velocity", "residual_decay", "outside_cost"):
         if not getattr(config, name) >= 0:
             raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name):g}: it must be 0 or more.")
 
