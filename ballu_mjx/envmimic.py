@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -163,20 +165,17 @@ def reward_terms(
 
 
 class Simulator:
-    """The MJX robot between control steps: states in, states and features out.
-
-    A state is (qpos, qvel, qacc_warmstart); all else in `mjx.Data` follows from it.
-    """
+    """The MJX robot between control steps: states in, states and features out."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        self.nq, self.nv = model.nq, model.nv
+        self.nv = model.nv
         self.model = mjx.put_model(model)
         self._template = mjx.make_data(model)
         self._balloon = simulation.balloon_id(model)
         self._count = simulation.substeps(model)
         names = ("balloon", "base", "foot_left", "foot_right")
-        self._sites = np.array([model.site(name).id for name in names])
-        self._bodies = model.site_bodyid[self._sites]
+        sites = [model.site(name).id for name in names]
+        self._sites = tuple(zip(sites, model.site_bodyid[sites].tolist(), strict=True))
 
     def altered(self, fields: Mapping[str, Array]) -> Simulator:
         """The same with other model fields, which may be traced."""
@@ -184,17 +183,49 @@ class Simulator:
         other.model = ballu.with_fields(self.model, dict(fields))
         return other
 
-    def load(self, qpos: Array, qvel: Array, warmstart: Array) -> mjx.Data:
-        return self._template.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)  # pyright: ignore
-
-    def observe(self, data: mjx.Data) -> tuple[Float[Array, " 27"], Float[Array, " 3"]]:
+    def observe(self, state: simulation.State) -> tuple[Float[Array, " 27"], Float[Array, " 3"]]:
         """Features and centre of mass (m, world) of a state."""
-        data = mjx.com_vel(self.model, mjx.com_pos(self.model, mjx.kinematics(self.model, data)))
-        return features(data, self._sites, self._bodies), data.subtree_com[1]
+        return _observe(self.model, self._template, state, self._sites)
 
-    def step(self, data: mjx.Data, command: Float[Array, " 2"], force: Float[Array, " 3"]) -> mjx.Data:
+    def observe_all(
+        self, qpos: Float[Array, "... nq"], qvel: Float[Array, "... nv"]
+    ) -> tuple[Float[Array, "... 27"], Float[Array, "... 3"]]:
+        """`observe`, of any number of states; one compiled program serves them all."""
+        shape, count = qpos.shape[:-1], math.prod(qpos.shape[:-1])
+        filled = np.arange(-(-count // _CHUNK) * _CHUNK) % count
+        flat = simulation.at(qpos.reshape(count, -1), qvel.reshape(count, -1))
+        chunks = [simulation.State(*(x[part] for x in flat)) for part in filled.reshape(-1, _CHUNK)]
+        pieces = [_observe_chunk(self.model, self._template, chunk, self._sites) for chunk in chunks]
+        features, com = (jnp.concatenate(parts)[:count] for parts in zip(*pieces, strict=True))
+        return features.reshape(*shape, -1), com.reshape(*shape, -1)
+
+    def step(self, state: simulation.State, command: Float[Array, " 2"], force: Float[Array, " 3"]) -> simulation.State:
         """One control step; see `simulation.control_step`."""
-        return simulation.control_step(self.model, data, command, force, balloon=self._balloon, count=self._count)
+        return simulation.control_step(
+            self.model, self._template, state, command, force, balloon=self._balloon, count=self._count
+        )
+
+
+@functools.partial(jax.jit, static_argnames="sites")
+def _observe(
+    model: mjx.Model, template: mjx.Data, state: simulation.State, sites: tuple[tuple[int, int], ...]
+) -> tuple[Float[Array, " 27"], Float[Array, " 3"]]:
+    """`Simulator.observe`; `sites` are ids of sites and of their bodies."""
+    data = simulation.load(template, state)
+    data = mjx.com_vel(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+    site, body = np.array(sites).T
+    return features(data, site, body), data.subtree_com[1]
+
+
+_CHUNK = 1024
+"""States that `Simulator.observe_all` looks at in one go."""
+
+
+@functools.partial(jax.jit, static_argnames="sites")
+def _observe_chunk(
+    model: mjx.Model, template: mjx.Data, states: simulation.State, sites: tuple[tuple[int, int], ...]
+) -> tuple[Float[Array, "states 27"], Float[Array, "states 3"]]:
+    return jax.vmap(lambda state: _observe(model, template, state, sites))(states)
 
 
 def stack(simulator: Simulator, motions: Sequence[Motion]) -> tuple[Reference, Float[Array, "recordings states 3"]]:
@@ -211,12 +242,7 @@ def stack(simulator: Simulator, motions: Sequence[Motion]) -> tuple[Reference, F
     command = pad([motion.command for motion in motions], longest - 1)
     steps = jnp.array([len(motion.command) for motion in motions])
 
-    @jax.jit
-    def observe_all(qpos: Array, qvel: Array) -> tuple[Array, Array]:
-        one = lambda q, v: simulator.observe(simulator.load(q, v, jnp.zeros(simulator.nv)))  # noqa: E731
-        return jax.vmap(jax.vmap(one))(qpos, qvel)
-
-    feature, com = observe_all(qpos, qvel)
+    feature, com = simulator.observe_all(qpos, qvel)
     return Reference(qpos, qvel, feature, command, steps), com
 
 
@@ -260,9 +286,7 @@ class EnvMimicEnv(Env):
         )
         history = jax.lax.dynamic_slice_in_dim(reference.features[recording], time - HISTORY + 1, HISTORY)
         simulation_state = {
-            "qpos": qpos,
-            "qvel": qvel,
-            "warmstart": jnp.zeros(self.simulator.nv),
+            "physics": simulation.at(qpos, qvel),
             "history": history,
             "recording": recording,
             "time": time,
@@ -287,12 +311,12 @@ class EnvMimicEnv(Env):
         s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
         recording, time = s["recording"], s["time"]
         force = world_force(action, s["history"][-1, 8], self.config)
-        data = self.simulator.load(s["qpos"], s["qvel"], s["warmstart"])
-        data = self.simulator.step(data, self.reference.command[recording, time], force)
-        seen, _ = self.simulator.observe(data)
+        before: simulation.State = s["physics"]
+        after = self.simulator.step(before, self.reference.command[recording, time], force)
+        seen, _ = self.simulator.observe(after)
 
         target = self.reference.features[recording, time + 1]
-        finite = jnp.all(jnp.isfinite(seen)) & jnp.all(jnp.isfinite(data.qvel))
+        finite = jnp.all(jnp.isfinite(seen)) & jnp.all(jnp.isfinite(after.qvel))
         seen = jnp.where(finite, seen, target)
         terms = reward_terms(seen, target, self.config)
         reward = jnp.where(finite, terms["tracking"] - self.config.force_cost * jnp.sum(force**2), 0.0)
@@ -300,9 +324,7 @@ class EnvMimicEnv(Env):
         remaining = s["remaining"] - 1
         timed_out = (remaining <= 0) | (time + 1 >= self.reference.steps[recording])
         s = s | {
-            "qpos": jnp.where(finite, data.qpos, s["qpos"]),
-            "qvel": jnp.where(finite, data.qvel, s["qvel"]),
-            "warmstart": jnp.where(finite, data.qacc_warmstart, 0.0),
+            "physics": jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before),
             "history": jnp.concatenate([s["history"][1:], seen[None]]),
             "time": time + 1,
             "remaining": remaining,

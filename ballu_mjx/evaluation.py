@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ballu_mjx import envmimic
+from ballu_mjx import envmimic, simulation
 from ballu_mjx import robot as ballu
 from ballu_mjx.envmimic import EnvMimicConfig
 from ballu_mjx.reconstruction import Motion
@@ -237,21 +237,18 @@ class OpenLoopEvaluator:
         )
 
         def step(carry: tuple, time: Array) -> tuple[tuple, tuple]:
-            qpos, qvel, warmstart, history = carry
+            state, history = carry
             commands = envmimic.commands_seen(reference.command[recording], time)
             action = policy(params, envmimic.policy_input(history, commands, config))
             force = scale * envmimic.world_force(action, history[-1, _BALLOON_YAW], config)
-            data = simulator.load(qpos, qvel, warmstart)
-            data = simulator.step(data, reference.command[recording, time], force)
-            seen, com = simulator.observe(data)
+            state = simulator.step(state, reference.command[recording, time], force)
+            seen, com = simulator.observe(state)
             history = jnp.concatenate([history[1:], seen[None]])
-            return (data.qpos, data.qvel, data.qacc_warmstart, history), (seen, com, force)
+            return (state, history), (seen, com, force)
 
-        qpos, qvel = reference.qpos[recording, start], reference.qvel[recording, start]
-        first, first_com = simulator.observe(simulator.load(qpos, qvel, jnp.zeros(simulator.nv)))
-        _, (features, com, force) = jax.lax.scan(
-            step, (qpos, qvel, jnp.zeros(simulator.nv), history), start + jnp.arange(length)
-        )
+        first_state = simulation.at(reference.qpos[recording, start], reference.qvel[recording, start])
+        first, first_com = simulator.observe(first_state)
+        _, (features, com, force) = jax.lax.scan(step, (first_state, history), start + jnp.arange(length))
         return jnp.concatenate([first[None], features]), jnp.concatenate([first_com[None], com]), force
 
     def _errors(self, replay: Replay) -> tuple[Errors, ...]:

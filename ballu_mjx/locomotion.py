@@ -17,7 +17,7 @@ import numpy as np
 from brax.envs.base import Env, State
 from jaxtyping import Array, Float
 
-from ballu_mjx import envmimic
+from ballu_mjx import envmimic, simulation
 from ballu_mjx import robot as ballu
 from ballu_mjx.envmimic import HISTORY
 from ballu_mjx.residual import Residual
@@ -129,11 +129,11 @@ class LocomotionEnv(Env):
 
         fields = s["setting"]["fields"] | {"geom_friction": self._friction.at[self._feet, 0].set(s["friction"])}
         simulator = self.simulator.altered(fields)
-        data = simulator.load(s["qpos"], s["qvel"], s["warmstart"])
-        data = simulator.step(data, command, force)
-        features, com = simulator.observe(data)
+        earlier: simulation.State = s["physics"]
+        after = simulator.step(earlier, command, force)
+        features, com = simulator.observe(after)
 
-        finite = jnp.all(jnp.isfinite(features)) & jnp.all(jnp.isfinite(data.qvel))
+        finite = jnp.all(jnp.isfinite(features)) & jnp.all(jnp.isfinite(after.qvel))
         before: Array = s["com"]
         last: Array = s["history"][-1]
         features, com = jnp.where(finite, features, last), jnp.where(finite, com, before)
@@ -142,9 +142,7 @@ class LocomotionEnv(Env):
         reward = jnp.where(finite, earned, 0.0)
         remaining = s["remaining"] - 1
         s = s | {
-            "qpos": jnp.where(finite, data.qpos, s["qpos"]),
-            "qvel": jnp.where(finite, data.qvel, s["qvel"]),
-            "warmstart": jnp.where(finite, data.qacc_warmstart, 0.0),
+            "physics": jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, earlier),
             "com": com,
             "history": jnp.concatenate([s["history"][1:], features[None]]),
             "commands": commands,
@@ -199,13 +197,12 @@ class LocomotionEnv(Env):
     def _begin(self, setting: Setting, qpos: Array, qvel: Array, friction: Array, rng: Array) -> State:
         key, key_length = jax.random.split(rng)
         mean = max(round(self.config.episode_seconds / ballu.CONTROL_TIMESTEP), 2)
-        features, com = self.simulator.observe(self.simulator.load(qpos, qvel, jnp.zeros(self.simulator.nv)))
+        physics = simulation.at(qpos, qvel)
+        features, com = self.simulator.observe(physics)
         s = {
             "setting": setting,
             "friction": friction,
-            "qpos": qpos,
-            "qvel": qvel,
-            "warmstart": jnp.zeros(self.simulator.nv),
+            "physics": physics,
             "com": com,
             "history": jnp.tile(features, (HISTORY, 1)),
             "commands": jnp.zeros((HISTORY, 2)),

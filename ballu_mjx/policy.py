@@ -144,7 +144,7 @@ class ClosedLoop:
 
         def look(state: State) -> tuple[Array, ...]:
             s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-            return s["qpos"], s["history"][-1], s["com"]
+            return s["physics"].qpos, s["history"][-1], s["com"]
 
         def run(params: Params, state: State) -> Any:
             def advance(state: State, _: None) -> tuple[State, Any]:
@@ -186,4 +186,4 @@ class ClosedLoop:
     def standing(self, count: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """`count` starting states, (qpos, qvel), as training draws them."""
         state: Any = self._reset(jax.random.split(jax.random.key(seed), count)).pipeline_state
-        return np.asarray(state["qpos"]), np.asarray(state["qvel"])
+        return np.asarray(state["physics"].qpos), np.asarray(state["physics"].qvel)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import functools
+from typing import NamedTuple
+
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
@@ -24,24 +28,56 @@ def substeps(model: mujoco.MjModel) -> int:
     return round(count)
 
 
+class State(NamedTuple):
+    """All that one physics step hands to the next: every other field of `mjx.Data` follows from it.
+
+    Loops carry this alone. With all of `mjx.Data`, whose constants turn into batches one by one, JAX traces the nested
+    loops of a vmapped step many times over, and every physics step copies what nobody reads.
+    """
+
+    qpos: Float[Array, " nq"]
+    qvel: Float[Array, " nv"]
+    warmstart: Float[Array, " nv"]
+    """`qacc_warmstart`: where the solver starts."""
+
+
+def at(qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> State:
+    """The state that nothing went before."""
+    return State(qpos, qvel, jnp.zeros_like(qvel))
+
+
+def load(template: mjx.Data, state: State) -> mjx.Data:
+    """`template` (of the same model, for its sizes) in another state; what follows from it is not computed yet."""
+    return template.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart)  # pyright: ignore
+
+
+# Compiled as part of whatever calls it; jitted to be traced once, not once a program.
+@functools.partial(jax.jit, static_argnames=("balloon", "count"))
 def control_step(
     model: mjx.Model,
-    data: mjx.Data,
+    template: mjx.Data,
+    state: State,
     command: Float[Array, " 2"],
     force: Float[Array, " 3"],
     *,
     balloon: int,
     count: int,
-) -> mjx.Data:
+) -> State:
     """Advance by `count` physics steps, command and external force held.
 
     **Arguments**
 
+    - `template`: data of the model, from `make_data`; of no influence but for what no step changes.
     - `command`: servo commands (left, right) in [0, 1].
     - `force`: force (N, world frame) at the centre of mass of the body with the id `balloon`.
     """
-    data = data.replace(ctrl=command, xfrc_applied=data.xfrc_applied.at[balloon, :3].set(force))  # pyright: ignore
-    return jax.lax.fori_loop(0, count, lambda _, d: mjx.step(model, d), data)
+    held = template.replace(ctrl=command, xfrc_applied=template.xfrc_applied.at[balloon, :3].set(force))  # pyright: ignore
+
+    def physics_step(_: Array, state: State) -> State:
+        data = mjx.step(model, load(held, state))
+        return State(data.qpos, data.qvel, data.qacc_warmstart)
+
+    return jax.lax.fori_loop(0, count, physics_step, state)
 
 
 def make_data(model: mujoco.MjModel) -> mjx.Data:

@@ -37,6 +37,7 @@ from jaxtyping import Array, Float
 from mujoco import mjx
 
 from ballu_mjx import robot, simulation
+from ballu_mjx.simulation import State
 
 INTEGRATORS = {"implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST, "Euler": mujoco.mjtIntegrator.mjINT_EULER}
 SOLVERS = {"Newton": mujoco.mjtSolver.mjSOL_NEWTON, "CG": mujoco.mjtSolver.mjSOL_CG}
@@ -190,12 +191,16 @@ def mjx_rollout(
     devices = jax.device_count()
     batch = -(-batch // devices) * devices
     step_count, balloon = simulation.substeps(model), simulation.balloon_id(model)
-    mjx_model, start = mjx.put_model(model), simulation.make_data(model).replace(qpos=jnp.asarray(qpos))  # pyright: ignore
+    mjx_model, template = mjx.put_model(model), simulation.make_data(model)
+    start = simulation.at(jnp.asarray(qpos, jnp.float32), jnp.zeros(model.nv))
 
     def one(command: Float[Array, "steps 2"]) -> Float[Array, " nq"]:
-        def step(data: mjx.Data, command: Float[Array, " 2"]) -> tuple[mjx.Data, None]:
-            data = simulation.control_step(mjx_model, data, command, jnp.zeros(3), balloon=balloon, count=step_count)
-            return data, None
+        def step(state: State, command: Float[Array, " 2"]) -> tuple[State, None]:
+            no_force = jnp.zeros(3)
+            state = simulation.control_step(
+                mjx_model, template, state, command, no_force, balloon=balloon, count=step_count
+            )
+            return state, None
 
         return jax.lax.scan(step, start, command)[0].qpos
 

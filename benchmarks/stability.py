@@ -26,6 +26,7 @@ from jax.sharding import PartitionSpec
 from mujoco import mjx
 
 from ballu_mjx import robot, simulation
+from ballu_mjx.simulation import State
 
 MAX_JOINT_SPEED = 100.0
 """rad/s"""
@@ -50,23 +51,24 @@ def main(
     substeps, balloon, devices = simulation.substeps(model), simulation.balloon_id(model), jax.device_count()
     steps = round(duration / robot.CONTROL_TIMESTEP)
     mjx_model = mjx.put_model(model)
-    start = simulation.make_data(model).replace(qpos=jnp.asarray(robot.standing_qpos(model)))  # pyright: ignore
+    template = simulation.make_data(model)
+    start = simulation.at(jnp.asarray(robot.standing_qpos(model), jnp.float32), jnp.zeros(model.nv))
 
     def worst(key: Array) -> tuple[Array, Array]:
         """Number of physics steps with a state that is not finite; each hinge's greatest speed (rad/s) before that."""
 
-        def control(data: mjx.Data, key: Array) -> tuple[mjx.Data, tuple[Array, Array]]:
+        def control(state: State, key: Array) -> tuple[State, tuple[Array, Array]]:
             command_key, force_key = jax.random.split(key)
             command = jax.random.uniform(command_key, (2,))
             push = jax.random.uniform(force_key, (3,), minval=-force, maxval=force)
 
-            def physics(data: mjx.Data, _: None) -> tuple[mjx.Data, tuple[Array, Array]]:
-                data = simulation.control_step(mjx_model, data, command, push, balloon=balloon, count=1)
-                finite = jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all()
-                return data, (finite, jnp.abs(data.qvel[6:]))
+            def physics(state: State, _: None) -> tuple[State, tuple[Array, Array]]:
+                state = simulation.control_step(mjx_model, template, state, command, push, balloon=balloon, count=1)
+                finite = jnp.isfinite(state.qpos).all() & jnp.isfinite(state.qvel).all()
+                return state, (finite, jnp.abs(state.qvel[6:]))
 
-            data, (finite, speed) = jax.lax.scan(physics, data, None, length=substeps)
-            return data, ((~finite).sum(), jnp.nanmax(speed, axis=0))
+            state, (finite, speed) = jax.lax.scan(physics, state, None, length=substeps)
+            return state, ((~finite).sum(), jnp.nanmax(speed, axis=0))
 
         _, (bad, speed) = jax.lax.scan(control, start, jax.random.split(key, steps))
         return bad.sum(), jnp.nanmax(speed, axis=0)

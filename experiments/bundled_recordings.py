@@ -186,6 +186,17 @@ def make(job: Job, robot_seed: int, output: Path) -> Path:
     return path
 
 
+def fresh(seed: int, folder: Path, each: int = 6) -> list[Path]:
+    """Recordings of `fresh_jobs`, in a folder; made by all cores, unless they are there."""
+    jobs = fresh_jobs(seed, each)
+    paths = [folder / job.split / f"{job.name}.csv.gz" for job in jobs]
+    missing = [(job, ROBOT_SEED, folder) for job, path in zip(jobs, paths, strict=True) if not path.exists()]
+    if missing:
+        with multiprocessing.get_context("spawn").Pool() as pool:
+            pool.starmap(make, missing)
+    return paths
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=assets() / "recordings", help="folder to write to")

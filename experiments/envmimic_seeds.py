@@ -27,7 +27,6 @@ if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a co
 import argparse
 import dataclasses
 import json
-import multiprocessing
 
 from ballu_mjx import runtime
 
@@ -69,18 +68,6 @@ def load(folder: Path) -> evaluation.Evaluation:
     """The evaluation of one run."""
     content = json.loads((folder / "evaluation.json").read_text())
     return evaluation.Evaluation(errors(content["vanilla"]), errors(content["envmimic"]))
-
-
-def fresh(seed: int, folder: Path, each: int) -> list[Path]:
-    """Recordings of the larger test set, made unless they are there."""
-    jobs = bundled_recordings.fresh_jobs(seed, each)
-    paths = [folder / job.split / f"{job.name}.csv.gz" for job in jobs]
-    missing = [job for job, path in zip(jobs, paths, strict=True) if not path.exists()]
-    if missing:
-        arguments = [(job, bundled_recordings.ROBOT_SEED, folder) for job in missing]
-        with multiprocessing.get_context("spawn").Pool() as pool:
-            pool.starmap(bundled_recordings.make, arguments)
-    return paths
 
 
 def evaluate(folders: list[Path], paths: list[Path]) -> list[evaluation.Evaluation]:
@@ -252,7 +239,7 @@ def main() -> None:
         for seed, folder in zip(options.seeds, folders[kind], strict=True):
             train(seed, folder, [*extra, *arguments])
     runs = {kind: [load(folder) for folder in folders[kind]] for kind in KINDS}
-    paths = fresh(options.fresh, options.output, 1 if options.quick else 6)
+    paths = bundled_recordings.fresh(options.fresh, options.output, 1 if options.quick else 6)
     larger = {kind: evaluate(folders[kind], paths) for kind in KINDS}
     parts = []
     for title, results in (("Bundled test recordings", runs), ("Fresh test recordings", larger)):

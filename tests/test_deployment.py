@@ -13,7 +13,7 @@ import pytest
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx import deployment, envmimic, robot, virtual_robot
+from ballu_mjx import deployment, envmimic, robot, simulation, virtual_robot
 from ballu_mjx.deployment import Capture, PolicyController, estimate
 
 EULER = slice(6, 9)
@@ -92,8 +92,7 @@ def test_features_stand_in_the_order_of_the_training_environment():
     qpos = robot.standing_qpos(model)
     qvel = np.zeros(model.nv)
     qvel[:3] = 0.3, -0.2, 0.1
-    observe = jax.jit(lambda qpos, qvel: simulator.observe(simulator.load(qpos, qvel, jax.numpy.zeros(model.nv)))[0])
-    seen = observe(qpos, qvel)
+    seen, _ = simulator.observe(simulation.at(jax.numpy.asarray(qpos), jax.numpy.asarray(qvel)))
     data = mujoco.MjData(model)
     capture = Capture([], [], [], [], [], [], [])
     for frame in range(10):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx import envmimic, evaluation, robot
+from ballu_mjx import envmimic, evaluation, robot, simulation
 from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.reconstruction import Motion
 
@@ -85,8 +85,7 @@ def test_features_agree_with_c_mujoco(still: Motion):
     data.qpos[:] = still.qpos[17]
     data.qvel[:] = rng.normal(0, 1.0, model.nv)
     mujoco.mj_forward(model, data)
-    loaded = simulator.load(*(jnp.array(x, jnp.float32) for x in (data.qpos, data.qvel, np.zeros(model.nv))))
-    ours, com = jax.jit(simulator.observe)(loaded)
+    ours, com = simulator.observe(simulation.at(*(jnp.array(x, jnp.float32) for x in (data.qpos, data.qvel))))
     frames = []
     for site in ("balloon", "base", "foot_left", "foot_right"):
         velocity = np.zeros(6)
@@ -136,7 +135,7 @@ def test_reset_starts_at_recorded_states_with_their_history(still: Motion, pushe
     assert set(time) == set(range(envmimic.HISTORY - 1, STEPS))
     motions = [still, pushed]
     for run in range(0, 256, 16):
-        np.testing.assert_allclose(s["qpos"][run], motions[recording[run]].qpos[time[run]], atol=1e-6)
+        np.testing.assert_allclose(s["physics"].qpos[run], motions[recording[run]].qpos[time[run]], atol=1e-6)
         expected = env.reference.features[recording[run], time[run] - 2 : time[run] + 1]
         np.testing.assert_array_equal(s["history"][run], expected)
 
@@ -145,10 +144,10 @@ def test_start_noise_stays_small_and_keeps_the_quaternion_a_unit(still: Motion):
     env = EnvMimicEnv(robot.load_model(), [still], EnvMimicConfig(start_noise=1.0))
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 256)).pipeline_state
     recorded = np.asarray(env.reference.qpos)[0, np.asarray(states["time"])]
-    np.testing.assert_allclose(np.linalg.norm(states["qpos"][:, 3:7], axis=1), 1.0, atol=1e-5)
-    angle = 2 * np.arccos(np.clip(np.abs(np.sum(states["qpos"][:, 3:7] * recorded[:, 3:7], axis=1)), 0, 1))
+    np.testing.assert_allclose(np.linalg.norm(states["physics"].qpos[:, 3:7], axis=1), 1.0, atol=1e-5)
+    angle = 2 * np.arccos(np.clip(np.abs(np.sum(states["physics"].qpos[:, 3:7] * recorded[:, 3:7], axis=1)), 0, 1))
     assert 0.3 < np.rad2deg(angle).mean() < 1.5
-    hinges = np.rad2deg(np.asarray(states["qpos"][:, 7:]) - recorded[:, 7:])
+    hinges = np.rad2deg(np.asarray(states["physics"].qpos[:, 7:]) - recorded[:, 7:])
     assert 0.4 < hinges[:, 0].std() < 0.6
     assert np.abs(hinges[:, 3]).max() == 0.0  # motors stay
 
@@ -168,7 +167,8 @@ def test_time_limits_truncate_and_divergence_terminates(still: Motion):
 
     state = jax.jit(env.reset)(jax.random.key(3))
     s = state.pipeline_state
-    broken = state.replace(pipeline_state=s | {"qvel": s["qvel"].at[3].set(jnp.nan)})
+    physics = s["physics"]._replace(qvel=s["physics"].qvel.at[3].set(jnp.nan))
+    broken = state.replace(pipeline_state=s | {"physics": physics})
     state = step(broken, jnp.zeros(3))
     assert (float(state.done), float(state.info["truncation"])) == (1.0, 0.0)
     assert float(state.metrics["diverged"]) == 1.0
@@ -184,8 +184,7 @@ def test_the_missing_force_earns_more_than_none_and_its_opposite_less(pushed: Mo
     state = state.replace(
         pipeline_state=s
         | {
-            "qpos": env.reference.qpos[0, start],
-            "qvel": env.reference.qvel[0, start],
+            "physics": simulation.at(env.reference.qpos[0, start], env.reference.qvel[0, start]),
             "history": env.reference.features[0, start - 2 : start + 1],
             "time": jnp.asarray(start, s["time"].dtype),
         }

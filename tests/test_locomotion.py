@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from ballu_mjx import envmimic, locomotion, ppo, robot
+from ballu_mjx import envmimic, locomotion, ppo, robot, simulation
 from ballu_mjx.envmimic import HISTORY, EnvMimicConfig
 from ballu_mjx.locomotion import LocomotionConfig, LocomotionEnv
 from ballu_mjx.policy import ClosedLoop
@@ -86,7 +86,7 @@ def test_randomization_draws_friction_and_start_and_is_off_by_default():
     draw = jax.jit(jax.vmap(PLAIN._start, in_axes=(None, 0)))
     plain = inner(draw(PLAIN.setting, keys))
     assert np.unique(plain["friction"]).tolist() == pytest.approx([0.9])
-    assert np.ptp(plain["qpos"], axis=0).max() == 0 and np.abs(plain["qvel"]).max() == 0
+    assert np.ptp(plain["physics"].qpos, axis=0).max() == 0 and np.abs(plain["physics"].qvel).max() == 0
 
     config = LocomotionConfig(domain_randomization=True)
     drawn = inner(draw(locomotion.setting_of(MODEL, config, None), keys))
@@ -94,7 +94,7 @@ def test_randomization_draws_friction_and_start_and_is_off_by_default():
     assert low <= drawn["friction"].min() < low + 0.05 and high - 0.05 < drawn["friction"].max() <= high
     yaw = np.rad2deg(np.asarray(drawn["history"])[:, -1, 8])
     assert config.start_yaw * 0.9 < yaw.max() <= config.start_yaw + 1 and yaw.min() < -config.start_yaw * 0.9
-    knees = np.asarray(drawn["qpos"])[:, 7:][:, robot.KNEES]
+    knees = np.asarray(drawn["physics"].qpos)[:, 7:][:, robot.KNEES]
     assert (knees >= robot.standing_qpos(MODEL)[7:][robot.KNEES] - 1e-6).all()
 
 
@@ -103,7 +103,9 @@ def test_friction_drawn_is_friction_felt():
     state = RESET(PLAIN.setting, jax.random.key(0))
     way = []
     for friction in (0.2, 1.0):
-        pushed = inner(state) | {"friction": jnp.float32(friction), "qvel": inner(state)["qvel"].at[0].set(1.0)}
+        thrown = inner(state)["physics"]
+        thrown = thrown._replace(qvel=thrown.qvel.at[0].set(1.0))
+        pushed = inner(state) | {"friction": jnp.float32(friction), "physics": thrown}
         now = dataclasses.replace(state, pipeline_state=pushed)
         for _ in range(10):
             now = STEP(now, -jnp.ones(2))
@@ -120,7 +122,7 @@ def test_identified_actuators_are_in_the_simulator_and_pass_from_episode_to_epis
         state = RESET(inner(state)["setting"], jax.random.key(1))
         for _ in range(20):
             state = STEP(state, jnp.ones(2))
-        reached.append(np.asarray(inner(state)["qpos"])[7:][robot.MOTORS])
+        reached.append(np.asarray(inner(state)["physics"].qpos)[7:][robot.MOTORS])
     left, right = np.rad2deg(reached[0] - reached[1])
     assert left > 15 and abs(right) < left / 3
 
@@ -136,9 +138,9 @@ def test_residual_pushes_in_the_balloon_s_heading_and_only_so_hard():
 
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
     force = turn @ (EnvMimicConfig().force_scale * action)
-    pushed = jax.jit(lambda force: simulator.step(simulator.load(qpos, zeros, zeros), jnp.zeros(2), force))
+    pushed = jax.jit(lambda force: simulator.step(simulation.at(qpos, zeros), jnp.zeros(2), force))
     expected = pushed(jnp.asarray(force, jnp.float32))
-    np.testing.assert_allclose(inner(state)["qvel"], expected.qvel, atol=1e-5)
+    np.testing.assert_allclose(inner(state)["physics"].qvel, expected.qvel, atol=1e-5)
     assert np.abs(np.asarray(expected.qvel - pushed(jnp.zeros(3)).qvel)).max() > 1e-3
     assert float(state.metrics["force"]) == pytest.approx(np.linalg.norm(force), rel=1e-5)
 
@@ -169,8 +171,8 @@ def test_closed_loop_is_the_environment_step_by_step():
     params = ppo.Params(ppo.Normalizer(np.zeros(()), {}, {}, {}), None, np.float32(0.8))
     loop = ClosedLoop(PLAIN, infer)
     setting = locomotion.setting_of(MODEL, LocomotionConfig(domain_randomization=True), None)
-    start = inner(RESET(setting, jax.random.key(3)))
-    qpos, qvel = (np.stack([np.asarray(inner(PLAIN.reset(jax.random.key(0)))[x]), start[x]]) for x in ("qpos", "qvel"))
+    still, start = (inner(RESET(x, jax.random.key(k)))["physics"] for x, k in ((PLAIN.setting, 0), (setting, 3)))
+    qpos, qvel = np.stack([still.qpos, start.qpos]), np.stack([still.qvel, start.qvel])
     rollout = loop(params, qpos, qvel, 5, setting)
     state = jax.jit(PLAIN.at)(setting, jnp.asarray(qpos[1]), jnp.asarray(qvel[1]), jax.random.key(0))
     for number in range(5):

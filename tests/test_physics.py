@@ -107,9 +107,9 @@ def test_mjx_follows_c_mujoco_over_a_control_step() -> None:
     @jax.jit
     @jax.vmap
     def step(qpos: Array, qvel: Array, command: Array, force: Array) -> tuple[Array, Array]:
-        data = template.replace(qpos=qpos, qvel=qvel)  # pyright: ignore
-        data = simulation.control_step(mjx_model, data, command, force, balloon=balloon, count=count)
-        return data.qpos, data.qvel
+        state = simulation.at(qpos, qvel)
+        state = simulation.control_step(mjx_model, template, state, command, force, balloon=balloon, count=count)
+        return state.qpos, state.qvel
 
     inputs = [jnp.asarray(x, jnp.float32) for x in (s.qpos, s.qvel, s.command, s.force)]
     qpos, qvel = (np.asarray(x) for x in step(*inputs))
@@ -270,14 +270,15 @@ def settled_derivatives() -> tuple[np.ndarray, np.ndarray]:
     model = weightless()
     mjx_model = mjx.put_model(model)
     data = afloat(model)
-    start = simulation.make_data(model).replace(qpos=jnp.asarray(data.qpos))  # pyright: ignore
+    template, start = simulation.make_data(model), simulation.at(jnp.asarray(data.qpos), jnp.zeros(model.nv))
 
     def knees(parameters: robot.ActuatorParameters, command: Float[Array, " 2"]) -> tuple[Array, Array]:
         moved = robot.with_fields(mjx_model, robot.actuator_fields(model, parameters))
-        data = simulation.control_step(
-            moved, start, command, jnp.zeros(3), balloon=simulation.balloon_id(model), count=SETTLING_STEPS
+        balloon, no_force = simulation.balloon_id(model), jnp.zeros(3)
+        state = simulation.control_step(
+            moved, template, start, command, no_force, balloon=balloon, count=SETTLING_STEPS
         )
-        return data.qpos[7:][robot.KNEES], data.qpos[7:][robot.KNEES]
+        return state.qpos[7:][robot.KNEES], state.qpos[7:][robot.KNEES]
 
     parameters = jax.tree.map(lambda *x: jnp.stack(x), *(case_parameters(case) for case in CASES))
     commands = jnp.asarray([case[0] for case in CASES])
