@@ -41,7 +41,7 @@ class State(NamedTuple):
     """`qacc_warmstart`: where the solver starts."""
 
 
-def at(qpos: Float[Array, " nq"], qvel: Float[Array, " nv"]) -> State:
+def at(qpos: Float[Array, "*batch nq"], qvel: Float[Array, "*batch nv"]) -> State:
     """The state that nothing went before."""
     return State(qpos, qvel, jnp.zeros_like(qvel))
 
