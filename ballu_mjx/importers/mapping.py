@@ -58,7 +58,7 @@ body = "ballu:balloon"   # "subject:segment", an object, or the name behind the 
 # orientation = ["qw", "qx", "qy", "qz"]                    # with rotation = "quaternion" (w, x, y, z), or three angles
 offset = [0.0, 0.0, 0.0] # m: the model's site `balloon` in the tracked body's frame
 turn = [0.0, 0.0, 0.0]   # deg, a rotation vector: the model's balloon frame in the tracked body's frame.
-                         # "start": whatever makes the balloon upright at the start, looking across the feet
+                         # "start": at the start the robot stands upright and looks along `forward`
 
 [base]                   # the model's site `base`: the middle of the hip axle
 body = "ballu:base"

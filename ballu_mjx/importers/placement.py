@@ -30,7 +30,9 @@ def place(trajectories: Trajectories, mapping: RoomMapping, name: str) -> Record
     **Raises** `InputError` where an orientation is needed and not there, or nothing was seen at all.
     """
     mapped = {role: _site(trajectories, mapping, role, body) for role, body in trajectories.bodies.items()}
-    _stand(trajectories, mapping, mapped)
+    for role, source in mapping.sources.items():
+        if source.turn == "start":
+            mapped[role] = _standing(mapped[role])
     if mapping.kind == "free":
         _to_floor(mapping, mapped)
         if mapping.start:
@@ -91,29 +93,13 @@ def _site(trajectories: Trajectories, mapping: RoomMapping, role: str, body: Bod
     return Body(position @ axes.T, quaternion)
 
 
-def _stand(trajectories: Trajectories, mapping: RoomMapping, mapped: dict[str, Body]) -> None:
-    """Turn bodies with `turn = "start"` so that they stand upright at the start, looking across the feet; in place."""
-    turning = [source for source in mapping.sources.values() if source.turn == "start"]
-    if not turning:
-        return
-    if not {"foot_left", "foot_right"} <= mapped.keys():
-        refuse(mapping.path, f"[{turning[0].role}] turn", 'it is "start", which needs both feet', "add them")
-    across = mapped["foot_left"].position - mapped["foot_right"].position
-    both = np.flatnonzero(~np.isnan(across).any(axis=1))[:_START_SAMPLES]
-    if not len(both):
-        refuse(trajectories.path, "", "both feet are never seen at once", 'give turn = [...] in place of "start"')
-    left = across[both].mean(axis=0)
-    upright = Rotation.from_euler("z", np.arctan2(-left[0], left[1]))
-    for source in turning:
-        mapped[source.role] = _upright(mapped[source.role], upright)
-
-
-def _upright(body: Body, upright: Rotation) -> Body:
+def _standing(body: Body) -> Body:
+    """The body turned in its own frame so that at the start it stands like the format's axes."""
     assert body.quaternion is not None
     seen = np.flatnonzero(~np.isnan(body.quaternion).any(axis=1))
     turned = Rotation.from_quat(body.quaternion[seen], scalar_first=True)
     quaternion = body.quaternion.copy()
-    quaternion[seen] = (turned * turned[:_START_SAMPLES].mean().inv() * upright).as_quat(scalar_first=True)
+    quaternion[seen] = (turned * turned[:_START_SAMPLES].mean().inv()).as_quat(scalar_first=True)
     return Body(body.position, quaternion)
 
 
