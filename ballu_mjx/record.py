@@ -232,7 +232,7 @@ def _offset(
 
 
 _ALIGNMENT_ERROR = 0.05
-"""s; nine of ten walks of the virtual robots, see docs/data.md."""
+"""s; nine of ten trials of virtual robots (benchmarks/alignment.py)."""
 
 
 def _write(options: Import, recording: Recording) -> None:

@@ -81,11 +81,11 @@ _Values = Callable[[_Group, Sequence[str]], Float[np.ndarray, "T n"]]
 
 
 def is_vicon(path: Path) -> bool:
-    """Whether the first line with text in it stands alone in its row, as a section's title does."""
+    """Whether the first line with text in it has one cell of it alone, as a section's title does."""
     for line in read_text(path).splitlines():
         cells = [cell for cell in line.replace(";", ",").replace("\t", ",").split(",") if cell.strip(' "')]
         if cells:
-            return len(cells) == 1 and "," not in line.strip(', ;\t"')
+            return len(cells) == 1
     return False
 
 
