@@ -193,8 +193,12 @@ def _offset(
     motion = response.measured(recording)
     if motion is None:
         raise InputError(f"{log}: neither knees nor base and feet were captured to find its offset by; {by_hand}.")
-    if time[-1] - time[0] < 1.0:
-        raise InputError(f"{log}: lasts less than a second; {by_hand}.")
+    for path, clock in ((log, time), (options.file, recording.time)):
+        if not 1.0 <= clock[-1] - clock[0] <= _LONGEST_SEARCH:
+            raise InputError(
+                f"{path}: lasts {clock[-1] - clock[0]:.4g} s; offsets are found for 1 to {_LONGEST_SEARCH:g} s, cut it "
+                f"or {by_hand}."
+            )
     grid, legs = response.nominal(time, command, recording.kind, knees=recording.knee is not None)
     within = options.offset_range
     if within is not None:
@@ -231,6 +235,8 @@ def _offset(
     return offset
 
 
+_LONGEST_SEARCH = 7200.0
+"""s."""
 _ALIGNMENT_ERROR = 0.05
 """s; nine of ten trials of virtual robots (benchmarks/alignment.py)."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import struct
 import tempfile
 from collections.abc import Callable, Mapping
@@ -117,6 +118,7 @@ def section(
     return "".join(delimiter.join(row) + "\n" for row in rows)
 
 
+EVENTS = "Events\n100\nSubject,Context,Name,Time (s),Description\nballu,Left,Foot Strike,1.2,The heel strikes\n"
 DEVICES = (
     "Devices\n1000\n,,Force plate - Force,,\nFrame,Sub Frame,Fx,Fy,Fz\n,,N,N,N\n1,0,0.1,0.2,0.3\n1,1,0.1,0.2,0.3\n"
 )
@@ -176,7 +178,13 @@ def test_several_sections_and_subjects_in_one_file(tmp_path: Path):
     rigid = {role: everything[role] for role in ("balloon", "base")}
     feet = {role: everything[role] for role in ("foot_left", "foot_right")}
     chair = section("Segments", {"seat": everything["base"]}, prefix="chair:")
-    parts = [DEVICES, section("Segments", rigid), chair, section("Trajectories", feet, prefix="shoes:", rotation=None)]
+    parts = [
+        EVENTS,
+        DEVICES,
+        section("Segments", rigid),
+        chair,
+        section("Trajectories", feet, prefix="shoes:", rotation=None),
+    ]
     rooms = 'robot = "r"\n' + KEPT + BODIES.replace("ballu:foot", "shoes:foot")
     same(read(tmp_path, "\n".join(parts).replace("\n", "\r\n"), rooms))
 
@@ -467,6 +475,18 @@ def test_c3d_without_what_is_asked_for_is_refused(c3d_file: Path):
     same(placement.place(c3d.read_c3d(c3d_file, c3d_room(c3d_file.parent, '[units]\nlength = "mm"\n')), room, "walk"))
 
 
+@pytest.mark.parametrize("seed", [2, 6, 93, 184])
+def test_a_c3d_with_damaged_parameters_is_refused_whatever_its_library_does(c3d_file: Path, seed: int):
+    """Some damage takes a process with ezc3d in it down: ours is not that one."""
+    rng = np.random.default_rng(seed)
+    content = bytearray(c3d_file.read_bytes())
+    content[1024:1536] = rng.integers(0, 256, 512, np.uint8).tobytes()
+    content[512 + rng.integers(4, 512)] = rng.integers(0, 256)
+    c3d_file.write_bytes(content)
+    with pytest.raises(InputError, match=r"walk\.c3d"):
+        c3d.read_c3d(c3d_file, c3d_room(c3d_file.parent))
+
+
 def test_what_is_no_c3d_is_refused(tmp_path: Path):
     (tmp_path / "walk.c3d").write_bytes(struct.pack("<256H", *range(256)))
     with pytest.raises(InputError, match="walk.c3d: not a C3D file"):
@@ -642,6 +662,36 @@ def test_broken_mappings_are_refused(tmp_path: Path, old: str, new: str, said: l
     assert str(refusal.value).startswith(str(tmp_path / "room.toml"))
     for part in said:
         assert part in str(refusal.value)
+
+
+VALUES = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.sampled_from(["x", "-z"])),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+KEYS = [("", field.name) for field in dataclasses.fields(mapping.RoomMapping)]
+KEYS += [("balloon", field.name) for field in dataclasses.fields(mapping.Source)]
+KEYS += [("commands", field.name) for field in dataclasses.fields(mapping.Commands)]
+KEYS += [("axes", "up"), ("origin", "start"), ("origin", "floor"), ("units", "angle"), ("knee_left", "column")]
+
+
+@settings(max_examples=150, deadline=None)
+@given(changes=st.lists(st.tuples(st.sampled_from(KEYS), VALUES), min_size=1, max_size=3))
+def test_whatever_stands_in_a_mapping_is_read_or_refused(changes: list[tuple[tuple[str, str], object]]):
+    content: dict = {"robot": "r", **{role: {"body": role} for role in ROLES}}
+    for (table, key), value in changes:
+        place = content.setdefault(table, {}) if table else content
+        if isinstance(place, dict):
+            place[key] = value
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "room.json"
+        path.write_text(json.dumps(content))
+        try:
+            checked = mapping.read_mapping(path)
+        except InputError as error:
+            assert str(error).startswith(str(path))
+        else:
+            assert np.linalg.det(checked.axes) == pytest.approx(1.0) and checked.robot.strip()
 
 
 def test_names_that_two_subjects_share_need_the_subject(tmp_path: Path):

@@ -145,6 +145,30 @@ def test_import_overwrites_nothing(room: Path, capsys: pytest.CaptureFixture[str
     assert (room / "out" / "walk.json").read_text() == "mine"
 
 
+def test_a_sweep_comes_from_a_table_with_its_commands(tmp_path: Path):
+    """Degrees, a knee that counts the other way round, and milliseconds of an absolute clock."""
+    (path,) = bundled("suspended")
+    sweep = read_recording(path)
+    assert sweep.motor is not None and sweep.knee is not None
+    columns = [1e3 * sweep.time + 1e9, *sweep.command.T, *np.rad2deg(sweep.motor).T, 90 - np.rad2deg(sweep.knee).T[0]]
+    columns.append(np.rad2deg(sweep.knee).T[1])
+    rows = [",".join(f"{x:.11g}" for x in row) for row in zip(*columns, strict=True)]
+    (tmp_path / "bench.csv").write_text("\n".join(["ms,cl,cr,ml,mr,kl,kr", *rows]) + "\n")
+    joints = {"motor_left": "ml", "motor_right": "mr", "knee_left": "kl", "knee_right": "kr"}
+    room = 'robot = "r"\nkind = "suspended"\n[units]\nangle = "deg"\ntime = "ms"\n'
+    room += '[commands]\ntime = "ms"\nleft = "cl"\nright = "cr"\n'
+    room += "".join(f'[{name}]\ncolumn = "{column}"\n' for name, column in joints.items())
+    room = room.replace('column = "kl"', 'column = "kl"\nsign = -1\nzero = 90')
+    (tmp_path / "room.toml").write_text(room)
+    line = ["import", tmp_path / "bench.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "sweep.csv"]
+    assert record.main(list(map(str, line))) == 0
+    read = read_recording(tmp_path / "sweep.csv")
+    np.testing.assert_allclose(np.asarray(read.knee), sweep.knee, atol=2e-5)
+    np.testing.assert_allclose(np.asarray(read.motor), sweep.motor, atol=2e-5)
+    np.testing.assert_allclose(read.command, sweep.command, atol=1e-4)
+    assert read.kind == "suspended" and read.time[0] == 0
+
+
 # ---- check ----
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ballu_mjx.errors import InputError
+from ballu_mjx.importers.ezc3d_process import read_points
 from ballu_mjx.importers.mapping import MARKER_TOLERANCE, RoomMapping
 from ballu_mjx.importers.trajectories import LENGTHS, Body, Trajectories, find, refuse, rigid_body, shorten
 
@@ -27,33 +26,27 @@ def read_c3d(path: Path, mapping: RoomMapping) -> Trajectories:
     """
     frames = _check_size(path)
     try:
-        import ezc3d
+        found = read_points(str(path))
     except ImportError as error:
         mend = 'install it by `pip install "ballu-mjx[import]"`'
         raise InputError(f"{path}: C3D files are read by ezc3d, which is not installed; {mend}.") from error
-    try:
-        content = ezc3d.c3d(str(path))
-        point = content["parameters"]["POINT"]
-        points = np.asarray(content["data"]["points"], float)[:3]
-        residuals = np.asarray(content["data"]["meta_points"]["residuals"], float)[0]
-        labels = _labels(point)
-    except Exception as error:  # whatever the library makes of a damaged file
-        reason = shorten(str(error).splitlines()[0] if str(error) else type(error).__name__)
-        refuse(path, "", f"not a whole C3D file ({reason})", _AGAIN)
-    if points.shape[2] == 0 or (frames is not None and points.shape[2] < frames):
-        refuse(path, "", f"holds {points.shape[2]} of the {frames or 'its'} frames that its header states", _AGAIN)
-    rate = mapping.rate or _first(point, "RATE")
-    if not isinstance(rate, int | float | np.number) or not 1 <= rate <= 1e5:
+    except ValueError as error:
+        refuse(path, "", f"not a whole C3D file ({shorten(str(error))})", _AGAIN)
+    points, count = found.position, found.position.shape[2]
+    if count == 0 or (frames is not None and count < frames) or found.residual.shape != points.shape[1:]:
+        refuse(path, "", f"holds {count} of the {frames or 'its'} frames that its header states", _AGAIN)
+    rate = mapping.rate or found.rate
+    if rate is None or not 1 <= rate <= 1e5:
         refuse(path, "POINT:RATE", f"{rate} is not a rate in Hz", "export again, or write rate = ... in the mapping")
-    unit = mapping.length or str(_first(point, "UNITS") or "").strip().lower()
+    unit = mapping.length or found.unit.lower()
     if unit not in LENGTHS:
         mend = 'write length = "..." under [units] in the mapping'
         refuse(path, "POINT:UNITS", f"the unit {shorten(unit)!r} is no length that is known", mend)
-    if len(labels) < points.shape[1]:
-        labels += [""] * (points.shape[1] - len(labels))
+    labels = found.labels[: points.shape[1]]
     points = points * LENGTHS[unit]
-    hidden = (residuals < 0) | (points == 0).all(axis=0)
-    points[:, hidden] = np.nan
+    if np.isinf(points).any():
+        refuse(path, "", "holds infinite positions", _AGAIN)
+    points[:, (found.residual < 0) | (points == 0).all(axis=0)] = np.nan
 
     def marker(name: str) -> np.ndarray:
         full = find(path, name, [label for label in labels if label], "marker")
@@ -73,7 +66,7 @@ def read_c3d(path: Path, mapping: RoomMapping) -> Trajectories:
             bodies[role] = rigid_body(path, role, several, geometry, MARKER_TOLERANCE)
         else:
             bodies[role] = Body(marker(source.body or ""))
-    return Trajectories(path, np.arange(points.shape[2]) / float(rate), bodies)
+    return Trajectories(path, np.arange(count) / rate, bodies)
 
 
 def _check_size(path: Path) -> int | None:
@@ -105,18 +98,3 @@ def _check_size(path: Path) -> int | None:
     if frames < 1 or start < 2 or size < (start - 1) * _BLOCK + frames * (4 * points + analog) * bytes_each:
         refuse(path, "", f"too short for the {max(frames, 0)} frames that its header states", _AGAIN)
     return frames
-
-
-def _first(point: Mapping[str, Any], name: str) -> Any:
-    value = point[name]["value"] if name in point else []
-    return value[0] if len(value) else None
-
-
-def _labels(point: Mapping[str, Any]) -> list[str]:
-    """All labels; above 255 there are LABELS2 and so on."""
-    labels: list[str] = []
-    for name in ["LABELS", *(f"LABELS{i}" for i in range(2, 100))]:
-        if name not in point:
-            break
-        labels += [str(label).strip() for label in point[name]["value"]]
-    return labels

@@ -16,7 +16,6 @@ angles), Tracker's objects as its settings say.
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -45,6 +44,8 @@ _TRANSLATIONS = (("TX", "TY", "TZ"), ("X", "Y", "Z"))
 _ROTATION = ("RX", "RY", "RZ")
 _HELICAL = ("Segments",)
 """Sections whose three rotation components are a rotation vector unless the mapping says otherwise."""
+_USED = ("Objects", "Segments", "Trajectories")
+"""Sections that must be whole; others that are laid out alike are read, and those that are not (Events) left alone."""
 _HEADER_ROWS = 5
 _SPELLINGS: Mapping[str, str] = {"degrees": "deg", "degree": "deg", "°": "deg", "radians": "rad", "radian": "rad"}
 _LARGEST = 1e6
@@ -136,7 +137,7 @@ def _delimiter(path: Path, lines: Sequence[str]) -> str:
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
+    return [cell.strip(' "') for cell in line.split(delimiter)]
 
 
 def _sections(path: Path, lines: Sequence[str], delimiter: str) -> list[_Section]:
@@ -148,13 +149,19 @@ def _sections(path: Path, lines: Sequence[str], delimiter: str) -> list[_Section
             line += 1
             continue
         end = next((i for i in range(line, len(lines)) if blank[i]), len(lines))
-        sections.append(_section(path, lines, delimiter, line, end))
+        section = _section(path, lines, delimiter, line, end)
+        if section is not None:
+            sections.append(section)
         line = end
     return sections
 
 
-def _section(path: Path, lines: Sequence[str], delimiter: str, start: int, end: int) -> _Section:
+def _section(path: Path, lines: Sequence[str], delimiter: str, start: int, end: int) -> _Section | None:
     title = _cells(lines[start], delimiter)
+    components = _cells(lines[start + 3], delimiter) if end - start >= _HEADER_ROWS else []
+    laid_out = components[:1] == ["Frame"] and components[1:2] in (["Sub Frame"], ["SubFrame"])
+    if not laid_out and not any(title[1:]) and _number(title[0]) is None and title[0] not in _USED:
+        return None
     place = f"line {start + 1}"
     if any(title[1:]) or _number(title[0]) is not None:
         mend = "export again; sections begin with a title such as Segments in a line of its own, after a blank line"
@@ -162,12 +169,12 @@ def _section(path: Path, lines: Sequence[str], delimiter: str, start: int, end: 
     if end - start < _HEADER_ROWS:
         problem = f"the section {shorten(title[0])!r} ends within its header"
         refuse(path, place, problem, "export again: title, rate, names, components and units stand above the samples")
-    rate_row, names, components, units = (_cells(lines[start + i], delimiter) for i in range(1, _HEADER_ROWS))
+    rate_row, names, units = (_cells(lines[start + i], delimiter) for i in (1, 2, 4))
     rate = _number(rate_row[0])
     if rate is None or not 1 <= rate <= 1e5 or any(rate_row[1:]):
         problem = f"{shorten(delimiter.join(rate_row))!r} is not a rate in Hz"
         refuse(path, f"line {start + 2}", problem, "export again; the rate stands alone below the title")
-    if components[0] != "Frame" or components[1:2] not in (["Sub Frame"], ["SubFrame"]):
+    if not laid_out:
         problem = f"the row of components begins with {shorten(delimiter.join(components[:2]))!r}"
         refuse(path, f"line {start + 4}", problem, "export again; it begins with Frame, Sub Frame")
     while components and not components[-1]:
