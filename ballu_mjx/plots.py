@@ -11,9 +11,11 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
 from ballu_mjx import robot
 from ballu_mjx.identification import Identification
+from ballu_mjx.recording import Recording
 from ballu_mjx.robot import SIDES
 from ballu_mjx.sweep import Sweep
 
@@ -247,4 +249,38 @@ def _unwrapped(runs: Float[np.ndarray, "runs T 3"], start: float) -> Float[np.nd
 
 def _save(figure: Figure, path: Path) -> None:
     FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=_DOTS_PER_INCH)
+
+
+def recording(path: Path, seen: Recording, gaps: Mapping[str, Sequence[tuple[float, float]]]) -> None:
+    """A recording over time: where the robot goes, heights, how the legs bend, commands. Drop-outs (first and last time
+    by column) are shaded."""
+    panels: list[tuple[str, list[tuple[str, np.ndarray, str]], str]] = []
+    if seen.base_position is not None:
+        panels.append(("base (m)", [(axis, seen.base_position[:, i], f"C{i}") for i, axis in enumerate("xyz")], "base"))
+    if seen.balloon_position is not None and seen.balloon_quaternion is not None:
+        angles = np.rad2deg(Rotation.from_quat(seen.balloon_quaternion, scalar_first=True).as_euler("ZYX"))
+        angles = np.unwrap(angles, axis=0, period=360.0)
+        lines = [(name, angles[:, i], f"C{i}") for i, name in enumerate(("yaw", "pitch", "roll"))]
+        panels.append(("balloon (deg)", lines, "balloon"))
+    if seen.foot_position is not None:
+        lines = [(s, seen.foot_position[:, i, 2], _SIDE_COLOURS[i]) for i, s in enumerate(SIDES)]
+        panels.append(("feet, height (m)", lines, "foot"))
+    for name, value in (("motor", seen.motor), ("knee", seen.knee)):
+        if value is not None:
+            lines = [(s, np.rad2deg(value[:, i]), _SIDE_COLOURS[i]) for i, s in enumerate(SIDES)]
+            panels.append((f"{name}s (deg)", lines, name))
+    lines = [(s, seen.command[:, i], _SIDE_COLOURS[i]) for i, s in enumerate(SIDES)]
+    panels.append(("command", lines, "command"))
+    figure = Figure(figsize=(9.0, 1.0 + 1.7 * len(panels)), layout="constrained")
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, (title, lines, prefix) in zip(axes, panels, strict=True):
+        for label, value, colour in lines:
+            axis.plot(seen.time, value, color=colour, label=label, linewidth=0.9)
+        for first, last in {span for name, spans in gaps.items() if name.startswith(prefix) for span in spans}:
+            axis.axvspan(first, last, color="0.85", linewidth=0)
+        axis.set_ylabel(title)
+        axis.legend(loc="upper right", fontsize="small", ncols=3)
+    axes[-1].set_xlabel("time (s)")
+    axes[0].set_title(f"{seen.name} ({seen.kind}, {seen.robot})")
     figure.savefig(path, dpi=_DOTS_PER_INCH)

@@ -255,7 +255,11 @@ def _description_path(path: Path) -> Path:
     return path.with_name(_name(path) + ".json")
 
 
-def _read_text(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """The text of a file, unpacked where its name ends in .gz.
+
+    **Raises** `InputError` where there is no such file, or none of at most `LARGEST_FILE` bytes of UTF-8 text.
+    """
     if not path.is_file():
         _refuse(path, "there is no such file", "put it there or check the path")
     try:
@@ -280,7 +284,7 @@ def _read_description(path: Path) -> tuple[Kind, str, str]:
     if not path.is_file():
         _refuse(path, "there is no description beside the recording", f"write one such as {example}")
     try:
-        keys = json.loads(_read_text(path))
+        keys = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
         place = f" (line {error.lineno}: {error.msg})" if isinstance(error, json.JSONDecodeError) else ""
         _refuse(path, f"not JSON{place}", f"write it such as {example}")
@@ -309,7 +313,7 @@ def _quote(keys: dict, key: str) -> str:
 
 def _read_columns(path: Path) -> dict[str, _Column]:
     """The CSV's columns by name, missing samples as NaN."""
-    text = _read_text(path)
+    text = read_text(path)
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     values = array.array("d")
     header: list[str] | None = None

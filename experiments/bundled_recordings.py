@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx import virtual_robot
+from ballu_mjx.gaits import Gait, hopping, one_legged, telegraph, waves
 from ballu_mjx.recording import write_recording
 from ballu_mjx.robot import CONTROL_TIMESTEP, assets
 
@@ -24,23 +25,6 @@ DECIMALS = 4
 """Of positions (quaternions get one fewer): rounding by a tenth of the noise at most keeps the set at 2 MB."""
 SECONDS = {"training": 20.0, "validation": 25.0, "test": 25.0}
 """Five seconds more for validation and test: five starts for a horizon of 20 s, where one alone is a matter of luck."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Gait:
-    """Bang-bang commands: each leg is at `high` for a fraction `duty` of every period, else at 0."""
-
-    period: float
-    """s."""
-    phase: float
-    """Right leg behind the left, in periods."""
-    duty: tuple[float, float]
-    high: tuple[float, float]
-
-    def commands(self, seconds: float) -> Float[np.ndarray, "steps 2"]:
-        time = np.arange(round(seconds / CONTROL_TIMESTEP)) * CONTROL_TIMESTEP
-        phases = time[:, None] / self.period + np.array([0.0, self.phase])
-        return np.where(phases % 1.0 < np.array(self.duty) - 1e-9, np.array(self.high), 0.0)
 
 
 TRAINING = (
@@ -67,38 +51,6 @@ NEAR = {
         Gait(0.95, 0.55, (0.40, 0.45), (0.95, 0.80)),
     ),
 }
-
-
-def hopping(seconds: float) -> Float[np.ndarray, "steps 2"]:
-    """Both legs together, a period of 1.4 s."""
-    return Gait(1.4, 0.0, (0.4, 0.4), (0.9, 0.9)).commands(seconds)
-
-
-def one_legged(seconds: float) -> Float[np.ndarray, "steps 2"]:
-    """Two strides on one leg, then two on the other."""
-    time = np.arange(round(seconds / CONTROL_TIMESTEP)) * CONTROL_TIMESTEP
-    left = Gait(1.0, 0.0, (0.45, 0.45), (1.0, 1.0)).commands(seconds)
-    return np.where(np.stack([time % 4.0 < 2.0, time % 4.0 >= 2.0], axis=1), left, 0.0)
-
-
-def telegraph(seconds: float, seed: int = 11) -> Float[np.ndarray, "steps 2"]:
-    """Each leg jumps to another random level after another random wait."""
-    rng = np.random.default_rng(seed)
-    commands = np.zeros((round(seconds / CONTROL_TIMESTEP), 2))
-    for leg in range(2):
-        step = 0
-        while step < len(commands):
-            wait = rng.integers(5, 20)
-            commands[step : step + wait, leg] = rng.uniform(0.0, 1.0)
-            step += wait
-    return np.round(commands, 3)
-
-
-def waves(seconds: float) -> Float[np.ndarray, "steps 2"]:
-    """Smooth waves whose period drifts from 0.8 to 1.8 s."""
-    time = np.arange(round(seconds / CONTROL_TIMESTEP)) * CONTROL_TIMESTEP
-    phase = 2 * np.pi * np.cumsum(CONTROL_TIMESTEP / np.linspace(0.8, 1.8, len(time)))
-    return np.round(0.5 - 0.5 * np.cos(np.stack([phase, phase + np.pi], axis=1)), 3)
 
 
 FAR = {"validation": (hopping, one_legged), "test": (telegraph, waves)}

@@ -173,7 +173,7 @@ def test_bundled_free_recordings_show_no_motors_and_weigh_two_megabytes_at_most(
     assert sum(path.stat().st_size for path in (robot.assets() / "recordings").rglob("*.*")) < 2 * 2**20
 
 
-LABORATORY = ("virtual_robot.py", "trials.py", "pipeline.py")
+LABORATORY = ("virtual_robot.py", "trials.py", "pipeline.py", "record.py")
 """Where the stand-in for the hardware is built, and where experiments on it are run."""
 
 
