@@ -140,6 +140,7 @@ def draw(
 def hide_robot(option: mujoco.MjvOption) -> None:
     """Let a view show the floor without the model's own robot, which `draw` then puts there in its place."""
     option.geomgroup[_ROBOT_GROUP] = 0
+    option.sitegroup[:] = 0
     option.flags[mujoco.mjtVisFlag.mjVIS_TENDON] = 0
 
 

@@ -248,7 +248,7 @@ def _add_evaluation(content: Content, folder: Path, base: str, prefix: str = "")
             f"`python -m ballu_mjx.evaluate {folder} --output {folder}` writes it anew."
         ) from None
     if (folder / "evaluation.txt").is_file():
-        content.texts.append((f"{prefix}groups", (folder / "evaluation.txt").read_text(encoding="utf-8")))
+        content.texts.append((f"{prefix}by group", (folder / "evaluation.txt").read_text(encoding="utf-8")))
 
 
 def _horizons(title: str, base: str, without: Mapping[str, Any], mimic: Mapping[str, Any]) -> Table:

@@ -55,8 +55,10 @@ def write(path: Path, take: Take) -> None:
     mujoco.mj_forward(model, data)
     option, camera = mujoco.MjvOption(), mujoco.MjvCamera()
     ghosts.hide_robot(option)
-    camera.azimuth, camera.elevation, camera.distance = 75.0, -12.0, 3.2
-    middle = np.mean([ghosts.poses(model, qpos).balloon for qpos in take.qpos.values()], axis=0)
+    camera.azimuth, camera.elevation = 75.0, -12.0
+    ways = np.stack([ghosts.poses(model, qpos).balloon for qpos in take.qpos.values()])
+    middle = ways.mean(axis=0)
+    apart = np.linalg.norm(ways - middle, axis=-1).max(axis=0)
     rate = round(1.0 / float(np.median(np.diff(take.time))))
     frames = imageio_ffmpeg.write_frames(
         str(path), (WIDTH, HEIGHT), fps=rate, codec="libx264", quality=7, macro_block_size=16
@@ -65,6 +67,7 @@ def write(path: Path, take: Take) -> None:
         frames.send(None)
         for state in range(len(take.time)):
             camera.lookat[:] = (*middle[state, :2], 0.7)
+            camera.distance = 2.4 + 1.2 * apart[state]
             renderer.update_scene(data, camera, option)
             robots = {name: qpos[state] for name, qpos in take.qpos.items()}
             force = ghosts.force_at(take, state) if ghosts.pushed(take) else None
