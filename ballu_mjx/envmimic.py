@@ -334,7 +334,7 @@ class EnvMimicEnv(Env):
             "reward_position": terms["position"],
             "reward_orientation": terms["orientation"],
             "force": jnp.linalg.norm(force),
-            "diverged": 1.0 - finite,
+            "diverged": jnp.asarray(~finite, jnp.float32),
         }
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             pipeline_state=s,

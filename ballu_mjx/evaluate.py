@@ -8,18 +8,19 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import tyro
 
-from ballu_mjx import runtime
+from ballu_mjx import replay, runtime
 from ballu_mjx.errors import InputError
+from ballu_mjx.replay import Take
 
 if TYPE_CHECKING:
-    from ballu_mjx.evaluation import Evaluation, OpenLoopEvaluator
+    from ballu_mjx.evaluation import Evaluation, OpenLoopEvaluator, Replay
     from ballu_mjx.ppo import Params
     from ballu_mjx.recording import Recording
 
@@ -35,7 +36,8 @@ class Options:
     last: bool = False
     """Take the last checkpoint instead of the best by validation error."""
     output: Path | None = None
-    """Folder for evaluation.txt, evaluation.json and tracking.png. Without this option: the table is only printed."""
+    """Folder for evaluation.txt, evaluation.json, tracking.png and replay.npz, the run's own, say. Without this option:
+    the table is only printed."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -106,25 +108,25 @@ def load_params(folder: Path, which: Literal["best", "last"]) -> tuple[int, Para
 
 
 def report(evaluator: OpenLoopEvaluator, params: Params, folder: Path, base: str) -> Evaluation:
-    """Evaluate, and write `evaluation.txt`, `evaluation.json` and `tracking.png` into `folder`; `base` names the
-    simulator without the residual."""
+    """Evaluate, and write `evaluation.txt`, `evaluation.json`, `tracking.png` and `replay.npz` into `folder`; `base`
+    names the simulator without the residual."""
     result = evaluator(params)
     (folder / "evaluation.txt").write_text(result.table(base) + "\n", encoding="utf-8")
     (folder / "evaluation.json").write_text(json.dumps(result.to_json(), indent=2) + "\n", encoding="utf-8")
-    tracking(evaluator, params, folder / "tracking.png")
+    replays = {base: evaluator.replay(params, scale=0.0), "envmimic": evaluator.replay(params)}
+    tracking(evaluator, replays, folder / "tracking.png")
+    replay.write(folder / replay.NAME, takes(evaluator, replays))
     return result
 
 
-def tracking(evaluator: OpenLoopEvaluator, params: Params, path: Path) -> None:
-    """Draw whole-recording replays: of the first recording of each group."""
+def tracking(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay], path: Path) -> None:
+    """Draw whole-recording replays, by simulator: of the first recording of each group."""
     from ballu_mjx import plots, robot
     from ballu_mjx.evaluation import group_of
 
-    replays = {"vanilla": evaluator.replay(params, scale=0.0), "envmimic": evaluator.replay(params)}
     shown: dict[str, plots.TrackingPanel] = {}
-    for run, (recording, _) in enumerate(evaluator.starts):
-        name = evaluator.motions[recording].name
-        if group_of(name) in shown:
+    for motion, run in zip(evaluator.motions, evaluator.first_runs, strict=True):
+        if group_of(motion.name) in shown:
             continue
         position, yaw = evaluator.recorded(run)
         states = len(yaw)
@@ -132,13 +134,35 @@ def tracking(evaluator: OpenLoopEvaluator, params: Params, path: Path) -> None:
             simulator: np.column_stack([replay.position[run, :states, :2], replay.yaw[run, :states]])
             for simulator, replay in replays.items()
         }
-        shown[group_of(name)] = plots.TrackingPanel(
-            title=name,
+        shown[group_of(motion.name)] = plots.TrackingPanel(
+            title=motion.name,
             time=np.arange(states) * robot.CONTROL_TIMESTEP,
             recording=np.column_stack([position[:, :2], yaw]),
             simulations=simulations,
         )
     plots.tracking(path, list(shown.values()))
+
+
+def takes(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay]) -> list[Take]:
+    """Whole-recording replays of every recording, by simulator, to be looked at; the force is the last simulator's."""
+    found = []
+    for index, motion in enumerate(evaluator.motions):
+        run = evaluator.first_runs[index]
+        first = evaluator.starts[run][1]
+        states = len(motion.qpos) - first
+        *_, last = replays.values()
+        simulated = {simulator: replay.qpos[index, :states] for simulator, replay in replays.items()}
+        found.append(
+            Take(
+                name=motion.name,
+                robot=motion.robot,
+                time=motion.time[first:],
+                qpos={"recording": motion.qpos[first:], **simulated},
+                command=motion.command[first:],
+                force=last.force[run, : states - 1],
+            )
+        )
+    return found
 
 
 def learning_curve(folder: Path, best_step: int) -> None:

@@ -44,6 +44,8 @@ class Replay(NamedTuple):
     """Centre of mass (m, world)."""
     force: Float[np.ndarray, "runs steps 3"]
     """Residual force (N, world)."""
+    qpos: Float[np.ndarray, "recordings states nq"]
+    """Generalized positions from each recording's first start."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,18 +198,26 @@ class OpenLoopEvaluator:
             return jax.vmap(lambda run: self._replay_one(policy, config, params, scale, run[0], run[1], length))(batch)
 
         spec = jax.sharding.PartitionSpec
-        self._replay = jax.jit(
-            jax.shard_map(
-                replay, mesh=mesh, in_specs=(spec(), spec(), spec("batch")), out_specs=spec("batch"), check_vma=False
-            )
+        split = jax.shard_map(
+            replay, mesh=mesh, in_specs=(spec(), spec(), spec("batch")), out_specs=spec("batch"), check_vma=False
         )
+        recordings = [recording for recording, _ in self.starts]
+        # Of each recording, the place in `starts` of the run over (nearly) all of it.
+        self.first_runs = [recordings.index(index) for index in range(len(self.motions))]
+
+        def replay_all(params: Any, scale: Array, batch: Int[Array, "runs 2"]) -> Any:
+            # Positions of every start would be as much again as all else that comes back.
+            *seen, qpos = split(params, scale, batch)
+            return *seen, qpos[jnp.array(self.first_runs)]
+
+        self._replay = jax.jit(replay_all)
 
     def replay(self, params: Any, *, scale: float = 1.0) -> Replay:
         """Simulate every start to the end; `scale` multiplies the force (0 is vanilla)."""
         params = jax.device_get(params)  # they may live on one device; the batch is spread over all
-        features, com, force = jax.device_get(self._replay(params, np.float32(scale), self._batch))
+        features, com, force, qpos = jax.device_get(self._replay(params, np.float32(scale), self._batch))
         runs = len(self.starts)
-        return Replay(features[:runs, :, :3], features[:runs, :, _BALLOON_YAW], com[:runs], force[:runs])
+        return Replay(features[:runs, :, :3], features[:runs, :, _BALLOON_YAW], com[:runs], force[:runs], qpos)
 
     def recorded(self, run: int) -> tuple[Float[np.ndarray, "states 3"], Float[np.ndarray, " states"]]:
         """Recorded balloon position (m) and yaw (rad) from the start of `run` to the recording's end."""
@@ -230,7 +240,7 @@ class OpenLoopEvaluator:
         recording: Array,
         start: Array,
         length: int,
-    ) -> tuple[Array, Array, Array]:
+    ) -> tuple[Array, Array, Array, Array]:
         reference, simulator = self._reference, self._simulator
         history = jax.lax.dynamic_slice_in_dim(
             reference.features[recording], start - envmimic.HISTORY + 1, envmimic.HISTORY
@@ -244,12 +254,15 @@ class OpenLoopEvaluator:
             state = simulator.step(state, reference.command[recording, time], force)
             seen, com = simulator.observe(state)
             history = jnp.concatenate([history[1:], seen[None]])
-            return (state, history), (seen, com, force)
+            return (state, history), (seen, com, force, state.qpos)
 
         first_state = simulation.at(reference.qpos[recording, start], reference.qvel[recording, start])
         first, first_com = simulator.observe(first_state)
-        _, (features, com, force) = jax.lax.scan(step, (first_state, history), start + jnp.arange(length))
-        return jnp.concatenate([first[None], features]), jnp.concatenate([first_com[None], com]), force
+        _, (features, com, force, qpos) = jax.lax.scan(step, (first_state, history), start + jnp.arange(length))
+        features, com, qpos = (
+            jnp.concatenate([x[None], xs]) for x, xs in ((first, features), (first_com, com), (first_state.qpos, qpos))
+        )
+        return features, com, force, qpos
 
     def _errors(self, replay: Replay) -> tuple[Errors, ...]:
         results = []

@@ -117,7 +117,7 @@ class LocomotionEnv(Env):
         """Start from a given state in the simulator that `setting` makes, with nominal friction, and without an end."""
         state = self._begin(setting, qpos, qvel, jnp.asarray(self._friction[self._feet[0], 0]), rng)
         s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-        return dataclasses.replace(state, pipeline_state=s | {"remaining": jnp.array(2**30)})  # pyright: ignore
+        return dataclasses.replace(state, pipeline_state=s | {"remaining": jnp.asarray(2**30, jnp.int32)})  # pyright: ignore
 
     def step(self, state: State, action: Array) -> State:
         """Advance one control step under the policy's commands and the residual's force."""
@@ -155,7 +155,7 @@ class LocomotionEnv(Env):
             "force": jnp.linalg.norm(force),
             "outside": jnp.asarray(excess > 0.0, jnp.float32),
             "excess": excess,
-            "diverged": 1.0 - finite,
+            "diverged": jnp.asarray(~finite, jnp.float32),
         }
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
             pipeline_state=s,

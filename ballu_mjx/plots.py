@@ -41,7 +41,7 @@ LABELS: Mapping[str, str] = {
 }
 _QUANTITIES = ("x (m)", "y (m)", "yaw (deg)")
 _DOTS_PER_INCH = 120
-_SIDE_COLOURS = ("#1f77b4", "#d64d1f")
+SIDE_COLOURS = ("#1f77b4", "#d64d1f")
 """Left and right, as in the model."""
 _STANCE_HEIGHT, _STANCE_SPEED = 0.012, 0.1
 """A planted foot's greatest height (m) and horizontal speed (m/s)."""
@@ -74,7 +74,7 @@ def tracking(path: Path, panels: Sequence[TrackingPanel]) -> None:
         column[-1].set_xlabel("time (s)")
         curves = {**panel.simulations, "recording": panel.recording}  # the recording last, on top
         for name, values in curves.items():
-            runs = _unwrapped(values if values.ndim == 3 else values[None], panel.recording[0, 2])
+            runs = unwrapped(values if values.ndim == 3 else values[None], panel.recording[0, 2])
             for index, axis in enumerate(column):
                 mean = runs[..., index].mean(axis=0)
                 axis.plot(panel.time, mean, color=COLOURS[name], label=LABELS[name], linewidth=1.5)
@@ -145,7 +145,7 @@ def gait(
     figure = Figure(figsize=(12.0, 10.0), layout="constrained")
     strip, heights, commands, above = figure.subplots(4, 1, height_ratios=(1.6, 1.0, 1.0, 1.4))
     for state in range(shown.start, shown.stop, round(0.25 / period)):
-        for part, colour in (("body", "grey"), (SIDES[0], _SIDE_COLOURS[0]), (SIDES[1], _SIDE_COLOURS[1])):
+        for part, colour in (("body", "grey"), (SIDES[0], SIDE_COLOURS[0]), (SIDES[1], SIDE_COLOURS[1])):
             strip.plot(sticks[part][state, :, 0], sticks[part][state, :, 2], color=colour, linewidth=1.0)
         strip.plot(*sticks["body"][state, -1, [0, 2]], "o", color="lightgrey", markersize=9)
     strip.axhline(0.0, color="black", linewidth=0.8)
@@ -154,10 +154,10 @@ def gait(
     strip.set_ylabel("z (m)")
     for leg, side in enumerate(SIDES):
         height = feet[shown, leg, 2]
-        heights.plot(time[shown], height, color=_SIDE_COLOURS[leg], label=side)
+        heights.plot(time[shown], height, color=SIDE_COLOURS[leg], label=side)
         stance = np.where(planted[shown, leg], -0.01 - 0.01 * leg, np.nan)
-        heights.plot(time[shown], stance, color=_SIDE_COLOURS[leg], linewidth=3)
-        commands.plot(time[shown], command[shown, leg], color=_SIDE_COLOURS[leg])
+        heights.plot(time[shown], stance, color=SIDE_COLOURS[leg], linewidth=3)
+        commands.plot(time[shown], command[shown, leg], color=SIDE_COLOURS[leg])
     heights.set_ylabel("height of foot (m)")
     heights.legend(loc="upper right")
     commands.set_ylabel("command")
@@ -165,7 +165,7 @@ def gait(
     above.plot(com[:, 0], com[:, 1], color="black", label="centre of mass")
     for leg, side in enumerate(SIDES):
         down = feet[planted[:, leg], leg]
-        above.plot(down[:, 0], down[:, 1], ".", color=_SIDE_COLOURS[leg], markersize=3, label=f"{side} foot, stance")
+        above.plot(down[:, 0], down[:, 1], ".", color=SIDE_COLOURS[leg], markersize=3, label=f"{side} foot, stance")
     above.set_aspect("equal", adjustable="datalim")
     above.set_xlabel("x (m)")
     above.set_ylabel("y (m)")
@@ -240,7 +240,7 @@ def actuator_curves(path: Path, sweep: Sweep, result: Identification) -> None:
     _save(figure, path)
 
 
-def _unwrapped(runs: Float[np.ndarray, "runs T 3"], start: float) -> Float[np.ndarray, "runs T 3"]:
+def unwrapped(runs: Float[np.ndarray, "runs T 3"], start: float) -> Float[np.ndarray, "runs T 3"]:
     """Yaw in degrees without jumps, starting on the same turn as the recording's."""
     yaw = np.unwrap(runs[..., 2], axis=-1)
     yaw = yaw - 2 * np.pi * np.round((yaw[:, :1] - start) / (2 * np.pi))
@@ -264,13 +264,13 @@ def recording(path: Path, seen: Recording, gaps: Mapping[str, Sequence[tuple[flo
         lines = [(name, angles[:, i], f"C{i}") for i, name in enumerate(("yaw", "pitch", "roll"))]
         panels.append(("balloon (deg)", lines, "balloon"))
     if seen.foot_position is not None:
-        lines = [(s, seen.foot_position[:, i, 2], _SIDE_COLOURS[i]) for i, s in enumerate(SIDES)]
+        lines = [(s, seen.foot_position[:, i, 2], SIDE_COLOURS[i]) for i, s in enumerate(SIDES)]
         panels.append(("feet, height (m)", lines, "foot"))
     for name, value in (("motor", seen.motor), ("knee", seen.knee)):
         if value is not None:
-            lines = [(s, np.rad2deg(value[:, i]), _SIDE_COLOURS[i]) for i, s in enumerate(SIDES)]
+            lines = [(s, np.rad2deg(value[:, i]), SIDE_COLOURS[i]) for i, s in enumerate(SIDES)]
             panels.append((f"{name}s (deg)", lines, name))
-    lines = [(s, seen.command[:, i], _SIDE_COLOURS[i]) for i, s in enumerate(SIDES)]
+    lines = [(s, seen.command[:, i], SIDE_COLOURS[i]) for i, s in enumerate(SIDES)]
     panels.append(("command", lines, "command"))
     figure = Figure(figsize=(9.0, 1.0 + 1.7 * len(panels)), layout="constrained")
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]

@@ -13,11 +13,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from ballu_mjx import actuators, locomotion, plots, policy, ppo, residual, robot, runs
+from ballu_mjx import actuators, locomotion, plots, policy, ppo, replay, residual, robot, runs
 from ballu_mjx.errors import InputError
 from ballu_mjx.locomotion import LocomotionConfig
 from ballu_mjx.policy import ClosedLoop, Policy, Rollout
 from ballu_mjx.ppo import PPOConfig
+from ballu_mjx.replay import Take
 from ballu_mjx.robot import ActuatorParameters
 from ballu_mjx.session import Session, restored_from
 from ballu_mjx.tasks import Task
@@ -101,6 +102,9 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
     loop = ClosedLoop(env, trained.infer)
     rollout = loop(trained.params, *loop.standing(), round(task.trial_seconds / robot.CONTROL_TIMESTEP))
     plots.gait(folder / "gait.png", rollout.qpos[0], rollout.command[0])
+    time_axis = np.arange(len(rollout.qpos[0])) * robot.CONTROL_TIMESTEP
+    episode = Take(name=task.name, time=time_axis, qpos={setting: rollout.qpos[0]}, command=rollout.command[0])
+    replay.write(folder / replay.NAME, [episode])
     print(summary(task, rollout, forces is not None))
     print(f"\nWritten to {folder}. {time.perf_counter() - started:.0f} s in all.")
     return 0

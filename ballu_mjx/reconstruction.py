@@ -99,6 +99,8 @@ class Motion:
     """Root-mean-square distance (mm) between measured and fitted positions before smoothing: balloon, base, feet."""
     interpolated: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """Samples that the recording's reader filled in, by column."""
+    robot: str = ""
+    """Which robot was recorded."""
     pitch_deviation: float = 0.0
     """Standard deviation (rad) of the base's pitch by the fit's own account. Neck and hips share this error with the
     opposite sign; balloon, legs and feet in the world do not."""
@@ -150,6 +152,7 @@ def reconstruct(
         qvel=qvel[states],
         residual_mm=_residuals(skeleton, grid, fitted),
         interpolated=dict(recording.interpolated),
+        robot=recording.robot,
         pitch_deviation=pitch_deviation,
     )
 

@@ -5,6 +5,7 @@ metrics.jsonl       one JSON object a line: `step` (control steps) and what was 
 tensorboard/        the same for TensorBoard
 checkpoints/STEP/   parameters (orbax): the last three, and the best by validation error
 evaluation.txt, evaluation.json, learning_curve.png, tracking.png
+replay.npz          what the robots did, for `ballu_mjx.report` and `ballu_mjx.view`
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx import envmimic, evaluation, robot, simulation
+from ballu_mjx import envmimic, evaluate, evaluation, ghosts, robot, simulation
 from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.reconstruction import Motion
 
@@ -206,13 +206,20 @@ def test_the_missing_force_earns_more_than_none_and_its_opposite_less(pushed: Mo
     assert total(force) > 20 * 0.99 * best
 
 
-def test_evaluator_finds_no_error_in_its_own_physics_and_some_in_pushed_ones():
+FORCE = np.array([0.04, 0.0, 0.02])
+
+
+@pytest.fixture(scope="module")
+def evaluator() -> evaluation.OpenLoopEvaluator:
+    """Of a recording without and a shorter one with `FORCE`; the policy's parameters are the force it gives."""
     config = EnvMimicConfig()
-    motions = [make_motion(np.zeros(3), "near-own", 60), make_motion(np.array([0.04, 0, 0.02]), "far-pushed", 60)]
+    motions = [make_motion(np.zeros(3), "near-own", 60), make_motion(FORCE, "far-pushed", 50)]
     constant = lambda params, _: params / config.force_scale  # noqa: E731
-    evaluator = evaluation.OpenLoopEvaluator(robot.load_model(), motions, config, constant)
-    force = jnp.array([0.04, 0.0, 0.02])
-    result = evaluator(force)
+    return evaluation.OpenLoopEvaluator(robot.load_model(), motions, config, constant)
+
+
+def test_evaluator_finds_no_error_in_its_own_physics_and_some_in_pushed_ones(evaluator: evaluation.OpenLoopEvaluator):
+    result = evaluator(jnp.array(FORCE))
     own, pushed = result.vanilla
     assert own.group == "near" and pushed.group == "far"
     assert own.position[1.0][0] < 1e-3 and own.yaw[1.0][0] < 0.1
@@ -220,3 +227,23 @@ def test_evaluator_finds_no_error_in_its_own_physics_and_some_in_pushed_ones():
     # The force that made the recording explains it; on the other recording it does harm, and the bound says so.
     assert result.ratio("far", "position", 2.0) < 0.1
     assert result.excess()[0] > 0 and "near-own" in result.excess()[1]
+
+
+def test_replays_kept_to_be_looked_at_are_those_evaluated(evaluator: evaluation.OpenLoopEvaluator):
+    replays = {"vanilla": evaluator.replay(jnp.array(FORCE), scale=0.0), "envmimic": evaluator.replay(jnp.array(FORCE))}
+    takes = evaluate.takes(evaluator, replays)
+    assert [take.name for take in takes] == ["near-own", "far-pushed"]
+    first = envmimic.HISTORY - 1
+    for take, motion, run in zip(takes, evaluator.motions, evaluator.first_runs, strict=True):
+        np.testing.assert_array_equal(take.qpos["recording"], motion.qpos[first:])
+        assert take.time[0] == pytest.approx(first * robot.CONTROL_TIMESTEP)
+        for name, replay in replays.items():
+            states = len(take.time)
+            seen = ghosts.poses(robot.load_model(), take.qpos[name])
+            np.testing.assert_allclose(seen.balloon, replay.position[run, :states], atol=1e-4)
+            np.testing.assert_allclose(seen.yaw, replay.yaw[run, :states], atol=1e-3)
+        assert take.force is not None
+        np.testing.assert_allclose(take.force, np.tile(FORCE, (len(take.time) - 1, 1)), atol=0.02)
+    # Of each recording, the simulator that it was made in.
+    for take, name in zip(takes, ("vanilla", "envmimic"), strict=True):
+        np.testing.assert_allclose(take.qpos[name], take.qpos["recording"], atol=0.02)

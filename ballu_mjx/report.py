@@ -1,0 +1,428 @@
+"""A run as one page for the browser: `python -m ballu_mjx.report RUN`.
+
+The page holds all it shows and loads nothing: options, learning curves, errors, plots over time, and the replay in 3D.
+JAX, MuJoCo, and all that needs them, are imported inside functions: `runtime.prepare` has to come first.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import importlib.resources
+import json
+import sys
+import webbrowser
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from ballu_mjx import replay, runtime, video
+from ballu_mjx.errors import InputError
+from ballu_mjx.replay import Take
+
+NAME = "report.html"
+_TEMPLATE = "report.html"
+_IMAGES = ("gait.png", "actuator_curves.png")
+"""Figures of a run's folder that have no interactive twin."""
+_CURVES = {
+    "reward": "reward per control step",
+    "validation_error": "validation error (ratio to vanilla)",
+}
+_QUANTITIES = (("position", "position RMSE (m)", 3), ("yaw", "yaw RMSE (deg)", 1))
+_WHOLE = (("mean_com_error", "mean CoM error (m)", 3), ("final_yaw_error", "final yaw error (deg)", 1))
+_FORCE_COLOURS = ("#cc0000", "#7b3294", "#998ec3")
+_ROW_HEIGHT = 170
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Write a run, or a folder of `train all`, as one page for the browser, which needs no network."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run, or of `train all`."""
+    output: Path | None = None
+    """File to write. Without this option: report.html in the run's folder."""
+    open: bool = False
+    """Show it in the browser."""
+    video: bool = False
+    """Write the replay as MP4 too, beside the page."""
+    show: str | None = None
+    """Recording (or task) that the video shows. Without this option: the first."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
+    try:
+        options = tyro.cli(
+            Options, args=arguments, prog="python -m ballu_mjx.report", config=(tyro.conf.FlagCreatePairsOff,)
+        )
+        if options.video:
+            video.choose_renderer()
+        runtime.prepare()
+        _report(options)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _report(options: Options) -> None:
+    path = options.output or options.run / NAME
+    if path.is_dir():
+        raise InputError(f"--output {path}: is a folder; give a file.")
+    content = collect(options.run)
+    if options.show is not None and options.show not in (names := [take.name for take in content.takes]):
+        raise InputError(f"--show {options.show}: there is no such replay; one of {', '.join(names) or 'none'}.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(render(content), encoding="utf-8")
+    print(f"Written to {path}, {path.stat().st_size / 1e6:.1f} MB.")
+    if not content.takes:
+        print(
+            f"There is no {replay.NAME} to show: `python -m ballu_mjx.evaluate RUN --output RUN` writes an EnvMimic's."
+        )
+    elif options.video:
+        shown = next(take for take in content.takes if options.show in (None, take.name))
+        try:
+            video.write(path.with_suffix(".mp4"), shown)
+            print(f"Written to {path.with_suffix('.mp4')}: {shown.name}.")
+        except InputError as error:
+            print(error, file=sys.stderr)
+    if options.open:
+        webbrowser.open(path.resolve().as_uri())
+
+
+# ---- what a page holds ----
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """A number as it is shown, and as it was stored."""
+
+    text: str
+    exact: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """A titled table."""
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Curve:
+    """What was measured in training: `values` by name of a run, each (control steps, values)."""
+
+    title: str
+    values: Mapping[str, tuple[np.ndarray, np.ndarray]]
+
+
+@dataclasses.dataclass
+class Content:
+    """All that a page shows."""
+
+    title: str
+    facts: list[tuple[str, str]] = dataclasses.field(default_factory=list)
+    tables: list[Table] = dataclasses.field(default_factory=list)
+    markdown: list[tuple[str, str]] = dataclasses.field(default_factory=list)
+    """Titled tables in Markdown."""
+    texts: list[tuple[str, str]] = dataclasses.field(default_factory=list)
+    """Titled plain text."""
+    curves: list[Curve] = dataclasses.field(default_factory=list)
+    images: list[tuple[str, bytes]] = dataclasses.field(default_factory=list)
+    """Titled PNGs."""
+    takes: list[Take] = dataclasses.field(default_factory=list)
+    options: list[tuple[str, list[tuple[str, str]]]] = dataclasses.field(default_factory=list)
+    """Options by section."""
+
+
+def collect(folder: Path) -> Content:
+    """What there is to show of a run, or of a folder of `train all`.
+
+    **Raises** `InputError` where `folder` is neither, or a file in it is damaged.
+    """
+    from ballu_mjx import pipeline
+
+    tables = [(task, pipeline.table_file(folder, task)) for task in pipeline.TABLES]
+    if not (folder / "config.json").is_file() and any(path.is_file() for _, path in tables):
+        return _story(folder, {task: path.read_text(encoding="utf-8") for task, path in tables if path.is_file()})
+    return _run(folder)
+
+
+def _run(folder: Path) -> Content:
+    from ballu_mjx import runs
+    from ballu_mjx.evaluation import base_name
+    from ballu_mjx.tasks import TASKS
+
+    config = runs.read_config(folder, "envmimic", "sysid", *TASKS)
+    content = Content(f"{config['task']}: {folder.resolve().name}")
+    start = (config.get("starts") or [{}])[-1]
+    content.facts = [("folder", str(folder.resolve())), ("begun", str(start.get("time", "")))]
+    content.facts += [("command", " ".join(map(str, start.get("command", []))))]
+    for use, files in config.get("recordings", {}).items():
+        content.facts.append((f"{use} recordings", ", ".join(str(file["path"]) for file in files)))
+    _add_evaluation(content, folder, base_name(config.get("actuators") is not None))
+    if (folder / "identification.txt").is_file():
+        content.texts.append(("Identification", (folder / "identification.txt").read_text(encoding="utf-8")))
+    content.curves = _curves({config["task"]: folder})
+    content.images = [(n, (folder / n).read_bytes()) for n in _IMAGES if (folder / n).is_file()]
+    if (folder / replay.NAME).is_file():
+        content.takes = replay.read(folder / replay.NAME)
+    robots = dict.fromkeys(take.robot for take in content.takes if take.robot)
+    if robots:
+        content.facts.append(("robot", ", ".join(robots)))
+    content.options = _options(config)
+    return content
+
+
+def _story(folder: Path, tables: Mapping[str, str]) -> Content:
+    """A folder of `train all`: its tables, and of each seed and task the policies over each other."""
+    from ballu_mjx import pipeline
+    from ballu_mjx.evaluation import base_name
+    from ballu_mjx.runs import read_config
+
+    content = Content(f"train all: {folder.resolve().name}", facts=[("folder", str(folder.resolve()))])
+    content.markdown = [(f"Transfer, {task}", text) for task, text in tables.items()]
+    for seed in sorted(path for path in folder.glob("seed-*") if path.is_dir()):
+        for task in tables:
+            where = f"{task}, {seed.name}"
+            policies = {setting: seed / f"{task}-{setting}" for setting in ("vanilla", *pipeline.SETTINGS)}
+            policies = {setting: path for setting, path in policies.items() if (path / "config.json").is_file()}
+            content.curves += [dataclasses.replace(c, title=f"{c.title} ({where})") for c in _curves(policies)]
+            own = {s: replay.read(p / replay.NAME)[0] for s, p in policies.items() if (p / replay.NAME).is_file()}
+            if own:
+                content.takes.append(_over_each_other(f"policies: {where}", own))
+            for setting in policies:
+                image = seed / f"trials-{task}-{setting}" / "trials.png"
+                if image.is_file():
+                    content.images.append((f"Trials on the robot: {where}, {setting}", image.read_bytes()))
+            learned = seed / f"envmimic-{task}"
+            if (learned / "config.json").is_file():
+                identified = read_config(learned, "envmimic").get("actuators") is not None
+                _add_evaluation(content, learned, base_name(identified), f"EnvMimic for {where}: ")
+                if (learned / replay.NAME).is_file():
+                    content.takes += [
+                        dataclasses.replace(take, name=f"EnvMimic for {where}: {take.name}")
+                        for take in replay.read(learned / replay.NAME)
+                    ]
+    return content
+
+
+def _over_each_other(name: str, own: Mapping[str, Take]) -> Take:
+    """Policies' episodes as one take, each in its own simulator, as long as the shortest."""
+    states = min(len(take.time) for take in own.values())
+    first = next(iter(own.values()))
+    qpos = {setting: next(iter(take.qpos.values()))[:states] for setting, take in own.items()}
+    return Take(name=name, time=first.time[:states], qpos=qpos)
+
+
+def _add_evaluation(content: Content, folder: Path, base: str, prefix: str = "") -> None:
+    """Tables from `evaluation.json`, and `evaluation.txt` as it is."""
+    path = folder / "evaluation.json"
+    if not path.is_file():
+        return
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        pairs = list(zip(found["vanilla"], found["envmimic"], strict=True))
+        content.facts.append((f"{prefix}score", f"{found['score']:.3f} (mean ratio to {base})"))
+        content.tables += [
+            _horizons(f"{prefix}{without['recording']}", base, without, mimic) for without, mimic in pairs
+        ]
+        header = ["", *(f"{title}, {name}" for _, title, _ in _WHOLE for name in (base, "EnvMimic")), "mean force (N)"]
+        rows = []
+        for without, mimic in pairs:
+            cells = [_cell(errors[key], digits) for key, _, digits in _WHOLE for errors in (without, mimic)]
+            rows.append([Cell(without["recording"]), *cells, _cell(mimic["mean_force"], 4)])
+        content.tables.append(Table(f"{prefix}whole recordings", header, rows))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{path}: is no evaluation ({type(error).__name__}: {error}); "
+            f"`python -m ballu_mjx.evaluate {folder} --output {folder}` writes it anew."
+        ) from None
+    if (folder / "evaluation.txt").is_file():
+        content.texts.append((f"{prefix}by group", (folder / "evaluation.txt").read_text(encoding="utf-8")))
+
+
+def _horizons(title: str, base: str, without: Mapping[str, Any], mimic: Mapping[str, Any]) -> Table:
+    """One recording's errors by horizon: mean over the starts, without and with the residual, and their ratio."""
+    header = ["horizon (s)"]
+    for key, quantity, _ in _QUANTITIES:
+        header += [f"{quantity}, {base}", f"{quantity}, EnvMimic", f"{key}, ratio"]
+    rows = []
+    for horizon in without["position"]:
+        row = [Cell(f"{float(horizon):g}")]
+        for key, _, digits in _QUANTITIES:
+            one, other = without[key][horizon][0], mimic[key][horizon][0]
+            row += [_cell(one, digits), _cell(other, digits), _cell(other / one if one else float("nan"), 2)]
+        rows.append(row)
+    return Table(title, header, rows)
+
+
+def _cell(value: float, digits: int) -> Cell:
+    return Cell(f"{value:.{digits}f}", repr(float(value)))
+
+
+def _curves(folders: Mapping[str, Path]) -> list[Curve]:
+    from ballu_mjx import runs
+
+    found = []
+    for name, title in _CURVES.items():
+        values = {run: runs.column(folder, name) for run, folder in folders.items()}
+        values = {run: pair for run, pair in values.items() if len(pair[0])}
+        if values:
+            found.append(Curve(title, values))
+    return found
+
+
+def _options(config: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """The sections of a `config.json`, each as names and values."""
+    sections, loose = [], []
+    for name, value in config.items():
+        if isinstance(value, dict):
+            sections.append((name, [(key, json.dumps(entry)) for key, entry in value.items()]))
+        elif isinstance(value, list):
+            sections.append((name, [(str(index), json.dumps(entry)) for index, entry in enumerate(value)]))
+        else:
+            loose.append((name, json.dumps(value)))
+    return [("run", loose), *sections]
+
+
+# ---- how it is shown ----
+
+
+def render(content: Content) -> str:
+    """The page. Strings of the run are escaped wherever they stand; nothing in them is markup.
+
+    **Raises** `InputError` where the packages of the extra `report` are missing.
+    """
+    try:
+        import jinja2
+        import markdown_it
+        import markupsafe
+        from plotly.offline import get_plotlyjs
+
+        from ballu_mjx import ghosts, stage
+    except ImportError as error:
+        raise InputError(
+            f"The report needs {error.name}, which comes with the extra report: pip install -c constraints.txt -e "
+            '".[report]".'
+        ) from None
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    template = environment.from_string(
+        importlib.resources.files("ballu_mjx").joinpath(_TEMPLATE).read_text(encoding="utf-8")
+    )
+    markdown = markdown_it.MarkdownIt("commonmark", {"html": False}).enable("table")
+    takes = [dataclasses.replace(take, time=take.time - take.time[0]) for take in content.takes]
+    head, own, tail = stage.shared([stage.page(take) for take in takes]) if takes else ("", [], "")
+    shown = {
+        "curves": [_plot(_curve_rows([curve]), "control steps (millions)") for curve in content.curves],
+        "takes": [_plot(_take_rows(take), "time (s)") for take in takes],
+        "stage": {"head": head, "own": own, "tail": tail},
+    }
+    return template.render(
+        content=content,
+        markdown=[(title, markupsafe.Markup(markdown.render(text))) for title, text in content.markdown],
+        images=[(title, base64.b64encode(png).decode()) for title, png in content.images],
+        legends=[[(ghosts.label(name), _hex(name)) for name in take.qpos] for take in takes],
+        arrow=ghosts.ARROW_LENGTH / 10,
+        with_force=any(ghosts.pushed(take) for take in takes),
+        shown=shown,
+        plotly=markupsafe.Markup(get_plotlyjs()),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Line:
+    name: str
+    colour: str
+    x: np.ndarray
+    y: np.ndarray
+    dash: str = "solid"
+
+
+_Rows = Sequence[tuple[str, Sequence[_Line]]]
+
+
+def _hex(name: str) -> str:
+    from matplotlib.colors import to_hex
+
+    from ballu_mjx import ghosts
+
+    return to_hex(ghosts.colour(name))
+
+
+def _curve_rows(curves: Sequence[Curve]) -> _Rows:
+    from ballu_mjx import ghosts
+
+    return [
+        (c.title, [_Line(ghosts.label(name), _hex(name), x / 1e6, y) for name, (x, y) in c.values.items()])
+        for c in curves
+    ]
+
+
+def _take_rows(take: Take) -> _Rows:
+    """x, y and yaw of each robot's balloon, the residual force, the commands."""
+    from ballu_mjx import ghosts, plots, robot
+
+    model = robot.load_model()
+    poses = {name: ghosts.poses(model, qpos) for name, qpos in take.qpos.items()}
+    start = next(iter(poses.values())).yaw[0]
+    ways = {
+        name: plots.unwrapped(np.column_stack([p.balloon[:, :2], p.yaw])[None], start)[0] for name, p in poses.items()
+    }
+    rows: list[tuple[str, Sequence[_Line]]] = [
+        (title, [_Line(ghosts.label(name), _hex(name), take.time, way[:, i]) for name, way in ways.items()])
+        for i, title in enumerate(("x (m)", "y (m)", "yaw (deg)"))
+    ]
+    steps = take.time[:-1]
+    if take.force is not None:
+        forces = zip("xyz", _FORCE_COLOURS, take.force.T, strict=True)
+        rows.append(("residual force (N)", [_Line(f"force {axis}", c, steps, value) for axis, c, value in forces]))
+    if take.command is not None:
+        sides = zip(robot.SIDES, plots.SIDE_COLOURS, ("solid", "dot"), take.command.T, strict=True)
+        rows.append(("command", [_Line(f"command, {side}", c, steps, value, dash) for side, c, dash, value in sides]))
+    return rows
+
+
+def _plot(rows: _Rows, x_title: str) -> dict[str, Any]:
+    """A plotly figure as plain data, a panel for each row, over one x."""
+    from plotly.subplots import make_subplots
+
+    figure = make_subplots(rows=len(rows), cols=1, shared_xaxes=True, vertical_spacing=0.03)
+    named: set[str] = set()
+    for index, (title, lines) in enumerate(rows, start=1):
+        for line in lines:
+            figure.add_scatter(
+                x=np.asarray(line.x, np.float32),
+                y=np.asarray(line.y, np.float32),
+                name=line.name,
+                legendgroup=line.name,
+                showlegend=line.name not in named,
+                mode="lines" if len(line.x) > 1 else "markers",
+                line={"color": line.colour, "width": 1.5, "dash": line.dash},
+                row=index,
+                col=1,
+            )
+            named.add(line.name)
+        figure.update_yaxes(title_text=title, row=index, col=1)
+    figure.update_xaxes(title_text=x_title, row=len(rows), col=1)
+    figure.update_layout(
+        height=_ROW_HEIGHT * len(rows) + 110,
+        margin={"l": 70, "r": 20, "t": 20, "b": 50},
+        template="plotly_white",
+        hovermode="x unified",
+        legend={"orientation": "h", "y": 1.0, "yanchor": "bottom"},
+    )
+    return json.loads(str(figure.to_json()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
