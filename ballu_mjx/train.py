@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from ballu_mjx.ppo import PPOConfig
 
 Config = TypeVar("Config")
+Data = TypeVar("Data")
+_CADENCES = ("validate_every", "keep_every")
+"""Options of the training commands' data that a run keeps."""
 _PROGRAM = "python -m ballu_mjx.train"
 
 
@@ -51,11 +54,13 @@ def _commands(arguments: Sequence[str]) -> dict[str, Callable[..., int]]:
     from ballu_mjx.ppo import PPOConfig
     from ballu_mjx.tasks import TASKS, Task
 
-    env_defaults, ppo_defaults = _defaults(arguments, "envmimic", EnvMimicConfig, PPOConfig, residual_training.QUICK)
+    data_defaults, env_defaults, ppo_defaults = _defaults(
+        arguments, "envmimic", residual_training.Data, EnvMimicConfig, PPOConfig, residual_training.QUICK
+    )
     fit_defaults = IdentificationConfig(**actuator_fit.QUICK if "--quick" in arguments else {})
 
     def envmimic(
-        data: residual_training.Data = residual_training.Data(),  # noqa: B008
+        data: residual_training.Data = data_defaults,
         env: EnvMimicConfig = env_defaults,
         ppo: PPOConfig = ppo_defaults,
     ) -> int:
@@ -70,12 +75,17 @@ def _commands(arguments: Sequence[str]) -> dict[str, Callable[..., int]]:
         return actuator_fit.fit(data, fit)
 
     def task_command(task: Task) -> Callable[..., int]:
-        env_defaults, ppo_defaults = _defaults(
-            arguments, task.name, LocomotionConfig, policy_training.defaults, policy_training.QUICK
+        data_defaults, env_defaults, ppo_defaults = _defaults(
+            arguments,
+            task.name,
+            policy_training.Data,
+            LocomotionConfig,
+            policy_training.defaults,
+            policy_training.QUICK,
         )
 
         def command(
-            data: policy_training.Data = policy_training.Data(),  # noqa: B008
+            data: policy_training.Data = data_defaults,
             env: LocomotionConfig = env_defaults,
             ppo: PPOConfig = ppo_defaults,
         ) -> int:
@@ -95,11 +105,12 @@ def _commands(arguments: Sequence[str]) -> dict[str, Callable[..., int]]:
 def _defaults(
     arguments: Sequence[str],
     task: str,
+    data_class: type[Data],
     env_class: type[Config],
     ppo: "Callable[..., PPOConfig]",
     quick: Mapping[str, Any],
-) -> "tuple[Config, PPOConfig]":
-    """Where the options of a task's training stand that are not given: in the run that goes on, or in `env_class` and
+) -> "tuple[Data, Config, PPOConfig]":
+    """Where the options of a task's training stand that are not given: in the run that goes on, or in the classes and
     `ppo`, with `quick` under --quick."""
     from ballu_mjx import runs
     from ballu_mjx.ppo import PPOConfig
@@ -110,8 +121,13 @@ def _defaults(
     first, _ = parser.parse_known_args([a for a in arguments if a != "--help"])
     if first.resume is not None and arguments[0] == task:
         config = runs.read_config(first.resume, task)
-        return runs.typed(env_class, config["env"], first.resume), runs.typed(PPOConfig, config["ppo"], first.resume)
-    return env_class(), ppo(**quick if first.quick else {})
+        cadence = {name: config["data"][name] for name in _CADENCES if name in config.get("data", {})}
+        return (
+            data_class(**cadence),
+            runs.typed(env_class, config["env"], first.resume),
+            runs.typed(PPOConfig, config["ppo"], first.resume),
+        )
+    return data_class(), env_class(), ppo(**quick if first.quick else {})
 
 
 if __name__ == "__main__":

@@ -51,33 +51,78 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@dataclasses.dataclass(frozen=True)
+class Stopped:
+    """A run that was interrupted, as it stood then."""
+
+    folder: Path
+    step: int
+    rows: list[dict]
+    error: str
+
+
 @pytest.fixture(scope="module")
-def trained(folder: Path) -> Path:
-    """A run of three training steps, validated at each."""
-    done = command(
-        "train", "envmimic", "--recordings", "data", "--num-timesteps", 3 * STEPS, "--validate-every", STEPS,
-        "--seed", 3, "--output", "run", *SIZES, folder=folder,
-    )  # fmt: skip
+def stopped(folder: Path) -> Stopped:
+    """A run interrupted after its first training step, validated at each."""
+    line = [sys.executable, "-m", "ballu_mjx.train", "envmimic", "--recordings", "data", "--output", "run"]
+    line += ["--num-timesteps", str(400 * STEPS), "--validate-every", str(STEPS), "--seed", "3", *SIZES]
+    # A shell's background jobs ignore SIGINT, and so would the tests' children there.
+    heed = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
+    line = [sys.executable, "-c", heed, *line]
+    metrics = folder / "run" / "metrics.jsonl"
+    with subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+        while process.poll() is None and not (metrics.exists() and '"reward"' in metrics.read_text()):
+            time.sleep(0.1)
+        os.kill(process.pid, signal.SIGINT)
+        error = process.communicate()[1].decode()
+    assert process.returncode == 130, error
+    step = runs.restore(folder / "run", "last")[0]
+    return Stopped(folder / "run", step, runs.read_metrics(folder / "run"), error)
+
+
+@pytest.fixture(scope="module")
+def trained(stopped: Stopped) -> Path:
+    """The same run, two training steps on."""
+    total = stopped.step + 2 * STEPS
+    beside = stopped.folder.parent / "data" / actuators.NAME
+    hidden = beside.rename(beside.with_suffix(".hidden"))  # a run keeps the actuators it began with
+    done = command("train", "envmimic", "--resume", "run", "--num-timesteps", total, folder=stopped.folder.parent)
+    hidden.rename(beside)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     assert done.stdout.count("position RMSE") == 1
-    assert "240 of 240 steps" in done.stderr
-    return folder / "run"
+    assert f"{total:,} of {total:,} steps" in done.stderr
+    return stopped.folder
+
+
+def test_interrupted_run_says_how_to_go_on(stopped: Stopped):
+    assert "--resume run" in stopped.error and "Traceback" not in stopped.error
+    assert stopped.step == stopped.rows[-1]["step"] > 0
+
+
+def test_interrupted_run_goes_on_where_it_stopped(stopped: Stopped, trained: Path):
+    rows, total = runs.read_metrics(trained), stopped.step + 2 * STEPS
+    assert rows[: len(stopped.rows)] == stopped.rows
+    assert [row["step"] for row in rows if "reward" in row] == list(range(STEPS, total + STEPS, STEPS))
+    config = json.loads((trained / "config.json").read_text())
+    assert config["ppo"]["seed"] == 3 and config["ppo"]["num_envs"] == 8  # given once, kept
+    beside = trained.parent / "data" / actuators.NAME
+    assert config["actuators"] == json.loads(beside.read_text())["parameters"]  # likewise
+    assert len(config["starts"]) == 2
+    assert runs.restore(trained, "last")[0] == total
 
 
 def test_run_folder_is_complete(trained: Path):
-    for name in ("evaluation.txt", "evaluation.json", "learning_curve.png", "tracking.png"):
+    for name in ("evaluation.txt", "evaluation.json", "learning_curve.png", "tracking.png", "replay.npz"):
         assert (trained / name).stat().st_size > 500, name
     assert list((trained / "tensorboard").glob("events.out.tfevents.*"))
     assert not [path for path in trained.rglob("*") if path.suffix in (".pkl", ".pickle", ".tmp")]
+    last = runs.restore(trained, "last")[0]
     rows = runs.read_metrics(trained)
-    assert [row["step"] for row in rows if "reward" in row] == [STEPS, 2 * STEPS, 3 * STEPS]
     validated = {row["step"]: row["validation_error"] for row in rows if "validation_error" in row}
-    assert list(validated) == [0, STEPS, 2 * STEPS, 3 * STEPS]
-    assert runs.restore(trained, "last")[0] == 3 * STEPS
+    assert list(validated) == list(range(0, last + STEPS, STEPS))
     assert runs.restore(trained, "best")[0] == min(validated, key=lambda step: validated[step])
     config = json.loads((trained / "config.json").read_text())
-    assert config["ppo"]["seed"] == 3 and config["ppo"]["num_envs"] == 8
     assert [Path(entry["path"]).name for entry in config["recordings"]["test"]] == ["far-2.csv", "near-1.csv"]
 
 
@@ -87,42 +132,6 @@ def test_evaluate_repeats_the_same_numbers(trained: Path):
     assert (trained / "evaluation.txt").read_text() in done.stdout
     first, second = (json.loads((f / "evaluation.json").read_text()) for f in (trained, trained.parent / "again"))
     assert first == second
-
-
-def test_interrupted_run_goes_on_where_it_stopped(trained: Path):
-    folder = trained.parent
-    line = [sys.executable, "-m", "ballu_mjx.train", "envmimic", "--recordings", "data", "--output", "stopped"]
-    line += ["--num-timesteps", str(400 * STEPS), "--validate-every", str(400 * STEPS), "--seed", "5", *SIZES]
-    metrics = folder / "stopped" / "metrics.jsonl"
-
-    # A shell's background jobs ignore SIGINT, and so would the tests' children there.
-    heed = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
-    line = [sys.executable, "-c", heed, *line]
-    with subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
-        while process.poll() is None and not (metrics.exists() and '"reward"' in metrics.read_text()):
-            time.sleep(0.1)
-        os.kill(process.pid, signal.SIGINT)
-        error = process.communicate()[1].decode()
-    assert process.returncode == 130, error
-    assert "--resume stopped" in error and "Traceback" not in error
-    stop = runs.restore(folder / "stopped", "last")[0]
-    before = runs.read_metrics(folder / "stopped")
-    assert stop == before[-1]["step"] > 0
-
-    total = stop + 2 * STEPS
-    beside = folder / "data" / actuators.NAME
-    hidden = beside.rename(beside.with_suffix(".hidden"))  # a run keeps the actuators it began with
-    done = command("train", "envmimic", "--resume", "stopped", "--num-timesteps", total, folder=folder)
-    hidden.rename(beside)
-    assert done.returncode == 0, done.stderr
-    after = runs.read_metrics(folder / "stopped")
-    assert after[: len(before)] == before
-    assert [row["step"] for row in after if "reward" in row] == list(range(STEPS, total + STEPS, STEPS))
-    config = json.loads((folder / "stopped" / "config.json").read_text())
-    assert config["ppo"]["seed"] == 5 and config["ppo"]["num_envs"] == 8  # given once, kept
-    assert config["actuators"] == json.loads(beside.read_text())["parameters"]  # likewise
-    assert len(config["starts"]) == 2
-    assert runs.restore(folder / "stopped", "last")[0] == total
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +223,7 @@ def test_wrong_path_is_refused_in_one_sentence(folder: Path):
         (["--recordings", "{suspended}"], "EnvMimic takes free ones only"),
         (["--recordings", "data", "--output", "data"], "data: the folder is not empty"),
         (["--resume", "data"], "data: there is no run"),
-        (["--resume", "run"], "run: is at step 240 already"),
+        (["--resume", "run"], " already"),
         (["--resume", "run", "--quick"], "--quick does not go with --resume"),
         (["--resume", "run", "--policy-layers", "8"], "--policy-layers does not go with --resume"),
         (["--recordings", "short.csv"], "lasts 3.0 s; validation and test need"),
