@@ -11,6 +11,7 @@ COMMANDS = (
     ("everything", "train all", "the whole story on a virtual robot"),
     ("looking", "report RUN", "a run as one page for the browser, with a replay in 3D"),
     ("", "view RUN", "the replay, or a recording, live"),
+    ("", "compare RUN RUN ...", "runs side by side, mean and interval over seeds"),
     ("the robot", "export RUN", "a policy as a controller that needs NumPy alone"),
 )
 """Stage, what follows `python -m ballu_mjx.`, what it is for."""
@@ -18,7 +19,7 @@ COMMANDS = (
 
 def main() -> None:
     """Print the commands by stage."""
-    print("Commands, each after `python -m ballu_mjx.`; --help explains one, `train ... --quick` shows that it works.\n")
+    print("Commands, each after `python -m ballu_mjx.`; --help explains one, `train ... --quick` shows it at work.\n")
     for stage, command, purpose in COMMANDS:
         print(f"  {stage:15} {command:20} {purpose}")
 

@@ -7,7 +7,7 @@ a whole recording small errors only compound. The paper's whole-recording figure
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -166,6 +166,20 @@ class Evaluation:
             "vanilla": [dataclasses.asdict(errors) for errors in self.vanilla],
             "envmimic": [dataclasses.asdict(errors) for errors in self.residual],
         }
+
+    @staticmethod
+    def from_json(content: Mapping[str, Any]) -> Evaluation:
+        """The inverse of `to_json`."""
+
+        def table(values: Mapping[str, Sequence[float]]) -> dict[float, tuple[float, float]]:
+            return {float(horizon): (mean, spread) for horizon, (mean, spread) in values.items()}
+
+        def errors(rows: Sequence[Mapping[str, Any]]) -> tuple[Errors, ...]:
+            return tuple(
+                Errors(**{**row, "position": table(row["position"]), "yaw": table(row["yaw"])}) for row in rows
+            )
+
+        return Evaluation(errors(content["vanilla"]), errors(content["envmimic"]))
 
 
 class OpenLoopEvaluator:

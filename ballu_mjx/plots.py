@@ -114,6 +114,25 @@ def learning_curve(
     _save(figure, path)
 
 
+def compared(path: Path, panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]]]) -> None:
+    """Learning curves side by side: by axis label, by row, control steps, mean, and half the interval's width (not a
+    number: none is drawn)."""
+    figure = Figure(figsize=(8.0, 3.5 * len(panels)), layout="constrained")
+    rows = list(dict.fromkeys(label for lines in panels.values() for label in lines))
+    for axis, (title, lines) in zip(
+        np.ravel(figure.subplots(len(panels), 1, sharex=True)), panels.items(), strict=True
+    ):
+        for label, (steps, mean, half) in lines.items():
+            colour = f"C{rows.index(label)}"
+            axis.plot(steps / 1e6, mean, color=colour, label=label)
+            axis.fill_between(steps / 1e6, mean - half, mean + half, color=colour, alpha=0.2, linewidth=0)
+        axis.set_ylabel(title)
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize="small", title="mean, 95 % interval")
+        axis.set_xlabel("control steps (millions)")
+    _save(figure, path)
+
+
 def reward_curve(path: Path, steps: Float[np.ndarray, " n"], reward: Float[np.ndarray, " n"], simulator: str) -> None:
     """Mean reward per control step (m/s) against control steps, in the simulator's colour."""
     figure = Figure(figsize=(7.0, 3.5), layout="constrained")

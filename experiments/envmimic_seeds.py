@@ -53,21 +53,9 @@ def train(seed: int, folder: Path, options: list[str]) -> None:
         subprocess.run(command + options, check=True)
 
 
-def errors(rows: list[dict]) -> tuple[evaluation.Errors, ...]:
-    """`evaluation.Errors` from their JSON."""
-
-    def table(values: dict[str, list[float]]) -> dict[float, tuple[float, float]]:
-        return {float(horizon): (mean, spread) for horizon, (mean, spread) in values.items()}
-
-    return tuple(
-        evaluation.Errors(**{**row, "position": table(row["position"]), "yaw": table(row["yaw"])}) for row in rows
-    )
-
-
 def load(folder: Path) -> evaluation.Evaluation:
     """The evaluation of one run."""
-    content = json.loads((folder / "evaluation.json").read_text())
-    return evaluation.Evaluation(errors(content["vanilla"]), errors(content["envmimic"]))
+    return evaluation.Evaluation.from_json(json.loads((folder / "evaluation.json").read_text()))
 
 
 def evaluate(folders: list[Path], paths: list[Path]) -> list[evaluation.Evaluation]:
