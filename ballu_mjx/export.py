@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import importlib.util
 import math
 import re
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -45,6 +46,9 @@ class Options:
     """Length of commands.csv, s. Without this option: that of a trial of the task."""
     no_open_loop: bool = False
     """Write no commands.csv: nothing is simulated."""
+    onnx: bool = False
+    """Write policy.onnx too, for other runtimes: from observation to commands, without estimator, rate limit and
+    time-out. Needs the extra onnx."""
     pulse_low: float = 1000.0
     """Pulse width, microseconds, at which the servo stands at command 0."""
     pulse_high: float = 2000.0
@@ -93,6 +97,8 @@ def export(options: Options) -> Path:
     for name, text in sources().items():
         (folder / name).write_text(text, encoding="utf-8")
     np.savez(folder / "weights.npz", **stored)  # pyright: ignore[reportArgumentType]
+    if options.onnx:
+        (folder / "policy.onnx").write_bytes(onnx_model(stored))
     if commands is not None:
         _write_commands(folder / "commands.csv", commands, options)
         print(_rate(commands))
@@ -124,6 +130,47 @@ def weights(policy: Policy, ppo_config: PPOConfig) -> dict[str, np.ndarray]:
         "check_features": features,
         "check_commands": np.array([act(row) for row in features]),
     }
+
+
+def onnx_model(stored: Mapping[str, np.ndarray]) -> bytes:
+    """`weights` as an ONNX graph.
+
+    Input `observation`, float32 [batch, 28], in the order and units of `controller.OBSERVATION`; output `command`,
+    float32 [batch, 2], left and right, in [0, 1].
+    """
+    from onnx import TensorProto, checker, helper, numpy_helper
+
+    nodes, constants = [], []
+
+    def constant(name: str, value: np.ndarray | float) -> str:
+        constants.append(numpy_helper.from_array(np.asarray(value, np.float32), name))
+        return name
+
+    def node(kind: str, inputs: list[str], output: str) -> str:
+        nodes.append(helper.make_node(kind, inputs, [output]))
+        return output
+
+    x = node("Sub", ["observation", constant("mean", stored["mean"])], "centred")
+    x = node("Div", [x, constant("std", stored["std"])], "normalized")
+    clip = float(stored["observation_clip"])
+    if math.isfinite(clip):
+        x = node("Clip", [x, constant("lowest", -clip), constant("highest", clip)], "clipped")
+    last = sum(name.startswith("kernel_") for name in stored) - 1
+    for i in range(last + 1):
+        kernel, bias = (constant(name, stored[name]) for name in (f"kernel_{i}", f"bias_{i}"))
+        x = node("Gemm", [x, kernel, bias], f"layer_{i}")
+        if i < last and str(stored["activation"]) == "swish":
+            x = node("Mul", [x, node("Sigmoid", [x], f"gate_{i}")], f"active_{i}")
+        elif i < last:
+            x = node("Tanh", [x], f"active_{i}")
+    x = node("Mul", [node("Add", [x, constant("one", 1.0)], "raised"), constant("half", 0.5)], "halved")
+    node("Clip", [x, constant("relaxed", 0.0), "one"], "command")
+    sizes = {"observation": len(stored["mean"]), "command": len(stored[f"bias_{last}"])}
+    ends = [helper.make_tensor_value_info(n, TensorProto.FLOAT, ["batch", size]) for n, size in sizes.items()]
+    graph = helper.make_graph(nodes, "policy", ends[:1], ends[1:], constants)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    checker.check_model(model)
+    return model.SerializeToString()
 
 
 def sources() -> dict[str, str]:
@@ -172,6 +219,8 @@ def _check(options: Options) -> None:
             raise InputError(
                 f"--{name.replace('_', '-')} is {getattr(options, name):g}: give microseconds, above 0 and below 20000."
             )
+    if options.onnx and importlib.util.find_spec("onnx") is None:
+        raise InputError('--onnx: the package onnx is not installed; `pip install "ballu-mjx[onnx]"` brings it.')
     if options.pulse_low == options.pulse_high:
         raise InputError(f"--pulse-low and --pulse-high are both {options.pulse_low:g}: the servos would not move.")
 
@@ -244,6 +293,7 @@ Files
     deployment.py    its estimator: positions and velocities from motion capture frames so far
     weights.npz      the policy's network and the normalization of its observation
     commands.csv     see 'Open loop' below
+    policy.onnx      with --onnx: the network alone, from 'observation' (as below) to 'command', for other runtimes
 
 Running it
     Needs Python 3.9 or newer and NumPy, nothing else. Copy this folder to the robot and there:

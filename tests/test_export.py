@@ -102,6 +102,31 @@ def test_exported_policy_is_the_policy_without_its_libraries(settings: dict, tmp
     np.testing.assert_allclose(np.load(tmp_path / "commands.npy"), expected, atol=1e-5)
 
 
+@pytest.mark.parametrize("settings", [{}, {"activation": "tanh"}, {"normalize_observations": False}])
+def test_onnx_is_the_policy(settings: dict, tmp_path: Path):
+    import onnxruntime
+
+    folder = export.export(
+        Options(write_run(tmp_path / "run", **settings), tmp_path / "robot", no_open_loop=True, onnx=True)
+    )
+    features = random_features(1000)
+    observations = np.array([controller.observation(row) for row in features], np.float32)
+    session = onnxruntime.InferenceSession(folder / "policy.onnx", providers=["CPUExecutionProvider"])
+    commands = np.asarray(session.run(["command"], {"observation": observations})[0])
+    act = Policy.load(tmp_path / "run").act()
+    np.testing.assert_allclose(commands, np.array([act(row) for row in features]), atol=1e-5)
+
+
+def test_onnx_that_is_not_installed_is_told_before_anything_is_written(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert export.main([str(run), "--output", str(tmp_path / "robot"), "--onnx"]) == 2
+    error = capsys.readouterr().err
+    assert "ballu-mjx[onnx]" in error and error.count("\n") == 1
+    assert not (tmp_path / "robot").exists()
+
+
 def test_self_test_passes_and_notices_other_weights(exported: Path, tmp_path: Path):
     done = subprocess.run([sys.executable, "controller.py"], cwd=exported, capture_output=True, text=True)
     assert done.returncode == 0 and "Passed." in done.stdout and "ms" in done.stdout, done.stderr
