@@ -104,6 +104,9 @@ class SuspendedLeg:
         self._relaxation_damping = np.zeros(self.model.nv)
         for kind, damping in _RELAXATION_DAMPING.items():
             self._relaxation_damping[self.model.joint(f"{kind}_{SIDES[0]}").dofadr[0]] = damping
+        # Jitted to be traced once: each stands in several loops, and under several derivatives.
+        self.residual_torque = jax.jit(self._residual_torque)
+        self._step = jax.jit(self._one_step)
 
     def settled_qpos(self, vector: Float[Array, " parameters"], command: Float[Array, ""]) -> Float[Array, " nq"]:
         """Generalized position at rest under a command; `[self.angles]` are motor and knee (rad). Differentiable, in
@@ -139,7 +142,7 @@ class SuspendedLeg:
         seen = SAMPLE_TIMESTEP * jnp.arange(times) - delay
         return jax.vmap(lambda column: jnp.interp(seen, timestep * jnp.arange(count + 1), column), 1, 1)(path)
 
-    def residual_torque(
+    def _residual_torque(
         self, qpos: Float[Array, " nq"], vector: Float[Array, " parameters"], command: Float[Array, ""]
     ) -> Float[Array, " nv"]:
         """Generalized force (N m) that nothing balances, at rest in `qpos`: zero where the leg hangs still."""
@@ -161,11 +164,11 @@ class SuspendedLeg:
         model = model.replace(dof_damping=jnp.asarray(self._relaxation_damping), opt=option)  # pyright: ignore
         rest = [vector[NAMES.index(name)] for name in ("default_motor_angle", "default_knee_angle")]
         qpos = jnp.zeros(self.model.nq).at[self.angles].set(jnp.stack(rest))
-        still = jnp.zeros(self.model.nv)
+        still = jnp.zeros(self.model.nv) + 0.0 * qpos[self.angles[0]]  # batched where the rest is, see `_root`
         step = lambda _, state: self._step(model, state, command)  # noqa: E731
         return jax.lax.fori_loop(0, _RELAXATION_STEPS, step, (qpos, still, still))[0]
 
-    def _step(self, model: mjx.Model, state: _State, command: Float[Array, ""]) -> _State:
+    def _one_step(self, model: mjx.Model, state: _State, command: Float[Array, ""]) -> _State:
         """One physics step. Only what a step needs is carried from one to the next: MJX in double precision changes the
         integer types of some other fields."""
         qpos, qvel, warmstart = state
@@ -218,8 +221,10 @@ def _root(residual: Callable[[Array, Any], Array], guess: Array, arguments: Any)
         x, _, _, _, trial, count = state
         return (count < _ROOT_STEPS) & ((count == 0) | (jnp.max(jnp.abs(trial - x)) > _ROOT_TOLERANCE))
 
-    size = guess.shape[0]
-    start = (guess, jnp.full(size, jnp.inf), jnp.eye(size), jnp.asarray(1e-4), guess, jnp.asarray(0))
+    # All of the state varies with the guess from the start: a constant among it would have vmap trace the loop again for
+    # each level of batches.
+    size, zero = guess.shape[0], 0.0 * guess[0]
+    start = (guess, jnp.full(size, jnp.inf) + zero, jnp.eye(size) + zero, 1e-4 + zero, guess, zero.astype(int))
     x, _, jacobian, *_ = jax.lax.while_loop(unfinished, body, start)
     return x, jacobian
 
