@@ -221,7 +221,7 @@ def _root(residual: Callable[[Array, Any], Array], guess: Array, arguments: Any)
         x, _, _, _, trial, count = state
         return (count < _ROOT_STEPS) & ((count == 0) | (jnp.max(jnp.abs(trial - x)) > _ROOT_TOLERANCE))
 
-    # All of the state varies with the guess from the start: a constant among it would have vmap trace the loop again for
+    # All of the state varies with the guess from the start: for a constant among it, vmap would trace the loop again at
     # each level of batches.
     size, zero = guess.shape[0], 0.0 * guess[0]
     start = (guess, jnp.full(size, jnp.inf) + zero, jnp.eye(size) + zero, 1e-4 + zero, guess, zero.astype(int))
