@@ -53,7 +53,7 @@ class EnvMimicConfig:
     """Largest force along each axis, N (paper: 1)."""
     force_scale: float = 0.05
     """Force, N, that one unit of the policy's output stands for. The forces that close the gap are hundredths of a
-    newton; with 1 N a unit, PPO's first steps throw the robot over and learning never recovers."""
+    newton: with 1 N a unit and a constant learning rate, PPO's first steps throw the robot over for good."""
     force_cost: float = 20.0
     """Reward lost per N^2 of force."""
     episode_seconds: float = 3.0
