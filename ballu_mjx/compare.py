@@ -50,18 +50,17 @@ class Row:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status: 2 for input that cannot be used."""
-    try:
+    """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
+
+    def run() -> None:
         runtime.prepare()
         _compare(
             tyro.cli(
                 Options, args=arguments, prog="python -m ballu_mjx.compare", config=(tyro.conf.FlagCreatePairsOff,)
             )
         )
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 2
-    return 0
+
+    return runtime.exit_status(run)
 
 
 def interval(values: Sequence[float]) -> tuple[float, float]:

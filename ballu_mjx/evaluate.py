@@ -42,19 +42,15 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
-    try:
+
+    def run() -> None:
         runtime.prepare()
         options = tyro.cli(
             Options, args=arguments, prog="python -m ballu_mjx.evaluate", config=(tyro.conf.FlagCreatePairsOff,)
         )
         _evaluate(options)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("Interrupted.", file=sys.stderr)
-        return 130
-    return 0
+
+    return runtime.exit_status(run)
 
 
 def _evaluate(options: Options) -> None:
@@ -110,10 +106,12 @@ def load_params(folder: Path, which: Literal["best", "last"]) -> tuple[int, Para
 def report(evaluator: OpenLoopEvaluator, params: Params, folder: Path, base: str) -> Evaluation:
     """Evaluate, and write `evaluation.txt`, `evaluation.json`, `tracking.png` and `replay.npz` into `folder`; `base`
     names the simulator without the residual."""
-    result = evaluator(params)
+    from ballu_mjx.evaluation import Evaluation
+
+    replays = {base: evaluator.replay(params, scale=0.0), "envmimic": evaluator.replay(params)}
+    result = Evaluation(*(evaluator.errors(each) for each in replays.values()))
     (folder / "evaluation.txt").write_text(result.table(base) + "\n", encoding="utf-8")
     (folder / "evaluation.json").write_text(json.dumps(result.to_json(), indent=2) + "\n", encoding="utf-8")
-    replays = {base: evaluator.replay(params, scale=0.0), "envmimic": evaluator.replay(params)}
     tracking(evaluator, replays, folder / "tracking.png")
     replay.write(folder / replay.NAME, takes(evaluator, replays))
     return result

@@ -242,8 +242,8 @@ class OpenLoopEvaluator:
     def __call__(self, params: Any) -> Evaluation:
         """Errors of the simulator with the policy, beside vanilla's."""
         if self._vanilla is None:
-            self._vanilla = self._errors(self.replay(params, scale=0.0))
-        return Evaluation(self._vanilla, self._errors(self.replay(params)))
+            self._vanilla = self.errors(self.replay(params, scale=0.0))
+        return Evaluation(self._vanilla, self.errors(self.replay(params)))
 
     def _replay_one(
         self,
@@ -278,7 +278,8 @@ class OpenLoopEvaluator:
         )
         return features, com, force, qpos
 
-    def _errors(self, replay: Replay) -> tuple[Errors, ...]:
+    def errors(self, replay: Replay) -> tuple[Errors, ...]:
+        """Errors of a replay, by recording."""
         results = []
         for index, motion in enumerate(self.motions):
             runs = [run for run, (recording, _) in enumerate(self.starts) if recording == index]

@@ -57,19 +57,15 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
-    try:
+
+    def run() -> None:
         runtime.prepare()
         options = tyro.cli(
             Options, args=arguments, prog="python -m ballu_mjx.export", config=(tyro.conf.FlagCreatePairsOff,)
         )
         export(options)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("Interrupted.", file=sys.stderr)
-        return 130
-    return 0
+
+    return runtime.exit_status(run)
 
 
 def export(options: Options) -> Path:

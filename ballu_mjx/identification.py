@@ -25,8 +25,10 @@ from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
 from ballu_mjx import robot as ballu
+from ballu_mjx import simulation
 from ballu_mjx.errors import InputError
 from ballu_mjx.robot import SIDES, ActuatorParameters
+from ballu_mjx.simulation import State
 from ballu_mjx.sweep import SAMPLE_TIMESTEP, Sweep
 
 CURVE_SAMPLES = 200
@@ -82,9 +84,6 @@ RANGES: dict[str, _Range] = {
     "torque_limit": _Range(4.0, 0.0, 0.3),
 }
 
-_State = tuple[Array, Array, Array]
-"""qpos, qvel, qacc_warmstart."""
-
 
 class SuspendedLeg:
     """The nominal robot's leg in MJX, hanging from a base held still, for any actuator parameters.
@@ -130,14 +129,13 @@ class SuspendedLeg:
         `qpos`; the motion starts `delay` (s) later. Differentiable forwards."""
         model = self._with(vector)
 
-        def step(state: _State, _: None) -> tuple[_State, Array]:
+        def step(state: State, _: None) -> tuple[State, Array]:
             state = self._step(model, state, command)
-            return state, state[0][self.angles]
+            return state, state.qpos[self.angles]
 
-        rest = jnp.zeros(self.model.nv)
         timestep = float(self.model.opt.timestep)
         count = int(np.ceil((times - 1) * SAMPLE_TIMESTEP / timestep))
-        _, path = jax.lax.scan(step, (qpos, rest, rest), length=count)
+        _, path = jax.lax.scan(step, simulation.at(qpos, jnp.zeros(self.model.nv)), length=count)
         path = jnp.concatenate([qpos[self.angles][None], path])
         seen = SAMPLE_TIMESTEP * jnp.arange(times) - delay
         return jax.vmap(lambda column: jnp.interp(seen, timestep * jnp.arange(count + 1), column), 1, 1)(path)
@@ -166,15 +164,12 @@ class SuspendedLeg:
         qpos = jnp.zeros(self.model.nq).at[self.angles].set(jnp.stack(rest))
         still = jnp.zeros(self.model.nv) + 0.0 * qpos[self.angles[0]]  # batched where the rest is, see `_root`
         step = lambda _, state: self._step(model, state, command)  # noqa: E731
-        return jax.lax.fori_loop(0, _RELAXATION_STEPS, step, (qpos, still, still))[0]
+        return jax.lax.fori_loop(0, _RELAXATION_STEPS, step, State(qpos, still, still)).qpos
 
-    def _one_step(self, model: mjx.Model, state: _State, command: Float[Array, ""]) -> _State:
-        """One physics step. Only what a step needs is carried from one to the next: MJX in double precision changes the
-        integer types of some other fields."""
-        qpos, qvel, warmstart = state
-        data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=command[None])  # pyright: ignore
-        data = mjx.step(model, data)
-        return data.qpos, data.qvel, data.qacc_warmstart
+    def _one_step(self, model: mjx.Model, state: State, command: Float[Array, ""]) -> State:
+        """One physics step."""
+        held = self._data.replace(ctrl=command[None])  # pyright: ignore
+        return simulation.physics_step(model, held, state)
 
 
 _RELAXATION_TIMESTEP = 0.05

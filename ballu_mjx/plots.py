@@ -302,4 +302,4 @@ def recording(path: Path, seen: Recording, gaps: Mapping[str, Sequence[tuple[flo
         axis.legend(loc="upper right", fontsize="small", ncols=3)
     axes[-1].set_xlabel("time (s)")
     axes[0].set_title(f"{seen.name} ({seen.kind}, {seen.robot})")
-    figure.savefig(path, dpi=_DOTS_PER_INCH)
+    _save(figure, path)

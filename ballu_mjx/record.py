@@ -30,7 +30,6 @@ LEAST_CONFIDENCE = 0.4
 """Of an `Alignment`: below it, another offset may as well be meant."""
 LEAST_CORRELATION = 0.35
 """Below it, the log does not belong to the motion."""
-_ENDINGS = (".csv", ".csv.gz")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +93,8 @@ class Simulate:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    try:
+
+    def run() -> int:
         runtime.prepare()
         options = tyro.extras.subcommand_cli_from_dict(
             {"import": Import, "check": Check, "simulate": Simulate, "example-mapping": _Example},
@@ -104,12 +104,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
         )
         return _run(options)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("Interrupted.", file=sys.stderr)
-        return 130
+
+    return runtime.exit_status(run)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,6 +134,7 @@ def _import(options: Import) -> None:
     from ballu_mjx.importers import placement
     from ballu_mjx.importers.mapping import read_mapping
     from ballu_mjx.importers.table import Table, commands_in, read_commands
+    from ballu_mjx.recording import name_of
 
     _check_output(options.output)
     if options.offset is not None and options.offset_range is not None:
@@ -146,7 +143,7 @@ def _import(options: Import) -> None:
         raise InputError("--offset: it is a command log's, and there is none; add --commands.")
     mapping = read_mapping(options.mapping)
     trajectories, table = _read(options, mapping)
-    recording = placement.place(trajectories, mapping, _name(options.output))
+    recording = placement.place(trajectories, mapping, name_of(options.output))
     print(f"{options.file}: {len(recording.time)} samples, {recording.time[-1] - recording.time[0]:.2f} s")
     if options.commands is None:
         if table is None or mapping.commands.left not in table.header:
@@ -243,14 +240,14 @@ _ALIGNMENT_ERROR = 0.05
 
 def _write(options: Import, recording: Recording) -> None:
     """Write, and read back what was written: the format's own reader judges it."""
-    from ballu_mjx.recording import read_recording, write_recording
+    from ballu_mjx.recording import description_path, read_recording, write_recording
 
     options.output.parent.mkdir(parents=True, exist_ok=True)
     write_recording(recording, options.output)
     try:
         read = read_recording(options.output)
     except InputError as error:
-        for path in (options.output, _description(options.output)):
+        for path in (options.output, description_path(options.output)):
             path.unlink()
         raise InputError(
             f"{options.file}: gives no recording by {options.mapping}, nothing written: {error}"
@@ -262,19 +259,11 @@ def _write(options: Import, recording: Recording) -> None:
 
 def _check_output(output: Path) -> None:
     """Refuse a name that is none of a recording's, or taken."""
-    if not output.name.endswith(_ENDINGS) or not _name(output):
-        raise InputError(f"{output}: not a recording's name; it must end in .csv or .csv.gz.")
-    for path in (output, _description(output)):
+    from ballu_mjx.recording import description_path
+
+    for path in (output, description_path(output)):
         if path.exists():
             raise InputError(f"{path}: stands there already; delete it, or give another --output.")
-
-
-def _name(path: Path) -> str:
-    return path.name.removesuffix(".gz").removesuffix(".csv")
-
-
-def _description(path: Path) -> Path:
-    return path.with_name(_name(path) + ".json")
 
 
 # ---- check ----
@@ -379,14 +368,14 @@ def _ranges(recording: Recording) -> list[tuple[str, np.ndarray]]:
 
 def _simulate(options: Simulate) -> None:
     from ballu_mjx import virtual_robot
-    from ballu_mjx.recording import read_recording, write_recording
+    from ballu_mjx.recording import name_of, read_recording, write_recording
     from ballu_mjx.robot import CONTROL_TIMESTEP
 
     _check_output(options.output)
     for name in ("robot_seed", "trial_seed"):
         if getattr(options, name) < 0:
             raise InputError(f"--{name.replace('_', '-')} {getattr(options, name)}: seeds are 0 or more.")
-    robot, name = virtual_robot.draw_robot(options.robot_seed), _name(options.output)
+    robot, name = virtual_robot.draw_robot(options.robot_seed), name_of(options.output)
     if options.suspended:
         if options.commands is not None or options.gait is not None:
             raise InputError("--suspended: a sweep has its own commands; leave --commands and --gait out.")

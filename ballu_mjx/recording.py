@@ -132,7 +132,7 @@ def read_recording(path: Path | str) -> Recording:
     being row 1) and mend.
     """
     path = Path(path)
-    description = _description_path(path)
+    description = description_path(path)
     columns = _read_columns(path)
     kind, made_by, notes = _read_description(description)
     groups = _present_groups(path, columns, kind)
@@ -142,7 +142,7 @@ def read_recording(path: Path | str) -> Recording:
     fields, interpolated = _fill(columns, groups, slice(first, last + 1))
     rows = len(columns["time"])
     recording = Recording(
-        name=_name(path),
+        name=name_of(path),
         kind=kind,
         robot=made_by,
         notes=notes,
@@ -172,7 +172,7 @@ def write_recording(recording: Recording, path: Path | str, *, decimals: int = 5
     **Raises** `ValueError` for infinite values or shapes that do not fit; `InputError` for another ending of `path`.
     """
     path = Path(path)
-    description = _description_path(path)
+    description = description_path(path)
     length = len(recording.time)
     header: list[str] = []
     cells: list[list[str]] = []
@@ -214,11 +214,11 @@ def recordings(paths: Iterable[Path | str]) -> list[Path]:
             inside = sorted(p for p in path.iterdir() if p.name.endswith(_ENDINGS) and not p.name.startswith("."))
             if not inside:
                 raise InputError(f"{path}: the folder holds no recording (.csv or .csv.gz); name one that does.")
-            twice = [b for a, b in zip(inside, inside[1:], strict=False) if _name(a) == _name(b)]
+            twice = [b for a, b in zip(inside, inside[1:], strict=False) if name_of(a) == name_of(b)]
             if twice:
                 raise InputError(f"{twice[0]}: stands there a second time, without .gz; delete one of the two.")
         elif path.exists():
-            _description_path(path)
+            description_path(path)
             inside = [path]
         else:
             raise InputError(f"{path}: there is no such file or folder; check the path.")
@@ -245,14 +245,19 @@ def _refuse(path: Path, problem: str, mend: str, *, column: str | None = None, r
     raise InputError(f"{', '.join(place)}: {problem}; {mend}.")
 
 
-def _name(path: Path) -> str:
+def name_of(path: Path) -> str:
+    """The name of the recording in a file: the file's, without its ending."""
     return path.name.removesuffix(".gz").removesuffix(".csv")
 
 
-def _description_path(path: Path) -> Path:
-    if not path.name.endswith(_ENDINGS) or not _name(path):
+def description_path(path: Path) -> Path:
+    """Where the description of the recording in `path` stands.
+
+    **Raises** `InputError` where that is not a recording's name.
+    """
+    if not path.name.endswith(_ENDINGS) or not name_of(path):
         raise InputError(f"{path}: not a recording's name; it must end in .csv or .csv.gz.")
-    return path.with_name(_name(path) + ".json")
+    return path.with_name(name_of(path) + ".json")
 
 
 def read_text(path: Path) -> str:

@@ -55,7 +55,8 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
-    try:
+
+    def run() -> None:
         options = tyro.cli(
             Options, args=arguments, prog="python -m ballu_mjx.report", config=(tyro.conf.FlagCreatePairsOff,)
         )
@@ -63,13 +64,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             video.choose_renderer()
         runtime.prepare()
         _report(options)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("Interrupted.", file=sys.stderr)
-        return 130
-    return 0
+
+    return runtime.exit_status(run)
 
 
 def _report(options: Options) -> None:

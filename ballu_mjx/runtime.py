@@ -14,6 +14,7 @@ import os
 import platform
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from ballu_mjx.errors import InputError
@@ -52,6 +53,19 @@ def prepare() -> None:
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(_MIN_COMPILE_SECONDS))
     check_jax()
     _import_mjx()
+
+
+def exit_status(command: Callable[[], int | None]) -> int:
+    """Run a command; returns its own exit status (None: 0), 2 for input that cannot be used, told on the terminal, and
+    130 when interrupted."""
+    try:
+        return command() or 0
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        return 130
 
 
 def check_jax() -> None:

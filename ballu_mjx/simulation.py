@@ -51,6 +51,12 @@ def load(template: mjx.Data, state: State) -> mjx.Data:
     return template.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart)  # pyright: ignore
 
 
+def physics_step(model: mjx.Model, held: mjx.Data, state: State) -> State:
+    """One physics step under the commands and forces of `held`, data of the model."""
+    data = mjx.step(model, load(held, state))
+    return State(data.qpos, data.qvel, data.qacc_warmstart)
+
+
 # Compiled as part of whatever calls it; jitted to be traced once, not once a program.
 @functools.partial(jax.jit, static_argnames=("balloon", "count"))
 def control_step(
@@ -72,12 +78,7 @@ def control_step(
     - `force`: force (N, world frame) at the centre of mass of the body with the id `balloon`.
     """
     held = template.replace(ctrl=command, xfrc_applied=template.xfrc_applied.at[balloon, :3].set(force))  # pyright: ignore
-
-    def physics_step(_: Array, state: State) -> State:
-        data = mjx.step(model, load(held, state))
-        return State(data.qpos, data.qvel, data.qacc_warmstart)
-
-    return jax.lax.fori_loop(0, count, physics_step, state)
+    return jax.lax.fori_loop(0, count, lambda _, state: physics_step(model, held, state), state)
 
 
 def make_data(model: mujoco.MjModel) -> mjx.Data:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import tyro
 
 from ballu_mjx import runtime
-from ballu_mjx.errors import InputError
 
 if TYPE_CHECKING:
     from ballu_mjx.ppo import PPOConfig
@@ -28,7 +27,8 @@ _PROGRAM = "python -m ballu_mjx.train"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    try:
+
+    def run() -> int:
         runtime.prepare()
         return tyro.extras.subcommand_cli_from_dict(
             _commands(arguments),
@@ -37,12 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             description="Learn from recordings of the robot. Each subcommand explains its options with --help.",
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
         )
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("Interrupted.", file=sys.stderr)
-        return 130
+
+    return runtime.exit_status(run)
 
 
 def _commands(arguments: Sequence[str]) -> dict[str, Callable[..., int]]:

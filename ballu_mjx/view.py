@@ -47,27 +47,27 @@ class Options:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command until it is interrupted; returns the exit status: 2 for input that cannot be used."""
-    try:
-        options = tyro.cli(
-            Options, args=arguments, prog="python -m ballu_mjx.view", config=(tyro.conf.FlagCreatePairsOff,)
-        )
-        if not 0 <= options.port <= 65535:
-            raise InputError(f"--port is {options.port}: it must be between 0 and 65535.")
-        if options.mujoco:
-            check_screen()
-        runtime.prepare()
-        takes = load(options.source)
-        first = choose(takes, options.show)
-        if options.mujoco:
-            _mujoco(takes[first])
-        else:
-            _serve(takes, first, options)
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("Closed.", file=sys.stderr)
-    return 0
+
+    def run() -> None:
+        try:
+            options = tyro.cli(
+                Options, args=arguments, prog="python -m ballu_mjx.view", config=(tyro.conf.FlagCreatePairsOff,)
+            )
+            if not 0 <= options.port <= 65535:
+                raise InputError(f"--port is {options.port}: it must be between 0 and 65535.")
+            if options.mujoco:
+                check_screen()
+            runtime.prepare()
+            takes = load(options.source)
+            first = choose(takes, options.show)
+            if options.mujoco:
+                _mujoco(takes[first])
+            else:
+                _serve(takes, first, options)
+        except KeyboardInterrupt:  # the way to close it
+            print("Closed.", file=sys.stderr)
+
+    return runtime.exit_status(run)
 
 
 def load(source: Path) -> list[Take]:

@@ -164,15 +164,11 @@ def figure(folders: list[Path], path: Path) -> None:
         return evaluation.OpenLoopEvaluator(model, motions, policies[0].config, policies[0].infer)
 
     evaluator = simulator(policies[0].actuators)
-    motions = evaluator.motions
     replays = [evaluator.replay(policy.params) for policy in policies]
     identified = evaluator.replay(policies[0].params, scale=0.0)
     vanilla = simulator(None).replay(policies[0].params, scale=0.0)
-    firsts: dict[str, int] = {}
-    for run, (index, _) in enumerate(evaluator.starts):
-        firsts.setdefault(motions[index].name, run)
     panels = []
-    for name, run in firsts.items():
+    for motion, run in zip(evaluator.motions, evaluator.first_runs, strict=True):
         position, yaw = evaluator.recorded(run)
         states = len(yaw)
 
@@ -181,7 +177,7 @@ def figure(folders: list[Path], path: Path) -> None:
 
         panels.append(
             plots.TrackingPanel(
-                title=name,
+                title=motion.name,
                 time=np.arange(states) * robot.CONTROL_TIMESTEP,
                 recording=np.column_stack([position[:, :2], yaw]),
                 simulations={
