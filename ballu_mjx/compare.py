@@ -76,12 +76,12 @@ def rows(folders: Sequence[Path]) -> list[Row]:
 
     **Raises** `InputError` where one is no run, or the tasks differ.
     """
-    from ballu_mjx import runs
+    from ballu_mjx import residual, runs
     from ballu_mjx.tasks import TASKS
 
     if len({folder.resolve() for folder in folders}) < len(folders):
         raise InputError("A run is given twice; give each once.")
-    configs = [runs.read_config(folder, "envmimic", *TASKS) for folder in folders]
+    configs = [runs.read_config(folder, *residual.TASKS, *TASKS) for folder in folders]
     for folder, config in zip(folders, configs, strict=True):
         if config["task"] != configs[0]["task"]:
             raise InputError(

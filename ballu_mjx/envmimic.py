@@ -10,7 +10,7 @@ import copy
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -23,6 +23,7 @@ from mujoco import mjx
 
 from ballu_mjx import robot as ballu
 from ballu_mjx import simulation
+from ballu_mjx.forces import Applied, Fields
 from ballu_mjx.reconstruction import Motion
 
 
@@ -176,16 +177,18 @@ class Simulator:
         names = ("balloon", "base", "foot_left", "foot_right")
         sites = [model.site(name).id for name in names]
         self._sites = tuple(zip(sites, model.site_bodyid[sites].tolist(), strict=True))
+        self._masses = jnp.asarray(model.body_mass / model.body_mass.sum())
 
     def altered(self, fields: Mapping[str, Array]) -> Simulator:
-        """The same with other model fields, which may be traced."""
+        """The same with other model fields, which may be traced. The centre of mass stays that of the model's own
+        masses: air that the robot drags along is no part of it."""
         other = copy.copy(self)
         other.model = ballu.with_fields(self.model, dict(fields))
         return other
 
     def observe(self, state: simulation.State) -> tuple[Float[Array, " 27"], Float[Array, " 3"]]:
         """Features and centre of mass (m, world) of a state."""
-        return _observe(self.model, self._template, state, self._sites)
+        return _observe(self.model, self._template, state, self._masses, self._sites)
 
     def observe_all(
         self, qpos: Float[Array, "... nq"], qvel: Float[Array, "... nv"]
@@ -195,26 +198,32 @@ class Simulator:
         filled = np.arange(-(-count // _CHUNK) * _CHUNK) % count
         flat = simulation.at(qpos.reshape(count, -1), qvel.reshape(count, -1))
         chunks = [simulation.State(*(x[part] for x in flat)) for part in filled.reshape(-1, _CHUNK)]
-        pieces = [_observe_chunk(self.model, self._template, chunk, self._sites) for chunk in chunks]
+        pieces = [_observe_chunk(self.model, self._template, chunk, self._masses, self._sites) for chunk in chunks]
         features, com = (jnp.concatenate(parts)[:count] for parts in zip(*pieces, strict=True))
         return features.reshape(*shape, -1), com.reshape(*shape, -1)
 
-    def step(self, state: simulation.State, command: Float[Array, " 2"], force: Float[Array, " 3"]) -> simulation.State:
+    def step(
+        self, state: simulation.State, command: Float[Array, " 2"], wrench: Float[Array, " 6"]
+    ) -> simulation.State:
         """One control step; see `simulation.control_step`."""
         return simulation.control_step(
-            self.model, self._template, state, command, force, balloon=self._balloon, count=self._count
+            self.model, self._template, state, command, wrench, balloon=self._balloon, count=self._count
         )
 
 
 @functools.partial(jax.jit, static_argnames="sites")
 def _observe(
-    model: mjx.Model, template: mjx.Data, state: simulation.State, sites: tuple[tuple[int, int], ...]
+    model: mjx.Model,
+    template: mjx.Data,
+    state: simulation.State,
+    masses: Float[Array, " bodies"],
+    sites: tuple[tuple[int, int], ...],
 ) -> tuple[Float[Array, " 27"], Float[Array, " 3"]]:
-    """`Simulator.observe`; `sites` are ids of sites and of their bodies."""
+    """`Simulator.observe`; `masses` are shares of the whole, `sites` ids of sites and of their bodies."""
     data = simulation.load(template, state)
     data = mjx.com_vel(model, mjx.com_pos(model, mjx.kinematics(model, data)))
     site, body = np.array(sites).T
-    return features(data, site, body), data.subtree_com[1]
+    return features(data, site, body), masses @ data.xipos
 
 
 _CHUNK = 1024
@@ -223,9 +232,13 @@ _CHUNK = 1024
 
 @functools.partial(jax.jit, static_argnames="sites")
 def _observe_chunk(
-    model: mjx.Model, template: mjx.Data, states: simulation.State, sites: tuple[tuple[int, int], ...]
+    model: mjx.Model,
+    template: mjx.Data,
+    states: simulation.State,
+    masses: Float[Array, " bodies"],
+    sites: tuple[tuple[int, int], ...],
 ) -> tuple[Float[Array, "states 27"], Float[Array, "states 3"]]:
-    return jax.vmap(lambda state: _observe(model, template, state, sites))(states)
+    return jax.vmap(lambda state: _observe(model, template, state, masses, sites))(states)
 
 
 def stack(simulator: Simulator, motions: Sequence[Motion]) -> tuple[Reference, Float[Array, "recordings states 3"]]:
@@ -263,12 +276,65 @@ def world_force(action: Float[Array, " 3"], yaw: Float[Array, ""], config: EnvMi
     return heading_rotation(yaw) @ jnp.clip(config.force_scale * action, -config.force_limit, config.force_limit)
 
 
+@dataclasses.dataclass(frozen=True)
+class ForcePolicy:
+    """EnvMimic's kind of residual (see `forces.ForceModel`): a policy's action is the force on the balloon.
+
+    **Fields**
+
+    - `config`: what the policy sees, and what its actions mean.
+    - `infer`: (parameters, observation) to the most likely action.
+    - `sample`: (parameters, observation, key) to a drawn one; None: there is none to be had.
+    """
+
+    config: EnvMimicConfig
+    infer: Callable[[Any, Float[Array, " inputs"]], Float[Array, " 3"]]
+    sample: Callable[[Any, Float[Array, " inputs"], Array], Float[Array, " 3"]] | None = None
+    name: str = "envmimic"
+
+    def inputs(self, history: Float[Array, "steps 27"], commands: Float[Array, "steps 2"]) -> Float[Array, " inputs"]:
+        """What the policy sees."""
+        return policy_input(history, commands, self.config)
+
+    def fields(self, params: Any) -> Fields:
+        """None: forces are all there is."""
+        return {}
+
+    def command(self, params: Any, commands: Float[Array, "steps 2"]) -> Float[Array, " 2"]:
+        """The command as it is."""
+        return commands[-1]
+
+    def wrench(
+        self,
+        params: Any,
+        history: Float[Array, "steps 27"],
+        commands: Float[Array, "steps 2"],
+        key: Array | None = None,
+    ) -> Float[Array, " 6"]:
+        """The policy's force, without a torque."""
+        seen = self.inputs(history, commands)
+        if key is None or self.sample is None:
+            action = self.infer(params, seen)
+        else:
+            action = self.sample(params, seen, key)
+        return jnp.concatenate([world_force(action, history[-1, 8], self.config), jnp.zeros(3)])
+
+
 class EnvMimicEnv(Env):
     """Tracking of recorded motions by a force on the balloon; Brax's environment interface, one robot, unbatched."""
 
-    def __init__(self, model: mujoco.MjModel, motions: Sequence[Motion], config: EnvMimicConfig) -> None:
-        self.config = config
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        motions: Sequence[Motion],
+        config: EnvMimicConfig,
+        beside: Applied | None = None,
+    ) -> None:
+        """`beside` is a residual that the simulator has already: the policy learns what it leaves."""
+        self.config, self.beside = config, beside
         self.simulator = Simulator(model)
+        if beside is not None:
+            self.simulator = self.simulator.altered(beside.model.fields(beside.params))
         self.reference, _ = stack(self.simulator, motions)
         self.episode_length = round(config.episode_seconds / ballu.CONTROL_TIMESTEP)
         self._spread = jnp.std(self.recorded_inputs(), axis=0)
@@ -311,8 +377,14 @@ class EnvMimicEnv(Env):
         s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
         recording, time = s["recording"], s["time"]
         force = world_force(action, s["history"][-1, 8], self.config)
+        command, wrench = self.reference.command[recording, time], jnp.concatenate([force, jnp.zeros(3)])
+        if self.beside is not None:
+            model, params = self.beside
+            commands = commands_seen(self.reference.command[recording], time)
+            command = model.command(params, commands)
+            wrench += model.wrench(params, s["history"], commands)
         before: simulation.State = s["physics"]
-        after = self.simulator.step(before, self.reference.command[recording, time], force)
+        after = self.simulator.step(before, command, wrench)
         seen, _ = self.simulator.observe(after)
 
         target = self.reference.features[recording, time + 1]

@@ -10,7 +10,7 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import tyro
@@ -59,9 +59,9 @@ def _evaluate(options: Options) -> None:
     from ballu_mjx.recording import read_recording
     from ballu_mjx.recording import recordings as expand
 
-    config = runs.read_config(options.run, "envmimic")
+    config = runs.read_config(options.run, *residual.TASKS)
     which = "last" if options.last else "best"
-    policy = residual.Residual.load(options.run, which)
+    loaded = residual.Residual.load(options.run, which)
     paths = expand(options.recordings) or runs.find_recordings(config, "test", options.run)
     recordings = [read_recording(path) for path in paths]
     for path, recording in zip(paths, recordings, strict=True):
@@ -69,16 +69,14 @@ def _evaluate(options: Options) -> None:
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
 
-    print(f"The {which} checkpoint of {options.run}: step {policy.step:,}.", flush=True)
-    model = robot.load_model(policy.actuators)
+    if loaded.step:
+        print(f"The {which} checkpoint of {options.run}: step {loaded.step:,}.", flush=True)
+    model = robot.load_model(loaded.actuators)
     motions = [reconstruct(recording, model) for recording in recordings]
-    evaluator = evaluation.OpenLoopEvaluator(model, motions, policy.config, policy.infer)
-    base = evaluation.base_name(policy.actuators is not None)
-    if options.output is None:
-        result = evaluator(policy.params)
-    else:
-        result = report(evaluator, policy.params, options.output, base)
-    print(result.table(base))
+    base = evaluation.base_name(loaded.actuators is not None)
+    evaluator = evaluation.OpenLoopEvaluator(model, motions, loaded.model, base)
+    result = evaluator(loaded.params) if options.output is None else report(evaluator, loaded.params, options.output)
+    print(result.table())
 
 
 def check_recording(path: Path, recording: Recording, *, long_enough: bool) -> None:
@@ -103,14 +101,14 @@ def load_params(folder: Path, which: Literal["best", "last"]) -> tuple[int, Para
     return step, ppo.from_tree(tree)
 
 
-def report(evaluator: OpenLoopEvaluator, params: Params, folder: Path, base: str) -> Evaluation:
-    """Evaluate, and write `evaluation.txt`, `evaluation.json`, `tracking.png` and `replay.npz` into `folder`; `base`
-    names the simulator without the residual."""
+def report(evaluator: OpenLoopEvaluator, params: Any, folder: Path) -> Evaluation:
+    """Evaluate, and write `evaluation.txt`, `evaluation.json`, `tracking.png` and `replay.npz` into `folder`."""
     from ballu_mjx.evaluation import Evaluation
 
-    replays = {base: evaluator.replay(params, scale=0.0), "envmimic": evaluator.replay(params)}
-    result = Evaluation(*(evaluator.errors(each) for each in replays.values()))
-    (folder / "evaluation.txt").write_text(result.table(base) + "\n", encoding="utf-8")
+    names = evaluator.base, evaluator.name
+    replays = dict(zip(names, (evaluator.replay(params, scale=0.0), evaluator.replay(params)), strict=True))
+    result = Evaluation(*(evaluator.errors(each) for each in replays.values()), *names)  # pyright: ignore[reportCallIssue]
+    (folder / "evaluation.txt").write_text(result.table() + "\n", encoding="utf-8")
     (folder / "evaluation.json").write_text(json.dumps(result.to_json(), indent=2) + "\n", encoding="utf-8")
     tracking(evaluator, replays, folder / "tracking.png")
     replay.write(folder / replay.NAME, takes(evaluator, replays))

@@ -7,7 +7,7 @@ a whole recording small errors only compound. The paper's whole-recording figure
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from ballu_mjx import envmimic, simulation
 from ballu_mjx import robot as ballu
-from ballu_mjx.envmimic import EnvMimicConfig
+from ballu_mjx.forces import ForceModel
 from ballu_mjx.reconstruction import Motion
 
 HORIZONS = (1.0, 2.0, 5.0, 10.0, 20.0)
@@ -28,9 +28,6 @@ START_INTERVAL = 1.0
 SCORE_HORIZONS = (5.0, 10.0)
 """Horizons (s) that the validation score looks at."""
 _BALLOON_YAW = 8
-
-Policy = Callable[[Any, Array], Array]
-"""(parameters, observation) to action, deterministic."""
 
 
 class Replay(NamedTuple):
@@ -84,6 +81,10 @@ class Evaluation:
 
     vanilla: tuple[Errors, ...]
     residual: tuple[Errors, ...]
+    base: str = "vanilla"
+    """What the simulator without the residual is called."""
+    name: str = "envmimic"
+    """What the simulator with it is called."""
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -126,12 +127,13 @@ class Evaluation:
                         )
         return float(worst), place
 
-    def table(self, base: str = "vanilla") -> str:
+    def table(self) -> str:
         """Errors by group and horizon, without and with the residual, with the spread over starts; then the whole
-        recordings. `base` is what the simulator without the residual is called."""
+        recordings."""
+        base, name = self.base, self.name
         lines = [
             f"{'':7}{'horizon':>8} |{'position RMSE (m)':^39}| {'yaw RMSE (deg)':^38}",
-            f"{'':7}{'(s)':>8} |{base:>14}{'EnvMimic':>16}{'ratio':>8} | {base:>13}{'EnvMimic':>16}{'ratio':>8}",
+            f"{'':7}{'(s)':>8} |{base:>14}{name:>16}{'ratio':>8} | {base:>13}{name:>16}{'ratio':>8}",
         ]
         for group in self.groups:
             for horizon in HORIZONS:
@@ -149,7 +151,7 @@ class Evaluation:
                     f"{cells[3]:>13}{cells[4]:>16}{cells[5]:>8}"
                 )
         lines += ["", f"{'whole recording':24}{'mean CoM error (m)':>28}{'final yaw error (deg)':>28}"]
-        lines.append(f"{'':24}{base:>15}{'EnvMimic':>13}{base:>15}{'EnvMimic':>13}")
+        lines.append(f"{'':24}{base:>15}{name:>13}{base:>15}{name:>13}")
         for without, mimic in zip(self.vanilla, self.residual, strict=True):
             lines.append(
                 f"{without.recording:24}{without.mean_com_error:>15.3f}{mimic.mean_com_error:>13.3f}"
@@ -161,10 +163,12 @@ class Evaluation:
         """All figures, as plain lists and numbers."""
         worst, place = self.excess()
         return {
+            "base": self.base,
+            "name": self.name,
             "score": self.score,
             "worst_beyond_bound": {"relative": worst, "where": place},
             "vanilla": [dataclasses.asdict(errors) for errors in self.vanilla],
-            "envmimic": [dataclasses.asdict(errors) for errors in self.residual],
+            "residual": [dataclasses.asdict(errors) for errors in self.residual],
         }
 
     @staticmethod
@@ -179,15 +183,18 @@ class Evaluation:
                 Errors(**{**row, "position": table(row["position"]), "yaw": table(row["yaw"])}) for row in rows
             )
 
-        return Evaluation(errors(content["vanilla"]), errors(content["envmimic"]))
+        names = str(content["base"]), str(content["name"])
+        return Evaluation(errors(content["vanilla"]), errors(content["residual"]), *names)
 
 
 class OpenLoopEvaluator:
-    """Replays a set of recordings; compiles once, for any parameters of the policy."""
+    """Replays a set of recordings; compiles once, for any parameters of the residual."""
 
     def __init__(
-        self, model: mujoco.MjModel, motions: Sequence[Motion], config: EnvMimicConfig, policy: Policy
+        self, model: mujoco.MjModel, motions: Sequence[Motion], residual: ForceModel, base: str = "vanilla"
     ) -> None:
+        """`base` is what `model`, the simulator without the residual, is called."""
+        self.base, self.name = base, residual.name
         self.motions = tuple(motions)
         self._simulator = envmimic.Simulator(model)
         self._reference, com = envmimic.stack(self._simulator, motions)
@@ -209,7 +216,7 @@ class OpenLoopEvaluator:
         self._batch = jax.device_put(jnp.array(padded, jnp.int32), sharding)
 
         def replay(params: Any, scale: Array, batch: Int[Array, "runs 2"]) -> Any:
-            return jax.vmap(lambda run: self._replay_one(policy, config, params, scale, run[0], run[1], length))(batch)
+            return jax.vmap(lambda run: self._replay_one(residual, params, scale, run[0], run[1], length))(batch)
 
         spec = jax.sharding.PartitionSpec
         split = jax.shard_map(
@@ -227,7 +234,7 @@ class OpenLoopEvaluator:
         self._replay = jax.jit(replay_all)
 
     def replay(self, params: Any, *, scale: float = 1.0) -> Replay:
-        """Simulate every start to the end; `scale` multiplies the force (0 is vanilla)."""
+        """Simulate every start to the end; `scale` is the residual's share (0: none, 1: all of it)."""
         params = jax.device_get(params)  # they may live on one device; the batch is spread over all
         features, com, force, qpos = jax.device_get(self._replay(params, np.float32(scale), self._batch))
         runs = len(self.starts)
@@ -240,22 +247,25 @@ class OpenLoopEvaluator:
         return states[:, :3], states[:, _BALLOON_YAW]
 
     def __call__(self, params: Any) -> Evaluation:
-        """Errors of the simulator with the policy, beside vanilla's."""
+        """Errors of the simulator with the residual, beside those of the one without."""
         if self._vanilla is None:
             self._vanilla = self.errors(self.replay(params, scale=0.0))
-        return Evaluation(self._vanilla, self.errors(self.replay(params)))
+        return Evaluation(self._vanilla, self.errors(self.replay(params)), self.base, self.name)
 
     def _replay_one(
         self,
-        policy: Policy,
-        config: EnvMimicConfig,
+        residual: ForceModel,
         params: Any,
         scale: Array,
         recording: Array,
         start: Array,
         length: int,
     ) -> tuple[Array, Array, Array, Array]:
-        reference, simulator = self._reference, self._simulator
+        reference, own = self._reference, self._simulator.model
+        fields = {
+            name: (1 - scale) * getattr(own, name) + scale * value for name, value in residual.fields(params).items()
+        }
+        simulator = self._simulator.altered(fields)
         history = jax.lax.dynamic_slice_in_dim(
             reference.features[recording], start - envmimic.HISTORY + 1, envmimic.HISTORY
         )
@@ -263,12 +273,12 @@ class OpenLoopEvaluator:
         def step(carry: tuple, time: Array) -> tuple[tuple, tuple]:
             state, history = carry
             commands = envmimic.commands_seen(reference.command[recording], time)
-            action = policy(params, envmimic.policy_input(history, commands, config))
-            force = scale * envmimic.world_force(action, history[-1, _BALLOON_YAW], config)
-            state = simulator.step(state, reference.command[recording, time], force)
+            wrench = scale * residual.wrench(params, history, commands)
+            command = (1 - scale) * commands[-1] + scale * residual.command(params, commands)
+            state = simulator.step(state, command, wrench)
             seen, com = simulator.observe(state)
             history = jnp.concatenate([history[1:], seen[None]])
-            return (state, history), (seen, com, force, state.qpos)
+            return (state, history), (seen, com, wrench[:3], state.qpos)
 
         first_state = simulation.at(reference.qpos[recording, start], reference.qvel[recording, start])
         first, first_com = simulator.observe(first_state)

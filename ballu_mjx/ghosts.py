@@ -151,7 +151,9 @@ def force_at(take: Take, state: int) -> Float[np.ndarray, " 3"] | None:
 
 def pushed(take: Take) -> str | None:
     """The robot of a take on which the residual force acts."""
-    return "envmimic" if take.force is not None and "envmimic" in take.qpos else None
+    if take.force is None:
+        return None
+    return next((name for name in take.qpos if name != "recording" and not name.startswith("vanilla")), None)
 
 
 def _mesh(kind: int, size: Float[np.ndarray, " 3"]) -> trimesh.Trimesh:

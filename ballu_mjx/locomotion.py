@@ -54,10 +54,10 @@ class LocomotionConfig:
     the residual knows what it does, which a policy paid for speed otherwise leaves. 0: nothing."""
 
 
-def setting_name(config: LocomotionConfig, identified: bool, residual: bool) -> str:
-    """What the paper calls a simulator: `envmimic`, or `vanilla` with `+sysid` and `+dr` as they apply."""
-    if residual:
-        return "envmimic"
+def setting_name(config: LocomotionConfig, identified: bool, residual: str | None) -> str:
+    """What the paper calls a simulator: the residual's name, or `vanilla` with `+sysid` and `+dr` as they apply."""
+    if residual is not None:
+        return residual
     return "vanilla" + "+sysid" * identified + "+dr" * config.domain_randomization
 
 
@@ -99,6 +99,8 @@ class LocomotionEnv(Env):
         """`model` is the nominal robot; `actuators` (None: nominal ones) and `residual` (None: none) improve it."""
         self.task, self.config, self.residual = task, config, residual
         self.simulator = envmimic.Simulator(model)
+        if residual is not None:
+            self.simulator = self.simulator.altered(residual.fields)
         self.setting = setting_of(model, config, actuators)
         self._feet = np.array([model.geom(f"foot_{side}").id for side in ballu.SIDES])
         self._friction = jnp.asarray(model.geom_friction)
@@ -125,12 +127,13 @@ class LocomotionEnv(Env):
         command = command_of(action)
         commands = jnp.concatenate([s["commands"][1:], command[None]])
         key, key_force = jax.random.split(s["key"])
-        force, excess = self._force(s["history"], commands, key_force)
+        wrench, excess = self._wrench(s["history"], commands, key_force)
 
         fields = s["setting"]["fields"] | {"geom_friction": self._friction.at[self._feet, 0].set(s["friction"])}
         simulator = self.simulator.altered(fields)
         earlier: simulation.State = s["physics"]
-        after = simulator.step(earlier, command, force)
+        arriving = command if self.residual is None else self.residual.command(commands)
+        after = simulator.step(earlier, arriving, wrench)
         features, com = simulator.observe(after)
 
         finite = jnp.all(jnp.isfinite(features)) & jnp.all(jnp.isfinite(after.qvel))
@@ -152,7 +155,7 @@ class LocomotionEnv(Env):
         metrics = {
             "velocity_x": velocity[0],
             "velocity_y": velocity[1],
-            "force": jnp.linalg.norm(force),
+            "force": jnp.linalg.norm(wrench[:3]),
             "outside": jnp.asarray(excess > 0.0, jnp.float32),
             "excess": excess,
             "diverged": jnp.asarray(~finite, jnp.float32),
@@ -220,15 +223,15 @@ class LocomotionEnv(Env):
             info={"truncation": zero},
         )
 
-    def _force(
+    def _wrench(
         self, history: Float[Array, "3 27"], commands: Float[Array, "3 2"], key: Array
-    ) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
-        """The residual's force (N, world), and how far its observation lies outside of what it was trained on."""
+    ) -> tuple[Float[Array, " 6"], Float[Array, ""]]:
+        """The residual's wrench (N, N m; world), and how far its observation lies outside of its data."""
         if self.residual is None:
-            return jnp.zeros(3), jnp.zeros(())
+            return jnp.zeros(6), jnp.zeros(())
         excess = self.residual.excess(history, commands)
-        force = self.residual.force(history, commands, key if self.config.sampled_residual else None)
-        return force * jnp.exp(-self.config.residual_decay * excess), excess
+        wrench = self.residual.wrench(history, commands, key if self.config.sampled_residual else None)
+        return wrench * jnp.exp(-self.config.residual_decay * excess), excess
 
 
 def setting_of(model: mujoco.MjModel, config: LocomotionConfig, actuators: ActuatorParameters | None) -> Setting:

@@ -27,8 +27,10 @@ COLOURS: Mapping[str, str] = {
     "vanilla+sysid+dr": "#e69f00",
     "supervised": "#56b4e9",
     "envmimic": "#009e73",
+    "aerodynamic": "#882255",
+    "aerodynamic+envmimic": "#332288",
 }
-"""One colour for each simulator in all figures (Okabe and Ito's, told apart by the colour-blind too)."""
+"""One colour for each simulator in all figures (Okabe and Ito's, two of Tol's: the colour-blind tell them apart)."""
 
 LABELS: Mapping[str, str] = {
     "recording": "recording",
@@ -38,6 +40,8 @@ LABELS: Mapping[str, str] = {
     "vanilla+sysid+dr": "vanilla+sysid+DR",
     "supervised": "supervised",
     "envmimic": "EnvMimic",
+    "aerodynamic": "aerodynamic",
+    "aerodynamic+envmimic": "aerodynamic+EnvMimic",
 }
 _QUANTITIES = ("x (m)", "y (m)", "yaw (deg)")
 _DOTS_PER_INCH = 120

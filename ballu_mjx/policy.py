@@ -68,7 +68,8 @@ class Policy:
     @property
     def setting(self) -> str:
         """The paper's name of the simulator; see `locomotion.setting_name`."""
-        return locomotion.setting_name(self.config, self.actuators is not None, self.residual is not None)
+        name = None if self.residual is None else Residual.load(self.residual).model.name
+        return locomotion.setting_name(self.config, self.actuators is not None, name)
 
     def environment(self) -> LocomotionEnv:
         """The simulator that the policy was trained in."""
@@ -89,7 +90,7 @@ def environment(
 ) -> LocomotionEnv:
     """A task's simulator.
 
-    **Raises** `InputError` where `residual` is no EnvMimic run, or one that belongs to other actuators.
+    **Raises** `InputError` where `residual` holds no residual, or one that belongs to other actuators.
     """
     force = None if residual is None else Residual.load(residual)
     if force is not None and not same_actuators(force.actuators, actuators):

@@ -52,7 +52,8 @@ class Data:
     """File of identified actuators (`train sysid` writes it), or the word nominal. Without this option: the residual's
     if there is one, else nominal."""
     residual: Path | None = None
-    """Folder of an EnvMimic run, whose forces act in every control step. Without this option: none."""
+    """Folder of a run of `train residual` or `train envmimic`, which acts in every control step. Without this option:
+    none."""
     output: Path | None = None
     """Folder of the run, new or empty. Without this option: one under runs/, named after task and time."""
     resume: Path | None = None
@@ -76,7 +77,9 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
     identified, forces = _simulator(task, data)
     env = policy.environment(task, config, identified, forces)
     folder = data.resume or runs.new_folder(data.output, task.name)
-    setting = locomotion.setting_name(config, identified is not None, forces is not None)
+    setting = locomotion.setting_name(
+        config, identified is not None, None if env.residual is None else env.residual.model.name
+    )
 
     print(f"Run folder: {folder}")
     print(f"  task: {task.name}; simulator: {setting}" + (f", residual {forces}" if forces is not None else ""))

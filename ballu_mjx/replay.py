@@ -39,7 +39,7 @@ class Take:
     command: Float[np.ndarray, "steps 2"] | None = None
     """Servo commands (left, right), from each state to the next; one fewer than states."""
     force: Float[np.ndarray, "steps 3"] | None = None
-    """Residual force (N, world) on the balloon of the robot `envmimic`, likewise."""
+    """Residual force (N, world) on the balloon of the robot with a residual, likewise."""
 
 
 def write(path: Path, takes: Sequence[Take]) -> None:

@@ -154,18 +154,17 @@ def collect(folder: Path) -> Content:
 
 
 def _run(folder: Path) -> Content:
-    from ballu_mjx import runs
-    from ballu_mjx.evaluation import base_name
+    from ballu_mjx import residual, runs
     from ballu_mjx.tasks import TASKS
 
-    config = runs.read_config(folder, "envmimic", "sysid", *TASKS)
+    config = runs.read_config(folder, *residual.TASKS, "sysid", *TASKS)
     content = Content(f"{config['task']}: {folder.resolve().name}")
     start = (config.get("starts") or [{}])[-1]
     content.facts = [("folder", str(folder.resolve())), ("begun", str(start.get("time", "")))]
     content.facts += [("command", " ".join(map(str, start.get("command", []))))]
     for use, files in config.get("recordings", {}).items():
         content.facts.append((f"{use} recordings", ", ".join(str(file["path"]) for file in files)))
-    _add_evaluation(content, folder, base_name(config.get("actuators") is not None))
+    _add_evaluation(content, folder)
     if (folder / "identification.txt").is_file():
         content.texts.append(("Identification", (folder / "identification.txt").read_text(encoding="utf-8")))
     content.curves = _curves({config["task"]: folder})
@@ -182,8 +181,6 @@ def _run(folder: Path) -> Content:
 def _story(folder: Path, tables: Mapping[str, str]) -> Content:
     """A folder of `train all`: its tables, and of each seed and task the policies over each other."""
     from ballu_mjx import pipeline
-    from ballu_mjx.evaluation import base_name
-    from ballu_mjx.runs import read_config
 
     content = Content(f"train all: {folder.resolve().name}", facts=[("folder", str(folder.resolve()))])
     content.markdown = [(f"Transfer, {task}", text) for task, text in tables.items()]
@@ -202,8 +199,7 @@ def _story(folder: Path, tables: Mapping[str, str]) -> Content:
                     content.images.append((f"Trials on the robot: {where}, {setting}", image.read_bytes()))
             learned = seed / f"envmimic-{task}"
             if (learned / "config.json").is_file():
-                identified = read_config(learned, "envmimic").get("actuators") is not None
-                _add_evaluation(content, learned, base_name(identified), f"EnvMimic for {where}: ")
+                _add_evaluation(content, learned, f"EnvMimic for {where}: ")
                 if (learned / replay.NAME).is_file():
                     content.takes += [
                         dataclasses.replace(take, name=f"EnvMimic for {where}: {take.name}")
@@ -220,19 +216,22 @@ def _over_each_other(name: str, own: Mapping[str, Take]) -> Take:
     return Take(name=name, time=first.time[:states], qpos=qpos)
 
 
-def _add_evaluation(content: Content, folder: Path, base: str, prefix: str = "") -> None:
+def _add_evaluation(content: Content, folder: Path, prefix: str = "") -> None:
     """Tables from `evaluation.json`, and `evaluation.txt` as it is."""
     path = folder / "evaluation.json"
     if not path.is_file():
         return
+    from ballu_mjx import plots
+
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-        pairs = list(zip(found["vanilla"], found["envmimic"], strict=True))
+        base, name = str(found["base"]), plots.LABELS.get(str(found["name"]), str(found["name"]))
+        pairs = list(zip(found["vanilla"], found["residual"], strict=True))
         content.facts.append((f"{prefix}score", f"{found['score']:.3f} (mean ratio to {base})"))
         content.tables += [
-            _horizons(f"{prefix}{without['recording']}", base, without, mimic) for without, mimic in pairs
+            _horizons(f"{prefix}{without['recording']}", (base, name), without, mimic) for without, mimic in pairs
         ]
-        header = ["", *(f"{title}, {name}" for _, title, _ in _WHOLE for name in (base, "EnvMimic")), "mean force (N)"]
+        header = ["", *(f"{title}, {each}" for _, title, _ in _WHOLE for each in (base, name)), "mean force (N)"]
         rows = []
         for without, mimic in pairs:
             cells = [_cell(errors[key], digits) for key, _, digits in _WHOLE for errors in (without, mimic)]
@@ -247,11 +246,11 @@ def _add_evaluation(content: Content, folder: Path, base: str, prefix: str = "")
         content.texts.append((f"{prefix}by group", (folder / "evaluation.txt").read_text(encoding="utf-8")))
 
 
-def _horizons(title: str, base: str, without: Mapping[str, Any], mimic: Mapping[str, Any]) -> Table:
+def _horizons(title: str, names: tuple[str, str], without: Mapping[str, Any], mimic: Mapping[str, Any]) -> Table:
     """One recording's errors by horizon: mean over the starts, without and with the residual, and their ratio."""
     header = ["horizon (s)"]
     for key, quantity, _ in _QUANTITIES:
-        header += [f"{quantity}, {base}", f"{quantity}, EnvMimic", f"{key}, ratio"]
+        header += [*(f"{quantity}, {name}" for name in names), f"{key}, ratio"]
     rows = []
     for horizon in without["position"]:
         row = [Cell(f"{float(horizon):g}")]

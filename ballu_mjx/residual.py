@@ -1,98 +1,110 @@
-"""A trained residual: the force that EnvMimic's policy adds to a simulator."""
+"""A learned residual, of whatever kind, for whoever simulates next."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ballu_mjx import envmimic, ppo, runs
-from ballu_mjx.envmimic import EnvMimicConfig
+from ballu_mjx import aerodynamics, ppo, robot, runs
+from ballu_mjx.aerodynamics import Aerodynamics
+from ballu_mjx.envmimic import EnvMimicConfig, ForcePolicy
 from ballu_mjx.errors import InputError
-from ballu_mjx.ppo import Inference, Params, PPOConfig, Sampler
+from ballu_mjx.forces import Applied, Fields, ForceModel, Sum
+from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.robot import ActuatorParameters
 
 ACTIONS = 3
 """Force along three axes."""
+TASKS = ("envmimic", "aerodynamic")
+"""Runs that leave a residual."""
 MARGIN = 0.1
 """How far beyond the recorded range, in its widths, an observation still counts as inside: the range is that of a
 finite sample."""
 _OBSERVED = "observed.json"
 _NARROW = 1e-3
-_YAW = 8  # the balloon's, among the features
 
 
 @dataclasses.dataclass(frozen=True)
 class Residual:
-    """The force policy of a run. `force` and `excess` are pure: they may be jitted and vmapped.
+    """The residual of a run. All methods are pure: they may be jitted and vmapped.
 
     **Fields**
 
-    - `config`: what the policy sees, and what its actions mean.
-    - `params`: as `ppo.train` returned them.
-    - `infer`: (parameters, observation) to the most likely action.
-    - `sample`: (parameters, observation, key) to a drawn one.
-    - `observed`: smallest and largest of each input over the recordings it was trained on.
+    - `model`: its kind.
+    - `params`: what was learned.
+    - `observed`: smallest and largest of each of the model's inputs over the recordings it was learned from.
     - `step`: control steps of training behind it.
-    - `actuators`: of the simulator that the force belongs to; None for the nominal ones.
+    - `actuators`: of the simulator that it belongs to; None for the nominal ones.
     """
 
-    config: EnvMimicConfig
-    params: Params
-    infer: Inference
-    sample: Sampler
+    model: ForceModel
+    params: Any
     observed: tuple[Float[np.ndarray, " inputs"], Float[np.ndarray, " inputs"]]
     step: int
     actuators: ActuatorParameters | None
 
     @staticmethod
     def load(folder: Path | str, which: Literal["best", "last"] = "best") -> Residual:
-        """The policy in a run's best (by validation error) or last checkpoint.
+        """The residual of a run; of EnvMimic's the policy in the best (by validation error) or last checkpoint.
 
-        **Raises** `InputError` where `folder` is no EnvMimic run or has no such checkpoint.
+        **Raises** `InputError` where `folder` is no such run or has no such checkpoint.
         """
         folder = Path(folder)
-        stored = runs.read_config(folder, "envmimic")
-        step, tree = runs.restore(folder, which)
-        params = ppo.from_tree(tree)
-        sizes = params.normalizer.mean["state"].shape[0], ACTIONS, runs.typed(PPOConfig, stored["ppo"], folder)
-        return Residual(
-            config=runs.typed(EnvMimicConfig, stored["env"], folder),
-            params=params,
-            infer=ppo.make_inference(*sizes),
-            sample=ppo.make_sampler(*sizes),
-            observed=_read_observed(folder / _OBSERVED, sizes[0]),
-            step=step,
-            actuators=runs.actuators(stored, folder),
-        )
+        stored = runs.read_config(folder, *TASKS)
+        identified = runs.actuators(stored, folder)
+        if stored["task"] == "aerodynamic":
+            step, model = 0, Aerodynamics(robot.load_model(identified))
+            params = aerodynamics.read(folder / aerodynamics.FILE)
+            inputs = _INPUTS
+        else:
+            step, tree = runs.restore(folder, which)
+            params = ppo.from_tree(tree)
+            inputs = params.normalizer.mean["state"].shape[0]
+            sizes = inputs, ACTIONS, runs.typed(PPOConfig, stored["ppo"], folder)
+            config = runs.typed(EnvMimicConfig, stored["env"], folder)
+            model = ForcePolicy(config, ppo.make_inference(*sizes), ppo.make_sampler(*sizes))
+            if stored.get("residual") is not None:
+                beside = Residual.load(stored["residual"])
+                model, params = Sum(beside.model, model), (beside.params, params)
+        return Residual(model, params, _read_observed(folder / _OBSERVED, inputs), step, identified)
 
-    def force(
+    @property
+    def applied(self) -> Applied:
+        """Model and parameters."""
+        return Applied(self.model, self.params)
+
+    @property
+    def fields(self) -> Fields:
+        """Model fields to simulate with; see `forces.ForceModel.fields`."""
+        return self.model.fields(self.params)
+
+    def command(self, commands: Float[Array, "steps 2"]) -> Float[Array, " 2"]:
+        """What the servos get; see `forces.ForceModel.command`."""
+        return self.model.command(self.params, commands)
+
+    def wrench(
         self, history: Float[Array, "steps features"], commands: Float[Array, "steps 2"], key: Array | None = None
-    ) -> Float[Array, " 3"]:
-        """Force (N, world) on the balloon's centre of mass over the coming control step.
-
-        **Arguments**
-
-        - `history`: `envmimic.features` of the last three control steps, the current one last.
-        - `commands`: of the last two control steps and the coming one; see `envmimic.commands_seen`.
-        - `key`: draws from the policy's distribution; without it, the most likely force.
-        """
-        seen = envmimic.policy_input(history, commands, self.config)
-        action = self.infer(self.params, seen) if key is None else self.sample(self.params, seen, key)
-        return envmimic.world_force(action, history[-1, _YAW], self.config)
+    ) -> Float[Array, " 6"]:
+        """Force and torque on the balloon over the coming control step; see `forces.ForceModel.wrench`."""
+        return self.model.wrench(self.params, history, commands, key)
 
     def excess(self, history: Float[Array, "steps features"], commands: Float[Array, "steps 2"]) -> Float[Array, ""]:
         """How far an observation lies outside of what the recordings showed: by the worst of its entries, in widths of
         that entry's range, `MARGIN` taken off; 0 inside."""
-        seen = envmimic.policy_input(history, commands, self.config)
+        seen = self.model.inputs(history, commands)
         low, high = (jnp.asarray(bound) for bound in self.observed)
         beyond = jnp.maximum(low - seen, seen - high) / jnp.maximum(high - low, _NARROW)
         return jnp.maximum(jnp.max(beyond) - MARGIN, 0.0)
+
+
+_INPUTS = 87
+"""Of `envmimic.policy_input` with its defaults."""
 
 
 def write_observed(run: runs.Run, inputs: Float[Array, "states inputs"]) -> None:

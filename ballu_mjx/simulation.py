@@ -64,20 +64,20 @@ def control_step(
     template: mjx.Data,
     state: State,
     command: Float[Array, " 2"],
-    force: Float[Array, " 3"],
+    wrench: Float[Array, " 6"],
     *,
     balloon: int,
     count: int,
 ) -> State:
-    """Advance by `count` physics steps, command and external force held.
+    """Advance by `count` physics steps, command and external wrench held.
 
     **Arguments**
 
     - `template`: data of the model, from `make_data`; of no influence but for what no step changes.
     - `command`: servo commands (left, right) in [0, 1].
-    - `force`: force (N, world frame) at the centre of mass of the body with the id `balloon`.
+    - `wrench`: force (N) and torque (N m), world frame, at the centre of mass of the body with the id `balloon`.
     """
-    held = template.replace(ctrl=command, xfrc_applied=template.xfrc_applied.at[balloon, :3].set(force))  # pyright: ignore
+    held = template.replace(ctrl=command, xfrc_applied=template.xfrc_applied.at[balloon].set(wrench))  # pyright: ignore
     return jax.lax.fori_loop(0, count, lambda _, state: physics_step(model, held, state), state)
 
 

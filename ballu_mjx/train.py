@@ -8,7 +8,7 @@ import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import tyro
 
@@ -43,11 +43,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _commands(arguments: Sequence[str]) -> dict[str, Callable[..., int]]:
     """Subcommands by name. A function's parameters are its options, their defaults depend on --resume and --quick."""
-    from ballu_mjx import actuator_fit, pipeline, policy_training, residual_training
+    from ballu_mjx import actuator_fit, air_fit, pipeline, policy_training, residual_training
+    from ballu_mjx.air_identification import AirConfig
     from ballu_mjx.envmimic import EnvMimicConfig
     from ballu_mjx.identification import IdentificationConfig
     from ballu_mjx.locomotion import LocomotionConfig
     from ballu_mjx.ppo import PPOConfig
+    from ballu_mjx.residual_data import RecordingsData
     from ballu_mjx.tasks import TASKS, Task
 
     data_defaults, env_defaults, ppo_defaults = _defaults(
@@ -62,6 +64,34 @@ def _commands(arguments: Sequence[str]) -> dict[str, Callable[..., int]]:
     ) -> int:
         """Learn residual forces from recordings, and measure them on recordings that training never saw."""
         return residual_training.train(data, env, ppo)
+
+    air_defaults = AirConfig(**air_fit.QUICK if "--quick" in arguments else {})
+
+    def aerodynamic(
+        method: Literal["aerodynamic", "envmimic"] = "aerodynamic",
+        data: RecordingsData = RecordingsData(),  # noqa: B008
+        fit: AirConfig = air_defaults,
+    ) -> int:
+        """Learn a residual from recordings, and measure it on recordings that training never saw.
+
+        The options are those of the method: give --method before --help to see them. aerodynamic identifies the air
+        around the balloon (added mass, drag, lift, its centre) by derivatives through the simulation; envmimic learns
+        forces by reinforcement learning, like `train envmimic`.
+        """
+        assert method == "aerodynamic"
+        return air_fit.fit(data, fit)
+
+    def envmimic_by_method(
+        method: Literal["aerodynamic", "envmimic"] = "envmimic",
+        data: residual_training.Data = data_defaults,
+        env: EnvMimicConfig = env_defaults,
+        ppo: PPOConfig = ppo_defaults,
+    ) -> int:
+        """Learn residual forces by reinforcement learning; see `train envmimic`."""
+        assert method == "envmimic"
+        return residual_training.train(data, env, ppo)
+
+    residual = envmimic_by_method if _method(arguments) == "envmimic" else aerodynamic
 
     def sysid(
         data: actuator_fit.SweepData = actuator_fit.SweepData(),  # noqa: B008
@@ -95,7 +125,14 @@ def _commands(arguments: Sequence[str]) -> dict[str, Callable[..., int]]:
         return pipeline.run(options)
 
     tasks = {name: task_command(task) for name, task in TASKS.items()}
-    return {"sysid": sysid, "envmimic": envmimic, **tasks, "all": everything}
+    return {"sysid": sysid, "envmimic": envmimic, "residual": residual, **tasks, "all": everything}
+
+
+def _method(arguments: Sequence[str]) -> str | None:
+    """What --method says, which decides what other options there are."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--method")
+    return parser.parse_known_args([a for a in arguments if a != "--help"])[0].method
 
 
 def _defaults(

@@ -196,7 +196,7 @@ def mjx_rollout(
 
     def one(command: Float[Array, "steps 2"]) -> Float[Array, " nq"]:
         def step(state: State, command: Float[Array, " 2"]) -> tuple[State, None]:
-            no_force = jnp.zeros(3)
+            no_force = jnp.zeros(6)
             state = simulation.control_step(
                 mjx_model, template, state, command, no_force, balloon=balloon, count=step_count
             )

@@ -61,6 +61,7 @@ def main(
             command_key, force_key = jax.random.split(key)
             command = jax.random.uniform(command_key, (2,))
             push = jax.random.uniform(force_key, (3,), minval=-force, maxval=force)
+            push = jnp.concatenate([push, jnp.zeros(3)])
 
             def physics(state: State, _: None) -> tuple[State, tuple[Array, Array]]:
                 state = simulation.control_step(mjx_model, template, state, command, push, balloon=balloon, count=1)

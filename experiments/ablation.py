@@ -29,7 +29,7 @@ import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 
 from ballu_mjx import actuators, evaluation, ppo, recording, robot  # noqa: E402
-from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv  # noqa: E402
+from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv, ForcePolicy  # noqa: E402
 from ballu_mjx.ppo import PPOConfig  # noqa: E402
 from ballu_mjx.reconstruction import Motion, reconstruct  # noqa: E402
 
@@ -87,8 +87,8 @@ def train(
     env_config = EnvMimicConfig(**row.env)
     ppo_config = PPOConfig(**{**sizes.ppo, "num_timesteps": sizes.steps, "seed": seed, **row.ppo})
     env = EnvMimicEnv(model, motions["training"], env_config)
-    policy = ppo.make_inference(env.observation_size, env.action_size, ppo_config)
-    evaluator = evaluation.OpenLoopEvaluator(model, motions["validation"], env_config, policy)
+    forces = ForcePolicy(env_config, ppo.make_inference(env.observation_size, env.action_size, ppo_config))
+    evaluator = evaluation.OpenLoopEvaluator(model, motions["validation"], forces)
     last = ppo.total_timesteps(ppo_config)
     history: list[dict[str, Any]] = []
     due = sizes.validate_every

@@ -63,7 +63,7 @@ def evaluate(folders: list[Path], paths: list[Path]) -> list[evaluation.Evaluati
     policies = [residual.Residual.load(folder) for folder in folders]
     model = robot.load_model(policies[0].actuators)
     motions = [reconstruction.reconstruct(recording.read_recording(path), model) for path in paths]
-    evaluator = evaluation.OpenLoopEvaluator(model, motions, policies[0].config, policies[0].infer)
+    evaluator = evaluation.OpenLoopEvaluator(model, motions, policies[0].model)
     return [evaluator(policy.params) for policy in policies]
 
 
@@ -161,7 +161,7 @@ def figure(folders: list[Path], path: Path) -> None:
     def simulator(actuators: robot.ActuatorParameters | None) -> evaluation.OpenLoopEvaluator:
         model = robot.load_model(actuators)
         motions = [reconstruction.reconstruct(recording.read_recording(p), model) for p in recording.bundled("test")]
-        return evaluation.OpenLoopEvaluator(model, motions, policies[0].config, policies[0].infer)
+        return evaluation.OpenLoopEvaluator(model, motions, policies[0].model)
 
     evaluator = simulator(policies[0].actuators)
     replays = [evaluator.replay(policy.params) for policy in policies]

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx import envmimic, evaluate, evaluation, ghosts, robot, simulation
-from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv
+from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv, ForcePolicy
 from ballu_mjx.reconstruction import Motion
 
 STEPS = 30
@@ -214,8 +214,8 @@ def evaluator() -> evaluation.OpenLoopEvaluator:
     """Of a recording without and a shorter one with `FORCE`; the policy's parameters are the force it gives."""
     config = EnvMimicConfig()
     motions = [make_motion(np.zeros(3), "near-own", 60), make_motion(FORCE, "far-pushed", 50)]
-    constant = lambda params, _: params / config.force_scale  # noqa: E731
-    return evaluation.OpenLoopEvaluator(robot.load_model(), motions, config, constant)
+    constant = ForcePolicy(config, lambda params, _: params / config.force_scale)
+    return evaluation.OpenLoopEvaluator(robot.load_model(), motions, constant)
 
 
 def test_evaluator_finds_no_error_in_its_own_physics_and_some_in_pushed_ones(evaluator: evaluation.OpenLoopEvaluator):

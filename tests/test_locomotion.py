@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ballu_mjx import envmimic, locomotion, ppo, robot, simulation
-from ballu_mjx.envmimic import HISTORY, EnvMimicConfig
+from ballu_mjx.envmimic import HISTORY, EnvMimicConfig, ForcePolicy
 from ballu_mjx.locomotion import LocomotionConfig, LocomotionEnv
 from ballu_mjx.policy import ClosedLoop
 from ballu_mjx.residual import MARGIN, Residual
@@ -25,11 +25,14 @@ INPUTS = 87
 def make_residual(action: np.ndarray, width: float = 1e6) -> Residual:
     """A residual whose policy always answers `action`, and that has seen inputs within plus and minus `width`."""
     bound = np.full(INPUTS, width, np.float32)
-    return Residual(
-        config=EnvMimicConfig(),
-        params=ppo.Params(ppo.Normalizer(np.zeros(()), {}, {}, {}), None, None),
+    forces = ForcePolicy(
+        EnvMimicConfig(),
         infer=lambda params, seen: jnp.asarray(action, jnp.float32),
         sample=lambda params, seen, key: jnp.asarray(action, jnp.float32) + jax.random.normal(key, (3,)),
+    )
+    return Residual(
+        forces,
+        params=None,
         observed=(-bound, bound),
         step=0,
         actuators=None,
@@ -138,10 +141,10 @@ def test_residual_pushes_in_the_balloon_s_heading_and_only_so_hard():
 
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
     force = turn @ (EnvMimicConfig().force_scale * action)
-    pushed = jax.jit(lambda force: simulator.step(simulation.at(qpos, zeros), jnp.zeros(2), force))
-    expected = pushed(jnp.asarray(force, jnp.float32))
+    pushed = jax.jit(lambda wrench: simulator.step(simulation.at(qpos, zeros), jnp.zeros(2), wrench))
+    expected = pushed(jnp.asarray([*force, 0, 0, 0], jnp.float32))
     np.testing.assert_allclose(inner(state)["physics"].qvel, expected.qvel, atol=1e-5)
-    assert np.abs(np.asarray(expected.qvel - pushed(jnp.zeros(3)).qvel)).max() > 1e-3
+    assert np.abs(np.asarray(expected.qvel - pushed(jnp.zeros(6)).qvel)).max() > 1e-3
     assert float(state.metrics["force"]) == pytest.approx(np.linalg.norm(force), rel=1e-5)
 
 
@@ -159,9 +162,9 @@ def test_force_fades_outside_of_what_the_residual_has_seen():
     forces = []
     for decay in (0.0, 3.0):
         env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(residual_decay=decay), residual=residual)
-        force, excess = env._force(far, commands, key)
+        wrench, excess = env._wrench(far, commands, key)
         assert float(excess) == pytest.approx(expected, rel=1e-5)
-        forces.append(float(jnp.linalg.norm(force)))
+        forces.append(float(jnp.linalg.norm(wrench)))
     assert forces[0] == pytest.approx(EnvMimicConfig().force_scale, rel=1e-5)
     assert forces[1] == pytest.approx(forces[0] * np.exp(-3.0 * expected), rel=1e-5)
 

@@ -106,18 +106,19 @@ def test_mjx_follows_c_mujoco_over_a_control_step() -> None:
 
     @jax.jit
     @jax.vmap
-    def step(qpos: Array, qvel: Array, command: Array, force: Array) -> tuple[Array, Array]:
+    def step(qpos: Array, qvel: Array, command: Array, wrench: Array) -> tuple[Array, Array]:
         state = simulation.at(qpos, qvel)
-        state = simulation.control_step(mjx_model, template, state, command, force, balloon=balloon, count=count)
+        state = simulation.control_step(mjx_model, template, state, command, wrench, balloon=balloon, count=count)
         return state.qpos, state.qvel
 
-    inputs = [jnp.asarray(x, jnp.float32) for x in (s.qpos, s.qvel, s.command, s.force)]
+    wrench = np.concatenate([s.force, 0.1 * s.force[:, ::-1]], axis=1)
+    inputs = [jnp.asarray(x, jnp.float32) for x in (s.qpos, s.qvel, s.command, wrench)]
     qpos, qvel = (np.asarray(x) for x in step(*inputs))
     expected_qpos, expected_qvel = [], []
     for i in range(len(s.qpos)):
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:] = s.qpos[i], s.qvel[i]
-        data.xfrc_applied[balloon, :3] = s.force[i]
+        data.xfrc_applied[balloon] = wrench[i]
         advance(model, data, s.command[i], robot.CONTROL_TIMESTEP)
         expected_qpos.append(data.qpos.copy())
         expected_qvel.append(data.qvel.copy())
@@ -274,7 +275,7 @@ def settled_derivatives() -> tuple[np.ndarray, np.ndarray]:
 
     def knees(parameters: robot.ActuatorParameters, command: Float[Array, " 2"]) -> tuple[Array, Array]:
         moved = robot.with_fields(mjx_model, robot.actuator_fields(model, parameters))
-        balloon, no_force = simulation.balloon_id(model), jnp.zeros(3)
+        balloon, no_force = simulation.balloon_id(model), jnp.zeros(6)
         state = simulation.control_step(
             moved, template, start, command, no_force, balloon=balloon, count=SETTLING_STEPS
         )

@@ -1,0 +1,179 @@
+"""The white-box residual: what the air does to the balloon, in sixteen numbers.
+
+A balloon drags half its displaced air along, is slowed by it, and is lifted at a point that need not be where the model
+has it. Each of these is a textbook's formula with a constant or two to find; none needs a network.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from ballu_mjx import envmimic, simulation
+from ballu_mjx import robot as ballu
+from ballu_mjx.errors import InputError
+from ballu_mjx.forces import Fields
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class AirParameters:
+    """What the nominal model leaves out of the air's effect on the balloon; all 0: nothing. Axes are the balloon's."""
+
+    added_mass: Float[Array, ""]
+    """Mass of air that the balloon drags along (kg); weightless."""
+    added_inertia: Float[Array, ""]
+    """Moment of inertia of that air (kg m^2)."""
+    lift: Float[Array, ""]
+    """Lift beyond the model's (N)."""
+    centre: Float[Array, " 3"]
+    """Where mass, lift and drag act, off the model's centre of the balloon (m)."""
+    linear_drag: Float[Array, " 3"]
+    """Force for each m/s along each axis (N s/m)."""
+    quadratic_drag: Float[Array, " 3"]
+    """Force for each m/s along each axis, times the speed (N s^2/m^2): half density times area times coefficient."""
+    turning_drag: Float[Array, " 3"]
+    """Torque for each rad/s about each axis (N m s)."""
+    delay: Float[Array, ""]
+    """How late commands reach the servos (s, at most `LONGEST_DELAY`). No air, but what moves late passes for heavy:
+    left out, it is laid at the added mass's door."""
+
+    @staticmethod
+    def none() -> AirParameters:
+        """The nominal model's air."""
+        zero = jnp.zeros(())
+        three = jnp.zeros(3)
+        return AirParameters(zero, zero, zero, three, three, three, three, zero)
+
+
+LONGEST_DELAY = (envmimic.HISTORY - 1) * ballu.CONTROL_TIMESTEP
+FORMAT = "ballu-air/1"
+FILE = "air.json"
+NAMES = tuple(field.name for field in dataclasses.fields(AirParameters))
+SIGNED = ("lift", "centre")
+"""All others are 0 or more."""
+
+
+class Aerodynamics:
+    """The force model (see `forces.ForceModel`) whose parameters are `AirParameters`."""
+
+    name = "aerodynamic"
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        """`model` is the robot without the residual."""
+        self._balloon = simulation.balloon_id(model)
+        self._mass, self._inertia = jnp.asarray(model.body_mass), jnp.asarray(model.body_inertia)
+        self._centre, self._gravcomp = jnp.asarray(model.body_ipos), jnp.asarray(model.body_gravcomp)
+        self._gravity = float(np.linalg.norm(model.opt.gravity))
+
+    def inputs(self, history: Float[Array, "steps 27"], commands: Float[Array, "steps 2"]) -> Float[Array, " inputs"]:
+        return envmimic.policy_input(history, commands, envmimic.EnvMimicConfig())
+
+    def fields(self, params: AirParameters) -> Fields:
+        """The balloon's mass, inertia, centre and lift. The lift carries the added mass."""
+        body = self._balloon
+        mass = self._mass.at[body].add(params.added_mass)
+        lift = (self._gravcomp[body] * self._mass[body] + params.added_mass) * self._gravity + params.lift
+        return {
+            "body_mass": mass,
+            "body_inertia": self._inertia.at[body].add(params.added_inertia),
+            "body_ipos": self._centre.at[body].add(params.centre),
+            "body_gravcomp": self._gravcomp.at[body].set(lift / (mass[body] * self._gravity)),
+        }
+
+    def command(self, params: AirParameters, commands: Float[Array, "steps 2"]) -> Float[Array, " 2"]:
+        """The mean over the coming control step of the commands, `delay` late."""
+        steps = jnp.clip(params.delay, 0.0, LONGEST_DELAY) / ballu.CONTROL_TIMESTEP
+        age = jnp.arange(envmimic.HISTORY - 1, -1, -1)
+        share = jnp.maximum(1.0 - jnp.abs(age - steps), 0.0)
+        return share @ commands
+
+    def wrench(
+        self,
+        params: AirParameters,
+        history: Float[Array, "steps 27"],
+        commands: Float[Array, "steps 2"],
+        key: Array | None = None,
+    ) -> Float[Array, " 6"]:
+        """Drag, from the balloon's velocity now and its turn over the last control step, through still air."""
+        del commands, key
+        now, before = rotation(history[-1, 6:9]), rotation(history[-2, 6:9])
+        velocity = now.T @ history[-1, 3:6]
+        speed = jnp.sqrt(jnp.sum(velocity**2) + _SLOW**2)
+        force = -(params.linear_drag + params.quadratic_drag * speed) * velocity
+        torque = -params.turning_drag * turn(before.T @ now) / ballu.CONTROL_TIMESTEP
+        return jnp.concatenate([now @ force, now @ torque])
+
+
+_SLOW = 1e-3
+"""m/s; keeps the speed differentiable at rest."""
+
+
+def rotation(euler: Float[Array, " 3"]) -> Float[Array, "3 3"]:
+    """Rotation matrix, body to world, of roll, pitch and yaw (rad; intrinsic z-y-x)."""
+    roll, pitch, yaw = euler
+    cr, sr, cp, sp = jnp.cos(roll), jnp.sin(roll), jnp.cos(pitch), jnp.sin(pitch)
+    tilt = jnp.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
+    return envmimic.heading_rotation(yaw) @ tilt
+
+
+def turn(matrix: Float[Array, "3 3"]) -> Float[Array, " 3"]:
+    """Rotation vector (rad) of a small rotation, to second order."""
+    return jnp.stack([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2
+
+
+def read(path: Path) -> AirParameters:
+    """The parameters in a file of the format `ballu-air/1`, which `train residual --method aerodynamic` writes.
+
+    **Raises** `InputError` naming file, key and mend.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as JSON ({error}); restore it or identify again.") from error
+    if (
+        not isinstance(content, dict)
+        or content.get("format") != FORMAT
+        or not isinstance(content.get("parameters"), dict)
+    ):
+        raise InputError(f'{path}: is not of the format "{FORMAT}"; give one that this program wrote.')
+    return from_json(content["parameters"], path)
+
+
+def as_json(params: AirParameters) -> dict[str, Any]:
+    """Numbers and lists of three by name."""
+    return {name: np.asarray(getattr(params, name), np.float64).round(9).tolist() for name in NAMES}
+
+
+def from_json(values: Mapping[str, Any], path: Path) -> AirParameters:
+    """The inverse of `as_json`.
+
+    **Raises** `InputError` naming `path`, the parameter and the mend.
+    """
+    unknown = sorted(set(values) - set(NAMES))
+    if unknown:
+        raise InputError(f"{path}: there is no parameter {unknown[0]!r}; there are {', '.join(NAMES)}.")
+    read = {}
+    for name, like in AirParameters.none().__dict__.items():
+        value = values.get(name)
+        numbers: list[Any] = value if isinstance(value, list) else [value]
+        if len(numbers) != max(like.size, 1) or not all(
+            isinstance(x, (int, float)) and not isinstance(x, bool) and math.isfinite(x) for x in numbers
+        ):
+            raise InputError(
+                f"{path}: {name} must be {'three numbers' if like.size == 3 else 'a number'}, not {value!r}."
+            )
+        if name not in SIGNED and min(numbers) < 0:
+            raise InputError(f"{path}: {name} is {value}; it must be 0 or more.")
+        read[name] = jnp.asarray(numbers, jnp.float32).reshape(like.shape)
+    return AirParameters(**read)

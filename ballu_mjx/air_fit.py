@@ -1,0 +1,93 @@
+"""Identifying the air: `python -m ballu_mjx.train residual --method aerodynamic`."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+
+from ballu_mjx import aerodynamics, air_identification, envmimic, evaluate, evaluation, runs
+from ballu_mjx.aerodynamics import Aerodynamics
+from ballu_mjx.air_identification import AirConfig, AirFit
+from ballu_mjx.envmimic import EnvMimicConfig
+from ballu_mjx.residual import write_observed
+from ballu_mjx.residual_data import Prepared, RecordingsData
+
+QUICK: Mapping[str, Any] = {"window_seconds": 0.5, "interval_seconds": 2.0, "evaluations": 3}
+"""Defaults of `AirConfig` under `--quick`."""
+
+
+def fit(data: RecordingsData, config: AirConfig) -> int:
+    """Read and check everything, identify, evaluate; returns the exit status."""
+    started = time.perf_counter()
+    air_identification.check(config)
+    prepared = Prepared.read(data)
+    folder = runs.new_folder(data.output, "aerodynamic")
+    prepared.announce(folder, data.quick)
+    model = prepared.load_model()
+    motions = prepared.reconstruct(model)
+    sections = {"fit": config, "data": data}
+    devices = [str(device) for device in jax.local_devices()]
+    description = runs.describe("aerodynamic", sections, prepared.files, devices, prepared.identified)
+    with runs.Run(folder, description) as run:
+        print("Compiling: about a minute the first time ...", flush=True)
+        stages = runs.Stages()
+
+        def report(evaluation: int, cost: float) -> None:
+            run.log(stages.update("air", evaluation, config.evaluations, cost), {"cost": cost})
+
+        result = air_identification.identify(model, motions["training"], config, report)
+        stages.close()
+        text = table(result)
+        run.write("identification.txt", text + "\n")
+        run.write(aerodynamics.FILE, json.dumps(details(result), indent=2) + "\n")
+        inputs = envmimic.EnvMimicEnv(model, motions["training"], EnvMimicConfig()).recorded_inputs()
+        write_observed(run, inputs)
+    print(f"\n{text}\n\nOpen-loop replay of the test recordings:\n")
+    evaluator = evaluation.OpenLoopEvaluator(model, motions["test"], Aerodynamics(model), prepared.base)
+    print(evaluate.report(evaluator, result.parameters, folder).table())
+    print(f"\nWritten to {folder}. {time.perf_counter() - started:.0f} s in all.")
+    return 0
+
+
+def details(result: AirFit) -> dict[str, Any]:
+    """What `air.json` holds."""
+    return {
+        "format": aerodynamics.FORMAT,
+        "parameters": aerodynamics.as_json(result.parameters),
+        "standard_errors": aerodynamics.as_json(result.standard_errors),
+        "draughts": result.draughts,
+        "windows": result.windows,
+        "cost": {"without": result.cost[0], "with": result.cost[1]},
+    }
+
+
+_UNITS = {
+    "added_mass": "kg",
+    "added_inertia": "kg m^2",
+    "lift": "N",
+    "centre": "m",
+    "linear_drag": "N s/m",
+    "quadratic_drag": "N s^2/m^2",
+    "turning_drag": "N m s",
+    "delay": "s",
+}
+
+
+def table(result: AirFit) -> str:
+    """Parameters with their standard errors."""
+    lines = [f"{'':18}{'':4}{'value':>12}{'std. error':>12}"]
+    values, errors = (aerodynamics.as_json(each) for each in (result.parameters, result.standard_errors))
+    for name, unit in _UNITS.items():
+        single = not isinstance(values[name], list)
+        rows = [(values[name], errors[name])] if single else zip(values[name], errors[name], strict=True)
+        for axis, (value, error) in zip("xyz", rows, strict=False):
+            lines.append(f"{name:18}{'' if single else axis:4}{value:>12.5f}{error:>12.5f}  {unit}")
+    lines.append(
+        f"{result.windows} windows; robust cost {result.cost[0]:.1f} without, {result.cost[1]:.1f} with. Axes are the "
+        "balloon's."
+    )
+    return "\n".join(lines)

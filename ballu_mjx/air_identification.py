@@ -1,0 +1,317 @@
+"""Identifying the air from recordings of free motion, by derivatives through MJX.
+
+The recordings are cut into short windows. Each is simulated from its recorded first state under its recorded commands;
+what the simulated balloon's place and orientation differ by from the recorded ones is made small, by nonlinear least
+squares with a loss that a slipped foot does not rule. A window is short enough for errors not to compound, and long
+enough for a force of hundredths of a newton to move the balloon by more than the starting state's uncertainty does.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import scipy.optimize
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
+
+from ballu_mjx import aerodynamics, envmimic, simulation
+from ballu_mjx import robot as ballu
+from ballu_mjx.aerodynamics import Aerodynamics, AirParameters
+from ballu_mjx.errors import InputError
+from ballu_mjx.reconstruction import Motion
+
+
+@dataclasses.dataclass(frozen=True)
+class AirConfig:
+    """How to identify the air."""
+
+    window_seconds: float = 1.0
+    """Length of a window, s."""
+    interval_seconds: float = 1.0
+    """Time between the starts of two windows, s."""
+    draughts: bool = False
+    """Estimate a constant horizontal draught for each recording beside the shared parameters. It is the day's: no
+    simulation uses it, but drag and the balloon's centre come out unspoiled by it."""
+    evaluations: int = 12
+    """Most steps of the least-squares solver."""
+
+
+class Scale(NamedTuple):
+    """A parameter's order of magnitude: where the solver looks first, and how far a weak prior lets it go."""
+
+    typical: float
+    prior: float = 3.0
+    """Standard deviation of the prior, in multiples of `typical`."""
+
+
+SCALES: dict[str, Scale] = {
+    "added_mass": Scale(0.1),
+    "added_inertia": Scale(2e-3),
+    "lift": Scale(0.03),
+    "centre": Scale(0.01),
+    "linear_drag": Scale(0.03, 1.0),
+    "quadratic_drag": Scale(0.2, 1.0),
+    "turning_drag": Scale(3e-3),
+    "delay": Scale(0.03),
+}
+"""By name; SI units."""
+DRAUGHT = Scale(0.03, 1.0)
+"""Of each component, m/s."""
+_POSITION = (0.003, 0.02)
+"""Expected error of the balloon's position (m) at a window's start, and what each second adds."""
+_ANGLE = (np.deg2rad(0.5), np.deg2rad(1.5))
+"""Likewise of its orientation (rad)."""
+_OUTLYING = 3.0
+"""Expected errors beyond which a window counts less: a foot slipped there, say."""
+_LOST = 20.0
+"""What a simulation that broke down counts as, in expected errors."""
+
+
+@dataclasses.dataclass(frozen=True)
+class AirFit:
+    """What came out."""
+
+    parameters: AirParameters
+    standard_errors: AirParameters
+    """Of white noise in windows independent of each other, beside the prior."""
+    draughts: dict[str, tuple[float, float]]
+    """Horizontal air velocity (m/s, world) by recording; empty where none were estimated."""
+    cost: tuple[float, float]
+    """Half the sum of squares, softened, without the residual and at the end."""
+    windows: int
+
+
+Report = Callable[[int, float], None]
+"""(evaluations so far, cost)."""
+
+
+def check(config: AirConfig) -> None:
+    """**Raises** `InputError` for options out of range, naming the option."""
+    for name in ("window_seconds", "interval_seconds"):
+        if not getattr(config, name) >= 2 * ballu.CONTROL_TIMESTEP:
+            raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name):g}: it must be 0.1 or more.")
+    if config.evaluations < 1:
+        raise InputError(f"--evaluations is {config.evaluations}: it must be 1 or more.")
+
+
+def identify(
+    model: mujoco.MjModel,
+    motions: Sequence[Motion],
+    config: AirConfig,
+    report: Report = lambda evaluations, cost: None,
+    *,
+    known: AirParameters | None = None,
+    free: Sequence[str] = aerodynamics.NAMES,
+) -> AirFit:
+    """Fit `AirParameters` to recorded motions.
+
+    **Arguments**
+
+    - `model`: the robot without the residual, its actuators identified.
+    - `report`: told of every evaluation.
+    - `known`: where to start, and the values of what is not `free`; None: no air.
+    - `free`: names of the parameters to fit.
+
+    **Raises** `InputError` where no recording is as long as a window.
+    """
+    check(config)
+    windows = _Windows(model, motions, config)
+    none = AirParameters.none()
+    start, unravel = ravel_pytree(none if known is None else known)
+    start = np.asarray(start, np.float64)
+    owner = np.repeat(aerodynamics.NAMES, [getattr(none, name).size for name in aerodynamics.NAMES])
+    scale, prior = np.array([SCALES[name] for name in owner]).T
+    places = np.flatnonzero(np.isin(owner, free))
+    low = np.where(np.isin(owner, aerodynamics.SIGNED), -np.inf, 0.0)
+    draughts = 2 * len(motions) if config.draughts else 0
+    prior = np.concatenate([prior[places], np.full(draughts, DRAUGHT.prior)])
+
+    def split(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        vector = start.copy()
+        vector[places] = x[: len(places)] * scale[places]
+        draught = x[len(places) :].reshape(-1, 2) * DRAUGHT.typical if draughts else np.zeros((len(motions), 2))
+        return vector, draught
+
+    evaluations = 0
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        nonlocal evaluations
+        evaluations += 1
+        errors = _soften(windows.errors(*split(x)))[0]
+        total = np.concatenate([errors.ravel(), x / prior])
+        report(evaluations, _cost(total))
+        return total
+
+    def jacobian(x: np.ndarray) -> np.ndarray:
+        vector, draught = split(x)
+        errors = windows.errors(vector, draught)
+        columns = np.zeros((*errors.shape, len(x)))
+        for column, place in enumerate(places):
+            direction = scale[place] * np.eye(len(vector))[place]
+            columns[..., column] = windows.derivative(vector, draught, direction, np.zeros(2))
+        for axis in range(2 if draughts else 0):
+            along = DRAUGHT.typical * np.eye(2)[axis]
+            found = windows.derivative(vector, draught, np.zeros(len(vector)), along)
+            for number in range(len(motions)):
+                mine = windows.recording == number
+                columns[mine, :, len(places) + 2 * number + axis] = found[mine]
+        softened = _soften(errors, columns)[1].reshape(-1, len(x))
+        return np.concatenate([softened, np.diag(1 / prior)])
+
+    x = np.concatenate([start[places] / scale[places], np.zeros(draughts)])
+    bound = np.concatenate([low[places], np.full(draughts, -np.inf)])
+    longest = np.where(owner == "delay", aerodynamics.LONGEST_DELAY / scale, np.inf)
+    ceiling = np.concatenate([longest[places], np.full(draughts, np.inf)])
+    first = residuals(x)
+    if known is None:  # not from the bound, where what must be positive has nowhere to go but up
+        x = np.where(np.isfinite(bound), 1.0, x)
+    solution = scipy.optimize.least_squares(
+        residuals,
+        x,
+        jacobian,  # pyright: ignore[reportArgumentType]
+        bounds=(bound, ceiling),
+        max_nfev=config.evaluations,
+    )
+    vector, draught = split(solution.x)
+    deviation = np.sqrt(np.diag(np.linalg.pinv(solution.jac.T @ solution.jac)))[: len(places)]
+    errors = np.zeros(len(vector))
+    errors[places] = deviation * scale[places]
+    return AirFit(
+        parameters=unravel(jnp.asarray(vector, jnp.float32)),
+        standard_errors=unravel(jnp.asarray(errors, jnp.float32)),
+        draughts={m.name: (float(d[0]), float(d[1])) for m, d in zip(motions, draught, strict=True)}
+        if draughts
+        else {},
+        cost=(_cost(first), float(solution.cost)),
+        windows=len(windows.recording),
+    )
+
+
+def _cost(residuals: np.ndarray) -> float:
+    return float(np.sum(residuals**2)) / 2
+
+
+def _soften(
+    errors: Float[np.ndarray, "windows entries"], slopes: Float[np.ndarray, "windows entries directions"] | None = None
+) -> tuple[Float[np.ndarray, "windows entries"], Float[np.ndarray, "windows entries directions"]]:
+    """Errors (and their derivatives) shortened, window by window, so that half their sum of squares is the pseudo-Huber
+    loss of each window's whole error: quadratic below `_OUTLYING`, linear above."""
+    squared = np.sum(errors**2, axis=1)[:, None] + 1e-12
+    root = np.sqrt(1 + squared / _OUTLYING**2)
+    loss = 2 * _OUTLYING**2 * (root - 1)
+    factor = np.sqrt(loss / squared)
+    if slopes is None:
+        return factor * errors, np.zeros((*errors.shape, 0))
+    # The factor's derivative by the squared error, along each direction.
+    change = (1 / root - loss / squared) / (2 * factor * squared)
+    along = 2 * np.einsum("we,wed->wd", errors, slopes)[:, None, :]
+    return factor * errors, factor[..., None] * slopes + change[..., None] * along * errors[..., None]
+
+
+class _Windows:
+    """Windows of recorded motions, and their simulation; compiles once."""
+
+    def __init__(self, model: mujoco.MjModel, motions: Sequence[Motion], config: AirConfig) -> None:
+        self._simulator, self._air = envmimic.Simulator(model), Aerodynamics(model)
+        _, self._unravel = ravel_pytree(AirParameters.none())
+        steps, every = (round(s / ballu.CONTROL_TIMESTEP) for s in (config.window_seconds, config.interval_seconds))
+        places = [
+            (number, start)
+            for number, motion in enumerate(motions)
+            for start in range(envmimic.HISTORY - 1, len(motion.command) - steps + 1, every)
+        ]
+        if not places:
+            raise InputError(f"No recording lasts {config.window_seconds:g} s; give longer ones, or --window-seconds.")
+        self.recording = np.array([number for number, _ in places])
+        reference, _ = envmimic.stack(self._simulator, motions)
+        qpos, qvel, features, command = (np.asarray(x) for x in reference[:4])
+        cut = lambda array, first, count: np.stack([array[r, s + first : s + first + count] for r, s in places])  # noqa: E731
+        history = envmimic.HISTORY
+        self._data = (
+            cut(qpos, 0, 1)[:, 0],
+            cut(qvel, 0, 1)[:, 0],
+            cut(features, 1 - history, history),
+            cut(command, 1 - history, steps + history - 1),
+            cut(features, 1, steps),
+        )
+        time = np.arange(1, steps + 1) * ballu.CONTROL_TIMESTEP
+        deviation = np.stack([_POSITION[0] + _POSITION[1] * time] * 3 + [_ANGLE[0] + _ANGLE[1] * time] * 3, axis=1)
+        self._deviation = deviation * np.sqrt(steps)  # neighbours in time say the same: a window counts once
+        mesh = jax.sharding.Mesh(np.array(jax.local_devices()), ("batch",))
+        spec = jax.sharding.PartitionSpec
+        self._run = jax.jit(
+            jax.shard_map(
+                self._batch,
+                mesh=mesh,
+                in_specs=(spec(), spec(), spec("batch"), spec("batch"), spec("batch")),
+                out_specs=spec("batch"),
+                check_vma=False,
+            )
+        )
+
+    def errors(self, vector: np.ndarray, draughts: np.ndarray) -> Float[np.ndarray, "windows entries"]:
+        """Errors of the simulated windows, in expected ones."""
+        return self._all(vector, draughts, np.zeros_like(vector), np.zeros(2))[0]
+
+    def derivative(
+        self, vector: np.ndarray, draughts: np.ndarray, direction: np.ndarray, draught: np.ndarray
+    ) -> Float[np.ndarray, "windows entries"]:
+        """Of `errors`, along a direction of the parameters, and one of every recording's draught."""
+        return self._all(vector, draughts, direction, draught)[1]
+
+    def _all(
+        self, vector: np.ndarray, draughts: np.ndarray, direction: np.ndarray, draught: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        count, devices = len(self.recording), jax.local_device_count()
+        filled = np.arange(-(-count // devices) * devices) % count
+        local = np.float32(draughts[self.recording[filled]]), np.float32(np.tile(draught, (len(filled), 1)))
+        data = tuple(x[filled] for x in self._data)
+        found = self._run(np.float32(vector), np.float32(direction), *local, data)
+        errors, slopes = (np.array(x, np.float64)[:count] for x in found)
+        lost = ~(np.isfinite(errors).all(axis=1) & np.isfinite(slopes).all(axis=1))
+        errors[lost], slopes[lost] = _LOST / np.sqrt(errors.shape[1]), 0.0
+        return errors, slopes
+
+    def _batch(
+        self, vector: Array, direction: Array, draughts: Array, along: Array, data: tuple
+    ) -> tuple[Array, Array]:
+        def one(draught: Array, draught_along: Array, own: tuple) -> tuple[Array, Array]:
+            return jax.jvp(lambda v, d: self._one(v, d, *own), (vector, draught), (direction, draught_along))
+
+        return jax.vmap(one)(draughts, along, data)
+
+    def _one(
+        self,
+        vector: Float[Array, " parameters"],
+        draught: Float[Array, " 2"],
+        qpos: Float[Array, " nq"],
+        qvel: Float[Array, " nv"],
+        history: Float[Array, "history 27"],
+        command: Float[Array, "steps 2"],
+        recorded: Float[Array, "windowsteps 27"],
+    ) -> Float[Array, " entries"]:
+        air = self._unravel(vector)
+        simulator = self._simulator.altered(self._air.fields(air))
+        wind = jnp.zeros(27).at[3:5].set(draught)
+        # What the parameters will move depends on them from the start, formally: JAX then traces the loops once.
+        nothing = 0.0 * (vector[0] + draught[0])
+        state = jax.tree.map(lambda x: x + nothing, simulation.at(qpos, qvel))
+
+        def step(carry: tuple, time: Int[Array, ""]) -> tuple[tuple, Array]:
+            state, history = carry
+            seen = jax.lax.dynamic_slice_in_dim(command, time, envmimic.HISTORY)
+            wrench = self._air.wrench(air, history - wind, seen)
+            state = simulator.step(state, self._air.command(air, seen), wrench)
+            features, _ = simulator.observe(state)
+            return (state, jnp.concatenate([history[1:], features[None]])), features
+
+        _, features = jax.lax.scan(step, (state, history + nothing), jnp.arange(len(recorded)))
+        position = features[:, :3] - recorded[:, :3]
+        angles = envmimic.wrap_angle(features[:, 6:9] - recorded[:, 6:9])
+        return (jnp.concatenate([position, angles], axis=1) / self._deviation).ravel()
