@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ballu_mjx import actuators, identification, plots, runs
+from ballu_mjx import actuators, identification, plots, runs, runtime
 from ballu_mjx.identification import IdentificationConfig
 from ballu_mjx.recording import bundled, read_recording
 from ballu_mjx.recording import recordings as expand
@@ -19,7 +19,7 @@ QUICK: Mapping[str, Any] = {"transients": False, "draws": 32, "starts": 4, "step
 
 
 @dataclasses.dataclass(frozen=True)
-class SweepData:
+class SweepData(runtime.CommandOptions):
     """Sweeps and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
     recordings: tuple[Path, ...] = ()

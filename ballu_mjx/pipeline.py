@@ -28,6 +28,7 @@ from ballu_mjx import (
     residual_training,
     robot,
     runs,
+    runtime,
     trials,
     virtual_robot,
 )
@@ -49,7 +50,7 @@ _DECIMALS = 4
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(runtime.CommandOptions):
     """What to run, and how long to train."""
 
     output: Path = Path("runs/all")

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ballu_mjx import actuators, locomotion, plots, policy, ppo, replay, residual, robot, runs
+from ballu_mjx import actuators, locomotion, plots, policy, ppo, replay, residual, robot, runs, runtime
 from ballu_mjx.errors import InputError
 from ballu_mjx.locomotion import LocomotionConfig
 from ballu_mjx.policy import ClosedLoop, Policy, Rollout
@@ -45,7 +45,7 @@ NOMINAL = Path("nominal")
 
 
 @dataclasses.dataclass(frozen=True)
-class Data:
+class Data(runtime.CommandOptions):
     """The simulator's parts, and folders."""
 
     actuators: Path | None = None

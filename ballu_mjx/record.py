@@ -33,7 +33,7 @@ LEAST_CORRELATION = 0.35
 
 
 @dataclasses.dataclass(frozen=True)
-class Import:
+class Import(runtime.CommandOptions):
     """Turn a motion-capture file into a recording, with the commands of a log beside it."""
 
     file: tyro.conf.Positional[Path]
@@ -57,7 +57,7 @@ class Import:
 
 
 @dataclasses.dataclass(frozen=True)
-class Check:
+class Check(runtime.CommandOptions):
     """Tell what recordings hold: rate, gaps, ranges and commands. Broken ones are refused, with the place and mend."""
 
     recordings: tyro.conf.Positional[tuple[Path, ...]]
@@ -67,7 +67,7 @@ class Check:
 
 
 @dataclasses.dataclass(frozen=True)
-class Simulate:
+class Simulate(runtime.CommandOptions):
     """Record on the virtual robot: try out a method, or what to send, before the hardware does."""
 
     output: Path
@@ -91,7 +91,7 @@ class Simulate:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
+    """Run the command; returns the exit status (`runtime.exit_status`)."""
     arguments = sys.argv[1:] if arguments is None else arguments
 
     def run() -> int:
@@ -105,11 +105,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         return _run(options)
 
-    return runtime.exit_status(run)
+    return runtime.exit_status(run, arguments)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Example:
+class _Example(runtime.CommandOptions):
     """Print a mapping file with every key and its default: to be saved, and cut down to what your room needs."""
 
 

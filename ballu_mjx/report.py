@@ -38,7 +38,7 @@ _ROW_HEIGHT = 170
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(runtime.CommandOptions):
     """Write a run, or a folder of `train all`, as one page for the browser, which needs no network."""
 
     run: tyro.conf.Positional[Path]
@@ -54,7 +54,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
+    """Run the command; returns the exit status (`runtime.exit_status`)."""
 
     def run() -> None:
         options = tyro.cli(
@@ -65,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         runtime.prepare()
         _report(options)
 
-    return runtime.exit_status(run)
+    return runtime.exit_status(run, arguments)
 
 
 def _report(options: Options) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from ballu_mjx import actuators, evaluate, evaluation, ppo, residual, robot, runs
+from ballu_mjx import actuators, evaluate, evaluation, ppo, residual, robot, runs, runtime
 from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.errors import InputError
 from ballu_mjx.evaluation import OpenLoopEvaluator, group_of
@@ -30,7 +30,7 @@ QUICK_RECORDINGS = 2
 
 
 @dataclasses.dataclass(frozen=True)
-class Data:
+class Data(runtime.CommandOptions):
     """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
     recordings: tuple[Path, ...] = ()

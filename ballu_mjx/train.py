@@ -25,7 +25,7 @@ _PROGRAM = "python -m ballu_mjx.train"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
+    """Run the command; returns the exit status (`runtime.exit_status`)."""
     arguments = sys.argv[1:] if arguments is None else arguments
 
     def run() -> int:
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
         )
 
-    return runtime.exit_status(run)
+    return runtime.exit_status(run, arguments)
 
 
 def _commands(arguments: Sequence[str]) -> dict[str, Callable[..., int]]:
