@@ -97,7 +97,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def run() -> int:
         runtime.prepare()
         options = tyro.extras.subcommand_cli_from_dict(
-            {"import": Import, "check": Check, "simulate": Simulate, "example-mapping": _Example},
+            subcommands(),
             args=arguments,
             prog="python -m ballu_mjx.record",
             description="Make and check recordings of the robot. Each subcommand explains its options with --help.",
@@ -106,6 +106,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _run(options)
 
     return runtime.exit_status(run, arguments)
+
+
+def subcommands() -> dict[str, type]:
+    """Options of the subcommands by name."""
+    return {"import": Import, "check": Check, "simulate": Simulate, "example-mapping": _Example}
 
 
 @dataclasses.dataclass(frozen=True)

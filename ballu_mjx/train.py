@@ -3,7 +3,7 @@
 JAX, and all that needs it, is imported inside functions: `runtime.prepare` has to come first.
 """
 
-# Not postponed here: tyro reads the annotations of functions whose names exist only inside `_commands`.
+# Not postponed here: tyro reads the annotations of functions whose names exist only inside `subcommands`.
 import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def run() -> int:
         runtime.prepare()
         return tyro.extras.subcommand_cli_from_dict(
-            _commands(arguments),
+            subcommands(arguments),
             args=arguments,
             prog=_PROGRAM,
             description="Learn from recordings of the robot. Each subcommand explains its options with --help.",
@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return runtime.exit_status(run, arguments)
 
 
-def _commands(arguments: Sequence[str]) -> dict[str, Callable[..., int]]:
+def subcommands(arguments: Sequence[str] = ()) -> dict[str, Callable[..., int]]:
     """Subcommands by name. A function's parameters are its options, their defaults depend on --resume and --quick."""
     from ballu_mjx import actuator_fit, pipeline, policy_training, residual_training
     from ballu_mjx.envmimic import EnvMimicConfig

@@ -2,6 +2,7 @@
 
 import importlib.util
 import pkgutil
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,8 @@ from pathlib import Path
 import pytest
 
 import ballu_mjx
-from ballu_mjx import runtime
+from ballu_mjx import __main__ as package
+from ballu_mjx import completion, runtime
 from ballu_mjx.__main__ import COMMANDS
 
 SUBCOMMANDS = [
@@ -103,3 +105,57 @@ def test_a_reader_that_has_seen_enough_is_no_error():
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 141
+
+
+def test_the_script_runs_commands_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert package.main(["record", "example-mapping"]) == 0
+    assert "[commands]" in capsys.readouterr().out
+    assert package.main(["record", "check", str(tmp_path / "nowhere")]) == 2
+    assert capsys.readouterr().err.startswith(f"{tmp_path}/nowhere: ")
+    assert package.main(["import", "walk.csv"]) == 2
+    assert "import: there is no such command" in capsys.readouterr().err
+    assert package.main(["completion"]) == 2
+    assert "bash or zsh" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def bash_script(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("completion") / "ballu_mjx"
+    path.write_text(completion.script("bash", package.NAMES))
+    return path
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ("", {"record", "train", "evaluate", "report", "view", "compare", "export"}),
+        ("tr", {"train"}),
+        ("record ", {"import", "check", "simulate", "example-mapping"}),
+        ("train ", {"sysid", "envmimic", "walk", "turn", "turn-right", "walk-backward", "all"}),
+        ("train envmimic --num-t", {"--num-timesteps"}),
+        ("record import --format ", {"auto", "vicon", "c3d", "table"}),
+        ("view --po", {"--port"}),
+        ("report rec", {"recordings"}),  # a path
+    ],
+)
+def test_bash_completes(bash_script: Path, typed: str, offered: set[str], tmp_path: Path):
+    (tmp_path / "recordings").mkdir()
+    words = ["ballu_mjx", *typed.split(" ")]
+    # What readline does: the function first; where it offers nothing, files, if the script asks for these by default.
+    ask = """source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); set -- $(complete -p ballu_mjx)
+        [[ " $* " =~ " -F "([^ ]+)" " ]]; "${BASH_REMATCH[1]}"
+        if [[ -z "${COMPREPLY[*]}" && " $* " == *" -o default "* ]]; then
+            COMPREPLY=($(compgen -f -- "${COMP_WORDS[COMP_CWORD]}"))
+        fi
+        printf '%s\\n' "${COMPREPLY[@]}" """
+    line = ["bash", "-c", ask, "bash", str(bash_script), *words]
+    done = subprocess.run(line, capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert done.stderr == ""
+    assert set(done.stdout.split()) - {"-h", "--help"} == offered
+
+
+def test_the_script_for_zsh_names_the_subcommands():
+    text = completion.script("zsh", package.NAMES)
+    assert text.startswith("#compdef ballu_mjx")
+    assert all(line.split()[-1] in text for line in SUBCOMMANDS)
