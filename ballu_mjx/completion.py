@@ -21,8 +21,10 @@ SHELLS = ("bash", "zsh")
 
 
 def script(shell: str, commands: Sequence[str]) -> str:
-    """What the shell, one of `SHELLS`, reads to complete commands (modules of this package), subcommands, options and their choices; in
-    bash paths too."""
+    """What the shell, one of `SHELLS`, reads to complete subcommands, options, their choices, and in bash paths.
+
+    `commands`: the modules of this package that are commands.
+    """
     runtime.prepare()
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
