@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from ballu_mjx import actuators, evaluate, evaluation, ppo, residual, robot, runs, runtime
+from ballu_mjx import actuators, evaluate, evaluation, loggers, ppo, residual, robot, runs
 from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.errors import InputError
 from ballu_mjx.evaluation import OpenLoopEvaluator, group_of
@@ -30,7 +30,7 @@ QUICK_RECORDINGS = 2
 
 
 @dataclasses.dataclass(frozen=True)
-class Data(runtime.CommandOptions):
+class Data(loggers.LoggingOptions):
     """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
     recordings: tuple[Path, ...] = ()
@@ -59,6 +59,7 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     started = time.perf_counter()
     devices = [str(device) for device in jax.local_devices()]
     ppo.check(ppo_config, len(devices))
+    loggers.check(data.wandb)
     if data.validate_every < 1:
         raise InputError(f"--validate-every is {data.validate_every}: it must be 1 or more.")
     first_step, restored = restored_from("envmimic", data.resume, ppo_config, output=data.output, quick=data.quick)
@@ -91,7 +92,7 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     config = runs.describe("envmimic", {"env": env_config, "ppo": ppo_config, "data": data}, files, devices, identified)
     resumed_at = None if restored is None else first_step
     validation = evaluator("validation")
-    with runs.Run(folder, config, resumed_at=resumed_at) as run:
+    with runs.Run(folder, config, resumed_at=resumed_at, wandb=data.wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)
         remaining = dataclasses.replace(ppo_config, num_timesteps=ppo_config.num_timesteps - first_step)
         progress = runs.Progress(first_step + ppo.total_timesteps(remaining), first_step)

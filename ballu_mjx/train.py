@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Config = TypeVar("Config")
 Data = TypeVar("Data")
-_CADENCES = ("validate_every", "keep_every")
+_KEPT = ("validate_every", "keep_every", "wandb")
 """Options of the training commands' data that a run keeps."""
 _PROGRAM = "python -m ballu_mjx.train"
 
@@ -117,9 +117,9 @@ def _defaults(
     first, _ = parser.parse_known_args([a for a in arguments if a != "--help"])
     if first.resume is not None and arguments[0] == task:
         config = runs.read_config(first.resume, task)
-        cadence = {name: config["data"][name] for name in _CADENCES if name in config.get("data", {})}
+        kept = {name: config["data"][name] for name in _KEPT if name in config.get("data", {})}
         return (
-            data_class(**cadence),
+            data_class(**kept),
             runs.typed(env_class, config["env"], first.resume),
             runs.typed(PPOConfig, config["ppo"], first.resume),
         )
