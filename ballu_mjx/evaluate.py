@@ -70,6 +70,7 @@ def _evaluate(options: Options) -> None:
         options.output.mkdir(parents=True, exist_ok=True)
 
     print(f"The {which} checkpoint of {options.run}: step {policy.step:,}.", flush=True)
+    print("Compiling: half a minute the first time ...", flush=True)
     model = robot.load_model(policy.actuators)
     motions = [reconstruct(recording, model) for recording in recordings]
     evaluator = evaluation.OpenLoopEvaluator(model, motions, policy.config, policy.infer)

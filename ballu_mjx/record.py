@@ -335,9 +335,8 @@ def report(path: Path, recording: Recording, gaps: dict[str, list[tuple[float, f
     for spans, names in groups.items():
         lengths = [b - a + step for a, b in spans]
         shown = names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
-        lines.append(
-            f"  {shown}: {len(spans)} drop-outs, {sum(lengths):.2f} s in all, the longest {max(lengths):.2f} s"
-        )
+        told = f"{len(spans)} drop-outs, {sum(lengths):.2f} s in all, the longest {max(lengths):.2f} s"
+        lines.append(f"  {shown}: " + (told if len(spans) > 1 else f"1 drop-out of {lengths[0]:.2f} s"))
     if not gaps:
         lines.append("  no drop-outs")
     for label, value in _ranges(recording):

@@ -80,7 +80,8 @@ def _report(options: Options) -> None:
     print(f"Written to {path}, {path.stat().st_size / 1e6:.1f} MB.")
     if not content.takes:
         print(
-            f"There is no {replay.NAME} to show: `python -m ballu_mjx.evaluate RUN --output RUN` writes an EnvMimic's."
+            "It has no replay in 3D: an identification has none, and an EnvMimic's is written by "
+            "`python -m ballu_mjx.evaluate RUN --output RUN`."
         )
     elif options.video:
         shown = next(take for take in content.takes if options.show in (None, take.name))

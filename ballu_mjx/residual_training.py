@@ -107,7 +107,8 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     best_step, params = evaluate.load_params(folder, "best")
     evaluate.learning_curve(folder, best_step)
     test = validation if files["test"] == files["validation"] else evaluator("test")
-    print(f"Best checkpoint: step {best_step:,}. Open-loop replay of the test recordings:\n")
+    untrained = "" if best_step else ", before any training: no later one validated better"
+    print(f"Best checkpoint: step {best_step:,}{untrained}. Open-loop replay of the test recordings:\n")
     base = evaluation.base_name(identified is not None)
     print(evaluate.report(test, params, folder, base).table(base))
     if data.quick:
@@ -129,7 +130,9 @@ def _choose(data: Data) -> dict[str, list[Path]]:
     else:
         files = {use: bundled(use) for use in USES if use not in files} | files
     if data.quick:
-        files = {"training": files["training"][:QUICK_RECORDINGS], "validation": _one_a_group(files["validation"])}
+        few = files["training"][:QUICK_RECORDINGS]
+        on_training = files["validation"] == files["training"]
+        files = {"training": few, "validation": few if on_training else _one_a_group(files["validation"])}
         files["test"] = files["validation"]  # a second set would be a second program to compile
     return files
 
