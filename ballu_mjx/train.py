@@ -90,9 +90,9 @@ def subcommands(arguments: Sequence[str] = ()) -> dict[str, Callable[..., int]]:
         command.__doc__ = f"{task.summary} In the nominal simulator, or one improved by --actuators and --residual."
         return command
 
-    def everything(options: pipeline.Options = pipeline.Options()) -> int:  # noqa: B008
+    def everything(story: pipeline.Options = pipeline.Options()) -> int:  # noqa: B008
         """The whole story on a virtual robot: data, actuators, EnvMimic, policies in four simulators, trials."""
-        return pipeline.run(options)
+        return pipeline.run(story)
 
     tasks = {name: task_command(task) for name, task in TASKS.items()}
     return {"sysid": sysid, "envmimic": envmimic, **tasks, "all": everything}
