@@ -70,7 +70,10 @@ class TensorBoard:
 
 
 class WeightsAndBiases:
-    """A run of a project of Weights & Biases; a run that is opened again goes on there too."""
+    """A run of a project of Weights & Biases.
+
+    A run that is opened again goes on there too; what it measures again, at steps that are there already, is ignored.
+    """
 
     def __init__(self, project: str, folder: Path, config: Mapping[str, Any]) -> None:
         """Begin, with the local files in the run's `folder`.

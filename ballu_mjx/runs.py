@@ -3,6 +3,7 @@
 config.json         all it takes to repeat the run
 metrics.jsonl       one JSON object a line: `step` (control steps) and what was measured there
 tensorboard/        the same for TensorBoard
+wandb/              the same for Weights & Biases, on demand
 checkpoints/STEP/   parameters (orbax): the last three, and the best by validation error
 evaluation.txt, evaluation.json, learning_curve.png, tracking.png
 replay.npz          what the robots did, for `ballu_mjx.report` and `ballu_mjx.view`
