@@ -1,4 +1,14 @@
-"""`python -m ballu_mjx`: which commands there are, in the order of the work."""
+"""`python -m ballu_mjx`: which commands there are, in the order of the work; with a command's name, that command.
+
+The script `ballu_mjx` is the same.
+"""
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+from ballu_mjx import completion, runtime
+from ballu_mjx.errors import InputError
 
 COMMANDS = (
     ("recording", "record import FILE", "make a recording from a Vicon CSV, a C3D or any table"),
@@ -15,14 +25,35 @@ COMMANDS = (
     ("the robot", "export RUN", "a policy as a controller that needs NumPy alone"),
 )
 """Stage, what follows `python -m ballu_mjx.`, what it is for."""
+NAMES = tuple(dict.fromkeys(command.split()[0] for _, command, _ in COMMANDS))
+"""Of the modules that are commands."""
 
 
-def main() -> None:
-    """Print the commands by stage."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command that the first of the arguments names, or print them all; returns its exit status."""
+    first, *others = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    if first in NAMES:
+        return importlib.import_module(f"{__package__}.{first}").main(others)
+    return runtime.exit_status(lambda: _own(first, others), others)
+
+
+def _own(first: str, others: Sequence[str]) -> None:
+    if first in ("-h", "--help"):
+        _print_commands()
+    elif first == "completion":
+        if len(others) != 1 or others[0] not in completion.SHELLS:
+            raise InputError(f"completion: give the shell, {' or '.join(completion.SHELLS)}.")
+        print(completion.script(others[0], NAMES))
+    else:
+        raise InputError(f"{first}: there is no such command; `python -m ballu_mjx` lists them.")
+
+
+def _print_commands() -> None:
     print("Commands, each after `python -m ballu_mjx.`; --help explains one, `train ... --quick` shows it at work.\n")
     for stage, command, purpose in COMMANDS:
         print(f"  {stage:15} {command:20} {purpose}")
+    print("\n`ballu_mjx train` and so on does the same; `ballu_mjx completion bash` (or zsh) prints its completion.")
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

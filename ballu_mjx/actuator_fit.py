@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ballu_mjx import actuators, identification, plots, runs
+from ballu_mjx import actuators, identification, loggers, plots, runs
 from ballu_mjx.identification import IdentificationConfig
 from ballu_mjx.recording import bundled, read_recording
 from ballu_mjx.recording import recordings as expand
@@ -19,7 +19,7 @@ QUICK: Mapping[str, Any] = {"transients": False, "draws": 32, "starts": 4, "step
 
 
 @dataclasses.dataclass(frozen=True)
-class SweepData:
+class SweepData(loggers.LoggingOptions):
     """Sweeps and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
     recordings: tuple[Path, ...] = ()
@@ -37,12 +37,14 @@ def fit(data: SweepData, config: IdentificationConfig) -> int:
     """Read and check the sweep, identify, write; returns the exit status."""
     started = time.perf_counter()
     identification.check(config)
+    loggers.check(data.wandb)
     paths = expand(data.recordings) if data.recordings else bundled("suspended")
     sweep = read_sweep({path: read_recording(path) for path in paths}, levels=data.levels)
     folder = runs.new_folder(data.output, "sysid")
     print(f"Run folder: {folder}")
     print(f"  sweep of {sweep.robot}: {len(sweep.command)} holds, {', '.join(path.name for path in paths)}")
-    with runs.Run(folder, runs.describe("sysid", {"fit": config, "data": data}, {"suspended": paths}, [])) as run:
+    content = runs.describe("sysid", {"fit": config, "data": data}, {"suspended": paths}, [])
+    with runs.Run(folder, content, wandb=data.wandb) as run:
         stages = runs.Stages()
 
         def report(stage: str, iteration: int, steps: int, loss: float) -> None:

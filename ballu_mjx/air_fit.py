@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-from ballu_mjx import aerodynamics, air_identification, envmimic, evaluate, evaluation, runs
+from ballu_mjx import aerodynamics, air_identification, envmimic, evaluate, evaluation, loggers, runs
 from ballu_mjx.aerodynamics import Aerodynamics
 from ballu_mjx.air_identification import AirConfig, AirFit
 from ballu_mjx.envmimic import EnvMimicConfig
@@ -24,6 +24,7 @@ def fit(data: RecordingsData, config: AirConfig) -> int:
     """Read and check everything, identify, evaluate; returns the exit status."""
     started = time.perf_counter()
     air_identification.check(config)
+    loggers.check(data.wandb)
     prepared = Prepared.read(data)
     folder = runs.new_folder(data.output, "aerodynamic")
     prepared.announce(folder, data.quick)
@@ -32,7 +33,7 @@ def fit(data: RecordingsData, config: AirConfig) -> int:
     sections = {"fit": config, "data": data}
     devices = [str(device) for device in jax.local_devices()]
     description = runs.describe("aerodynamic", sections, prepared.files, devices, prepared.identified)
-    with runs.Run(folder, description) as run:
+    with runs.Run(folder, description, wandb=data.wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)
         stages = runs.Stages()
 

@@ -31,7 +31,7 @@ _UNTOLD = ("seed", "num_timesteps")
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(runtime.CommandOptions):
     """Compare runs of one task: a table and a plot, mean with 95 % interval over runs that differ in the seed alone."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
@@ -50,7 +50,7 @@ class Row:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
+    """Run the command; returns the exit status (`runtime.exit_status`)."""
 
     def run() -> None:
         runtime.prepare()
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             )
         )
 
-    return runtime.exit_status(run)
+    return runtime.exit_status(run, arguments)
 
 
 def interval(values: Sequence[float]) -> tuple[float, float]:

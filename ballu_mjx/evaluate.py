@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(runtime.CommandOptions):
     """Replay recordings open loop, without and with a run's residual forces, and print the errors of both."""
 
     run: tyro.conf.Positional[Path]
@@ -41,7 +41,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
+    """Run the command; returns the exit status (`runtime.exit_status`)."""
 
     def run() -> None:
         runtime.prepare()
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         _evaluate(options)
 
-    return runtime.exit_status(run)
+    return runtime.exit_status(run, arguments)
 
 
 def _evaluate(options: Options) -> None:
@@ -71,6 +71,7 @@ def _evaluate(options: Options) -> None:
 
     if loaded.step:
         print(f"The {which} checkpoint of {options.run}: step {loaded.step:,}.", flush=True)
+    print("Compiling: half a minute the first time ...", flush=True)
     model = robot.load_model(loaded.actuators)
     motions = [reconstruct(recording, model) for recording in recordings]
     base = evaluation.base_name(loaded.actuators is not None)

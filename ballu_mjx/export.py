@@ -35,7 +35,7 @@ _CHECKS = 20
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(runtime.CommandOptions):
     """Write a locomotion policy as a controller for the robot that needs Python and NumPy only."""
 
     run: tyro.conf.Positional[Path]
@@ -56,7 +56,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
+    """Run the command; returns the exit status (`runtime.exit_status`)."""
 
     def run() -> None:
         runtime.prepare()
@@ -65,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         export(options)
 
-    return runtime.exit_status(run)
+    return runtime.exit_status(run, arguments)
 
 
 def export(options: Options) -> Path:

@@ -24,6 +24,7 @@ import numpy as np
 from ballu_mjx import (
     actuator_fit,
     actuators,
+    loggers,
     policy_training,
     residual_training,
     robot,
@@ -49,7 +50,7 @@ _DECIMALS = 4
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(loggers.LoggingOptions):
     """What to run, and how long to train."""
 
     output: Path = Path("runs/all")
@@ -127,7 +128,8 @@ class Story:
         config = IdentificationConfig(**actuator_fit.QUICK if self.options.quick else {})
 
         def make(folder: Path) -> None:
-            data = actuator_fit.SweepData(recordings=(sweep / "sweep.csv.gz",), output=folder)
+            recordings = (sweep / "sweep.csv.gz",)
+            data = actuator_fit.SweepData(recordings=recordings, output=folder, wandb=self.options.wandb)
             actuator_fit.fit(data, config)
 
         return _stage(self._shared / "sysid", config, [sweep], make)
@@ -139,7 +141,7 @@ class Story:
         ppo = policy_training.defaults(seed=self.seed, **quick)
         needs = []
         # Six checkpoints in all, or one a training step: the last three are what is replayed on the robot.
-        data = policy_training.Data(keep_every=max(ppo.num_timesteps // 6, 1))
+        data = policy_training.Data(keep_every=max(ppo.num_timesteps // 6, 1), wandb=self.options.wandb)
         if setting == "envmimic":
             needs = [self.residual(task)]
             data = dataclasses.replace(data, residual=needs[0])
@@ -149,7 +151,7 @@ class Story:
 
         def make(folder: Path) -> None:
             started = runs.checkpoints(folder)
-            where = policy_training.Data(resume=folder, keep_every=data.keep_every)
+            where = policy_training.Data(resume=folder, keep_every=data.keep_every, wandb=data.wandb)
             where = where if started else dataclasses.replace(data, output=folder)
             _stop_unless_done(policy_training.train(TASKS[task], where, config, ppo))
 
@@ -200,9 +202,10 @@ class Story:
                 validation=(recordings / "validation",),
                 actuators=identified / actuators.NAME,
                 output=folder,
+                wandb=self.options.wandb,
             )
             if runs.checkpoints(folder):
-                data = residual_training.Data(resume=folder)
+                data = residual_training.Data(resume=folder, wandb=data.wandb)
             _stop_unless_done(residual_training.train(data, config, ppo))
 
         return _stage(self._own / f"envmimic-{task}", (config, ppo), [recordings, identified], make)

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ballu_mjx import actuators, locomotion, plots, policy, ppo, replay, residual, robot, runs
+from ballu_mjx import actuators, locomotion, loggers, plots, policy, ppo, replay, residual, robot, runs
 from ballu_mjx.errors import InputError
 from ballu_mjx.locomotion import LocomotionConfig
 from ballu_mjx.policy import ClosedLoop, Policy, Rollout
@@ -45,7 +45,7 @@ NOMINAL = Path("nominal")
 
 
 @dataclasses.dataclass(frozen=True)
-class Data:
+class Data(loggers.LoggingOptions):
     """The simulator's parts, and folders."""
 
     actuators: Path | None = None
@@ -70,6 +70,7 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
     started = time.perf_counter()
     devices = [str(device) for device in jax.local_devices()]
     ppo.check(ppo_config, len(devices))
+    loggers.check(data.wandb)
     check(config)
     if data.keep_every < 1:
         raise InputError(f"--keep-every is {data.keep_every}: it must be 1 or more.")
@@ -88,7 +89,7 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
     content = runs.describe(task.name, {"env": config, "ppo": ppo_config, "data": data}, {}, devices, identified)
     content["residual"] = None if forces is None else str(forces.resolve())
     resumed_at = None if restored is None else first_step
-    with runs.Run(folder, content, resumed_at=resumed_at) as run:
+    with runs.Run(folder, content, resumed_at=resumed_at, wandb=data.wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)
         remaining = dataclasses.replace(ppo_config, num_timesteps=ppo_config.num_timesteps - first_step)
         progress = runs.Progress(first_step + ppo.total_timesteps(remaining), first_step)

@@ -33,7 +33,7 @@ LEAST_CORRELATION = 0.35
 
 
 @dataclasses.dataclass(frozen=True)
-class Import:
+class Import(runtime.CommandOptions):
     """Turn a motion-capture file into a recording, with the commands of a log beside it."""
 
     file: tyro.conf.Positional[Path]
@@ -57,7 +57,7 @@ class Import:
 
 
 @dataclasses.dataclass(frozen=True)
-class Check:
+class Check(runtime.CommandOptions):
     """Tell what recordings hold: rate, gaps, ranges and commands. Broken ones are refused, with the place and mend."""
 
     recordings: tyro.conf.Positional[tuple[Path, ...]]
@@ -67,7 +67,7 @@ class Check:
 
 
 @dataclasses.dataclass(frozen=True)
-class Simulate:
+class Simulate(runtime.CommandOptions):
     """Record on the virtual robot: try out a method, or what to send, before the hardware does."""
 
     output: Path
@@ -91,13 +91,13 @@ class Simulate:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
+    """Run the command; returns the exit status (`runtime.exit_status`)."""
     arguments = sys.argv[1:] if arguments is None else arguments
 
     def run() -> int:
         runtime.prepare()
         options = tyro.extras.subcommand_cli_from_dict(
-            {"import": Import, "check": Check, "simulate": Simulate, "example-mapping": _Example},
+            subcommands(),
             args=arguments,
             prog="python -m ballu_mjx.record",
             description="Make and check recordings of the robot. Each subcommand explains its options with --help.",
@@ -105,11 +105,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         return _run(options)
 
-    return runtime.exit_status(run)
+    return runtime.exit_status(run, arguments)
+
+
+def subcommands() -> dict[str, type]:
+    """Options of the subcommands by name."""
+    return {"import": Import, "check": Check, "simulate": Simulate, "example-mapping": _Example}
 
 
 @dataclasses.dataclass(frozen=True)
-class _Example:
+class _Example(runtime.CommandOptions):
     """Print a mapping file with every key and its default: to be saved, and cut down to what your room needs."""
 
 
@@ -330,9 +335,8 @@ def report(path: Path, recording: Recording, gaps: dict[str, list[tuple[float, f
     for spans, names in groups.items():
         lengths = [b - a + step for a, b in spans]
         shown = names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
-        lines.append(
-            f"  {shown}: {len(spans)} drop-outs, {sum(lengths):.2f} s in all, the longest {max(lengths):.2f} s"
-        )
+        told = f"{len(spans)} drop-outs, {sum(lengths):.2f} s in all, the longest {max(lengths):.2f} s"
+        lines.append(f"  {shown}: " + (told if len(spans) > 1 else f"1 drop-out of {lengths[0]:.2f} s"))
     if not gaps:
         lines.append("  no drop-outs")
     for label, value in _ranges(recording):

@@ -38,7 +38,7 @@ _ROW_HEIGHT = 170
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(runtime.CommandOptions):
     """Write a run, or a folder of `train all`, as one page for the browser, which needs no network."""
 
     run: tyro.conf.Positional[Path]
@@ -54,7 +54,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
+    """Run the command; returns the exit status (`runtime.exit_status`)."""
 
     def run() -> None:
         options = tyro.cli(
@@ -65,7 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         runtime.prepare()
         _report(options)
 
-    return runtime.exit_status(run)
+    return runtime.exit_status(run, arguments)
 
 
 def _report(options: Options) -> None:
@@ -80,7 +80,8 @@ def _report(options: Options) -> None:
     print(f"Written to {path}, {path.stat().st_size / 1e6:.1f} MB.")
     if not content.takes:
         print(
-            f"There is no {replay.NAME} to show: `python -m ballu_mjx.evaluate RUN --output RUN` writes an EnvMimic's."
+            "It has no replay in 3D: an identification has none, and an EnvMimic's is written by "
+            "`python -m ballu_mjx.evaluate RUN --output RUN`."
         )
     elif options.video:
         shown = next(take for take in content.takes if options.show in (None, take.name))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import mujoco
 
-from ballu_mjx import actuators, evaluate, robot, runs
+from ballu_mjx import actuators, evaluate, loggers, robot, runs
 from ballu_mjx.errors import InputError
 from ballu_mjx.evaluation import base_name, group_of
 from ballu_mjx.reconstruction import Motion, reconstruct
@@ -22,7 +22,7 @@ QUICK_RECORDINGS = 2
 
 
 @dataclasses.dataclass(frozen=True)
-class RecordingsData:
+class RecordingsData(loggers.LoggingOptions):
     """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
     recordings: tuple[Path, ...] = ()
@@ -111,7 +111,9 @@ def _choose(data: RecordingsData, earlier: Path | None) -> dict[str, list[Path]]
     else:
         files = {use: bundled(use) for use in USES if use not in files} | files
     if data.quick:
-        files = {"training": files["training"][:QUICK_RECORDINGS], "validation": _one_a_group(files["validation"])}
+        few = files["training"][:QUICK_RECORDINGS]
+        on_training = files["validation"] == files["training"]
+        files = {"training": few, "validation": few if on_training else _one_a_group(files["validation"])}
         files["test"] = files["validation"]  # a second set would be a second program to compile
     return files
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from ballu_mjx import evaluate, evaluation, policy, ppo, runs
+from ballu_mjx import evaluate, evaluation, loggers, policy, ppo, runs
 from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv, ForcePolicy
 from ballu_mjx.errors import InputError
 from ballu_mjx.evaluation import OpenLoopEvaluator
@@ -44,14 +44,16 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     started = time.perf_counter()
     devices = [str(device) for device in jax.local_devices()]
     ppo.check(ppo_config, len(devices))
+    loggers.check(data.wandb)
     if data.validate_every < 1:
         raise InputError(f"--validate-every is {data.validate_every}: it must be 1 or more.")
     first_step, restored = restored_from("envmimic", data.resume, ppo_config, output=data.output, quick=data.quick)
-    beside = _beside(data)
+    where = _where_beside(data)
+    beside = None if where is None else Residual.load(where)
     prepared = Prepared.read(data, data.resume)
     if beside is not None and not policy.same_actuators(beside.actuators, prepared.identified):
         raise InputError(
-            f"{data.residual}: was learned beside other actuators than {prepared.where}; give --actuators the same."
+            f"{where}: was learned beside other actuators than {prepared.where}; give --actuators the same."
         )
     folder = data.resume or runs.new_folder(data.output, "envmimic")
     prepared.announce(folder, data.quick)
@@ -73,10 +75,10 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
 
     sections = {"env": env_config, "ppo": ppo_config, "data": data}
     config = runs.describe("envmimic", sections, prepared.files, devices, prepared.identified)
-    config["residual"] = None if data.residual is None else str(data.residual.resolve())
+    config["residual"] = None if where is None else str(where.resolve())
     resumed_at = None if restored is None else first_step
     validation = evaluator("validation")
-    with runs.Run(folder, config, resumed_at=resumed_at) as run:
+    with runs.Run(folder, config, resumed_at=resumed_at, wandb=data.wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)
         remaining = dataclasses.replace(ppo_config, num_timesteps=ppo_config.num_timesteps - first_step)
         progress = runs.Progress(first_step + ppo.total_timesteps(remaining), first_step)
@@ -92,7 +94,8 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     best_step, params = evaluate.load_params(folder, "best")
     evaluate.learning_curve(folder, best_step)
     test = validation if prepared.one_set else evaluator("test")
-    print(f"Best checkpoint: step {best_step:,}. Open-loop replay of the test recordings:\n")
+    untrained = "" if best_step else ", before any training: no later one validated better"
+    print(f"Best checkpoint: step {best_step:,}{untrained}. Open-loop replay of the test recordings:\n")
     print(evaluate.report(test, all_params(params), folder).table())
     if data.quick:
         print("\nThese numbers mean little: --quick trains for seconds.")
@@ -100,12 +103,11 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     return 0
 
 
-def _beside(data: Data) -> Residual | None:
-    """The residual that acts beside the forces to be learned."""
-    folder = data.residual
-    if data.resume is not None:
-        if folder is not None:
-            raise InputError("--residual does not go with --resume, which keeps the simulator; leave one out.")
-        stored = runs.read_config(data.resume, "envmimic").get("residual")
-        folder = None if stored is None else Path(stored)
-    return None if folder is None else Residual.load(folder)
+def _where_beside(data: Data) -> Path | None:
+    """The run of the residual that acts beside the forces to be learned."""
+    if data.resume is None:
+        return data.residual
+    if data.residual is not None:
+        raise InputError("--residual does not go with --resume, which keeps the simulator; leave one out.")
+    stored = runs.read_config(data.resume, "envmimic").get("residual")
+    return None if stored is None else Path(stored)

@@ -3,6 +3,7 @@
 config.json         all it takes to repeat the run
 metrics.jsonl       one JSON object a line: `step` (control steps) and what was measured there
 tensorboard/        the same for TensorBoard
+wandb/              the same for Weights & Biases, on demand
 checkpoints/STEP/   parameters (orbax): the last three, and the best by validation error
 evaluation.txt, evaluation.json, learning_curve.png, tracking.png
 replay.npz          what the robots did, for `ballu_mjx.report` and `ballu_mjx.view`
@@ -26,7 +27,6 @@ from typing import IO, Any, Literal, TextIO, TypeVar
 import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
-from tensorboardX import SummaryWriter
 from tqdm import tqdm
 
 try:
@@ -35,7 +35,7 @@ except ImportError:  # Windows, where runs are not locked
     fcntl = None
 
 from ballu_mjx import actuators as actuator_files
-from ballu_mjx import robot
+from ballu_mjx import loggers, robot
 from ballu_mjx.errors import InputError
 from ballu_mjx.robot import ActuatorParameters
 
@@ -176,10 +176,14 @@ def find_recordings(config: Mapping[str, Any], use: str, folder: Path) -> list[P
 class Run:
     """An open run folder, for writing. A context manager: leaving it closes the files."""
 
-    def __init__(self, folder: Path, config: Mapping[str, Any], *, resumed_at: int | None = None) -> None:
+    def __init__(
+        self, folder: Path, config: Mapping[str, Any], *, resumed_at: int | None = None, wandb: str | None = None
+    ) -> None:
         """Open `folder`, new unless `resumed_at` says at which control step an old run goes on.
 
-        **Raises** `InputError` where another process has it open.
+        `wandb`: a project of Weights & Biases to log to as well.
+
+        **Raises** `InputError` where another process has it open, or Weights & Biases refuses.
 
         What an old run measured after that step is dropped: it will be measured again.
         """
@@ -191,30 +195,29 @@ class Run:
             _write(folder / _METRICS, "".join(json.dumps(row) + "\n" for row in kept))
             config = {**config, "starts": read_config(folder, config["task"])["starts"] + list(config["starts"])}
         _write(folder / _CONFIG, json.dumps(config, indent=2, default=str) + "\n")
-        self._metrics = (folder / _METRICS).open("a", encoding="utf-8")
-        purge = None if resumed_at is None else resumed_at + 1
-        self._tensorboard = SummaryWriter(str(folder / "tensorboard"), purge_step=purge)
+        next_step = None if resumed_at is None else resumed_at + 1
+        self._loggers: list[loggers.Logger] = [
+            loggers.JsonLines(folder / _METRICS),
+            loggers.TensorBoard(folder / "tensorboard", next_step),
+        ]
+        if wandb is not None:
+            self._loggers.append(loggers.WeightsAndBiases(wandb, folder, config))
         self._manager: ocp.CheckpointManager | None = None
 
     def __enter__(self) -> Run:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._metrics.close()
-        self._tensorboard.close()
+        for logger in self._loggers:
+            logger.close(failed=exception[0] is not None)
         self._lock.close()
         if self._manager is not None:
             self._manager.close()
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
         """Add a line of measurements at `step`."""
-        row = {"step": step, **{name: value if math.isfinite(value) else None for name, value in metrics.items()}}
-        self._metrics.write(json.dumps(row) + "\n")
-        self._metrics.flush()
-        for name, value in metrics.items():
-            if math.isfinite(value):
-                self._tensorboard.add_scalar(name, value, step)
-        self._tensorboard.flush()
+        for logger in self._loggers:
+            logger.log(step, metrics)
 
     def save(self, step: int, tree: Mapping[str, Any], score: float | None) -> None:
         """Write a checkpoint of nested dictionaries of arrays, unless that of `step` stands there already.

@@ -6,6 +6,7 @@ This module imports neither JAX nor anything that does, so that a command's `mai
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import importlib
 import importlib.metadata
@@ -14,7 +15,9 @@ import os
 import platform
 import re
 import sys
-from collections.abc import Callable
+import textwrap
+import traceback
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ballu_mjx.errors import InputError
@@ -22,6 +25,8 @@ from ballu_mjx.errors import InputError
 _DEVICE_COUNT_FLAG = "--xla_force_host_platform_device_count"
 _MIN_COMPILE_SECONDS = 1.0
 """Programs that compile faster than this are not worth a file in the cache."""
+_MOST_SAID = 300
+"""Characters of an unexpected error's message: XLA's fill pages."""
 
 
 def prepare() -> None:
@@ -55,17 +60,38 @@ def prepare() -> None:
     _import_mjx()
 
 
-def exit_status(command: Callable[[], int | None]) -> int:
-    """Run a command; returns its own exit status (None: 0), 2 for input that cannot be used, told on the terminal, and
-    130 when interrupted."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CommandOptions:
+    """Options of every command."""
+
+    debug: bool = False
+    """Show errors with their traceback: where in the code they came from."""
+
+
+def exit_status(command: Callable[[], int | None], arguments: Sequence[str] | None = None) -> int:
+    """Run a command; returns its own exit status (None: 0), 2 for input that cannot be used, 1 for what the system
+    refuses and for faults of this package, 130 when interrupted, and 141 where nobody reads on.
+
+    Errors are told on the terminal in a sentence, or by their traceback where `arguments` (None: the process's own)
+    hold --debug. That is read here, for options may fail before they are parsed.
+    """
+    debug = "--debug" in (sys.argv[1:] if arguments is None else arguments)
     try:
-        return command() or 0
-    except InputError as error:
-        print(error, file=sys.stderr)
-        return 2
+        status = command() or 0
+        sys.stdout.flush()
+        return status
     except KeyboardInterrupt:
         print("Interrupted.", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # the reader, `head` say, has seen enough; Python must not flush the rest at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        else:
+            print(_told(error), file=sys.stderr)
+        return 2 if isinstance(error, InputError) else 1
 
 
 def check_jax() -> None:
@@ -102,6 +128,17 @@ def cache_dir() -> Path:
         base = Path.home() / ".cache"
     cpu = hashlib.sha256(_cpu_description().encode()).hexdigest()[:12]
     return base / "ballu_mjx" / f"jaxlib-{importlib.metadata.version('jaxlib')}-{cpu}"
+
+
+def _told(error: Exception) -> str:
+    """An error in a sentence."""
+    if isinstance(error, InputError):
+        return str(error)
+    said = " ".join(str(error).split())
+    if isinstance(error, OSError):
+        return f"The system refused: {said}; mend that, or run again with --debug to see what asked for it."
+    what = f"{type(error).__name__}: {textwrap.shorten(said, _MOST_SAID)}" if said else type(error).__name__
+    return f"This is a fault of ballu_mjx, not of your input: {what}; run again with --debug and report it."
 
 
 def _with_host_devices(flags: str, count: int) -> str:

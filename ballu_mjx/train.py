@@ -3,7 +3,7 @@
 JAX, and all that needs it, is imported inside functions: `runtime.prepare` has to come first.
 """
 
-# Not postponed here: tyro reads the annotations of functions whose names exist only inside `_commands`.
+# Not postponed here: tyro reads the annotations of functions whose names exist only inside `subcommands`.
 import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -19,29 +19,29 @@ if TYPE_CHECKING:
 
 Config = TypeVar("Config")
 Data = TypeVar("Data")
-_CADENCES = ("validate_every", "keep_every")
+_KEPT = ("validate_every", "keep_every", "wandb")
 """Options of the training commands' data that a run keeps."""
 _PROGRAM = "python -m ballu_mjx.train"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status: 2 for input that cannot be used, 130 when interrupted."""
-    arguments = sys.argv[1:] if arguments is None else arguments
+    """Run the command; returns the exit status (`runtime.exit_status`)."""
+    arguments = _by_method(sys.argv[1:] if arguments is None else arguments)
 
     def run() -> int:
         runtime.prepare()
         return tyro.extras.subcommand_cli_from_dict(
-            _commands(arguments),
+            subcommands(arguments),
             args=arguments,
             prog=_PROGRAM,
             description="Learn from recordings of the robot. Each subcommand explains its options with --help.",
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
         )
 
-    return runtime.exit_status(run)
+    return runtime.exit_status(run, arguments)
 
 
-def _commands(arguments: Sequence[str]) -> dict[str, Callable[..., int]]:
+def subcommands(arguments: Sequence[str] = ()) -> dict[str, Callable[..., int]]:
     """Subcommands by name. A function's parameters are its options, their defaults depend on --resume and --quick."""
     from ballu_mjx import actuator_fit, air_fit, pipeline, policy_training, residual_training
     from ballu_mjx.air_identification import AirConfig
@@ -67,31 +67,18 @@ def _commands(arguments: Sequence[str]) -> dict[str, Callable[..., int]]:
 
     air_defaults = AirConfig(**air_fit.QUICK if "--quick" in arguments else {})
 
-    def aerodynamic(
+    def residual(
         method: Literal["aerodynamic", "envmimic"] = "aerodynamic",
         data: RecordingsData = RecordingsData(),  # noqa: B008
         fit: AirConfig = air_defaults,
     ) -> int:
         """Learn a residual from recordings, and measure it on recordings that training never saw.
 
-        The options are those of the method: give --method before --help to see them. aerodynamic identifies the air
-        around the balloon (added mass, drag, lift, its centre) by derivatives through the simulation; envmimic learns
-        forces by reinforcement learning, like `train envmimic`.
+        --method aerodynamic identifies the air around the balloon (added mass, drag, lift, its centre) by derivatives
+        through the simulation; --method envmimic is `train envmimic`, with that command's options.
         """
-        assert method == "aerodynamic"
+        del method  # the other was told apart by `_by_method`
         return air_fit.fit(data, fit)
-
-    def envmimic_by_method(
-        method: Literal["aerodynamic", "envmimic"] = "envmimic",
-        data: residual_training.Data = data_defaults,
-        env: EnvMimicConfig = env_defaults,
-        ppo: PPOConfig = ppo_defaults,
-    ) -> int:
-        """Learn residual forces by reinforcement learning; see `train envmimic`."""
-        assert method == "envmimic"
-        return residual_training.train(data, env, ppo)
-
-    residual = envmimic_by_method if _method(arguments) == "envmimic" else aerodynamic
 
     def sysid(
         data: actuator_fit.SweepData = actuator_fit.SweepData(),  # noqa: B008
@@ -120,19 +107,22 @@ def _commands(arguments: Sequence[str]) -> dict[str, Callable[..., int]]:
         command.__doc__ = f"{task.summary} In the nominal simulator, or one improved by --actuators and --residual."
         return command
 
-    def everything(options: pipeline.Options = pipeline.Options()) -> int:  # noqa: B008
+    def everything(story: pipeline.Options = pipeline.Options()) -> int:  # noqa: B008
         """The whole story on a virtual robot: data, actuators, EnvMimic, policies in four simulators, trials."""
-        return pipeline.run(options)
+        return pipeline.run(story)
 
     tasks = {name: task_command(task) for name, task in TASKS.items()}
     return {"sysid": sysid, "envmimic": envmimic, "residual": residual, **tasks, "all": everything}
 
 
-def _method(arguments: Sequence[str]) -> str | None:
-    """What --method says, which decides what other options there are."""
+def _by_method(arguments: Sequence[str]) -> list[str]:
+    """`residual --method envmimic` is `envmimic`, whose options are others than the other method's."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--method")
-    return parser.parse_known_args([a for a in arguments if a != "--help"])[0].method
+    first, rest = parser.parse_known_args(arguments)
+    if rest[:1] == ["residual"] and first.method == "envmimic":
+        return ["envmimic", *rest[1:]]
+    return list(arguments)
 
 
 def _defaults(
@@ -154,9 +144,9 @@ def _defaults(
     first, _ = parser.parse_known_args([a for a in arguments if a != "--help"])
     if first.resume is not None and arguments[0] == task:
         config = runs.read_config(first.resume, task)
-        cadence = {name: config["data"][name] for name in _CADENCES if name in config.get("data", {})}
+        kept = {name: config["data"][name] for name in _KEPT if name in config.get("data", {})}
         return (
-            data_class(**cadence),
+            data_class(**kept),
             runs.typed(env_class, config["env"], first.resume),
             runs.typed(PPOConfig, config["ppo"], first.resume),
         )

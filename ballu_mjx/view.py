@@ -30,7 +30,7 @@ _FRAME = 1.0 / 40.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(runtime.CommandOptions):
     """Show the replay of a run, or a recording as it is reconstructed, in 3D: in the browser, on this machine alone."""
 
     source: tyro.conf.Positional[Path]
@@ -46,7 +46,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command until it is interrupted; returns the exit status: 2 for input that cannot be used."""
+    """Run the command until it is interrupted; returns the exit status (`runtime.exit_status`)."""
 
     def run() -> None:
         try:
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:  # the way to close it
             print("Closed.", file=sys.stderr)
 
-    return runtime.exit_status(run)
+    return runtime.exit_status(run, arguments)
 
 
 def load(source: Path) -> list[Take]:

@@ -139,7 +139,7 @@ def table(runs: list[evaluation.Evaluation], base: str) -> str:
 def worst_case(runs: list[evaluation.Evaluation], base: str) -> str:
     """Markdown: how near a run comes to the bound on what it may make worse than the simulator `base`."""
     bound = f"1.2 times {base} plus 2 cm and 3 deg"
-    lines = [f"Worst case against {bound}, over recordings and horizons, by seed (negative: within):"]
+    lines = [f"Worst case against {bound}, over recordings and horizons, by seed (negative: within):", ""]
     lines += [f"- {relative:+.0%} of the bound, {place}" for relative, place in (run.excess() for run in runs)]
     return "\n".join(lines)
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballu_mjx import actuators, evaluate, residual, robot, runs, train
+from ballu_mjx import actuators, evaluate, residual, residual_data, residual_training, robot, runs, train
 from ballu_mjx.recording import Recording, bundled, read_recording, write_recording
 from ballu_mjx.sweep import read_sweep
 
@@ -196,6 +196,12 @@ def test_damaged_actuators_are_refused(tmp_path: Path, folder: Path, change: dic
         assert train.main([*arguments, "--output", str(tmp_path / "run")]) == 2
     assert says in errors.getvalue() and "bad.json" in errors.getvalue() and errors.getvalue().count("\n") == 1
     assert not (tmp_path / "run").exists()
+
+
+def test_quick_validates_on_own_recordings_where_there_are_no_others(folder: Path):
+    files = residual_data._choose(residual_training.Data(recordings=(folder / "data",), quick=True))
+    assert len(files["training"]) == 2 and files["validation"] == files["training"] == files["test"]
+    residual_data._read(files)
 
 
 def test_help_explains_every_option(folder: Path):
