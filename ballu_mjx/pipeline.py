@@ -1,9 +1,10 @@
 """The whole story in one command, on a virtual robot: `python -m ballu_mjx.train all`.
 
 Stages, in the paper's order: an actuator sweep and its identification; vanilla policies; their actions replayed on the
-robot, several times each; one EnvMimic a task; policies in the four simulators; trials on the robot; tables. Every
-stage is a folder, and beside it stands the key of what it was made from (options, and the keys of the stages it needs):
-an interrupted run goes on where it was, and a changed option redoes what depends on it and nothing else.
+robot, several times each; one EnvMimic a task, and beyond the paper the air identified from the same recordings;
+policies in all simulators; trials on the robot; tables. Every stage is a folder, and beside it stands the key of what
+it was made from (options, and the keys of the stages it needs): an interrupted run goes on where it was, and a changed
+option redoes what depends on it and nothing else.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import numpy as np
 from ballu_mjx import (
     actuator_fit,
     actuators,
+    air_fit,
     loggers,
     policy_training,
     residual_training,
@@ -32,6 +34,7 @@ from ballu_mjx import (
     trials,
     virtual_robot,
 )
+from ballu_mjx.air_identification import AirConfig
 from ballu_mjx.envmimic import EnvMimicConfig
 from ballu_mjx.errors import InputError
 from ballu_mjx.identification import IdentificationConfig
@@ -44,8 +47,8 @@ from ballu_mjx.transfer import Transfer, turning_table, walking_table
 
 TABLES = {"walk": walking_table, "turn": turning_table}
 """The paper's tables, by task."""
-SETTINGS = ("vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic")
-"""The paper's four simulators."""
+SETTINGS = ("vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic", "aerodynamic")
+"""The paper's four simulators, and one with the identified air instead of EnvMimic's forces."""
 _DECIMALS = 4
 
 
@@ -70,7 +73,7 @@ class Options(loggers.LoggingOptions):
     residual_steps: int = 1_500_000
     """Control steps to train each EnvMimic for."""
     quick: bool = False
-    """Every stage within five minutes in all, for one task and two simulators; the tables mean nothing."""
+    """Every stage within five minutes in all, for one task and three simulators; the tables mean nothing."""
 
 
 def run(options: Options) -> int:
@@ -79,7 +82,7 @@ def run(options: Options) -> int:
     _check(options)
     settings = SETTINGS
     if options.quick:
-        settings = ("vanilla+dr", "envmimic")
+        settings = ("vanilla+dr", "envmimic", "aerodynamic")
         options = dataclasses.replace(options, trials=min(options.trials, 2), takes=1, tasks=options.tasks[:1])
     results: dict[str, dict[str, list[list[Transfer]]]] = {
         task: {setting: [] for setting in settings} for task in options.tasks
@@ -136,14 +139,15 @@ class Story:
 
     def policy(self, task: str, setting: str) -> Path:
         """The run of a policy's training."""
-        config = LocomotionConfig(domain_randomization=setting == "envmimic" or setting.endswith("+dr"))
+        learned = setting in ("envmimic", "aerodynamic")
+        config = LocomotionConfig(domain_randomization=learned or setting.endswith("+dr"))
         quick = policy_training.QUICK if self.options.quick else {"num_timesteps": self.options.policy_steps}
         ppo = policy_training.defaults(seed=self.seed, **quick)
         needs = []
         # Six checkpoints in all, or one a training step: the last three are what is replayed on the robot.
         data = policy_training.Data(keep_every=max(ppo.num_timesteps // 6, 1), wandb=self.options.wandb)
-        if setting == "envmimic":
-            needs = [self.residual(task)]
+        if learned:
+            needs = [self.residual(task, setting)]
             data = dataclasses.replace(data, residual=needs[0])
         elif "+sysid" in setting:
             needs = [self.identified()]
@@ -189,12 +193,10 @@ class Story:
         options = {"robot": self.options.robot, "seed": self.seed, "takes": takes, "seconds": seconds}
         return _stage(self._own / f"recordings-{task}", options, sources, make)
 
-    def residual(self, task: str) -> Path:
-        """The run of EnvMimic's training."""
+    def residual(self, task: str, method: str) -> Path:
+        """The run of a residual, learned from the recordings of the task."""
         recordings, identified = self.recordings(task), self.identified()
-        config = EnvMimicConfig()
-        quick = residual_training.QUICK if self.options.quick else {"num_timesteps": self.options.residual_steps}
-        ppo = PPOConfig(seed=self.seed, **quick)
+        options = self._air() if method == "aerodynamic" else self._envmimic()
 
         def make(folder: Path) -> None:
             data = residual_training.Data(
@@ -204,11 +206,21 @@ class Story:
                 output=folder,
                 wandb=self.options.wandb,
             )
+            if isinstance(options, AirConfig):
+                air_fit.fit(data, options)
+                return
             if runs.checkpoints(folder):
                 data = residual_training.Data(resume=folder, wandb=data.wandb)
-            _stop_unless_done(residual_training.train(data, config, ppo))
+            _stop_unless_done(residual_training.train(data, *options))
 
-        return _stage(self._own / f"envmimic-{task}", (config, ppo), [recordings, identified], make)
+        return _stage(self._own / f"{method}-{task}", options, [recordings, identified], make)
+
+    def _air(self) -> AirConfig:
+        return AirConfig(**air_fit.QUICK if self.options.quick else {})
+
+    def _envmimic(self) -> tuple[EnvMimicConfig, PPOConfig]:
+        quick = residual_training.QUICK if self.options.quick else {"num_timesteps": self.options.residual_steps}
+        return EnvMimicConfig(), PPOConfig(seed=self.seed, **quick)
 
     def transfers(self, task: str, setting: str) -> list[Transfer]:
         """How the policy's trials on the robot compare with its own simulator."""

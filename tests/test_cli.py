@@ -199,7 +199,7 @@ def test_damaged_actuators_are_refused(tmp_path: Path, folder: Path, change: dic
 
 
 def test_quick_validates_on_own_recordings_where_there_are_no_others(folder: Path):
-    files = residual_data._choose(residual_training.Data(recordings=(folder / "data",), quick=True))
+    files = residual_data._choose(residual_training.Data(recordings=(folder / "data",), quick=True), None)
     assert len(files["training"]) == 2 and files["validation"] == files["training"] == files["test"]
     residual_data._read(files)
 
