@@ -34,7 +34,7 @@ class Residual:
     **Fields**
 
     - `config`: what the policy sees, and what its actions mean.
-    - `params`: as `ppo.train` returned them.
+    - `params`: what `learner.params` gave.
     - `infer`: (parameters, observation) to the most likely action.
     - `sample`: (parameters, observation, key) to a drawn one.
     - `observed`: smallest and largest of each input over the recordings it was trained on.

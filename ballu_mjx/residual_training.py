@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from ballu_mjx import actuators, evaluate, evaluation, ppo, residual, robot, runs
+from ballu_mjx import actuators, evaluate, evaluation, learner, ppo, residual, robot, runs
 from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.errors import InputError
 from ballu_mjx.evaluation import OpenLoopEvaluator, group_of
@@ -20,7 +20,7 @@ from ballu_mjx.reconstruction import reconstruct
 from ballu_mjx.recording import Recording, bundled, read_recording
 from ballu_mjx.recording import recordings as expand
 from ballu_mjx.robot import ActuatorParameters
-from ballu_mjx.session import Session, restored_from
+from ballu_mjx.session import Session, start_from
 
 USES = ("training", "validation", "test")
 QUICK: Mapping[str, Any] = {"num_timesteps": 120_000, "num_envs": 256, "batch_size": 128}
@@ -46,8 +46,8 @@ class Data:
     output: Path | None = None
     """Folder of the run, new or empty. Without this option: one under runs/, named after the time."""
     resume: Path | None = None
-    """Go on with the run in this folder, from its last checkpoint's parameters, with its recordings and configuration;
-    options given beside it change these. --num-timesteps counts from the run's start."""
+    """Go on with the run in this folder, from its last checkpoint, with its recordings and configuration; options
+    given beside it change these. --num-timesteps counts from the run's start."""
     quick: bool = False
     """See everything work within two minutes, on a few recordings; the numbers mean little."""
     validate_every: int = 400_000
@@ -61,7 +61,7 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     ppo.check(ppo_config, len(devices))
     if data.validate_every < 1:
         raise InputError(f"--validate-every is {data.validate_every}: it must be 1 or more.")
-    first_step, restored = restored_from("envmimic", data.resume, ppo_config, output=data.output, quick=data.quick)
+    start = start_from("envmimic", data.resume, ppo_config, output=data.output, quick=data.quick)
     files = _choose(data)
     recordings = _read(files)
     identified, where = _actuators(data, files["training"], recordings["training"])
@@ -79,7 +79,7 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     model = robot.load_model(identified)
     motions = {use: [reconstruct(recording, model) for recording in recordings[use]] for use in USES}
     env = EnvMimicEnv(model, motions["training"], env_config)
-    if restored is not None and restored.normalizer.mean["state"].shape != env.observation_size["state"]:
+    if start.params is not None and start.params.normalizer.mean["state"].shape != env.observation_size["state"]:
         raise InputError(
             f"{data.resume}: its policy was trained on other observations; leave the options of env as they were."
         )
@@ -89,16 +89,14 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
         return evaluation.OpenLoopEvaluator(model, motions[use], env_config, policy)
 
     config = runs.describe("envmimic", {"env": env_config, "ppo": ppo_config, "data": data}, files, devices, identified)
-    resumed_at = None if restored is None else first_step
     validation = evaluator("validation")
-    with runs.Run(folder, config, resumed_at=resumed_at) as run:
+    with runs.Run(folder, config, resumed_at=start.resumed_at) as run:
         print("Compiling: about a minute the first time ...", flush=True)
-        remaining = dataclasses.replace(ppo_config, num_timesteps=ppo_config.num_timesteps - first_step)
-        progress = runs.Progress(first_step + ppo.total_timesteps(remaining), first_step)
+        progress = runs.Progress(learner.total_timesteps(ppo_config, start.step), start.step)
         residual.write_observed(run, env.recorded_inputs())
-        session = Session(run, progress, data.validate_every, resumed_at, lambda params: validation(params).score)
+        session = Session(run, progress, data.validate_every, lambda params: validation(params).score)
         try:
-            session.train(env, remaining, restored, first_step)
+            session.train(env, ppo_config, start, config)
         except KeyboardInterrupt:
             print(f"To go on: python -m ballu_mjx.train envmimic --resume {folder}", file=sys.stderr)
             return session.exit_status

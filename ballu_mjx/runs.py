@@ -3,7 +3,8 @@
 config.json         all it takes to repeat the run
 metrics.jsonl       one JSON object a line: `step` (control steps) and what was measured there
 tensorboard/        the same for TensorBoard
-checkpoints/STEP/   parameters (orbax): the last three, and the best by validation error
+checkpoints/STEP/   the last three, and the best by validation error (orbax): `params`, all it takes to use what was
+                    learned; `training`, what else it takes to go on; `record`, checksums of the two
 evaluation.txt, evaluation.json, learning_curve.png, tracking.png
 replay.npz          what the robots did, for `ballu_mjx.report` and `ballu_mjx.view`
 """
@@ -16,6 +17,7 @@ import hashlib
 import importlib.metadata
 import json
 import math
+import shutil
 import sys
 import time
 import typing
@@ -23,6 +25,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Literal, TextIO, TypeVar
 
+import jax
 import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
@@ -39,11 +42,14 @@ from ballu_mjx import robot
 from ballu_mjx.errors import InputError
 from ballu_mjx.robot import ActuatorParameters
 
-FORMAT = "ballu-run/1"
+FORMAT = "ballu-run/2"
+"""Version 1 had checkpoints of parameters alone."""
 KEPT = 3
 """Latest checkpoints that are kept."""
 
-_CONFIG, _METRICS, _LOCK = "config.json", "metrics.jsonl", ".lock"
+_READABLE = ("ballu-run/1", FORMAT)
+_CONFIG, _METRICS, _LOCK, _CHECKPOINTS = "config.json", "metrics.jsonl", ".lock", "checkpoints"
+_PARAMS, _TRAINING, _RECORD = "params", "training", "record"
 _BUNDLED = "bundled:"
 _NO_SCORE = 1e30
 _PACKAGES = ("ballu-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "optimistix", "numpy")
@@ -65,7 +71,7 @@ def new_folder(output: Path | None, task: str) -> Path:
         raise InputError(f"{output}: is a file; give --output a folder that is new or empty.")
     if output.exists() and any(output.iterdir()):
         mend = "give --output a folder that is new or empty"
-        if (output / "checkpoints").is_dir():
+        if (output / _CHECKPOINTS).is_dir():
             mend = f"--resume {output} goes on with it, or give --output another folder"
         raise InputError(f"{output}: the folder is not empty; {mend}.")
     return output
@@ -83,7 +89,7 @@ def read_config(folder: Path, *tasks: str) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); restore it or start a new run.") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
+    if not isinstance(content, dict) or content.get("format") not in _READABLE:
         raise InputError(f"{path}: is not of the format {FORMAT}; use the version of ballu_mjx that wrote it.")
     if content.get("task") not in tasks:
         needed = " or ".join(repr(task) for task in tasks)
@@ -177,16 +183,18 @@ class Run:
     """An open run folder, for writing. A context manager: leaving it closes the files."""
 
     def __init__(self, folder: Path, config: Mapping[str, Any], *, resumed_at: int | None = None) -> None:
-        """Open `folder`, new unless `resumed_at` says at which control step an old run goes on.
+        """Open `folder`, new unless `resumed_at` says at which control step an old run goes on; -1 is from its very
+        beginning.
 
         **Raises** `InputError` where another process has it open.
 
-        What an old run measured after that step is dropped: it will be measured again.
+        What an old run measured and saved after that step is dropped: it will be measured again.
         """
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         self._lock = _locked(folder / _LOCK)
         if resumed_at is not None:
+            _drop_checkpoints(folder, resumed_at)
             kept = [row for row in read_metrics(folder) if row["step"] <= resumed_at]
             _write(folder / _METRICS, "".join(json.dumps(row) + "\n" for row in kept))
             config = {**config, "starts": read_config(folder, config["task"])["starts"] + list(config["starts"])}
@@ -216,17 +224,35 @@ class Run:
                 self._tensorboard.add_scalar(name, value, step)
         self._tensorboard.flush()
 
-    def save(self, step: int, tree: Mapping[str, Any], score: float | None) -> None:
-        """Write a checkpoint of nested dictionaries of arrays, unless that of `step` stands there already.
+    def save(
+        self,
+        step: int,
+        params: Mapping[str, Any],
+        score: float | None,
+        *,
+        training: Mapping[str, np.ndarray] | None = None,
+        due: int | None = None,
+    ) -> None:
+        """Write a checkpoint, unless that of `step` stands there already.
 
-        `score`: validation error, the smallest is the best; None where there is none.
+        **Arguments**
+
+        - `params`: nested dictionaries of arrays.
+        - `score`: validation error, the smallest is the best; None where there is none.
+        - `training`: what else it takes to go on.
+        - `due`: step of the last checkpoint whose turn it was; None: this one's.
         """
         if self._manager is None:
             self._manager = _manager(self.folder)
         if step in self._manager.all_steps():
             return
+        trees = {_PARAMS: dict(params)} | ({} if training is None else {_TRAINING: dict(training)})
+        record = {"sha256": {name: _digest(tree) for name, tree in trees.items()}, "due": step if due is None else due}
+        items = {name: ocp.args.StandardSave(tree) for name, tree in trees.items()}
         metrics = None if score is None else {"score": score if math.isfinite(score) else _NO_SCORE}
-        self._manager.save(step, args=ocp.args.StandardSave(dict(tree)), metrics=metrics)
+        self._manager.save(
+            step, args=ocp.args.Composite(**items, **{_RECORD: ocp.args.JsonSave(record)}), metrics=metrics
+        )
         self._manager.wait_until_finished()
 
     def write(self, name: str, text: str) -> None:
@@ -234,26 +260,59 @@ class Run:
         _write(self.folder / name, text)
 
 
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """What `Run.save` wrote; see there."""
+
+    step: int
+    params: dict[str, Any]
+    training: dict[str, np.ndarray] | None
+    due: int
+
+
 def restore(folder: Path, which: Which) -> tuple[int, dict[str, Any]]:
-    """Step and content of a run's best or last checkpoint, or of that of a step.
+    """Step and parameters of a run's best or last checkpoint, or of that of a step.
+
+    A damaged last checkpoint is told on the terminal, and the one before taken.
+
+    **Raises** `InputError` where there is none, or that which was asked for is damaged.
+    """
+    if which == "last":
+        checkpoint = last_checkpoint(folder)
+    else:
+        scores = {step: _stored_score(folder, step) for step in checkpoints(folder)}
+        scored = {step: score for step, score in scores.items() if score is not None}
+        step = min(scored, key=lambda step: (scored[step], -step), default=None) if which == "best" else which
+        if step not in scores:
+            raise _no_checkpoint(folder, "validated checkpoint" if which == "best" else "checkpoint")
+        try:
+            checkpoint = _read(folder, step, training=False)
+        except _DamagedError as error:
+            raise InputError(f"{error}; restore it from a copy, or use another checkpoint of the run.") from error
+    return checkpoint.step, checkpoint.params
+
+
+def last_checkpoint(folder: Path, *, training: bool = False) -> Checkpoint:
+    """A run's last checkpoint that is whole, with or without what it takes to go on; damaged ones are told on the
+    terminal.
 
     **Raises** `InputError` where there is none.
     """
-    if (folder / "checkpoints").is_dir():
-        with _manager(folder) as manager:
-            step = {"last": manager.latest_step, "best": manager.best_step}.get(str(which), lambda: which)()
-            if step in manager.all_steps():
-                return step, manager.restore(step, args=ocp.args.StandardRestore())
-    kind = "validated checkpoint" if which == "best" else "checkpoint"
-    raise InputError(f"{folder}: the run has no {kind}; train for longer.")
+    steps = checkpoints(folder)
+    for step in reversed(steps):
+        try:
+            return _read(folder, step, training=training)
+        except _DamagedError as error:
+            print(f"{error}; taking the one before.", file=sys.stderr)
+    if steps:
+        raise InputError(f"{folder}: all checkpoints of the run are damaged; restore one from a copy or start anew.")
+    raise _no_checkpoint(folder, "checkpoint")
 
 
 def checkpoints(folder: Path) -> list[int]:
     """Steps of the checkpoints that a run has kept, in order."""
-    if not (folder / "checkpoints").is_dir():
-        return []
-    with _manager(folder) as manager:
-        return sorted(manager.all_steps())
+    place = folder / _CHECKPOINTS
+    return sorted(ocp.utils.checkpoint_steps(place)) if place.is_dir() else []
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
@@ -355,6 +414,70 @@ def _locked(path: Path) -> IO[str]:
     return file
 
 
+class _DamagedError(Exception):
+    """A checkpoint that does not hold what was written."""
+
+
+def _read(folder: Path, step: int, *, training: bool) -> Checkpoint:
+    """**Raises** `_DamagedError`."""
+    place = (folder / _CHECKPOINTS / str(step)).resolve()
+    try:
+        if (place / "default").is_dir():  # of version 1
+            return Checkpoint(step, _standard(place / "default"), None, step)
+        record = json.loads((place / _RECORD / "metadata").read_text(encoding="utf-8"))
+        names = [name for name in record["sha256"] if name == _PARAMS or training]
+        trees = {name: _standard(place / name) for name in names}
+        changed = [name for name, tree in trees.items() if _digest(tree) != record["sha256"][name]]
+        found = Checkpoint(step, trees[_PARAMS], trees.get(_TRAINING), int(record["due"]))
+    except Exception as error:  # orbax, tensorstore and the decoders raise whatever damage brings them to
+        raise _DamagedError(f"{place}: the checkpoint is damaged ({type(error).__name__} on reading)") from error
+    if changed:
+        raise _DamagedError(f"{place}: the checkpoint is damaged (the checksum of {', '.join(changed)} is wrong)")
+    return found
+
+
+def _standard(place: Path) -> dict[str, Any]:
+    with ocp.StandardCheckpointer() as checkpointer:
+        return jax.tree.map(np.asarray, checkpointer.restore(place))
+
+
+def _digest(tree: Mapping[str, Any]) -> str:
+    """SHA-256 of nested dictionaries of arrays."""
+    digest = hashlib.sha256()
+    for path, leaf in jax.tree.leaves_with_path(tree):
+        array = np.asarray(leaf)
+        digest.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape} ".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def _drop_checkpoints(folder: Path, after: int) -> None:
+    """Remove checkpoints after a step, half-written ones, and those without a legible score, which would stop orbax."""
+    place = folder / _CHECKPOINTS
+    whole = {str(step) for step in checkpoints(folder) if step <= after}
+    for path in place.iterdir() if place.is_dir() else ():
+        if path.is_dir() and (path.name not in whole or not _legible(path)):
+            shutil.rmtree(path)
+
+
+def _legible(place: Path) -> bool:
+    score = place / "metrics" / "metrics"
+    try:
+        return not score.exists() or "score" in json.loads(score.read_text(encoding="utf-8"))
+    except (ValueError, TypeError):
+        return False
+
+
+def _stored_score(folder: Path, step: int) -> float | None:
+    place = folder / _CHECKPOINTS / str(step)
+    score = place / "metrics" / "metrics"
+    return json.loads(score.read_text(encoding="utf-8"))["score"] if score.exists() and _legible(place) else None
+
+
+def _no_checkpoint(folder: Path, kind: str) -> InputError:
+    return InputError(f"{folder}: the run has no {kind}; train for longer.")
+
+
 def _manager(folder: Path) -> ocp.CheckpointManager:
     best = policies.BestN(get_metric_fn=_score, reverse=True, n=1, keep_checkpoints_without_metrics=False)
     options = ocp.CheckpointManagerOptions(
@@ -363,7 +486,7 @@ def _manager(folder: Path) -> ocp.CheckpointManager:
         preservation_policy=policies.AnyPreservationPolicy([policies.LatestN(KEPT), best]),
         enable_async_checkpointing=False,
     )
-    return ocp.CheckpointManager((folder / "checkpoints").resolve(), options=options)
+    return ocp.CheckpointManager((folder / _CHECKPOINTS).resolve(), options=options)
 
 
 def _score(metrics: Any) -> float:
