@@ -4,7 +4,7 @@ config.json         all it takes to repeat the run
 metrics.jsonl       one JSON object a line: `step` (control steps) and what was measured there
 tensorboard/        the same for TensorBoard
 checkpoints/STEP/   the last three, and the best by validation error (orbax): `params`, all it takes to use what was
-                    learned; `training`, what else it takes to go on; `record`, checksums of the two
+                    learned; `training`, what else it takes to go on; `record.json`, checksums of all files
 evaluation.txt, evaluation.json, learning_curve.png, tracking.png
 replay.npz          what the robots did, for `ballu_mjx.report` and `ballu_mjx.view`
 """
@@ -49,7 +49,7 @@ KEPT = 3
 
 _READABLE = ("ballu-run/1", FORMAT)
 _CONFIG, _METRICS, _LOCK, _CHECKPOINTS = "config.json", "metrics.jsonl", ".lock", "checkpoints"
-_PARAMS, _TRAINING, _RECORD = "params", "training", "record"
+_PARAMS, _TRAINING, _RECORD = "params", "training", "record.json"
 _BUNDLED = "bundled:"
 _NO_SCORE = 1e30
 _PACKAGES = ("ballu-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "optimistix", "numpy")
@@ -247,13 +247,15 @@ class Run:
         if step in self._manager.all_steps():
             return
         trees = {_PARAMS: dict(params)} | ({} if training is None else {_TRAINING: dict(training)})
-        record = {"sha256": {name: _digest(tree) for name, tree in trees.items()}, "due": step if due is None else due}
         items = {name: ocp.args.StandardSave(tree) for name, tree in trees.items()}
-        metrics = None if score is None else {"score": score if math.isfinite(score) else _NO_SCORE}
-        self._manager.save(
-            step, args=ocp.args.Composite(**items, **{_RECORD: ocp.args.JsonSave(record)}), metrics=metrics
-        )
+        finite = None if score is None else score if math.isfinite(score) else _NO_SCORE
+        metrics = None if finite is None else {"score": finite}
+        self._manager.save(step, args=ocp.args.Composite(**items), metrics=metrics)
         self._manager.wait_until_finished()
+        # Last of all: what has no record was not written to the end.
+        place = self.folder / _CHECKPOINTS / str(step)
+        record = {"score": finite, "due": step if due is None else due, "files": _checksums(place)}
+        _write(place / _RECORD, json.dumps({**record, "sha256": _checksum(record)}, indent=2) + "\n")
 
     def write(self, name: str, text: str) -> None:
         """Write a text file into the folder."""
@@ -279,17 +281,17 @@ def restore(folder: Path, which: Which) -> tuple[int, dict[str, Any]]:
     """
     if which == "last":
         checkpoint = last_checkpoint(folder)
-    else:
-        scores = {step: _stored_score(folder, step) for step in checkpoints(folder)}
+        return checkpoint.step, checkpoint.params
+    steps = checkpoints(folder)
+    try:
+        scores = {step: _record(folder, step)["score"] for step in steps} if which == "best" else {}
         scored = {step: score for step, score in scores.items() if score is not None}
         step = min(scored, key=lambda step: (scored[step], -step), default=None) if which == "best" else which
-        if step not in scores:
+        if step not in steps:
             raise _no_checkpoint(folder, "validated checkpoint" if which == "best" else "checkpoint")
-        try:
-            checkpoint = _read(folder, step, training=False)
-        except _DamagedError as error:
-            raise InputError(f"{error}; restore it from a copy, or use another checkpoint of the run.") from error
-    return checkpoint.step, checkpoint.params
+        return step, _read(folder, step, training=False).params
+    except _DamagedError as error:
+        raise InputError(f"{error}; restore it from a copy, or use the run's last checkpoint.") from error
 
 
 def last_checkpoint(folder: Path, *, training: bool = False) -> Checkpoint:
@@ -421,19 +423,50 @@ class _DamagedError(Exception):
 def _read(folder: Path, step: int, *, training: bool) -> Checkpoint:
     """**Raises** `_DamagedError`."""
     place = (folder / _CHECKPOINTS / str(step)).resolve()
+    record = _record(folder, step)
+    old = place / "default"  # of version 1
     try:
-        if (place / "default").is_dir():  # of version 1
-            return Checkpoint(step, _standard(place / "default"), None, step)
-        record = json.loads((place / _RECORD / "metadata").read_text(encoding="utf-8"))
-        names = [name for name in record["sha256"] if name == _PARAMS or training]
-        trees = {name: _standard(place / name) for name in names}
-        changed = [name for name, tree in trees.items() if _digest(tree) != record["sha256"][name]]
-        found = Checkpoint(step, trees[_PARAMS], trees.get(_TRAINING), int(record["due"]))
+        params = _standard(old if old.is_dir() else place / _PARAMS)
+        more = _standard(place / _TRAINING) if training and (place / _TRAINING).is_dir() else None
     except Exception as error:  # orbax, tensorstore and the decoders raise whatever damage brings them to
-        raise _DamagedError(f"{place}: the checkpoint is damaged ({type(error).__name__} on reading)") from error
-    if changed:
-        raise _DamagedError(f"{place}: the checkpoint is damaged (the checksum of {', '.join(changed)} is wrong)")
-    return found
+        raise _DamagedError(f"{place}: the checkpoint cannot be read ({type(error).__name__})") from error
+    return Checkpoint(step, params, more, record["due"])
+
+
+def _record(folder: Path, step: int) -> dict[str, Any]:
+    """What is written beside a checkpoint of it. Before orbax sees the checkpoint: it does not take damage quietly.
+
+    **Raises** `_DamagedError` where the checkpoint is not as it was written.
+    """
+    place = folder / _CHECKPOINTS / str(step)
+    path = place / _RECORD
+    try:
+        if (place / "default").is_dir():  # of version 1, which has no checksums
+            score = place / "metrics" / "metrics"
+            return {"score": json.loads(score.read_bytes())["score"] if score.exists() else None, "due": step}
+        record = json.loads(path.read_bytes())
+        intact = record.pop("sha256") == _checksum(record)
+    except FileNotFoundError as error:
+        raise _DamagedError(f"{place}: the checkpoint is half-written") from error
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise _DamagedError(f"{path}: the checkpoint is damaged") from error
+    if not intact:
+        raise _DamagedError(f"{path}: the checkpoint is damaged")
+    now = _checksums(place)
+    for name, checksum in record["files"].items():
+        if now.get(name) != checksum:
+            raise _DamagedError(f"{place / name}: the checkpoint is damaged")
+    return record
+
+
+def _checksums(place: Path) -> dict[str, str]:
+    """SHA-256 of every file of a checkpoint but its record."""
+    files = sorted(path for path in place.rglob("*") if path.is_file() and not path.name.startswith(_RECORD))
+    return {path.relative_to(place).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def _checksum(record: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
 def _standard(place: Path) -> dict[str, Any]:
@@ -441,37 +474,20 @@ def _standard(place: Path) -> dict[str, Any]:
         return jax.tree.map(np.asarray, checkpointer.restore(place))
 
 
-def _digest(tree: Mapping[str, Any]) -> str:
-    """SHA-256 of nested dictionaries of arrays."""
-    digest = hashlib.sha256()
-    for path, leaf in jax.tree.leaves_with_path(tree):
-        array = np.asarray(leaf)
-        digest.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape} ".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()
-
-
 def _drop_checkpoints(folder: Path, after: int) -> None:
-    """Remove checkpoints after a step, half-written ones, and those without a legible score, which would stop orbax."""
+    """Remove checkpoints after a step, and all that are damaged or half-written, over which orbax would stumble."""
+
+    def keep(step: int) -> bool:
+        try:
+            return step <= after and bool(_record(folder, step))
+        except _DamagedError:
+            return False
+
     place = folder / _CHECKPOINTS
-    whole = {str(step) for step in checkpoints(folder) if step <= after}
+    kept = {str(step) for step in checkpoints(folder) if keep(step)}
     for path in place.iterdir() if place.is_dir() else ():
-        if path.is_dir() and (path.name not in whole or not _legible(path)):
+        if path.is_dir() and path.name not in kept:
             shutil.rmtree(path)
-
-
-def _legible(place: Path) -> bool:
-    score = place / "metrics" / "metrics"
-    try:
-        return not score.exists() or "score" in json.loads(score.read_text(encoding="utf-8"))
-    except (ValueError, TypeError):
-        return False
-
-
-def _stored_score(folder: Path, step: int) -> float | None:
-    place = folder / _CHECKPOINTS / str(step)
-    score = place / "metrics" / "metrics"
-    return json.loads(score.read_text(encoding="utf-8"))["score"] if score.exists() and _legible(place) else None
 
 
 def _no_checkpoint(folder: Path, kind: str) -> InputError:
