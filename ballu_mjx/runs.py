@@ -231,7 +231,7 @@ class Run:
         score: float | None,
         *,
         training: Mapping[str, np.ndarray] | None = None,
-        due: int | None = None,
+        notes: Mapping[str, Any] | None = None,
     ) -> None:
         """Write a checkpoint, unless that of `step` stands there already.
 
@@ -240,7 +240,7 @@ class Run:
         - `params`: nested dictionaries of arrays.
         - `score`: validation error, the smallest is the best; None where there is none.
         - `training`: what else it takes to go on.
-        - `due`: step of the last checkpoint whose turn it was; None: this one's.
+        - `notes`: what whoever goes on wants to know beside it; goes into JSON and back.
         """
         if self._manager is None:
             self._manager = _manager(self.folder)
@@ -254,7 +254,7 @@ class Run:
         self._manager.wait_until_finished()
         # Last of all: what has no record was not written to the end.
         place = self.folder / _CHECKPOINTS / str(step)
-        record = {"score": finite, "due": step if due is None else due, "files": _checksums(place)}
+        record = {"score": finite, "notes": dict(notes or {}), "files": _checksums(place)}
         _write(place / _RECORD, json.dumps({**record, "sha256": _checksum(record)}, indent=2) + "\n")
 
     def write(self, name: str, text: str) -> None:
@@ -269,7 +269,7 @@ class Checkpoint:
     step: int
     params: dict[str, Any]
     training: dict[str, np.ndarray] | None
-    due: int
+    notes: dict[str, Any]
 
 
 def restore(folder: Path, which: Which) -> tuple[int, dict[str, Any]]:
@@ -430,7 +430,7 @@ def _read(folder: Path, step: int, *, training: bool) -> Checkpoint:
         more = _standard(place / _TRAINING) if training and (place / _TRAINING).is_dir() else None
     except Exception as error:  # orbax, tensorstore and the decoders raise whatever damage brings them to
         raise _DamagedError(f"{place}: the checkpoint cannot be read ({type(error).__name__})") from error
-    return Checkpoint(step, params, more, record["due"])
+    return Checkpoint(step, params, more, record["notes"])
 
 
 def _record(folder: Path, step: int) -> dict[str, Any]:
@@ -443,7 +443,7 @@ def _record(folder: Path, step: int) -> dict[str, Any]:
     try:
         if (place / "default").is_dir():  # of version 1, which has no checksums
             score = place / "metrics" / "metrics"
-            return {"score": json.loads(score.read_bytes())["score"] if score.exists() else None, "due": step}
+            return {"score": json.loads(score.read_bytes())["score"] if score.exists() else None, "notes": {}}
         record = json.loads(path.read_bytes())
         intact = record.pop("sha256") == _checksum(record)
     except FileNotFoundError as error:

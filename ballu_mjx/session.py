@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import math
 import signal
@@ -31,8 +32,6 @@ class Start:
 
     folder: Path | None = None
     """The run that goes on."""
-    config: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Its `config.json`, as it was."""
     checkpoint: Checkpoint | None = None
     """None: the run was stopped before it had one."""
 
@@ -53,19 +52,19 @@ class Start:
         """What was learned before."""
         return None if self.checkpoint is None else ppo.from_tree(self.checkpoint.params)
 
-    def state(self, new: Learner, ppo_config: PPOConfig, config: Mapping[str, Any]) -> TrainingState:
-        """The state to go on from under `config`, to be the run's `config.json`; what cannot go on of the old one is
-        told on the terminal."""
+    def state(self, new: Learner, ppo_config: PPOConfig, made_with: Mapping[str, Any]) -> TrainingState:
+        """The state to go on from with what `_made_with` says; what cannot go on of the old one is told on the
+        terminal."""
         if self.checkpoint is None or self.folder is None:
             return new.begin(ppo_config.seed)
-        stored, before = self.checkpoint.training, self.config["ppo"]
+        stored, before = self.checkpoint.training, self.checkpoint.notes
         anew = "the optimizer and the environments start anew"
         if stored is None:
             print(f"{self.folder}: {anew}: an older version kept parameters alone.")
         else:
             if ppo_config.learning_rate != before["learning_rate"]:
                 stored = learner.with_learning_rate(stored, ppo_config.learning_rate)
-            same = _task(config) == _task(self.config) and ppo_config.seed == before["seed"]
+            same = all(before[name] == made_with[name] for name in ("seed", "environments"))
             try:
                 state, whole = new.go_on(stored, environments=same)
             except ValueError as error:
@@ -99,21 +98,27 @@ def start_from(task: str, folder: Path | None, config: PPOConfig, *, output: Pat
             )
     if not runs.checkpoints(folder):
         print(f"{folder}: was stopped before its first checkpoint; starting from the beginning.", file=sys.stderr)
-        return Start(folder, before)
+        return Start(folder)
     checkpoint = runs.last_checkpoint(folder, training=True)
     # Whoever was stopped between the last checkpoint and the results still needs these.
     if checkpoint.step >= config.num_timesteps and (folder / replay.NAME).exists():
         raise InputError(
             f"{folder}: is at step {checkpoint.step:,} already; give a --num-timesteps above that to train for longer."
         )
-    return Start(folder, before, checkpoint)
+    return Start(folder, checkpoint)
 
 
-def _task(config: Mapping[str, Any]) -> Any:
-    """What of a run's `config.json` its environments are made of."""
-    recordings = config["recordings"].get("training", [])
-    parts = {name: config.get(name) for name in ("env", "actuators", "residual")}
-    return json.loads(json.dumps([parts, [entry["sha256"] for entry in recordings]], default=str))
+def _made_with(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a run's `config.json` a training state depends on beyond its shapes. Kept with every checkpoint: the
+    `config.json` beside it may be that of a later start."""
+    recordings = [entry["sha256"] for entry in config["recordings"].get("training", [])]
+    parts = {name: config.get(name) for name in ("env", "actuators", "residual")} | {"recordings": recordings}
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return {
+        "learning_rate": config["ppo"]["learning_rate"],
+        "seed": config["ppo"]["seed"],
+        "environments": hashlib.sha256(text.encode()).hexdigest(),
+    }
 
 
 class Session:
@@ -129,7 +134,8 @@ class Session:
         smallest being the best; without it the greatest reward is."""
         self._run, self._progress, self._validate = run, progress, validate
         self._every = keep_every
-        self._due: int | None = None
+        self._due: int | None = None  # step of the last checkpoint that was not an interruption's
+        self._made_with: dict[str, Any] = {}
         self._saved = 0
         self._score: float | None = None
         self._warned = False
@@ -141,12 +147,14 @@ class Session:
         **Raises** `KeyboardInterrupt` after SIGINT (Ctrl-C) or SIGTERM, the last state saved, and `InputError`
         where learning broke down, with the last good checkpoint named.
         """
+        self._made_with = _made_with(content)
         if start.checkpoint is not None:
-            self._due, self._saved = start.checkpoint.due, start.checkpoint.step
+            self._saved = start.checkpoint.step
+            self._due = start.checkpoint.notes.get("due", self._saved)
         try:
             with self._interrupts_noted():
                 state, metrics = learner.train(
-                    env, config, self._step_done, start=lambda new: start.state(new, config, content)
+                    env, config, self._step_done, start=lambda new: start.state(new, config, self._made_with)
                 )
                 if self._due != int(state.steps):
                     self._keep(int(state.steps), state, metrics)
@@ -200,7 +208,8 @@ class Session:
 
     def _save(self, step: int, state: TrainingState, score: float | None) -> None:
         params = ppo.as_tree(learner.params(state))
-        self._run.save(step, params, score, training=learner.stored(state), due=self._due)
+        notes = {**self._made_with, "due": self._due}
+        self._run.save(step, params, score, training=learner.stored(state), notes=notes)
         self._saved = step
 
     @contextlib.contextmanager

@@ -22,7 +22,7 @@ from ballu_mjx.errors import InputError
 from ballu_mjx.learner import Learner, TrainingState
 from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.runs import Progress, Run
-from ballu_mjx.session import Session, Start, start_from
+from ballu_mjx.session import Session, Start, _made_with, start_from
 
 GOOD = {"reward": 0.1, "diverged": 0.0, "steps_per_second": 100.0, "total_loss": 0.5}
 
@@ -87,7 +87,7 @@ def test_a_signal_ends_training_after_the_step_and_is_told_to_the_shell(tmp_path
                     session._step_done(120, state(2.0), GOOD)
         assert session.exit_status == 128 + number
         stopped = runs.last_checkpoint(tmp_path / "run", training=True)
-        assert (stopped.step, stopped.due) == (120, 100) and stopped.training is not None
+        assert (stopped.step, stopped.notes["due"]) == (120, 100) and stopped.training is not None
         assert runs.restore(tmp_path / "run", "best")[0] == 100, "nobody has measured the other"
         assert signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL), "given back"
     finally:
@@ -133,7 +133,8 @@ def small() -> Learner:
 
 def saved(folder: Path, state: TrainingState, config: dict[str, Any], step: int = 160) -> Path:
     with Run(folder, config) as run:
-        run.save(step, ppo.as_tree(learner.params(state)), -1.0, training=learner.stored(state))
+        tree, training = ppo.as_tree(learner.params(state)), learner.stored(state)
+        run.save(step, tree, -1.0, training=training, notes=_made_with(config))
     return folder
 
 
@@ -144,7 +145,7 @@ def resumed(folder: Path, config: PPOConfig) -> Start:
 def test_a_run_goes_on_with_its_whole_state(tmp_path, small, capsys):
     before = small.begin(5)
     start = resumed(saved(tmp_path / "run", before, content(env={"friction": (1.0, 2.0)})), CONFIG)
-    again = start.state(small, CONFIG, content(env={"friction": [1.0, 2.0]}))
+    again = start.state(small, CONFIG, _made_with(content(env={"friction": [1.0, 2.0]})))
     for name, value in learner.stored(before).items():
         np.testing.assert_array_equal(learner.stored(again)[name], value)
     assert start.step == 160 and capsys.readouterr().out == ""
@@ -158,7 +159,7 @@ def test_changed_options_start_the_environments_anew(tmp_path, small, capsys, pp
     before = small.begin(5)
     start = resumed(saved(tmp_path / "run", before, content()), CONFIG)
     changed = dataclasses.replace(CONFIG, learning_rate=0.5, **ppo_change)
-    again = learner.stored(start.state(small, changed, content(changed, **sections)))
+    again = learner.stored(start.state(small, changed, _made_with(content(changed, **sections))))
     said = capsys.readouterr().out
     assert (
         "the environments start anew, for the options changed; the optimizer goes on" in said and said.count("\n") == 1
@@ -182,12 +183,14 @@ def test_a_run_of_an_older_version_goes_on_from_its_parameters(tmp_path, small, 
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config | {"format": "ballu-run/1"}))
     start = resumed(folder, CONFIG)
-    again = learner.params(start.state(small, CONFIG, content()))
+    again = learner.params(start.state(small, CONFIG, _made_with(content())))
     assert "an older version kept parameters alone" in capsys.readouterr().out
     assert start.step == 160
     for name, value in learner.stored(before).items():
         if name.startswith("networks"):
-            np.testing.assert_array_equal(learner.stored(start.state(small, CONFIG, content()))[name], value)
+            np.testing.assert_array_equal(
+                learner.stored(start.state(small, CONFIG, _made_with(content())))[name], value
+            )
     np.testing.assert_array_equal(again.normalizer.mean["state"], params.normalizer.mean["state"])
     with Run(folder, content(), resumed_at=160) as run:
         run.save(240, ppo.as_tree(params), None)
