@@ -98,7 +98,9 @@ def test_learns_what_brax_s_own_loop_learns():
     _, params, losses = brax_ppo.train(
         environment=Follower(),
         wrap_env_fn=lambda env, **_: Braxs(env),
-        network_factory=lambda observation, action, **_: ppo.make_networks(observation, action, config),
+        network_factory=lambda observation_size, action_size, preprocess_observations_fn=None: ppo.make_networks(
+            observation_size, action_size, config
+        ),
         num_timesteps=steps * size,
         num_evals=steps + 1,
         run_evals=False,
@@ -131,7 +133,7 @@ def test_learns_what_brax_s_own_loop_learns():
         np.testing.assert_allclose(getattr(ours.normalizer, name)["state"], getattr(statistics, name)["state"], **close)
     for name, loss in losses.items():
         if name not in ("training/sps", "training/walltime"):
-            assert metrics[name.removeprefix("training/")] == pytest.approx(float(loss), **{"rel": 1e-3, "abs": 1e-5})
+            assert metrics[name.removeprefix("training/")] == pytest.approx(float(loss), rel=1e-3, abs=1e-5)
 
 
 def same(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray]) -> bool:
