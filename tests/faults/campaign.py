@@ -112,21 +112,20 @@ class Trainer:
         if process.exitcode:
             raise RuntimeError(f"The training ended with {process.exitcode}:\n{self.told.read_text()}")
 
-    def kill(self, folder: Path, delay: float, *, while_starting: bool = False) -> bool:
-        """Start training, and kill it `delay` seconds after it began to measure, or after the process began; returns
-        whether it was still at it."""
+    def kill(self, folder: Path, steps: int, delay: float) -> bool:
+        """Start training, and kill it `delay` seconds after it has measured `steps` training steps, or after the
+        process began where these are 0; returns whether it was still at it."""
         process = self.start(folder)
-        if not while_starting:
-            path = folder / "metrics.jsonl"
-            old = path.stat().st_ino if path.exists() else None
-            first: int | None = None  # size of the new file, which begins with the rows that are kept
-            while process.is_alive():
-                if path.exists() and path.stat().st_ino != old:
-                    size = path.stat().st_size
-                    first = size if first is None else first
-                    if size > first:
-                        break
-                time.sleep(0.002)
+        path = folder / "metrics.jsonl"
+        old = path.stat().st_ino if path.exists() else None
+        first: int | None = None  # lines that are kept: the file is a new one then
+        while steps and process.is_alive():
+            if path.exists() and path.stat().st_ino != old:
+                lines = path.read_bytes().count(b"\n")
+                first = lines if first is None else first
+                if lines >= first + steps:
+                    break
+            time.sleep(0.002)
         process.join(delay)
         alive = process.is_alive()
         process.kill()
@@ -186,8 +185,10 @@ def kills(at: Trainer, reference: Path, folder: Path, count: int, random: np.ran
     `reference` did."""
     met = 0
     for _ in range(count):
-        starting = random.random() < 0.2
-        met += at.kill(folder, random.uniform(0.0, 3.0 if starting else 0.7), while_starting=starting)
+        if random.random() < 0.2:
+            met += at.kill(folder, 0, random.uniform(0.0, 3.0))
+        else:
+            met += at.kill(folder, int(random.integers(1, 20)), random.uniform(0.0, 0.2))
     at.finish(folder)
     return met, same(folder, reference)
 
@@ -234,7 +235,7 @@ def main() -> int:
             count("killed", met, met * survived)
             remaining, run = remaining - max(met, 1), run + 1
         if options.damages:
-            at.kill(at.work / "killed", 0.5)
+            at.kill(at.work / "killed", STEPS // 2, 0.0)
         for number in range(options.damages):
             folder = at.work / f"damaged-{number}"
             what, survived = tried(lambda folder=folder: damaged(at, reference, folder, random))

@@ -30,13 +30,14 @@ def undisturbed(at: Trainer) -> Path:
 
 def test_a_killed_training_ends_as_if_nothing_had_happened(at: Trainer, undisturbed: Path):
     folder, random = at.work / "often", np.random.default_rng()
-    delays = random.uniform(0.0, 0.5, 3)
-    assert sum(at.kill(folder, delay) for delay in delays) > 0, "all kills came too late"
+    moments = [(int(random.integers(first, 20)), random.uniform(0.0, 0.2)) for first in (campaign.EVERY + 1, 1, 1)]
+    assert all([at.kill(folder, *moment) for moment in moments[:2]]), "the training was over before it was killed"
+    at.kill(folder, *moments[2])
     at.finish(folder)
     rows, _ = campaign.outcome(folder)
     steps = [row["step"] for row in rows]
-    assert steps == list(range(campaign.STEP, campaign.STEPS * campaign.STEP + 1, campaign.STEP)), delays
-    assert campaign.same(folder, undisturbed), delays
+    assert steps == list(range(campaign.STEP, campaign.STEPS * campaign.STEP + 1, campaign.STEP)), moments
+    assert campaign.same(folder, undisturbed), moments
 
 
 def test_a_second_process_is_refused_until_the_first_is_killed(at: Trainer):
