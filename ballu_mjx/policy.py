@@ -32,7 +32,7 @@ class Policy:
     **Fields**
 
     - `task`, `config`, `actuators` (None: nominal), `residual` (the run's folder; None: none): its simulator.
-    - `params`: as `ppo.train` returned them.
+    - `params`: what `learner.params` gave.
     - `infer`: (parameters, observation) to action.
     - `step`: control steps of training behind it.
     """

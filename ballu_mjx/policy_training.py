@@ -13,14 +13,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from ballu_mjx import actuators, locomotion, loggers, plots, policy, ppo, replay, residual, robot, runs
+from ballu_mjx import actuators, learner, locomotion, loggers, plots, policy, ppo, replay, residual, robot, runs
 from ballu_mjx.errors import InputError
 from ballu_mjx.locomotion import LocomotionConfig
 from ballu_mjx.policy import ClosedLoop, Policy, Rollout
 from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.replay import Take
 from ballu_mjx.robot import ActuatorParameters
-from ballu_mjx.session import Session, restored_from
+from ballu_mjx.session import Session, start_from
 from ballu_mjx.tasks import Task
 
 defaults = functools.partial(
@@ -57,8 +57,8 @@ class Data(loggers.LoggingOptions):
     output: Path | None = None
     """Folder of the run, new or empty. Without this option: one under runs/, named after task and time."""
     resume: Path | None = None
-    """Go on with the run in this folder, from its last checkpoint's parameters, in its simulator; options of env and
-    ppo given beside it change these. --num-timesteps counts from the run's start."""
+    """Go on with the run in this folder, from its last checkpoint, in its simulator; options of env and ppo given
+    beside it change these. --num-timesteps counts from the run's start."""
     quick: bool = False
     """See everything work within two minutes; the policy will not walk."""
     keep_every: int = 500_000
@@ -74,7 +74,7 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
     check(config)
     if data.keep_every < 1:
         raise InputError(f"--keep-every is {data.keep_every}: it must be 1 or more.")
-    first_step, restored = restored_from(task.name, data.resume, ppo_config, output=data.output, quick=data.quick)
+    start = start_from(task.name, data.resume, ppo_config, output=data.output, quick=data.quick)
     identified, forces = _simulator(task, data)
     env = policy.environment(task, config, identified, forces)
     folder = data.resume or runs.new_folder(data.output, task.name)
@@ -88,14 +88,12 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
         print("  --quick: sizes so small that the policy will not walk.")
     content = runs.describe(task.name, {"env": config, "ppo": ppo_config, "data": data}, {}, devices, identified)
     content["residual"] = None if forces is None else str(forces.resolve())
-    resumed_at = None if restored is None else first_step
-    with runs.Run(folder, content, resumed_at=resumed_at, wandb=data.wandb) as run:
+    with runs.Run(folder, content, resumed_at=start.resumed_at, wandb=data.wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)
-        remaining = dataclasses.replace(ppo_config, num_timesteps=ppo_config.num_timesteps - first_step)
-        progress = runs.Progress(first_step + ppo.total_timesteps(remaining), first_step)
-        session = Session(run, progress, data.keep_every, resumed_at)
+        progress = runs.Progress(learner.total_timesteps(ppo_config, start.step), start.step)
+        session = Session(run, progress, data.keep_every)
         try:
-            session.train(env, remaining, restored, first_step)
+            session.train(env, ppo_config, start, content)
         except KeyboardInterrupt:
             print(f"To go on: python -m ballu_mjx.train {task.name} --resume {folder}", file=sys.stderr)
             return session.exit_status

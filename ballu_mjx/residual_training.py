@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from ballu_mjx import evaluate, evaluation, loggers, policy, ppo, runs
+from ballu_mjx import evaluate, evaluation, learner, loggers, policy, ppo, runs
 from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv, ForcePolicy
 from ballu_mjx.errors import InputError
 from ballu_mjx.evaluation import OpenLoopEvaluator
@@ -19,7 +19,7 @@ from ballu_mjx.forces import ForceModel, Sum
 from ballu_mjx.ppo import Params, PPOConfig
 from ballu_mjx.residual import Residual, write_observed
 from ballu_mjx.residual_data import Prepared, RecordingsData
-from ballu_mjx.session import Session, restored_from
+from ballu_mjx.session import Session, start_from
 
 QUICK: Mapping[str, Any] = {"num_timesteps": 120_000, "num_envs": 256, "batch_size": 128}
 """Defaults of `PPOConfig` under `--quick`."""
@@ -33,8 +33,8 @@ class Data(RecordingsData):
     """Folder of another residual's run, which acts beside the forces: these learn what it leaves. Its actuators are
     taken. Without this option: none."""
     resume: Path | None = None
-    """Go on with the run in this folder, from its last checkpoint's parameters, with its recordings and configuration;
-    options given beside it change these. --num-timesteps counts from the run's start."""
+    """Go on with the run in this folder, from its last checkpoint, with its recordings and configuration; options
+    given beside it change these. --num-timesteps counts from the run's start."""
     validate_every: int = 400_000
     """Control steps between two validations, each of which leaves a checkpoint."""
 
@@ -47,7 +47,7 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     loggers.check(data.wandb)
     if data.validate_every < 1:
         raise InputError(f"--validate-every is {data.validate_every}: it must be 1 or more.")
-    first_step, restored = restored_from("envmimic", data.resume, ppo_config, output=data.output, quick=data.quick)
+    start = start_from("envmimic", data.resume, ppo_config, output=data.output, quick=data.quick)
     where = _where_beside(data)
     beside = None if where is None else Residual.load(where)
     prepared = Prepared.read(data, data.resume)
@@ -60,7 +60,7 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     model = prepared.load_model()
     motions = prepared.reconstruct(model)
     env = EnvMimicEnv(model, motions["training"], env_config, None if beside is None else beside.applied)
-    if restored is not None and restored.normalizer.mean["state"].shape != env.observation_size["state"]:
+    if start.params is not None and start.params.normalizer.mean["state"].shape != env.observation_size["state"]:
         raise InputError(
             f"{data.resume}: its policy was trained on other observations; leave the options of env as they were."
         )
@@ -76,17 +76,14 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     sections = {"env": env_config, "ppo": ppo_config, "data": data}
     config = runs.describe("envmimic", sections, prepared.files, devices, prepared.identified)
     config["residual"] = None if where is None else str(where.resolve())
-    resumed_at = None if restored is None else first_step
     validation = evaluator("validation")
-    with runs.Run(folder, config, resumed_at=resumed_at, wandb=data.wandb) as run:
+    with runs.Run(folder, config, resumed_at=start.resumed_at, wandb=data.wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)
-        remaining = dataclasses.replace(ppo_config, num_timesteps=ppo_config.num_timesteps - first_step)
-        progress = runs.Progress(first_step + ppo.total_timesteps(remaining), first_step)
+        progress = runs.Progress(learner.total_timesteps(ppo_config, start.step), start.step)
         write_observed(run, env.recorded_inputs())
-        validate = lambda params: validation(all_params(params)).score  # noqa: E731
-        session = Session(run, progress, data.validate_every, resumed_at, validate)
+        session = Session(run, progress, data.validate_every, lambda params: validation(all_params(params)).score)
         try:
-            session.train(env, remaining, restored, first_step)
+            session.train(env, ppo_config, start, config)
         except KeyboardInterrupt:
             print(f"To go on: python -m ballu_mjx.train envmimic --resume {folder}", file=sys.stderr)
             return session.exit_status

@@ -4,7 +4,8 @@ config.json         all it takes to repeat the run
 metrics.jsonl       one JSON object a line: `step` (control steps) and what was measured there
 tensorboard/        the same for TensorBoard
 wandb/              the same for Weights & Biases, on demand
-checkpoints/STEP/   parameters (orbax): the last three, and the best by validation error
+checkpoints/STEP/   the last three, and the best by validation error (orbax): `params`, all it takes to use what was
+                    learned; `training`, what else it takes to go on; `record.json`, checksums of all files
 evaluation.txt, evaluation.json, learning_curve.png, tracking.png
 replay.npz          what the robots did, for `ballu_mjx.report` and `ballu_mjx.view`
 """
@@ -17,6 +18,7 @@ import hashlib
 import importlib.metadata
 import json
 import math
+import shutil
 import sys
 import time
 import typing
@@ -24,6 +26,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Literal, TextIO, TypeVar
 
+import jax
 import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
@@ -39,11 +42,14 @@ from ballu_mjx import loggers, robot
 from ballu_mjx.errors import InputError
 from ballu_mjx.robot import ActuatorParameters
 
-FORMAT = "ballu-run/1"
+FORMAT = "ballu-run/2"
+"""Version 1 had checkpoints of parameters alone."""
 KEPT = 3
 """Latest checkpoints that are kept."""
 
-_CONFIG, _METRICS, _LOCK = "config.json", "metrics.jsonl", ".lock"
+_READABLE = ("ballu-run/1", FORMAT)
+_CONFIG, _METRICS, _LOCK, _CHECKPOINTS = "config.json", "metrics.jsonl", ".lock", "checkpoints"
+_PARAMS, _TRAINING, _RECORD = "params", "training", "record.json"
 _BUNDLED = "bundled:"
 _NO_SCORE = 1e30
 _PACKAGES = ("ballu-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "optimistix", "numpy")
@@ -65,7 +71,7 @@ def new_folder(output: Path | None, task: str) -> Path:
         raise InputError(f"{output}: is a file; give --output a folder that is new or empty.")
     if output.exists() and any(output.iterdir()):
         mend = "give --output a folder that is new or empty"
-        if (output / "checkpoints").is_dir():
+        if (output / _CHECKPOINTS).is_dir():
             mend = f"--resume {output} goes on with it, or give --output another folder"
         raise InputError(f"{output}: the folder is not empty; {mend}.")
     return output
@@ -83,7 +89,7 @@ def read_config(folder: Path, *tasks: str) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read ({error}); restore it or start a new run.") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
+    if not isinstance(content, dict) or content.get("format") not in _READABLE:
         raise InputError(f"{path}: is not of the format {FORMAT}; use the version of ballu_mjx that wrote it.")
     if content.get("task") not in tasks:
         needed = " or ".join(repr(task) for task in tasks)
@@ -179,18 +185,20 @@ class Run:
     def __init__(
         self, folder: Path, config: Mapping[str, Any], *, resumed_at: int | None = None, wandb: str | None = None
     ) -> None:
-        """Open `folder`, new unless `resumed_at` says at which control step an old run goes on.
+        """Open `folder`, new unless `resumed_at` says at which control step an old run goes on; -1 is from its very
+        beginning.
 
         `wandb`: a project of Weights & Biases to log to as well.
 
         **Raises** `InputError` where another process has it open, or Weights & Biases refuses.
 
-        What an old run measured after that step is dropped: it will be measured again.
+        What an old run measured and saved after that step is dropped: it will be measured again.
         """
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         self._lock = _locked(folder / _LOCK)
         if resumed_at is not None:
+            _drop_checkpoints(folder, resumed_at)
             kept = [row for row in read_metrics(folder) if row["step"] <= resumed_at]
             _write(folder / _METRICS, "".join(json.dumps(row) + "\n" for row in kept))
             config = {**config, "starts": read_config(folder, config["task"])["starts"] + list(config["starts"])}
@@ -219,44 +227,97 @@ class Run:
         for logger in self._loggers:
             logger.log(step, metrics)
 
-    def save(self, step: int, tree: Mapping[str, Any], score: float | None) -> None:
-        """Write a checkpoint of nested dictionaries of arrays, unless that of `step` stands there already.
+    def save(
+        self,
+        step: int,
+        params: Mapping[str, Any],
+        score: float | None,
+        *,
+        training: Mapping[str, np.ndarray] | None = None,
+        notes: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Write a checkpoint, unless that of `step` stands there already.
 
-        `score`: validation error, the smallest is the best; None where there is none.
+        **Arguments**
+
+        - `params`: nested dictionaries of arrays.
+        - `score`: validation error, the smallest is the best; None where there is none.
+        - `training`: what else it takes to go on.
+        - `notes`: what whoever goes on wants to know beside it; goes into JSON and back.
         """
         if self._manager is None:
             self._manager = _manager(self.folder)
         if step in self._manager.all_steps():
             return
-        metrics = None if score is None else {"score": score if math.isfinite(score) else _NO_SCORE}
-        self._manager.save(step, args=ocp.args.StandardSave(dict(tree)), metrics=metrics)
+        trees = {_PARAMS: dict(params)} | ({} if training is None else {_TRAINING: dict(training)})
+        items = {name: ocp.args.StandardSave(tree) for name, tree in trees.items()}
+        finite = None if score is None else score if math.isfinite(score) else _NO_SCORE
+        metrics = None if finite is None else {"score": finite}
+        self._manager.save(step, args=ocp.args.Composite(**items), metrics=metrics)
         self._manager.wait_until_finished()
+        # Last of all: what has no record was not written to the end.
+        place = self.folder / _CHECKPOINTS / str(step)
+        record = {"score": finite, "notes": dict(notes or {}), "files": _checksums(place)}
+        _write(place / _RECORD, json.dumps({**record, "sha256": _checksum(record)}, indent=2) + "\n")
 
     def write(self, name: str, text: str) -> None:
         """Write a text file into the folder."""
         _write(self.folder / name, text)
 
 
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """What `Run.save` wrote; see there."""
+
+    step: int
+    params: dict[str, Any]
+    training: dict[str, np.ndarray] | None
+    notes: dict[str, Any]
+
+
 def restore(folder: Path, which: Which) -> tuple[int, dict[str, Any]]:
-    """Step and content of a run's best or last checkpoint, or of that of a step.
+    """Step and parameters of a run's best or last checkpoint, or of that of a step.
+
+    A damaged last checkpoint is told on the terminal, and the one before taken.
+
+    **Raises** `InputError` where there is none, or that which was asked for is damaged.
+    """
+    if which == "last":
+        checkpoint = last_checkpoint(folder)
+        return checkpoint.step, checkpoint.params
+    steps = checkpoints(folder)
+    try:
+        scores = {step: _record(folder, step)["score"] for step in steps} if which == "best" else {}
+        scored = {step: score for step, score in scores.items() if score is not None}
+        step = min(scored, key=lambda step: (scored[step], -step), default=None) if which == "best" else which
+        if step not in steps:
+            raise _no_checkpoint(folder, "validated checkpoint" if which == "best" else "checkpoint")
+        return step, _read(folder, step, training=False).params
+    except _DamagedError as error:
+        raise InputError(f"{error}; restore it from a copy, or use the run's last checkpoint.") from error
+
+
+def last_checkpoint(folder: Path, *, training: bool = False) -> Checkpoint:
+    """A run's last checkpoint that is whole, with or without what it takes to go on; damaged ones are told on the
+    terminal.
 
     **Raises** `InputError` where there is none.
     """
-    if (folder / "checkpoints").is_dir():
-        with _manager(folder) as manager:
-            step = {"last": manager.latest_step, "best": manager.best_step}.get(str(which), lambda: which)()
-            if step in manager.all_steps():
-                return step, manager.restore(step, args=ocp.args.StandardRestore())
-    kind = "validated checkpoint" if which == "best" else "checkpoint"
-    raise InputError(f"{folder}: the run has no {kind}; train for longer.")
+    steps = checkpoints(folder)
+    for step in reversed(steps):
+        try:
+            return _read(folder, step, training=training)
+        except _DamagedError as error:
+            print(f"{error}; taking the one before.", file=sys.stderr)
+    if steps:
+        raise InputError(f"{folder}: all checkpoints of the run are damaged; restore one from a copy or start anew.")
+    raise _no_checkpoint(folder, "checkpoint")
 
 
 def checkpoints(folder: Path) -> list[int]:
     """Steps of the checkpoints that a run has kept, in order."""
-    if not (folder / "checkpoints").is_dir():
-        return []
-    with _manager(folder) as manager:
-        return sorted(manager.all_steps())
+    place = folder / _CHECKPOINTS
+    return sorted(ocp.utils.checkpoint_steps(place)) if place.is_dir() else []
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
@@ -358,6 +419,84 @@ def _locked(path: Path) -> IO[str]:
     return file
 
 
+class _DamagedError(Exception):
+    """A checkpoint that does not hold what was written."""
+
+
+def _read(folder: Path, step: int, *, training: bool) -> Checkpoint:
+    """**Raises** `_DamagedError`."""
+    place = (folder / _CHECKPOINTS / str(step)).resolve()
+    record = _record(folder, step)
+    old = place / "default"  # of version 1
+    try:
+        params = _standard(old if old.is_dir() else place / _PARAMS)
+        more = _standard(place / _TRAINING) if training and (place / _TRAINING).is_dir() else None
+    except Exception as error:  # orbax, tensorstore and the decoders raise whatever damage brings them to
+        raise _DamagedError(f"{place}: the checkpoint cannot be read ({type(error).__name__})") from error
+    return Checkpoint(step, params, more, record["notes"])
+
+
+def _record(folder: Path, step: int) -> dict[str, Any]:
+    """What is written beside a checkpoint of it. Before orbax sees the checkpoint: it does not take damage quietly.
+
+    **Raises** `_DamagedError` where the checkpoint is not as it was written.
+    """
+    place = folder / _CHECKPOINTS / str(step)
+    path = place / _RECORD
+    try:
+        if (place / "default").is_dir():  # of version 1, which has no checksums
+            score = place / "metrics" / "metrics"
+            return {"score": json.loads(score.read_bytes())["score"] if score.exists() else None, "notes": {}}
+        record = json.loads(path.read_bytes())
+        intact = record.pop("sha256") == _checksum(record)
+    except FileNotFoundError as error:
+        raise _DamagedError(f"{place}: the checkpoint is half-written") from error
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise _DamagedError(f"{path}: the checkpoint is damaged") from error
+    if not intact:
+        raise _DamagedError(f"{path}: the checkpoint is damaged")
+    now = _checksums(place)
+    for name, checksum in record["files"].items():
+        if now.get(name) != checksum:
+            raise _DamagedError(f"{place / name}: the checkpoint is damaged")
+    return record
+
+
+def _checksums(place: Path) -> dict[str, str]:
+    """SHA-256 of every file of a checkpoint but its record."""
+    files = sorted(path for path in place.rglob("*") if path.is_file() and not path.name.startswith(_RECORD))
+    return {path.relative_to(place).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def _checksum(record: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+
+
+def _standard(place: Path) -> dict[str, Any]:
+    with ocp.StandardCheckpointer() as checkpointer:
+        return jax.tree.map(np.asarray, checkpointer.restore(place))
+
+
+def _drop_checkpoints(folder: Path, after: int) -> None:
+    """Remove checkpoints after a step, and all that are damaged or half-written, over which orbax would stumble."""
+
+    def keep(step: int) -> bool:
+        try:
+            return step <= after and bool(_record(folder, step))
+        except _DamagedError:
+            return False
+
+    place = folder / _CHECKPOINTS
+    kept = {str(step) for step in checkpoints(folder) if keep(step)}
+    for path in place.iterdir() if place.is_dir() else ():
+        if path.is_dir() and path.name not in kept:
+            shutil.rmtree(path)
+
+
+def _no_checkpoint(folder: Path, kind: str) -> InputError:
+    return InputError(f"{folder}: the run has no {kind}; train for longer.")
+
+
 def _manager(folder: Path) -> ocp.CheckpointManager:
     best = policies.BestN(get_metric_fn=_score, reverse=True, n=1, keep_checkpoints_without_metrics=False)
     options = ocp.CheckpointManagerOptions(
@@ -366,7 +505,7 @@ def _manager(folder: Path) -> ocp.CheckpointManager:
         preservation_policy=policies.AnyPreservationPolicy([policies.LatestN(KEPT), best]),
         enable_async_checkpointing=False,
     )
-    return ocp.CheckpointManager((folder / "checkpoints").resolve(), options=options)
+    return ocp.CheckpointManager((folder / _CHECKPOINTS).resolve(), options=options)
 
 
 def _score(metrics: Any) -> float:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import hashlib
+import json
 import math
 import signal
 import sys
@@ -13,40 +16,109 @@ from typing import Any
 
 from brax.envs.base import Env
 
-from ballu_mjx import ppo, runs
+from ballu_mjx import learner, ppo, replay, runs
 from ballu_mjx.errors import InputError
+from ballu_mjx.learner import Learner, TrainingState
 from ballu_mjx.ppo import Params, PPOConfig
-from ballu_mjx.runs import Progress, Run
+from ballu_mjx.runs import Checkpoint, Progress, Run
 
 _DIVERGED = 1e-3
 """Share of control steps in which physics may break down before the user is told."""
 
 
-def restored_from(
-    task: str, folder: Path | None, config: PPOConfig, *, output: Path | None, quick: bool
-) -> tuple[int, Params | None]:
-    """Step and parameters that training starts from: 0 and None for a new run, which `folder` None is.
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """Where a training begins: anew, or where a run stopped."""
+
+    folder: Path | None = None
+    """The run that goes on."""
+    checkpoint: Checkpoint | None = None
+    """None: the run was stopped before it had one."""
+
+    @property
+    def resumed_at(self) -> int | None:
+        """What `Run` wants to know."""
+        if self.folder is None:
+            return None
+        return -1 if self.checkpoint is None else self.checkpoint.step
+
+    @property
+    def step(self) -> int:
+        """Control steps done before."""
+        return 0 if self.checkpoint is None else self.checkpoint.step
+
+    @property
+    def params(self) -> Params | None:
+        """What was learned before."""
+        return None if self.checkpoint is None else ppo.from_tree(self.checkpoint.params)
+
+    def state(self, new: Learner, ppo_config: PPOConfig, made_with: Mapping[str, Any]) -> TrainingState:
+        """The state to go on from with what `_made_with` says; what cannot go on of the old one is told on the
+        terminal."""
+        if self.checkpoint is None or self.folder is None:
+            return new.begin(ppo_config.seed)
+        stored, before = self.checkpoint.training, self.checkpoint.notes
+        anew = "the optimizer and the environments start anew"
+        if stored is None:
+            print(f"{self.folder}: {anew}: an older version kept parameters alone.")
+        else:
+            if ppo_config.learning_rate != before["learning_rate"]:
+                stored = learner.with_learning_rate(stored, ppo_config.learning_rate)
+            same = all(before[name] == made_with[name] for name in ("seed", "environments"))
+            try:
+                state, whole = new.go_on(stored, environments=same)
+            except ValueError as error:
+                print(f"{self.folder}: {anew}: the stored ones do not fit ({error}).")
+            else:
+                if not whole:
+                    print(
+                        f"{self.folder}: the environments start anew, for the options changed; the optimizer goes on."
+                    )
+                return state
+        return new.begin_from(ppo.from_tree(self.checkpoint.params), self.step)
+
+
+def start_from(task: str, folder: Path | None, config: PPOConfig, *, output: Path | None, quick: bool) -> Start:
+    """Where training starts from: anew, where `folder` is None.
 
     **Raises** `InputError` where the run to go on with is none, has ended, or does not go with the options.
     """
     if folder is None:
-        return 0, None
+        return Start()
     for option, given in (("--output", output is not None), ("--quick", quick)):
         if given:
             raise InputError(f"{option} does not go with --resume, which keeps folder and sizes; leave one out.")
-    stored = runs.typed(PPOConfig, runs.read_config(folder, task)["ppo"], folder)
+    before = runs.read_config(folder, task)
+    stored = runs.typed(PPOConfig, before["ppo"], folder)
     for name in ("policy_layers", "value_layers", "activation", "normalize_observations"):
         if getattr(stored, name) != getattr(config, name):
             raise InputError(
                 f"--{name.replace('_', '-')} does not go with --resume: the stored parameters have "
                 f"{getattr(stored, name)}; leave it out or start a new run."
             )
-    step, tree = runs.restore(folder, "last")
-    if step >= config.num_timesteps:
+    if not runs.checkpoints(folder):
+        print(f"{folder}: was stopped before its first checkpoint; starting from the beginning.", file=sys.stderr)
+        return Start(folder)
+    checkpoint = runs.last_checkpoint(folder, training=True)
+    # Whoever was stopped between the last checkpoint and the results still needs these.
+    if checkpoint.step >= config.num_timesteps and (folder / replay.NAME).exists():
         raise InputError(
-            f"{folder}: is at step {step:,} already; give a --num-timesteps above that to train for longer."
+            f"{folder}: is at step {checkpoint.step:,} already; give a --num-timesteps above that to train for longer."
         )
-    return step, ppo.from_tree(tree)
+    return Start(folder, checkpoint)
+
+
+def _made_with(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a run's `config.json` a training state depends on beyond its shapes. Kept with every checkpoint: the
+    `config.json` beside it may be that of a later start."""
+    recordings = [entry["sha256"] for entry in config["recordings"].get("training", [])]
+    parts = {name: config.get(name) for name in ("env", "actuators", "residual")} | {"recordings": recordings}
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return {
+        "learning_rate": config["ppo"]["learning_rate"],
+        "seed": config["ppo"]["seed"],
+        "environments": hashlib.sha256(text.encode()).hexdigest(),
+    }
 
 
 class Session:
@@ -56,41 +128,39 @@ class Session:
     """The signal that came, set by its handler: the next finished training step is the last."""
 
     def __init__(
-        self,
-        run: Run,
-        progress: Progress,
-        keep_every: int,
-        kept_at: int | None,
-        validate: Callable[[Params], float] | None = None,
+        self, run: Run, progress: Progress, keep_every: int, validate: Callable[[Params], float] | None = None
     ) -> None:
-        """A checkpoint is kept every `keep_every` control steps, the last at `kept_at` (None: none yet), with the
-        validation error that `validate` gives, the smallest being the best; without it the greatest reward is."""
+        """A checkpoint is kept every `keep_every` control steps, with the validation error that `validate` gives, the
+        smallest being the best; without it the greatest reward is."""
         self._run, self._progress, self._validate = run, progress, validate
-        self._every, self._kept_at = keep_every, kept_at
+        self._every = keep_every
+        self._due: int | None = None  # step of the last checkpoint that was not an interruption's
+        self._made_with: dict[str, Any] = {}
+        self._saved = 0
         self._score: float | None = None
-        self._last: tuple[int, Params, Mapping[str, float]] | None = None
         self._warned = False
         self._started = time.perf_counter()
 
-    def train(self, env: Env, config: PPOConfig, restored: Params | None, first_step: int) -> None:
-        """Train `env`, from `restored` parameters at `first_step` on where there are any.
+    def train(self, env: Env, config: PPOConfig, start: Start, content: Mapping[str, Any]) -> None:
+        """Train `env` from `start` on; `content` is the run's `config.json`.
 
-        **Raises** `KeyboardInterrupt` after SIGINT (Ctrl-C) or SIGTERM, the last parameters saved, and `InputError`
+        **Raises** `KeyboardInterrupt` after SIGINT (Ctrl-C) or SIGTERM, the last state saved, and `InputError`
         where learning broke down, with the last good checkpoint named.
         """
+        self._made_with = _made_with(content)
+        if start.checkpoint is not None:
+            self._saved = start.checkpoint.step
+            self._due = start.checkpoint.notes.get("due", self._saved)
         try:
             with self._interrupts_noted():
-                ppo.train(env, config, self._step_done, restore=restored, first_step=first_step)
-                assert self._last is not None
-                if self._last[0] != self._kept_at:
-                    self._keep(*self._last)
+                state, metrics = learner.train(
+                    env, config, self._step_done, start=lambda new: start.state(new, config, self._made_with)
+                )
+                if self._due != int(state.steps):
+                    self._keep(int(state.steps), state, metrics)
         except KeyboardInterrupt:
-            step = 0
-            if self._last is not None:
-                step = self._last[0]
-                self._run.save(step, ppo.as_tree(self._last[1]), None)
             self._progress.close()
-            print(f"Interrupted at step {step:,}.", file=sys.stderr)
+            print(f"Interrupted; saved at step {self._saved:,}.", file=sys.stderr)
             raise
         self._progress.close()
 
@@ -99,13 +169,13 @@ class Session:
         """A shell's for the signal that ended the training."""
         return 128 + (self.interrupted or signal.SIGINT)
 
-    def _step_done(self, step: int, params: Params, metrics: dict[str, float]) -> None:
+    def _step_done(self, step: int, state: TrainingState, metrics: dict[str, float]) -> None:
         if not all(math.isfinite(value) for value in metrics.values()):
             self._progress.close()
             broken = ", ".join(name for name, value in metrics.items() if not math.isfinite(value))
             raise InputError(
                 f"Learning broke down before step {step:,}: {broken} is not a number any more. The last good "
-                f"checkpoint is that of step {self._kept_at:,}; go on from it with --resume and a smaller "
+                f"checkpoint is that of step {self._saved:,}; go on from it with --resume and a smaller "
                 "--learning-rate, or look for recordings or options that throw the robot about."
             )
         if metrics.get("diverged", 0.0) > _DIVERGED and not self._warned:
@@ -115,26 +185,32 @@ class Session:
                 "forces or starting states are too violent for the simulator's time step.",
                 file=sys.stderr,
             )
-        self._last = (step, params, metrics)
         if metrics:
             self._run.log(step, metrics | {"seconds": time.perf_counter() - self._started})
-        if self._kept_at is None or step - self._kept_at >= self._every:
-            self._keep(step, params, metrics)
+        if self._due is None or step - self._due >= self._every:
+            self._keep(step, state, metrics)
         if metrics:
             shown = f"reward {metrics['reward']:.3f}"
             if self._score is not None:
                 shown += f", validation error {self._score:.3f}"
             self._progress.update(step, metrics["steps_per_second"], shown)
         if self.interrupted:
+            self._save(step, state, None)
             raise KeyboardInterrupt
 
-    def _keep(self, step: int, params: Params, metrics: Mapping[str, float]) -> None:
-        self._kept_at = step
+    def _keep(self, step: int, state: TrainingState, metrics: Mapping[str, float]) -> None:
+        self._due = step
         score = -metrics.get("reward", -math.inf)
         if self._validate is not None:
-            score = self._score = self._validate(params)
+            score = self._score = self._validate(learner.params(state))
             self._run.log(step, {"validation_error": score})
-        self._run.save(step, ppo.as_tree(params), score)
+        self._save(step, state, score)
+
+    def _save(self, step: int, state: TrainingState, score: float | None) -> None:
+        params = ppo.as_tree(learner.params(state))
+        notes = {**self._made_with, "due": self._due}
+        self._run.save(step, params, score, training=learner.stored(state), notes=notes)
+        self._saved = step
 
     @contextlib.contextmanager
     def _interrupts_noted(self) -> Iterator[None]:

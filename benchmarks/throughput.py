@@ -23,7 +23,7 @@ import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 from mujoco import rollout  # noqa: E402
 
-from ballu_mjx import ppo, reconstruction, recording, robot, simulation  # noqa: E402
+from ballu_mjx import learner, ppo, reconstruction, recording, robot, simulation  # noqa: E402
 from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv  # noqa: E402
 
 
@@ -31,17 +31,17 @@ def training_rates(env: EnvMimicEnv, config: ppo.PPOConfig) -> list[float]:
     """Control steps per second of each training step but the first, which compiles."""
     rates: list[float] = []
 
-    def note(step: int, params: ppo.Params, metrics: dict[str, float]) -> None:
+    def note(step: int, state: learner.TrainingState, metrics: dict[str, float]) -> None:
         if metrics:
             rates.append(metrics["steps_per_second"])
 
-    ppo.train(env, config, note)
+    learner.train(env, config, note)
     return rates[1:]
 
 
 def stepping_rates(env: EnvMimicEnv, num_envs: int, repeats: int, length: int = 20) -> list[float]:
     """Control steps per second of the environments alone, sharded over all devices."""
-    wrapped = ppo.wrap_for_training(env)
+    wrapped = learner.wrap_for_training(env)
     devices = jax.local_device_count()
     keys = jax.random.split(jax.random.key(0), num_envs).reshape(devices, -1)
     action = jnp.zeros((num_envs // devices, env.action_size))

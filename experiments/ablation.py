@@ -28,7 +28,7 @@ import jax  # noqa: E402
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 
-from ballu_mjx import actuators, evaluation, ppo, recording, robot  # noqa: E402
+from ballu_mjx import actuators, evaluation, learner, ppo, recording, robot  # noqa: E402
 from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv, ForcePolicy  # noqa: E402
 from ballu_mjx.ppo import PPOConfig  # noqa: E402
 from ballu_mjx.reconstruction import Motion, reconstruct  # noqa: E402
@@ -89,16 +89,16 @@ def train(
     env = EnvMimicEnv(model, motions["training"], env_config)
     forces = ForcePolicy(env_config, ppo.make_inference(env.observation_size, env.action_size, ppo_config))
     evaluator = evaluation.OpenLoopEvaluator(model, motions["validation"], forces)
-    last = ppo.total_timesteps(ppo_config)
+    last = learner.total_timesteps(ppo_config)
     history: list[dict[str, Any]] = []
     due = sizes.validate_every
 
-    def look(step: int, params: ppo.Params, metrics: dict[str, float]) -> None:
+    def look(step: int, state: learner.TrainingState, metrics: dict[str, float]) -> None:
         nonlocal due
         if step < due and step < last:
             return
         due = step + sizes.validate_every
-        result = evaluator(params)
+        result = evaluator(learner.params(state))
         ratios = {
             f"{group} {quantity} {horizon:g}": result.ratio(group, quantity, horizon)
             for group in result.groups
@@ -107,7 +107,7 @@ def train(
         }
         history.append({"step": step, "score": result.score, "reward": metrics["reward"], "ratios": ratios})
 
-    ppo.train(env, ppo_config, look)
+    learner.train(env, ppo_config, look)
     return history
 
 

@@ -46,7 +46,7 @@ np.save(sys.argv[3], [controller.act(row) for row in features])
 def write_run(folder: Path, task: str = "walk", **settings: Any) -> Path:
     """A run whose policy is drawn at random, with commands all over [0, 1]."""
     config = PPOConfig(policy_layers=(16, 12), value_layers=(4,), **settings)
-    networks = ppo._networks(locomotion.OBSERVATIONS, ACTIONS, config=config)
+    networks = ppo.make_networks(locomotion.OBSERVATIONS, ACTIONS, config)
     tree: Any = jax.device_get(networks.policy_network.init(jax.random.key(1)))
     tree["params"]["Dense_0"]["kernel"] = 100.0 * tree["params"]["Dense_0"]["kernel"]
     rng = np.random.default_rng(2)

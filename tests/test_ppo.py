@@ -1,78 +1,23 @@
-"""Does PPO learn, restart where it should, treat time limits as such, and repeat itself?"""
+"""Does PPO learn, restart where it should, treat time limits as such, repeat itself, and go on as if never stopped?"""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.envs.base import Env, State
+from brax.envs.base import State
+from brax.training.agents.ppo import train as brax_ppo
 from brax.training.agents.ppo.losses import compute_gae
+from follower import Follower, physics
 
-from ballu_mjx import ppo
+from ballu_mjx import learner, ppo
 from ballu_mjx.errors import InputError
-
-# Brax 0.14.2 places parameters with a function that newer JAX means to drop.
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:brax")
-
-
-class Follower(Env):
-    """A point mass pushed along a line, rewarded for staying at a place drawn at the start."""
-
-    limit = 10
-
-    def reset(self, rng: jax.Array) -> State:
-        goal = jax.random.uniform(rng, (), minval=-1.0, maxval=1.0)
-        physics = {"position": jnp.zeros(()), "velocity": jnp.zeros(()), "goal": goal, "time": jnp.zeros((), jnp.int32)}
-        zero = jnp.zeros(())
-        return State(
-            physics,  # pyright: ignore
-            self._observe(physics),
-            zero,
-            zero,
-            {"distance": zero},
-            {"truncation": zero},
-        )
-
-    def step(self, state: State, action: jax.Array) -> State:
-        s = physics(state)
-        velocity = 0.5 * s["velocity"] + action[0]
-        s = s | {"velocity": velocity, "position": s["position"] + velocity, "time": s["time"] + 1}
-        distance = jnp.abs(s["position"] - s["goal"])
-        escaped = jnp.abs(s["position"]) > 3.0
-        late = s["time"] >= self.limit
-        return dataclasses.replace(
-            state,
-            pipeline_state=s,
-            obs=self._observe(s),
-            reward=jnp.exp(-4.0 * distance),
-            done=jnp.asarray(escaped | late, jnp.float32),
-            metrics={"distance": distance},
-            info=state.info | {"truncation": jnp.asarray(late & ~escaped, jnp.float32)},
-        )
-
-    def _observe(self, s: dict) -> jax.Array:
-        return jnp.stack([s["position"] - s["goal"], s["velocity"]])
-
-    @property
-    def observation_size(self) -> int:
-        return 2
-
-    @property
-    def action_size(self) -> int:
-        return 1
-
-    @property
-    def backend(self) -> str:
-        return "none"
-
-
-def physics(state: State) -> dict[str, Any]:
-    return state.pipeline_state  # pyright: ignore
-
+from ballu_mjx.learner import Learner
 
 SMALL = ppo.PPOConfig(
     num_timesteps=40_000,
@@ -82,18 +27,24 @@ SMALL = ppo.PPOConfig(
     num_minibatches=4,
     learning_rate=3e-3,
     activation="tanh",
-    averaging=1,
+    averaging=3,
     policy_layers=(16,),
     value_layers=(16,),
 )
 
 
+Calls = list[tuple[int, ppo.Params, dict[str, float]]]
+
+
 @pytest.fixture(scope="module")
-def trained() -> tuple[ppo.Params, list[tuple[int, ppo.Params, dict[str, float]]]]:
-    calls = []
-    params, last = ppo.train(Follower(), SMALL, lambda *call: calls.append(call))
-    assert last == calls[-1][2]
-    return params, calls
+def trained() -> tuple[dict[str, np.ndarray], Calls]:
+    """All of the last state, and what every call brought."""
+    calls: Calls = []
+    last, metrics = learner.train(
+        Follower(), SMALL, lambda step, state, metrics: calls.append((step, learner.params(state), metrics))
+    )
+    assert metrics == calls[-1][2]
+    return learner.stored(last), calls
 
 
 def test_learning_curve_rises(trained):
@@ -105,7 +56,8 @@ def test_learning_curve_rises(trained):
 
 
 def test_policy_used_alone_gains_what_training_reported(trained):
-    params, calls = trained
+    _, calls = trained
+    params = calls[-1][1]
     env = Follower()
     policy = ppo.make_inference(env.observation_size, env.action_size, SMALL)
 
@@ -130,32 +82,189 @@ def test_calls_count_every_control_step_once(trained):
     assert calls[-1][1].normalizer.count == calls[-1][0]
 
 
-def test_same_seed_same_policy_and_another_seed_another():
-    config = dataclasses.replace(SMALL, num_timesteps=5000)
-    policies = [
-        jax.tree.leaves(ppo.train(Follower(), dataclasses.replace(config, seed=seed))[0].policy) for seed in (3, 3, 4)
+class Braxs(learner._Training):
+    """With what only Brax's own loop reads."""
+
+    def _with_extras(self, shown: State, outcome: State, keys: jax.Array) -> State:
+        state = super()._with_extras(shown, outcome, keys)
+        return dataclasses.replace(state, info=state.info | {"episode_done": state.done, "episode_metrics": {}})
+
+
+# Brax 0.14.2 places parameters with a function that newer JAX means to drop.
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:brax")
+def test_learns_what_brax_s_own_loop_learns():
+    steps, config = 3, SMALL
+    size = config.batch_size * config.num_minibatches * config.unroll_length
+    _, params, losses = brax_ppo.train(
+        environment=Follower(),
+        wrap_env_fn=lambda env, **_: Braxs(env),
+        network_factory=lambda observation_size, action_size, preprocess_observations_fn=None: ppo.make_networks(
+            observation_size, action_size, config
+        ),
+        num_timesteps=steps * size,
+        num_evals=steps + 1,
+        run_evals=False,
+        num_eval_envs=1,
+        episode_length=1,
+        num_envs=config.num_envs,
+        unroll_length=config.unroll_length,
+        batch_size=config.batch_size,
+        num_minibatches=config.num_minibatches,
+        num_updates_per_batch=config.num_updates_per_batch,
+        learning_rate=config.learning_rate,
+        learning_rate_schedule="ADAPTIVE_KL",
+        desired_kl=config.desired_kl,
+        entropy_cost=config.entropy_cost,
+        discounting=config.discounting,
+        gae_lambda=config.gae_lambda,
+        clipping_epsilon=config.clipping_epsilon,
+        max_grad_norm=config.max_grad_norm,
+        normalize_observations=True,
+    )
+    state, metrics = learner.train(Follower(), dataclasses.replace(config, num_timesteps=steps * size))
+    ours = learner.params(state)
+    statistics, policy, value = jax.device_get(params)
+    # The two are compiled differently, which may cost the last digits.
+    close: Any = {"rtol": 1e-3, "atol": 2e-5}
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, **close), (state.networks.policy, ours.value), (policy, value)
+    )
+    for name in ("mean", "std"):
+        np.testing.assert_allclose(getattr(ours.normalizer, name)["state"], getattr(statistics, name)["state"], **close)
+    for name, loss in losses.items():
+        if name not in ("training/sps", "training/walltime"):
+            assert metrics[name.removeprefix("training/")] == pytest.approx(float(loss), rel=1e-3, abs=1e-5)
+
+
+def same(first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray]) -> bool:
+    return first.keys() == second.keys() and all(np.array_equal(first[name], second[name]) for name in first)
+
+
+@pytest.fixture(scope="module")
+def short() -> Learner:
+    return Learner(Follower(), SMALL)
+
+
+def after(learned: Learner, state: learner.TrainingState, steps: int) -> dict[str, np.ndarray]:
+    for _ in range(steps):
+        state, _ = learned.step(state)
+    return learner.stored(state)
+
+
+def test_going_on_from_a_stored_state_is_as_if_never_stopped(short):
+    straight = after(short, short.begin(3), 5)
+    part = after(short, short.begin(3), 2)
+    other = Learner(Follower(), SMALL)  # as in another process
+    state, whole = other.go_on(part)
+    assert whole and same(after(other, state, 3), straight)
+    assert not same(after(short, short.begin(4), 5), straight), "another seed"
+
+
+def test_the_policy_that_is_handed_out_is_an_average(short):
+    state = short.begin(0)
+    average: Any = None
+    for count in (1, 2, 3, 3, 3):
+        state, _ = short.step(state)
+        latest = jax.device_get(state.networks.policy)
+        average = latest if average is None else jax.tree.map(lambda a, b: a + (b - a) / count, average, latest)  # noqa: B023
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), learner.params(state).policy, average
+        )
+    assert not np.array_equal(*(jax.tree.leaves(x)[1] for x in (average, latest)))
+
+
+def test_the_training_step_is_compiled_once(short):
+    state = short.begin(0)
+    for _ in range(3):
+        state, _ = short.step(state)
+    state, _ = short.go_on(learner.stored(state))
+    short.step(state)
+    state = short.begin_from(learner.params(short.begin(1)), 100)
+    short.step(state)
+    assert short.step._cache_size() == 1
+
+
+def test_copies_of_a_state_outlive_it(short):
+    state = short.begin(0)
+    copies = learner.stored(state), learner.params(state)
+    before = jax.tree.map(np.copy, copies)
+    for _ in range(2):
+        state, _ = short.step(state)
+    jax.tree.map(np.testing.assert_array_equal, copies, before)
+
+
+def test_with_other_environments_the_optimizer_goes_on(short):
+    stored = after(short, short.begin(0), 2)
+    fewer = Learner(Follower(), dataclasses.replace(SMALL, num_envs=32))
+    state, whole = fewer.go_on(learner.with_learning_rate(stored, 0.125))
+    kept = learner.stored(state)
+    assert not whole
+    assert kept["environments.reward"].shape == (32,)
+    (rate,) = {float(value) for name, value in kept.items() if name.endswith("hyperparams.learning_rate")}
+    assert rate == 0.125
+    going = [
+        name for name in stored if name.split(".")[0] not in ("environments", "key") and "learning_rate" not in name
     ]
-    for first, second in zip(policies[0], policies[1], strict=True):
-        np.testing.assert_array_equal(first, second)
-    assert any(not np.array_equal(a, b) for a, b in zip(policies[0], policies[2], strict=True))
+    assert len(going) > 20 and all(np.array_equal(stored[name], kept[name]) for name in going)
+    wider = Learner(Follower(), dataclasses.replace(SMALL, value_layers=(17,)))
+    with pytest.raises(ValueError, match="another shape"):
+        wider.go_on(stored)
 
 
-def test_training_goes_on_from_restored_parameters(trained):
-    params, calls = trained
-    restored = ppo.from_tree(ppo.as_tree(params))
+def test_training_goes_on_from_parameters_alone(trained):
+    _, calls = trained
+    params = ppo.from_tree(ppo.as_tree(calls[-1][1]))
     steps = []
-    again, metrics = ppo.train(
+    state, metrics = learner.train(
         Follower(),
-        dataclasses.replace(SMALL, num_timesteps=2560),
-        lambda step, params, metrics: steps.append((step, params)),
-        restore=restored,
-        first_step=100,
+        dataclasses.replace(SMALL, num_timesteps=2660),
+        lambda step, state, metrics: steps.append((step, learner.params(state))),
+        start=lambda new: new.begin_from(params, 100),
     )
     assert [step for step, _ in steps] == [100, 2660]
     for kept, given in zip(jax.tree.leaves(steps[0][1]), jax.tree.leaves(params), strict=True):
         np.testing.assert_array_equal(kept, given)
     assert metrics["reward"] > 0.9 * calls[-1][2]["reward"]
-    assert again.normalizer.count == params.normalizer.count + 2560
+    assert learner.params(state).normalizer.count == params.normalizer.count + 2560
+
+
+def test_long_trainings_call_less_often_and_go_on_in_the_same_rhythm():
+    size = SMALL.batch_size * SMALL.num_minibatches * SMALL.unroll_length
+    config = dataclasses.replace(SMALL, num_timesteps=801 * size)  # more than twice as many as there are calls
+    assert learner._schedule(config, 0) == (3, 267)
+    assert learner._schedule(config, 300 * size) == (3, 167)
+    assert learner.total_timesteps(config, 300 * size) == learner.total_timesteps(config) == 801 * size
+    assert learner._schedule(config, 801 * size) == (3, 0)
+
+
+class Exploding(Follower):
+    """Whose observation, reward or metric is no number right of 0.5, and which does not notice."""
+
+    part = "obs"
+
+    def step(self, state: State, action: jax.Array) -> State:
+        after = super().step(state, action)
+        bad = physics(after)["position"] > 0.5
+        broken = jax.tree.map(lambda x: jnp.where(bad, jnp.nan, x), getattr(after, self.part))
+        return dataclasses.replace(after, **{self.part: broken})
+
+
+@pytest.mark.parametrize("part", ["obs", "reward", "metrics"])
+def test_numbers_that_are_none_reach_neither_learner_nor_means(part):
+    environment = Exploding()
+    environment.part = part
+    env = learner.wrap_for_training(environment)
+    state = env.reset(jax.random.split(jax.random.PRNGKey(0), 2))
+    before = physics(state)["goal"]
+    state = env.step(state, jnp.array([[0.6], [0.1]]))
+    np.testing.assert_array_equal(state.done, [1.0, 0.0])
+    np.testing.assert_array_equal(state.info["truncation"], 0.0)
+    np.testing.assert_array_equal(state.metrics["diverged"], [1.0, 0.0])
+    assert state.reward[0] == 0.0 and state.reward[1] > 0.0
+    assert physics(state)["goal"][0] != before[0] and physics(state)["goal"][1] == before[1]
+    assert all(
+        np.isfinite(leaf).all() for leaf in jax.tree.leaves((state.obs, state.reward, state.info, state.metrics))
+    )
 
 
 def test_fresh_policy_pushes_little(trained):
@@ -170,7 +279,7 @@ def test_fresh_policy_pushes_little(trained):
 
 
 def test_every_reset_draws_a_fresh_state():
-    env = ppo.wrap_for_training(Follower())
+    env = learner.wrap_for_training(Follower())
     step = jax.jit(env.step)
     state = jax.jit(env.reset)(jax.random.split(jax.random.key(0), 8))
     goals = [np.asarray(physics(state)["goal"])]
@@ -185,7 +294,7 @@ def test_every_reset_draws_a_fresh_state():
 
 
 def test_only_finished_environments_are_reset():
-    env = ppo.wrap_for_training(Follower())
+    env = learner.wrap_for_training(Follower())
     state = env.reset(jax.random.split(jax.random.key(0), 2))
     goals = np.asarray(physics(state)["goal"])
     for _ in range(3):
@@ -198,11 +307,12 @@ def test_only_finished_environments_are_reset():
     assert physics(state)["time"][1] == 3
     # Reward and metrics are the finished episode's, not the fresh one's.
     assert state.reward[0] < 0.01 and state.metrics["distance"][0] > 2.0
-    np.testing.assert_allclose(state.obs["progress"], np.stack([state.reward, state.metrics["distance"]], 1))
+    np.testing.assert_array_equal(state.info["measured"]["reward"], state.reward)
+    np.testing.assert_array_equal(state.info["measured"]["distance"], state.metrics["distance"])
 
 
 def test_time_limit_is_told_from_an_end():
-    env = ppo.wrap_for_training(Follower())
+    env = learner.wrap_for_training(Follower())
     state = env.reset(jax.random.split(jax.random.key(0), 2))
     ends = []
     for _ in range(Follower.limit + 1):

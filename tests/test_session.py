@@ -1,33 +1,69 @@
 """Between PPO and the run's folder: what interrupts, breaks or doubles a training."""
 
+import dataclasses
 import io
+import json
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as ocp
 import pytest
+from brax.training.acme import running_statistics
+from brax.training.agents.ppo.losses import PPONetworkParams
+from brax.training.types import UInt64
+from follower import Follower
 
-from ballu_mjx import ppo, runs
+from ballu_mjx import learner, ppo, runs
 from ballu_mjx.errors import InputError
+from ballu_mjx.learner import Learner, TrainingState
+from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.runs import Progress, Run
-from ballu_mjx.session import Session
+from ballu_mjx.session import Session, Start, _made_with, start_from
 
 GOOD = {"reward": 0.1, "diverged": 0.0, "steps_per_second": 100.0, "total_loss": 0.5}
 
 
-def params(value: float) -> ppo.Params:
-    moments = ({"state": np.full(2, value, np.float32)},) * 3
-    weights = {"w": np.full(3, value, np.float32)}
-    return ppo.Params(ppo.Normalizer(np.float32(1) * np.ones(()), *moments), weights, weights)
+CONFIG = PPOConfig(
+    num_timesteps=1000, num_envs=8, batch_size=8, num_minibatches=2, policy_layers=(4,), value_layers=(4,)
+)
+
+
+def state(value: float) -> TrainingState:
+    """One that nobody will go on from."""
+    weights = {"w": jnp.full(3, value)}
+    array: Any = jnp.full(2, value)
+    return TrainingState(
+        networks=PPONetworkParams(policy=weights, value=weights),  # pyright: ignore[reportCallIssue]
+        averaged=weights,
+        averaged_steps=jnp.zeros((), jnp.int32),
+        optimizer=array,
+        normalizer=running_statistics.init_state({"state": array}),
+        environments=array,
+        key=jnp.zeros(2, jnp.uint32),
+        steps=UInt64(hi=0, lo=0),  # pyright: ignore[reportCallIssue]
+    )
+
+
+def content(config: PPOConfig = CONFIG, **sections: Any) -> dict[str, Any]:
+    return {
+        "format": runs.FORMAT,
+        "task": "walk",
+        "ppo": dataclasses.asdict(config),
+        "recordings": {},
+        "starts": [],
+    } | sections
 
 
 def open_run(folder: Path) -> Run:
-    return Run(folder, {"format": runs.FORMAT, "task": "walk", "starts": []})
+    return Run(folder, content())
 
 
 def session_in(run: Run, **options) -> Session:
-    return Session(run, Progress(1000, stream=io.StringIO()), keep_every=100, kept_at=None, **options)
+    return Session(run, Progress(1000, stream=io.StringIO()), keep_every=100, **options)
 
 
 def test_a_run_is_written_by_one_process_at_a_time(tmp_path):
@@ -45,11 +81,14 @@ def test_a_signal_ends_training_after_the_step_and_is_told_to_the_shell(tmp_path
         with open_run(tmp_path / "run") as run:
             session = session_in(run)
             with session._interrupts_noted():
-                session._step_done(100, params(1.0), GOOD)
+                session._step_done(100, state(1.0), GOOD)
                 os.kill(os.getpid(), number)
                 with pytest.raises(KeyboardInterrupt):
-                    session._step_done(120, params(2.0), GOOD)
+                    session._step_done(120, state(2.0), GOOD)
         assert session.exit_status == 128 + number
+        stopped = runs.last_checkpoint(tmp_path / "run", training=True)
+        assert (stopped.step, stopped.notes["due"]) == (120, 100) and stopped.training is not None
+        assert runs.restore(tmp_path / "run", "best")[0] == 100, "nobody has measured the other"
         assert signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL), "given back"
     finally:
         signal.signal(number, before)
@@ -58,11 +97,11 @@ def test_a_signal_ends_training_after_the_step_and_is_told_to_the_shell(tmp_path
 def test_a_loss_that_is_no_number_ends_training_with_the_last_good_checkpoint(tmp_path):
     with open_run(tmp_path / "run") as run:
         session = session_in(run)
-        session._step_done(100, params(1.0), GOOD)
+        session._step_done(100, state(1.0), GOOD)
         with pytest.raises(
             InputError, match="total_loss is not a number any more. The last good checkpoint is that of step 100"
         ):
-            session._step_done(200, params(np.nan), GOOD | {"total_loss": float("nan")})
+            session._step_done(200, state(np.nan), GOOD | {"total_loss": float("nan")})
     step, tree = runs.restore(tmp_path / "run", "last")
     assert step == 100 and np.all(tree["policy"]["w"] == 1.0)
     assert [row["step"] for row in runs.read_metrics(tmp_path / "run")] == [100]
@@ -72,7 +111,7 @@ def test_diverging_physics_is_told_once_and_only_above_a_thousandth(tmp_path, ca
     with open_run(tmp_path / "run") as run:
         session = session_in(run)
         for step, share in ((100, 0.0005), (200, 0.02), (300, 0.03)):
-            session._step_done(step, params(1.0), GOOD | {"diverged": share})
+            session._step_done(step, state(1.0), GOOD | {"diverged": share})
     error = capsys.readouterr().err
     assert error.count("Physics diverged") == 1 and "2.00%" in error
 
@@ -80,8 +119,97 @@ def test_diverging_physics_is_told_once_and_only_above_a_thousandth(tmp_path, ca
 def test_without_validation_the_greatest_reward_is_the_best_checkpoint(tmp_path):
     with open_run(tmp_path / "run") as run:
         session = session_in(run)
-        session._step_done(0, params(0.0), {})
+        session._step_done(0, state(0.0), {})
         for step, reward in ((100, 0.1), (200, 0.3), (300, 0.2)):
-            session._step_done(step, params(step), GOOD | {"reward": reward})
+            session._step_done(step, state(step), GOOD | {"reward": reward})
     assert runs.restore(tmp_path / "run", "best")[0] == 200
     assert runs.restore(tmp_path / "run", "last")[0] == 300
+
+
+@pytest.fixture(scope="module")
+def small() -> Learner:
+    return Learner(Follower(), CONFIG)
+
+
+def saved(folder: Path, state: TrainingState, config: dict[str, Any], step: int = 160) -> Path:
+    with Run(folder, config) as run:
+        tree, training = ppo.as_tree(learner.params(state)), learner.stored(state)
+        run.save(step, tree, -1.0, training=training, notes=_made_with(config))
+    return folder
+
+
+def resumed(folder: Path, config: PPOConfig) -> Start:
+    return start_from("walk", folder, config, output=None, quick=False)
+
+
+def test_a_run_goes_on_with_its_whole_state(tmp_path, small, capsys):
+    before = small.begin(5)
+    start = resumed(saved(tmp_path / "run", before, content(env={"friction": (1.0, 2.0)})), CONFIG)
+    again = start.state(small, CONFIG, _made_with(content(env={"friction": [1.0, 2.0]})))
+    for name, value in learner.stored(before).items():
+        np.testing.assert_array_equal(learner.stored(again)[name], value)
+    assert start.step == 160 and capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("ppo_change", "sections"),
+    [({"seed": 1}, {}), ({}, {"env": {"friction": 2}}), ({}, {"recordings": {"training": [{"sha256": "1"}]}})],
+)
+def test_changed_options_start_the_environments_anew(tmp_path, small, capsys, ppo_change, sections):
+    before = small.begin(5)
+    start = resumed(saved(tmp_path / "run", before, content()), CONFIG)
+    changed = dataclasses.replace(CONFIG, learning_rate=0.5, **ppo_change)
+    again = learner.stored(start.state(small, changed, _made_with(content(changed, **sections))))
+    said = capsys.readouterr().out
+    assert (
+        "the environments start anew, for the options changed; the optimizer goes on" in said and said.count("\n") == 1
+    )
+    stored = learner.stored(before)
+    assert np.array_equal(again["optimizer.1.count"], stored["optimizer.1.count"])
+    assert again["optimizer.1.hyperparams.learning_rate"] == 0.5
+    goal = "environments.pipeline_state.goal"
+    assert again[goal].shape == stored[goal].shape and not np.array_equal(again[goal], stored[goal])
+
+
+def test_a_run_of_an_older_version_goes_on_from_its_parameters(tmp_path, small, capsys):
+    before = small.begin(5)
+    folder = tmp_path / "run"
+    params = learner.params(before)
+    with Run(folder, content()):
+        pass
+    options = ocp.CheckpointManagerOptions(enable_async_checkpointing=False)
+    with ocp.CheckpointManager((folder / "checkpoints").resolve(), options=options) as manager:
+        manager.save(160, args=ocp.args.StandardSave(ppo.as_tree(params)))
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | {"format": "ballu-run/1"}))
+    start = resumed(folder, CONFIG)
+    again = learner.params(start.state(small, CONFIG, _made_with(content())))
+    assert "an older version kept parameters alone" in capsys.readouterr().out
+    assert start.step == 160
+    for name, value in learner.stored(before).items():
+        if name.startswith("networks"):
+            np.testing.assert_array_equal(
+                learner.stored(start.state(small, CONFIG, _made_with(content())))[name], value
+            )
+    np.testing.assert_array_equal(again.normalizer.mean["state"], params.normalizer.mean["state"])
+    with Run(folder, content(), resumed_at=160) as run:
+        run.save(240, ppo.as_tree(params), None)
+    assert runs.checkpoints(folder) == [160, 240] and runs.last_checkpoint(folder).step == 240
+
+
+def test_a_run_without_a_checkpoint_begins_again_in_its_folder(tmp_path, capsys):
+    folder = tmp_path / "run"
+    with open_run(folder) as run:
+        run.log(0, {"validation_error": 1.0})
+    start = resumed(folder, CONFIG)
+    assert "starting from the beginning" in capsys.readouterr().err
+    with Run(folder, content(), resumed_at=start.resumed_at):
+        assert runs.read_metrics(folder) == [], "it will be measured again"
+
+
+def test_a_run_that_ended_without_its_results_may_go_on_to_them(tmp_path, small):
+    folder = saved(tmp_path / "run", small.begin(5), content(), step=1120)
+    assert resumed(folder, CONFIG).step == 1120
+    (folder / "replay.npz").write_bytes(b"")
+    with pytest.raises(InputError, match="already"):
+        resumed(folder, CONFIG)

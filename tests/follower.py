@@ -1,0 +1,65 @@
+"""An environment that is learned within seconds, without physics to compile."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+
+
+class Follower(Env):
+    """A point mass pushed along a line, rewarded for staying at a place drawn at the start."""
+
+    limit = 10
+
+    def reset(self, rng: jax.Array) -> State:
+        goal = jax.random.uniform(rng, (), minval=-1.0, maxval=1.0)
+        physics = {"position": jnp.zeros(()), "velocity": jnp.zeros(()), "goal": goal, "time": jnp.zeros((), jnp.int32)}
+        zero = jnp.zeros(())
+        return State(
+            physics,  # pyright: ignore
+            self._observe(physics),
+            zero,
+            zero,
+            {"distance": zero},
+            {"truncation": zero},
+        )
+
+    def step(self, state: State, action: jax.Array) -> State:
+        s = physics(state)
+        velocity = 0.5 * s["velocity"] + action[0]
+        s = s | {"velocity": velocity, "position": s["position"] + velocity, "time": s["time"] + 1}
+        distance = jnp.abs(s["position"] - s["goal"])
+        escaped = jnp.abs(s["position"]) > 3.0
+        late = s["time"] >= self.limit
+        return dataclasses.replace(
+            state,
+            pipeline_state=s,
+            obs=self._observe(s),
+            reward=jnp.exp(-4.0 * distance),
+            done=jnp.asarray(escaped | late, jnp.float32),
+            metrics={"distance": distance},
+            info=state.info | {"truncation": jnp.asarray(late & ~escaped, jnp.float32)},
+        )
+
+    def _observe(self, s: dict) -> jax.Array:
+        return jnp.stack([s["position"] - s["goal"], s["velocity"]])
+
+    @property
+    def observation_size(self) -> int:
+        return 2
+
+    @property
+    def action_size(self) -> int:
+        return 1
+
+    @property
+    def backend(self) -> str:
+        return "none"
+
+
+def physics(state: State) -> dict[str, Any]:
+    return state.pipeline_state  # pyright: ignore
