@@ -105,13 +105,14 @@ class Aerodynamics:
         commands: Float[Array, "steps 2"],
         key: Array | None = None,
     ) -> Float[Array, " 6"]:
-        """Drag, from the balloon's velocity now and its turn over the last control step, through still air."""
+        """Drag in still air, by the velocities in the middle of the coming control step, extrapolated from the last."""
         del commands, key
-        now, before = rotation(history[-1, 6:9]), rotation(history[-2, 6:9])
-        velocity = now.T @ history[-1, 3:6]
+        earlier, before, now = (rotation(seen[6:9]) for seen in history[-3:])
+        velocity = now.T @ (1.5 * history[-1, 3:6] - 0.5 * history[-2, 3:6])
+        turned = 2 * turn(before.T @ now) - turn(earlier.T @ before)
         speed = jnp.sqrt(jnp.sum(velocity**2) + _SLOW**2)
         force = -(params.linear_drag + params.quadratic_drag * speed) * velocity
-        torque = -params.turning_drag * turn(before.T @ now) / ballu.CONTROL_TIMESTEP
+        torque = -params.turning_drag * turned / ballu.CONTROL_TIMESTEP
         return jnp.concatenate([now @ force, now @ torque])
 
 

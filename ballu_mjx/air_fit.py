@@ -60,7 +60,6 @@ def details(result: AirFit) -> dict[str, Any]:
         "format": aerodynamics.FORMAT,
         "parameters": aerodynamics.as_json(result.parameters),
         "standard_errors": aerodynamics.as_json(result.standard_errors),
-        "draughts": result.draughts,
         "windows": result.windows,
         "cost": {"without": result.cost[0], "with": result.cost[1]},
     }

@@ -31,13 +31,10 @@ from ballu_mjx.reconstruction import Motion
 class AirConfig:
     """How to identify the air."""
 
-    window_seconds: float = 1.0
-    """Length of a window, s."""
-    interval_seconds: float = 1.0
+    window_seconds: float = 2.0
+    """Length of a window, s. Shorter ones leave more to the starting state, and gave the added mass a half too high."""
+    interval_seconds: float = 2.0
     """Time between the starts of two windows, s."""
-    draughts: bool = False
-    """Estimate a constant horizontal draught for each recording beside the shared parameters. It is the day's: no
-    simulation uses it, but drag and the balloon's centre come out unspoiled by it."""
     evaluations: int = 12
     """Most steps of the least-squares solver."""
 
@@ -61,8 +58,6 @@ SCALES: dict[str, Scale] = {
     "delay": Scale(0.03),
 }
 """By name; SI units."""
-DRAUGHT = Scale(0.03, 1.0)
-"""Of each component, m/s."""
 _POSITION = (0.003, 0.02)
 """Expected error of the balloon's position (m) at a window's start, and what each second adds."""
 _ANGLE = (np.deg2rad(0.5), np.deg2rad(1.5))
@@ -79,9 +74,7 @@ class AirFit:
 
     parameters: AirParameters
     standard_errors: AirParameters
-    """Of white noise in windows independent of each other, beside the prior."""
-    draughts: dict[str, tuple[float, float]]
-    """Horizontal air velocity (m/s, world) by recording; empty where none were estimated."""
+    """Of windows that err independently, by as much as expected."""
     cost: tuple[float, float]
     """Half the sum of squares, softened, without the residual and at the end."""
     windows: int
@@ -128,68 +121,47 @@ def identify(
     owner = np.repeat(aerodynamics.NAMES, [getattr(none, name).size for name in aerodynamics.NAMES])
     scale, prior = np.array([SCALES[name] for name in owner]).T
     places = np.flatnonzero(np.isin(owner, free))
-    low = np.where(np.isin(owner, aerodynamics.SIGNED), -np.inf, 0.0)
-    draughts = 2 * len(motions) if config.draughts else 0
-    prior = np.concatenate([prior[places], np.full(draughts, DRAUGHT.prior)])
 
-    def split(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def whole(x: np.ndarray) -> np.ndarray:
         vector = start.copy()
-        vector[places] = x[: len(places)] * scale[places]
-        draught = x[len(places) :].reshape(-1, 2) * DRAUGHT.typical if draughts else np.zeros((len(motions), 2))
-        return vector, draught
+        vector[places] = x * scale[places]
+        return vector
 
     evaluations = 0
 
     def residuals(x: np.ndarray) -> np.ndarray:
         nonlocal evaluations
         evaluations += 1
-        errors = _soften(windows.errors(*split(x)))[0]
-        total = np.concatenate([errors.ravel(), x / prior])
+        total = np.concatenate([_soften(windows.errors(whole(x)))[0].ravel(), x / prior[places]])
         report(evaluations, _cost(total))
         return total
 
     def jacobian(x: np.ndarray) -> np.ndarray:
-        vector, draught = split(x)
-        errors = windows.errors(vector, draught)
-        columns = np.zeros((*errors.shape, len(x)))
-        for column, place in enumerate(places):
-            direction = scale[place] * np.eye(len(vector))[place]
-            columns[..., column] = windows.derivative(vector, draught, direction, np.zeros(2))
-        for axis in range(2 if draughts else 0):
-            along = DRAUGHT.typical * np.eye(2)[axis]
-            found = windows.derivative(vector, draught, np.zeros(len(vector)), along)
-            for number in range(len(motions)):
-                mine = windows.recording == number
-                columns[mine, :, len(places) + 2 * number + axis] = found[mine]
-        softened = _soften(errors, columns)[1].reshape(-1, len(x))
-        return np.concatenate([softened, np.diag(1 / prior)])
+        vector = whole(x)
+        along = [windows.derivative(vector, scale[place] * np.eye(len(vector))[place]) for place in places]
+        softened = _soften(windows.errors(vector), np.stack(along, axis=-1))[1]
+        return np.concatenate([softened.reshape(-1, len(x)), np.diag(1 / prior[places])])
 
-    x = np.concatenate([start[places] / scale[places], np.zeros(draughts)])
-    bound = np.concatenate([low[places], np.full(draughts, -np.inf)])
-    longest = np.where(owner == "delay", aerodynamics.LONGEST_DELAY / scale, np.inf)
-    ceiling = np.concatenate([longest[places], np.full(draughts, np.inf)])
-    first = residuals(x)
+    x = start[places] / scale[places]
+    low = np.where(np.isin(owner, aerodynamics.SIGNED), -np.inf, 0.0)[places]
+    high = np.where(owner == "delay", aerodynamics.LONGEST_DELAY / scale, np.inf)[places]
+    without = _cost(residuals(x))
     if known is None:  # not from the bound, where what must be positive has nowhere to go but up
-        x = np.where(np.isfinite(bound), 1.0, x)
+        x = np.where(np.isfinite(low), 1.0, x)
     solution = scipy.optimize.least_squares(
         residuals,
         x,
         jacobian,  # pyright: ignore[reportArgumentType]
-        bounds=(bound, ceiling),
+        bounds=(low, high),
         max_nfev=config.evaluations,
     )
-    vector, draught = split(solution.x)
-    deviation = np.sqrt(np.diag(np.linalg.pinv(solution.jac.T @ solution.jac)))[: len(places)]
-    errors = np.zeros(len(vector))
-    errors[places] = deviation * scale[places]
+    errors = np.zeros(len(start))
+    errors[places] = np.sqrt(np.diag(np.linalg.pinv(solution.jac.T @ solution.jac))) * scale[places]
     return AirFit(
-        parameters=unravel(jnp.asarray(vector, jnp.float32)),
+        parameters=unravel(jnp.asarray(whole(solution.x), jnp.float32)),
         standard_errors=unravel(jnp.asarray(errors, jnp.float32)),
-        draughts={m.name: (float(d[0]), float(d[1])) for m, d in zip(motions, draught, strict=True)}
-        if draughts
-        else {},
-        cost=(_cost(first), float(solution.cost)),
-        windows=len(windows.recording),
+        cost=(without, float(solution.cost)),
+        windows=windows.count,
     )
 
 
@@ -228,7 +200,7 @@ class _Windows:
         ]
         if not places:
             raise InputError(f"No recording lasts {config.window_seconds:g} s; give longer ones, or --window-seconds.")
-        self.recording = np.array([number for number, _ in places])
+        self.count = len(places)
         reference, _ = envmimic.stack(self._simulator, motions)
         qpos, qvel, features, command = (np.asarray(x) for x in reference[:4])
         cut = lambda array, first, count: np.stack([array[r, s + first : s + first + count] for r, s in places])  # noqa: E731
@@ -249,47 +221,39 @@ class _Windows:
             jax.shard_map(
                 self._batch,
                 mesh=mesh,
-                in_specs=(spec(), spec(), spec("batch"), spec("batch"), spec("batch")),
+                in_specs=(spec(), spec(), spec("batch")),
                 out_specs=spec("batch"),
                 check_vma=False,
             )
         )
 
-    def errors(self, vector: np.ndarray, draughts: np.ndarray) -> Float[np.ndarray, "windows entries"]:
+    def errors(self, vector: np.ndarray) -> Float[np.ndarray, "windows entries"]:
         """Errors of the simulated windows, in expected ones."""
-        return self._all(vector, draughts, np.zeros_like(vector), np.zeros(2))[0]
+        return self._all(vector, np.zeros_like(vector))[0]
 
-    def derivative(
-        self, vector: np.ndarray, draughts: np.ndarray, direction: np.ndarray, draught: np.ndarray
-    ) -> Float[np.ndarray, "windows entries"]:
-        """Of `errors`, along a direction of the parameters, and one of every recording's draught."""
-        return self._all(vector, draughts, direction, draught)[1]
+    def derivative(self, vector: np.ndarray, direction: np.ndarray) -> Float[np.ndarray, "windows entries"]:
+        """Of `errors`, along a direction of the parameters."""
+        return self._all(vector, direction)[1]
 
-    def _all(
-        self, vector: np.ndarray, draughts: np.ndarray, direction: np.ndarray, draught: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        count, devices = len(self.recording), jax.local_device_count()
-        filled = np.arange(-(-count // devices) * devices) % count
-        local = np.float32(draughts[self.recording[filled]]), np.float32(np.tile(draught, (len(filled), 1)))
+    def _all(self, vector: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        devices = jax.local_device_count()
+        filled = np.arange(-(-self.count // devices) * devices) % self.count
         data = tuple(x[filled] for x in self._data)
-        found = self._run(np.float32(vector), np.float32(direction), *local, data)
-        errors, slopes = (np.array(x, np.float64)[:count] for x in found)
+        found = self._run(np.float32(vector), np.float32(direction), data)
+        errors, slopes = (np.array(x, np.float64)[: self.count] for x in found)
         lost = ~(np.isfinite(errors).all(axis=1) & np.isfinite(slopes).all(axis=1))
         errors[lost], slopes[lost] = _LOST / np.sqrt(errors.shape[1]), 0.0
         return errors, slopes
 
-    def _batch(
-        self, vector: Array, direction: Array, draughts: Array, along: Array, data: tuple
-    ) -> tuple[Array, Array]:
-        def one(draught: Array, draught_along: Array, own: tuple) -> tuple[Array, Array]:
-            return jax.jvp(lambda v, d: self._one(v, d, *own), (vector, draught), (direction, draught_along))
+    def _batch(self, vector: Array, direction: Array, data: tuple) -> tuple[Array, Array]:
+        def one(*own: Array) -> tuple[Array, Array]:
+            return jax.jvp(lambda vector: self._one(vector, *own), (vector,), (direction,))
 
-        return jax.vmap(one)(draughts, along, data)
+        return jax.vmap(one)(*data)
 
     def _one(
         self,
         vector: Float[Array, " parameters"],
-        draught: Float[Array, " 2"],
         qpos: Float[Array, " nq"],
         qvel: Float[Array, " nv"],
         history: Float[Array, "history 27"],
@@ -298,15 +262,14 @@ class _Windows:
     ) -> Float[Array, " entries"]:
         air = self._unravel(vector)
         simulator = self._simulator.altered(self._air.fields(air))
-        wind = jnp.zeros(27).at[3:5].set(draught)
         # What the parameters will move depends on them from the start, formally: JAX then traces the loops once.
-        nothing = 0.0 * (vector[0] + draught[0])
+        nothing = 0.0 * vector[0]
         state = jax.tree.map(lambda x: x + nothing, simulation.at(qpos, qvel))
 
         def step(carry: tuple, time: Int[Array, ""]) -> tuple[tuple, Array]:
             state, history = carry
             seen = jax.lax.dynamic_slice_in_dim(command, time, envmimic.HISTORY)
-            wrench = self._air.wrench(air, history - wind, seen)
+            wrench = self._air.wrench(air, history, seen)
             state = simulator.step(state, self._air.command(air, seen), wrench)
             features, _ = simulator.observe(state)
             return (state, jnp.concatenate([history[1:], features[None]])), features

@@ -78,11 +78,14 @@ def history(euler: np.ndarray, velocity: np.ndarray, turning: np.ndarray) -> jnp
     """Features of a balloon that moves and turns; `turning` in its own frame."""
     now = aerodynamics.rotation(jnp.asarray(euler))
     hat = np.array([[0, -turning[2], turning[1]], [turning[2], 0, -turning[0]], [-turning[1], turning[0], 0]])
-    before = now @ jax.scipy.linalg.expm(jnp.asarray(-robot.CONTROL_TIMESTEP * hat))
-    yaw, pitch = jnp.arctan2(before[1, 0], before[0, 0]), jnp.arcsin(-before[2, 0])
-    angles = [jnp.array([jnp.arctan2(before[2, 1], before[2, 2]), pitch, yaw])] * 2 + [jnp.asarray(euler)]
+
+    def angles(age: int) -> jnp.ndarray:
+        matrix = now @ jax.scipy.linalg.expm(jnp.asarray(-age * robot.CONTROL_TIMESTEP * hat))
+        roll, yaw = jnp.arctan2(matrix[2, 1], matrix[2, 2]), jnp.arctan2(matrix[1, 0], matrix[0, 0])
+        return jnp.array([roll, jnp.arcsin(-matrix[2, 0]), yaw])
+
     seen = jnp.zeros((envmimic.HISTORY, 27)).at[:, 3:6].set(jnp.asarray(velocity))
-    return seen.at[:, 6:9].set(jnp.stack(angles))
+    return seen.at[:, 6:9].set(jnp.stack([angles(age) for age in (2, 1, 0)]))
 
 
 def test_no_air_is_the_nominal_model():
