@@ -1,12 +1,13 @@
 # %% [markdown]
-# # EnvMimic over seeds: the README's tables and figure
+# # Fidelity: the README's tables and figure
 #
 # Section "Improved Simulation Fidelity" of the paper, open loop: recorded commands are replayed from recorded states in
-# four simulators, on recordings that training never saw: vanilla, vanilla with identified actuators (vanilla+sysid),
-# and either with EnvMimic's forces. One run of `python -m ballu_mjx.train envmimic` a seed, on identified actuators and
-# on nominal ones; runs that are there already are not repeated.
+# six simulators, on recordings that training never saw: vanilla, vanilla with identified actuators (vanilla+sysid),
+# either with EnvMimic's forces, and the second with the identified air (aerodynamic), alone and with EnvMimic's forces
+# for what that leaves. One run of `python -m ballu_mjx.train envmimic` a seed and kind, one of `train residual`; runs
+# that are there already are not repeated.
 #
-# `python experiments/envmimic_seeds.py` takes about forty minutes on two cores; `--quick` shows that it works.
+# `python experiments/fidelity.py` takes about an hour on two cores; `--quick` shows that it works.
 
 # %%
 from __future__ import annotations
@@ -42,15 +43,15 @@ from ballu_mjx import evaluation, plots, reconstruction, recording, residual, ro
 
 
 # %%
-KINDS = {"identified": [], "nominal": ["--actuators", "nominal"]}
-"""Options of the runs, by the actuators of their simulator."""
+KINDS = {"nominal": "EnvMimic", "identified": "EnvMimic on identified actuators", "hybrid": "aerodynamic+EnvMimic"}
+"""Of EnvMimic, with what their simulators are called in the tables."""
 
 
-def train(seed: int, folder: Path, options: list[str]) -> None:
-    """Run the main job for one seed, unless its evaluation is there."""
+def train(folder: Path, *arguments: str) -> None:
+    """Run `python -m ballu_mjx.train` into `folder`, unless its evaluation is there."""
     if not (folder / "evaluation.json").exists():
-        command = [sys.executable, "-m", "ballu_mjx.train", "envmimic", "--seed", str(seed), "--output", str(folder)]
-        subprocess.run(command + options, check=True)
+        command = [sys.executable, "-m", "ballu_mjx.train", *arguments, "--output", str(folder)]
+        subprocess.run(command, check=True)
 
 
 def load(folder: Path) -> evaluation.Evaluation:
@@ -77,16 +78,19 @@ def spread(values: list[float], digits: int = 2) -> str:
     return f"{np.mean(values):.{digits}f} ({min(values):.{digits}f} to {max(values):.{digits}f})"
 
 
-def comparison(nominal: list[evaluation.Evaluation], identified: list[evaluation.Evaluation]) -> str:
-    """Markdown: RMSE of the four simulators, and in brackets what that leaves of vanilla's."""
+def comparison(results: dict[str, list[evaluation.Evaluation]]) -> str:
+    """Markdown: RMSE of the simulators, and in brackets what that leaves of vanilla's."""
+    nominal, identified = results["nominal"], results["identified"]
     columns = [(group, horizon) for group in nominal[0].groups for horizon in evaluation.SCORE_HORIZONS]
     head = [f"{group}, {horizon:g} s: m, deg" for group, horizon in columns]
     lines = ["| simulator | " + " | ".join(head) + " |", "| --- " * (1 + len(columns)) + "|"]
     rows = {
         "vanilla": [run.vanilla for run in nominal],
         "vanilla+sysid": [run.vanilla for run in identified],
-        "EnvMimic": [run.residual for run in nominal],
-        "EnvMimic on identified actuators": [run.residual for run in identified],
+        KINDS["nominal"]: [run.residual for run in nominal],
+        KINDS["identified"]: [run.residual for run in identified],
+        "aerodynamic": [run.residual for run in results["aerodynamic"]],
+        KINDS["hybrid"]: [run.residual for run in results["hybrid"]],
     }
     for label, runs in rows.items():
         cells = []
@@ -103,11 +107,11 @@ def comparison(nominal: list[evaluation.Evaluation], identified: list[evaluation
     return "\n".join(lines)
 
 
-def table(runs: list[evaluation.Evaluation], base: str) -> str:
-    """Markdown: RMSE of the simulator `base` and of EnvMimic on it, and their ratio, by group and horizon."""
+def table(runs: list[evaluation.Evaluation], base: str, name: str) -> str:
+    """Markdown: RMSE of the simulator `base` and of `name`, and their ratio, by group and horizon."""
     lines = [
-        f"| test recordings | horizon (s) | position, {base} (m) | EnvMimic (m) | ratio | yaw, {base} (deg) | "
-        "EnvMimic (deg) | ratio |",
+        f"| test recordings | horizon (s) | position, {base} (m) | {name} (m) | ratio | yaw, {base} (deg) | "
+        f"{name} (deg) | ratio |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for group in runs[0].groups:
@@ -124,7 +128,7 @@ def table(runs: list[evaluation.Evaluation], base: str) -> str:
             lines.append(f"| {group} | {horizon:g} | " + " | ".join(cells) + " |")
     lines += [
         "",
-        f"| whole recording | CoM error, {base} (m) | EnvMimic (m) | final yaw error, {base} (deg) | EnvMimic (deg) |",
+        f"| whole recording | CoM error, {base} (m) | {name} (m) | final yaw error, {base} (deg) | {name} (deg) |",
     ]
     lines.append("| --- | --- | --- | --- | --- |")
     for index, without in enumerate(runs[0].vanilla):
@@ -154,19 +158,21 @@ def against(nominal: list[evaluation.Evaluation], runs: list[evaluation.Evaluati
 
 
 # %%
-def figure(folders: list[Path], path: Path) -> None:
-    """Replay the test recordings in vanilla, with identified actuators, and with every seed's forces beside these."""
-    policies = [residual.Residual.load(folder) for folder in folders]
+def figure(folders: list[Path], air: Path, path: Path) -> None:
+    """Replay the test recordings in vanilla, with identified actuators, with every seed's forces beside these, and with
+    the identified air."""
+    policies, blown = [residual.Residual.load(folder) for folder in folders], residual.Residual.load(air)
 
-    def simulator(actuators: robot.ActuatorParameters | None) -> evaluation.OpenLoopEvaluator:
+    def simulator(actuators: robot.ActuatorParameters | None, kind: residual.Residual) -> evaluation.OpenLoopEvaluator:
         model = robot.load_model(actuators)
         motions = [reconstruction.reconstruct(recording.read_recording(p), model) for p in recording.bundled("test")]
-        return evaluation.OpenLoopEvaluator(model, motions, policies[0].model)
+        return evaluation.OpenLoopEvaluator(model, motions, kind.model)
 
-    evaluator = simulator(policies[0].actuators)
+    evaluator = simulator(policies[0].actuators, policies[0])
     replays = [evaluator.replay(policy.params) for policy in policies]
     identified = evaluator.replay(policies[0].params, scale=0.0)
-    vanilla = simulator(None).replay(policies[0].params, scale=0.0)
+    vanilla = simulator(None, policies[0]).replay(policies[0].params, scale=0.0)
+    aerodynamic = simulator(blown.actuators, blown).replay(blown.params)
     panels = []
     for motion, run in zip(evaluator.motions, evaluator.first_runs, strict=True):
         position, yaw = evaluator.recorded(run)
@@ -184,6 +190,7 @@ def figure(folders: list[Path], path: Path) -> None:
                     "vanilla": curve(vanilla),
                     "vanilla+sysid": curve(identified),
                     "envmimic": np.stack([curve(replay) for replay in replays]),
+                    "aerodynamic": curve(aerodynamic),
                 },
             )
         )
@@ -206,10 +213,10 @@ class Options:
 
 
 def parse() -> Options:
-    parser = argparse.ArgumentParser(description="EnvMimic over seeds: the README's table and figure.")
+    parser = argparse.ArgumentParser(description="Fidelity of six simulators: the README's tables and figure.")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="one training a seed")
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the larger test set")
-    parser.add_argument("--output", type=Path, default=Path("runs/envmimic-seeds"), help="folder of the runs")
+    parser.add_argument("--output", type=Path, default=Path("runs/fidelity"), help="folder of the runs")
     parser.add_argument("--quick", action="store_true", help="train for seconds; the numbers mean nothing")
     arguments = parser.parse_args()
     return Options(arguments.seeds, arguments.fresh, arguments.output, arguments.quick)
@@ -217,23 +224,31 @@ def parse() -> Options:
 
 def main() -> None:
     options = parse()
-    extra = ["--quick", "--test", str(robot.assets() / "recordings" / "test")] if options.quick else []
-    folders = {kind: [options.output / f"{kind}-seed-{seed}" for seed in options.seeds] for kind in KINDS}
-    for kind, arguments in KINDS.items():
+    quick = ["--quick"] if options.quick else []
+    # A quick training tests on what it validates on: the tables need the test recordings.
+    extra = [*quick, "--test", str(robot.assets() / "recordings" / "test")] if options.quick else []
+    air = options.output / "aerodynamic"
+    train(air, "residual", "--method", "aerodynamic", *extra)
+    kinds = {"nominal": ["--actuators", "nominal"], "identified": [], "hybrid": ["--residual", str(air)]}
+    folders = {kind: [options.output / f"{kind}-seed-{seed}" for seed in options.seeds] for kind in kinds}
+    for kind, arguments in kinds.items():
         for seed, folder in zip(options.seeds, folders[kind], strict=True):
-            train(seed, folder, [*extra, *arguments])
-    runs = {kind: [load(folder) for folder in folders[kind]] for kind in KINDS}
+            train(folder, "envmimic", "--seed", str(seed), *extra, *arguments)
+    folders["aerodynamic"] = [air]
+    runs = {kind: [load(folder) for folder in members] for kind, members in folders.items()}
     paths = bundled_recordings.fresh(options.fresh, options.output, 1 if options.quick else 6)
-    larger = {kind: evaluate(folders[kind], paths) for kind in KINDS}
+    larger = {kind: evaluate(members, paths) for kind, members in folders.items()}
     parts = []
     for title, results in (("Bundled test recordings", runs), ("Fresh test recordings", larger)):
-        nominal, identified = results["nominal"], results["identified"]
-        parts += [f"### {title}", comparison(nominal, identified)]
-        parts += ["EnvMimic on identified actuators. " + worst_case(against(nominal, identified), "vanilla")]
-        parts += [table(identified, "vanilla+sysid"), table(nominal, "vanilla")]
+        parts += [f"### {title}", comparison(results)]
+        for kind, name in (("identified", KINDS["identified"]), ("aerodynamic", "aerodynamic")):
+            parts += [f"{name}. " + worst_case(against(results["nominal"], results[kind]), "vanilla")]
+            parts += [table(results[kind], "vanilla+sysid", name)]
+        parts += [table(results["hybrid"], "vanilla+sysid", KINDS["hybrid"])]
+        parts += [table(results["nominal"], "vanilla", KINDS["nominal"])]
     text = "\n\n".join(parts)
     (options.output / "table.md").write_text(text + "\n")
-    figure(folders["identified"], options.output / "tracking.png")
+    figure(folders["identified"], air, options.output / "tracking.png")
     print(text)
     print(f"\nWritten to {options.output}.")
 
