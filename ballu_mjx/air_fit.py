@@ -38,7 +38,7 @@ def fit(data: RecordingsData, config: AirConfig) -> int:
         stages = runs.Stages()
 
         def report(evaluation: int, cost: float) -> None:
-            run.log(stages.update("air", evaluation, config.evaluations, cost), {"cost": cost})
+            run.log(stages.update("air", evaluation, 1 + config.evaluations, cost), {"cost": cost})
 
         result = air_identification.identify(model, motions["training"], config, report)
         stages.close()
