@@ -108,7 +108,7 @@ def subcommands(arguments: Sequence[str] = ()) -> dict[str, Callable[..., int]]:
         return command
 
     def everything(story: pipeline.Options = pipeline.Options()) -> int:  # noqa: B008
-        """The whole story on a virtual robot: data, actuators, EnvMimic, policies in four simulators, trials."""
+        """The whole story on a virtual robot: data, actuators, residuals, policies in five simulators, trials."""
         return pipeline.run(story)
 
     tasks = {name: task_command(task) for name, task in TASKS.items()}

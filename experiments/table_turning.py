@@ -4,9 +4,9 @@
 # Section "Improved Sim-to-real Transfer" of the paper, its second task. The reward is the velocity along y, to the
 # left of the robot, which starts looking along x: it must turn and walk. As in Table I, a policy is trained in each of
 # four simulators: with identified actuators (vanilla+sysid), with domain randomization (vanilla+DR), with both
-# (vanilla+sysid+DR), and with EnvMimic's forces besides both (ours). Each then runs on the robot for 22 s. The table
-# gives the difference in final yaw between simulation and robot, and how far the robot came along y and how far it
-# turned.
+# (vanilla+sysid+DR), and with EnvMimic's forces besides both; and, beyond the paper, in a fifth with the identified air
+# besides both (aerodynamic). Each then runs on the robot for 22 s. The table gives the difference in final yaw between
+# simulation and robot, and how far the robot came along y and how far it turned.
 #
 # The paper's robot is real, its numbers are one policy's each, and its yaw errors are signed. Here a virtual robot
 # stands in for it, every policy is trained with several seeds and tried five times, each time in another draught;

@@ -3,9 +3,9 @@
 #
 # Section "Improved Sim-to-real Transfer" of the paper. A policy is trained to walk forward (reward: velocity along x)
 # in four simulators: with identified actuators (vanilla+sysid), with domain randomization (vanilla+DR), with both
-# (vanilla+sysid+DR), and with EnvMimic's forces besides both (ours). Each then walks on the robot for 24 s. The table
-# gives the mean distance between the centres of mass of simulation and robot, and how far the robot came, along x and
-# in all.
+# (vanilla+sysid+DR), and with EnvMimic's forces besides both; and, beyond the paper, in a fifth with the identified air
+# besides both (aerodynamic). Each then walks on the robot for 24 s. The table gives the mean distance between the
+# centres of mass of simulation and robot, and how far the robot came, along x and in all.
 #
 # The paper's robot is real and its numbers are one policy's each. Here a virtual robot stands in for it, every policy
 # is trained with several seeds and tried five times, each time in another draught; numbers are means with the 95 %
