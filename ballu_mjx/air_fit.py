@@ -2,30 +2,51 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import time
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import jax
 
-from ballu_mjx import aerodynamics, air_identification, envmimic, evaluate, evaluation, loggers, runs
+from ballu_mjx import aerodynamics, air_identification, envmimic, evaluate, evaluation, loggers, robot, runs
 from ballu_mjx.aerodynamics import Aerodynamics
 from ballu_mjx.air_identification import AirConfig, AirFit
 from ballu_mjx.envmimic import EnvMimicConfig
-from ballu_mjx.residual import write_observed
+from ballu_mjx.errors import InputError
+from ballu_mjx.residual import Residual, write_observed
 from ballu_mjx.residual_data import Prepared, RecordingsData
 
 QUICK: Mapping[str, Any] = {"window_seconds": 0.5, "interval_seconds": 2.0, "evaluations": 3}
 """Defaults of `AirConfig` under `--quick`."""
 
 
-def fit(data: RecordingsData, config: AirConfig) -> int:
+@dataclasses.dataclass(frozen=True)
+class AirData(RecordingsData):
+    """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
+
+    known: Path | None = None
+    """Folder of an earlier run whose parameters are kept but for those of --free: balloons lose lift over weeks, and
+    `--known RUN --free lift` finds how much from one recording. Without this option: nothing is known."""
+    free: tuple[Literal[aerodynamics.NAMES], ...] = aerodynamics.NAMES  # pyright: ignore[reportInvalidTypeForm]
+    """Parameters to identify."""
+
+
+def fit(data: AirData, config: AirConfig) -> int:
     """Read and check everything, identify, evaluate; returns the exit status."""
     started = time.perf_counter()
     air_identification.check(config)
     loggers.check(data.wandb)
+    if not data.free or (data.known is None and set(data.free) != set(aerodynamics.NAMES)):
+        raise InputError("--free: name one or more, and beside fewer than all the run that knows the others, --known.")
+    known = None if data.known is None else Residual.load(data.known)
+    if known is not None and not isinstance(known.model, Aerodynamics):
+        raise InputError(f"{data.known}: is no run of --method aerodynamic; give one.")
     prepared = Prepared.read(data)
+    if known is not None and not robot.same_actuators(known.actuators, prepared.identified):
+        raise InputError(f"{data.known}: belongs to other actuators than {prepared.where}; give --actuators the same.")
     folder = runs.new_folder(data.output, "aerodynamic")
     prepared.announce(folder, data.quick)
     model = prepared.load_model()
@@ -40,7 +61,8 @@ def fit(data: RecordingsData, config: AirConfig) -> int:
         def report(evaluation: int, cost: float) -> None:
             run.log(stages.update("air", evaluation, 1 + config.evaluations, cost), {"cost": cost})
 
-        result = air_identification.identify(model, motions["training"], config, report)
+        values = None if known is None else known.params
+        result = air_identification.identify(model, motions["training"], config, report, known=values, free=data.free)
         stages.close()
         text = table(result)
         run.write("identification.txt", text + "\n")

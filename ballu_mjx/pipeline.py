@@ -199,16 +199,17 @@ class Story:
         options = self._air() if method == "aerodynamic" else self._envmimic()
 
         def make(folder: Path) -> None:
-            data = residual_training.Data(
-                recordings=(recordings / "training",),
-                validation=(recordings / "validation",),
-                actuators=identified / actuators.NAME,
-                output=folder,
-                wandb=self.options.wandb,
-            )
+            sources: dict[str, Any] = {
+                "recordings": (recordings / "training",),
+                "validation": (recordings / "validation",),
+                "actuators": identified / actuators.NAME,
+                "output": folder,
+                "wandb": self.options.wandb,
+            }
             if isinstance(options, AirConfig):
-                air_fit.fit(data, options)
+                air_fit.fit(air_fit.AirData(**sources), options)
                 return
+            data = residual_training.Data(**sources)
             if runs.checkpoints(folder):
                 data = residual_training.Data(resume=folder, wandb=data.wandb)
             _stop_unless_done(residual_training.train(data, *options))

@@ -93,22 +93,12 @@ def environment(
     **Raises** `InputError` where `residual` holds no residual, or one that belongs to other actuators.
     """
     force = None if residual is None else Residual.load(residual)
-    if force is not None and not same_actuators(force.actuators, actuators):
+    if force is not None and not robot.same_actuators(force.actuators, actuators):
         raise InputError(
             f"{residual}: its forces were learned beside other actuators; give --actuators the same file, or leave it "
             "out to take the residual's."
         )
     return LocomotionEnv(robot.load_model(), task, config, actuators=actuators, residual=force)
-
-
-def same_actuators(one: ActuatorParameters | None, other: ActuatorParameters | None) -> bool:
-    """Whether two simulators have equal actuators (None: nominal)."""
-    if one is None or other is None:
-        return one is other
-    return all(
-        np.array_equal(np.float32(getattr(one, f.name)), np.float32(getattr(other, f.name)))
-        for f in dataclasses.fields(one)
-    )
 
 
 class Rollout(NamedTuple):

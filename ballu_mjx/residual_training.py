@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from ballu_mjx import evaluate, evaluation, learner, loggers, policy, ppo, runs
+from ballu_mjx import evaluate, evaluation, learner, loggers, ppo, robot, runs
 from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv, ForcePolicy
 from ballu_mjx.errors import InputError
 from ballu_mjx.evaluation import OpenLoopEvaluator
@@ -51,7 +51,7 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     where = _where_beside(data)
     beside = None if where is None else Residual.load(where)
     prepared = Prepared.read(data, data.resume)
-    if beside is not None and not policy.same_actuators(beside.actuators, prepared.identified):
+    if beside is not None and not robot.same_actuators(beside.actuators, prepared.identified):
         raise InputError(
             f"{where}: was learned beside other actuators than {prepared.where}; give --actuators the same."
         )

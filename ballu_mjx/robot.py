@@ -103,6 +103,16 @@ class ActuatorParameters:
         )
 
 
+def same_actuators(one: ActuatorParameters | None, other: ActuatorParameters | None) -> bool:
+    """Whether two simulators have equal actuators (None: nominal)."""
+    if one is None or other is None:
+        return one is other
+    return all(
+        np.array_equal(np.float32(getattr(one, f.name)), np.float32(getattr(other, f.name)))
+        for f in dataclasses.fields(one)
+    )
+
+
 def cable_length(
     model: mujoco.MjModel, knee: Float[Array | np.ndarray, " sides"], motor: Float[Array | np.ndarray, " sides"]
 ) -> Float[Array, " sides"]:

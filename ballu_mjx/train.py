@@ -49,7 +49,6 @@ def subcommands(arguments: Sequence[str] = ()) -> dict[str, Callable[..., int]]:
     from ballu_mjx.identification import IdentificationConfig
     from ballu_mjx.locomotion import LocomotionConfig
     from ballu_mjx.ppo import PPOConfig
-    from ballu_mjx.residual_data import RecordingsData
     from ballu_mjx.tasks import TASKS, Task
 
     data_defaults, env_defaults, ppo_defaults = _defaults(
@@ -69,7 +68,7 @@ def subcommands(arguments: Sequence[str] = ()) -> dict[str, Callable[..., int]]:
 
     def residual(
         method: Literal["aerodynamic", "envmimic"] = "aerodynamic",
-        data: RecordingsData = RecordingsData(),  # noqa: B008
+        data: air_fit.AirData = air_fit.AirData(),  # noqa: B008
         fit: AirConfig = air_defaults,
     ) -> int:
         """Learn a residual from recordings, and measure it on recordings that training never saw.
