@@ -83,17 +83,17 @@ def rows(folders: Sequence[Path]) -> list[Row]:
         raise InputError("A run is given twice; give each once.")
     configs = [runs.read_config(folder, *residual.TASKS, *TASKS) for folder in folders]
     for folder, config in zip(folders, configs, strict=True):
-        if config["task"] != configs[0]["task"]:
+        if _kind(config) != _kind(configs[0]):
             raise InputError(
                 f"{folder}: is a run of {config['task']!r}, {folders[0]} one of {configs[0]['task']!r}; compare runs "
                 "of one task."
             )
     options = [_options(config) for config in configs]
-    names = dict.fromkeys(name for each in options for name in each)
+    names = [name for name in options[0] if all(name in each for each in options)]
     differing = [name for name in names if len({each.get(name) for each in options}) > 1]
     found: dict[str, list[Path]] = {}
     for folder, each in zip(folders, options, strict=True):
-        label = ", ".join(f"{name} {each.get(name, 'none')}" for name in differing) or configs[0]["task"]
+        label = ", ".join(f"{name} {each[name]}" for name in differing) or configs[0]["task"]
         found.setdefault(label, []).append(folder)
     return [Row(label, tuple(members)) for label, members in found.items()]
 
@@ -108,10 +108,10 @@ def figures(folder: Path) -> dict[str, float]:
     from ballu_mjx.evaluation import SCORE_HORIZONS, Evaluation
 
     steps, reward = runs.column(folder, "reward")
-    if not len(steps):
-        raise InputError(f"{folder}: has not trained yet (metrics.jsonl holds no reward); leave it out.")
-    found = {"reward at the end": float(reward[steps > (1 - _LAST) * steps[-1]].mean())}
     path = folder / "evaluation.json"
+    if not len(steps) and not path.exists():
+        raise InputError(f"{folder}: has not trained yet (metrics.jsonl holds no reward); leave it out.")
+    found = {"reward at the end": float(reward[steps > (1 - _LAST) * steps[-1]].mean())} if len(steps) else {}
     if path.exists():
         try:
             evaluation = Evaluation.from_json(json.loads(path.read_text(encoding="utf-8")))
@@ -183,18 +183,24 @@ def _compare(options: Options) -> None:
 
 def _options(config: Mapping[str, Any]) -> dict[str, str]:
     """What tells a run from others: options of environment and learning, actuators, residual and recordings."""
-    found = {
+    found = {"task": config["task"]} | {
         name: json.dumps(value)
-        for section in ("env", "ppo")
-        for name, value in config[section].items()
+        for section in ("env", "ppo", "fit")
+        for name, value in config.get(section, {}).items()
         if name not in _UNTOLD
     }
     found["actuators"] = "nominal" if config.get("actuators") is None else _digest(config["actuators"])
     for use, files in config.get("recordings", {}).items():
         found[f"{use} recordings"] = _digest([file["sha256"] for file in files])
-    if config.get("residual") is not None:
-        found["residual"] = config["residual"]
+    found["residual"] = config.get("residual") or "none"
     return found
+
+
+def _kind(config: Mapping[str, Any]) -> str:
+    """What runs may be compared: residuals of whatever kind, and policies of one task."""
+    from ballu_mjx import residual
+
+    return "residual" if config["task"] in residual.TASKS else config["task"]
 
 
 def _digest(value: Any) -> str:

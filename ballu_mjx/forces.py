@@ -5,7 +5,7 @@ Everything that simulates takes residuals by this one interface, whatever they w
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -14,6 +14,7 @@ Fields = dict[str, Array]
 """Fields of `mjx.Model` by name."""
 
 
+@runtime_checkable
 class ForceModel(Protocol):
     """A kind of residual. All methods are pure: they may be jitted, vmapped and differentiated.
 
