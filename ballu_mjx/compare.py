@@ -104,12 +104,14 @@ def figures(folder: Path) -> dict[str, float]:
 
     **Raises** `InputError` where the run has not trained yet, or its evaluation is damaged.
     """
-    from ballu_mjx import runs
+    from ballu_mjx import residual, runs
     from ballu_mjx.evaluation import SCORE_HORIZONS, Evaluation
+    from ballu_mjx.tasks import TASKS
 
     steps, reward = runs.column(folder, "reward")
     path = folder / "evaluation.json"
-    if not len(steps) and not path.exists():
+    identified = runs.read_config(folder, *residual.TASKS, *TASKS)["task"] == "aerodynamic"
+    if not len(steps) and not identified:
         raise InputError(f"{folder}: has not trained yet (metrics.jsonl holds no reward); leave it out.")
     found = {"reward at the end": float(reward[steps > (1 - _LAST) * steps[-1]].mean())} if len(steps) else {}
     if path.exists():
