@@ -53,8 +53,8 @@ class EnvMimicConfig:
     force_limit: float = 1.0
     """Largest force along each axis, N (paper: 1)."""
     force_scale: float = 1.0
-    """Force, N, that one unit of the policy's output stands for (paper: 1). The forces that close the gap are hundredths of
-    a newton; a smaller unit learns more slowly, and with the adaptive step (`PPOConfig.desired_kl`) it protects from
+    """Force, N, that one unit of the policy's output stands for (paper: 1). The forces that close the gap are
+    hundredths of a newton; a smaller unit learns more slowly, and with the adaptive step (`desired_kl`) protects from
     nothing."""
     force_cost: float = 20.0
     """Reward lost per N^2 of force."""
