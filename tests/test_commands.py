@@ -132,7 +132,7 @@ def bash_script(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("", {"record", "train", "evaluate", "report", "view", "compare", "export"}),
         ("tr", {"train"}),
         ("record ", {"import", "check", "simulate", "example-mapping"}),
-        ("train ", {"sysid", "envmimic", "walk", "turn", "turn-right", "walk-backward", "all"}),
+        ("train ", {"sysid", "envmimic", "residual", "walk", "turn", "turn-right", "walk-backward", "all"}),
         ("train envmimic --num-t", {"--num-timesteps"}),
         ("record import --format ", {"auto", "vicon", "c3d", "table"}),
         ("view --po", {"--port"}),
