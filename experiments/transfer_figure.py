@@ -82,10 +82,12 @@ def draw(ways: dict[str, list[list[Way]]], seeds: Sequence[int], path: Path) -> 
     """One panel a setting, all to one scale: a line a trial, a dash pattern a seed, a dot where the robot ends."""
     low, high = _limits(np.concatenate([way for runs in ways.values() for trials in runs for way in trials]))
     width, height = high - low
-    columns = 2 if len(ways) > 2 and width > 1.3 * height else len(ways)
+    columns = len(ways)
+    if len(ways) > 2 and width > 1.3 * height:
+        columns = 2 if len(ways) <= 4 else 3
     rows = -(-len(ways) // columns)
     panel = 12.0 / max(columns, 3)
-    size = (panel * columns + 0.4, ((panel - 0.2) * height / width + 0.35) * rows + (0.75 if len(seeds) > 1 else 0.4))
+    size = (panel * columns + 0.4, ((panel - 0.2) * height / width + 0.65) * rows + (0.75 if len(seeds) > 1 else 0.4))
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     styles = [_SEED_STYLES[index % len(_SEED_STYLES)] for index in range(len(seeds))]
@@ -102,8 +104,9 @@ def draw(ways: dict[str, list[list[Way]]], seeds: Sequence[int], path: Path) -> 
         axis.set(title=plots.LABELS[setting], xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axis.set_aspect("equal")
         axis.grid(alpha=0.3)
-    for axis in axes[-1]:
+    for axis in axes.flat[len(ways) - columns : len(ways)]:  # the lowest of each column
         axis.set_xlabel("x (m)")
+        axis.tick_params(labelbottom=True)
     for axis in axes[:, 0]:
         axis.set_ylabel("y (m)")
     if len(seeds) > 1:
