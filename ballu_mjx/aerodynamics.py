@@ -74,6 +74,7 @@ class Aerodynamics:
         self._balloon = simulation.balloon_id(model)
         self._mass, self._inertia = jnp.asarray(model.body_mass), jnp.asarray(model.body_inertia)
         self._centre, self._gravcomp = jnp.asarray(model.body_ipos), jnp.asarray(model.body_gravcomp)
+        self._timestep, self._substeps = float(model.opt.timestep), simulation.substeps(model)
         self._gravity = float(np.linalg.norm(model.opt.gravity))
 
     def inputs(self, history: Float[Array, "steps 27"], commands: Float[Array, "steps 2"]) -> Float[Array, " inputs"]:
@@ -91,12 +92,14 @@ class Aerodynamics:
             "body_gravcomp": self._gravcomp.at[body].set(lift / (mass[body] * self._gravity)),
         }
 
-    def command(self, params: AirParameters, commands: Float[Array, "steps 2"]) -> Float[Array, " 2"]:
-        """The mean over the coming control step of the commands, `delay` late."""
-        steps = jnp.clip(params.delay, 0.0, LONGEST_DELAY) / ballu.CONTROL_TIMESTEP
-        age = jnp.arange(envmimic.HISTORY - 1, -1, -1)
-        share = jnp.maximum(1.0 - jnp.abs(age - steps), 0.0)
-        return share @ commands
+    def command(self, params: AirParameters, commands: Float[Array, "steps 2"]) -> Float[Array, "parts 2"]:
+        """What has arrived by the start of each physics step, `delay` late.
+
+        Not a mean of old and new command: a servo that saturates would turn at once as fast as it can.
+        """
+        late = jnp.clip(params.delay, 0.0, LONGEST_DELAY) - self._timestep * jnp.arange(self._substeps)
+        age = jnp.ceil(late / ballu.CONTROL_TIMESTEP - _JUST)
+        return commands[envmimic.HISTORY - 1 - jnp.maximum(age, 0).astype(int)]
 
     def wrench(
         self,
@@ -116,6 +119,8 @@ class Aerodynamics:
         return jnp.concatenate([now @ force, now @ torque])
 
 
+_JUST = 1e-3
+"""Of a control step: a delay of just so many physics steps is over when they are."""
 _SLOW = 1e-3
 """m/s; keeps the speed differentiable at rest."""
 

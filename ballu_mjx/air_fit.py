@@ -19,6 +19,8 @@ from ballu_mjx.errors import InputError
 from ballu_mjx.residual import Residual, write_observed
 from ballu_mjx.residual_data import Prepared, RecordingsData
 
+_MOST = 24
+"""Evaluations for two searches for the delay, and before and after all."""
 QUICK: Mapping[str, Any] = {"window_seconds": 0.5, "interval_seconds": 2.0, "evaluations": 3}
 """Defaults of `AirConfig` under `--quick`."""
 
@@ -59,7 +61,7 @@ def fit(data: AirData, config: AirConfig) -> int:
         stages = runs.Stages()
 
         def report(evaluation: int, cost: float) -> None:
-            run.log(stages.update("air", evaluation, 1 + config.evaluations, cost), {"cost": cost})
+            run.log(stages.update("air", evaluation, _MOST + 2 * config.evaluations, cost), {"cost": cost})
 
         values = None if known is None else known.params
         result = air_identification.identify(model, motions["training"], config, report, known=values, free=data.free)

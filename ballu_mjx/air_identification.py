@@ -35,8 +35,8 @@ class AirConfig:
     """Length of a window, s. Shorter ones leave more to the starting state, and gave the added mass a half too high."""
     interval_seconds: float = 2.0
     """Time between the starts of two windows, s."""
-    evaluations: int = 12
-    """Most steps of the least-squares solver."""
+    evaluations: int = 8
+    """Most steps of the least-squares solver, each of the two times that it runs."""
 
 
 class Scale(NamedTuple):
@@ -52,16 +52,18 @@ SCALES: dict[str, Scale] = {
     "added_inertia": Scale(2e-3),
     "lift": Scale(0.03),
     "centre": Scale(0.01),
-    "linear_drag": Scale(0.03, 1.0),
-    "quadratic_drag": Scale(0.2, 1.0),
+    "linear_drag": Scale(0.03),
+    "quadratic_drag": Scale(0.2),
     "turning_drag": Scale(3e-3),
-    "delay": Scale(0.03),
+    "delay": Scale(0.05),
 }
 """By name; SI units."""
-_POSITION = (0.003, 0.02)
+_POSITION = (0.002, 0.01)
 """Expected error of the balloon's position (m) at a window's start, and what each second adds."""
-_ANGLE = (np.deg2rad(0.5), np.deg2rad(1.5))
+_ANGLE = (np.deg2rad(0.3), np.deg2rad(0.6))
 """Likewise of its orientation (rad)."""
+_ROUNDS = 2
+"""Of a search for the delay and a fit of all else."""
 _OUTLYING = 3.0
 """Expected errors beyond which a window counts less: a foot slipped there, say."""
 _LOST = 20.0
@@ -74,7 +76,7 @@ class AirFit:
 
     parameters: AirParameters
     standard_errors: AirParameters
-    """Of windows that err independently, by as much as expected."""
+    """Of windows that err independently, by as much as expected; 0 for what was not free, and for the delay."""
     cost: tuple[float, float]
     """Half the sum of squares, softened, without the residual and at the end."""
     windows: int
@@ -120,47 +122,68 @@ def identify(
     start = np.asarray(start, np.float64)
     owner = np.repeat(aerodynamics.NAMES, [getattr(none, name).size for name in aerodynamics.NAMES])
     scale, prior = np.array([SCALES[name] for name in owner]).T
-    places = np.flatnonzero(np.isin(owner, free))
-
-    def whole(x: np.ndarray) -> np.ndarray:
-        vector = start.copy()
-        vector[places] = x * scale[places]
-        return vector
-
+    places = np.flatnonzero(np.isin(owner, [name for name in free if name != "delay"]))
+    low = np.where(np.isin(owner, aerodynamics.SIGNED), -np.inf, 0.0)[places]
     evaluations = 0
 
-    def residuals(x: np.ndarray) -> np.ndarray:
+    def residuals(vector: np.ndarray) -> np.ndarray:
         nonlocal evaluations
         evaluations += 1
-        total = np.concatenate([_soften(windows.errors(whole(x)))[0].ravel(), x / prior[places]])
+        prior_part = (vector / (scale * prior))[places]
+        total = np.concatenate([_soften(windows.errors(vector))[0].ravel(), prior_part])
         report(evaluations, _cost(total))
         return total
 
-    def jacobian(x: np.ndarray) -> np.ndarray:
-        vector = whole(x)
-        along = [windows.derivative(vector, scale[place] * np.eye(len(vector))[place]) for place in places]
-        softened = _soften(windows.errors(vector), np.stack(along, axis=-1))[1]
-        return np.concatenate([softened.reshape(-1, len(x)), np.diag(1 / prior[places])])
+    def with_delay(vector: np.ndarray) -> np.ndarray:
+        """With the best delay of whole physics steps: a cost that moves by steps has no derivative to follow."""
+        step = ballu.CONTROL_TIMESTEP / simulation.substeps(model)
+        tried = [
+            np.where(owner == "delay", delay, vector)
+            for delay in np.arange(0.0, aerodynamics.LONGEST_DELAY + step / 2, step)
+        ]
+        return min(tried, key=lambda each: _cost(residuals(each)))
 
-    x = start[places] / scale[places]
-    low = np.where(np.isin(owner, aerodynamics.SIGNED), -np.inf, 0.0)[places]
-    high = np.where(owner == "delay", aerodynamics.LONGEST_DELAY / scale, np.inf)[places]
-    without = _cost(residuals(x))
-    if known is None:  # not from the bound, where what must be positive has nowhere to go but up
-        x = np.where(np.isfinite(low), 1.0, x)
-    solution = scipy.optimize.least_squares(
-        residuals,
-        x,
-        jacobian,  # pyright: ignore[reportArgumentType]
-        bounds=(low, high),
-        max_nfev=config.evaluations,
-    )
+    def fitted(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The best of the other parameters, and the Jacobian there."""
+
+        def whole(x: np.ndarray) -> np.ndarray:
+            moved = vector.copy()
+            moved[places] = x * scale[places]
+            return moved
+
+        def jacobian(x: np.ndarray) -> np.ndarray:
+            here = whole(x)
+            along = [windows.derivative(here, scale[place] * np.eye(len(here))[place]) for place in places]
+            softened = _soften(windows.errors(here), np.stack(along, axis=-1))[1]
+            return np.concatenate([softened.reshape(-1, len(x)), np.diag(1 / prior[places])])
+
+        solution = scipy.optimize.least_squares(
+            lambda x: residuals(whole(x)),
+            vector[places] / scale[places],
+            jacobian,  # pyright: ignore[reportArgumentType]
+            bounds=(low, np.inf),
+            max_nfev=config.evaluations,
+        )
+        return whole(solution.x), solution.jac
+
+    without = _cost(residuals(start))
+    best, jacobian = start, np.zeros((1, len(places)))
+    if known is None:  # not from the bounds, where what must be positive has nowhere to go but up
+        best = np.where(np.isin(owner, aerodynamics.SIGNED), 0.0, scale)
+    for number in range(_ROUNDS if "delay" in free else 1):
+        before = best
+        if "delay" in free:
+            best = with_delay(best)
+        if number and np.array_equal(best, before):
+            break
+        if len(places):
+            best, jacobian = fitted(best)
     errors = np.zeros(len(start))
-    errors[places] = np.sqrt(np.diag(np.linalg.pinv(solution.jac.T @ solution.jac))) * scale[places]
+    errors[places] = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian))) * scale[places]
     return AirFit(
-        parameters=unravel(jnp.asarray(whole(solution.x), jnp.float32)),
+        parameters=unravel(jnp.asarray(best, jnp.float32)),
         standard_errors=unravel(jnp.asarray(errors, jnp.float32)),
-        cost=(without, float(solution.cost)),
+        cost=(without, _cost(residuals(best))),
         windows=windows.count,
     )
 

@@ -204,11 +204,13 @@ class Simulator:
         return features.reshape(*shape, -1), com.reshape(*shape, -1)
 
     def step(
-        self, state: simulation.State, command: Float[Array, " 2"], wrench: Float[Array, " 6"]
+        self, state: simulation.State, command: Float[Array, "*parts 2"], wrench: Float[Array, " 6"]
     ) -> simulation.State:
-        """One control step; see `simulation.control_step`."""
+        """One control step under a command, or one for each of equal parts of it; see `simulation.control_step`."""
+        parts = command.reshape(-1, 2)
+        commands = jnp.repeat(parts, self._count // len(parts), axis=0)
         return simulation.control_step(
-            self.model, self._template, state, command, wrench, balloon=self._balloon, count=self._count
+            self.model, self._template, state, commands, wrench, balloon=self._balloon, count=self._count
         )
 
 
@@ -301,9 +303,9 @@ class ForcePolicy:
         """None: forces are all there is."""
         return {}
 
-    def command(self, params: Any, commands: Float[Array, "steps 2"]) -> Float[Array, " 2"]:
+    def command(self, params: Any, commands: Float[Array, "steps 2"]) -> Float[Array, "1 2"]:
         """The command as it is."""
-        return commands[-1]
+        return commands[-1:]
 
     def wrench(
         self,

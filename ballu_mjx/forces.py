@@ -35,8 +35,9 @@ class ForceModel(Protocol):
         """Model fields to simulate with instead of the model's own."""
         ...
 
-    def command(self, params: Any, commands: Float[Array, "steps 2"]) -> Float[Array, " 2"]:
-        """What the servos get over the coming control step."""
+    def command(self, params: Any, commands: Float[Array, "steps 2"]) -> Float[Array, "parts 2"]:
+        """What the servos get over equal parts of the coming control step; a number of them that divides its physics
+        steps."""
         ...
 
     def wrench(
@@ -80,7 +81,7 @@ class Sum:
             raise ValueError(f"Both residuals change {', '.join(shared)}.")
         return first | second
 
-    def command(self, params: Any, commands: Float[Array, "steps 2"]) -> Float[Array, " 2"]:
+    def command(self, params: Any, commands: Float[Array, "steps 2"]) -> Float[Array, "parts 2"]:
         changes = [part.command(own, commands) - commands[-1] for part, own in zip(self.parts, params, strict=True)]
         return commands[-1] + sum(changes)
 

@@ -84,7 +84,7 @@ class Residual:
         """Model fields to simulate with; see `forces.ForceModel.fields`."""
         return self.model.fields(self.params)
 
-    def command(self, commands: Float[Array, "steps 2"]) -> Float[Array, " 2"]:
+    def command(self, commands: Float[Array, "steps 2"]) -> Float[Array, "parts 2"]:
         """What the servos get; see `forces.ForceModel.command`."""
         return self.model.command(self.params, commands)
 

@@ -63,22 +63,27 @@ def control_step(
     model: mjx.Model,
     template: mjx.Data,
     state: State,
-    command: Float[Array, " 2"],
+    command: Float[Array, " 2"] | Float[Array, "count 2"],
     wrench: Float[Array, " 6"],
     *,
     balloon: int,
     count: int,
 ) -> State:
-    """Advance by `count` physics steps, command and external wrench held.
+    """Advance by `count` physics steps, the external wrench held.
 
     **Arguments**
 
     - `template`: data of the model, from `make_data`; of no influence but for what no step changes.
-    - `command`: servo commands (left, right) in [0, 1].
+    - `command`: servo commands (left, right) in [0, 1], held, or one pair for each physics step.
     - `wrench`: force (N) and torque (N m), world frame, at the centre of mass of the body with the id `balloon`.
     """
-    held = template.replace(ctrl=command, xfrc_applied=template.xfrc_applied.at[balloon].set(wrench))  # pyright: ignore
-    return jax.lax.fori_loop(0, count, lambda _, state: physics_step(model, held, state), state)
+    commands = jnp.broadcast_to(command, (count, 2))
+    template = template.replace(xfrc_applied=template.xfrc_applied.at[balloon].set(wrench))  # pyright: ignore
+
+    def step(number: Array, state: State) -> State:
+        return physics_step(model, template.replace(ctrl=commands[number]), state)  # pyright: ignore
+
+    return jax.lax.fori_loop(0, count, step, state)
 
 
 def make_data(model: mujoco.MjModel) -> mjx.Data:

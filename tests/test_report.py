@@ -142,12 +142,12 @@ def test_numbers_are_those_of_the_evaluation(run: Path, page: Path):
     stored = json.loads((run / "evaluation.json").read_text())
     shown = [a["title"] for tag, a in Elements(page.read_text()).elements if tag == "td" and "title" in a]
     expected: list[float] = []
-    for without, mimic in zip(stored["vanilla"], stored["envmimic"], strict=True):
+    for without, mimic in zip(stored["vanilla"], stored["residual"], strict=True):
         for horizon in map(str, HORIZONS):
             for quantity in ("position", "yaw"):
                 pair = [e[quantity][horizon][0] for e in (without, mimic)]
                 expected += [*pair, pair[1] / pair[0]]
-    for without, mimic in zip(stored["vanilla"], stored["envmimic"], strict=True):
+    for without, mimic in zip(stored["vanilla"], stored["residual"], strict=True):
         expected += [e[key] for key in ("mean_com_error", "final_yaw_error") for e in (without, mimic)]
         expected.append(mimic["mean_force"])
     assert [float(value or "nan") for value in shown] == expected
@@ -255,7 +255,7 @@ def test_what_cannot_be_reported_is_refused(short: Path, capsys, arguments: list
 
 def test_damaged_evaluation_is_refused(short: Path, tmp_path: Path, capsys):
     folder = shutil.copytree(short, tmp_path / "run")
-    for content in ("", "[]", '{"vanilla": [{}], "envmimic": [{}], "score": 1.0}', '{"score": "<b>"}'):
+    for content in ("", "[]", '{"vanilla": [{}], "residual": [{}], "score": 1.0}', '{"score": "<b>"}'):
         (folder / "evaluation.json").write_text(content)
         assert report.main([str(folder)]) == 2
         error = capsys.readouterr().err
