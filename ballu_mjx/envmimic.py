@@ -52,10 +52,9 @@ class EnvMimicConfig:
     """Sharpness of the added orientation term, 1/rad^2: at 20 it still pays 0.92 for 6 deg of yaw."""
     force_limit: float = 1.0
     """Largest force along each axis, N (paper: 1)."""
-    force_scale: float = 1.0
-    """Force, N, that one unit of the policy's output stands for (paper: 1). The forces that close the gap are
-    hundredths of a newton; a smaller unit learns more slowly, and with the adaptive step (`desired_kl`) protects from
-    nothing."""
+    force_scale: float = 0.05
+    """Force, N, that one unit of the policy's output stands for. The forces that close the gap are hundredths of a
+    newton: with 1 N a unit, PPO's first steps throw the robot over, with a constant learning rate for good."""
     force_cost: float = 20.0
     """Reward lost per N^2 of force."""
     episode_seconds: float = 3.0

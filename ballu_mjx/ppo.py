@@ -23,7 +23,7 @@ from ballu_mjx.errors import InputError
 class PPOConfig:
     """How to learn. A control step is one environment advanced by one action."""
 
-    num_timesteps: int = 1_500_000
+    num_timesteps: int = 3_000_000
     """Control steps to train for, all environments together; rounded up to whole training steps."""
     num_envs: int = 1024
     """Environments simulated side by side, over all devices together."""

@@ -35,7 +35,7 @@ class Data(RecordingsData):
     resume: Path | None = None
     """Go on with the run in this folder, from its last checkpoint, with its recordings and configuration; options
     given beside it change these. --num-timesteps counts from the run's start."""
-    validate_every: int = 200_000
+    validate_every: int = 400_000
     """Control steps between two validations, each of which leaves a checkpoint."""
 
 

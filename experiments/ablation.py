@@ -51,7 +51,7 @@ ROWS: Mapping[str, Row] = {
     "defaults": Row(),
     "paper's reward alone": Row(PAPER_REWARD),
     "critic blind to the error": Row({"critic_sees_error": False}),
-    "0.05 N a unit of output": Row({"force_scale": 0.05}),
+    "1 N a unit of output": Row({"force_scale": 1.0}),
     "commands not observed": Row({"observe_command": False}),
     "no noise on starts and observations": Row({"observation_noise": 0.0, "start_noise": 0.0}),
     "no cost on force": Row({"force_cost": 0.0}),
@@ -59,7 +59,7 @@ ROWS: Mapping[str, Row] = {
     "last iterate instead of the average": Row(ppo={"averaging": 1}),
     "none of these (the paper's method to the letter)": Row(
         PAPER_REWARD
-        | {"critic_sees_error": False, "observe_command": False, "observation_noise": 0.0}
+        | {"critic_sees_error": False, "force_scale": 1.0, "observe_command": False, "observation_noise": 0.0}
         | {"start_noise": 0.0, "force_cost": 0.0},
         {"desired_kl": 0.0, "averaging": 1},
     ),
