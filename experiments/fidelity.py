@@ -74,7 +74,9 @@ def evaluate(folders: list[Path], paths: list[Path]) -> list[evaluation.Evaluati
 
 # %%
 def spread(values: list[float], digits: int = 2) -> str:
-    """Mean and range."""
+    """Mean and range, of one value that alone."""
+    if len(values) == 1:
+        return f"{values[0]:.{digits}f}"
     return f"{np.mean(values):.{digits}f} ({min(values):.{digits}f} to {max(values):.{digits}f})"
 
 
