@@ -45,12 +45,12 @@ from ballu_mjx.virtual_robot import VirtualRobot  # noqa: E402
 
 
 # %%
-def replayed(path: Path, virtual: VirtualRobot, trial: int) -> recording.Recording:
-    """The commands of a bundled recording, on a robot, in a draught of their own."""
+def replayed(path: Path, virtual: VirtualRobot, trial: int, folder: Path) -> recording.Recording:
+    """The commands of a bundled recording, on a robot, in a draught of their own; recorded into `folder`."""
     bundled = recording.read_recording(path)
     steps = round((bundled.time[-1] - bundled.time[0]) / robot.CONTROL_TIMESTEP)
     rows = np.searchsorted(bundled.time, bundled.time[0] + np.arange(steps) * robot.CONTROL_TIMESTEP + 1e-6) - 1
-    return virtual_robot.record(
+    recorded = virtual_robot.record(
         virtual,
         virtual_robot.draw_trial(trial),
         virtual_robot.open_loop(bundled.command[np.maximum(rows, 0)]),
@@ -58,6 +58,9 @@ def replayed(path: Path, virtual: VirtualRobot, trial: int) -> recording.Recordi
         bundled.name,
         "Deflation.",
     )
+    folder.mkdir(parents=True, exist_ok=True)
+    recording.write_recording(recorded, folder / f"{bundled.name}.csv.gz")
+    return recording.read_recording(folder / f"{bundled.name}.csv.gz")  # which fills the gaps of hidden markers
 
 
 # %% [markdown]
@@ -106,12 +109,14 @@ def main() -> None:
     deflated = dataclasses.replace(full, buoyancy=full.buoyancy * (1 - options.loss))
     tests = recording.bundled("test")[:: 4 if options.quick else 1]
 
-    def motions(virtual: VirtualRobot) -> list[Motion]:
-        recordings = [replayed(path, virtual, 1000 + number) for number, path in enumerate(tests)]
+    def motions(virtual: VirtualRobot, name: str) -> list[Motion]:
+        folder = options.output / name
+        recordings = [replayed(path, virtual, 1000 + number, folder) for number, path in enumerate(tests)]
         return [reconstruction.reconstruct(each, model) for each in recordings]
 
-    before, after = motions(full), motions(deflated)
-    one = [reconstruction.reconstruct(replayed(recording.bundled("training")[0], deflated, 2000), model)]
+    before, after = motions(full, "before"), motions(deflated, "after")
+    gait = replayed(recording.bundled("training")[0], deflated, 2000, options.output / "one")
+    one = [reconstruction.reconstruct(gait, model)]
     config = AirConfig(interval_seconds=1.0)
     seconds = []
     for _ in range(2):  # the first compiles
