@@ -36,7 +36,8 @@ class AirConfig:
     interval_seconds: float = 2.0
     """Time between the starts of two windows, s."""
     evaluations: int = 8
-    """Most steps of the least-squares solver, each of the two times that it runs."""
+    """Most steps of the least-squares solver with all parameters free, each of the two times that it runs; with fewer
+    free, which cost less a step, accordingly more."""
 
 
 class Scale(NamedTuple):
@@ -162,7 +163,7 @@ def identify(
             vector[places] / scale[places],
             jacobian,  # pyright: ignore[reportArgumentType]
             bounds=(low, np.inf),
-            max_nfev=config.evaluations,
+            max_nfev=config.evaluations * len(start) // len(places),
         )
         return whole(solution.x), solution.jac
 
