@@ -131,9 +131,10 @@ class Evaluation:
         """Errors by group and horizon, without and with the residual, with the spread over starts; then the whole
         recordings."""
         base, name = self.base, self.name
+        wide, narrow = max(16, len(name) + 2), max(13, len(name) + 2)
         lines = [
-            f"{'':7}{'horizon':>8} |{'position RMSE (m)':^39}| {'yaw RMSE (deg)':^38}",
-            f"{'':7}{'(s)':>8} |{base:>14}{name:>16}{'ratio':>8} | {base:>13}{name:>16}{'ratio':>8}",
+            f"{'':7}{'horizon':>8} |{'position RMSE (m)':^{wide + 23}}| {'yaw RMSE (deg)':^{wide + 22}}",
+            f"{'':7}{'(s)':>8} |{base:>14}{name:>{wide}}{'ratio':>8} | {base:>13}{name:>{wide}}{'ratio':>8}",
         ]
         for group in self.groups:
             for horizon in HORIZONS:
@@ -147,15 +148,18 @@ class Evaluation:
                         cells.append(f"{mean:.{digits}f} ± {spread:.{digits}f}")
                     cells.append(f"{self.ratio(group, quantity, horizon):.2f}")
                 lines.append(
-                    f"{group:7}{horizon:>8g} |{cells[0]:>14}{cells[1]:>16}{cells[2]:>8} | "
-                    f"{cells[3]:>13}{cells[4]:>16}{cells[5]:>8}"
+                    f"{group:7}{horizon:>8g} |{cells[0]:>14}{cells[1]:>{wide}}{cells[2]:>8} | "
+                    f"{cells[3]:>13}{cells[4]:>{wide}}{cells[5]:>8}"
                 )
-        lines += ["", f"{'whole recording':24}{'mean CoM error (m)':>28}{'final yaw error (deg)':>28}"]
-        lines.append(f"{'':24}{base:>15}{name:>13}{base:>15}{name:>13}")
+        lines += [
+            "",
+            f"{'whole recording':24}{'mean CoM error (m)':>{15 + narrow}}{'final yaw error (deg)':>{15 + narrow}}",
+        ]
+        lines.append(f"{'':24}{base:>15}{name:>{narrow}}{base:>15}{name:>{narrow}}")
         for without, mimic in zip(self.vanilla, self.residual, strict=True):
             lines.append(
-                f"{without.recording:24}{without.mean_com_error:>15.3f}{mimic.mean_com_error:>13.3f}"
-                f"{without.final_yaw_error:>15.1f}{mimic.final_yaw_error:>13.1f}"
+                f"{without.recording:24}{without.mean_com_error:>15.3f}{mimic.mean_com_error:>{narrow}.3f}"
+                f"{without.final_yaw_error:>15.1f}{mimic.final_yaw_error:>{narrow}.1f}"
             )
         return "\n".join(lines)
 
