@@ -17,7 +17,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ballu_mjx.errors import InputError
+from ballu_mjx.errors import InputError, is_number
 from ballu_mjx.robot import ActuatorParameters
 
 FORMAT = "ballu-actuators/1"
@@ -77,7 +77,7 @@ def from_json(values: Mapping[str, Any], path: Path) -> ActuatorParameters:
     pairs = []
     for name in _FIELDS:
         pair = values.get(name)
-        if not (isinstance(pair, list) and len(pair) == 2 and all(_is_number(x) for x in pair)):
+        if not (isinstance(pair, list) and len(pair) == 2 and all(is_number(x) for x in pair)):
             raise InputError(f"{path}: {name} must be two numbers, [left, right]; it is {pair!r}.")
         if name in _POSITIVE and min(pair) <= 0:
             raise InputError(f"{path}: {name} is {pair}; it must be greater than 0.")
@@ -88,7 +88,3 @@ def from_json(values: Mapping[str, Any], path: Path) -> ActuatorParameters:
     if unknown:
         raise InputError(f"{path}: there is no parameter {sorted(unknown)[0]!r}; there are {', '.join(_FIELDS)}.")
     return ActuatorParameters(*pairs)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from jaxtyping import Array, Float
 
 from ballu_mjx import envmimic, simulation
 from ballu_mjx import robot as ballu
-from ballu_mjx.errors import InputError
+from ballu_mjx.errors import InputError, is_number
 from ballu_mjx.forces import Fields
 
 
@@ -173,9 +172,7 @@ def from_json(values: Mapping[str, Any], path: Path) -> AirParameters:
     for name, like in AirParameters.none().__dict__.items():
         value = values.get(name)
         numbers: list[Any] = value if isinstance(value, list) else [value]
-        if len(numbers) != max(like.size, 1) or not all(
-            isinstance(x, (int, float)) and not isinstance(x, bool) and math.isfinite(x) for x in numbers
-        ):
+        if len(numbers) != max(like.size, 1) or not all(is_number(x) for x in numbers):
             raise InputError(
                 f"{path}: {name} must be {'three numbers' if like.size == 3 else 'a number'}, not {value!r}."
             )

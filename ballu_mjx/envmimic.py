@@ -339,7 +339,8 @@ class EnvMimicEnv(Env):
             self.simulator = self.simulator.altered(beside.model.fields(beside.params))
         self.reference, _ = stack(self.simulator, motions)
         self.episode_length = round(config.episode_seconds / ballu.CONTROL_TIMESTEP)
-        self._spread = jnp.std(self.recorded_inputs(), axis=0)
+        self.recorded_inputs = recorded_inputs(self.reference, config)
+        self._spread = jnp.std(self.recorded_inputs, axis=0)
         shapes = jax.eval_shape(self.reset, jax.random.key(0)).obs
         self._observation_size = {name: shape.shape for name, shape in shapes.items()}
 
@@ -448,17 +449,17 @@ class EnvMimicEnv(Env):
             critic += [to_heading @ error[:3], to_heading @ error[3:6], wrap_angle(error[6:9])]
         return {"state": seen + noise, "critic": jnp.concatenate([*critic, commands.ravel()])}
 
-    def recorded_inputs(self) -> Float[Array, "states inputs"]:
-        """What the policy would see of every recorded state."""
-        reference, config = self.reference, self.config
 
-        def inputs(recording: Array, time: Array) -> Array:
-            history = jax.lax.dynamic_slice_in_dim(reference.features[recording], time - HISTORY + 1, HISTORY)
-            return policy_input(history, commands_seen(reference.command[recording], time), config)
+def recorded_inputs(reference: Reference, config: EnvMimicConfig) -> Float[Array, "states inputs"]:
+    """What the policy would see of every recorded state."""
 
-        steps = np.asarray(reference.steps)
-        pairs = np.array([(r, k) for r, count in enumerate(steps) for k in range(HISTORY - 1, count)])
-        return jax.jit(jax.vmap(inputs))(*jnp.array(pairs).T)
+    def inputs(recording: Array, time: Array) -> Array:
+        history = jax.lax.dynamic_slice_in_dim(reference.features[recording], time - HISTORY + 1, HISTORY)
+        return policy_input(history, commands_seen(reference.command[recording], time), config)
+
+    steps = np.asarray(reference.steps)
+    pairs = np.array([(r, k) for r, count in enumerate(steps) for k in range(HISTORY - 1, count)])
+    return jax.jit(jax.vmap(inputs))(*jnp.array(pairs).T)
 
 
 def commands_seen(commands: Float[Array, "steps 2"], time: Int[Array, ""]) -> Float[Array, "3 2"]:

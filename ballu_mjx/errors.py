@@ -1,4 +1,7 @@
-"""The one exception that users are meant to see."""
+"""The one exception that users are meant to see, and what all readers of files ask of a value."""
+
+import math
+from typing import Any
 
 
 class InputError(Exception):
@@ -7,3 +10,8 @@ class InputError(Exception):
     The message is one sentence that names the file, the place in it and the mend; commands print it alone and exit
     with status 2.
     """
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value from JSON or TOML is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

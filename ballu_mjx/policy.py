@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -65,7 +66,7 @@ class Policy:
             step=step,
         )
 
-    @property
+    @functools.cached_property  # a residual's name takes reading its run
     def setting(self) -> str:
         """The paper's name of the simulator; see `locomotion.setting_name`."""
         name = None if self.residual is None else Residual.load(self.residual).model.name

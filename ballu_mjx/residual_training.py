@@ -30,8 +30,8 @@ class Data(RecordingsData):
     """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
     residual: Path | None = None
-    """Folder of another residual's run, which acts beside the forces: these learn what it leaves. Its actuators are
-    taken. Without this option: none."""
+    """Folder of another residual's run, which acts beside the forces: these learn what it leaves. It must have
+    been learned beside the same actuators. Without this option: none."""
     resume: Path | None = None
     """Go on with the run in this folder, from its last checkpoint, with its recordings and configuration; options
     given beside it change these. --num-timesteps counts from the run's start."""
@@ -80,7 +80,7 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     with runs.Run(folder, config, resumed_at=start.resumed_at, wandb=data.wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)
         progress = runs.Progress(learner.total_timesteps(ppo_config, start.step), start.step)
-        write_observed(run, env.recorded_inputs())
+        write_observed(run, env.recorded_inputs)
         session = Session(run, progress, data.validate_every, lambda params: validation(all_params(params)).score)
         try:
             session.train(env, ppo_config, start, config)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -14,6 +13,7 @@ from typing import Any, Literal, NoReturn, cast
 import numpy as np
 from jaxtyping import Float
 
+from ballu_mjx.errors import is_number
 from ballu_mjx.importers.trajectories import ANGLES, LENGTHS, TIMES, refuse, shorten, suggest
 from ballu_mjx.recording import COLUMNS, Kind, read_text
 from ballu_mjx.robot import SIDES
@@ -248,7 +248,7 @@ class _Keys:
         value = self.get(key)
         if value is None:
             return default
-        if not _is_number(value) or (positive and value <= 0):
+        if not is_number(value) or (positive and value <= 0):
             self.bad(key, "write a positive number" if positive else "write a number")
         return float(value)
 
@@ -256,7 +256,7 @@ class _Keys:
         value = self.get(key)
         if value is None:
             return default
-        if not isinstance(value, list) or len(value) != count or not all(map(_is_number, value)):
+        if not isinstance(value, list) or len(value) != count or not all(map(is_number, value)):
             self.bad(key, f"write {count} numbers, [{', '.join(['0.0'] * count)}]")
         return tuple(map(float, value))
 
@@ -276,10 +276,6 @@ class _Keys:
                 refuse(
                     self.path, where, "there is no such key", f"leave it out, {suggest(key, self.taken).rstrip('?')}"
                 )
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _axes(keys: _Keys) -> Float[np.ndarray, "3 3"]:
@@ -326,7 +322,7 @@ def _source(keys: _Keys, role: str) -> Source:
         if not isinstance(geometry, list) or len(geometry) != len(markers):
             keys.bad("geometry", "write one position [x, y, z] for each of the markers")
         for place in geometry:
-            if not isinstance(place, list) or len(place) != 3 or not all(map(_is_number, place)):
+            if not isinstance(place, list) or len(place) != 3 or not all(map(is_number, place)):
                 keys.bad("geometry", "write positions as [x, y, z], in metres")
         geometry = tuple(tuple(map(float, place)) for place in geometry)
     offset = keys.numbers("offset", 3, (0.0, 0.0, 0.0))
