@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import reprlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ballu_mjx import files
 from ballu_mjx.errors import InputError, is_number
 from ballu_mjx.robot import ActuatorParameters
 
@@ -26,12 +28,14 @@ NAME = "actuators.json"
 _FIELDS = tuple(field.name for field in dataclasses.fields(ActuatorParameters))
 _POSITIVE = ("knee_spring_stiffness", "motor_gain", "torque_limit")
 _LARGEST_ANGLE = math.pi
+_SMALLEST, _LARGEST = 1e-9, 1e3
+"""Springs, gains and torques beyond this are no robot's of 0.3 kg."""
 
 
 def write(path: Path, robot: str, parameters: ActuatorParameters, more: Mapping[str, Any]) -> None:
     """Write `parameters` of the robot named `robot`, with `more` keys beside them."""
     content = {"format": FORMAT, "robot": robot, "parameters": as_json(parameters), **more}
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    files.write(path, json.dumps(content, indent=2) + "\n")
 
 
 def read(path: Path) -> tuple[str, ActuatorParameters]:
@@ -39,15 +43,12 @@ def read(path: Path) -> tuple[str, ActuatorParameters]:
 
     **Raises** `InputError` naming file, key and mend.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file; `python -m ballu_mjx.train sysid` writes one.") from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error}); restore it or identify again.") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file; `python -m ballu_mjx.train sysid` writes one.")
+    content = files.read_json(path, "restore it or identify again")
+    if content.get("format") != FORMAT:
         raise InputError(f'{path}: "format" is not "{FORMAT}"; give a file that `train sysid` wrote.')
-    if not isinstance(content.get("robot"), str) or not content["robot"]:
+    if not isinstance(content.get("robot"), str) or not content["robot"].strip():
         raise InputError(f'{path}: "robot" must be the name that the robot\'s recordings carry.')
     if not isinstance(content.get("parameters"), dict):
         raise InputError(f'{path}: "parameters" is missing; give a file that `train sysid` wrote.')
@@ -78,13 +79,14 @@ def from_json(values: Mapping[str, Any], path: Path) -> ActuatorParameters:
     for name in _FIELDS:
         pair = values.get(name)
         if not (isinstance(pair, list) and len(pair) == 2 and all(is_number(x) for x in pair)):
-            raise InputError(f"{path}: {name} must be two numbers, [left, right]; it is {pair!r}.")
-        if name in _POSITIVE and min(pair) <= 0:
-            raise InputError(f"{path}: {name} is {pair}; it must be greater than 0.")
+            raise InputError(f"{path}: {name} must be two numbers, [left, right]; it is {reprlib.repr(pair)}.")
+        if name in _POSITIVE and not _SMALLEST <= min(pair) <= max(pair) <= _LARGEST:
+            raise InputError(f"{path}: {name} is {pair}; it must be greater than 0, and in SI units.")
         if name not in _POSITIVE and max(map(abs, pair)) > _LARGEST_ANGLE:
             raise InputError(f"{path}: {name} is {pair}: give it in radians, not degrees.")
         pairs.append(jnp.array(pair, jnp.float32))
     unknown = set(values) - set(_FIELDS)
     if unknown:
-        raise InputError(f"{path}: there is no parameter {sorted(unknown)[0]!r}; there are {', '.join(_FIELDS)}.")
+        name = reprlib.repr(sorted(unknown)[0])
+        raise InputError(f"{path}: there is no parameter {name}; there are {', '.join(_FIELDS)}.")
     return ActuatorParameters(*pairs)

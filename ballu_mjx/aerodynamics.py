@@ -7,7 +7,7 @@ has it. Each of these is a textbook's formula with a constant or two to find; no
 from __future__ import annotations
 
 import dataclasses
-import json
+import reprlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from ballu_mjx import envmimic, simulation
+from ballu_mjx import envmimic, files, simulation
 from ballu_mjx import robot as ballu
 from ballu_mjx.errors import InputError, is_number
 from ballu_mjx.forces import Fields
@@ -61,6 +61,8 @@ FILE = "air.json"
 NAMES = tuple(field.name for field in dataclasses.fields(AirParameters))
 SIGNED = ("lift", "centre")
 """All others are 0 or more."""
+_MOST = 100.0
+"""No parameter of a balloon comes near, in SI units."""
 
 
 class Aerodynamics:
@@ -142,15 +144,8 @@ def read(path: Path) -> AirParameters:
 
     **Raises** `InputError` naming file, key and mend.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as JSON ({error}); restore it or identify again.") from error
-    if (
-        not isinstance(content, dict)
-        or content.get("format") != FORMAT
-        or not isinstance(content.get("parameters"), dict)
-    ):
+    content = files.read_json(path, "restore it or identify again")
+    if content.get("format") != FORMAT or not isinstance(content.get("parameters"), dict):
         raise InputError(f'{path}: is not of the format "{FORMAT}"; give one that this program wrote.')
     return from_json(content["parameters"], path)
 
@@ -167,16 +162,18 @@ def from_json(values: Mapping[str, Any], path: Path) -> AirParameters:
     """
     unknown = sorted(set(values) - set(NAMES))
     if unknown:
-        raise InputError(f"{path}: there is no parameter {unknown[0]!r}; there are {', '.join(NAMES)}.")
+        raise InputError(f"{path}: there is no parameter {reprlib.repr(unknown[0])}; there are {', '.join(NAMES)}.")
     read = {}
     for name, like in AirParameters.none().__dict__.items():
         value = values.get(name)
         numbers: list[Any] = value if isinstance(value, list) else [value]
         if len(numbers) != max(like.size, 1) or not all(is_number(x) for x in numbers):
-            raise InputError(
-                f"{path}: {name} must be {'three numbers' if like.size == 3 else 'a number'}, not {value!r}."
-            )
+            needed = "three numbers" if like.size == 3 else "a number"
+            raise InputError(f"{path}: {name} must be {needed}, not {reprlib.repr(value)}.")
         if name not in SIGNED and min(numbers) < 0:
             raise InputError(f"{path}: {name} is {value}; it must be 0 or more.")
+        most = LONGEST_DELAY if name == "delay" else _MOST
+        if max(map(abs, numbers)) > most:
+            raise InputError(f"{path}: {name} is {value}; it must be {most:g} or less.")
         read[name] = jnp.asarray(numbers, jnp.float32).reshape(like.shape)
     return AirParameters(**read)

@@ -2,8 +2,7 @@
 
 The recordings are cut into short windows. Each is simulated from its recorded first state under its recorded commands;
 what the simulated balloon's place and orientation differ by from the recorded ones is made small, by nonlinear least
-squares with a loss that a slipped foot does not rule. A window is short enough for errors not to compound, and long
-enough for a force of hundredths of a newton to move the balloon by more than the starting state's uncertainty does.
+squares with a loss that a slipped foot does not rule.
 """
 
 from __future__ import annotations
@@ -20,11 +19,12 @@ import scipy.optimize
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from ballu_mjx import aerodynamics, envmimic, simulation
+from ballu_mjx import aerodynamics, envmimic, simulation, windows
 from ballu_mjx import robot as ballu
 from ballu_mjx.aerodynamics import Aerodynamics, AirParameters
 from ballu_mjx.errors import InputError
 from ballu_mjx.reconstruction import Motion
+from ballu_mjx.windows import OUTLYING, Windows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,14 +59,8 @@ SCALES: dict[str, Scale] = {
     "delay": Scale(0.05),
 }
 """By name; SI units."""
-_POSITION = (0.002, 0.01)
-"""Expected error of the balloon's position (m) at a window's start, and what each second adds."""
-_ANGLE = (np.deg2rad(0.3), np.deg2rad(0.6))
-"""Likewise of its orientation (rad)."""
 _ROUNDS = 2
 """Of a search for the delay and a fit of all else."""
-_OUTLYING = 3.0
-"""Expected errors beyond which a window counts less: a foot slipped there, say."""
 _LOST = 20.0
 """What a simulation that broke down counts as, in expected errors."""
 
@@ -89,11 +83,9 @@ Report = Callable[[int, float], None]
 
 def check(config: AirConfig) -> None:
     """**Raises** `InputError` for options out of range, naming the option."""
-    for name in ("window_seconds", "interval_seconds"):
-        if not getattr(config, name) >= 2 * ballu.CONTROL_TIMESTEP:
-            raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name):g}: it must be 0.1 or more.")
+    windows.check(config.window_seconds, config.interval_seconds)
     if config.evaluations < 1:
-        raise InputError(f"--evaluations is {config.evaluations}: it must be 1 or more.")
+        raise InputError(f"--evaluations is {config.evaluations}: it must be 1 or more; 1 is the nearest.")
 
 
 def identify(
@@ -117,7 +109,7 @@ def identify(
     **Raises** `InputError` where no recording is as long as a window.
     """
     check(config)
-    windows = _Windows(model, motions, config)
+    simulated = _Fit(model, motions, config)
     none = AirParameters.none()
     start, unravel = ravel_pytree(none if known is None else known)
     start = np.asarray(start, np.float64)
@@ -131,7 +123,7 @@ def identify(
         nonlocal evaluations
         evaluations += 1
         prior_part = (vector / (scale * prior))[places]
-        total = np.concatenate([_soften(windows.errors(vector))[0].ravel(), prior_part])
+        total = np.concatenate([_soften(simulated.errors(vector))[0].ravel(), prior_part])
         report(evaluations, _cost(total))
         return total
 
@@ -154,8 +146,8 @@ def identify(
 
         def jacobian(x: np.ndarray) -> np.ndarray:
             here = whole(x)
-            along = [windows.derivative(here, scale[place] * np.eye(len(here))[place]) for place in places]
-            softened = _soften(windows.errors(here), np.stack(along, axis=-1))[1]
+            along = [simulated.linear(here, scale[place] * np.eye(len(here))[place]) for place in places]
+            softened = _soften(along[0][0], np.stack([slopes for _, slopes in along], axis=-1))[1]
             return np.concatenate([softened.reshape(-1, len(x)), np.diag(1 / prior[places])])
 
         solution = scipy.optimize.least_squares(
@@ -185,7 +177,7 @@ def identify(
         parameters=unravel(jnp.asarray(best, jnp.float32)),
         standard_errors=unravel(jnp.asarray(errors, jnp.float32)),
         cost=(without, _cost(residuals(best))),
-        windows=windows.count,
+        windows=simulated.count,
     )
 
 
@@ -197,10 +189,10 @@ def _soften(
     errors: Float[np.ndarray, "windows entries"], slopes: Float[np.ndarray, "windows entries directions"] | None = None
 ) -> tuple[Float[np.ndarray, "windows entries"], Float[np.ndarray, "windows entries directions"]]:
     """Errors (and their derivatives) shortened, window by window, so that half their sum of squares is the pseudo-Huber
-    loss of each window's whole error: quadratic below `_OUTLYING`, linear above."""
+    loss of each window's whole error: quadratic below `OUTLYING`, linear above."""
     squared = np.sum(errors**2, axis=1)[:, None] + 1e-12
-    root = np.sqrt(1 + squared / _OUTLYING**2)
-    loss = 2 * _OUTLYING**2 * (root - 1)
+    root = np.sqrt(1 + squared / OUTLYING**2)
+    loss = 2 * OUTLYING**2 * (root - 1)
     factor = np.sqrt(loss / squared)
     if slopes is None:
         return factor * errors, np.zeros((*errors.shape, 0))
@@ -210,95 +202,51 @@ def _soften(
     return factor * errors, factor[..., None] * slopes + change[..., None] * along * errors[..., None]
 
 
-class _Windows:
+class _Fit:
     """Windows of recorded motions, and their simulation; compiles once."""
 
     def __init__(self, model: mujoco.MjModel, motions: Sequence[Motion], config: AirConfig) -> None:
         self._simulator, self._air = envmimic.Simulator(model), Aerodynamics(model)
         _, self._unravel = ravel_pytree(AirParameters.none())
-        steps, every = (round(s / ballu.CONTROL_TIMESTEP) for s in (config.window_seconds, config.interval_seconds))
-        places = [
-            (number, start)
-            for number, motion in enumerate(motions)
-            for start in range(envmimic.HISTORY - 1, len(motion.command) - steps + 1, every)
-        ]
-        if not places:
-            raise InputError(f"No recording lasts {config.window_seconds:g} s; give longer ones, or --window-seconds.")
-        self.count = len(places)
-        reference, _ = envmimic.stack(self._simulator, motions)
-        qpos, qvel, features, command = (np.asarray(x) for x in reference[:4])
-        cut = lambda array, first, count: np.stack([array[r, s + first : s + first + count] for r, s in places])  # noqa: E731
-        history = envmimic.HISTORY
-        self._data = (
-            cut(qpos, 0, 1)[:, 0],
-            cut(qvel, 0, 1)[:, 0],
-            cut(features, 1 - history, history),
-            cut(command, 1 - history, steps + history - 1),
-            cut(features, 1, steps),
-        )
-        time = np.arange(1, steps + 1) * ballu.CONTROL_TIMESTEP
-        deviation = np.stack([_POSITION[0] + _POSITION[1] * time] * 3 + [_ANGLE[0] + _ANGLE[1] * time] * 3, axis=1)
-        self._deviation = deviation * np.sqrt(steps)  # neighbours in time say the same: a window counts once
-        mesh = jax.sharding.Mesh(np.array(jax.local_devices()), ("batch",))
-        spec = jax.sharding.PartitionSpec
-        self._run = jax.jit(
-            jax.shard_map(
-                self._batch,
-                mesh=mesh,
-                in_specs=(spec(), spec(), spec("batch")),
-                out_specs=spec("batch"),
-                check_vma=False,
-            )
-        )
+        self._windows = windows.cut(self._simulator, motions, config.window_seconds, config.interval_seconds)
+        self._run = windows.spread(self._linear_one, shared=2)
+
+    @property
+    def count(self) -> int:
+        """Of the windows."""
+        return len(self._windows.qpos)
 
     def errors(self, vector: np.ndarray) -> Float[np.ndarray, "windows entries"]:
         """Errors of the simulated windows, in expected ones."""
-        return self._all(vector, np.zeros_like(vector))[0]
+        return self.linear(vector, np.zeros_like(vector))[0]
 
-    def derivative(self, vector: np.ndarray, direction: np.ndarray) -> Float[np.ndarray, "windows entries"]:
-        """Of `errors`, along a direction of the parameters."""
-        return self._all(vector, direction)[1]
-
-    def _all(self, vector: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        devices = jax.local_device_count()
-        filled = np.arange(-(-self.count // devices) * devices) % self.count
-        data = tuple(x[filled] for x in self._data)
-        found = self._run(np.float32(vector), np.float32(direction), data)
-        errors, slopes = (np.array(x, np.float64)[: self.count] for x in found)
+    def linear(
+        self, vector: np.ndarray, direction: np.ndarray
+    ) -> tuple[Float[np.ndarray, "windows entries"], Float[np.ndarray, "windows entries"]]:
+        """`errors`, and their derivative along a direction of the parameters."""
+        found = self._run(np.float32(vector), np.float32(direction), self._windows)
+        errors, slopes = (np.array(x, np.float64) for x in found)
         lost = ~(np.isfinite(errors).all(axis=1) & np.isfinite(slopes).all(axis=1))
         errors[lost], slopes[lost] = _LOST / np.sqrt(errors.shape[1]), 0.0
         return errors, slopes
 
-    def _batch(self, vector: Array, direction: Array, data: tuple) -> tuple[Array, Array]:
-        def one(*own: Array) -> tuple[Array, Array]:
-            return jax.jvp(lambda vector: self._one(vector, *own), (vector,), (direction,))
+    def _linear_one(self, vector: Array, direction: Array, window: Windows) -> tuple[Array, Array]:
+        return jax.jvp(lambda vector: self._one(vector, window), (vector,), (direction,))
 
-        return jax.vmap(one)(*data)
-
-    def _one(
-        self,
-        vector: Float[Array, " parameters"],
-        qpos: Float[Array, " nq"],
-        qvel: Float[Array, " nv"],
-        history: Float[Array, "history 27"],
-        command: Float[Array, "steps 2"],
-        recorded: Float[Array, "windowsteps 27"],
-    ) -> Float[Array, " entries"]:
+    def _one(self, vector: Float[Array, " parameters"], window: Windows) -> Float[Array, " entries"]:
         air = self._unravel(vector)
         simulator = self._simulator.altered(self._air.fields(air))
         # What the parameters will move depends on them from the start, formally: JAX then traces the loops once.
         nothing = 0.0 * vector[0]
-        state = jax.tree.map(lambda x: x + nothing, simulation.at(qpos, qvel))
+        state = jax.tree.map(lambda x: x + nothing, simulation.at(jnp.asarray(window.qpos), jnp.asarray(window.qvel)))
 
         def step(carry: tuple, time: Int[Array, ""]) -> tuple[tuple, Array]:
             state, history = carry
-            seen = jax.lax.dynamic_slice_in_dim(command, time, envmimic.HISTORY)
+            seen = jax.lax.dynamic_slice_in_dim(window.commands, time, envmimic.HISTORY)
             wrench = self._air.wrench(air, history, seen)
             state = simulator.step(state, self._air.command(air, seen), wrench)
             features, _ = simulator.observe(state)
             return (state, jnp.concatenate([history[1:], features[None]])), features
 
-        _, features = jax.lax.scan(step, (state, history + nothing), jnp.arange(len(recorded)))
-        position = features[:, :3] - recorded[:, :3]
-        angles = envmimic.wrap_angle(features[:, 6:9] - recorded[:, 6:9])
-        return (jnp.concatenate([position, angles], axis=1) / self._deviation).ravel()
+        _, features = jax.lax.scan(step, (state, window.history + nothing), jnp.arange(len(window.features)))
+        return windows.errors(features, window.features).ravel()

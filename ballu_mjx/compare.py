@@ -104,8 +104,9 @@ def figures(folder: Path) -> dict[str, float]:
 
     **Raises** `InputError` where the run has not trained yet, or its evaluation is damaged.
     """
+    from ballu_mjx import evaluation as evaluations
     from ballu_mjx import residual, runs
-    from ballu_mjx.evaluation import SCORE_HORIZONS, Evaluation
+    from ballu_mjx.evaluation import SCORE_HORIZONS
     from ballu_mjx.tasks import TASKS
 
     steps, reward = runs.column(folder, "reward")
@@ -115,13 +116,7 @@ def figures(folder: Path) -> dict[str, float]:
         raise InputError(f"{folder}: has not trained yet (metrics.jsonl holds no reward); leave it out.")
     found = {"reward at the end": float(reward[steps > (1 - _LAST) * steps[-1]].mean())} if len(steps) else {}
     if path.exists():
-        try:
-            evaluation = Evaluation.from_json(json.loads(path.read_text(encoding="utf-8")))
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(
-                f"{path}: cannot be read ({error!r}); `python -m ballu_mjx.evaluate {folder} --output {folder}` writes "
-                "it again."
-            ) from error
+        evaluation = evaluations.read(path)
         for group in evaluation.groups:
             for quantity in ("position", "yaw"):
                 for horizon in SCORE_HORIZONS:

@@ -67,19 +67,20 @@ class Controller:
     - `folder`: holds `weights.npz`.
     - `full_travel`: s, see `FULL_TRAVEL`.
     - `timeout`: s, see `TIMEOUT`; below `MEMORY`.
+
+    **Raises** `ValueError` for numbers out of range, and where `weights.npz` is damaged.
     """
 
     def __init__(self, folder: Path | str, full_travel: float = FULL_TRAVEL, timeout: float = TIMEOUT) -> None:
         if not (full_travel > 0 and 0 < timeout < MEMORY):
             raise ValueError(f"full_travel must be above 0, timeout between 0 and {MEMORY:g} s")
-        with np.load(Path(folder) / "weights.npz", allow_pickle=False) as file:
-            self.weights = {name: file[name] for name in file.files}
+        self.weights = _read(Path(folder) / "weights.npz")
         count = sum(name.startswith("kernel_") for name in self.weights)
         self._layers = [
             (self.weights[f"kernel_{i}"].astype(float), self.weights[f"bias_{i}"].astype(float)) for i in range(count)
         ]
         self._mean, self._std, self._clip = (self.weights[n].astype(float) for n in ("mean", "std", "observation_clip"))
-        self._activation = {"swish": _swish, "tanh": np.tanh}[str(self.weights["activation"])]
+        self._activation = _ACTIVATIONS[str(self.weights["activation"])]
         self.full_travel, self.timeout = full_travel, timeout
         self.command = np.zeros(2)
         """The present command (left, right); the servos are taken to start relaxed."""
@@ -196,6 +197,39 @@ class Controller:
 
 def _swish(x: np.ndarray) -> np.ndarray:
     return x * (1 + np.tanh(x / 2)) / 2  # without overflow
+
+
+_ACTIVATIONS = {"swish": _swish, "tanh": np.tanh}
+_LARGEST = 1e6
+"""No weight of a network that was trained comes near."""
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of `weights.npz`; raises `ValueError` where they are no network for this controller."""
+    with path.open("rb") as file:
+        try:
+            with np.load(file, allow_pickle=False) as archive:
+                weights = {name: archive[name] for name in archive.files}
+            width = len(OBSERVATION)
+            shapes = {"mean": (width,), "std": (width,), "observation_clip": ()}
+            for number in range(sum(name.startswith("kernel_") for name in weights)):
+                last = width
+                width = weights[f"kernel_{number}"].shape[-1]
+                shapes.update({f"kernel_{number}": (last, width), f"bias_{number}": (width,)})
+            good = width == 2 and all(
+                weights[name].shape == shape
+                and weights[name].dtype.kind == "f"
+                # The clip is infinite where observations are not normalized.
+                and (name == "observation_clip" or bool(np.all(np.abs(weights[name]) < _LARGEST)))
+                for name, shape in shapes.items()
+            )
+            good = good and bool(np.all(weights["std"] > 0)) and bool(weights["observation_clip"] > 0)
+            good = good and str(weights["activation"]) in _ACTIVATIONS
+        except Exception as error:  # what unpacking and NumPy make of damage is of many kinds
+            raise ValueError(f"{path}: is damaged ({type(error).__name__}); copy it from the export again.") from error
+    if not good:
+        raise ValueError(f"{path}: is no network of this controller; copy it from the export again.")
+    return weights
 
 
 def _values(frame: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:

@@ -23,6 +23,7 @@ from mujoco import mjx
 
 from ballu_mjx import robot as ballu
 from ballu_mjx import simulation
+from ballu_mjx.errors import InputError
 from ballu_mjx.forces import Applied, Fields
 from ballu_mjx.reconstruction import Motion
 
@@ -70,6 +71,23 @@ class EnvMimicConfig:
     start_noise: float = 1.0
     """Perturbation of the starting state, in multiples of what reconstruction from motion capture leaves uncertain
     (1 mm and 0.5 deg; 1 cm/s, 2 deg/s for base and 5 deg/s for joints)."""
+
+
+def check(config: EnvMimicConfig) -> None:
+    """**Raises** `InputError` for options out of range, naming the option and the nearest value that fits."""
+    for field in dataclasses.fields(config):
+        option, value = f"--{field.name.replace('_', '-')}", getattr(config, field.name)
+        if isinstance(value, bool):
+            continue
+        if field.name in ("force_limit", "force_scale"):
+            if not (value > 0 and math.isfinite(value)):
+                raise InputError(f"{option} is {value:g}: it must be greater than 0; {field.default:g} is usual.")
+        elif field.name == "episode_seconds":
+            least = 2 * ballu.CONTROL_TIMESTEP
+            if not (value >= least and math.isfinite(value)):
+                raise InputError(f"{option} is {value:g}: it must be {least:g} or more; {least:g} is the nearest.")
+        elif not all(x >= 0 and math.isfinite(x) for x in (value if isinstance(value, tuple) else (value,))):
+            raise InputError(f"{option} is {value}: it must be 0 or more; 0 is the nearest.")
 
 
 class Reference(NamedTuple):
@@ -269,6 +287,11 @@ def policy_input(
     return jnp.concatenate([seen, commands.ravel()]) if config.observe_command else seen
 
 
+def input_size(config: EnvMimicConfig) -> int:
+    """Numbers in `policy_input`."""
+    return HISTORY * (_FEATURES + 2 * config.observe_command)
+
+
 def world_force(action: Float[Array, " 3"], yaw: Float[Array, ""], config: EnvMimicConfig) -> Float[Array, " 3"]:
     """The force (N, world) that an action stands for, within the limit along each axis.
 
@@ -314,12 +337,16 @@ class ForcePolicy:
         key: Array | None = None,
     ) -> Float[Array, " 6"]:
         """The policy's force, without a torque."""
-        seen = self.inputs(history, commands)
+        seen, yaw = self.inputs(history, commands), history[-1, 8]
         if key is None or self.sample is None:
-            action = self.infer(params, seen)
+            force = self.force(params, seen, yaw)
         else:
-            action = self.sample(params, seen, key)
-        return jnp.concatenate([world_force(action, history[-1, 8], self.config), jnp.zeros(3)])
+            force = world_force(self.sample(params, seen, key), yaw, self.config)
+        return jnp.concatenate([force, jnp.zeros(3)])
+
+    def force(self, params: Any, seen: Float[Array, " inputs"], yaw: Float[Array, ""]) -> Float[Array, " 3"]:
+        """The most likely force (N, world) for what the policy sees, at a heading."""
+        return world_force(self.infer(params, seen), yaw, self.config)
 
 
 class EnvMimicEnv(Env):
@@ -468,20 +495,31 @@ def commands_seen(commands: Float[Array, "steps 2"], time: Int[Array, ""]) -> Fl
     return jax.lax.dynamic_slice_in_dim(commands, start, HISTORY)
 
 
+def start_spread(nv: int) -> Float[np.ndarray, " directions"]:
+    """What reconstruction leaves uncertain of a state, as standard deviations of positions and velocities along the
+    directions of `qvel`: 1 mm, 0.5 deg; 1 cm/s, 2 deg/s for the base and 5 deg/s for joints.
+
+    Motors hardly vary: the cable makes a degree of theirs a push on the knee that no reconstruction error is.
+    """
+    degree = np.pi / 180
+    position = np.concatenate([np.full(3, 1e-3), np.full(nv - 3, 0.5 * degree)])
+    position[6:][ballu.MOTORS] = 1e-3 * degree
+    return np.concatenate([position, np.full(3, 0.01), np.full(3, 2 * degree), np.full(nv - 6, 5 * degree)])
+
+
 def _perturb(
     key: Array, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], scale: float
 ) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
     """A state within the reconstruction's uncertainty of the recorded one."""
     key_base, key_turn, key_hinge, key_velocity = jax.random.split(key, 4)
-    degree = np.pi / 180
-    base = qpos[:3] + scale * 1e-3 * jax.random.normal(key_base, (3,))
-    turn = scale * 0.5 * degree * jax.random.normal(key_turn, (3,))
+    nv = qvel.shape[0]
+    position, velocity = np.split(scale * start_spread(nv), 2)
+    base = qpos[:3] + position[:3] * jax.random.normal(key_base, (3,))
+    turn = position[3:6] * jax.random.normal(key_turn, (3,))
     # A small rotation in the body frame: q (1, turn / 2), normalized.
     w, v = qpos[3], qpos[4:7]
     quaternion = jnp.concatenate([(w - v @ turn / 2)[None], v + (w * turn + jnp.cross(v, turn)) / 2])
-    hinges = qpos[7:] + scale * 0.5 * degree * jax.random.normal(key_hinge, (qpos.shape[0] - 7,))
-    # Motors stay: the cable makes a degree of theirs a push on the knee that no reconstruction error is.
+    hinges = qpos[7:] + position[6:] * jax.random.normal(key_hinge, (nv - 6,))
     hinges = hinges.at[ballu.MOTORS].set(qpos[7:][ballu.MOTORS])
-    spread = np.concatenate([np.full(3, 0.01), np.full(3, 2 * degree), np.full(qvel.shape[0] - 6, 5 * degree)])
-    qvel = qvel + scale * spread * jax.random.normal(key_velocity, qvel.shape)
+    qvel = qvel + velocity * jax.random.normal(key_velocity, qvel.shape)
     return jnp.concatenate([base, quaternion / jnp.linalg.norm(quaternion), hinges]), qvel

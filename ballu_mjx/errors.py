@@ -1,6 +1,5 @@
 """The one exception that users are meant to see, and what all readers of files ask of a value."""
 
-import math
 from typing import Any
 
 
@@ -12,6 +11,9 @@ class InputError(Exception):
     """
 
 
+_LARGEST = 3.4e38
+
+
 def is_number(value: Any) -> bool:
-    """Whether a value from JSON or TOML is a finite number."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """Whether a value from JSON or TOML is a finite number, in single precision too."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and -_LARGEST < value < _LARGEST

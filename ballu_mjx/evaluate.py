@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import tyro
 
-from ballu_mjx import replay, runtime
+from ballu_mjx import files, replay, runtime
 from ballu_mjx.errors import InputError
 from ballu_mjx.replay import Take
 
@@ -67,6 +67,7 @@ def _evaluate(options: Options) -> None:
     for path, recording in zip(paths, recordings, strict=True):
         check_recording(path, recording, long_enough=True)
     if options.output is not None:
+        files.check_folder(options.output)
         options.output.mkdir(parents=True, exist_ok=True)
 
     if loaded.step:
@@ -109,8 +110,8 @@ def report(evaluator: OpenLoopEvaluator, params: Any, folder: Path) -> Evaluatio
     names = evaluator.base, evaluator.name
     replays = dict(zip(names, (evaluator.replay(params, scale=0.0), evaluator.replay(params)), strict=True))
     result = Evaluation(*(evaluator.errors(each) for each in replays.values()), *names)  # pyright: ignore[reportCallIssue]
-    (folder / "evaluation.txt").write_text(result.table() + "\n", encoding="utf-8")
-    (folder / "evaluation.json").write_text(json.dumps(result.to_json(), indent=2) + "\n", encoding="utf-8")
+    files.write(folder / "evaluation.txt", result.table() + "\n")
+    files.write(folder / "evaluation.json", json.dumps(result.to_json(), indent=2) + "\n")
     tracking(evaluator, replays, folder / "tracking.png")
     replay.write(folder / replay.NAME, takes(evaluator, replays))
     return result

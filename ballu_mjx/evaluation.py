@@ -7,7 +7,9 @@ a whole recording small errors only compound. The paper's whole-recording figure
 from __future__ import annotations
 
 import dataclasses
+import reprlib
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -16,8 +18,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ballu_mjx import envmimic, simulation
+from ballu_mjx import envmimic, files, simulation
 from ballu_mjx import robot as ballu
+from ballu_mjx.errors import InputError, is_number
 from ballu_mjx.forces import ForceModel
 from ballu_mjx.reconstruction import Motion
 
@@ -64,10 +67,14 @@ class Errors:
     """Mean magnitude of the residual force (N)."""
 
 
+GROUPS = ("near", "far", "all")
+"""What recordings are reported in."""
+
+
 def group_of(name: str) -> str:
     """The group a recording is reported in."""
     head = name.split("-")[0]
-    return head if head in ("near", "far") else "all"
+    return head if head in GROUPS else "all"
 
 
 def base_name(identified: bool) -> str:
@@ -177,18 +184,66 @@ class Evaluation:
 
     @staticmethod
     def from_json(content: Mapping[str, Any]) -> Evaluation:
-        """The inverse of `to_json`."""
+        """The inverse of `to_json`.
 
-        def table(values: Mapping[str, Sequence[float]]) -> dict[float, tuple[float, float]]:
-            return {float(horizon): (mean, spread) for horizon, (mean, spread) in values.items()}
+        **Raises** `ValueError`, `TypeError`, `KeyError` or `AttributeError` for what is none.
+        """
 
-        def errors(rows: Sequence[Mapping[str, Any]]) -> tuple[Errors, ...]:
-            return tuple(
-                Errors(**{**row, "position": table(row["position"]), "yaw": table(row["yaw"])}) for row in rows
+        def number(value: Any) -> float:
+            if not is_number(value):
+                raise ValueError(f"{reprlib.repr(value)} is no number")
+            return float(value)
+
+        def text(value: Any) -> str:
+            if not isinstance(value, str):
+                raise ValueError(f"{reprlib.repr(value)} is no text")
+            return value
+
+        def table(values: Any) -> dict[float, tuple[float, float]]:
+            found = {float(horizon[:8]): (number(mean), number(spread)) for horizon, (mean, spread) in values.items()}
+            if not all(horizon in HORIZONS for horizon in found):
+                raise ValueError(f"errors are taken over {HORIZONS} s, not {reprlib.repr(list(found))}")
+            if not all(1e-9 < error < 1e9 and spread >= 0 for error, spread in found.values()):
+                raise ValueError("errors are greater than 0, their spreads 0 or more")
+            return found
+
+        def errors(row: Any) -> Errors:
+            found = Errors(
+                recording=text(row["recording"]),
+                group=text(row["group"]),
+                position=table(row["position"]),
+                yaw=table(row["yaw"]),
+                mean_com_error=number(row["mean_com_error"]),
+                final_yaw_error=number(row["final_yaw_error"]),
+                mean_force=number(row["mean_force"]),
             )
+            if found.group not in GROUPS or not found.position or found.position.keys() != found.yaw.keys():
+                raise ValueError(f"{reprlib.repr(found.recording)} has no group or not the same horizons for both")
+            return found
 
-        names = str(content["base"]), str(content["name"])
-        return Evaluation(errors(content["vanilla"]), errors(content["residual"]), *names)
+        without, mimic = (tuple(map(errors, content[which])) for which in ("vanilla", "residual"))
+        if not without or [_compared(e) for e in without] != [_compared(e) for e in mimic]:
+            raise ValueError("there are not the same recordings and horizons without the residual and with it")
+        return Evaluation(without, mimic, text(content["base"]), text(content["name"]))
+
+
+def _compared(errors: Errors) -> tuple[str, str, set[float]]:
+    return errors.recording, errors.group, set(errors.position)
+
+
+def read(path: Path) -> Evaluation:
+    """The evaluation in a file, `evaluation.json` of a run, say.
+
+    **Raises** `InputError` where it is none.
+    """
+    mend = f"`python -m ballu_mjx.evaluate {path.parent} --output {path.parent}` writes it again"
+    content = files.read_json(path, mend)
+    try:
+        return Evaluation.from_json(content)
+    except KeyError as error:
+        raise InputError(f"{path}: is no evaluation ({error} is missing); {mend}.") from error
+    except (ValueError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: is no evaluation ({error}); {mend}.") from error
 
 
 class OpenLoopEvaluator:

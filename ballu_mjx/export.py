@@ -79,7 +79,7 @@ def export(options: Options) -> Path:
     from ballu_mjx.tasks import TASKS
 
     _check(options)
-    ppo_config = runs.typed(PPOConfig, runs.read_config(options.run, *TASKS)["ppo"], options.run)
+    ppo_config = runs.typed(PPOConfig, runs.read_config(options.run, *TASKS), "ppo", options.run)
     folder = runs.new_folder(options.output or options.run / "export", "export")
     policy = Policy.load(options.run)
     stored = weights(policy, ppo_config)

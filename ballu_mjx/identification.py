@@ -479,9 +479,9 @@ def check(config: IdentificationConfig) -> None:
     """
     for name in ("draws", "starts", "steps", "degree"):
         if getattr(config, name) < 1:
-            raise InputError(f"--{name} is {getattr(config, name)}: it must be 1 or more.")
+            raise InputError(f"--{name} is {getattr(config, name)}: it must be 1 or more; 1 is the nearest.")
     if config.seed < 0:
-        raise InputError(f"--seed is {config.seed}: it must be 0 or more.")
+        raise InputError(f"--seed is {config.seed}: it must be 0 or more; 0 is the nearest.")
 
 
 class Identifier:

@@ -29,7 +29,7 @@ from brax.training.types import Transition, UInt64
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int, UInt32
 
-from ballu_mjx import ppo
+from ballu_mjx import distributed, ppo
 from ballu_mjx.ppo import STATE, Normalizer, Params, PPOConfig
 
 
@@ -130,7 +130,8 @@ class _Training(Wrapper):
 
 
 class Learner:
-    """PPO for one environment and configuration, on all local devices.
+    """PPO for one environment and configuration, on all devices, those of other processes included (see
+    `ballu_mjx.distributed`).
 
     Each device has its share of the environments, and collects and learns from their experience; gradients and
     statistics are means over all of them.
@@ -138,7 +139,7 @@ class Learner:
 
     def __init__(self, env: Env, config: PPOConfig) -> None:
         """**Raises** `InputError` from `ppo.check`."""
-        self._devices = jax.local_device_count()
+        self._devices = jax.device_count()
         ppo.check(config, self._devices)
         self._config, self._env = config, wrap_for_training(env)
         shapes = jax.eval_shape(self._env.reset, jax.random.split(jax.random.PRNGKey(0), 1)).obs
@@ -161,7 +162,7 @@ class Learner:
         )
         self._gradient = gradients.loss_and_pgrad(loss, pmap_axis_name=_AXIS, has_aux=True)  # pyright: ignore
 
-        mesh = Mesh(np.array(jax.local_devices()), (_AXIS,))
+        mesh = Mesh(np.array(jax.devices()), (_AXIS,))
         each: Any = PartitionSpec()
         specs = TrainingState(*[each] * len(TrainingState._fields))._replace(environments=PartitionSpec(_AXIS))
         self._shardings: Any = TrainingState(*(NamedSharding(mesh, spec) for spec in specs))  # pyright: ignore
@@ -178,7 +179,7 @@ class Learner:
 
     def begin(self, seed: int) -> TrainingState:
         """A fresh state; Brax's with this seed."""
-        return self._begin(jax.random.PRNGKey(seed))
+        return self._begin(np.array(jax.random.PRNGKey(seed)))  # an array of one device is not for all processes
 
     def go_on(self, stored: Stored, *, environments: bool = True) -> tuple[TrainingState, bool]:
         """The state that `stored` was made of, and whether all of it could be used.
@@ -222,7 +223,11 @@ class Learner:
         )
         networks = PPONetworkParams(policy=params.policy, value=params.value)  # pyright: ignore[reportCallIssue]
         filled = state._replace(networks=networks, averaged=params.policy, normalizer=normalizer, steps=_uint64(steps))
-        return self._placed(jax.tree.map(lambda x, like: np.array(x, like.dtype), filled, state))
+
+        def placeable(x: Any, like: Array) -> Any:
+            return x if isinstance(x, jax.Array) else np.array(x, like.dtype)
+
+        return self._placed(jax.tree.map(placeable, filled, state))
 
     def _placed(self, state: TrainingState) -> TrainingState:
         """From the host to where `step` wants it."""
@@ -347,7 +352,7 @@ def train(
     *,
     start: Callable[[Learner], TrainingState] | None = None,
 ) -> tuple[TrainingState, dict[str, float]]:
-    """Learn a policy for `env`, on all local devices, until `config.num_timesteps` control steps are done.
+    """Learn a policy for `env`, on all devices, until `config.num_timesteps` control steps are done.
 
     **Arguments**
 
@@ -400,8 +405,8 @@ def params(state: TrainingState) -> Params:
 
 
 def stored(state: TrainingState) -> dict[str, np.ndarray]:
-    """All of `state`, copied to the host, for `Learner.go_on`."""
-    return {_name(path): np.array(leaf) for path, leaf in jax.tree.leaves_with_path(state)}
+    """All of `state`, copied to the host, for `Learner.go_on`; all processes must ask for it."""
+    return {_name(path): distributed.on_host(leaf) for path, leaf in jax.tree.leaves_with_path(state)}
 
 
 def with_learning_rate(stored: Stored, rate: float) -> dict[str, np.ndarray]:

@@ -8,6 +8,7 @@ data: settings share a compiled program. Only the residual, which adds a network
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -20,6 +21,7 @@ from jaxtyping import Array, Float
 from ballu_mjx import envmimic, simulation
 from ballu_mjx import robot as ballu
 from ballu_mjx.envmimic import HISTORY
+from ballu_mjx.errors import InputError
 from ballu_mjx.residual import Residual
 from ballu_mjx.robot import ActuatorParameters
 from ballu_mjx.tasks import Step, Task
@@ -52,6 +54,23 @@ class LocomotionConfig:
     outside_cost: float = 0.0
     """Reward (m/s) lost per width of that range by which the residual's observation leaves it: keeps the policy where
     the residual knows what it does, which a policy paid for speed otherwise leaves. 0: nothing."""
+
+
+def check(config: LocomotionConfig) -> None:
+    """**Raises** `InputError` for options out of range, naming the option and the mend."""
+    low, high = config.friction
+    if not 0 < low <= high < math.inf:
+        raise InputError(f"--friction is {low:g} {high:g}: give two numbers above 0, the smaller first.")
+    least = 2 * ballu.CONTROL_TIMESTEP
+    if not least <= config.episode_seconds < math.inf:
+        raise InputError(
+            f"--episode-seconds is {config.episode_seconds:g}: it must be {least:g} or more; {least:g} is the nearest."
+        )
+    for name in ("start_yaw", "start_tilt", "start_angle", "start_velocity", "residual_decay", "outside_cost"):
+        if not 0 <= getattr(config, name) < math.inf:
+            raise InputError(
+                f"--{name.replace('_', '-')} is {getattr(config, name):g}: it must be 0 or more; 0 is the nearest."
+            )
 
 
 def setting_name(config: LocomotionConfig, identified: bool, residual: str | None) -> str:

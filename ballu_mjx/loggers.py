@@ -6,14 +6,17 @@ import dataclasses
 import importlib.util
 import json
 import math
+import time
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from tensorboardX import SummaryWriter
+from tensorboardX import summary
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
 
-from ballu_mjx import runtime
+from ballu_mjx import files, runtime
 from ballu_mjx.errors import InputError
 
 _WANDB_ID = "wandb-id.txt"
@@ -54,16 +57,23 @@ class JsonLines:
 
 
 class TensorBoard:
-    """Event files, of what is finite."""
+    """Event files, of what is finite. Written at once, and not by tensorboardX's thread: a full disk kills that, and
+    whoever writes next waits for ever."""
 
     def __init__(self, folder: Path, first_step: int | None = None) -> None:
         """Write into `folder`; `first_step` of a run that goes on: what is there from that step on is hidden."""
-        self._writer = SummaryWriter(str(folder), purge_step=first_step)
+        folder.mkdir(parents=True, exist_ok=True)
+        self._writer = EventsWriter(str(folder / "events"))
+        if first_step is not None:
+            self._write(first_step, session_log=SessionLog(status=SessionLog.START))
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
         for name, value in _finite(metrics).items():
-            self._writer.add_scalar(name, value, step)
+            self._write(step, summary=summary.scalar(name, value))
         self._writer.flush()
+
+    def _write(self, step: int, **content: Any) -> None:
+        self._writer.write_event(Event(wall_time=time.time(), step=step, **content))
 
     def close(self, *, failed: bool = False) -> None:
         self._writer.close()
@@ -84,12 +94,12 @@ class WeightsAndBiases:
 
         path = folder / _WANDB_ID
         if not path.exists():
-            path.write_text(uuid.uuid4().hex, encoding="utf-8")
+            files.write(path, uuid.uuid4().hex)
         try:
             self._run = wandb.init(
                 project=project,
                 name=folder.name,
-                id=path.read_text(encoding="utf-8"),
+                id=files.read_text(path),
                 resume="allow",
                 dir=folder,
                 config=dict(config),

@@ -13,6 +13,7 @@ import dataclasses
 import gc
 import hashlib
 import json
+import re
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -26,11 +27,13 @@ from ballu_mjx import (
     actuator_fit,
     actuators,
     air_fit,
+    files,
     loggers,
     policy_training,
     residual_training,
     robot,
     runs,
+    transfer,
     trials,
     virtual_robot,
 )
@@ -50,6 +53,7 @@ TABLES = {"walk": walking_table, "turn": turning_table}
 SETTINGS = ("vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic", "aerodynamic")
 """The paper's four simulators, and one with the identified air instead of EnvMimic's forces."""
 _DECIMALS = 4
+_KEY = re.compile("[0-9a-f]{16}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,11 +236,11 @@ class Story:
             policy = Policy.load(source)
             draws = [virtual_robot.draw_trial(_draw(self.seed, task, "trials", number)) for number in range(count)]
             found = trials.run(policy, self._robot, draws, folder, *self._simulator(policy))
-            (folder / "transfer.json").write_text(json.dumps([t.to_json() for t in found], indent=2) + "\n")
+            transfer.write(folder / "transfer.json", found)
 
         options = {"robot": self.options.robot, "seed": self.seed, "trials": count}
         folder = _stage(self._own / f"trials-{task}-{setting}", options, [source], make)
-        return [Transfer.from_json(entry) for entry in json.loads((folder / "transfer.json").read_text())]
+        return transfer.read(folder / "transfer.json")
 
     def _actions(self, run: Path, seconds: float) -> list[np.ndarray]:
         """Commands of each of a policy's kept checkpoints over `seconds`, in its own simulator from standing."""
@@ -273,11 +277,11 @@ def _stage(folder: Path, options: Any, needs: Sequence[Path], make: Callable[[Pa
     """
     content = {
         "options": options if isinstance(options, dict) else _plain(options),
-        "needs": [json.loads(_mark(need).read_text())["key"] for need in needs],
+        "needs": [_read_mark(_mark(need))["key"] for need in needs],
     }
     key = hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
     mark = _mark(folder)
-    found = json.loads(mark.read_text()) if mark.exists() else None
+    found = _read_mark(mark) if mark.exists() else None
     if found is not None and found["key"] == key and found["done"]:
         return folder
     if found is not None and found["key"] != key:
@@ -306,9 +310,20 @@ def _mark(folder: Path) -> Path:
 
 
 def _write_mark(path: Path, key: str, content: dict[str, Any], *, done: bool) -> None:
-    draft = path.with_suffix(".tmp")
-    draft.write_text(json.dumps({"key": key, "done": done, **content}, indent=2, default=str) + "\n", encoding="utf-8")
-    draft.replace(path)
+    files.write(path, json.dumps({"key": key, "done": done, **content}, indent=2, default=str) + "\n")
+
+
+def _read_mark(path: Path) -> dict[str, Any]:
+    """The content of a stage's file.
+
+    **Raises** `InputError` where it is damaged.
+    """
+    mend = "delete it, and its stage will be made anew"
+    content = files.read_json(path, mend)
+    key = content.get("key")
+    if not (isinstance(key, str) and _KEY.fullmatch(key) and isinstance(content.get("done"), bool)):
+        raise InputError(f'{path}: "key" and "done" are not as this program writes them; {mend}.')
+    return content
 
 
 def _plain(options: Any) -> Any:
@@ -333,3 +348,4 @@ def _check(options: Options) -> None:
         raise InputError("--tasks is empty; name walk, turn, or both.")
     if options.output.exists() and not options.output.is_dir():
         raise InputError(f"{options.output}: is a file; give --output a folder.")
+    files.check_folder(options.output)

@@ -28,9 +28,11 @@ COLOURS: Mapping[str, str] = {
     "supervised": "#56b4e9",
     "envmimic": "#009e73",
     "aerodynamic": "#882255",
+    "analytic": "#999933",
     "aerodynamic+envmimic": "#332288",
+    "aerodynamic+analytic": "#aa4499",
 }
-"""One colour for each simulator in all figures (Okabe and Ito's, two of Tol's: the colour-blind tell them apart)."""
+"""One colour for each simulator in all figures (Okabe and Ito's, four of Tol's: the colour-blind tell them apart)."""
 
 LABELS: Mapping[str, str] = {
     "recording": "recording",
@@ -41,7 +43,9 @@ LABELS: Mapping[str, str] = {
     "supervised": "supervised",
     "envmimic": "EnvMimic",
     "aerodynamic": "aerodynamic",
+    "analytic": "analytic",
     "aerodynamic+envmimic": "aerodynamic+EnvMimic",
+    "aerodynamic+analytic": "aerodynamic+analytic",
 }
 _QUANTITIES = ("x (m)", "y (m)", "yaw (deg)")
 _DOTS_PER_INCH = 120
@@ -114,6 +118,31 @@ def learning_curve(
     lower.set_xlabel("control steps (millions)")
     lower.legend()
     for axis in (upper, lower):
+        axis.grid(alpha=0.3)
+    _save(figure, path)
+
+
+def fit_curve(
+    path: Path,
+    losses: Mapping[str, tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]],
+    validation: tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]],
+    label: str,
+    simulator: str,
+    best_step: int,
+) -> None:
+    """Losses by name and the validation error, called `label`, against gradient steps, in the simulator's colour."""
+    figure = Figure(figsize=(7.0, 6.0), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    for (name, curve), style in zip(losses.items(), ("-", "--"), strict=False):
+        upper.plot(*curve, color=COLOURS[simulator], linestyle=style, label=name)
+    lower.plot(*validation, color=COLOURS[simulator], marker="o", markersize=4)
+    lower.axhline(1.0, color=COLOURS["vanilla"], linestyle="--", label="no force")
+    lower.axvline(best_step, color="grey", linestyle=":", label="best checkpoint")
+    upper.set_ylabel("loss")
+    lower.set_ylabel(label)
+    lower.set_xlabel("gradient steps")
+    for axis in (upper, lower):
+        axis.legend()
         axis.grid(alpha=0.3)
     _save(figure, path)
 

@@ -54,15 +54,22 @@ class Policy:
         """
         folder = Path(folder)
         stored = runs.read_config(folder, *TASKS)
+        config = runs.typed(LocomotionConfig, stored, "env", folder, locomotion.check)
+        sizes = locomotion.OBSERVATIONS, ACTIONS, runs.typed(PPOConfig, stored, "ppo", folder, ppo.check_values)
+        infer = ppo.make_inference(*sizes)
         step, tree = runs.restore(folder, which)
-        residual = stored["residual"]
+        params = ppo.from_tree(tree)
+        if not ppo.fits(infer, params, locomotion.OBSERVATIONS):
+            raise InputError(
+                f"{folder}: the stored parameters are not of the network in its config.json; restore one of the two."
+            )
         return Policy(
             task=TASKS[stored["task"]],
-            config=runs.typed(LocomotionConfig, stored["env"], folder),
+            config=config,
             actuators=runs.actuators(stored, folder),
-            residual=None if residual is None else Path(residual),
-            params=ppo.from_tree(tree),
-            infer=ppo.make_inference(locomotion.OBSERVATIONS, ACTIONS, runs.typed(PPOConfig, stored["ppo"], folder)),
+            residual=runs.residual(stored, folder),
+            params=params,
+            infer=infer,
             step=step,
         )
 

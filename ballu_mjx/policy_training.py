@@ -13,7 +13,20 @@ from typing import Any
 import jax
 import numpy as np
 
-from ballu_mjx import actuators, learner, locomotion, loggers, plots, policy, ppo, replay, residual, robot, runs
+from ballu_mjx import (
+    actuators,
+    distributed,
+    learner,
+    locomotion,
+    loggers,
+    plots,
+    policy,
+    ppo,
+    replay,
+    residual,
+    robot,
+    runs,
+)
 from ballu_mjx.errors import InputError
 from ballu_mjx.locomotion import LocomotionConfig
 from ballu_mjx.policy import ClosedLoop, Policy, Rollout
@@ -45,7 +58,7 @@ NOMINAL = Path("nominal")
 
 
 @dataclasses.dataclass(frozen=True)
-class Data(loggers.LoggingOptions):
+class Data(loggers.LoggingOptions, distributed.DistributedOptions):
     """The simulator's parts, and folders."""
 
     actuators: Path | None = None
@@ -68,26 +81,30 @@ class Data(loggers.LoggingOptions):
 def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfig) -> int:
     """Check everything, train, show the gait; returns the exit status."""
     started = time.perf_counter()
-    devices = [str(device) for device in jax.local_devices()]
+    distributed.join(data)
+    devices = [str(device) for device in jax.devices()]
     ppo.check(ppo_config, len(devices))
     loggers.check(data.wandb)
-    check(config)
+    locomotion.check(config)
     if data.keep_every < 1:
         raise InputError(f"--keep-every is {data.keep_every}: it must be 1 or more.")
     start = start_from(task.name, data.resume, ppo_config, output=data.output, quick=data.quick)
     identified, forces = _simulator(task, data)
     env = policy.environment(task, config, identified, forces)
-    folder = data.resume or runs.new_folder(data.output, task.name)
     setting = locomotion.setting_name(
         config, identified is not None, None if env.residual is None else env.residual.model.name
     )
 
+    content = runs.describe(task.name, {"env": config, "ppo": ppo_config, "data": data}, {}, devices, identified)
+    content["residual"] = None if forces is None else str(forces.resolve())
+    if not distributed.is_first():
+        return Session(None, None, data.keep_every).follow(env, ppo_config, start, content)
+
+    folder = data.resume or runs.new_folder(data.output, task.name)
     print(f"Run folder: {folder}")
     print(f"  task: {task.name}; simulator: {setting}" + (f", residual {forces}" if forces is not None else ""))
     if data.quick:
         print("  --quick: sizes so small that the policy will not walk.")
-    content = runs.describe(task.name, {"env": config, "ppo": ppo_config, "data": data}, {}, devices, identified)
-    content["residual"] = None if forces is None else str(forces.resolve())
     with runs.Run(folder, content, resumed_at=start.resumed_at, wandb=data.wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)
         progress = runs.Progress(learner.total_timesteps(ppo_config, start.step), start.step)
@@ -112,20 +129,6 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
     return 0
 
 
-def check(config: LocomotionConfig) -> None:
-    """**Raises** `InputError` for options out of range, naming the option and the mend."""
-    low, high = config.friction
-    if not 0 < low <= high:
-        raise InputError(f"--friction is {low:g} {high:g}: give two numbers above 0, the smaller first.")
-    if not config.episode_seconds >= 2 * robot.CONTROL_TIMESTEP:
-        raise InputError(
-            f"--episode-seconds is {config.episode_seconds:g}: it must be {2 * robot.CONTROL_TIMESTEP:g} or more."
-        )
-    for name in ("start_yaw", "start_tilt", "start_angle", "start_velocity", "residual_decay", "outside_cost"):
-        if not getattr(config, name) >= 0:
-            raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name):g}: it must be 0 or more.")
-
-
 def summary(task: Task, rollout: Rollout, with_residual: bool) -> str:
     """What the first of some runs did, in words."""
     way = rollout.com[0, -1] - rollout.com[0, 0]
@@ -148,8 +151,7 @@ def _simulator(task: Task, data: Data) -> tuple[ActuatorParameters | None, Path 
             if given is not None:
                 raise InputError(f"{option} does not go with --resume, which keeps the simulator; leave one out.")
         stored = runs.read_config(data.resume, task.name)
-        forces = stored["residual"]
-        return runs.actuators(stored, data.resume), None if forces is None else Path(forces)
+        return runs.actuators(stored, data.resume), runs.residual(stored, data.resume)
     if data.actuators == NOMINAL:
         return None, data.residual
     if data.actuators is not None:

@@ -6,6 +6,7 @@ The learning itself is `ballu_mjx.learner`'s.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
 
@@ -13,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.training.agents.ppo import networks as brax_networks
-from flax import linen
+from flax import errors, linen
 from jaxtyping import Array, Float
 
 from ballu_mjx.errors import InputError
@@ -89,43 +90,70 @@ class Params(NamedTuple):
 
 
 ObservationSize = int | Mapping[str, tuple[int, ...] | int]
-Inference = Callable[[Params, Float[Array, " observations"]], Float[Array, " actions"]]
+Inference = Callable[[Params, Float[Array, "*batch observations"]], Float[Array, "*batch actions"]]
 Sampler = Callable[[Params, Float[Array, " observations"], Array], Float[Array, " actions"]]
 
 STATE, CRITIC = "state", "critic"
 """Names of an observation's parts: what the policy sees and, where there is one of its own, the value function."""
 
 _INITIAL_MEAN_SCALE = 0.01
+_NARROWEST = 1e-4
+"""Smallest standard deviation that an observation is divided by."""
+
+
+_COUNTS = (
+    "num_timesteps",
+    "num_envs",
+    "unroll_length",
+    "batch_size",
+    "num_minibatches",
+    "num_updates_per_batch",
+    "averaging",
+)
+_POSITIVE = ("learning_rate", "initial_std", "reward_scaling", "max_grad_norm", "observation_clip", "clipping_epsilon")
+_WIDEST, _LARGEST = 2**14, 2**31 - 1
+
+
+def check_values(config: PPOConfig) -> None:
+    """Refuse values that no option may have, each for itself.
+
+    **Raises** `InputError` naming the option, and the nearest value that it may have.
+    """
+    for name in (*_COUNTS, "seed"):
+        value, least = getattr(config, name), int(name != "seed")
+        # 64 bits count the control steps; all else is XLA's, whose sizes and seeds have 32.
+        most = 2**62 if name == "num_timesteps" else _LARGEST
+        if not least <= value <= most:
+            said, nearest = (f"{least} or more", least) if value < least else (f"{most} or less", most)
+            raise InputError(f"{_option(name)} is {value}: it must be {said}; {nearest} is the nearest.")
+    for name in _POSITIVE:
+        if not (getattr(config, name) > 0 and math.isfinite(getattr(config, name))):
+            usual = getattr(PPOConfig, name)
+            raise InputError(
+                f"{_option(name)} is {getattr(config, name)}: it must be greater than 0; {usual} is usual."
+            )
+    for name in ("entropy_cost", "desired_kl"):
+        if not (getattr(config, name) >= 0 and math.isfinite(getattr(config, name))):
+            raise InputError(f"{_option(name)} is {getattr(config, name)}: it must be 0 or more; 0 is the nearest.")
+    for name in ("discounting", "gae_lambda"):
+        value = getattr(config, name)
+        if not 0 <= value <= 1:
+            raise InputError(
+                f"{_option(name)} is {value}: it must be between 0 and 1; {int(value > 1)} is the nearest."
+            )
+    for name in ("policy_layers", "value_layers"):
+        if not (widths := getattr(config, name)) or min(widths) < 1 or max(widths) > _WIDEST:
+            raise InputError(
+                f"{_option(name)} is {widths}: give one width of 1 or more, and {_WIDEST} or less, for each layer."
+            )
 
 
 def check(config: PPOConfig, devices: int) -> None:
     """Refuse sizes that do not fit each other or the number of devices, before anything is compiled.
 
-    **Raises** `InputError` naming the option, and the nearest value that fits.
+    **Raises** `InputError` naming the option, and the nearest value that fits; also from `check_values`.
     """
-    sizes = (
-        "num_timesteps",
-        "num_envs",
-        "unroll_length",
-        "batch_size",
-        "num_minibatches",
-        "num_updates_per_batch",
-        "averaging",
-    )
-    for name in (*sizes, "averaging"):
-        if getattr(config, name) < 1:
-            raise InputError(f"{_option(name)} is {getattr(config, name)}: it must be 1 or more.")
-    for name in ("learning_rate", "initial_std", "reward_scaling", "max_grad_norm", "observation_clip"):
-        if not getattr(config, name) > 0:
-            raise InputError(f"{_option(name)} is {getattr(config, name)}: it must be greater than 0.")
-    for name in ("discounting", "gae_lambda"):
-        if not 0 <= getattr(config, name) <= 1:
-            raise InputError(f"{_option(name)} is {getattr(config, name)}: it must be between 0 and 1.")
-    if config.seed < 0:
-        raise InputError(f"--seed is {config.seed}: it must be 0 or more.")
-    for name in ("policy_layers", "value_layers"):
-        if not getattr(config, name) or min(getattr(config, name)) < 1:
-            raise InputError(f"{_option(name)} is {getattr(config, name)}: give one width of 1 or more for each layer.")
+    check_values(config)
     if config.batch_size % devices:
         nearest = max(round(config.batch_size / devices), 1) * devices
         raise InputError(
@@ -175,7 +203,7 @@ def make_inference(observation_size: ObservationSize, action_size: int, config: 
     """
     networks = make_networks(observation_size, action_size, config)
 
-    def infer(params: Params, observation: Float[Array, " observations"]) -> Float[Array, " actions"]:
+    def infer(params: Params, observation: Float[Array, "*batch observations"]) -> Float[Array, "*batch actions"]:
         logits = networks.policy_network.apply(params.normalizer, params.policy, {STATE: observation})
         return networks.parametric_action_distribution.mode(logits)
 
@@ -191,6 +219,26 @@ def make_sampler(observation_size: ObservationSize, action_size: int, config: PP
         return networks.parametric_action_distribution.sample(logits, key)
 
     return sample
+
+
+def fits(infer: Inference, params: Params, inputs: int) -> bool:
+    """Whether `params` are of the network that `infer` evaluates for so many inputs."""
+    observation = jax.ShapeDtypeStruct((inputs,), jnp.float32)
+    try:
+        jax.eval_shape(infer, params, observation)
+    except (errors.FlaxError, TypeError, ValueError, KeyError):
+        return False
+    return True
+
+
+def initial_policy(inputs: Float[Array | np.ndarray, "states inputs"], action_size: int, config: PPOConfig) -> Params:
+    """A fresh policy whose normalizer knows the observations `inputs`; it has no value function."""
+    inputs = np.asarray(inputs, np.float64)
+    std = np.maximum(inputs.std(axis=0), _NARROWEST)
+    mean, std, summed = (np.asarray(x, np.float32) for x in (inputs.mean(axis=0), std, std**2 * len(inputs)))
+    normalizer = Normalizer(np.asarray(len(inputs), np.float32), {STATE: mean}, {STATE: std}, {STATE: summed})
+    policy = make_networks({STATE: (inputs.shape[1],)}, action_size, config).policy_network
+    return Params(normalizer, policy.init(jax.random.key(config.seed)), {})
 
 
 def as_tree(params: Params) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import tyro
 
-from ballu_mjx import runtime
+from ballu_mjx import files, runtime
 from ballu_mjx.errors import InputError
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def _import(options: Import) -> None:
     from ballu_mjx.importers import placement
     from ballu_mjx.importers.mapping import read_mapping
     from ballu_mjx.importers.table import Table, commands_in, read_commands
-    from ballu_mjx.recording import name_of
+    from ballu_mjx.recording import SHORTEST, name_of
 
     _check_output(options.output)
     if options.offset is not None and options.offset_range is not None:
@@ -149,6 +149,8 @@ def _import(options: Import) -> None:
     mapping = read_mapping(options.mapping)
     trajectories, table = _read(options, mapping)
     recording = placement.place(trajectories, mapping, name_of(options.output))
+    if recording.time[-1] - recording.time[0] < SHORTEST:
+        raise InputError(f"{options.file}: lasts less than {SHORTEST:g} s; capture for longer.")
     print(f"{options.file}: {len(recording.time)} samples, {recording.time[-1] - recording.time[0]:.2f} s")
     if options.commands is None:
         if table is None or mapping.commands.left not in table.header:
@@ -158,7 +160,7 @@ def _import(options: Import) -> None:
             )
         time, command = trajectories.time, commands_in(table, mapping.commands)
     else:
-        time, command = read_commands(Table(options.commands), mapping.commands)
+        time, command = read_commands(Table(options.commands, options.mapping), mapping.commands)
         time = time + (_offset(options, recording, time, command) if options.offset is None else options.offset)
     recording, cut = placement.with_commands(options.commands or options.file, recording, time, command)
     if max(cut) > 0:
@@ -180,7 +182,7 @@ def _read(options: Import, mapping: RoomMapping) -> tuple[Trajectories, Table | 
         return c3d.read_c3d(options.file, mapping), None
     if kind == "vicon":
         return vicon.read_vicon(options.file, mapping), None
-    table = Table(options.file)
+    table = Table(options.file, options.mapping)
     return read_table(table, mapping), table
 
 
@@ -263,12 +265,13 @@ def _write(options: Import, recording: Recording) -> None:
 
 
 def _check_output(output: Path) -> None:
-    """Refuse a name that is none of a recording's, or taken."""
+    """Refuse a name that is none of a recording's, or taken, and a folder that cannot be written to."""
     from ballu_mjx.recording import description_path
 
     for path in (output, description_path(output)):
         if path.exists():
             raise InputError(f"{path}: stands there already; delete it, or give another --output.")
+    files.check_folder(output.parent)
 
 
 # ---- check ----

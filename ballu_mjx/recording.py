@@ -24,7 +24,6 @@ import gzip
 import io
 import json
 import math
-import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal, NoReturn
@@ -33,7 +32,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation, Slerp
 
-from ballu_mjx import robot
+from ballu_mjx import files, robot
 from ballu_mjx.errors import InputError
 
 FORMAT = "ballu-recording/1"
@@ -47,9 +46,6 @@ LONGEST_GAP = 0.5
 """Longest stretch (s) without a sample that is filled in."""
 SHORTEST = 1.0
 """Shortest recording (s)."""
-LARGEST_FILE = 128 * 2**20
-"""Bytes of text; close to two hours at 100 Hz."""
-
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "time": ("time",),
     "command": ("command_left", "command_right"),
@@ -198,9 +194,9 @@ def write_recording(recording: Recording, path: Path | str, *, decimals: int = 5
         with gzip.GzipFile(filename="", mode="wb", compresslevel=9, fileobj=buffer, mtime=0) as stream:
             stream.write(content)
         content = buffer.getvalue()
-    path.write_bytes(content)
+    files.write(path, content)
     keys = {"format": FORMAT, "kind": recording.kind, "robot": recording.robot, "notes": recording.notes}
-    description.write_bytes((json.dumps(keys, indent=2, ensure_ascii=False) + "\n").encode())
+    files.write(description, json.dumps(keys, indent=2, ensure_ascii=False) + "\n")
 
 
 def recordings(paths: Iterable[Path | str]) -> list[Path]:
@@ -260,41 +256,12 @@ def description_path(path: Path) -> Path:
     return path.with_name(name_of(path) + ".json")
 
 
-def read_text(path: Path) -> str:
-    """The text of a file, unpacked where its name ends in .gz.
-
-    **Raises** `InputError` where there is no such file, or none of at most `LARGEST_FILE` bytes of UTF-8 text.
-    """
-    if not path.is_file():
-        _refuse(path, "there is no such file", "put it there or check the path")
-    try:
-        with gzip.open(path, "rb") if path.name.endswith(".gz") else path.open("rb") as stream:
-            content = stream.read(LARGEST_FILE + 1)
-    except (gzip.BadGzipFile, EOFError, zlib.error):
-        _refuse(path, "not a whole gzip file", "compress or copy it again, or give the plain .csv")
-    except OSError as error:
-        _refuse(path, f"cannot be read ({error.strerror})", "check the file and its permissions")
-    if len(content) > LARGEST_FILE:
-        _refuse(path, f"holds more than {LARGEST_FILE >> 20} MiB of text", "cut it into shorter recordings")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = content.count(b"\n", 0, error.start) + 1
-        _refuse(path, f"line {line} is not UTF-8 text", "save the file as UTF-8 text")
-
-
 def _read_description(path: Path) -> tuple[Kind, str, str]:
     """Kind, robot and notes."""
     example = f'{{"format": "{FORMAT}", "kind": "free", "robot": "...", "notes": "..."}}'
     if not path.is_file():
         _refuse(path, "there is no description beside the recording", f"write one such as {example}")
-    try:
-        keys = json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        place = f" (line {error.lineno}: {error.msg})" if isinstance(error, json.JSONDecodeError) else ""
-        _refuse(path, f"not JSON{place}", f"write it such as {example}")
-    if not isinstance(keys, dict):
-        _refuse(path, "not a JSON object", f"write it such as {example}")
+    keys = files.read_json(path, f"write it such as {example}")
     if keys.get("format") != FORMAT:
         _refuse(path, f'"format" is {_quote(keys, "format")}', f'it must be "{FORMAT}", the format this version reads')
     kind, made_by, notes = keys.get("kind"), keys.get("robot"), keys.get("notes", "")
@@ -318,7 +285,7 @@ def _quote(keys: dict, key: str) -> str:
 
 def _read_columns(path: Path) -> dict[str, _Column]:
     """The CSV's columns by name, missing samples as NaN."""
-    text = read_text(path)
+    text = files.read_text(path)
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     values = array.array("d")
     header: list[str] | None = None

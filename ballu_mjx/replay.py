@@ -8,6 +8,8 @@ and where they are known `i/command` and `i/force`; `i/robot` says which robot w
 from __future__ import annotations
 
 import dataclasses
+import io
+import textwrap
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from ballu_mjx import files
 from ballu_mjx.errors import InputError
 
 FORMAT = "ballu-replay/1"
@@ -22,6 +25,10 @@ NAME = "replay.npz"
 
 _MEND = "python -m ballu_mjx.evaluate RUN --output RUN writes it anew"
 _COORDINATES = 14
+_TOLERANCE = 0.02
+"""Of a quaternion's length."""
+_LARGEST = 1e6
+"""m, rad and s; what is beyond is no motion."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,10 +60,9 @@ def write(path: Path, takes: Sequence[Take]) -> None:
             f"{index}/{name}": value for name in ("command", "force") if (value := getattr(take, name)) is not None
         }
     single = {name: a.astype(np.float32) if a.dtype.kind == "f" else a for name, a in arrays.items()}
-    draft = path.with_name(path.name + ".tmp")
-    with draft.open("wb") as file:
-        np.savez_compressed(file, **single)  # pyright: ignore[reportArgumentType]
-    draft.replace(path)
+    archive = io.BytesIO()
+    np.savez_compressed(archive, **single)  # pyright: ignore[reportArgumentType]
+    files.write(path, archive.getvalue())
 
 
 def read(path: Path) -> list[Take]:
@@ -64,21 +70,25 @@ def read(path: Path) -> list[Take]:
 
     **Raises** `InputError` where it is none of the format, damaged, or holds pickled objects, which are never loaded.
     """
+    if not path.exists():
+        raise InputError(f"{path}: there is no replay; {_MEND}.")
     try:
-        with path.open("rb") as file:
-            archive = np.load(file, allow_pickle=False)
-            if not isinstance(archive, Mapping):
-                raise ValueError("a single array")
-            arrays = {name: archive[name] for name in archive}
-    except FileNotFoundError:
-        raise InputError(f"{path}: there is no replay; {_MEND}.") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: is no archive of plain arrays ({error}); {_MEND}.") from None
+        with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > files.LARGEST:
+                raise ValueError(f"more than {files.LARGEST >> 20} MiB")
+            arrays = {name.removesuffix(".npy"): _array(archive.read(name)) for name in archive.namelist()}
+    except Exception as error:  # what unpacking and NumPy make of damage is of many kinds
+        said = textwrap.shorten(str(error), 80) or type(error).__name__
+        raise InputError(f"{path}: is no archive of plain arrays ({said}); {_MEND}.") from None
     found = arrays.pop("format", None)
     if found is None or str(found) != FORMAT:
         raise InputError(f"{path}: is not of the format {FORMAT}; {_MEND}.")
     names = arrays.pop("names", np.array([], str))
     return [_take(path, str(name), f"{index}/", arrays) for index, name in enumerate(names.ravel())]
+
+
+def _array(content: bytes) -> np.ndarray:
+    return np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
 
 
 def _take(path: Path, name: str, prefix: str, arrays: Mapping[str, np.ndarray]) -> Take:
@@ -92,10 +102,21 @@ def _take(path: Path, name: str, prefix: str, arrays: Mapping[str, np.ndarray]) 
         value = own.get(key)
         if value is None and key in ("command", "force"):
             continue
-        if value is None or value.dtype.kind != "f" or value.shape != shape or not np.isfinite(value).all():
+        if value is None or value.dtype.kind != "f" or value.shape != shape or not (np.abs(value) < _LARGEST).all():
             raise InputError(f"{path}: {prefix}{key} is not an array of {shape} finite numbers; {_MEND}.")
     if time is None or states < 2 or not qpos:
         raise InputError(f"{path}: take {name!r} has no robot, or less than two states; {_MEND}.")
+    command = own.get("command", np.zeros(0))
+    turns = [np.linalg.norm(value[:, 3:7], axis=1) for value in qpos.values()]
+    if (
+        not (np.diff(time) > 0).all()
+        or ((command < 0) | (command > 1)).any()
+        or max(np.abs(turn - 1).max() for turn in turns) > _TOLERANCE
+    ):
+        raise InputError(
+            f"{path}: take {name!r} has times that run back, commands outside of 0 to 1, or quaternions that are none; "
+            f"{_MEND}."
+        )
     return Take(
         name=name,
         robot=str(own.get("robot", "")),

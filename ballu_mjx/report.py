@@ -14,14 +14,17 @@ import sys
 import webbrowser
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tyro
 
-from ballu_mjx import replay, runtime, video
+from ballu_mjx import files, replay, runtime, video
 from ballu_mjx.errors import InputError
 from ballu_mjx.replay import Take
+
+if TYPE_CHECKING:
+    from ballu_mjx.evaluation import Errors
 
 NAME = "report.html"
 _TEMPLATE = "report.html"
@@ -76,7 +79,7 @@ def _report(options: Options) -> None:
     if options.show is not None and options.show not in (names := [take.name for take in content.takes]):
         raise InputError(f"--show {options.show}: there is no such replay; one of {', '.join(names) or 'none'}.")
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(render(content), encoding="utf-8")
+    files.write(path, render(content))
     print(f"Written to {path}, {path.stat().st_size / 1e6:.1f} MB.")
     if not content.takes:
         print(
@@ -150,7 +153,7 @@ def collect(folder: Path) -> Content:
 
     tables = [(task, pipeline.table_file(folder, task)) for task in pipeline.TABLES]
     if not (folder / "config.json").is_file() and any(path.is_file() for _, path in tables):
-        return _story(folder, {task: path.read_text(encoding="utf-8") for task, path in tables if path.is_file()})
+        return _story(folder, {task: files.read_text(path) for task, path in tables if path.is_file()})
     return _run(folder)
 
 
@@ -163,11 +166,11 @@ def _run(folder: Path) -> Content:
     start = (config.get("starts") or [{}])[-1]
     content.facts = [("folder", str(folder.resolve())), ("begun", str(start.get("time", "")))]
     content.facts += [("command", " ".join(map(str, start.get("command", []))))]
-    for use, files in config.get("recordings", {}).items():
-        content.facts.append((f"{use} recordings", ", ".join(str(file["path"]) for file in files)))
+    for use, used in config.get("recordings", {}).items():
+        content.facts.append((f"{use} recordings", ", ".join(str(file["path"]) for file in used)))
     _add_evaluation(content, folder)
     if (folder / "identification.txt").is_file():
-        content.texts.append(("Identification", (folder / "identification.txt").read_text(encoding="utf-8")))
+        content.texts.append(("Identification", files.read_text(folder / "identification.txt")))
     content.curves = _curves({config["task"]: folder})
     content.images = [(n, (folder / n).read_bytes()) for n in _IMAGES if (folder / n).is_file()]
     if (folder / replay.NAME).is_file():
@@ -222,42 +225,36 @@ def _add_evaluation(content: Content, folder: Path, prefix: str = "") -> None:
     path = folder / "evaluation.json"
     if not path.is_file():
         return
-    from ballu_mjx import plots
+    from ballu_mjx import evaluation, plots
 
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        base, name = str(found["base"]), plots.LABELS.get(str(found["name"]), str(found["name"]))
-        pairs = list(zip(found["vanilla"], found["residual"], strict=True))
-        content.facts.append((f"{prefix}score", f"{found['score']:.3f} (mean ratio to {base})"))
-        content.tables += [
-            _horizons(f"{prefix}{without['recording']}", (base, name), without, mimic) for without, mimic in pairs
-        ]
-        header = ["", *(f"{title}, {each}" for _, title, _ in _WHOLE for each in (base, name)), "mean force (N)"]
-        rows = []
-        for without, mimic in pairs:
-            cells = [_cell(errors[key], digits) for key, _, digits in _WHOLE for errors in (without, mimic)]
-            rows.append([Cell(without["recording"]), *cells, _cell(mimic["mean_force"], 4)])
-        content.tables.append(Table(f"{prefix}whole recordings", header, rows))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"{path}: is no evaluation ({type(error).__name__}: {error}); "
-            f"`python -m ballu_mjx.evaluate {folder} --output {folder}` writes it anew."
-        ) from None
+    found = evaluation.read(path)
+    base, name = found.base, plots.LABELS.get(found.name, found.name)
+    pairs = list(zip(found.vanilla, found.residual, strict=True))
+    content.facts.append((f"{prefix}score", f"{found.score:.3f} (mean ratio to {base})"))
+    content.tables += [
+        _horizons(f"{prefix}{without.recording}", (base, name), without, mimic) for without, mimic in pairs
+    ]
+    header = ["", *(f"{title}, {each}" for _, title, _ in _WHOLE for each in (base, name)), "mean force (N)"]
+    rows = []
+    for without, mimic in pairs:
+        cells = [_cell(getattr(errors, key), digits) for key, _, digits in _WHOLE for errors in (without, mimic)]
+        rows.append([Cell(without.recording), *cells, _cell(mimic.mean_force, 4)])
+    content.tables.append(Table(f"{prefix}whole recordings", header, rows))
     if (folder / "evaluation.txt").is_file():
-        content.texts.append((f"{prefix}by group", (folder / "evaluation.txt").read_text(encoding="utf-8")))
+        content.texts.append((f"{prefix}by group", files.read_text(folder / "evaluation.txt")))
 
 
-def _horizons(title: str, names: tuple[str, str], without: Mapping[str, Any], mimic: Mapping[str, Any]) -> Table:
+def _horizons(title: str, names: tuple[str, str], without: Errors, mimic: Errors) -> Table:
     """One recording's errors by horizon: mean over the starts, without and with the residual, and their ratio."""
     header = ["horizon (s)"]
     for key, quantity, _ in _QUANTITIES:
         header += [*(f"{quantity}, {name}" for name in names), f"{key}, ratio"]
     rows = []
-    for horizon in without["position"]:
-        row = [Cell(f"{float(horizon):g}")]
+    for horizon in without.position:
+        row = [Cell(f"{horizon:g}")]
         for key, _, digits in _QUANTITIES:
-            one, other = without[key][horizon][0], mimic[key][horizon][0]
-            row += [_cell(one, digits), _cell(other, digits), _cell(other / one if one else float("nan"), 2)]
+            one, other = getattr(without, key)[horizon][0], getattr(mimic, key)[horizon][0]
+            row += [_cell(one, digits), _cell(other, digits), _cell(other / one, 2)]
         rows.append(row)
     return Table(title, header, rows)
 

@@ -11,17 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ballu_mjx import aerodynamics, ppo, robot, runs
+from ballu_mjx import aerodynamics, envmimic, files, ppo, robot, runs
 from ballu_mjx.aerodynamics import Aerodynamics
 from ballu_mjx.envmimic import EnvMimicConfig, ForcePolicy
-from ballu_mjx.errors import InputError
+from ballu_mjx.errors import InputError, is_number
 from ballu_mjx.forces import Applied, Fields, ForceModel, Sum
 from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.robot import ActuatorParameters
 
 ACTIONS = 3
 """Force along three axes."""
-TASKS = ("envmimic", "aerodynamic")
+NETWORKS = ("envmimic", "supervised", "analytic")
+"""Runs that leave a network of forces."""
+TASKS = (*NETWORKS, "aerodynamic")
 """Runs that leave a residual."""
 MARGIN = 0.1
 """How far beyond the recorded range, in its widths, an observation still counts as inside: the range is that of a
@@ -50,28 +52,40 @@ class Residual:
     actuators: ActuatorParameters | None
 
     @staticmethod
-    def load(folder: Path | str, which: Literal["best", "last"] = "best") -> Residual:
-        """The residual of a run; of EnvMimic's the policy in the best (by validation error) or last checkpoint.
+    def load(
+        folder: Path | str, which: Literal["best", "last"] = "best", *, beside: frozenset[Path] = frozenset()
+    ) -> Residual:
+        """The residual of a run; of a network that in the best (by validation error) or last checkpoint.
+        `beside`: runs of which it is a part.
 
         **Raises** `InputError` where `folder` is no such run or has no such checkpoint.
         """
         folder = Path(folder)
+        beside |= {folder.resolve()}
         stored = runs.read_config(folder, *TASKS)
         identified = runs.actuators(stored, folder)
         if stored["task"] == "aerodynamic":
             step, model = 0, Aerodynamics(robot.load_model(identified))
             params = aerodynamics.read(folder / aerodynamics.FILE)
-            inputs = _INPUTS
+            inputs = envmimic.input_size(EnvMimicConfig())
         else:
             step, tree = runs.restore(folder, which)
             params = ppo.from_tree(tree)
             inputs = params.normalizer.mean["state"].shape[0]
-            sizes = inputs, ACTIONS, runs.typed(PPOConfig, stored["ppo"], folder)
-            config = runs.typed(EnvMimicConfig, stored["env"], folder)
-            model = ForcePolicy(config, ppo.make_inference(*sizes), ppo.make_sampler(*sizes))
-            if stored.get("residual") is not None:
-                beside = Residual.load(stored["residual"])
-                model, params = Sum(beside.model, model), (beside.params, params)
+            sizes = inputs, ACTIONS, runs.typed(PPOConfig, stored, "ppo", folder, ppo.check_values)
+            config = runs.typed(EnvMimicConfig, stored, "env", folder, envmimic.check)
+            infer = ppo.make_inference(*sizes)
+            if not (inputs == envmimic.input_size(config) and ppo.fits(infer, params, inputs)):
+                raise InputError(
+                    f"{folder}: the stored parameters do not fit the networks in its config.json; restore one of them."
+                )
+            sample = ppo.make_sampler(*sizes) if stored["task"] == "envmimic" else None
+            model = ForcePolicy(config, infer, sample, stored["task"])
+            if (where := runs.residual(stored, folder)) is not None:
+                if where.resolve() in beside:
+                    raise InputError(f"{folder}: its residual stands beside itself; restore its config.json.")
+                other = Residual.load(where, beside=beside)
+                model, params = Sum(other.model, model), (other.params, params)
         return Residual(model, params, _read_observed(folder / _OBSERVED, inputs), step, identified)
 
     @property
@@ -103,23 +117,18 @@ class Residual:
         return jnp.maximum(jnp.max(beyond) - MARGIN, 0.0)
 
 
-_INPUTS = 87
-"""Of `envmimic.policy_input` with its defaults."""
-
-
-def write_observed(run: runs.Run, inputs: Float[Array, "states inputs"]) -> None:
+def write_observed(run: runs.Run, inputs: Float[Array | np.ndarray, "states inputs"]) -> None:
     """Leave in the run's folder the range of what its policy saw in the recordings."""
     low, high = np.min(inputs, axis=0), np.max(inputs, axis=0)
     run.write(_OBSERVED, json.dumps({"low": low.tolist(), "high": high.tolist()}) + "\n")
 
 
 def _read_observed(path: Path, size: int) -> tuple[np.ndarray, np.ndarray]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        low, high = (np.asarray(content[name], np.float32) for name in ("low", "high"))
-        if low.shape == high.shape == (size,) and np.all(low <= high):
+    mend = "train the residual again"
+    content = files.read_json(path, mend)
+    bounds = [content.get(name) for name in ("low", "high")]
+    if all(isinstance(bound, list) and len(bound) == size and all(map(is_number, bound)) for bound in bounds):
+        low, high = (np.asarray(bound, np.float32) for bound in bounds)
+        if np.all(low <= high):
             return low, high
-        problem = f"low and high must be {size} numbers each, low at most high"
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        problem = str(error)
-    raise InputError(f"{path}: the range of the observations cannot be read ({problem}); train the residual again.")
+    raise InputError(f"{path}: low and high are not {size} numbers each, low at most high; {mend}.")

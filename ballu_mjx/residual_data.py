@@ -72,6 +72,11 @@ class Prepared:
         """What the simulator without residual is called."""
         return base_name(self.identified is not None)
 
+    def check_beside(self, learned_with: ActuatorParameters | None, run: Path | None) -> None:
+        """**Raises** `InputError` where the residual of `run` was learned beside other actuators than these."""
+        if not robot.same_actuators(learned_with, self.identified):
+            raise InputError(f"{run}: was learned beside other actuators than {self.where}; give --actuators the same.")
+
     @property
     def one_set(self) -> bool:
         """Whether test and validation are the same recordings."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from ballu_mjx import evaluate, evaluation, learner, loggers, ppo, robot, runs
+from ballu_mjx import distributed, envmimic, evaluate, evaluation, learner, loggers, ppo, runs
 from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv, ForcePolicy
 from ballu_mjx.errors import InputError
 from ballu_mjx.evaluation import OpenLoopEvaluator
@@ -26,7 +26,7 @@ QUICK: Mapping[str, Any] = {"num_timesteps": 120_000, "num_envs": 256, "batch_si
 
 
 @dataclasses.dataclass(frozen=True)
-class Data(RecordingsData):
+class Data(RecordingsData, distributed.DistributedOptions):
     """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
     residual: Path | None = None
@@ -42,8 +42,10 @@ class Data(RecordingsData):
 def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     """Read and check everything, train, evaluate; returns the exit status."""
     started = time.perf_counter()
-    devices = [str(device) for device in jax.local_devices()]
+    distributed.join(data)
+    devices = [str(device) for device in jax.devices()]
     ppo.check(ppo_config, len(devices))
+    envmimic.check(env_config)
     loggers.check(data.wandb)
     if data.validate_every < 1:
         raise InputError(f"--validate-every is {data.validate_every}: it must be 1 or more.")
@@ -51,12 +53,12 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     where = _where_beside(data)
     beside = None if where is None else Residual.load(where)
     prepared = Prepared.read(data, data.resume)
-    if beside is not None and not robot.same_actuators(beside.actuators, prepared.identified):
-        raise InputError(
-            f"{where}: was learned beside other actuators than {prepared.where}; give --actuators the same."
-        )
-    folder = data.resume or runs.new_folder(data.output, "envmimic")
-    prepared.announce(folder, data.quick)
+    if beside is not None:
+        prepared.check_beside(beside.actuators, where)
+    first = distributed.is_first()
+    folder = data.resume or runs.new_folder(data.output if first else None, "envmimic")
+    if first:
+        prepared.announce(folder, data.quick)
     model = prepared.load_model()
     motions = prepared.reconstruct(model)
     env = EnvMimicEnv(model, motions["training"], env_config, None if beside is None else beside.applied)
@@ -77,11 +79,17 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     config = runs.describe("envmimic", sections, prepared.files, devices, prepared.identified)
     config["residual"] = None if where is None else str(where.resolve())
     validation = evaluator("validation")
+
+    def validate(params: Params) -> float:
+        return validation(all_params(params)).score
+
+    if not first:
+        return Session(None, None, data.validate_every, validate).follow(env, ppo_config, start, config)
     with runs.Run(folder, config, resumed_at=start.resumed_at, wandb=data.wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)
         progress = runs.Progress(learner.total_timesteps(ppo_config, start.step), start.step)
         write_observed(run, env.recorded_inputs)
-        session = Session(run, progress, data.validate_every, lambda params: validation(all_params(params)).score)
+        session = Session(run, progress, data.validate_every, validate)
         try:
             session.train(env, ppo_config, start, config)
         except KeyboardInterrupt:
@@ -106,5 +114,4 @@ def _where_beside(data: Data) -> Path | None:
         return data.residual
     if data.residual is not None:
         raise InputError("--residual does not go with --resume, which keeps the simulator; leave one out.")
-    stored = runs.read_config(data.resume, "envmimic").get("residual")
-    return None if stored is None else Path(stored)
+    return runs.residual(runs.read_config(data.resume, "envmimic"), data.resume)

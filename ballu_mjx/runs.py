@@ -12,17 +12,21 @@ replay.npz          what the robots did, for `ballu_mjx.report` and `ballu_mjx.v
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime
 import hashlib
 import importlib.metadata
+import io
 import json
+import logging
 import math
+import reprlib
 import shutil
 import sys
 import time
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Literal, TextIO, TypeVar
 
@@ -38,8 +42,8 @@ except ImportError:  # Windows, where runs are not locked
     fcntl = None
 
 from ballu_mjx import actuators as actuator_files
-from ballu_mjx import loggers, robot
-from ballu_mjx.errors import InputError
+from ballu_mjx import files, loggers, robot
+from ballu_mjx.errors import InputError, is_number
 from ballu_mjx.robot import ActuatorParameters
 
 FORMAT = "ballu-run/2"
@@ -52,6 +56,10 @@ _CONFIG, _METRICS, _LOCK, _CHECKPOINTS = "config.json", "metrics.jsonl", ".lock"
 _PARAMS, _TRAINING, _RECORD = "params", "training", "record.json"
 _BUNDLED = "bundled:"
 _NO_SCORE = 1e30
+_MOST_STEPS = 2**63
+_LONGEST_PATH = 300
+_OVERHEAD = 2**20
+"""Bytes of a checkpoint beside its arrays, at most."""
 _PACKAGES = ("ballu-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "optimistix", "numpy")
 
 Which = Literal["best", "last"] | int
@@ -61,12 +69,12 @@ Config = TypeVar("Config")
 def new_folder(output: Path | None, task: str) -> Path:
     """The folder of a new run, empty or not there yet: `output`, or one under `runs/` named after task and time.
 
-    **Raises** `InputError` where `output` holds something.
+    **Raises** `InputError` where `output` holds something, or cannot be written to.
     """
     if output is None:
         stem = f"{task}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         names = (stem if not number else f"{stem}-{number + 1}" for number in range(1000))
-        return next(folder for name in names if not (folder := Path("runs") / name).exists())
+        output = next(folder for name in names if not (folder := Path("runs") / name).exists())
     if output.exists() and not output.is_dir():
         raise InputError(f"{output}: is a file; give --output a folder that is new or empty.")
     if output.exists() and any(output.iterdir()):
@@ -74,6 +82,7 @@ def new_folder(output: Path | None, task: str) -> Path:
         if (output / _CHECKPOINTS).is_dir():
             mend = f"--resume {output} goes on with it, or give --output another folder"
         raise InputError(f"{output}: the folder is not empty; {mend}.")
+    files.check_folder(output)
     return output
 
 
@@ -85,31 +94,75 @@ def read_config(folder: Path, *tasks: str) -> dict[str, Any]:
     path = folder / _CONFIG
     if not path.is_file():
         raise InputError(f"{folder}: there is no run ({_CONFIG} is missing); check the path.")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); restore it or start a new run.") from error
-    if not isinstance(content, dict) or content.get("format") not in _READABLE:
+    mend = "restore it or start a new run"
+    content = files.read_json(path, mend)
+    if content.get("format") not in _READABLE:
         raise InputError(f"{path}: is not of the format {FORMAT}; use the version of ballu_mjx that wrote it.")
     if content.get("task") not in tasks:
         needed = " or ".join(repr(task) for task in tasks)
-        raise InputError(f"{folder}: is a run of {content.get('task')!r}; one of {needed} is needed here.")
+        raise InputError(f"{path}: is of a run of {_shown(content.get('task'))}; one of {needed} is needed here.")
+    for name, fits in _SHAPES.items():
+        if name in content and not fits(content[name]):
+            raise InputError(f'{path}: "{name}" is not what a run keeps there, {_shown(content[name])}; {mend}.')
     return content
 
 
-def typed(cls: type[Config], values: Mapping[str, Any], path: Path) -> Config:
-    """The configuration of class `cls`, a dataclass, from its JSON; fields that are missing take their default.
+def _is_description(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(value.get(name), str) for name in ("path", "sha256"))
 
-    **Raises** `InputError` naming `path` and the field for fields that `cls` does not have.
+
+def _is_start(value: Any) -> bool:
+    return isinstance(value, dict) and isinstance(value.get("command", []), list)
+
+
+def _is_list_of(value: Any, fits: Callable[[Any], bool]) -> bool:
+    return isinstance(value, list) and all(map(fits, value))
+
+
+_SHAPES: Mapping[str, Callable[[Any], bool]] = {
+    **dict.fromkeys(("env", "ppo", "data", "fit"), lambda value: isinstance(value, dict)),
+    "actuators": lambda value: value is None or isinstance(value, dict),
+    "residual": lambda value: value is None or isinstance(value, str),
+    "recordings": lambda value: (
+        isinstance(value, dict) and all(_is_list_of(entries, _is_description) for entries in value.values())
+    ),
+    "starts": lambda value: _is_list_of(value, _is_start),
+}
+"""What stands under the keys of a `config.json`, as far as anybody looks into it."""
+
+
+def typed(
+    cls: type[Config],
+    config: Mapping[str, Any],
+    section: str,
+    folder: Path,
+    check: Callable[[Config], None] = lambda config: None,
+) -> Config:
+    """The configuration of class `cls`, a dataclass, in a section of the `config.json` of the run in `folder`; fields
+    that are missing take their default.
+
+    **Raises** `InputError` naming the file and the field for fields that `cls` does not have, for values of other
+    types, and where `check` raises it.
     """
+    path = folder / _CONFIG
     fields = {field.name: field for field in dataclasses.fields(cls)}  # pyright: ignore[reportArgumentType]
     hints = typing.get_type_hints(cls)
-    for name in values:
+    values = _needed(config, section, folder)
+    for name, value in values.items():
         if name not in fields:
             raise InputError(
-                f"{path / _CONFIG}: {cls.__name__} has no field {name!r}; use the version of ballu_mjx that wrote it."
+                f"{path}: {cls.__name__} has no field {_shown(name)}; use the version of ballu_mjx that wrote it."
             )
-    return cls(**{name: _as_type(hints[name], value) for name, value in values.items()})
+        if not _is_of_type(hints[name], value):
+            raise InputError(
+                f"{path}: {name} of {section} is {_shown(value)}, which it cannot be; restore it or start a new run."
+            )
+    found = cls(**{name: _as_type(hints[name], value) for name, value in values.items()})
+    try:
+        check(found)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return found
 
 
 def actuators(config: Mapping[str, Any], folder: Path) -> ActuatorParameters | None:
@@ -117,8 +170,24 @@ def actuators(config: Mapping[str, Any], folder: Path) -> ActuatorParameters | N
 
     **Raises** `InputError` where they are damaged.
     """
-    stored = config.get("actuators")
+    stored = _needed(config, "actuators", folder)
     return None if stored is None else actuator_files.from_json(stored, folder / _CONFIG)
+
+
+def residual(config: Mapping[str, Any], folder: Path) -> Path | None:
+    """The run of the residual in a run's simulator; None where there is none.
+
+    **Raises** `InputError` where the key is missing.
+    """
+    stored = _needed(config, "residual", folder)
+    return None if stored is None else Path(stored)
+
+
+def _needed(config: Mapping[str, Any], key: str, folder: Path) -> Any:
+    """What stands under a key; None in runs of version 1, which had not all of them."""
+    if key not in config and config.get("format") == FORMAT:
+        raise InputError(f'{folder / _CONFIG}: "{key}" is missing; restore it or start a new run.')
+    return config.get(key)
 
 
 def describe(
@@ -163,17 +232,25 @@ def find_recordings(config: Mapping[str, Any], use: str, folder: Path) -> list[P
     **Raises** `InputError` where one is missing or has changed.
     """
     paths = []
-    for entry in config["recordings"][use]:
+    described = _needed(config, "recordings", folder).get(use)
+    if not described:
+        raise InputError(f"{folder / _CONFIG}: names no recordings for {use}; give some by options.")
+    for entry in described:
         place = entry["path"]
-        path = Path(place)
+        path, there = Path(place), False
         if place.startswith(_BUNDLED):
             path = robot.assets() / "recordings" / place.removeprefix(_BUNDLED)
-        if not path.is_file():
-            raise InputError(f"{path}: the recording that {folder} used is gone; restore it or give --recordings.")
+        with contextlib.suppress(OSError):  # a name that no file can have
+            there = path.is_file()
+        if not there:
+            shown = place if len(place) < _LONGEST_PATH else place[:_LONGEST_PATH] + "..."
+            raise InputError(
+                f"{shown}: the recording, which {folder / _CONFIG} names, is gone; restore it or give --recordings."
+            )
         if describe_recording(path)["sha256"] != entry["sha256"]:
             raise InputError(
-                f"{path}: the recording has changed since {folder} used it; restore it, or give it by --recordings to "
-                "use it as it is."
+                f"{path}: the recording has changed since {folder / _CONFIG} was written; restore it, or give it by "
+                "--recordings to use it as it is."
             )
         paths.append(path)
     return paths
@@ -190,37 +267,67 @@ class Run:
 
         `wandb`: a project of Weights & Biases to log to as well.
 
-        **Raises** `InputError` where another process has it open, or Weights & Biases refuses.
+        **Raises** `InputError` where another process has it open, it cannot be written to, or Weights & Biases refuses.
 
         What an old run measured and saved after that step is dropped: it will be measured again.
         """
         self.folder = folder
+        self._whole = None if resumed_at == -1 else resumed_at
+        """Step of the last checkpoint that was written to the end."""
+        self._loggers: list[loggers.Logger] = []
+        self._manager: ocp.CheckpointManager | None = None
+        files.check_folder(folder)
         folder.mkdir(parents=True, exist_ok=True)
         self._lock = _locked(folder / _LOCK)
+        try:
+            self._open(config, resumed_at, wandb)
+        except Exception as error:
+            self.__exit__(type(error), error, None)
+            raise
+
+    def _open(self, config: Mapping[str, Any], resumed_at: int | None, wandb: str | None) -> None:
+        folder = self.folder
         if resumed_at is not None:
+            kept = read_metrics(folder, resumed_at)
+            before = read_config(folder, config["task"]).get("starts", [])
             _drop_checkpoints(folder, resumed_at)
-            kept = [row for row in read_metrics(folder) if row["step"] <= resumed_at]
-            _write(folder / _METRICS, "".join(json.dumps(row) + "\n" for row in kept))
-            config = {**config, "starts": read_config(folder, config["task"])["starts"] + list(config["starts"])}
-        _write(folder / _CONFIG, json.dumps(config, indent=2, default=str) + "\n")
+            files.write(folder / _METRICS, "".join(json.dumps(row) + "\n" for row in kept))
+            config = {**config, "starts": [*before, *config["starts"]]}
+        files.write(folder / _CONFIG, json.dumps(config, indent=2, default=str) + "\n")
         next_step = None if resumed_at is None else resumed_at + 1
-        self._loggers: list[loggers.Logger] = [
-            loggers.JsonLines(folder / _METRICS),
-            loggers.TensorBoard(folder / "tensorboard", next_step),
-        ]
+        self._loggers.append(loggers.JsonLines(folder / _METRICS))
+        self._loggers.append(loggers.TensorBoard(folder / "tensorboard", next_step))
         if wandb is not None:
             self._loggers.append(loggers.WeightsAndBiases(wandb, folder, config))
-        self._manager: ocp.CheckpointManager | None = None
 
     def __enter__(self) -> Run:
         return self
 
-    def __exit__(self, *exception: object) -> None:
-        for logger in self._loggers:
-            logger.close(failed=exception[0] is not None)
-        self._lock.close()
-        if self._manager is not None:
-            self._manager.close()
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        """Close the files.
+
+        **Raises** `InputError` where the disk is full, instead of whatever came of that.
+        """
+        with contextlib.ExitStack() as closing:
+            closing.callback(self._told_of_full_disk, error)
+            if self._manager is not None:
+                # Closed already where the disk is full; whatever it says now comes of that.
+                closing.enter_context(contextlib.suppress(Exception) if error else contextlib.nullcontext())
+                closing.callback(self._manager.close)
+            closing.callback(self._lock.close)
+            for logger in self._loggers:
+                # What a logger could not write before, it cannot now.
+                closing.enter_context(contextlib.suppress(OSError) if error is not None else contextlib.nullcontext())
+                closing.callback(logger.close, failed=error is not None)
+
+    def _told_of_full_disk(self, error: BaseException | None) -> None:
+        """Raise an `InputError` instead of an exception that comes of a full disk."""
+        if error is None or not files.is_full(error):
+            return
+        then = "start again"
+        if self._whole is not None:
+            then = f"go on with --resume {self.folder}: the checkpoint of step {self._whole:,} is whole"
+        raise InputError(f"{self.folder}: its disk is full; make room there, then {then}.") from error
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
         """Add a line of measurements at `step`."""
@@ -253,16 +360,21 @@ class Run:
         items = {name: ocp.args.StandardSave(tree) for name, tree in trees.items()}
         finite = None if score is None else score if math.isfinite(score) else _NO_SCORE
         metrics = None if finite is None else {"score": finite}
-        self._manager.save(step, args=ocp.args.Composite(**items), metrics=metrics)
-        self._manager.wait_until_finished()
+        files.reserve(self.folder, _OVERHEAD + 2 * sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(trees)))
+        with _quiet_when_full(self._manager):
+            self._manager.save(step, args=ocp.args.Composite(**items), metrics=metrics)
+            self._manager.wait_until_finished()
         # Last of all: what has no record was not written to the end.
         place = self.folder / _CHECKPOINTS / str(step)
-        record = {"score": finite, "notes": dict(notes or {}), "files": _checksums(place)}
-        _write(place / _RECORD, json.dumps({**record, "sha256": _checksum(record)}, indent=2) + "\n")
+        files.sync(self.folder / _METRICS)
+        files.sync_all(place)
+        record = {"step": step, "score": finite, "notes": dict(notes or {}), "files": _checksums(place)}
+        files.write(place / _RECORD, json.dumps({**record, "sha256": _checksum(record)}, indent=2) + "\n")
+        self._whole = step
 
     def write(self, name: str, text: str) -> None:
         """Write a text file into the folder."""
-        _write(self.folder / name, text)
+        files.write(self.folder / name, text)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -320,11 +432,27 @@ def checkpoints(folder: Path) -> list[int]:
     return sorted(ocp.utils.checkpoint_steps(place)) if place.is_dir() else []
 
 
-def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """The rows of a run's `metrics.jsonl`; a last line cut off in the middle is left out."""
+def read_metrics(folder: Path, last: int | None = None) -> list[dict[str, Any]]:
+    """The rows of a run's `metrics.jsonl`, up to the step `last` where it is given; a last line cut off is left out.
+
+    **Raises** `InputError` naming the line where it is damaged.
+    """
     path = folder / _METRICS
-    lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
-    return [json.loads(line) for line in lines]
+    lines = files.read_text(path).split("\n")[:-1] if path.exists() else []
+    rows: list[dict[str, Any]] = []
+    mend = "restore the file, or delete the line"
+    for number, line in enumerate(lines, start=1):
+        row = files.parse_object(line, f"{path}, line {number}", mend)
+        step, before = row.get("step"), rows[-1]["step"] if rows else 0
+        if type(step) is not int or not before <= step < _MOST_STEPS:
+            raise InputError(f'{path}, line {number}: "step" is no step after the one before; {mend}.')
+        for name, value in row.items():
+            if value is not None and not is_number(value):
+                raise InputError(f"{path}, line {number}: {_shown(name)} is {_shown(value)}, no number; {mend}.")
+        if last is not None and step > last:
+            break
+        rows.append(row)
+    return rows
 
 
 def column(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -451,10 +579,12 @@ def _record(folder: Path, step: int) -> dict[str, Any]:
         intact = record.pop("sha256") == _checksum(record)
     except FileNotFoundError as error:
         raise _DamagedError(f"{place}: the checkpoint is half-written") from error
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise _DamagedError(f"{path}: the checkpoint is damaged") from error
     if not intact:
         raise _DamagedError(f"{path}: the checkpoint is damaged")
+    if record.get("step", step) != step:  # older ones do not say
+        raise _DamagedError(f"{place}: the checkpoint is that of step {record['step']}")
     now = _checksums(place)
     for name, checksum in record["files"].items():
         if now.get(name) != checksum:
@@ -473,7 +603,7 @@ def _checksum(record: Mapping[str, Any]) -> str:
 
 
 def _standard(place: Path) -> dict[str, Any]:
-    with ocp.StandardCheckpointer() as checkpointer:
+    with ocp.StandardCheckpointer(multiprocessing_options=_alone()) as checkpointer:
         return jax.tree.map(np.asarray, checkpointer.restore(place))
 
 
@@ -504,24 +634,70 @@ def _manager(folder: Path) -> ocp.CheckpointManager:
         best_mode="min",
         preservation_policy=policies.AnyPreservationPolicy([policies.LatestN(KEPT), best]),
         enable_async_checkpointing=False,
+        create=False,
+        multiprocessing_options=_alone(),
     )
-    return ocp.CheckpointManager((folder / _CHECKPOINTS).resolve(), options=options)
+    place = (folder / _CHECKPOINTS).resolve()
+    place.mkdir(parents=True, exist_ok=True)  # which the manager would do only if all processes had one
+    return ocp.CheckpointManager(place, options=options)
+
+
+def _alone() -> ocp.options.MultiprocessingOptions:
+    """This process reads and writes by itself, whatever others train with it."""
+    if jax.process_count() == 1:
+        return ocp.options.MultiprocessingOptions()
+    number = jax.process_index()
+    return ocp.options.MultiprocessingOptions(
+        primary_host=number, active_processes={number}, barrier_sync_key_prefix=f"process-{number}"
+    )
+
+
+@contextlib.contextmanager
+def _quiet_when_full(manager: ocp.CheckpointManager) -> Iterator[None]:
+    """Keep what orbax says of a full disk off the terminal: each of its threads fills pages. The exception stays."""
+    said, before = io.StringIO(), logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    full = False
+    try:
+        with contextlib.redirect_stderr(said):
+            try:
+                yield
+            except Exception as error:
+                full = files.is_full(error)
+                if full:
+                    with contextlib.suppress(Exception):  # the same once more
+                        manager.close()  # and with it, its threads
+                raise
+    finally:
+        if not full:  # else its threads go on complaining until the process ends
+            logging.disable(before)
+            sys.stderr.write(said.getvalue())
 
 
 def _score(metrics: Any) -> float:
     return metrics["score"]
 
 
-def _write(path: Path, text: str) -> None:
-    """Write all of a file or nothing."""
-    draft = path.with_name(path.name + ".tmp")
-    draft.write_text(text, encoding="utf-8")
-    draft.replace(path)
+def _is_of_type(hint: Any, value: Any) -> bool:
+    """Whether a value from JSON can be one of a field's type."""
+    kind, inner = typing.get_origin(hint), typing.get_args(hint)
+    if kind is typing.Literal:
+        return any(type(value) is type(each) and value == each for each in inner)
+    if kind is tuple:
+        hints = [inner[0]] * len(value) if inner[-1] is ... and isinstance(value, list) else list(inner)
+        fits = isinstance(value, list) and len(value) == len(hints)
+        return fits and all(map(_is_of_type, hints, value))
+    return is_number(value) if hint is float else type(value) is hint
 
 
 def _as_type(hint: Any, value: Any) -> Any:
     """JSON has no tuples."""
     return tuple(value) if typing.get_origin(hint) is tuple and isinstance(value, list) else value
+
+
+def _shown(value: Any) -> str:
+    """A value from JSON in a sentence."""
+    return reprlib.repr(value)
 
 
 def _version(package: str) -> str | None:

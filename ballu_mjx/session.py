@@ -9,14 +9,15 @@ import json
 import math
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from brax.envs.base import Env
 
-from ballu_mjx import learner, ppo, replay, runs
+from ballu_mjx import distributed, files, learner, ppo, replay, runs
 from ballu_mjx.errors import InputError
 from ballu_mjx.learner import Learner, TrainingState
 from ballu_mjx.ppo import Params, PPOConfig
@@ -89,7 +90,8 @@ def start_from(task: str, folder: Path | None, config: PPOConfig, *, output: Pat
         if given:
             raise InputError(f"{option} does not go with --resume, which keeps folder and sizes; leave one out.")
     before = runs.read_config(folder, task)
-    stored = runs.typed(PPOConfig, before["ppo"], folder)
+    files.check_folder(folder)
+    stored = runs.typed(PPOConfig, before, "ppo", folder, ppo.check_values)
     for name in ("policy_layers", "value_layers", "activation", "normalize_observations"):
         if getattr(stored, name) != getattr(config, name):
             raise InputError(
@@ -121,6 +123,62 @@ def _made_with(config: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+class Watchdog:
+    """Tells the user when no training step has finished for long: a context manager around the training.
+
+    It watches from a thread, which holds nothing up and ends with the process.
+    """
+
+    def __init__(self, folder: Path, limit: float = 300.0, stream: TextIO | None = None) -> None:
+        """`limit`: s."""
+        # Bound now: what a checkpoint says while it is written is caught for a while.
+        self._folder, self._limit, self._stream = folder, limit, stream or sys.stderr
+        self._step: int | None = None
+        self._last = time.monotonic()
+        self._woken = threading.Condition()
+        self._over = False
+
+    def step_done(self, step: int | None) -> None:
+        """Training has got to control step `step`; None: it is about to take its first step."""
+        with self._woken:
+            self._step, self._last = step, time.monotonic()
+
+    def __enter__(self) -> Watchdog:
+        self.step_done(None)
+        threading.Thread(target=self._watch, name="watchdog", daemon=True).start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        with self._woken:
+            self._over = True
+            self._woken.notify()
+
+    def _watch(self) -> None:
+        told: float | None = None  # the standstill that has been told of
+        with self._woken:
+            while not self._over:
+                left = self._last + self._limit - time.monotonic()
+                if left > 0 or told == self._last:
+                    self._woken.wait(max(left, self._limit / 10))
+                    continue
+                told = self._last
+                print(self._said(), file=self._stream, flush=True)
+
+    def _said(self) -> str:
+        minutes = f"{self._limit / 60:.3g} minutes"
+        if self._step is None:
+            return (
+                f"No training step has finished for {minutes}: a first compilation takes one or two, more where other "
+                "work keeps the machine busy. If nothing comes of it, end the process and try fewer --num-envs, "
+                "or delete the cache of compiled programs."
+            )
+        return (
+            f"No training step has finished for {minutes}, since step {self._step:,}: look whether the machine sleeps, "
+            "has run out of memory or does other work. If it does not go on, end the process, and go on with "
+            f"--resume {self._folder}: what is saved stays."
+        )
+
+
 class Session:
     """One stretch of training."""
 
@@ -128,10 +186,15 @@ class Session:
     """The signal that came, set by its handler: the next finished training step is the last."""
 
     def __init__(
-        self, run: Run, progress: Progress, keep_every: int, validate: Callable[[Params], float] | None = None
+        self,
+        run: Run | None,
+        progress: Progress | None,
+        keep_every: int,
+        validate: Callable[[Params], float] | None = None,
     ) -> None:
         """A checkpoint is kept every `keep_every` control steps, with the validation error that `validate` gives, the
-        smallest being the best; without it the greatest reward is."""
+        smallest being the best; without it the greatest reward is. Processes that write nothing (see
+        `ballu_mjx.distributed`) have neither `run` nor `progress`."""
         self._run, self._progress, self._validate = run, progress, validate
         self._every = keep_every
         self._due: int | None = None  # step of the last checkpoint that was not an interruption's
@@ -140,6 +203,7 @@ class Session:
         self._score: float | None = None
         self._warned = False
         self._started = time.perf_counter()
+        self._watchdog = Watchdog(Path("RUN") if run is None else run.folder)
 
     def train(self, env: Env, config: PPOConfig, start: Start, content: Mapping[str, Any]) -> None:
         """Train `env` from `start` on; `content` is the run's `config.json`.
@@ -152,17 +216,26 @@ class Session:
             self._saved = start.checkpoint.step
             self._due = start.checkpoint.notes.get("due", self._saved)
         try:
-            with self._interrupts_noted():
+            with self._interrupts_noted(), self._watchdog:
                 state, metrics = learner.train(
                     env, config, self._step_done, start=lambda new: start.state(new, config, self._made_with)
                 )
                 if self._due != int(state.steps):
                     self._keep(int(state.steps), state, metrics)
         except KeyboardInterrupt:
-            self._progress.close()
-            print(f"Interrupted; saved at step {self._saved:,}.", file=sys.stderr)
+            self._close()
+            if self._run is not None:
+                print(f"Interrupted; saved at step {self._saved:,}.", file=sys.stderr)
             raise
-        self._progress.close()
+        self._close()
+
+    def follow(self, env: Env, config: PPOConfig, start: Start, content: Mapping[str, Any]) -> int:
+        """`train` in a process that writes nothing; returns the exit status."""
+        try:
+            self.train(env, config, start, content)
+        except KeyboardInterrupt:
+            return self.exit_status
+        return 0
 
     @property
     def exit_status(self) -> int:
@@ -170,15 +243,16 @@ class Session:
         return 128 + (self.interrupted or signal.SIGINT)
 
     def _step_done(self, step: int, state: TrainingState, metrics: dict[str, float]) -> None:
+        self._watchdog.step_done(step if metrics else None)
         if not all(math.isfinite(value) for value in metrics.values()):
-            self._progress.close()
+            self._close()
             broken = ", ".join(name for name, value in metrics.items() if not math.isfinite(value))
             raise InputError(
                 f"Learning broke down before step {step:,}: {broken} is not a number any more. The last good "
                 f"checkpoint is that of step {self._saved:,}; go on from it with --resume and a smaller "
                 "--learning-rate, or look for recordings or options that throw the robot about."
             )
-        if metrics.get("diverged", 0.0) > _DIVERGED and not self._warned:
+        if metrics.get("diverged", 0.0) > _DIVERGED and not self._warned and self._run is not None:
             self._warned = True
             print(
                 f"Physics diverged in {metrics['diverged']:.2%} of the control steps (these robots were reset); the "
@@ -186,31 +260,42 @@ class Session:
                 file=sys.stderr,
             )
         if metrics:
-            self._run.log(step, metrics | {"seconds": time.perf_counter() - self._started})
+            self._log(step, metrics | {"seconds": time.perf_counter() - self._started})
         if self._due is None or step - self._due >= self._every:
             self._keep(step, state, metrics)
-        if metrics:
+        if metrics and self._progress is not None:
             shown = f"reward {metrics['reward']:.3f}"
             if self._score is not None:
                 shown += f", validation error {self._score:.3f}"
             self._progress.update(step, metrics["steps_per_second"], shown)
-        if self.interrupted:
+        if distributed.anywhere(bool(self.interrupted)):
             self._save(step, state, None)
             raise KeyboardInterrupt
+        self._watchdog.step_done(step if metrics else None)
 
     def _keep(self, step: int, state: TrainingState, metrics: Mapping[str, float]) -> None:
         self._due = step
         score = -metrics.get("reward", -math.inf)
         if self._validate is not None:
+            began = time.perf_counter()
             score = self._score = self._validate(learner.params(state))
-            self._run.log(step, {"validation_error": score})
+            self._log(step, {"validation_error": score, "validation_seconds": time.perf_counter() - began})
         self._save(step, state, score)
 
     def _save(self, step: int, state: TrainingState, score: float | None) -> None:
-        params = ppo.as_tree(learner.params(state))
+        params, training = ppo.as_tree(learner.params(state)), learner.stored(state)
         notes = {**self._made_with, "due": self._due}
-        self._run.save(step, params, score, training=learner.stored(state), notes=notes)
+        if self._run is not None:
+            self._run.save(step, params, score, training=training, notes=notes)
         self._saved = step
+
+    def _log(self, step: int, metrics: Mapping[str, float]) -> None:
+        if self._run is not None:
+            self._run.log(step, metrics)
+
+    def _close(self) -> None:
+        if self._progress is not None:
+            self._progress.close()
 
     @contextlib.contextmanager
     def _interrupts_noted(self) -> Iterator[None]:

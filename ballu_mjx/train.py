@@ -43,12 +43,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def subcommands(arguments: Sequence[str] = ()) -> dict[str, Callable[..., int]]:
     """Subcommands by name. A function's parameters are its options, their defaults depend on --resume and --quick."""
-    from ballu_mjx import actuator_fit, air_fit, pipeline, policy_training, residual_training
+    from ballu_mjx import actuator_fit, air_fit, force_fit, pipeline, policy_training, residual_training
     from ballu_mjx.air_identification import AirConfig
+    from ballu_mjx.analytic import AnalyticConfig
     from ballu_mjx.envmimic import EnvMimicConfig
     from ballu_mjx.identification import IdentificationConfig
     from ballu_mjx.locomotion import LocomotionConfig
     from ballu_mjx.ppo import PPOConfig
+    from ballu_mjx.residual_data import RecordingsData
+    from ballu_mjx.supervised import SupervisedConfig
     from ballu_mjx.tasks import TASKS, Task
 
     data_defaults, env_defaults, ppo_defaults = _defaults(
@@ -64,20 +67,39 @@ def subcommands(arguments: Sequence[str] = ()) -> dict[str, Callable[..., int]]:
         """Learn residual forces from recordings, and measure them on recordings that training never saw."""
         return residual_training.train(data, env, ppo)
 
-    air_defaults = AirConfig(**air_fit.QUICK if "--quick" in arguments else {})
+    quick = "--quick" in arguments
+    air_defaults = AirConfig(**air_fit.QUICK if quick else {})
+    supervised_defaults = SupervisedConfig(**force_fit.QUICK["supervised"] if quick else {})
+    analytic_defaults = AnalyticConfig(**force_fit.QUICK["analytic"] if quick else {})
 
     def residual(
-        method: Literal["aerodynamic", "envmimic"] = "aerodynamic",
+        method: Literal["aerodynamic", "supervised", "analytic", "envmimic"] = "aerodynamic",
         data: air_fit.AirData = air_fit.AirData(),  # noqa: B008
         fit: AirConfig = air_defaults,
     ) -> int:
         """Learn a residual from recordings, and measure it on recordings that training never saw.
 
         --method aerodynamic identifies the air around the balloon (added mass, drag, lift, its centre) by derivatives
-        through the simulation; --method envmimic is `train envmimic`, with that command's options.
+        through the simulation. The others learn a network of forces on the balloon: supervised by regression on the
+        forces that explain the recordings, analytic by gradients of the tracking error through the simulation, envmimic
+        by reinforcement learning (it is `train envmimic`). Each has options of its own: see its --help.
         """
-        del method  # the other was told apart by `_by_method`
+        del method  # the others were told apart by `_by_method`
         return air_fit.fit(data, fit)
+
+    def residual_supervised(
+        data: RecordingsData = RecordingsData(),  # noqa: B008
+        fit: SupervisedConfig = supervised_defaults,
+    ) -> int:
+        """Learn residual forces by regression on the forces that explain the recordings."""
+        return force_fit.fit_supervised(data, fit)
+
+    def residual_analytic(
+        data: force_fit.AnalyticData = force_fit.AnalyticData(),  # noqa: B008
+        fit: AnalyticConfig = analytic_defaults,
+    ) -> int:
+        """Learn residual forces by gradients of the tracking error through the simulation."""
+        return force_fit.fit_analytic(data, fit)
 
     def sysid(
         data: actuator_fit.SweepData = actuator_fit.SweepData(),  # noqa: B008
@@ -111,16 +133,18 @@ def subcommands(arguments: Sequence[str] = ()) -> dict[str, Callable[..., int]]:
         return pipeline.run(story)
 
     tasks = {name: task_command(task) for name, task in TASKS.items()}
-    return {"sysid": sysid, "envmimic": envmimic, "residual": residual, **tasks, "all": everything}
+    by_method = {"supervised": residual_supervised, "analytic": residual_analytic}
+    named = {name: by_method[name] for name in by_method if arguments[:1] == [name]}
+    return {"sysid": sysid, "envmimic": envmimic, "residual": residual, **named, **tasks, "all": everything}
 
 
 def _by_method(arguments: Sequence[str]) -> list[str]:
-    """`residual --method envmimic` is `envmimic`, whose options are others than the other method's."""
+    """`residual --method envmimic` is `envmimic` and so on: each method has options of its own."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--method")
     first, rest = parser.parse_known_args(arguments)
-    if rest[:1] == ["residual"] and first.method == "envmimic":
-        return ["envmimic", *rest[1:]]
+    if rest[:1] == ["residual"] and first.method in ("envmimic", "supervised", "analytic"):
+        return [first.method, *rest[1:]]
     return list(arguments)
 
 
@@ -146,8 +170,8 @@ def _defaults(
         kept = {name: config["data"][name] for name in _KEPT if name in config.get("data", {})}
         return (
             data_class(**kept),
-            runs.typed(env_class, config["env"], first.resume),
-            runs.typed(PPOConfig, config["ppo"], first.resume),
+            runs.typed(env_class, config, "env", first.resume),
+            runs.typed(PPOConfig, config, "ppo", first.resume),
         )
     return data_class(), env_class(), ppo(**quick if first.quick else {})
 

@@ -6,12 +6,16 @@ All of section "Improved Sim-to-real Transfer": Table I (`fwd_walk`) for walking
 from __future__ import annotations
 
 import dataclasses
+import json
+import pathlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from ballu_mjx import files
+from ballu_mjx.errors import InputError, is_number
 from ballu_mjx.robot import CONTROL_TIMESTEP
 
 STRIDE = 1.0
@@ -72,8 +76,35 @@ class Transfer:
 
     @staticmethod
     def from_json(values: Mapping[str, Any]) -> Transfer:
-        """The inverse of `to_json`."""
+        """The inverse of `to_json`.
+
+        **Raises** `ValueError` where a figure is missing or is no number.
+        """
+        names = {field.name for field in dataclasses.fields(Transfer)}
+        if values.keys() != names or not all(map(is_number, values.values())):
+            raise ValueError(f"it needs {', '.join(sorted(names))}, each a number")
         return Transfer(**{name: float(value) for name, value in values.items()})
+
+
+def write(path: pathlib.Path, transfers: Sequence[Transfer]) -> None:
+    """Write trials, as JSON."""
+    files.write(path, json.dumps([each.to_json() for each in transfers], indent=2) + "\n")
+
+
+def read(path: pathlib.Path) -> list[Transfer]:
+    """The trials in a file that `write` wrote.
+
+    **Raises** `InputError` where it is none.
+    """
+    mend = "delete its folder, and the trials will be made anew"
+    found = files.parse_json(files.read_text(path), str(path), mend)
+    try:
+        if isinstance(found, list) and found:
+            return [Transfer.from_json(each) for each in found]
+        problem = "holds no trials"
+    except (ValueError, AttributeError) as error:
+        problem = f"holds a trial that is none ({error})"
+    raise InputError(f"{path}: {problem}; {mend}.")
 
 
 def compare(simulation: Path, robot: Path) -> Transfer:

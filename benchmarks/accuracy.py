@@ -20,6 +20,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
+from collections.abc import Callable
 from typing import Annotated
 
 from ballu_mjx import runtime
@@ -184,12 +185,10 @@ class MjxResult:
     cpu: float
 
 
-def mjx_rollout(
-    model: mujoco.MjModel, qpos: Float[np.ndarray, " nq"], commands: Float[np.ndarray, "count steps 2"], batch: int
-) -> MjxResult:
-    """The same by MJX in float32, the sequences repeated to fill `batch` and sharded over all devices."""
-    devices = jax.device_count()
-    batch = -(-batch // devices) * devices
+def mjx_program(
+    model: mujoco.MjModel, qpos: Float[np.ndarray, " nq"], devices: int
+) -> Callable[[Float[Array, "batch steps 2"]], Float[Array, "batch nq"]]:
+    """The same by MJX in float32: from commands to final generalized positions, the batch sharded over `devices`."""
     step_count, balloon = simulation.substeps(model), simulation.balloon_id(model)
     mjx_model, template = mjx.put_model(model), simulation.make_data(model)
     start = simulation.at(jnp.asarray(qpos, jnp.float32), jnp.zeros(model.nv))
@@ -204,16 +203,26 @@ def mjx_rollout(
 
         return jax.lax.scan(step, start, command)[0].qpos
 
-    mesh = jax.make_mesh((devices,), ("batch",), axis_types=(jax.sharding.AxisType.Auto,))
+    axis_types = (jax.sharding.AxisType.Auto,)
+    mesh = jax.make_mesh((devices,), ("batch",), axis_types=axis_types, devices=jax.local_devices()[:devices])
     spec = PartitionSpec("batch")
     # Sharded by hand: left to the compiler, the solver's loops would wait for all devices at every iteration.
-    rollout = jax.jit(jax.shard_map(jax.vmap(one), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
+    return jax.jit(jax.shard_map(jax.vmap(one), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
+
+
+def mjx_rollout(
+    model: mujoco.MjModel, qpos: Float[np.ndarray, " nq"], commands: Float[np.ndarray, "count steps 2"], batch: int
+) -> MjxResult:
+    """Positions and speed of `mjx_program` on all devices, the sequences repeated to fill `batch`."""
+    devices = jax.device_count()
+    batch = -(-batch // devices) * devices
+    rollout = mjx_program(model, qpos, devices)
     inputs = jnp.asarray(np.resize(commands, (batch, *commands.shape[1:])), jnp.float32)
     final = np.asarray(rollout(inputs))
     clock, processor = [], []
     for _ in range(3):
         start_clock, start_processor = time.perf_counter(), time.process_time()
-        rollout(inputs).block_until_ready()
+        jax.block_until_ready(rollout(inputs))
         clock.append(time.perf_counter() - start_clock)
         processor.append(time.process_time() - start_processor)
     simulated = batch * commands.shape[1] * robot.CONTROL_TIMESTEP

@@ -21,6 +21,7 @@ import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
+from jaxtyping import Float  # noqa: E402
 from mujoco import rollout  # noqa: E402
 
 from ballu_mjx import learner, ppo, reconstruction, recording, robot, simulation  # noqa: E402
@@ -57,12 +58,10 @@ def stepping_rates(env: EnvMimicEnv, num_envs: int, repeats: int, length: int = 
 
 
 def rollout_rates(
-    model: mujoco.MjModel, threads: int, repeats: int, runs: int = 64, seconds: float = 2.0
+    model: mujoco.MjModel, threads: int, repeats: int, commands: Float[np.ndarray, "runs steps 2"]
 ) -> list[float]:
-    """Control steps per second of C MuJoCo under random bang-bang commands."""
-    count = simulation.substeps(model)
-    steps = round(seconds / robot.CONTROL_TIMESTEP)
-    commands = np.random.default_rng(0).integers(0, 2, (runs, steps, 2)).astype(float)
+    """Control steps per second of C MuJoCo."""
+    count, (runs, steps, _) = simulation.substeps(model), commands.shape
     data = mujoco.MjData(model)
     data.qpos[:] = robot.standing_qpos(model)
     state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
@@ -93,10 +92,11 @@ def main() -> None:
     config = ppo.PPOConfig(num_envs=arguments.num_envs, num_timesteps=(repeats + 1) * step_size)
 
     devices = jax.local_device_count()
+    commands = np.random.default_rng(0).integers(0, 2, (64, 40, 2)).astype(float)
     rows = {
         "PPO training, learning included": training_rates(env, config),
         "MJX environments alone": stepping_rates(env, config.num_envs, repeats),
-        f"C MuJoCo rollout, {devices} threads": rollout_rates(model, devices, repeats),
+        f"C MuJoCo rollout, {devices} threads": rollout_rates(model, devices, repeats, commands),
     }
     print(
         f"{devices} {jax.default_backend()} devices, {config.num_envs} environments, time step {model.opt.timestep} s"

@@ -27,7 +27,6 @@ if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a co
 # %%
 import argparse
 import dataclasses
-import json
 
 from ballu_mjx import runtime
 
@@ -56,7 +55,7 @@ def train(folder: Path, *arguments: str) -> None:
 
 def load(folder: Path) -> evaluation.Evaluation:
     """The evaluation of one run."""
-    return evaluation.Evaluation.from_json(json.loads((folder / "evaluation.json").read_text()))
+    return evaluation.read(folder / "evaluation.json")
 
 
 def evaluate(folders: list[Path], paths: list[Path]) -> list[evaluation.Evaluation]:

@@ -29,7 +29,7 @@ AIR = AirParameters(
     turning_drag=jnp.array([2e-3, 3e-3, 4e-3]),
     delay=jnp.array(0.05),
 )
-CONFIG = AirConfig(window_seconds=1.5, interval_seconds=0.75, evaluations=6)
+CONFIG = AirConfig(window_seconds=0.5, interval_seconds=0.5, evaluations=8)
 COMMANDS = jnp.zeros((envmimic.HISTORY, 2))
 
 
@@ -143,9 +143,7 @@ def motions() -> list[Motion]:
 
 @pytest.fixture(scope="module")
 def found(motions: list[Motion]) -> AirFit:
-    return air_identification.identify(
-        MODEL, motions, AirConfig(window_seconds=0.5, interval_seconds=0.5, evaluations=8)
-    )
+    return air_identification.identify(MODEL, motions, CONFIG)
 
 
 def test_known_air_is_found_again_in_another_simulator_s_motion(found: AirFit):

@@ -254,7 +254,7 @@ def test_changed_recording_is_noticed(trained, monkeypatch, capsys):
         assert evaluate.main(["run"]) == 2
     finally:
         path.write_bytes(content)
-    assert "has changed since run used it" in capsys.readouterr().err
+    assert "has changed since run/config.json was written" in capsys.readouterr().err
 
 
 def test_last_three_checkpoints_and_the_best_are_kept(tmp_path: Path):

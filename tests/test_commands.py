@@ -92,10 +92,18 @@ def test_an_unexpected_error_is_called_a_fault_of_the_package(capsys: pytest.Cap
 
 
 def test_what_the_system_refuses_is_no_fault_of_the_package(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    (tmp_path / "file").touch()
-    assert main(f"record simulate --gait walking --seconds 1 --output {tmp_path}/file/walk.csv") == 1
+    def open_nothing() -> None:
+        (tmp_path / "nothing").open()
+
+    assert runtime.exit_status(open_nothing, []) == 1
     told = capsys.readouterr().err
-    assert f"{tmp_path}/file" in told and "fault" not in told and told.count("\n") == 1
+    assert f"{tmp_path}/nothing" in told and "fault" not in told and told.count("\n") == 1
+
+
+def test_a_folder_that_is_none_is_refused_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "file").touch()
+    assert main(f"record simulate --gait walking --seconds 1 --output {tmp_path}/file/walk.csv") == 2
+    assert f"{tmp_path}/file: cannot be written to" in capsys.readouterr().err
 
 
 def test_a_reader_that_has_seen_enough_is_no_error():

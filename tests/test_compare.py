@@ -24,9 +24,9 @@ def write(folder: Path, seed: int, scale: float, reward: float, task: str = "env
         "starts": [],
     }
     with runs.Run(folder, config) as run:
+        run.log(0, {"validation_error": 1.0})
         for step in range(0, 101, 5):
             run.log(step, {"reward": reward if step > 90 else 0.0})
-        run.log(0, {"validation_error": 1.0})
         run.log(100, {"validation_error": reward / 2})
     errors = [
         Errors(name, name[:4].strip("-"), {h: (x * h, 0.1) for h in HORIZONS}, {h: (x, 0.1) for h in HORIZONS}, 0, 0, 0)
@@ -83,7 +83,7 @@ def test_what_cannot_be_compared_is_refused(folders: list[Path], tmp_path: Path,
         ([folders[0], walk], "compare runs of one task"),
         ([folders[0], folders[0]], "given twice"),
         ([tmp_path / "nothing"], "there is no run"),
-        ([folders[1]], "evaluation.json: cannot be read"),
+        ([folders[1]], "evaluation.json: is no evaluation"),
         ([folders[2]], "has not trained yet"),
     ):
         assert compare.main([str(folder) for folder in given]) == 2

@@ -303,7 +303,7 @@ def test_command_refuses_what_it_cannot_use(run: Path, tmp_path: Path, capsys: p
     (tmp_path / "other" / "config.json").write_text('{"format": "ballu-run/1", "task": "envmimic"}')
     for arguments, words in (
         ([tmp_path / "nothing"], "there is no run"),
-        ([tmp_path / "other"], "is a run of 'envmimic'"),
+        ([tmp_path / "other"], "is of a run of 'envmimic'"),
         ([run, "--output", tmp_path / "full", "--no-open-loop"], "not empty"),
         ([run, "--seconds", "0"], "--seconds"),
         ([run, "--pulse-low", "-1"], "--pulse-low"),

@@ -464,7 +464,7 @@ def test_a_c3d_cut_anywhere_is_refused(c3d_file: Path, share: float):
 def test_c3d_without_what_is_asked_for_is_refused(c3d_file: Path):
     room = c3d_room(c3d_file.parent)
     (c3d_file.parent / "room.toml").write_text((c3d_file.parent / "room.toml").read_text().replace("B4", "B9"))
-    with pytest.raises(InputError, match=r"walk.c3d: there is no marker 'B9'; mend the mapping"):
+    with pytest.raises(InputError, match=r"walk.c3d: there is no marker 'B9'; mend .*room\.toml"):
         c3d.read_c3d(c3d_file, mapping.read_mapping(c3d_file.parent / "room.toml"))
     content = bytearray(c3d_file.read_bytes())
     place = content.index(b"UNITS")
@@ -697,5 +697,5 @@ def test_whatever_stands_in_a_mapping_is_read_or_refused(changes: list[tuple[tup
 def test_names_that_two_subjects_share_need_the_subject(tmp_path: Path):
     found = captured(np.eye(3))
     text = section("Segments", found) + "\n" + section("Segments", {"base": found["base"]}, prefix="twin:")
-    with pytest.raises(InputError, match="'base' belongs to several subjects; name one: ballu:base, twin:base"):
+    with pytest.raises(InputError, match=r"'base' belongs to several subjects; name one in .*: ballu:base, twin:base"):
         read(tmp_path, text, 'robot = "r"\n' + BODIES.replace("ballu:", ""))

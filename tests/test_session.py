@@ -5,6 +5,8 @@ import io
 import json
 import os
 import signal
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +19,12 @@ from brax.training.agents.ppo.losses import PPONetworkParams
 from brax.training.types import UInt64
 from follower import Follower
 
-from ballu_mjx import learner, ppo, runs
+from ballu_mjx import files, learner, ppo, runs
 from ballu_mjx.errors import InputError
 from ballu_mjx.learner import Learner, TrainingState
 from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.runs import Progress, Run
-from ballu_mjx.session import Session, Start, _made_with, start_from
+from ballu_mjx.session import Session, Start, Watchdog, _made_with, start_from
 
 GOOD = {"reward": 0.1, "diverged": 0.0, "steps_per_second": 100.0, "total_loss": 0.5}
 
@@ -213,3 +215,58 @@ def test_a_run_that_ended_without_its_results_may_go_on_to_them(tmp_path, small)
     (folder / "replay.npz").write_bytes(b"")
     with pytest.raises(InputError, match="already"):
         resumed(folder, CONFIG)
+
+
+def until_told(stream: io.StringIO, lines: int) -> list[str]:
+    """What was told, when it is so many lines, or after two seconds."""
+    end = time.monotonic() + 2.0
+    while stream.getvalue().count("\n") < lines and time.monotonic() < end:
+        time.sleep(0.01)
+    return stream.getvalue().splitlines()
+
+
+def test_the_user_is_told_once_of_each_standstill_and_of_compiling_in_other_words():
+    stream = io.StringIO()
+    with Watchdog(Path("runs/walk"), limit=0.1, stream=stream) as watchdog:
+        (compiling,) = until_told(stream, 1)
+        assert "a first compilation takes" in compiling and "--num-envs" in compiling
+        time.sleep(0.3)
+        assert len(stream.getvalue().splitlines()) == 1, "said again"
+        for step in range(20, 120, 20):  # goes on for longer than the limit
+            watchdog.step_done(step)
+            time.sleep(0.05)
+        assert len(stream.getvalue().splitlines()) == 1
+        _, standing = until_told(stream, 2)
+        assert "since step 100" in standing and "--resume runs/walk" in standing
+    time.sleep(0.3)
+    assert stream.getvalue().count("\n") == 2, "the training is over"
+
+
+def test_a_training_that_ends_leaves_no_watchdog(tmp_path):
+    with open_run(tmp_path / "run") as run:
+        session = session_in(run)
+        assert session._watchdog._limit == 300.0
+        with session._watchdog:
+            assert any(thread.name == "watchdog" and thread.daemon for thread in threading.enumerate())
+        end = time.monotonic() + 2.0
+        while any(thread.name == "watchdog" for thread in threading.enumerate()) and time.monotonic() < end:
+            time.sleep(0.01)
+        assert not any(thread.name == "watchdog" for thread in threading.enumerate())
+
+
+def test_a_folder_that_takes_no_results_is_found_before_the_work(tmp_path):
+    (tmp_path / "file").write_text("")
+    places = [tmp_path / "file" / "run"]
+    if Path("/proc").is_dir():
+        places.append(Path("/proc/run"))  # read-only for root too
+    if os.geteuid():
+        (tmp_path / "locked").mkdir(mode=0o555)
+        places.append(tmp_path / "locked" / "run")
+    for place in places:
+        with pytest.raises(InputError, match="cannot be written to .*; mend its permissions, or give another folder"):
+            files.check_folder(place)
+        with pytest.raises(InputError, match="cannot be written to"):
+            runs.new_folder(place, "walk")
+    files.check_folder(tmp_path / "new" / "run")
+    left = {path.name for path in tmp_path.iterdir()} - {"locked"}
+    assert left == {"file"}, "what was tried is left behind"

@@ -49,7 +49,7 @@ def read_c3d(path: Path, mapping: RoomMapping) -> Trajectories:
     points[:, (found.residual < 0) | (points == 0).all(axis=0)] = np.nan
 
     def marker(name: str) -> np.ndarray:
-        full = find(path, name, [label for label in labels if label], "marker")
+        full = find(path, name, [label for label in labels if label], "marker", mapping.path)
         if labels.count(full) > 1:
             refuse(path, "POINT:LABELS", f"{shorten(full)!r} stands there twice", "give markers different names")
         return points[:, labels.index(full)].T

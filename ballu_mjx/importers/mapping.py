@@ -13,9 +13,10 @@ from typing import Any, Literal, NoReturn, cast
 import numpy as np
 from jaxtyping import Float
 
+from ballu_mjx import files
 from ballu_mjx.errors import is_number
 from ballu_mjx.importers.trajectories import ANGLES, LENGTHS, TIMES, refuse, shorten, suggest
-from ballu_mjx.recording import COLUMNS, Kind, read_text
+from ballu_mjx.recording import COLUMNS, Kind
 from ballu_mjx.robot import SIDES
 
 ROLES = ("balloon", "base", *(f"foot_{side}" for side in SIDES))
@@ -157,15 +158,14 @@ def read_mapping(path: Path) -> RoomMapping:
 
     **Raises** `InputError` naming file, key and mend.
     """
-    text = read_text(path)
-    try:
-        content = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        kind = "JSON" if path.suffix == ".json" else "TOML"
-        mend = "mend it there; `python -m ballu_mjx.record example-mapping` prints one that works"
-        refuse(path, "", f"not {kind} ({error})", mend)
-    if not isinstance(content, dict):
-        refuse(path, "", "not a table of keys", "start from `python -m ballu_mjx.record example-mapping`")
+    mend = "mend it there; `python -m ballu_mjx.record example-mapping` prints one that works"
+    if path.suffix == ".json":
+        content = files.read_json(path, mend)
+    else:
+        try:
+            content = tomllib.loads(files.read_text(path))
+        except (ValueError, RecursionError) as error:
+            refuse(path, "", f"not TOML ({shorten(str(error))})", mend)
     top = _Keys(path, "", content)
     robot = top.text("robot")
     kind = cast(Kind, top.choice("kind", ("free", "suspended"), "free"))
@@ -207,7 +207,7 @@ class _Keys:
         self.taken: set[str] = set()
 
     def bad(self, key: str, mend: str) -> NoReturn:
-        value = shorten(json.dumps(self.values[key], default=str)) if key in self.values else "missing"
+        value = shorten(_json(self.values[key])) if key in self.values else "missing"
         place = f"[{self.name}] {key}" if self.name else f"key {key}"
         refuse(self.path, place, "it is missing" if value == "missing" else f"it is {value}", mend)
 
@@ -276,6 +276,13 @@ class _Keys:
                 refuse(
                     self.path, where, "there is no such key", f"leave it out, {suggest(key, self.taken).rstrip('?')}"
                 )
+
+
+def _json(value: Any) -> str:
+    try:
+        return json.dumps(value, default=str)
+    except ValueError:  # TOML's hexadecimal numbers may have more digits than Python prints
+        return "a number of very many digits"
 
 
 def _axes(keys: _Keys) -> Float[np.ndarray, "3 3"]:

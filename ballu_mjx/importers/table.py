@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from ballu_mjx.files import read_text
 from ballu_mjx.importers.mapping import Commands, RoomMapping, Source
 from ballu_mjx.importers.trajectories import (
     ANGLES,
@@ -23,7 +24,6 @@ from ballu_mjx.importers.trajectories import (
     suggest,
     to_quaternion,
 )
-from ballu_mjx.recording import read_text
 
 _COMMAND_TOLERANCE = 0.005
 """Commands so far outside of [0, 1] are noise of a servo's own measurement, and are clipped."""
@@ -32,9 +32,13 @@ _COMMAND_TOLERANCE = 0.005
 class Table:
     """A CSV's columns by name, converted to numbers when asked for."""
 
-    def __init__(self, path: Path) -> None:
-        """Read the CSV at `path`. Raises `InputError` for one without header or samples, or with rows cut off."""
+    def __init__(self, path: Path, mapping: Path | None = None) -> None:
+        """Read the CSV at `path`; `mapping` is what names its columns, for messages.
+
+        Raises `InputError` for one without header or samples, or with rows cut off.
+        """
         self.path = path
+        self._mapping = "the mapping" if mapping is None else str(mapping)
         text = read_text(path)
         header_line = next((line for line in text.splitlines() if line.strip()), "")
         delimiter = max(",;\t", key=header_line.count)
@@ -66,7 +70,7 @@ class Table:
         """The numbers of a column, NaN where a cell is empty. Raises `InputError` naming line, column and mend."""
         if name not in self.header:
             hint = suggest(name, self.header).rstrip("?")
-            refuse(self.path, "", f"there is no column {shorten(name)!r}", f"mend the mapping, {hint}")
+            refuse(self.path, "", f"there is no column {shorten(name)!r}", f"mend {self._mapping}, {hint}")
         if self.header.count(name) > 1:
             refuse(self.path, "", f"the column {shorten(name)!r} stands there twice", "rename one")
         place = self.header.index(name)

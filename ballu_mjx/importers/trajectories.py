@@ -69,8 +69,8 @@ def suggest(name: str, known: Iterable[str], *, most: int = 12) -> str:
     return f"there are {shown}" if names else "there are none"
 
 
-def find(path: Path, name: str, known: Iterable[str], what: str) -> str:
-    """The full name in `known` that `name` means: itself, or the only one that is `name` behind its subject's.
+def find(path: Path, name: str, known: Iterable[str], what: str, mapping: Path) -> str:
+    """The full name in `known` that `name` means, in `mapping`: itself, or the only one that is it behind a subject's.
 
     **Raises** `InputError` where there is none or several.
     """
@@ -79,10 +79,11 @@ def find(path: Path, name: str, known: Iterable[str], what: str) -> str:
         return name
     behind = [full for full in names if full.rpartition(":")[2] == name]
     if len(behind) > 1:
-        refuse(path, "", f"{what} {shorten(name)!r} belongs to several subjects", f"name one: {', '.join(behind[:4])}")
+        mend = f"name one in {mapping}: {', '.join(behind[:4])}"
+        refuse(path, "", f"{what} {shorten(name)!r} belongs to several subjects", mend)
     if not behind:
         hint = suggest(name, names).rstrip("?")
-        refuse(path, "", f"there is no {what} {shorten(name)!r}", f"mend the mapping, {hint}")
+        refuse(path, "", f"there is no {what} {shorten(name)!r}", f"mend {mapping}, {hint}")
     return behind[0]
 
 

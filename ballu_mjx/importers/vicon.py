@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from ballu_mjx.files import read_text
 from ballu_mjx.importers.mapping import MARKER_TOLERANCE, RoomMapping, Source
 from ballu_mjx.importers.trajectories import (
     ANGLES,
@@ -37,7 +38,6 @@ from ballu_mjx.importers.trajectories import (
     suggest,
     to_quaternion,
 )
-from ballu_mjx.recording import read_text
 
 _PREFIX = "Global Angle "
 _TRANSLATIONS = (("TX", "TY", "TZ"), ("X", "Y", "Z"))
@@ -99,7 +99,7 @@ def read_vicon(path: Path, mapping: RoomMapping) -> Trajectories:
     lines = read_text(path).splitlines()
     delimiter = _delimiter(path, lines)
     groups = _groups(path, _sections(path, lines, delimiter), mapping)
-    wanted = {role: _wanted(path, source, groups) for role, source in mapping.sources.items()}
+    wanted = {role: _wanted(path, mapping.path, source, groups) for role, source in mapping.sources.items()}
     if not wanted:
         refuse(mapping.path, "", "it asks for no body of a Vicon file", "say what the balloon is, or give a table")
     used = list({id(g.section): g.section for gs in wanted.values() for g in gs}.values())
@@ -209,21 +209,21 @@ def _groups(path: Path, sections: Sequence[_Section], mapping: RoomMapping) -> d
     return groups
 
 
-def _wanted(path: Path, source: Source, groups: Mapping[str, list[_Group]]) -> list[_Group]:
+def _wanted(path: Path, mapping: Path, source: Source, groups: Mapping[str, list[_Group]]) -> list[_Group]:
     if source.position:
         mend = 'a Vicon file has bodies and markers by name, write body = "..." there'
-        refuse(path, "", f"the mapping gives [{source.role}] by columns", mend)
+        refuse(path, "", f"{mapping} gives [{source.role}] by columns", mend)
     found = []
     for name in source.markers or (source.body or "",):
-        full = find(path, name, groups, "body or marker")
+        full = find(path, name, groups, "body or marker", mapping)
         candidates = [g for g in groups[full] if source.section in (None, g.section.title)]
         if not candidates:
             titles = [g.section.title for g in groups[full]]
             problem = f"{shorten(full)!r} does not stand in a section {shorten(str(source.section))!r}"
-            refuse(path, "", problem, f"mend the mapping, {suggest(str(source.section), titles).rstrip('?')}")
+            refuse(path, "", problem, f"mend {mapping}, {suggest(str(source.section), titles).rstrip('?')}")
         if len(candidates) > 1:
             titles = ", ".join(dict.fromkeys(g.section.title for g in candidates))
-            mend = f'add section = "..." to [{source.role}] in the mapping'
+            mend = f'add section = "..." to [{source.role}] in {mapping}'
             refuse(path, "", f"{shorten(full)!r} stands in several sections ({titles})", mend)
         found.append(candidates[0])
     return found

@@ -1,10 +1,10 @@
-"""Kill trainings at random moments and damage what they saved, again and again, and count what survives.
+"""Kill trainings at random moments, damage what they saved, fill their disk, and count what survives.
 
-    python tests/faults/campaign.py --kills 20 --damages 20
+    python tests/faults/campaign.py --kills 20 --damages 20 --swaps 10 --full 10 --twice 5
 
 The training is a small one without physics, through the run folders and sessions that every training uses. After each
 fault the run is resumed; at the end its parameters and measurements are held against those of a training that nobody
-disturbed.
+disturbed. Filling a disk takes the right to mount a small one in memory (root's); without it that fault is left out.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import json
 import multiprocessing.forkserver
 import os
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -36,7 +37,9 @@ STEPS = 60
 """Training steps of the whole training."""
 EVERY = 5
 """Training steps between two checkpoints."""
-TIMINGS = ("seconds", "steps_per_second")
+DISK = 32 * 2**20
+"""Bytes of a disk that is to be filled."""
+TIMINGS = ("seconds", "steps_per_second", "validation_seconds")
 """Measurements that no two trainings share."""
 
 
@@ -68,9 +71,10 @@ def train(folder: Path) -> None:
 
 
 def quietly(folder: Path, told: Path) -> None:
-    """`train`, with what it says in the file `told`."""
+    """`train` as a command does it, with what it says in the file `told`."""
     with told.open("a") as stream, contextlib.redirect_stdout(stream), contextlib.redirect_stderr(stream):
-        train(folder)
+        status = runtime.exit_status(lambda: train(folder), [])
+    sys.exit(status)
 
 
 @dataclasses.dataclass
@@ -112,12 +116,11 @@ class Trainer:
         if process.exitcode:
             raise RuntimeError(f"The training ended with {process.exitcode}:\n{self.told.read_text()}")
 
-    def kill(self, folder: Path, steps: int, delay: float) -> bool:
-        """Start training, and kill it `delay` seconds after it has measured `steps` training steps, or after the
-        process began where these are 0; returns whether it was still at it."""
-        process = self.start(folder)
+    def started(self, folder: Path, steps: int) -> Any:
+        """Start training, and wait until it has measured `steps` training steps or is over; returns the process."""
         path = folder / "metrics.jsonl"
         old = path.stat().st_ino if path.exists() else None
+        process = self.start(folder)
         first: int | None = None  # lines that are kept: the file is a new one then
         while steps and process.is_alive():
             if path.exists() and path.stat().st_ino != old:
@@ -126,6 +129,12 @@ class Trainer:
                 if lines >= first + steps:
                     break
             time.sleep(0.002)
+        return process
+
+    def kill(self, folder: Path, steps: int, delay: float) -> bool:
+        """Start training, and kill it `delay` seconds after it has measured `steps` training steps, or after the
+        process began where these are 0; returns whether it was still at it."""
+        process = self.started(folder, steps)
         process.join(delay)
         alive = process.is_alive()
         process.kill()
@@ -201,10 +210,103 @@ def damaged(at: Trainer, reference: Path, folder: Path, random: np.random.Genera
     return done, same(folder, reference)
 
 
+def swapped(at: Trainer, reference: Path, folder: Path, random: np.random.Generator) -> tuple[str, bool]:
+    """Copy a training that was killed to `folder`, exchange a file of its last two checkpoints, or all of them, let it
+    end; returns what was done."""
+    from ballu_mjx import runs
+
+    shutil.copytree(reference.parent / "killed", folder)
+    one, other = (folder / "checkpoints" / str(step) for step in runs.checkpoints(folder)[-2:])
+    what = "swapped whole"
+    if random.random() < 0.7:
+        what = "file swapped"
+        files = [path.relative_to(other) for path in checkpoint_files(folder)]
+        # Names of data files differ from one checkpoint to the next.
+        name = random.choice(np.array([str(path) for path in files if (one / path).exists()]))
+        one, other = one / name, other / name
+    aside = folder / "aside"
+    one.rename(aside)
+    other.rename(one)
+    aside.rename(other)
+    at.finish(folder)
+    return what, same(folder, reference)
+
+
+@contextlib.contextmanager
+def small_disk(work: Path, size: int) -> Iterator[Path | None]:
+    """A disk in memory of `size` bytes; None where this process may not mount one."""
+    place = work / "disk"
+    place.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(place)]
+    try:
+        mounted = sys.platform == "linux" and not subprocess.run(command, capture_output=True, check=False).returncode
+    except OSError:
+        mounted = False
+    try:
+        yield place if mounted else None
+    finally:
+        if mounted:
+            subprocess.run(["umount", "--lazy", str(place)], check=True)
+        place.rmdir()
+
+
+def fill(place: Path, free: int) -> Path:
+    """Fill a disk but for about `free` bytes; returns the file that does."""
+    ballast = place / "ballast"
+    with ballast.open("wb", buffering=0) as file:
+        with contextlib.suppress(OSError):
+            while True:
+                file.write(bytes(4096))
+        file.truncate(max(ballast.stat().st_size - free, 0))
+    return ballast
+
+
+def full_disk(at: Trainer, reference: Path, disk: Path, steps: int, free: int) -> bool:
+    """Fill the disk of a training after so many steps; returns whether one sentence said so, a whole checkpoint was
+    left, and with room again it ended as `reference` did. Raises `RuntimeError` where it did not stop."""
+    from ballu_mjx import runs
+
+    folder = disk / "run"
+    process = at.started(folder, steps)
+    before = len(at.told.read_text())
+    ballast = fill(disk, free)
+    process.join(60)
+    if process.is_alive():
+        process.kill()
+        raise RuntimeError("The training neither goes on nor ends on a full disk.")
+    said = at.told.read_text()[before:].strip()
+    one_sentence = process.exitcode == 2 and "\n" not in said and f"{folder}: its disk is full; make room" in said
+    last = runs.last_checkpoint(folder, training=True)
+    if not one_sentence or (f"step {last.step:,} is whole" not in said):
+        raise RuntimeError(f"Exit status {process.exitcode}, checkpoint {last.step}: {said!r}")
+    ballast.unlink()
+    at.finish(folder)
+    ended = same(folder, reference)
+    shutil.rmtree(folder)
+    return ended
+
+
+def twice(at: Trainer, reference: Path, folder: Path, steps: int) -> bool:
+    """Start a second training in the folder of one that runs; returns whether it was refused by one sentence, and the
+    first ended as `reference` did."""
+    first = at.started(folder, steps)
+    before = len(at.told.read_text())
+    second = at.start(folder)
+    second.join()
+    said = at.told.read_text()[before:]
+    alive = first.is_alive()
+    first.join()
+    refused = second.exitcode == 2 and "another process is writing to this run" in said
+    return alive and refused and first.exitcode == 0 and same(folder, reference)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=20, help="trainings killed (SIGKILL)")
     parser.add_argument("--damages", type=int, default=20, help="checkpoints cut off, or with one bit turned")
+    parser.add_argument("--swaps", type=int, default=10, help="checkpoints exchanged, or a file of them")
+    parser.add_argument("--full", type=int, default=10, help="disks filled up")
+    parser.add_argument("--twice", type=int, default=5, help="second processes in the folder of a run")
     parser.add_argument("--seed", type=int, default=0, help="of the moments and places")
     options = parser.parse_args()
     runtime.prepare()
@@ -234,12 +336,28 @@ def main() -> int:
             met = share if met is None else met
             count("killed", met, met * survived)
             remaining, run = remaining - max(met, 1), run + 1
-        if options.damages:
+        if options.damages or options.swaps:
             at.kill(at.work / "killed", STEPS // 2, 0.0)
         for number in range(options.damages):
             folder = at.work / f"damaged-{number}"
             what, survived = tried(lambda folder=folder: damaged(at, reference, folder, random))
             count(f"checkpoint {what or 'damaged'}", 1, int(survived))
+        for number in range(options.swaps):
+            folder = at.work / f"swapped-{number}"
+            what, survived = tried(lambda folder=folder: swapped(at, reference, folder, random))
+            count(f"checkpoints: {what or 'swapped'}", 1, int(survived))
+        for number in range(options.twice):
+            folder, steps = at.work / f"twice-{number}", int(random.integers(1, 20))
+            _, survived = tried(lambda f=folder, s=steps: (None, twice(at, reference, f, s)))
+            count("second process in the folder", 1, int(survived))
+        for _ in range(options.full):
+            with small_disk(at.work, DISK) as disk:
+                if disk is None:
+                    print("disk full: left out, for this process may not mount a small one", file=sys.stderr)
+                    break
+                moment = int(random.integers(EVERY + 1, 30)), int(2 ** random.uniform(0, 18))
+                _, survived = tried(lambda d=disk, m=moment: (None, full_disk(at, reference, d, *m)))
+                count("disk full", 1, int(survived))
     print("| fault | injected | survived | lost |\n| --- | --- | --- | --- |")
     for fault, (faults, survived) in sorted(table.items()):
         print(f"| {fault} | {faults} | {survived} | {faults - survived} |")

@@ -1,4 +1,4 @@
-"""What happens to a training whose process is killed, whose checkpoint is damaged, or that is started twice?"""
+"""What happens to a training that is killed or started twice, whose checkpoint is damaged, whose disk is full?"""
 
 from __future__ import annotations
 
@@ -38,6 +38,13 @@ def test_a_killed_training_ends_as_if_nothing_had_happened(at: Trainer, undistur
     steps = [row["step"] for row in rows]
     assert steps == list(range(campaign.STEP, campaign.STEPS * campaign.STEP + 1, campaign.STEP)), moments
     assert campaign.same(folder, undisturbed), moments
+
+
+def test_the_same_training_again_gives_the_same_numbers_to_the_bit(at: Trainer, undisturbed: Path):
+    at.finish(at.work / "again")
+    assert campaign.same(at.work / "again", undisturbed)
+    rows, _ = campaign.outcome(undisturbed)
+    assert len({row["total_loss"] for row in rows}) == len(rows), "nothing was learned that could differ"
 
 
 def test_a_second_process_is_refused_until_the_first_is_killed(at: Trainer):
@@ -93,6 +100,40 @@ def test_training_goes_on_from_the_checkpoint_before_a_damaged_one(at: Trainer, 
     assert (
         f"checkpoints/{last}/metrics/metrics: the checkpoint is damaged; taking the one before." in at.told.read_text()
     )
+
+
+def test_checkpoints_that_were_exchanged_are_not_taken(undisturbed: Path, tmp_path: Path, capsys):
+    """Whole ones: every file of them is as it was written."""
+    shutil.copytree(undisturbed / "checkpoints", tmp_path / "checkpoints")
+    steps = runs.checkpoints(tmp_path)
+    one, other, aside = (tmp_path / "checkpoints" / name for name in (str(steps[-1]), str(steps[-2]), "aside"))
+    for old, new in ((one, aside), (other, one), (aside, other)):
+        old.rename(new)
+    assert runs.last_checkpoint(tmp_path).step == steps[-3]
+    said = capsys.readouterr().err
+    assert f"the checkpoint is that of step {steps[-2]}" in said and said.count("\n") == 2
+
+
+def test_a_full_disk_ends_training_in_a_sentence_and_loses_nothing(at: Trainer, undisturbed: Path):
+    with campaign.small_disk(at.work, campaign.DISK) as disk:
+        if disk is None:
+            pytest.skip("this process may not mount a small disk")
+        assert campaign.full_disk(at, undisturbed, disk, campaign.EVERY + 3, free=3000)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+@pytest.mark.parametrize(("saved", "then"), [(True, "the checkpoint of step 80 is whole"), (False, "start again")])
+def test_measurements_that_cannot_be_written_end_a_run_in_a_sentence(tmp_path: Path, saved: bool, then: str):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "metrics.jsonl").symlink_to("/dev/full")
+    content = {"format": runs.FORMAT, "task": campaign.TASK, "starts": []}
+    with pytest.raises(InputError) as error, runs.Run(folder, content) as run:
+        if saved:
+            run.save(80, {"w": np.zeros(3)}, None)
+        run.log(160, {"reward": 1.0})
+    said = str(error.value)
+    assert said.startswith(f"{folder}: its disk is full; make room there, then ") and then in said
 
 
 def test_when_every_checkpoint_is_damaged_one_sentence_says_so(undisturbed: Path, tmp_path: Path):

@@ -1,0 +1,224 @@
+"""Residual forces by the gradient of the tracking error through the simulation.
+
+Windows of the recordings are simulated with the network's forces, and every control step of them is linearized
+(`linearization`). Backpropagation through these derivatives, in time order, is backpropagation through the accurate
+simulator, contacts included; and for small changes of the forces the linearized windows go on standing in for it, so
+that one simulation serves hundreds of gradients. Then all is simulated and linearized afresh.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import optax
+from jaxtyping import Array, Float, Int
+
+from ballu_mjx import envmimic, simulation, windows
+from ballu_mjx.envmimic import ForcePolicy
+from ballu_mjx.errors import InputError
+from ballu_mjx.forces import Applied
+from ballu_mjx.linearization import ControlSteps, Linearized, Linearizer
+from ballu_mjx.windows import OUTLYING, Windows
+
+
+@dataclasses.dataclass(frozen=True)
+class AnalyticConfig:
+    """How to learn by gradients through the simulation."""
+
+    window_seconds: float = 2.0
+    """Length of a window, s."""
+    interval_seconds: float = 2.0
+    """Time between the starts of two windows, s."""
+    rounds: int = 2
+    """Simulations of all windows, each linearized and then learned on."""
+    updates: int = 200
+    """Gradient steps in a round."""
+    validate_every: int = 50
+    """Gradient steps between two validations, each of which leaves a checkpoint."""
+    batch_size: int = 64
+    """Windows in a gradient step."""
+    learning_rate: float = 1e-3
+    """Adam's."""
+    max_grad_norm: float = 1.0
+    """Gradients longer than this are shortened to it: contacts make some windows' derivatives a thousand times longer
+    than others'."""
+    averaging: int = 50
+    """Gradient steps over which the network that is handed out is averaged (exponentially)."""
+    force_cost: float = 0.0
+    """Loss for each N^2 of force."""
+    observation_noise: float = 0.3
+    """Noise on what the network sees in training, in multiples of each entry's spread over the recordings."""
+    start_noise: float = 0.0
+    """Perturbation of a window's first state, in multiples of what reconstruction leaves uncertain."""
+    seed: int = 0
+    """Seeds network, batches and noise."""
+
+
+def check(config: AnalyticConfig) -> None:
+    """**Raises** `InputError` for options out of range, naming the option."""
+    windows.check(config.window_seconds, config.interval_seconds)
+    for name in ("rounds", "updates", "validate_every", "batch_size", "learning_rate", "max_grad_norm", "averaging"):
+        if not getattr(config, name) > 0:
+            raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name)}: it must be greater than 0.")
+
+
+def simulator(
+    model: mujoco.MjModel, forces: ForcePolicy, beside: Applied | None = None
+) -> Callable[[Any, Windows], tuple[ControlSteps, Float[np.ndarray, "windows windowsteps 27"]]]:
+    """A compiled simulation of windows under the forces of `forces` (and of `beside`): (its parameters, windows) to all
+    control steps, window after window, and the features after each."""
+    robot = envmimic.Simulator(model)
+    if beside is not None:
+        robot = robot.altered(beside.model.fields(beside.params))
+
+    def run(params: Any, window: Windows) -> tuple[ControlSteps, Array]:
+        def step(carry: tuple, time: Int[Array, ""]) -> tuple[tuple, tuple]:
+            state, history = carry
+            commands = jax.lax.dynamic_slice_in_dim(window.commands, time, envmimic.HISTORY)
+            force = forces.wrench(params, history, commands)[:3]
+            command, wrench = commands[-1], jnp.concatenate([force, jnp.zeros(3)])
+            if beside is not None:
+                command = beside.model.command(beside.params, commands)
+                wrench += beside.model.wrench(beside.params, history, commands)
+            after = robot.step(state, command, wrench)
+            features, _ = robot.observe(after)
+            done = ControlSteps(state, history, commands, force), features
+            return (after, jnp.concatenate([history[1:], features[None]])), done
+
+        first = simulation.at(jnp.asarray(window.qpos), jnp.asarray(window.qvel)), window.history
+        return jax.lax.scan(step, first, jnp.arange(len(window.features)))[1]
+
+    spread = windows.spread(run, shared=1)
+
+    def whole(params: Any, recorded: Windows) -> tuple[ControlSteps, np.ndarray]:
+        steps, features = spread(params, recorded)
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps), features
+
+    return whole
+
+
+Report = Callable[[int, Any, dict[str, float]], None]
+"""(gradient steps so far, the averaged parameters, measurements)."""
+
+
+def train(
+    model: mujoco.MjModel,
+    forces: ForcePolicy,
+    wrap: Callable[[Any], Any],
+    start: Any,
+    recorded: Windows,
+    spread: Float[np.ndarray, " inputs"],
+    config: AnalyticConfig,
+    report: Report,
+    beside: Applied | None = None,
+) -> None:
+    """Learn the parameters of `forces`.
+
+    **Arguments**
+
+    - `wrap`: what is learned to what `forces` takes.
+    - `start`: what is learned, to begin with.
+    - `recorded`: windows of the training recordings.
+    - `spread`: of each of the network's inputs over the recordings.
+    - `report`: told every `validate_every` gradient steps.
+    - `beside`: a residual that the simulator has already.
+    """
+    simulate, linearize = simulator(model, forces, beside), Linearizer(model, beside)
+    optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
+    some = _updates(forces, wrap, optimizer, spread, config)
+    carry = (start, optimizer.init(start), start)
+    key = jax.random.key(config.seed)
+    done = 0
+    for _ in range(config.rounds):
+        steps, features = simulate(wrap(jax.device_get(carry[0])), recorded)
+        data = _in_windows(linearize(steps), steps.force, recorded)
+        loss = float(np.mean(jax.vmap(_loss)(features, recorded.features)))
+        for first in range(0, config.updates, config.validate_every):
+            key, own = jax.random.split(key)
+            count = min(config.validate_every, config.updates - first)
+            carry, (linear, gradient) = some(carry, jax.random.split(own, count), data)
+            done += count
+            found = {"loss": loss, "linear_loss": float(jnp.mean(linear)), "gradient": float(jnp.median(gradient))}
+            report(done, jax.device_get(carry[2]), found)
+
+
+def _in_windows(
+    linearized: Linearized, force: Float[Array | np.ndarray, "steps 3"], recorded: Windows
+) -> tuple[Linearized, Float[Array, "windows windowsteps 3"], Windows]:
+    shape = recorded.features.shape[:2]
+    parts = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32).reshape(*shape, *x.shape[1:]), (linearized, force))
+    return *parts, jax.tree.map(jnp.asarray, recorded)
+
+
+def _loss(
+    features: Float[Array | np.ndarray, "windowsteps 27"], recorded: Float[Array | np.ndarray, "windowsteps 27"]
+) -> Float[Array, ""]:
+    """Pseudo-Huber, of a whole window's error."""
+    squared = jnp.sum(windows.errors(features, recorded) ** 2)
+    return 2 * OUTLYING**2 * (jnp.sqrt(1 + squared / OUTLYING**2) - 1)
+
+
+def _updates(
+    forces: ForcePolicy,
+    wrap: Callable[[Any], Any],
+    optimizer: optax.GradientTransformation,
+    spread: Float[np.ndarray, " inputs"],
+    config: AnalyticConfig,
+) -> Callable[..., Any]:
+    """Gradient steps on linearized windows, compiled."""
+
+    def window_loss(
+        params: Any, key: Array, linear: Linearized, about: Float[Array, "windowsteps 3"], window: Windows
+    ) -> tuple[Array, Array]:
+        free = linear.state.shape[1]
+        key_start, key_noise = jax.random.split(key)
+        first = config.start_noise * envmimic.start_spread(free // 2) * jax.random.normal(key_start, (free,))
+
+        def step(carry: tuple, inputs: tuple) -> tuple[tuple, tuple]:
+            moved, history = carry
+            linear, about, time, key = inputs
+            commands = jax.lax.dynamic_slice_in_dim(window.commands, time, envmimic.HISTORY)
+            noise = config.observation_noise * spread * jax.random.normal(key, spread.shape)
+            force = forces.force(wrap(params), forces.inputs(history, commands) + noise, history[-1, 8])
+            both = jnp.concatenate([moved, force - about])
+            features = linear.features + linear.seen @ both
+            return (linear.state @ both, jnp.concatenate([history[1:], features[None]])), (features, force)
+
+        steps = len(window.features)
+        through = linear, about, jnp.arange(steps), jax.random.split(key_noise, steps)
+        _, (features, force) = jax.lax.scan(step, (first, window.history), through)
+        tracking = _loss(features, window.features)
+        return tracking + config.force_cost * jnp.mean(jnp.sum(force**2, axis=-1)), tracking
+
+    @jax.jit
+    def some(carry: tuple, keys: Array, data: tuple) -> tuple[tuple, tuple]:
+        count = len(data[1])
+        size = min(config.batch_size, count)
+
+        def update(carry: tuple, key: Array) -> tuple[tuple, tuple]:
+            params, state, average = carry
+            key_choice, key_noise = jax.random.split(key)
+            chosen = jax.random.permutation(key_choice, count)[:size]
+            batch = jax.tree.map(lambda x: x[chosen], data)
+
+            def loss(params: Any) -> tuple[Array, Array]:
+                both = jax.vmap(lambda key, *own: window_loss(params, key, *own))(
+                    jax.random.split(key_noise, size), *batch
+                )
+                return jnp.mean(both[0]), jnp.mean(both[1])
+
+            (_, tracking), slope = jax.value_and_grad(loss, has_aux=True)(params)
+            change, state = optimizer.update(slope, state, params)
+            params = optax.apply_updates(params, change)
+            average = jax.tree.map(lambda a, p: a + (p - a) / config.averaging, average, params)
+            return (params, state, average), (tracking, optax.tree.norm(slope))
+
+        return jax.lax.scan(update, carry, keys)
+
+    return some

@@ -1,0 +1,196 @@
+"""Residual forces without reinforcement learning: `python -m ballu_mjx.train residual --method supervised|analytic`."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ballu_mjx import analytic, envmimic, evaluate, evaluation, loggers, plots, ppo, runs, supervised, windows
+from ballu_mjx.analytic import AnalyticConfig
+from ballu_mjx.envmimic import EnvMimicConfig, ForcePolicy
+from ballu_mjx.forces import Sum
+from ballu_mjx.linearization import Linearizer
+from ballu_mjx.ppo import Params, PPOConfig
+from ballu_mjx.reconstruction import Motion
+from ballu_mjx.residual import ACTIONS, Residual, write_observed
+from ballu_mjx.residual_data import Prepared, RecordingsData
+from ballu_mjx.runs import Run
+from ballu_mjx.supervised import SupervisedConfig
+
+QUICK: Mapping[str, Mapping[str, Any]] = {
+    "supervised": {"window_seconds": 0.5, "updates": 400},
+    "analytic": {"window_seconds": 0.5, "rounds": 1, "updates": 50},
+}
+"""Defaults of the methods' configurations under `--quick`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class AnalyticData(RecordingsData):
+    """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
+
+    residual: Path | None = None
+    """Folder of another residual's run, which acts beside the forces: these learn what it leaves. It must have been
+    learned beside the same actuators. Without this option: none."""
+
+
+def fit_supervised(data: RecordingsData, config: SupervisedConfig) -> int:
+    """Read and check everything, label, regress, evaluate; returns the exit status."""
+    supervised.check(config)
+    return _fit("supervised", data, config, None, _Supervised)
+
+
+def fit_analytic(data: AnalyticData, config: AnalyticConfig) -> int:
+    """Read and check everything, learn, evaluate; returns the exit status."""
+    analytic.check(config)
+    beside = None if data.residual is None else Residual.load(data.residual)
+    return _fit("analytic", data, config, beside, _Analytic)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Setup:
+    """What both methods learn with."""
+
+    model: mujoco.MjModel
+    motions: Mapping[str, Sequence[Motion]]
+    forces: ForcePolicy
+    start: Params
+    inputs: Float[np.ndarray, "states inputs"]
+    beside: Residual | None
+
+    def with_policy(self, policy: Any) -> Params:
+        """Parameters of `forces`."""
+        return self.start._replace(policy=policy)
+
+
+class _Fit:
+    """A method at work: what it learned goes to `save` with its validation error, relative to no force."""
+
+    error = "validation error (ratio)"
+
+    def __init__(self, setup: _Setup, config: Any, run: Run, validate: Callable[[Any], float]) -> None:
+        self.setup, self.config, self.run, self.validate = setup, config, run, validate
+        self.stages, self.began = runs.Stages(), time.perf_counter()
+
+    @property
+    def still(self) -> Any:
+        """A policy without force, which whatever is learned has to beat."""
+        return jax.tree.map(np.zeros_like, jax.device_get(self.setup.start.policy))
+
+    def save(self, step: int, total: int, policy: Any, error: float, metrics: Mapping[str, float]) -> None:
+        """Keep what was learned, and tell."""
+        seconds = time.perf_counter() - self.began
+        self.run.log(step, {**metrics, "validation_error": error, "seconds": seconds})
+        self.run.save(step, ppo.as_tree(self.setup.with_policy(jax.device_get(policy))), error)
+        self.stages.update("learning", step, total, error)
+
+
+class _Supervised(_Fit):
+    error = "error of validation forces (ratio)"
+
+    def learn(self) -> None:
+        """Labels for training and validation, and the regression."""
+        setup, config = self.setup, self.config
+        simulate, linearize = analytic.simulator(setup.model, setup.forces), Linearizer(setup.model)
+        found = {}
+        for use in ("training", "validation"):
+            robots = envmimic.Simulator(setup.model)
+            cut = windows.cut(robots, setup.motions[use], config.window_seconds, config.interval_seconds)
+            steps, _ = simulate(setup.with_policy(self.still), cut)
+            force = supervised.labels(cut, linearize(steps), config)
+            found[use] = supervised.examples(cut, force, setup.forces.config)
+            print(f"Labels, {use}: {_rms(force) * 1e3:.1f} mN (RMS along an axis).", flush=True)
+        infer = jax.jit(lambda policy, seen: setup.forces.infer(setup.with_policy(policy), seen))
+        seen, actions = found["validation"]
+
+        def validate(step: int, policy: Any, loss: float) -> None:
+            error = _rms(np.asarray(infer(policy, seen)) - actions) / _rms(actions)
+            self.save(step, config.updates, policy, error, {"loss": loss})
+
+        validate(0, self.still, float(np.mean(found["training"][1] ** 2)))
+        supervised.regress(infer, setup.start.policy, found["training"], config, validate)
+
+
+class _Analytic(_Fit):
+    def learn(self) -> None:
+        """Gradients through the simulation; the validation is open loop."""
+        setup, config = self.setup, self.config
+        robots = envmimic.Simulator(setup.model)
+        cut = windows.cut(robots, setup.motions["training"], config.window_seconds, config.interval_seconds)
+        total = config.rounds * config.updates
+
+        def report(step: int, policy: Any, metrics: dict[str, float]) -> None:
+            self.save(step, total, policy, self.validate(setup.with_policy(policy)), metrics)
+
+        report(0, self.still, {})
+        analytic.train(
+            setup.model,
+            setup.forces,
+            setup.with_policy,
+            setup.start.policy,
+            cut,
+            np.std(setup.inputs, axis=0),
+            config,
+            report,
+            None if setup.beside is None else setup.beside.applied,
+        )
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _fit(task: str, data: RecordingsData, config: Any, beside: Residual | None, method: type) -> int:
+    started = time.perf_counter()
+    loggers.check(data.wandb)
+    prepared = Prepared.read(data)
+    if beside is not None:
+        prepared.check_beside(beside.actuators, data.residual)  # pyright: ignore[reportAttributeAccessIssue]
+    folder = runs.new_folder(data.output, task)
+    prepared.announce(folder, data.quick)
+    model = prepared.load_model()
+    motions = prepared.reconstruct(model)
+    env, network = EnvMimicConfig(), dataclasses.replace(PPOConfig(), seed=config.seed)
+    reference, _ = envmimic.stack(envmimic.Simulator(model), motions["training"])
+    inputs = np.asarray(envmimic.recorded_inputs(reference, env))
+    infer = ppo.make_inference({ppo.STATE: (inputs.shape[1],)}, ACTIONS, network)
+    forces = ForcePolicy(env, infer, name=task)
+    setup = _Setup(model, motions, forces, ppo.initial_policy(inputs, ACTIONS, network), inputs, beside)
+    whole = forces if beside is None else Sum(beside.model, forces)
+
+    def all_params(params: Params) -> Any:
+        return params if beside is None else (beside.params, params)
+
+    def evaluator(use: str) -> evaluation.OpenLoopEvaluator:
+        return evaluation.OpenLoopEvaluator(model, motions[use], whole, prepared.base)
+
+    sections = {"env": env, "ppo": network, "fit": config, "data": data}
+    devices = [str(device) for device in jax.local_devices()]
+    description = runs.describe(task, sections, prepared.files, devices, prepared.identified)
+    description["residual"] = None if beside is None else str(data.residual.resolve())  # pyright: ignore
+    validation = evaluator("validation")
+    with Run(folder, description, wandb=data.wandb) as run:
+        print("Compiling: about a minute the first time ...", flush=True)
+        write_observed(run, inputs)
+        work = method(setup, config, run, lambda params: validation(all_params(params)).score)
+        work.learn()
+        work.stages.close()
+    best_step, params = evaluate.load_params(folder, "best")
+    names = [name for name in ("loss", "linear_loss") if len(runs.column(folder, name)[0])]
+    losses = {name.replace("_", " "): runs.column(folder, name) for name in names}
+    validated = runs.column(folder, "validation_error")
+    plots.fit_curve(folder / "learning_curve.png", losses, validated, method.error, task, best_step)
+    test = validation if prepared.one_set else evaluator("test")
+    print(f"Best checkpoint: gradient step {best_step:,}. Open-loop replay of the test recordings:\n")
+    print(evaluate.report(test, all_params(params), folder).table())
+    if data.quick:
+        print("\nThese numbers mean little: --quick learns for seconds.")
+    print(f"\nWritten to {folder}. {time.perf_counter() - started:.0f} s in all.")
+    return 0

@@ -1,0 +1,121 @@
+"""Control steps to first order: what a small change of the state before, or of the force on the balloon, changes after.
+
+Derivatives are taken forward, direction by direction, through the same accurate physics that everything else is
+simulated with: the solver's loop has no reverse mode, and a reverse mode of its own would be that of another model.
+Twenty-nine directions a control step are few beside the thousands of gradients that can then be had without simulating.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from ballu_mjx import envmimic, simulation, windows
+from ballu_mjx.forces import Applied
+
+FORCE = 3
+"""Directions of the force on the balloon."""
+_CHUNK = 64
+"""Control steps that are linearized in one go."""
+
+
+class ControlSteps(NamedTuple):
+    """Control steps to linearize about: states before, and what acts over them."""
+
+    physics: simulation.State
+    history: Float[Array | np.ndarray, "steps 3 27"]
+    """`envmimic.features` of the last three control steps, the state's own last: what a residual beside sees."""
+    commands: Float[Array | np.ndarray, "steps 3 2"]
+    """Commands of the last two control steps and the coming one."""
+    force: Float[Array | np.ndarray, "steps 3"]
+    """On the balloon (N, world)."""
+
+
+class Linearized(NamedTuple):
+    """Control steps to first order. The state's directions are those of `mjx.Data.qvel` for positions (the base turns
+    about its own axes), then the velocities'."""
+
+    features: Float[Array | np.ndarray, "steps 27"]
+    """After the step."""
+    state: Float[Array | np.ndarray, "steps 2nv 2nv+3"]
+    """Derivative of the state after by the state before and the force (N)."""
+    seen: Float[Array | np.ndarray, "steps 27 2nv+3"]
+    """Derivative of the features after, likewise."""
+
+
+class Linearizer:
+    """The robot's control steps, to first order; compiles once."""
+
+    def __init__(self, model: mujoco.MjModel, beside: Applied | None = None) -> None:
+        """`beside` is a residual that the simulator has already."""
+        self._nv, self._beside = model.nv, beside
+        self._simulator = envmimic.Simulator(model)
+        if beside is not None:
+            self._simulator = self._simulator.altered(beside.model.fields(beside.params))
+        self._along = windows.spread(self._one, shared=0)
+
+    @property
+    def directions(self) -> int:
+        """Of the state before and the force."""
+        return 2 * self._nv + FORCE
+
+    def __call__(self, steps: ControlSteps) -> Linearized:
+        """Linearize; a step whose derivatives are no numbers comes back with zeros."""
+        count, every = len(steps.force), self.directions
+        units = np.tile(np.eye(every, dtype=np.float32), (_CHUNK, 1))
+        found = []
+        for first in range(0, count, _CHUNK):
+            place = np.repeat(np.arange(first, first + _CHUNK) % count, every)
+            chunk = jax.tree.map(lambda x, place=place: np.asarray(x, np.float32)[place], steps)
+            found.append([x.reshape(_CHUNK, every, -1) for x in self._along(chunk, units)])
+        features, state, seen = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
+        good = np.isfinite(state).all(axis=(1, 2)) & np.isfinite(seen).all(axis=(1, 2))
+        state, seen = (np.where(good.reshape(-1, 1, 1), x, 0.0).transpose(0, 2, 1) for x in (state, seen))
+        return Linearized(features[:, 0], state, seen)
+
+    def _one(self, step: ControlSteps, direction: Float[Array, " directions"]) -> tuple[Array, Array, Array]:
+        nv, physics = self._nv, step.physics
+        turned = _expand(physics.qpos, direction[:nv])
+
+        def after(amount: Float[Array, ""]) -> tuple[simulation.State, Array]:
+            moved = simulation.State(
+                physics.qpos + amount * turned,
+                physics.qvel + amount * direction[nv : 2 * nv],
+                physics.warmstart + 0.0 * amount,
+            )
+            commands, force = jnp.asarray(step.commands), step.force + amount * direction[2 * nv :]
+            command, wrench = commands[-1], jnp.concatenate([force, jnp.zeros(3)])
+            if self._beside is not None:
+                model, params = self._beside
+                seen, _ = self._simulator.observe(moved)
+                history = jnp.concatenate([step.history[:-1], seen[None]])
+                command = model.command(params, commands)
+                wrench += model.wrench(params, history, commands)
+            state = self._simulator.step(moved, command, wrench)
+            return state, self._simulator.observe(state)[0]
+
+        (state, features), (change, seen) = jax.jvp(after, (jnp.zeros(()),), (jnp.ones(()),))
+        return features, jnp.concatenate([_compress(state.qpos, change.qpos), change.qvel]), seen
+
+
+def _expand(qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:
+    """Rates of generalized positions of the velocities `change`, in MuJoCo's conventions: q' = q (0, omega) / 2."""
+    turn = _product(qpos[3:7], jnp.concatenate([jnp.zeros(1), change[3:6]])) / 2
+    return jnp.concatenate([change[:3], turn, change[6:]])
+
+
+def _compress(qpos: Float[Array, " nq"], change: Float[Array, " nq"]) -> Float[Array, " nv"]:
+    """The inverse of `_expand`."""
+    conjugate = qpos[3:7] * jnp.array([1.0, -1.0, -1.0, -1.0])
+    return jnp.concatenate([change[:3], 2 * _product(conjugate, change[3:7])[1:], change[7:]])
+
+
+def _product(a: Float[Array, " 4"], b: Float[Array, " 4"]) -> Float[Array, " 4"]:
+    """Of quaternions (w, x, y, z)."""
+    v, w = a[1:], b[1:]
+    return jnp.concatenate([(a[0] * b[0] - v @ w)[None], a[0] * w + b[0] * v + jnp.cross(v, w)])

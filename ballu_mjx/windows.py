@@ -1,0 +1,123 @@
+"""Short windows of recorded motion, and how far a simulated one is off: what residuals are fitted to by derivatives.
+
+A window starts in a recorded state and runs under the recorded commands. It is short enough for errors not to compound,
+and long enough for a force of hundredths of a newton to move the balloon by more than the starting state's uncertainty.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ballu_mjx import envmimic
+from ballu_mjx import robot as ballu
+from ballu_mjx.errors import InputError
+from ballu_mjx.reconstruction import Motion
+
+POSITION = (0.002, 0.01)
+"""Expected error of the balloon's position (m) at a window's start, and what each second adds."""
+ANGLE = (np.deg2rad(0.3), np.deg2rad(0.6))
+"""Likewise of its orientation (rad)."""
+OUTLYING = 3.0
+"""Expected errors beyond which a window counts less: a foot slipped there, say."""
+
+
+class Windows(NamedTuple):
+    """Windows of recorded motions; `windowsteps` control steps each."""
+
+    qpos: Float[Array | np.ndarray, "windows nq"]
+    """First states."""
+    qvel: Float[Array | np.ndarray, "windows nv"]
+    history: Float[Array | np.ndarray, "windows 3 27"]
+    """`envmimic.features` of the first state and the two before."""
+    commands: Float[Array | np.ndarray, "windows commands 2"]
+    """From two control steps before the first on."""
+    features: Float[Array | np.ndarray, "windows windowsteps 27"]
+    """Recorded, after each control step."""
+
+
+def check(window_seconds: float, interval_seconds: float) -> None:
+    """**Raises** `InputError` for lengths out of range, naming the option."""
+    for name, value in (("--window-seconds", window_seconds), ("--interval-seconds", interval_seconds)):
+        if not 2 * ballu.CONTROL_TIMESTEP <= value < math.inf:
+            raise InputError(f"{name} is {value:g}: it must be 0.1 or more; 0.1 is the nearest.")
+
+
+def cut(
+    simulator: envmimic.Simulator, motions: Sequence[Motion], window_seconds: float, interval_seconds: float
+) -> Windows:
+    """Windows of the given length, one every `interval_seconds`.
+
+    **Raises** `InputError` where no recording is as long as a window.
+    """
+    steps, every = (round(s / ballu.CONTROL_TIMESTEP) for s in (window_seconds, interval_seconds))
+    history = envmimic.HISTORY
+    places = [
+        (number, start)
+        for number, motion in enumerate(motions)
+        for start in range(history - 1, len(motion.command) - steps + 1, every)
+    ]
+    if not places:
+        raise InputError(f"No recording lasts {window_seconds:g} s; give longer ones, or --window-seconds.")
+    reference, _ = envmimic.stack(simulator, motions)
+    qpos, qvel, features, command = (np.asarray(x) for x in reference[:4])
+
+    def of(array: np.ndarray, first: int, count: int) -> np.ndarray:
+        return np.stack([array[r, s + first : s + first + count] for r, s in places])
+
+    return Windows(
+        of(qpos, 0, 1)[:, 0],
+        of(qvel, 0, 1)[:, 0],
+        of(features, 1 - history, history),
+        of(command, 1 - history, steps + history - 1),
+        of(features, 1, steps),
+    )
+
+
+def errors(
+    features: Float[Array | np.ndarray, "windowsteps 27"], recorded: Float[Array | np.ndarray, "windowsteps 27"]
+) -> Float[Array, "windowsteps 6"]:
+    """Of the balloon's position and orientation, in expected errors. Neighbours in time say the same: all of a window's
+    squares add up to one for each of the six where errors are as expected."""
+    steps = len(recorded)
+    time = np.arange(1, steps + 1)[:, None] * ballu.CONTROL_TIMESTEP
+    start, each_second = np.array([POSITION] * 3 + [ANGLE] * 3).T
+    difference = jnp.asarray(features) - recorded
+    position, angles = difference[:, :3], envmimic.wrap_angle(difference[:, 6:9])
+    return jnp.concatenate([position, angles], axis=1) / ((start + each_second * time) * np.sqrt(steps))
+
+
+def spread(function: Callable[..., Any], shared: int) -> Callable[..., Any]:
+    """`function`, compiled for batches and spread over the devices.
+
+    Of its arguments the first `shared` are the same for all; the others, like what it returns, are arrays (or trees of
+    them), along whose first axis it runs.
+    """
+    devices = jax.local_devices()
+    mesh = jax.sharding.Mesh(np.array(devices), ("batch",))
+    spec = jax.sharding.PartitionSpec
+
+    @jax.jit
+    def run(common: tuple, batch: tuple) -> Any:
+        return jax.shard_map(
+            lambda common, batch: jax.vmap(lambda *own: function(*common, *own))(*batch),
+            mesh=mesh,
+            in_specs=(spec(), spec("batch")),
+            out_specs=spec("batch"),
+            check_vma=False,
+        )(common, batch)
+
+    def whole(*arguments: Any) -> Any:
+        common, batch = arguments[:shared], arguments[shared:]
+        count = len(jax.tree.leaves(batch)[0])
+        filled = np.arange(-(-count // len(devices)) * len(devices)) % count
+        batch = jax.tree.map(lambda x: np.asarray(x)[filled], batch)
+        return jax.tree.map(lambda x: np.asarray(x)[:count], run(jax.device_get(common), batch))
+
+    return whole

@@ -1,0 +1,62 @@
+"""A locomotion task on the robot in PyBullet, as a Gymnasium environment: for Stable-Baselines3, the paper's stack."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bullet
+import gymnasium  # pyright: ignore[reportMissingImports]
+import numpy as np
+from jaxtyping import Float
+
+from ballu_mjx import robot
+from ballu_mjx.controller import observation
+from ballu_mjx.tasks import TASKS, Step
+
+OBSERVATIONS = 28
+"""As `locomotion.OBSERVATIONS`, which would bring MJX and Brax into every process."""
+
+
+class LocomotionEnv(gymnasium.Env):
+    """`locomotion.LocomotionEnv` in the nominal simulator, with PyBullet under it: the same observations, actions,
+    rewards, starting state and random lengths of episodes. `info["reward"]` is the reward as it was, whatever wrappers
+    make of it."""
+
+    def __init__(self, task: str, timestep: float, episode_seconds: float) -> None:
+        """`timestep` (s) is Bullet's, `episode_seconds` the mean length of an episode."""
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBSERVATIONS,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        model = robot.load_model()
+        self._task, self.robot = TASKS[task], bullet.Robot(model, timestep)
+        self._start = robot.standing_qpos(model)
+        self._mean = round(episode_seconds / robot.CONTROL_TIMESTEP)
+        self._com, self._remaining = np.zeros(3), 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Float[np.ndarray, " 28"], dict[str, Any]]:
+        """Standing, at the origin, facing x."""
+        super().reset(seed=seed)
+        self.robot.reset(self._start)
+        features, self._com = self.robot.observe()
+        self._remaining = int(self.np_random.integers(self._mean // 2, self._mean + self._mean // 2 + 1))
+        return observation(features).astype(np.float32), {}
+
+    def step(
+        self, action: Float[np.ndarray, " 2"]
+    ) -> tuple[Float[np.ndarray, " 28"], float, bool, bool, dict[str, Any]]:
+        """Advance one control step under the policy's commands."""
+        command = np.clip((np.asarray(action, float) + 1) / 2, 0.0, 1.0)
+        self.robot.step(command.tolist())
+        features, com = self.robot.observe()
+        finite = bool(np.isfinite(features).all())
+        velocity = (com - self._com) / robot.CONTROL_TIMESTEP
+        reward = float(self._task.reward(Step(velocity, features, command))) if finite else 0.0  # pyright: ignore
+        self._com = com
+        self._remaining -= 1
+        seen = observation(features) if finite else np.zeros(OBSERVATIONS)
+        return seen.astype(np.float32), reward, not finite, self._remaining <= 0, {"reward": reward}
+
+    def close(self) -> None:
+        """Give the world back."""
+        self.robot.close()

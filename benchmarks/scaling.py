@@ -1,0 +1,169 @@
+"""How does training scale? Steps per second of the main job over cores, devices, environments, episodes and recordings.
+
+Every measurement is a process of its own that runs PPO on EnvMimic with the command's sizes but for what is varied, and
+tells control steps per second, learning included (medians of five training steps, the first, which compiles, left out),
+the seconds that the first one took, and the most memory it ever held (resident):
+
+- cores: kept to one, two, ... cores, with a host device for each;
+- devices: all cores, split into one, two, ... host devices;
+- environments: from 64 to 8,192, a training step with as many pieces of experience;
+- episode length: from 1 to 10 s;
+- recordings: from one to sixteen, the bundled ones again and again.
+
+`python benchmarks/scaling.py`; `--quick` shows within minutes that it works, and its numbers mean little.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import resource
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import common
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+
+from ballu_mjx import runtime
+
+AXES = {
+    "cores": "cores",
+    "devices": "host devices on all cores",
+    "environments": "environments",
+    "episode_seconds": "mean length of an episode (s)",
+    "recordings": "recordings",
+}
+"""What is varied, and how its axis is called."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Speed and memory of training, over what it depends on."""
+
+    environments: tuple[int, ...] = (64, 256, 1024, 4096, 8192)
+    """Numbers of environments."""
+    episode_seconds: tuple[float, ...] = (1.0, 3.0, 10.0)
+    """Mean lengths of an episode, s."""
+    recordings: tuple[int, ...] = (1, 4, 16)
+    """Numbers of recordings."""
+    repeats: int = 5
+    """Training steps that are timed."""
+    only: tuple[str, ...] = ()
+    """Vary these alone, of cores, devices, environments, episode_seconds and recordings. Without this option: all."""
+    output: Path = Path("runs/bench-scaling")
+    """Folder for scaling.json, scaling.png and memory.png."""
+    quick: bool = False
+    """Cores alone, with few and short steps of 64 environments."""
+
+
+def measure(environments: int, episode_seconds: float | None, recordings: int | None, repeats: int) -> dict[str, Any]:
+    """What a child process answers: steps per second, seconds of the first step, and bytes held at most."""
+    runtime.prepare()
+    import jax
+
+    from ballu_mjx import learner, ppo, reconstruction, recording, robot
+    from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv
+
+    model = robot.load_model()
+    paths = recording.bundled("training")
+    paths = list(itertools.islice(itertools.cycle(paths), recordings or len(paths)))
+    known = {path: reconstruction.reconstruct(recording.read_recording(path), model) for path in set(paths)}
+    config = EnvMimicConfig()
+    if episode_seconds is not None:
+        config = dataclasses.replace(config, episode_seconds=episode_seconds)
+    env = EnvMimicEnv(model, [known[path] for path in paths], config)
+    sizes = ppo.PPOConfig(num_envs=environments)
+    sizes = dataclasses.replace(sizes, batch_size=max(environments // sizes.num_minibatches, jax.local_device_count()))
+    each = sizes.batch_size * sizes.num_minibatches * sizes.unroll_length
+    sizes = dataclasses.replace(sizes, num_timesteps=(repeats + 1) * each)
+    rates: list[float] = []
+
+    def note(step: int, state: learner.TrainingState, metrics: dict[str, float]) -> None:
+        if metrics:
+            rates.append(metrics["steps_per_second"])
+
+    began = time.perf_counter()
+    learner.train(env, sizes, note)
+    first = time.perf_counter() - began - sum(each / rate for rate in rates[1:])
+    return {
+        "steps_per_second": rates[1:],
+        "first_seconds": first,
+        "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024),
+        "devices": jax.local_device_count(),
+    }
+
+
+def plot_speed(path: Path, rows: list[dict[str, Any]], machine: str) -> None:
+    """A panel for each thing varied."""
+    shown = [axis for axis in AXES if any(row["axis"] == axis for row in rows)]
+    figure = Figure(figsize=(4.0 * len(shown), 3.6), layout="constrained")
+    for axes, axis in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
+        mine = [row for row in rows if row["axis"] == axis]
+        values = [row["value"] for row in mine]
+        speed = [float(np.median(row["steps_per_second"])) for row in mine]
+        axes.plot(values, speed, color="#0072b2", marker="o")
+        if axis == "cores":
+            axes.plot(values, [speed[0] * value / values[0] for value in values], "--", color="gray", linewidth=0.8)
+        if axis != "devices" and axis != "cores":
+            axes.set_xscale("log")
+        axes.set(xlabel=AXES[axis], ylabel="control steps per second", ylim=(0, None))
+        axes.grid(alpha=0.3)
+    figure.suptitle(f"{machine}, PPO on EnvMimic", fontsize=9)
+    common.save(figure, path)
+
+
+def plot_memory(path: Path, rows: list[dict[str, Any]], machine: str) -> None:
+    """Peak memory over the number of environments."""
+    figure = Figure(figsize=(6.0, 4.0), layout="constrained")
+    axes = figure.subplots()
+    held = [row["peak_bytes"] / 1e9 for row in rows]
+    axes.plot([row["value"] for row in rows], held, color="#0072b2", marker="o")
+    axes.set(xscale="log", xlabel="environments", ylabel="peak resident memory (GB)", ylim=(0, None))
+    axes.set_title(f"{machine}, PPO on EnvMimic", fontsize=9)
+    axes.grid(alpha=0.3)
+    common.save(figure, path)
+
+
+def main(options: Options) -> None:
+    usual = 1024
+    if options.quick:
+        options = dataclasses.replace(options, repeats=2, only=options.only or ("cores",), environments=(64,))
+        usual = 64
+    counts = common.core_counts()
+    varied: dict[str, tuple[float, ...]] = {
+        "cores": tuple(counts),
+        "devices": tuple(counts),
+        "environments": options.environments,
+        "episode_seconds": options.episode_seconds,
+        "recordings": options.recordings,
+    }
+    rows: list[dict[str, Any]] = []
+    print(f"{'':42}{'control steps/s':>32}{'first step':>12}{'memory':>10}")
+    for axis, values in varied.items():
+        if options.only and axis not in options.only:
+            continue
+        for value in values:
+            request: dict[str, Any] = {"environments": usual, "episode_seconds": None, "recordings": None}
+            if axis in request:
+                request[axis] = value
+            request["repeats"] = options.repeats
+            used = common.cores()[: int(value)] if axis == "cores" else None
+            flags = f"--xla_force_host_platform_device_count={int(value)}" if axis == "devices" else ""
+            found = common.child(__file__, request, cores=used, env={"XLA_FLAGS": flags} if flags else None)
+            rows.append({"axis": axis, "value": value, **found})
+            speed = common.spread(found["steps_per_second"])
+            memory = f"{found['peak_bytes'] / 1e9:.2f} GB"
+            print(f"{f'{value:g} {AXES[axis]}':42}{speed:>32}{found['first_seconds']:>10.0f} s{memory:>10}", flush=True)
+    common.write(options.output, "scaling", {"quick": options.quick, "environments": usual, "rows": rows})
+    machine = common.described(common.machine())
+    plot_speed(options.output / "scaling.png", rows, machine)
+    if over := [row for row in rows if row["axis"] == "environments"]:
+        plot_memory(options.output / "memory.png", over, machine)
+
+
+if __name__ == "__main__" and not common.answer(measure):
+    main(tyro.cli(Options, description=__doc__))

@@ -1,0 +1,349 @@
+"""How long until it walks? PPO on the robot in MJX, beside the paper's stack: Stable-Baselines3 and PyBullet.
+
+The task is forward walking: the reward is the velocity of the centre of mass along x (m/s). Both learn from the same
+observations, actions, random lengths of episodes and starting states, with the same networks. Of Stable-Baselines3's
+PPO there are two: one with the batch, epochs, discount and so on of ours (same), one with its own (defaults, rewards
+and observations normalized as its authors advise). It has as many processes as serve it best of one, two and four a
+core.
+
+What is measured, from the start of the process on (imports and compiling included): wall time until the mean reward of
+the last 100,000 control steps, exploration included, reaches the target; and control steps per second, learning
+included, the median over batches. Ours is timed with an empty cache of compiled programs (cold) and with a full one
+(warm).
+
+Where MuJoCo Playground is installed (`pip install playground`), its training on its nearest task that needs no download
+stands beside it for the rate alone: the planar walker of DeepMind's Control Suite, brax's PPO, batches of our size.
+
+`python benchmarks/training.py`; `--quick` shows within minutes that it works, and its numbers mean little.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import multiprocessing
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import common
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+
+from ballu_mjx import runtime
+
+TASK = "walk"
+OURS, SAME, DEFAULTS, PLAYGROUND = "ours", "SB3 + PyBullet (same)", "SB3 + PyBullet (defaults)", "Playground"
+COLOURS = {OURS: "#0072b2", SAME: "#d55e00", DEFAULTS: "#009e73"}
+PLAYGROUND_TASK = "WalkerWalk"
+EPISODE_SECONDS = 12.0
+"""Mean length of an episode (s), for both."""
+BULLET_TIMESTEP = 1 / 240
+"""s; Bullet's default, and its fastest here that stays stable."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Wall time to walking, and steps per second."""
+
+    target: float = 0.2
+    """Mean reward (m/s) to be reached."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """A training of each kind for every seed; the ratio is of medians."""
+    steps: int = 3_000_000
+    """Control steps after which a training ends that has not reached the target."""
+    output: Path = Path("runs/bench-training")
+    """Folder for training.json and training.png."""
+    quick: bool = False
+    """One seed, some batches; nobody will walk."""
+
+
+Curve = list[tuple[float, int, float]]
+"""Seconds since the process was started, control steps done, mean reward of the last batch (m/s)."""
+
+
+WINDOW = 100_000
+"""Control steps over which the reward is averaged: of episodes that began together, one batch shows one phase."""
+
+
+def measure(kind: str, **request: Any) -> Any:
+    """What a child process answers."""
+    functions = {OURS: train_ours, SAME: train_same, DEFAULTS: train_defaults, PLAYGROUND: playground_rate}
+    return {"processes": stepping_rate, **functions}[kind](**request)
+
+
+class _ReachedError(Exception):
+    """The target is reached."""
+
+
+def train_ours(launched: float, seed: int, steps: int, target: float, config: dict[str, Any]) -> Curve:
+    """`python -m ballu_mjx.train walk` without its run folder; `config` is a `PPOConfig`."""
+    runtime.prepare()
+    from ballu_mjx import learner, policy, ppo
+    from ballu_mjx.locomotion import LocomotionConfig
+    from ballu_mjx.tasks import TASKS
+
+    curve: Curve = []
+
+    def note(step: int, state: learner.TrainingState, metrics: dict[str, float]) -> None:
+        if metrics:
+            curve.append((time.time() - launched, step, metrics["reward"]))
+            if seconds_to(curve, target) is not None:
+                raise _ReachedError
+
+    env = policy.environment(TASKS[TASK], LocomotionConfig(episode_seconds=EPISODE_SECONDS), None, None)
+    try:
+        learner.train(env, dataclasses.replace(ppo.PPOConfig(**config), num_timesteps=steps, seed=seed), note)
+    except _ReachedError:
+        pass
+    return curve
+
+
+def _environments(processes: int, scale: float) -> Any:
+    """Environments, each in a process of its own, their rewards multiplied by `scale`.
+
+    Forked where the system can, which no JAX that has started stands against here: processes that import everything
+    anew would cost Stable-Baselines3 seconds for what is not its own.
+    """
+    from stable_baselines3.common.vec_env import SubprocVecEnv  # pyright: ignore[reportMissingImports]
+
+    def make() -> Any:
+        import bullet_gym
+        import gymnasium  # pyright: ignore[reportMissingImports]
+
+        env = bullet_gym.LocomotionEnv(TASK, BULLET_TIMESTEP, EPISODE_SECONDS)
+        return gymnasium.wrappers.TransformReward(env, lambda reward: scale * float(reward))
+
+    fork = "fork" in multiprocessing.get_all_start_methods()
+    return SubprocVecEnv([make] * processes, start_method="fork" if fork else None)
+
+
+def stepping_rate(processes: int, steps: int) -> float:
+    """Control steps per second of the environments alone."""
+    environments = _environments(processes, 1.0)
+    environments.reset()
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, processes, 2)).astype(np.float32)
+    environments.step(actions[0])
+    began = time.perf_counter()
+    for action in actions:
+        environments.step(action)
+    took = time.perf_counter() - began
+    environments.close()
+    return steps * processes / took
+
+
+def train_same(launched: float, seed: int, steps: int, target: float, config: dict[str, Any], processes: int) -> Curve:
+    """Stable-Baselines3 with our hyperparameters; it has no adaptive learning rate and no averaged policy."""
+    from torch import nn  # pyright: ignore[reportMissingImports]
+
+    batch = config["batch_size"] * config["unroll_length"]
+    options = {
+        "learning_rate": config["learning_rate"],
+        "n_steps": batch * config["num_minibatches"] // processes,
+        "batch_size": batch,
+        "n_epochs": config["num_updates_per_batch"],
+        "gamma": config["discounting"],
+        "gae_lambda": config["gae_lambda"],
+        "clip_range": config["clipping_epsilon"],
+        "ent_coef": config["entropy_cost"],
+        "vf_coef": 0.25,  # brax's
+        "max_grad_norm": config["max_grad_norm"],
+        "policy_kwargs": {
+            "net_arch": {"pi": list(config["policy_layers"]), "vf": list(config["value_layers"])},
+            "activation_fn": {"swish": nn.SiLU, "tanh": nn.Tanh}[config["activation"]],
+            "log_std_init": float(np.log(config["initial_std"])),
+        },
+    }
+    normalize = {"norm_reward": False, "clip_obs": config["observation_clip"]}
+    return _train_sb3(launched, seed, steps, target, processes, config["reward_scaling"], normalize, options)
+
+
+def train_defaults(
+    launched: float, seed: int, steps: int, target: float, config: dict[str, Any], processes: int
+) -> Curve:
+    """Stable-Baselines3 with all of its own; its networks are as large as ours."""
+    return _train_sb3(launched, seed, steps, target, processes, 1.0, {}, {})
+
+
+def _train_sb3(
+    launched: float,
+    seed: int,
+    steps: int,
+    target: float,
+    processes: int,
+    scale: float,
+    normalize: dict[str, Any],
+    options: dict[str, Any],
+) -> Curve:
+    import torch  # pyright: ignore[reportMissingImports]
+    from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
+    from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
+    from stable_baselines3.common.vec_env import VecNormalize  # pyright: ignore[reportMissingImports]
+
+    # Networks this small learn no faster on more, and the environments want the cores.
+    torch.set_num_threads(1)
+    curve: Curve = []
+
+    class Note(BaseCallback):
+        """Keeps the mean of the rewards as they were, and ends training at the target."""
+
+        rewards: list[float] = []
+        reached = False
+
+        def _on_rollout_start(self) -> None:
+            self.rewards = []
+
+        def _on_step(self) -> bool:
+            self.rewards += [info["reward"] for info in self.locals["infos"]]
+            return not self.reached
+
+        def _on_rollout_end(self) -> None:
+            curve.append((time.time() - launched, self.num_timesteps, float(np.mean(self.rewards))))
+            self.reached = seconds_to(curve, target) is not None
+
+    environments = VecNormalize(_environments(processes, scale), gamma=options.get("gamma", 0.99), **normalize)
+    try:
+        PPO("MlpPolicy", environments, seed=seed, device="cpu", **options).learn(steps, Note())
+    finally:
+        environments.close()
+    return curve
+
+
+def playground_rate(steps: int, config: dict[str, Any]) -> dict[str, float]:
+    """Control steps and simulated seconds per second of brax's PPO on Playground's task: its networks, our batch."""
+    runtime.prepare()
+    import functools
+
+    from brax.training.agents.ppo import networks
+    from brax.training.agents.ppo import train as ppo
+    from mujoco_playground import registry, wrapper  # pyright: ignore[reportMissingImports]
+    from mujoco_playground.config import dm_control_suite_params  # pyright: ignore[reportMissingImports]
+
+    env = registry.load(PLAYGROUND_TASK, config_overrides={"impl": "jax"})
+    params = dm_control_suite_params.brax_ppo_config(PLAYGROUND_TASK, "jax").to_dict()
+    factory = functools.partial(networks.make_ppo_networks, **params.pop("network_factory", {}))
+    sizes = ("num_envs", "batch_size", "num_minibatches", "unroll_length", "num_updates_per_batch")
+    params |= {name: config[name] for name in sizes}
+    rates: list[float] = []
+
+    def note(step: int, metrics: Mapping[str, Any]) -> None:
+        if "training/sps" in metrics:
+            rates.append(float(metrics["training/sps"]))
+
+    each = config["batch_size"] * config["num_minibatches"] * config["unroll_length"] * params["action_repeat"]
+    params |= {"num_timesteps": steps, "num_evals": max(steps // each, 2) + 1, "num_eval_envs": 2, "run_evals": False}
+    ppo.train(
+        environment=env,
+        wrap_env_fn=wrapper.wrap_for_brax_training,
+        network_factory=factory,
+        progress_fn=note,
+        seed=0,
+        **params,
+    )
+    rate = float(np.median(rates[1:]))
+    return {"control_steps_per_second": rate, "simulated_seconds_per_second": rate * env.dt}
+
+
+def seconds_to(curve: Curve, target: float) -> float | None:
+    """When the mean over the last `WINDOW` reached the target; None: never."""
+    for last, (seconds, steps, _) in enumerate(curve):
+        recent = [reward for _, done, reward in curve[: last + 1] if done > steps - WINDOW]
+        if steps >= WINDOW and np.mean(recent) >= target:
+            return seconds
+    return None
+
+
+def rate(curve: Curve) -> float | None:
+    """Control steps per second, the median over batches without the first, which compiles; None of one batch alone."""
+    times, steps, _ = zip(*curve, strict=True)
+    return float(np.median(np.diff(steps) / np.diff(times))) if len(curve) > 1 else None
+
+
+def plot(path: Path, rows: list[dict[str, Any]], target: float, machine: str) -> None:
+    """Mean reward over wall time."""
+    figure = Figure(figsize=(8.0, 5.0), layout="constrained")
+    axes = figure.subplots()
+    seen = set()
+    for row in rows:
+        seconds, _, rewards = zip(*row["curve"], strict=True)
+        name = row["kind"] + (f", {row['cache']}" if row["cache"] else "")
+        style = "--" if row["cache"] == "cold" else "-"
+        label = None if name in seen else name
+        axes.plot(seconds, rewards, style, color=COLOURS[row["kind"]], label=label, marker=".", markersize=3)
+        seen.add(name)
+    axes.axhline(target, color="black", linewidth=0.8)
+    axes.set(xscale="log", xlabel="wall time from the start of the process (s)")
+    axes.set_ylabel("mean velocity along x while learning (m/s)")
+    axes.set_title(machine, fontsize=9)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    common.save(figure, path)
+
+
+def main(options: Options) -> None:
+    runtime.prepare()
+    from ballu_mjx import policy_training
+
+    config = dataclasses.asdict(policy_training.defaults())
+    if options.quick:
+        options = dataclasses.replace(options, seeds=(0,), steps=21_000)
+    counts = [len(common.cores()) * each for each in ((2,) if options.quick else (1, 2, 4))]
+    stepping = {n: common.child(__file__, {"kind": "processes", "processes": n, "steps": 100}) for n in counts}
+    processes = max(stepping, key=lambda n: stepping[n])
+    print("PyBullet environments alone: " + ", ".join(f"{n} processes {r:,.0f} steps/s" for n, r in stepping.items()))
+
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as cache:
+        environment = {"JAX_COMPILATION_CACHE_DIR": cache}
+        for seed in options.seeds:
+            for kind in (OURS, SAME, DEFAULTS):
+                request = {"kind": kind, "seed": seed, "steps": options.steps, "target": options.target}
+                request["config"] = config
+                if kind != OURS:
+                    request["processes"] = processes
+                caches = ("",) if kind != OURS else ("cold", "warm") if seed == options.seeds[0] else ("warm",)
+                for state in caches:
+                    curve = common.child(__file__, {**request, "launched": time.time()}, env=environment)
+                    rows.append({"kind": kind, "cache": state, "seed": seed, "curve": curve})
+                    reached, speed = seconds_to(curve, options.target), rate(curve)
+                    rows[-1] |= {"seconds_to_target": reached, "control_steps_per_second": speed}
+                    told = "never" if reached is None else f"{reached:.0f} s"
+                    steps = "" if speed is None else f"; {speed:,.0f} control steps/s"
+                    print(f"{kind} {state} seed {seed}: {options.target} m/s reached: {told}{steps}", flush=True)
+
+    playground: Any = "not installed"
+    if importlib.util.find_spec("mujoco_playground") is not None:
+        steps = 21_000 if options.quick else 400_000
+        playground = common.child(__file__, {"kind": PLAYGROUND, "steps": steps, "config": config})
+    print(f"MuJoCo Playground, {PLAYGROUND_TASK}: {playground}")
+
+    ratios = compare(rows)
+    for line, value in ratios.items():
+        print(f"{line}: {value:.1f}")
+    result = {"quick": options.quick, "target": options.target, "stepping": stepping, "processes": processes}
+    common.write(options.output, "training", {**result, "rows": rows, "playground": playground, "ratios": ratios})
+    plot(options.output / "training.png", rows, options.target, common.described(common.machine()))
+
+
+def compare(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """How many times faster and sooner ours is than the better of Stable-Baselines3's two, medians over seeds."""
+
+    def median(kind: str, cache: str, name: str) -> float:
+        values = [row[name] for row in rows if (row["kind"], row["cache"]) == (kind, cache)]
+        known = [value if value is not None else np.inf for value in values]
+        return float(np.median(known)) if known else np.nan
+
+    found = {}
+    fastest = max(median(kind, "", "control_steps_per_second") for kind in (SAME, DEFAULTS))
+    found["steps/s, times"] = median(OURS, "warm", "control_steps_per_second") / fastest
+    soonest = min(median(kind, "", "seconds_to_target") for kind in (SAME, DEFAULTS))
+    for cache in ("cold", "warm"):
+        found[f"sooner at the target, {cache}, times"] = soonest / median(OURS, cache, "seconds_to_target")
+    return {name: value for name, value in found.items() if np.isfinite(value)}
+
+
+if __name__ == "__main__" and not common.answer(measure):
+    main(tyro.cli(Options, description=__doc__))

@@ -1,0 +1,793 @@
+"""Hand every reader files that are damaged in every way, and count what it makes of them.
+
+    python tests/faults/mutations.py --files 10000
+
+A file must be refused, by one sentence that names it, or what is read from it must keep the promises of its format.
+Readers are called in this process, and stopped after a while; C3D files, whose library is called in a process of its
+own, and checkpoints, which are restored from the disk, get fewer files than the others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import gzip
+import io
+import json
+import math
+import re
+import shutil
+import signal
+import sys
+import tempfile
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from ballu_mjx import runtime
+from ballu_mjx.errors import InputError
+
+OUTCOMES = ("refused", "accepted", "nonsense", "crashed", "hung")
+LONGEST = 10.0
+"""Seconds until a reader hangs; three times as many for processes of their own."""
+LONGEST_SENTENCE = 900
+"""Characters, paths included."""
+ROBOT = "ballu-room-3"
+
+Random = np.random.Generator
+
+
+# ---- damage ----
+
+NUMBERS = ("nan", "inf", "-inf", "NaN", "1e308", "1e400", "-0", "-0.0", "1e-320", "0", "-1", "9" * 11,
+           "1" + "0" * 400, "1_0", "1,5", "", " ", "²", "1e", "--1", "true", "null", '"', "'", "\0")  # fmt: skip
+VALUES: tuple[Any, ...] = (
+    None, True, False, "", " ", "x", "1", "nan", "\0", "\ud800", "a" * 5000, "../../etc/passwd", [], {}, [[]], [None],
+    {"": 0}, -1, 0, 1, 2, 1.5, -0.0, 1e308, -1e308, 1e-320, math.nan, math.inf, -math.inf, 2**31, 2**63, 2**64, 10**400,
+)  # fmt: skip
+
+
+def _cut(content: bytes, random: Random) -> bytes:
+    return content[: random.integers(len(content) + 1)]
+
+
+def _flip(content: bytes, random: Random) -> bytes:
+    changed = bytearray(content)
+    for place in random.integers(len(content), size=random.integers(1, 4)) if content else ():
+        changed[place] ^= 1 << int(random.integers(8))
+    return bytes(changed)
+
+
+def _insert(content: bytes, random: Random) -> bytes:
+    place = int(random.integers(len(content) + 1))
+    added = random.choice([b"\0", b"\xff\xfe", b"[" * 50_000, b"{", b'"', b"\n", b"\r", b",", bytes(20), b"9" * 6000])
+    return content[:place] + added + content[place:]
+
+
+def _delete(content: bytes, random: Random) -> bytes:
+    place = int(random.integers(len(content) + 1))
+    return content[:place] + content[place + int(random.integers(1, 40)) :]
+
+
+def _double(content: bytes, random: Random) -> bytes:
+    first, last = sorted(random.integers(len(content) + 1, size=2))
+    return content[:last] + content[first:]
+
+
+def _junk(content: bytes, random: Random) -> bytes:
+    return random.bytes(int(random.integers(0, 2000)))
+
+
+def _nothing(content: bytes, random: Random) -> bytes:
+    return random.choice([b"", b"\n", b" ", b"\xef\xbb\xbf", b"\0", bytes(5000)])
+
+
+BYTES = (_cut, _flip, _insert, _delete, _double, _junk, _nothing)
+
+
+def _encoding(content: bytes, random: Random) -> bytes:
+    text = content.decode(errors="replace")
+    return text.encode(str(random.choice(["utf-16", "utf-32", "utf-8-sig", "utf-16-be"])))
+
+
+def _lines(content: bytes, random: Random) -> bytes:
+    lines = content.split(b"\n")
+    first, second = (int(i) for i in random.integers(len(lines), size=2))
+    match int(random.integers(4)):
+        case 0:
+            lines[first], lines[second] = lines[second], lines[first]
+        case 1:
+            lines.insert(second, lines[first])
+        case 2:
+            del lines[min(first, second) : min(first, second) + int(random.integers(1, 60))]
+        case _:
+            lines[first] = lines[first][: len(lines[first]) // 2]
+    return b"\n".join(lines)
+
+
+def _number(content: bytes, random: Random) -> bytes:
+    places = [match.span() for match in re.finditer(rb"-?\d+(\.\d+)?(e[+-]?\d+)?", content)]
+    for _ in range(int(random.integers(1, 3))):
+        if places:
+            first, last = places[int(random.integers(len(places)))]
+            content = content[:first] + str(random.choice(NUMBERS)).encode() + content[last:]
+    return content
+
+
+TEXT = (*BYTES, _encoding, _lines, _number, _number)
+
+
+def _cells(content: bytes, random: Random) -> bytes:
+    rows = [line.split(",") for line in content.decode().split("\n")]
+    filled = [row for row in rows if len(row) > 2] or rows
+    row = filled[int(random.integers(len(filled)))]
+    first, second = (int(i) for i in random.integers(len(row), size=2))
+    match int(random.integers(6)):
+        case 0:
+            row[first] = str(random.choice(NUMBERS))
+        case 1:
+            row[first], row[second] = row[second], row[first]
+        case 2:
+            del row[first]
+        case 3:
+            row.insert(first, row[second])
+        case 4:  # two columns exchange their samples, not their names
+            for each in filled[1:]:
+                if max(first, second) < len(each):
+                    each[first], each[second] = each[second], each[first]
+        case _:
+            factor = float(random.choice([1000.0, -1.0, 57.3, 1e-3, 0.0, 1e300]))
+            for each in filled[1:]:
+                with contextlib.suppress(ValueError, IndexError):
+                    each[first] = repr(float(each[first]) * factor)
+    return "\n".join(map(",".join, rows)).encode()
+
+
+CSV = (*TEXT, _cells, _cells, _cells, _cells)
+
+
+def _places(value: Any) -> Iterator[tuple[Any, Any]]:
+    """Every entry in a tree of dictionaries and lists, as its container and key."""
+    for key in value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
+        yield value, key
+        yield from _places(value[key])
+
+
+def _values(content: bytes, random: Random) -> bytes:
+    tree = json.loads(content)
+    for _ in range(int(random.integers(1, 3))):
+        places = list(_places(tree))
+        if not places:
+            break
+        holder, key = places[int(random.integers(len(places)))]
+        match int(random.integers(5)):
+            case 0 if isinstance(holder, dict):
+                holder[f"{key}s"] = holder.pop(key)
+            case 1:
+                del holder[key]
+            case 2:
+                other, name = places[int(random.integers(len(places)))]
+                holder[key] = json.loads(json.dumps(other[name]))
+            case _:
+                holder[key] = VALUES[int(random.integers(len(VALUES)))]
+    return json.dumps(tree).encode()
+
+
+JSON = (*TEXT, _values, _values, _values, _values, _values)
+
+
+def _json_lines(content: bytes, random: Random) -> bytes:
+    lines = content.split(b"\n")
+    place = int(random.integers(len(lines) - 1))
+    lines[place] = _values(lines[place], random)
+    return b"\n".join(lines)
+
+
+def _packed(damages: Sequence[Callable[[bytes, Random], bytes]]) -> Callable[[bytes, Random], bytes]:
+    def damage(content: bytes, random: Random) -> bytes:
+        return gzip.compress(damages[int(random.integers(len(damages)))](gzip.decompress(content), random), mtime=0)
+
+    return damage
+
+
+def _arrays(content: bytes, random: Random) -> bytes:
+    with np.load(io.BytesIO(content)) as archive:
+        arrays = {name: archive[name] for name in archive}
+    name = str(random.choice(list(arrays)))
+    array = arrays.pop(name)
+    other = arrays[str(random.choice(list(arrays)))]
+    number = array.dtype.kind == "f" and array.size
+    match int(random.integers(8)):
+        case 0:
+            pass
+        case 1:
+            arrays[name + "0"] = array
+        case 2:
+            arrays[name] = other
+        case 3:
+            arrays[name] = array[..., None]
+        case 4:
+            arrays[name] = array.astype("S") if array.dtype.kind != "U" else np.array(7)
+        case 5 if array.ndim:
+            arrays[name] = array[::-1]
+        case 6 if array.ndim:
+            arrays[name] = array[: len(array) // 2]
+        case _ if number:
+            value = float(random.choice([np.nan, np.inf, -1.0, 1e30, 0.0]))
+            arrays[name] = np.where(random.random(array.shape) < random.choice([0.01, 1.0]), value, array)
+        case _:
+            arrays[name] = np.array(["x", "\0"])
+    output = io.BytesIO()
+    np.savez_compressed(output, **arrays)  # pyright: ignore[reportArgumentType]
+    return output.getvalue()
+
+
+ARCHIVE = (*BYTES, _arrays, _arrays, _arrays, _arrays, _arrays)
+
+
+# ---- what each format promises ----
+
+
+@dataclasses.dataclass(frozen=True)
+class Format:
+    """A format: how one file of it is damaged, read, and found to keep its promises."""
+
+    name: str
+    file: Path
+    """The one that is damaged; it and all that is read with it are valid before."""
+    damages: Sequence[Callable[[bytes, Random], bytes]]
+    read: Callable[[], Any]
+    fault: Callable[[Any], str | None]
+    """What of the promises is broken; None: nothing."""
+    share: int = 10
+    """Of the files."""
+    partial: tuple[Path, ...] = ()
+    """What must not be left behind where the file is refused."""
+
+
+def finite(*values: Any) -> bool:
+    return all(np.isfinite(np.asarray(value, float)).all() for value in values)
+
+
+def recording_fault(recording: Any) -> str | None:
+    time = recording.time
+    if not (finite(time) and (np.diff(time) > 0).all() and time[-1] - time[0] > 0.99 and len(time) > 40):
+        return "time"
+    if not (finite(recording.command) and (recording.command >= 0).all() and (recording.command <= 1).all()):
+        return "command"
+    for name in ("balloon_position", "base_position", "foot_position", "motor", "knee"):
+        value = getattr(recording, name)
+        if value is not None and not (finite(value) and np.abs(value).max() <= 100 and len(value) == len(time)):
+            return name
+    for value in (recording.balloon_quaternion, recording.base_quaternion):
+        if value is None:
+            continue
+        if not (finite(value) and np.abs(np.linalg.norm(value, axis=1) - 1).max() < 1e-6):
+            return "length of a quaternion"
+        if ((value[1:] * value[:-1]).sum(axis=1) < 0).any():
+            return "sign of a quaternion"
+    needed = ("motor", "knee") if recording.kind == "suspended" else ("balloon_position", "base_position")
+    if recording.kind not in ("free", "suspended") or any(getattr(recording, name) is None for name in needed):
+        return "kind"
+    return None if recording.robot.strip() and printable(recording.robot, recording.notes) else "text"
+
+
+def printable(*texts: str) -> bool:
+    try:
+        return bool("".join(texts).encode()) or True
+    except UnicodeEncodeError:
+        return False
+
+
+def actuators_fault(found: Any) -> str | None:
+    name, parameters = found
+    for field in ("knee_spring_stiffness", "motor_gain", "torque_limit"):
+        value = np.asarray(getattr(parameters, field))
+        if not (finite(value) and value.shape == (2,) and (value > 0).all() and (value < 1e4).all()):
+            return field
+    angles = np.concatenate([parameters.default_motor_angle, parameters.default_knee_angle])
+    return None if finite(angles) and np.abs(angles).max() < 3.2 and printable(name) else "angle"
+
+
+def air_fault(found: Any) -> str | None:
+    for name, value in dataclasses.asdict(found).items():
+        if not finite(value) or (name not in ("lift", "centre") and (np.asarray(value) < 0).any()):
+            return name
+        if np.abs(np.asarray(value)).max() > (0.2 if name == "delay" else 1e3):
+            return name
+    return None
+
+
+def observed_fault(found: Any) -> str | None:
+    low, high = found
+    return None if finite(low, high) and low.shape == high.shape == (87,) and (low <= high).all() else "range"
+
+
+def options_fault(found: Sequence[Any]) -> str | None:
+    """Every number finite, every count and size one."""
+    for config in found:
+        for field in dataclasses.fields(config):
+            value, kind = getattr(config, field.name), type(getattr(type(config)(), field.name))
+            if type(value) is not kind and not (kind is float and type(value) is int):
+                return f"type of {field.name}"
+            numbers = value if isinstance(value, tuple) else (value,)
+            if not all(isinstance(x, str | bool) or math.isfinite(x) for x in numbers):
+                return field.name
+            if type(value) is int and kind is int and field.name != "seed" and value < 1:
+                return field.name
+    return None
+
+
+def metrics_fault(rows: Any) -> str | None:
+    steps = [row["step"] for row in rows]
+    if any(type(step) is not int for step in steps) or sorted(steps) != steps or min(steps, default=0) < 0:
+        return "steps"
+    numbers = [value for row in rows for value in row.values() if value is not None]
+    return None if all(type(x) in (int, float) for x in numbers) and finite(*numbers) else "measurements"
+
+
+def evaluation_fault(found: Any) -> str | None:
+    each = [*found.vanilla, *found.residual]
+    numbers = [x for errors in each for table in (errors.position, errors.yaw) for pair in table.values() for x in pair]
+    numbers += [x for e in each for x in (e.mean_com_error, e.final_yaw_error, e.mean_force)]
+    return None if finite(*numbers) and finite(found.score) and printable(*(e.recording for e in each)) else "numbers"
+
+
+def replay_fault(takes: Any) -> str | None:
+    for take in takes:
+        arrays = [take.time, *take.qpos.values(), *(a for a in (take.command, take.force) if a is not None)]
+        if not finite(*arrays) or (np.diff(take.time) <= 0).any():
+            return "numbers"
+        if take.command is not None and ((take.command < 0) | (take.command > 1)).any():
+            return "command"
+        if any(np.abs(np.linalg.norm(qpos[:, 3:7], axis=1) - 1).max() > 0.05 for qpos in take.qpos.values()):
+            return "length of a quaternion"
+    return None
+
+
+def mapping_fault(found: Any) -> str | None:
+    numbers = [x for source in found.sources.values() for x in (*source.offset, *(source.geometry or ()))]
+    numbers += [found.axes, *found.commands.range_left, *found.commands.range_right]
+    numbers += [x for joint in found.joints.values() for x in (joint.sign, joint.zero)]
+    fits = round(float(np.linalg.det(found.axes))) == 1 and (found.rate is None or found.rate > 0)
+    return None if fits and all(finite(x) for x in numbers) and found.robot.strip() else "numbers"
+
+
+def transfers_fault(found: Any) -> str | None:
+    return None if found and finite([list(each.to_json().values()) for each in found]) else "figures"
+
+
+# ---- valid examples ----
+
+
+def formats(work: Path) -> list[Format]:
+    """Every format that is read, with a valid example of it in a folder of its own below `work`."""
+    from ballu_mjx import actuators, aerodynamics, pipeline, residual, robot, transfer
+    from ballu_mjx.importers import mapping
+    from ballu_mjx.recording import bundled, read_recording, write_recording
+
+    whole = read_recording(bundled("test")[0])
+    fields = {field.name: getattr(whole, field.name) for field in dataclasses.fields(whole)}
+    cut = {name: value[:130] for name, value in fields.items() if isinstance(value, np.ndarray)}
+    short = dataclasses.replace(whole, **cut)
+
+    def place() -> Path:  # its name must not be that of the file, which messages are to name
+        return Path(tempfile.mkdtemp(dir=work))
+
+    found: list[Format] = []
+
+    def add(name: str, file: Path, damages: Sequence[Any], read: Callable[[], Any], fault: Any, **more: Any) -> None:
+        found.append(Format(name, file, damages, read, fault, **more))
+
+    for name, ending, damaged, damages, share in (
+        ("recording, .csv", ".csv", "walk.csv", CSV, 25),
+        ("recording, .csv.gz", ".csv.gz", "walk.csv.gz", (*BYTES, _packed(CSV)), 10),
+        ("recording, .json", ".csv", "walk.json", JSON, 12),
+    ):
+        folder = place()
+        path = folder / f"walk{ending}"
+        write_recording(short, path)
+        add(name, folder / damaged, damages, lambda path=path: read_recording(path), recording_fault, share=share)
+    folder = place()
+    sweep = read_recording(bundled("suspended")[0])
+    fields = {field.name: getattr(sweep, field.name) for field in dataclasses.fields(sweep)}
+    cut = {name: value[:130] for name, value in fields.items() if isinstance(value, np.ndarray)}
+    write_recording(dataclasses.replace(sweep, **cut), folder / "sweep.csv")
+    add("suspended recording, .csv", folder / "sweep.csv", CSV, lambda p=folder / "sweep.csv": read_recording(p),
+        recording_fault)  # fmt: skip
+
+    folder = place()
+    path = folder / actuators.NAME
+    shutil.copy(robot.assets() / "recordings" / actuators.NAME, path)
+    add("actuators.json", path, JSON, lambda path=path: actuators.read(path), actuators_fault)
+    folder = place()
+    path = folder / aerodynamics.FILE
+    values = dict.fromkeys(("centre", "linear_drag", "quadratic_drag", "turning_drag"), [0.01, 0.02, 0.03])
+    values |= {"added_mass": 0.1, "added_inertia": 0.003, "lift": -0.004, "delay": 0.05}
+    path.write_text(json.dumps({"format": aerodynamics.FORMAT, "parameters": values, "windows": 3}))
+    add("air.json", path, JSON, lambda path=path: aerodynamics.read(path), air_fault)
+    folder = place()
+    path = folder / "observed.json"
+    path.write_text(json.dumps({"low": [-0.5] * 87, "high": [0.5] * 87}))
+    add("observed.json", path, JSON, lambda path=path: residual._read_observed(path, 87), observed_fault, share=6)
+
+    found += _run_formats(place, short.robot)
+
+    folder = place()
+    path = folder / "sweep.stage.json"
+    pipeline._write_mark(path, "0123456789abcdef", {"options": {"robot": 0}, "needs": []}, done=True)
+    add("stage.json", path, JSON, lambda path=path: pipeline._read_mark(path),
+        lambda mark: None if type(mark["done"]) is bool and len(mark["key"]) == 16 else "key", share=5)  # fmt: skip
+    folder = place()
+    path = folder / "transfer.json"
+    transfer.write(path, [transfer.Transfer(*np.arange(9.0) / 7), transfer.Transfer(*np.arange(9.0))])
+    add("transfer.json", path, JSON, lambda path=path: transfer.read(path), transfers_fault, share=5)
+
+    folder = place()
+    path = folder / "room.toml"
+    path.write_text(mapping.EXAMPLE)
+    add("mapping, TOML", path, TEXT, lambda path=path: mapping.read_mapping(path), mapping_fault)
+    folder = place()
+    path = folder / "room.json"
+    offset = {"offset": [0.1, 0, 0], "turn": [0, 0, 90]}
+    tables = {"balloon": {"markers": ["a", "b", "c"], "geometry": [[0.1, 0, 0], [0, 1, 0], [0, 0, 1]], **offset}}
+    tables |= {role: {"body": f"ballu:{role}"} for role in mapping.ROLES[1:]}
+    tables |= {"knee_left": {"column": "kl", "sign": -1, "zero": 3.5}, "commands": {"range_left": [0, 90]}}
+    content = {"robot": ROBOT, "axes": {"forward": "x"}, "origin": {"floor": 0.1}, "units": {"length": "mm"}, **tables}
+    path.write_text(json.dumps(content))
+    add("mapping, JSON", path, JSON, lambda path=path: mapping.read_mapping(path), mapping_fault)
+
+    found += _import_formats(place, short)
+    folder = place()
+    add("weights.npz of a controller", _write_weights(folder), ARCHIVE, _Controlled(folder), controller_fault)
+    return found
+
+
+def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
+    """The files of a run's folder."""
+    from ballu_mjx import compare, evaluation, replay, report, residual_training, runs
+    from ballu_mjx import envmimic as tasks
+    from ballu_mjx import ppo as learning
+    from ballu_mjx.envmimic import EnvMimicConfig
+    from ballu_mjx.evaluation import Errors, Evaluation
+    from ballu_mjx.ppo import PPOConfig
+    from ballu_mjx.recording import bundled
+    from ballu_mjx.replay import Take
+
+    def errors(scale: float) -> tuple[Errors, ...]:
+        table = {horizon: (scale * horizon, 0.1) for horizon in (1.0, 5.0, 10.0)}
+        return tuple(Errors(f"{group}-1", group, table, table, scale, 2 * scale, 0.1) for group in ("near", "far"))
+
+    def qpos() -> np.ndarray:
+        values = np.full((12, 14), 0.1)
+        values[:, 3:7] = [1, 0, 0, 0]
+        return values
+
+    def write(folder: Path) -> Path:
+        sections = {"env": EnvMimicConfig(), "ppo": PPOConfig(), "data": residual_training.Data()}
+        files = {use: [bundled(use)[0]] for use in ("training", "validation", "test")}
+        content = runs.describe("envmimic", sections, files, ["cpu"]) | {"residual": None}
+        with runs.Run(folder, content) as run:
+            for step in range(0, 400, 100):
+                run.log(step, {"validation_error": 1.0 - step / 1000})
+                run.log(step, {"reward": 1.0 + step / 1000, "seconds": step / 7, "loss": math.nan})
+                run.save(step, {"w": np.arange(5.0)}, 1.0 - step / 1000, training={"step": np.array(step)})
+        (folder / "evaluation.json").write_text(json.dumps(Evaluation(errors(1.0), errors(0.5)).to_json()))
+        takes = [
+            Take(
+                name=name,
+                robot=robot_name,
+                time=0.05 * np.arange(12),
+                qpos={"recording": qpos(), "vanilla": qpos()},
+                command=np.full((11, 2), 0.5),
+                force=np.zeros((11, 3)),
+            )
+            for name in ("near-1", "far-1")
+        ]
+        replay.write(folder / replay.NAME, takes)
+        return folder
+
+    example = write(place() / "example")
+
+    def copied() -> Path:
+        return shutil.copytree(example, place() / "run")
+
+    def read_run(folder: Path) -> Any:
+        """As the commands that show, compare, evaluate or go on with a run do, but for its checkpoints."""
+        config = runs.read_config(folder, "envmimic")
+        found = [
+            runs.typed(EnvMimicConfig, config, "env", folder, tasks.check),
+            runs.typed(PPOConfig, config, "ppo", folder, learning.check_values),
+        ]
+        runs.actuators(config, folder)
+        runs.residual(config, folder)
+        runs.find_recordings(config, "training", folder)
+        report.collect(folder)
+        compare.rows([folder])
+        compare.figures(folder)
+        return found
+
+    def read_metrics(folder: Path) -> Any:
+        rows = runs.read_metrics(folder)
+        report.collect(folder)
+        return rows
+
+    def read_evaluation(folder: Path) -> Any:
+        report.collect(folder)
+        return evaluation.read(folder / "evaluation.json")
+
+    found = []
+    for name, file, damages, read, fault, share in (
+        ("config.json of a run", "config.json", JSON, read_run, options_fault, 16),
+        ("metrics.jsonl", "metrics.jsonl", (*TEXT, *[_json_lines] * 5), read_metrics, metrics_fault, 10),
+        ("evaluation.json", "evaluation.json", JSON, read_evaluation, evaluation_fault, 10),
+        ("replay.npz", replay.NAME, ARCHIVE, lambda folder: replay.read(folder / replay.NAME), replay_fault, 10),
+    ):
+        folder = copied()
+        found.append(Format(name, folder / file, damages, lambda f=folder, r=read: r(f), fault, share))
+
+    def read_checkpoint(folder: Path) -> Any:
+        said = io.StringIO()
+        with contextlib.redirect_stderr(said):
+            checkpoint = runs.last_checkpoint(folder, training=True)
+        if checkpoint.step < 300:
+            raise InputError(said.getvalue().rstrip("\n"))
+        return checkpoint
+
+    def checkpoint_fault(found: Any) -> str | None:
+        fits = found.training["step"] == 300 and np.array_equal(found.params["w"], np.arange(5.0))
+        return None if fits else "content"
+
+    for name, file, share in (
+        ("record.json of a checkpoint", "record.json", 2),
+        ("score of a checkpoint", "metrics/metrics", 1),
+        ("metadata of a checkpoint", "params/_METADATA", 1),
+    ):
+        folder = copied()
+        path = folder / "checkpoints" / "300" / file
+        found.append(Format(name, path, JSON, lambda f=folder: read_checkpoint(f), checkpoint_fault, share))
+    return found
+
+
+def _import_formats(place: Callable[[], Path], short: Any) -> list[Format]:
+    """What `record import` reads."""
+    from scipy.spatial.transform import Rotation
+
+    from ballu_mjx import record
+    from ballu_mjx.importers.mapping import ROLES
+    from ballu_mjx.recording import description_path, read_recording
+
+    feet, count = short.foot_position, len(short.time)
+    positions = dict(zip(ROLES, (short.balloon_position, short.base_position, feet[:, 0], feet[:, 1]), strict=True))
+    turn = Rotation.from_quat(short.balloon_quaternion, scalar_first=True)
+
+    def rows(header: Sequence[str], *columns: np.ndarray) -> str:
+        table = np.column_stack(columns)
+        return "\n".join([*header, *(",".join(f"{x:.7g}" for x in row) for row in table)]) + "\n"
+
+    log = rows(["time,command_left,command_right"], short.time, short.command)
+    bodies = "\n".join(f'[{role}]\nbody = "ballu:{role}"' for role in ROLES)
+    names = ",".join(f"ballu:{role},,,,," for role in ROLES)
+    units = ",".join(["deg,deg,deg,mm,mm,mm"] * 4)
+    vicon = rows(
+        ["Segments", "100", f",,{names}", "Frame,Sub Frame," + ",".join(["RX,RY,RZ,TX,TY,TZ"] * 4), f",,{units}"],
+        np.arange(1, count + 1),
+        np.zeros(count),
+        *(np.column_stack([np.rad2deg(turn.as_rotvec()), 1e3 * positions[role]]) for role in ROLES),
+    )
+    table = rows(
+        ["time,bx,by,bz,bw,bi,bj,bk,px,py,pz,lx,ly,lz,rx,ry,rz,command_left,command_right"],
+        short.time,
+        positions["balloon"],
+        short.balloon_quaternion,
+        *(positions[role] for role in ROLES[1:]),
+        short.command,
+    )
+    columns = '[balloon]\nposition = ["bx", "by", "bz"]\norientation = ["bw", "bi", "bj", "bk"]\n'
+    columns += 'rotation = "quaternion"\n' + "\n".join(
+        f'[{role}]\nposition = ["{x}x", "{x}y", "{x}z"]' for role, x in zip(ROLES[1:], "plr", strict=True)
+    )
+    top = f'robot = "{ROBOT}"\n'
+
+    found = []
+
+    def add(
+        name: str,
+        damaged: str,
+        damages: Sequence[Any],
+        captured: str,
+        rooms: str,
+        capture: bytes,
+        logged: bool,
+        share: int,
+    ) -> None:
+        folder = place()
+        (folder / captured).write_bytes(capture)
+        (folder / "room.toml").write_text(rooms)
+        (folder / "log.csv").write_text(log)
+        output = folder / "out" / "walk.csv"
+        options = record.Import(
+            file=folder / captured,
+            mapping=folder / "room.toml",
+            output=output,
+            commands=folder / "log.csv" if logged else None,
+            offset=0.0 if logged else None,
+        )
+
+        def read() -> Any:
+            for path in (output, description_path(output)):
+                path.unlink(missing_ok=True)
+            record._import(options)
+            return read_recording(output)
+
+        written = (output, description_path(output))
+        found.append(Format(name, folder / damaged, damages, read, recording_fault, share, written))
+
+    metres = top + '[units]\nlength = "m"\n' + columns
+    add("Vicon CSV", "walk.csv", CSV, "walk.csv", top + bodies, vicon.encode(), True, 10)
+    add("table", "walk.csv", CSV, "walk.csv", metres, table.encode(), False, 10)
+    add("command log", "log.csv", CSV, "walk.csv", top + bodies, vicon.encode(), True, 8)
+    add("mapping of an import", "room.toml", TEXT, "walk.csv", metres, table.encode(), False, 8)
+    try:
+        import ezc3d
+    except ImportError:
+        print("C3D files are left out: the extra import is not installed.", file=sys.stderr)
+        return found
+    cluster = np.array([[0.1, 0, 0], [0, 0.1, 0], [-0.1, 0, 0], [0, 0, 0.1]])
+    markers = {f"B{i}": positions["balloon"] + turn.apply(corner) for i, corner in enumerate(cluster)}
+    markers |= {f"ballu:{role}": positions[role] for role in ROLES[1:]}
+    points = np.stack([1e3 * value.T for value in markers.values()], axis=1)
+    content = ezc3d.c3d()
+    for key, value in (("RATE", [100.0]), ("LABELS", list(markers)), ("UNITS", ["mm"])):
+        content["parameters"]["POINT"][key]["value"] = value
+    content["data"]["points"] = np.concatenate([points, np.ones((1, *points.shape[1:]))])
+    path = place() / "walk.c3d"
+    content.write(str(path))
+    named = ", ".join(f'"B{i}"' for i in range(len(cluster)))
+    rooms = f"{top}[balloon]\nmarkers = [{named}]\ngeometry = {cluster.tolist()}\n" + bodies.split("\n", 2)[2]
+    add("C3D", "walk.c3d", BYTES, "walk.c3d", rooms, path.read_bytes(), True, 1)
+    return found
+
+
+def _write_weights(folder: Path) -> Path:
+    """A controller's network, as `ballu_mjx.export` writes it."""
+    random = np.random.default_rng(0)
+    sizes = [28, 8, 2]
+    arrays: dict[str, np.ndarray] = {"mean": np.zeros(28), "std": np.ones(28), "observation_clip": np.array(10.0)}
+    for i, (rows, columns) in enumerate(zip(sizes, sizes[1:], strict=False)):
+        arrays |= {f"kernel_{i}": random.normal(size=(rows, columns)), f"bias_{i}": np.zeros(columns)}
+    arrays = {name: value.astype(np.float32) for name, value in arrays.items()} | {"activation": np.array("swish")}
+    np.savez(folder / "weights.npz", **arrays)  # pyright: ignore[reportArgumentType]
+    return folder / "weights.npz"
+
+
+class _Controlled:
+    """Reads a controller, which knows no `InputError`: it runs without this package."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __call__(self) -> Any:
+        from ballu_mjx.controller import Controller
+
+        try:
+            return Controller(self.folder)
+        except ValueError as error:
+            raise InputError(str(error)) from error
+
+
+def controller_fault(controller: Any) -> str | None:
+    command = controller.act(np.linspace(-1, 1, 27))
+    return None if finite(command) and command.shape == (2,) and (0 <= command).all() else "command"
+
+
+# ---- the campaign ----
+
+
+class _Hang(BaseException):
+    """A reader's time is over. No `Exception`: readers catch these."""
+
+
+@contextlib.contextmanager
+def limited(seconds: float) -> Iterator[None]:
+    def end(number: int, frame: Any) -> None:
+        raise _Hang
+
+    before = signal.signal(signal.SIGALRM, end)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def judge(form: Format) -> tuple[str, str]:
+    """What a reader makes of the file as it stands: one of `OUTCOMES`, and why."""
+    said = io.StringIO()
+    try:
+        with (
+            warnings.catch_warnings(),
+            contextlib.redirect_stdout(said),
+            limited(LONGEST * (3 if form.share < 3 else 1)),
+        ):
+            warnings.simplefilter("error")  # a user would see it instead of a sentence
+            found = form.read()
+        fault = form.fault(found)
+    except InputError as error:
+        sentence = str(error)
+        left = [path.name for path in form.partial if path.exists()]
+        if form.file.name not in sentence or "\n" in sentence or len(sentence) > LONGEST_SENTENCE or left:
+            return "crashed", f"refused without naming the file, or leaving {left}: {sentence[:300]!r}"
+        return "refused", sentence
+    except _Hang:
+        return "hung", ""
+    except Exception as error:
+        return "crashed", f"{type(error).__name__}: {str(error)[:200]}\n{traceback.format_exc(limit=-3)}"
+    return ("nonsense", fault) if fault else ("accepted", "")
+
+
+def campaign(
+    files: int, seed: int, *, only: str = "", keep: Path | None = None
+) -> tuple[dict[str, dict[str, int]], list[str]]:
+    """Damage about so many files; returns counts of outcomes by format, and what went wrong."""
+    table: dict[str, dict[str, int]] = {}
+    wrong: list[str] = []
+    with tempfile.TemporaryDirectory() as work:
+        chosen = [form for form in formats(Path(work)) if only in form.name]
+        whole = sum(form.share for form in chosen)
+        counts = [max(math.ceil(files * form.share / whole), 1) for form in chosen]
+        with tqdm(total=sum(counts), unit="files", dynamic_ncols=True) as bar:
+            for form, count in zip(chosen, counts, strict=True):
+                row = table[form.name] = dict.fromkeys(OUTCOMES, 0)
+                valid = form.file.read_bytes()
+                outcome, why = judge(form)
+                if outcome != "accepted":
+                    raise AssertionError(f"the valid {form.name} is {outcome}: {why}")
+                for number in range(count):
+                    random = np.random.default_rng([seed, sum(form.name.encode()), number])
+                    damage = form.damages[int(random.integers(len(form.damages)))]
+                    form.file.write_bytes(damage(valid, random))
+                    outcome, why = judge(form)
+                    row[outcome] += 1
+                    bar.update()
+                    if outcome not in OUTCOMES[:2]:
+                        wrong.append(f"{form.name}, number {number} ({damage.__name__[1:]}): {outcome}, {why}")
+                        if keep is not None:
+                            keep.mkdir(parents=True, exist_ok=True)
+                            shutil.copy(form.file, keep / f"{number}-{form.file.name}")
+                form.file.write_bytes(valid)
+    return table, wrong
+
+
+def markdown(table: Mapping[str, Mapping[str, int]]) -> str:
+    """The counts, and their sums."""
+    lines = ["| format | files | " + " | ".join(OUTCOMES) + " |", "| --- |" + " ---: |" * (1 + len(OUTCOMES))]
+    total = {outcome: sum(row[outcome] for row in table.values()) for outcome in OUTCOMES}
+    for name, row in [*table.items(), ("all", total)]:
+        lines.append(f"| {name} | {sum(row.values()):,} | " + " | ".join(f"{row[o]:,}" for o in OUTCOMES) + " |")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--files", type=int, default=10_000, help="how many, all formats together")
+    parser.add_argument("--seed", type=int, default=0, help="of the damage")
+    parser.add_argument("--only", default="", help="formats whose name holds this")
+    parser.add_argument("--keep", type=Path, help="folder for the files that a reader is wrong about")
+    options = parser.parse_args()
+    runtime.prepare()
+    table, wrong = campaign(options.files, options.seed, only=options.only, keep=options.keep)
+    print("\n".join(wrong), file=sys.stderr)
+    print(markdown(table))
+    return int(bool(wrong))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

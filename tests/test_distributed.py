@@ -1,0 +1,94 @@
+"""Does one training in two processes learn what it learns in one, and is it kept by the first alone?"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ballu_mjx import distributed, runs
+from ballu_mjx.distributed import DistributedOptions
+from ballu_mjx.errors import InputError
+
+TRAINING = """
+import json, sys
+from ballu_mjx import runtime
+runtime.prepare()
+from pathlib import Path
+from ballu_mjx import distributed, ppo, runs
+from ballu_mjx.session import Session, Start
+from follower import Follower
+
+options, folder = json.loads(sys.argv[1]), Path(sys.argv[2])
+distributed.join(distributed.DistributedOptions(**options))
+config = ppo.PPOConfig(num_envs=32, batch_size=16, num_minibatches=2, unroll_length=5, num_timesteps=160 * 6,
+                       policy_layers=(8,), value_layers=(8,))
+sections = {"env": Follower.limit, "ppo": config}
+content = {"task": "follow", "starts": [], "recordings": {}, "ppo": {"learning_rate": 1e-4, "seed": 0}}
+if distributed.is_first():
+    with runs.Run(folder, content) as run:
+        Session(run, None, 320).train(Follower(), config, Start(), content)
+else:
+    sys.exit(Session(None, None, 320).follow(Follower(), config, Start(), content))
+"""
+
+
+def start(folder: Path, devices: int, **options: Any) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", TRAINING, json.dumps(options), str(folder)]
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    flags = f"--xla_force_host_platform_device_count={devices}"
+    environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": path}
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def finish(*processes: subprocess.Popen[str]) -> None:
+    try:
+        for process in processes:
+            _, said = process.communicate(timeout=300)
+            assert process.returncode == 0, said
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
+
+
+def test_two_processes_learn_what_one_with_two_devices_does(tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    together = {"coordinator": f"127.0.0.1:{port}", "num_processes": 2}
+    both = [start(tmp_path / f"process-{i}", 1, **together, process_id=i) for i in range(2)]
+    finish(*both, start(tmp_path / "alone", 2))
+
+    def curve(folder: str) -> list[list[float]]:
+        return [[row["reward"], row["total_loss"], row["distance"]] for row in runs.read_metrics(tmp_path / folder)]
+
+    assert len(curve("process-0")) == 6
+    np.testing.assert_allclose(curve("process-0"), curve("alone"), rtol=1e-6)
+    assert not (tmp_path / "process-1").exists()
+    kept, expected = (runs.last_checkpoint(tmp_path / name, training=True) for name in ("process-0", "alone"))
+    assert kept.step == expected.step
+    assert kept.training is not None and expected.training is not None
+    for name, values in expected.training.items():  # the environments of both processes among them
+        np.testing.assert_allclose(kept.training[name], values, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"process_id": 1}, "--process-id goes with --coordinator"),
+        ({"coordinator": "here:1"}, "needs --num-processes and --process-id"),
+        ({"coordinator": "here:1", "num_processes": 2, "process_id": 2}, "must be 0 to 1"),
+        ({"coordinator": "here", "num_processes": 2, "process_id": 1}, "give host:port"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(given: dict[str, Any], told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        distributed.join(DistributedOptions(**given))
