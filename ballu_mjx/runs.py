@@ -24,6 +24,7 @@ import math
 import reprlib
 import shutil
 import sys
+import threading
 import time
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -655,23 +656,38 @@ def _alone() -> ocp.options.MultiprocessingOptions:
 @contextlib.contextmanager
 def _quiet_when_full(manager: ocp.CheckpointManager) -> Iterator[None]:
     """Keep what orbax says of a full disk off the terminal: each of its threads fills pages. The exception stays."""
-    said, before = io.StringIO(), logging.root.manager.disable
+    stderr, before = sys.stderr, logging.root.manager.disable
+    sys.stderr = said = io.StringIO()
     logging.disable(logging.CRITICAL)
     full = False
     try:
-        with contextlib.redirect_stderr(said):
-            try:
-                yield
-            except Exception as error:
-                full = files.is_full(error)
-                if full:
-                    with contextlib.suppress(Exception):  # the same once more
-                        manager.close()  # and with it, its threads
-                raise
+        yield
+    except Exception as error:
+        full = files.is_full(error)
+        if full:
+            with contextlib.suppress(Exception):  # the same once more
+                manager.close()  # and with it, its threads
+        raise
     finally:
-        if not full:  # else its threads go on complaining until the process ends
+        if full:  # tensorstore's threads go on complaining until the process ends
+            sys.stderr = _OfThisThread(stderr)
+        else:
+            sys.stderr = stderr
             logging.disable(before)
-            sys.stderr.write(said.getvalue())
+            stderr.write(said.getvalue())
+
+
+class _OfThisThread(io.TextIOBase):
+    """A stream that takes what the thread which made it says, and drops what others do."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream, self._thread = stream, threading.get_ident()
+
+    def write(self, text: str, /) -> int:
+        return self._stream.write(text) if threading.get_ident() == self._thread else len(text)
+
+    def flush(self) -> None:
+        self._stream.flush()
 
 
 def _score(metrics: Any) -> float:
