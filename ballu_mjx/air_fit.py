@@ -58,10 +58,11 @@ def fit(data: AirData, config: AirConfig) -> int:
     description = runs.describe("aerodynamic", sections, prepared.files, devices, prepared.identified)
     with runs.Run(folder, description, wandb=data.wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)
-        stages = runs.Stages()
+        stages, began = runs.Stages(), time.perf_counter()
 
         def report(evaluation: int, cost: float) -> None:
-            run.log(stages.update("air", evaluation, _MOST + 2 * config.evaluations, cost), {"cost": cost})
+            done = stages.update("air", evaluation, _MOST + 2 * config.evaluations, cost)
+            run.log(done, {"cost": cost, "seconds": time.perf_counter() - began})
 
         values = None if known is None else known.params
         result = air_identification.identify(model, motions["training"], config, report, known=values, free=data.free)

@@ -138,15 +138,30 @@ def make(job: Job, robot_seed: int, output: Path) -> Path:
     return path
 
 
-def fresh(seed: int, folder: Path, each: int = 6) -> list[Path]:
+def fresh(seed: int, folder: Path, each: int = 6, robot_seed: int = ROBOT_SEED) -> list[Path]:
     """Recordings of `fresh_jobs`, in a folder; made by all cores, unless they are there."""
     jobs = fresh_jobs(seed, each)
     paths = [folder / job.split / f"{job.name}.csv.gz" for job in jobs]
-    missing = [(job, ROBOT_SEED, folder) for job, path in zip(jobs, paths, strict=True) if not path.exists()]
-    if missing:
-        with multiprocessing.get_context("spawn").Pool() as pool:
-            pool.starmap(make, missing)
+    make_all([job for job, path in zip(jobs, paths, strict=True) if not path.exists()], robot_seed, folder)
     return paths
+
+
+def data_set(robot_seed: int, folder: Path) -> list[Path]:
+    """Record the whole data set on a virtual robot into a folder; the sweep comes last."""
+    paths = make_all(jobs(), robot_seed, folder)
+    sweep = folder / "suspended" / "sweep.csv.gz"
+    sweep.parent.mkdir(parents=True, exist_ok=True)
+    suspended = virtual_robot.record_sweep(virtual_robot.draw_robot(robot_seed), seed=robot_seed, name="sweep")
+    write_recording(suspended, sweep, decimals=DECIMALS)
+    return [*paths, sweep]
+
+
+def make_all(jobs: list[Job], robot_seed: int, folder: Path) -> list[Path]:
+    """`make` on all cores."""
+    if not jobs:
+        return []
+    with multiprocessing.get_context("spawn").Pool() as pool:
+        return pool.starmap(make, [(job, robot_seed, folder) for job in jobs])
 
 
 def main() -> None:
@@ -154,14 +169,8 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=assets() / "recordings", help="folder to write to")
     parser.add_argument("--robot", type=int, default=ROBOT_SEED, help="seed of the virtual robot (bundled: 0)")
     arguments = parser.parse_args()
-    with multiprocessing.get_context("spawn").Pool() as pool:
-        for path in pool.starmap(make, [(job, arguments.robot, arguments.output) for job in jobs()]):
-            print(path)
-    robot = virtual_robot.draw_robot(arguments.robot)
-    path = arguments.output / "suspended" / "sweep.csv.gz"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_recording(virtual_robot.record_sweep(robot, seed=arguments.robot, name="sweep"), path, decimals=DECIMALS)
-    print(path)
+    for path in data_set(arguments.robot, arguments.output):
+        print(path)
 
 
 if __name__ == "__main__":

@@ -2,16 +2,19 @@
 # # Fidelity: the README's tables and figure
 #
 # Section "Improved Simulation Fidelity" of the paper, open loop: recorded commands are replayed from recorded states in
-# five simulators, on recordings that training never saw: vanilla, vanilla with identified actuators (vanilla+sysid),
-# either with EnvMimic's forces, and the second with the identified air (aerodynamic); with `--hybrid` also that with
-# EnvMimic's forces for what the air leaves. One run of `python -m ballu_mjx.train envmimic` a seed and kind, one of
-# `train residual`; runs that are there already are not repeated.
+# several simulators, on recordings that training never saw: vanilla, vanilla with identified actuators (vanilla+sysid),
+# either with EnvMimic's forces, and the second with what the other methods learn: regression on the forces that explain
+# the recordings (supervised), gradients through the simulator (analytic), the air's parameters (aerodynamic), and
+# networks for what the air leaves (aerodynamic+analytic, aerodynamic+EnvMimic). One training a method and seed; runs
+# that are there already are not repeated.
 #
-# `python experiments/fidelity.py` takes about half an hour on two cores; `--quick` shows that it works.
+# `python experiments/fidelity.py` takes about three quarters of an hour on two cores; `--robot N` does the same on
+# another virtual robot, recorded and its actuators identified first; `--quick` shows that it works.
 
 # %%
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -27,6 +30,7 @@ if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a co
 # %%
 import argparse
 import dataclasses
+from collections.abc import Mapping
 
 from ballu_mjx import runtime
 
@@ -34,16 +38,39 @@ runtime.prepare()
 
 import bundled_recordings  # noqa: E402
 import numpy as np  # noqa: E402
+from jaxtyping import Float  # noqa: E402
 
-from ballu_mjx import evaluation, plots, reconstruction, recording, residual, robot  # noqa: E402
+from ballu_mjx import evaluation, plots, reconstruction, recording, residual, robot, runs  # noqa: E402
 
 # %% [markdown]
 # ## Train
 
 
 # %%
-KINDS = {"nominal": "EnvMimic", "identified": "EnvMimic on identified actuators", "hybrid": "aerodynamic+EnvMimic"}
-"""Of EnvMimic, with what their simulators are called in the tables."""
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """One way to a simulator that is better than vanilla."""
+
+    label: str
+    arguments: tuple[str, ...]
+    """Of `python -m ballu_mjx.train`."""
+    seeded: bool = True
+    nominal: bool = False
+    """On nominal actuators instead of identified ones."""
+    beside_air: bool = False
+    """Learns what the identified air leaves."""
+
+
+AIR = "aerodynamic"
+METHODS = {
+    "nominal": Method("EnvMimic", ("envmimic",), nominal=True),
+    "identified": Method("EnvMimic on identified actuators", ("envmimic",)),
+    "supervised": Method("supervised", ("residual", "--method", "supervised")),
+    "analytic": Method("analytic", ("residual", "--method", "analytic")),
+    AIR: Method("aerodynamic", ("residual", "--method", "aerodynamic"), seeded=False),
+    "air-analytic": Method("aerodynamic+analytic", ("residual", "--method", "analytic"), beside_air=True),
+    "air-envmimic": Method("aerodynamic+EnvMimic", ("envmimic",), beside_air=True),
+}
 
 
 def train(folder: Path, *arguments: str) -> None:
@@ -56,6 +83,36 @@ def train(folder: Path, *arguments: str) -> None:
 def load(folder: Path) -> evaluation.Evaluation:
     """The evaluation of one run."""
     return evaluation.read(folder / "evaluation.json")
+
+
+def seconds(folder: Path) -> float:
+    """Wall time that a run learned for, its validations included, reading and compiling for them not."""
+    return float(runs.column(folder, "seconds")[1][-1])
+
+
+@dataclasses.dataclass(frozen=True)
+class Recorded:
+    """A virtual robot's recordings, and its identified actuators."""
+
+    training: list[Path]
+    validation: list[Path]
+    test: list[Path]
+    actuators: Path
+
+
+def record(robot_seed: int, folder: Path) -> Recorded:
+    """The bundled recordings for robot 0; for another one they are made, and its actuators identified, in `folder`."""
+    place = robot.assets() / "recordings"
+    if robot_seed != bundled_recordings.ROBOT_SEED:
+        place = folder / "recordings"
+        if not (place / "suspended" / "sweep.csv.gz").exists():
+            bundled_recordings.data_set(robot_seed, place)
+        if not (place / "actuators.json").exists():
+            sysid = [sys.executable, "-m", "ballu_mjx.train", "sysid", "--recordings", str(place / "suspended")]
+            subprocess.run([*sysid, "--output", str(folder / "sysid")], check=True)
+            shutil.copy(folder / "sysid" / "actuators.json", place)
+    training, validation, test = (recording.recordings([place / use]) for use in ("training", "validation", "test"))
+    return Recorded(training, validation, test, place / "actuators.json")
 
 
 def evaluate(folders: list[Path], paths: list[Path]) -> list[evaluation.Evaluation]:
@@ -79,33 +136,41 @@ def spread(values: list[float], digits: int = 2) -> str:
     return f"{np.mean(values):.{digits}f} ({min(values):.{digits}f} to {max(values):.{digits}f})"
 
 
-def comparison(results: dict[str, list[evaluation.Evaluation]]) -> str:
-    """Markdown: RMSE of the simulators, and in brackets what that leaves of vanilla's."""
+def ratios(values: list[float]) -> str:
+    """Mean and, in brackets, the range."""
+    return f"{np.mean(values):.2f}" + ("" if len(values) == 1 else f" [{min(values):.2f}, {max(values):.2f}]")
+
+
+Results = Mapping[str, list[evaluation.Evaluation]]
+"""Of each method of `METHODS`, those of all seeds."""
+
+
+def comparison(results: Results, times: Mapping[str, list[float]]) -> str:
+    """Markdown: RMSE of the simulators, what that leaves of vanilla's, and the range of that over seeds; and how long
+    learning took."""
     nominal, identified = results["nominal"], results["identified"]
     columns = [(group, horizon) for group in nominal[0].groups for horizon in evaluation.SCORE_HORIZONS]
     head = [f"{group}, {horizon:g} s: m, deg" for group, horizon in columns]
-    lines = ["| simulator | " + " | ".join(head) + " |", "| --- " * (1 + len(columns)) + "|"]
-    rows = {
-        "vanilla": [run.vanilla for run in nominal],
-        "vanilla+sysid": [run.vanilla for run in identified],
-        KINDS["nominal"]: [run.residual for run in nominal],
-        KINDS["identified"]: [run.residual for run in identified],
-        "aerodynamic": [run.residual for run in results["aerodynamic"]],
-    }
-    if "hybrid" in results:
-        rows[KINDS["hybrid"]] = [run.residual for run in results["hybrid"]]
-    for label, runs in rows.items():
+    lines = ["| simulator | " + " | ".join(head) + " | learning (s) |", "| --- " * (2 + len(columns)) + "|"]
+    rows = {"vanilla": [run.vanilla for run in nominal[:1]], "vanilla+sysid": [run.vanilla for run in identified[:1]]}
+    rows |= {METHODS[name].label: [run.residual for run in found] for name, found in results.items()}
+    took = {METHODS[name].label: f"{np.mean(values):.0f}" for name, values in times.items()}
+
+    def means(row: str, group: str, quantity: str, horizon: float) -> Float[np.ndarray, " seeds"]:
+        return np.array(
+            [np.mean([getattr(e, quantity)[horizon][0] for e in run if e.group == group]) for run in rows[row]]
+        )
+
+    for row in rows:
         cells = []
         for group, horizon in columns:
             parts = []
             for quantity, digits in (("position", 3), ("yaw", 1)):
-                values, base = (
-                    [np.mean([getattr(e, quantity)[horizon][0] for e in run if e.group == group]) for run in side]
-                    for side in (runs, rows["vanilla"])
-                )
-                parts.append(f"{np.mean(values):.{digits}f} ({np.mean(values) / np.mean(base):.2f})")
+                values = means(row, group, quantity, horizon)
+                left = ratios(list(values / means("vanilla", group, quantity, horizon)))
+                parts.append(f"{np.mean(values):.{digits}f}: {left}")
             cells.append(", ".join(parts))
-        lines.append(f"| {label} | " + " | ".join(cells) + " |")
+        lines.append(f"| {row} | " + " | ".join([*cells, took.get(row, "")]) + " |")
     return "\n".join(lines)
 
 
@@ -139,7 +204,7 @@ def table(runs: list[evaluation.Evaluation], base: str, name: str) -> str:
             f"| {without.recording} | {without.mean_com_error:.2f} | {spread([e.mean_com_error for e in ours])} | "
             f"{without.final_yaw_error:.0f} | {spread([e.final_yaw_error for e in ours], 0)} |"
         )
-    return "\n".join([*lines, "", worst_case(runs, base)])
+    return "\n".join(lines)
 
 
 def worst_case(runs: list[evaluation.Evaluation], base: str) -> str:
@@ -160,14 +225,14 @@ def against(nominal: list[evaluation.Evaluation], runs: list[evaluation.Evaluati
 
 
 # %%
-def figure(folders: list[Path], air: Path, path: Path) -> None:
-    """Replay the test recordings in vanilla, with identified actuators, with every seed's forces beside these, and with
-    the identified air."""
+def figure(folders: list[Path], air: Path, paths: list[Path], path: Path) -> None:
+    """Replay recordings in vanilla, with identified actuators, with every seed's forces beside these, and with the
+    identified air."""
     policies, blown = [residual.Residual.load(folder) for folder in folders], residual.Residual.load(air)
 
     def simulator(actuators: robot.ActuatorParameters | None, kind: residual.Residual) -> evaluation.OpenLoopEvaluator:
         model = robot.load_model(actuators)
-        motions = [reconstruction.reconstruct(recording.read_recording(p), model) for p in recording.bundled("test")]
+        motions = [reconstruction.reconstruct(recording.read_recording(p), model) for p in paths]
         return evaluation.OpenLoopEvaluator(model, motions, kind.model)
 
     evaluator = simulator(policies[0].actuators, policies[0])
@@ -208,54 +273,74 @@ def figure(folders: list[Path], air: Path, path: Path) -> None:
 class Options:
     """What the command line says."""
 
+    methods: list[str]
     seeds: list[int]
+    robot: int
     fresh: int
-    hybrid: bool
     output: Path
     quick: bool
 
 
 def parse() -> Options:
     parser = argparse.ArgumentParser(description="Fidelity of simulators: the README's tables and figure.")
+    always = ("nominal", "identified", AIR)  # the figure and the long tables are of these
+    parser.add_argument(
+        "--methods",
+        nargs="*",
+        choices=[name for name in METHODS if name not in always],
+        default=[name for name in METHODS if name not in always],
+        help=f"beside {', '.join(always)}",
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="one training a seed")
+    parser.add_argument("--robot", type=int, default=bundled_recordings.ROBOT_SEED, help="seed of the virtual robot")
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the larger test set")
-    parser.add_argument("--hybrid", action="store_true", help="train EnvMimic on the identified air as well")
     parser.add_argument("--output", type=Path, default=Path("runs/fidelity"), help="folder of the runs")
     parser.add_argument("--quick", action="store_true", help="train for seconds; the numbers mean nothing")
     arguments = parser.parse_args()
-    return Options(arguments.seeds, arguments.fresh, arguments.hybrid, arguments.output, arguments.quick)
+    methods = [name for name in METHODS if name in always or name in arguments.methods]
+    return Options(methods, arguments.seeds, arguments.robot, arguments.fresh, arguments.output, arguments.quick)
+
+
+def learn(options: Options, recorded: Recorded) -> dict[str, list[Path]]:
+    """All runs of all methods; the air first, beside which others learn."""
+    folders = {}
+    for name in sorted(options.methods, key=lambda name: name != AIR):
+        method = METHODS[name]
+        arguments = [*method.arguments, *(["--quick"] if options.quick else [])]
+        # A quick training would test on what it validates on: the tables need the test recordings.
+        training = recorded.training[:2] if options.quick else recorded.training
+        for use, paths in (("recordings", training), ("validation", recorded.validation), ("test", recorded.test)):
+            arguments += [f"--{use}", *map(str, paths)]
+        arguments += ["--actuators", "nominal" if method.nominal else str(recorded.actuators)]
+        arguments += ["--residual", str(options.output / AIR)] if method.beside_air else []
+        runs = [(options.output / f"{name}-seed-{seed}", ["--seed", str(seed)]) for seed in options.seeds]
+        for folder, seed in runs if method.seeded else [(options.output / name, [])]:
+            train(folder, *arguments, *seed)
+            folders.setdefault(name, []).append(folder)
+    return {name: folders[name] for name in options.methods}
 
 
 def main() -> None:
     options = parse()
-    quick = ["--quick"] if options.quick else []
-    # A quick training tests on what it validates on: the tables need the test recordings.
-    extra = [*quick, "--test", str(robot.assets() / "recordings" / "test")] if options.quick else []
-    air = options.output / "aerodynamic"
-    train(air, "residual", "--method", "aerodynamic", *extra)
-    kinds = {"nominal": ["--actuators", "nominal"], "identified": []}
-    if options.hybrid:
-        kinds["hybrid"] = ["--residual", str(air)]
-    folders = {kind: [options.output / f"{kind}-seed-{seed}" for seed in options.seeds] for kind in kinds}
-    for kind, arguments in kinds.items():
-        for seed, folder in zip(options.seeds, folders[kind], strict=True):
-            train(folder, "envmimic", "--seed", str(seed), *extra, *arguments)
-    folders["aerodynamic"] = [air]
-    runs = {kind: [load(folder) for folder in members] for kind, members in folders.items()}
-    paths = bundled_recordings.fresh(options.fresh, options.output, 1 if options.quick else 6)
-    larger = {kind: evaluate(members, paths) for kind, members in folders.items()}
+    recorded = record(options.robot, options.output)
+    folders = learn(options, recorded)
+    results = {name: [load(folder) for folder in members] for name, members in folders.items()}
+    times = {name: [seconds(folder) for folder in members] for name, members in folders.items()}
+    each = 1 if options.quick else 6
+    paths = bundled_recordings.fresh(options.fresh, options.output, each, options.robot)
+    larger = {name: evaluate(members, paths) for name, members in folders.items()}
     parts = []
-    for title, results in (("Bundled test recordings", runs), ("Fresh test recordings", larger)):
-        parts += [f"### {title}", comparison(results)]
-        for kind, name in (("identified", KINDS["identified"]), ("aerodynamic", "aerodynamic")):
-            parts += [f"{name}. " + worst_case(against(results["nominal"], results[kind]), "vanilla")]
-            parts += [table(results[kind], "vanilla+sysid", name)]
-        if options.hybrid:
-            parts += [table(results["hybrid"], "vanilla+sysid", KINDS["hybrid"])]
-        parts += [table(results["nominal"], "vanilla", KINDS["nominal"])]
+    for title, found in (("Bundled test recordings", results), ("Fresh test recordings", larger)):
+        parts += [f"### {title}", comparison(found, times)]
+        nominal = found["nominal"]
+        for name in options.methods:
+            evaluations = found[name] if METHODS[name].nominal else against(nominal, found[name])
+            parts += [f"{METHODS[name].label}. " + worst_case(evaluations, "vanilla")]
+        for name in ("identified", AIR, "nominal"):
+            parts += [table(found[name], "vanilla" if METHODS[name].nominal else "vanilla+sysid", METHODS[name].label)]
     text = "\n\n".join(parts)
     (options.output / "table.md").write_text(text + "\n")
-    figure(folders["identified"], air, options.output / "tracking.png")
+    figure(folders["identified"], folders[AIR][0], recorded.test, options.output / "tracking.png")
     print(text)
     print(f"\nWritten to {options.output}.")
 
