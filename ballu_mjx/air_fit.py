@@ -19,8 +19,8 @@ from ballu_mjx.errors import InputError
 from ballu_mjx.residual import Residual, write_observed
 from ballu_mjx.residual_data import Prepared, RecordingsData
 
-_MOST = 24
-"""Evaluations for two searches for the delay, and before and after all."""
+_BESIDE = 22
+"""Evaluations beside those of the first fit: a search for the delay, and fits for two to three delays beside it."""
 QUICK: Mapping[str, Any] = {"window_seconds": 0.5, "interval_seconds": 2.0, "evaluations": 3}
 """Defaults of `AirConfig` under `--quick`."""
 
@@ -61,7 +61,7 @@ def fit(data: AirData, config: AirConfig) -> int:
         stages, began = runs.Stages(), time.perf_counter()
 
         def report(evaluation: int, cost: float) -> None:
-            done = stages.update("air", evaluation, _MOST + 2 * config.evaluations, cost)
+            done = stages.update("air", evaluation, _BESIDE + config.evaluations, cost)
             run.log(done, {"cost": cost, "seconds": time.perf_counter() - began})
 
         values = None if known is None else known.params

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 import scipy.optimize
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ballu_mjx import aerodynamics, envmimic, simulation, windows
 from ballu_mjx import robot as ballu
@@ -36,8 +36,8 @@ class AirConfig:
     interval_seconds: float = 2.0
     """Time between the starts of two windows, s."""
     evaluations: int = 8
-    """Most steps of the least-squares solver with all parameters free, each of the two times that it runs; with fewer
-    free, which cost less a step, accordingly more."""
+    """Most steps of the least-squares solver with all parameters free, at the first delay; with fewer free, which cost
+    less a step, accordingly more."""
 
 
 class Scale(NamedTuple):
@@ -59,8 +59,8 @@ SCALES: dict[str, Scale] = {
     "delay": Scale(0.05),
 }
 """By name; SI units."""
-_ROUNDS = 2
-"""Of a search for the delay and a fit of all else."""
+_AGAIN = 4
+"""Most steps of the solver for each further delay, from the best fit so far."""
 _LOST = 20.0
 """What a simulation that broke down counts as, in expected errors."""
 
@@ -71,7 +71,7 @@ class AirFit:
 
     parameters: AirParameters
     standard_errors: AirParameters
-    """Of windows that err independently, by as much as expected; 0 for what was not free, and for the delay."""
+    """Of windows that err independently, by as much as expected; 0 for what was not free."""
     cost: tuple[float, float]
     """Half the sum of squares, softened, without the residual and at the end."""
     windows: int
@@ -115,6 +115,8 @@ def identify(
     start = np.asarray(start, np.float64)
     owner = np.repeat(aerodynamics.NAMES, [getattr(none, name).size for name in aerodynamics.NAMES])
     scale, prior = np.array([SCALES[name] for name in owner]).T
+    step = ballu.CONTROL_TIMESTEP / simulation.substeps(model)
+    delays = np.arange(0.0, aerodynamics.LONGEST_DELAY + step / 2, step)
     places = np.flatnonzero(np.isin(owner, [name for name in free if name != "delay"]))
     low = np.where(np.isin(owner, aerodynamics.SIGNED), -np.inf, 0.0)[places]
     evaluations = 0
@@ -129,15 +131,11 @@ def identify(
 
     def with_delay(vector: np.ndarray) -> np.ndarray:
         """With the best delay of whole physics steps: a cost that moves by steps has no derivative to follow."""
-        step = ballu.CONTROL_TIMESTEP / simulation.substeps(model)
-        tried = [
-            np.where(owner == "delay", delay, vector)
-            for delay in np.arange(0.0, aerodynamics.LONGEST_DELAY + step / 2, step)
-        ]
+        tried = [np.where(owner == "delay", delay, vector) for delay in delays]
         return min(tried, key=lambda each: _cost(residuals(each)))
 
-    def fitted(vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The best of the other parameters, and the Jacobian there."""
+    def fitted(vector: np.ndarray, most: int) -> Optimum:
+        """The best of the other parameters, in so many steps at most."""
 
         def whole(x: np.ndarray) -> np.ndarray:
             moved = vector.copy()
@@ -155,30 +153,64 @@ def identify(
             vector[places] / scale[places],
             jacobian,  # pyright: ignore[reportArgumentType]
             bounds=(low, np.inf),
-            max_nfev=config.evaluations * len(start) // len(places),
+            max_nfev=most * len(start) // len(places),
         )
-        return whole(solution.x), solution.jac
+        variance = np.zeros(len(start))
+        variance[places] = np.diag(np.linalg.pinv(solution.jac.T @ solution.jac)) * scale[places] ** 2
+        return Optimum(whole(solution.x), variance, _cost(solution.fun))
 
     without = _cost(residuals(start))
-    best, jacobian = start, np.zeros((1, len(places)))
+    best = start
     if known is None:  # not from the bounds, where what must be positive has nowhere to go but up
         best = np.where(np.isin(owner, aerodynamics.SIGNED), 0.0, scale)
-    for number in range(_ROUNDS if "delay" in free else 1):
-        before = best
+    if "delay" in free:
+        best = with_delay(best)
+    found = Optimum(best, np.zeros(len(start)), _cost(residuals(best)))
+    if len(places):
+        found = fitted(best, config.evaluations)
         if "delay" in free:
-            best = with_delay(best)
-        if number and np.array_equal(best, before):
-            break
-        if len(places):
-            best, jacobian = fitted(best)
-    errors = np.zeros(len(start))
-    errors[places] = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian))) * scale[places]
+            found = over_delays(found, owner == "delay", delays, lambda vector: fitted(vector, _AGAIN))
     return AirFit(
-        parameters=unravel(jnp.asarray(best, jnp.float32)),
-        standard_errors=unravel(jnp.asarray(errors, jnp.float32)),
-        cost=(without, _cost(residuals(best))),
+        parameters=unravel(jnp.asarray(found.vector, jnp.float32)),
+        standard_errors=unravel(jnp.asarray(np.sqrt(found.variance), jnp.float32)),
+        cost=(without, found.cost),
         windows=simulated.count,
     )
+
+
+class Optimum(NamedTuple):
+    """Of a fit: all parameters, their variances, and the cost."""
+
+    vector: Float[np.ndarray, " parameters"]
+    variance: Float[np.ndarray, " parameters"]
+    cost: float
+
+
+def over_delays(
+    first: Optimum,
+    delay: Bool[np.ndarray, " parameters"],
+    delays: Float[np.ndarray, " delays"],
+    fitted: Callable[[np.ndarray], Optimum],
+) -> Optimum:
+    """The best fit of all, found by walking from `first` along the delays, with all else fitted again at each: a delay
+    and an added mass explain much the same motion. To variances comes what the delay's own uncertainty, by the costs
+    beside the best, makes of them."""
+    place = int(np.argmin(np.abs(delays - first.vector[delay])))
+    fits = {place: first}
+    while True:
+        best = min(fits, key=lambda at: fits[at].cost)
+        missing = [at for at in (best - 1, best + 1) if 0 <= at < len(delays) and at not in fits]
+        if not missing:
+            break
+        fits[missing[0]] = fitted(np.where(delay, delays[missing[0]], fits[best].vector))
+    beside = [at for at in (best - 1, best + 1) if at in fits]
+    step = delays[1] - delays[0]
+    # Costs are half squares of expected errors: a parabola through three of them is a normal distribution's exponent.
+    curvature = 2 * np.mean([fits[at].cost - fits[best].cost for at in beside]) / step**2
+    variance = 1 / max(curvature, 1 / delays[-1] ** 2) + step**2 / 12
+    near = [*beside, best]
+    slope = (fits[max(near)].vector - fits[min(near)].vector) / (delays[max(near)] - delays[min(near)])
+    return fits[best]._replace(variance=fits[best].variance + slope**2 * variance)
 
 
 def _cost(residuals: np.ndarray) -> float:

@@ -14,7 +14,7 @@ import pytest
 
 from ballu_mjx import aerodynamics, air_identification, envmimic, robot
 from ballu_mjx.aerodynamics import Aerodynamics, AirParameters
-from ballu_mjx.air_identification import AirConfig, AirFit
+from ballu_mjx.air_identification import AirConfig, AirFit, Optimum, over_delays
 from ballu_mjx.errors import InputError
 from ballu_mjx.reconstruction import Motion
 
@@ -117,6 +117,29 @@ def test_late_commands_arrive_physics_step_by_physics_step():
     for delay, ages in ((0.0, [0] * 5), (0.05, [1] * 5), (0.02, [1, 1, 0, 0, 0]), (0.08, [2, 2, 2, 1, 1])):
         late = dataclasses.replace(AIR, delay=jnp.array(delay))
         np.testing.assert_array_equal(air.command(late, sent), sent[2 - np.array(ages)])
+
+
+def test_a_delay_and_what_passes_for_it_are_found_together():
+    """On a quadratic cost, whose optimum and covariance are known: the first fit is at a wrong delay."""
+    step, truth = 0.01, np.array([0.062, 0.12])
+    precision = np.linalg.inv(np.array([[4e-5, -9e-5], [-9e-5, 2.5e-4]]))  # of (delay, mass)
+
+    def fitted(vector: np.ndarray) -> Optimum:
+        late = vector[0] - truth[0]
+        mass = truth[1] - precision[0, 1] / precision[1, 1] * late
+        moved = np.array([vector[0], mass])
+        return Optimum(
+            moved, np.array([0.0, 1 / precision[1, 1]]), float((moved - truth) @ precision @ (moved - truth)) / 2
+        )
+
+    delays = np.arange(11) * step
+    found = over_delays(fitted(np.array([0.02, 0.0])), np.array([True, False]), delays, fitted)
+    assert found.vector[0] == pytest.approx(0.06)
+    rounding = np.array([1.0, precision[0, 1] / precision[1, 1]]) ** 2 * step**2 / 12
+    np.testing.assert_allclose(found.variance, np.diag(np.linalg.inv(precision)) + rounding, rtol=1e-6)
+
+    at_an_end = over_delays(fitted(np.array([0.1, 0.0])), np.array([True, False]), delays[:4] + 0.07, fitted)
+    assert at_an_end.vector[0] == pytest.approx(0.07) and at_an_end.variance[0] > 0
 
 
 def test_drag_opposes_the_motion_whatever_the_heading():
