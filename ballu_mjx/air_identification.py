@@ -220,16 +220,16 @@ def _cost(residuals: np.ndarray) -> float:
 def _soften(
     errors: Float[np.ndarray, "windows entries"], slopes: Float[np.ndarray, "windows entries directions"] | None = None
 ) -> tuple[Float[np.ndarray, "windows entries"], Float[np.ndarray, "windows entries directions"]]:
-    """Errors (and their derivatives) shortened, window by window, so that half their sum of squares is the pseudo-Huber
-    loss of each window's whole error: quadratic below `OUTLYING`, linear above."""
+    """Errors (and their derivatives) shortened, window by window, so that their sum of squares is `windows.soften` of
+    each window's whole error."""
     squared = np.sum(errors**2, axis=1)[:, None] + 1e-12
-    root = np.sqrt(1 + squared / OUTLYING**2)
-    loss = 2 * OUTLYING**2 * (root - 1)
+    loss = windows.soften(squared)
     factor = np.sqrt(loss / squared)
     if slopes is None:
         return factor * errors, np.zeros((*errors.shape, 0))
     # The factor's derivative by the squared error, along each direction.
-    change = (1 / root - loss / squared) / (2 * factor * squared)
+    steepness = 1 / np.sqrt(1 + squared / OUTLYING**2)
+    change = (steepness - loss / squared) / (2 * factor * squared)
     along = 2 * np.einsum("we,wed->wd", errors, slopes)[:, None, :]
     return factor * errors, factor[..., None] * slopes + change[..., None] * along * errors[..., None]
 

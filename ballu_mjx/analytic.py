@@ -24,7 +24,7 @@ from ballu_mjx.envmimic import ForcePolicy
 from ballu_mjx.errors import InputError
 from ballu_mjx.forces import Applied
 from ballu_mjx.linearization import ControlSteps, Linearized, Linearizer
-from ballu_mjx.windows import OUTLYING, Windows
+from ballu_mjx.windows import Windows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,9 +159,8 @@ def _in_windows(
 def _loss(
     features: Float[Array | np.ndarray, "windowsteps 27"], recorded: Float[Array | np.ndarray, "windowsteps 27"]
 ) -> Float[Array, ""]:
-    """Pseudo-Huber, of a whole window's error."""
-    squared = jnp.sum(windows.errors(features, recorded) ** 2)
-    return 2 * OUTLYING**2 * (jnp.sqrt(1 + squared / OUTLYING**2) - 1)
+    """Of a whole window's error."""
+    return windows.soften(jnp.sum(windows.errors(features, recorded) ** 2))
 
 
 def _updates(

@@ -93,6 +93,11 @@ def errors(
     return jnp.concatenate([position, angles], axis=1) / ((start + each_second * time) * np.sqrt(steps))
 
 
+def soften(squared: Any) -> Any:
+    """Pseudo-Huber loss of windows, by their errors' squared length: that itself below `OUTLYING`, linear above."""
+    return 2 * OUTLYING**2 * ((1 + squared / OUTLYING**2) ** 0.5 - 1)
+
+
 def spread(function: Callable[..., Any], shared: int) -> Callable[..., Any]:
     """`function`, compiled for batches and spread over the devices.
 
