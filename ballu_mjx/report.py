@@ -83,7 +83,7 @@ def _report(options: Options) -> None:
     print(f"Written to {path}, {path.stat().st_size / 1e6:.1f} MB.")
     if not content.takes:
         print(
-            "It has no replay in 3D: an identification has none, and an EnvMimic's is written by "
+            "It has no replay in 3D: identifications and robots other than BALLU have none, and an EnvMimic's is written by "
             "`python -m ballu_mjx.evaluate RUN --output RUN`."
         )
     elif options.video:
