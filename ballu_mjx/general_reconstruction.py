@@ -101,7 +101,7 @@ def _inverse_kinematics(
     """Generalized positions that fit the measurements, and the RMS distance (mm) that is left, by site."""
     misfit = _Misfit(model, robot, grid, parameters)
     qpos = misfit.first_guess()
-    found, information = np.zeros((len(grid.places), model.nq)), np.zeros((model.nv, model.nv))
+    found, information = np.zeros((len(grid.places), model.nq)), []
     for sample in range(len(found)):
         damping = 1e-6
         error, slope = misfit(qpos, sample), misfit.slope(sample)
@@ -118,8 +118,9 @@ def _inverse_kinematics(
                     break
             elif (damping := 10 * damping) > 1e6:
                 break
-        found[sample], information = qpos, information + slope.T @ slope
-    _check_seen(model, information, name)
+        found[sample] = qpos
+        information.append(slope.T @ slope)
+    _check_seen(model, np.array(information), name)
     distance = misfit.distance(found)
     worst = max(distance, key=lambda site: distance[site])
     if distance[worst] > 1e3 * _WORST_FIT:
@@ -203,11 +204,14 @@ class _Misfit:
         return Rotation.from_quat(self.data.xquat[self.body], scalar_first=True)
 
 
-def _check_seen(model: mujoco.MjModel, information: Float[np.ndarray, "nv nv"], name: str) -> None:
-    """**Raises** `InputError` naming the joint that the measurements of a whole recording leave open."""
+def _check_seen(model: mujoco.MjModel, information: Float[np.ndarray, "T nv nv"], name: str) -> None:
+    """**Raises** `InputError` naming the joint that most samples leave open, each taken alone."""
     values, vectors = np.linalg.eigh(information)
-    if values[0] < _UNSEEN * values[-1]:
-        joint = model.joint(int(model.dof_jntid[int(np.argmax(np.abs(vectors[:, 0])))])).name
+    seen = values[:, 0] / values[:, -1]
+    middle = int(np.argsort(seen)[len(seen) // 2])
+    if seen[middle] < _UNSEEN:
+        open_dof = np.argmax(np.abs(vectors[middle, :, 0]))
+        joint = model.joint(int(model.dof_jntid[open_dof])).name
         raise InputError(
             f'{name}: nothing that is measured shows the joint {joint}; add it to "joints" of the robot description '
             "and record it, or add a point that it moves."

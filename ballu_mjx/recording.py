@@ -260,7 +260,7 @@ class _Layout:
     """Columns by field, and which fields are what: those of BALLU, or of another robot's description."""
 
     columns: Mapping[str, tuple[str, ...]]
-    mandatory: Mapping[Kind, tuple[str, ...]]
+    mandatory: Mapping[str, tuple[str, ...]]
     positions: tuple[str, ...]
     angles: tuple[str, ...]
     points: tuple[str, ...] = ()

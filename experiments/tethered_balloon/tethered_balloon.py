@@ -1,13 +1,13 @@
 # %% [markdown]
 # # Another robot: a tethered balloon in wind
 #
-# Not a biped: a balloon on a tether of two rods, with two propellers. Its model (`balloon.xml`) knows no air. The "real"
-# one flies in wind, with the drag of MuJoCo's ellipsoid fluid model and gusts that come and go. From recordings of it,
-# in the project's format, the project's own command learns the forces that its simulator lacks; all that it is told of
-# the robot stands in `balloon.robot.json`. The table gives errors on recordings that training never saw.
+# Not a biped: a balloon on a tether of two rods, with two propellers. Its model (`balloon.xml`) knows no air. The
+# "real" one flies in wind, with the drag of MuJoCo's ellipsoid fluid model and gusts that come and go. From recordings
+# of it, in the project's format, the project's own command learns the forces that its simulator lacks; all that it is
+# told of the robot stands in `balloon.robot.json`. The table gives errors on recordings that training never saw.
 #
-# `python experiments/tethered_balloon/tethered_balloon.py` takes a few minutes a seed on two cores; `--quick` shows that
-# it works.
+# `python experiments/tethered_balloon/tethered_balloon.py` takes a few minutes a seed on two cores; `--quick` shows
+# that it works.
 
 # %%
 from __future__ import annotations
@@ -126,16 +126,19 @@ def record_all(description: RobotDescription, folder: Path, quick: bool) -> None
 # %% [markdown]
 # ## EnvMimic, by the command
 
-
 # %%
+FULL = ["--num-timesteps", "600000", "--validate-every", "150000"]
+QUICK = ["--num-timesteps", "20000", "--num-envs", "64", "--batch-size", "64"]
+
+
 def learn(recordings: Path, run: Path, seed: int, quick: bool) -> Evaluation:
     """Train, unless the run is there already; its evaluation on the test recordings."""
     if not (run / "evaluation.json").exists():
         command = [sys.executable, "-m", "ballu_mjx.train", "envmimic", "--robot-description", str(DESCRIPTION)]
         for option, use in (("recordings", "training"), ("validation", "validation"), ("test", "test")):
             command += [f"--{option}", str(recordings / use)]
-        sizes = ["--num-timesteps", "20000", "--num-envs", "64"] if quick else ["--num-timesteps", "600000", "--validate-every", "150000"]
-        subprocess.run([*command, "--seed", str(seed), "--output", str(run), *sizes], check=True)
+        command += QUICK if quick else FULL
+        subprocess.run([*command, "--seed", str(seed), "--output", str(run)], check=True)
     return evaluation.read(run / "evaluation.json")
 
 
@@ -163,7 +166,10 @@ def main() -> None:
     found = [learn(recordings, options.output / f"envmimic-{seed}", seed, options.quick) for seed in seeds]
 
     horizons = [h for h in evaluation.HORIZONS if any(h in each.position for each in found[0].vanilla)]
-    lines = ["| horizon (s) | vanilla: m, deg | EnvMimic: m, deg | ratio: position, yaw |", "| ---: | --- | --- | --- |"]
+    lines = [
+        "| horizon (s) | vanilla: m, deg | EnvMimic: m, deg | ratio: position, yaw |",
+        "| ---: | --- | --- | --- |",
+    ]
     curves: dict[str, list[list[float]]] = {"vanilla": [], "envmimic": []}
     for horizon in horizons:
         cells = []
