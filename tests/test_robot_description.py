@@ -177,7 +177,7 @@ def test_a_free_robot_is_recovered_wherever_it_is(tmp_path: Path):
     (tmp_path / "balloon.xml").write_text(text.replace(joints, '<freejoint name="root"/>'))
     shutil.copy(BALLOON / "balloon.robot.json", tmp_path)
     open_ended = robot_description.read(tmp_path / "balloon.robot.json")
-    in_json(joints=["bend_x", "bend_y"])(tmp_path / "balloon.robot.json")
+    in_json(joints=["bend_x", "bend_y", "swivel"])(tmp_path / "balloon.robot.json")
     found = robot_description.read(tmp_path / "balloon.robot.json")
     assert not found.anchored
     model = found.load_model()
@@ -194,7 +194,8 @@ def test_a_free_robot_is_recovered_wherever_it_is(tmp_path: Path):
     made = Recording(
         name="loose", kind="free", robot="loose", time=time, command=np.zeros((len(time), 2)),
         balloon_position=seen[:, 0], balloon_quaternion=np.array(turns), base_position=None, foot_position=None,
-        points={"knot": seen[:, 1]}, angles={"bend_x": 0.2 * np.sin(3 * time), "bend_y": np.full(len(time), 0.1)},
+        points={"knot": seen[:, 1]},
+        angles={"bend_x": 0.2 * np.sin(3 * time), "bend_y": np.full(len(time), 0.1), "swivel": 0.3 * time},
     )  # fmt: skip
     motion = reconstruct(made, model, found)
     np.testing.assert_allclose(motion.qvel[10, :3], [0.3, 0, 0], atol=0.02)
