@@ -27,6 +27,8 @@ _MAX_STEPS = 200
 """Levenberg-Marquardt steps: a handful, but for the first sample."""
 _CONVERGED = 1e-6
 """Step (rad or m) of no consequence."""
+_NO_GAIN = 1e-6
+"""Of the squared misfit: where measurements do not fit the model, steps shrink slowly."""
 _UNSEEN = 1e-9
 """Of the best seen direction's information: what a direction shows that no measurement sees."""
 
@@ -112,9 +114,10 @@ def _inverse_kinematics(
             moved = qpos.copy()
             mujoco.mj_integratePos(model, moved, step, 1.0)
             after = misfit(moved, sample)
-            if after @ after <= error @ error:
+            gain = error @ error - after @ after
+            if gain >= 0:
                 qpos, error, slope, damping = moved, after, misfit.slope(sample), max(damping / 10, 1e-12)
-                if np.max(np.abs(step)) < _CONVERGED:
+                if np.max(np.abs(step)) < _CONVERGED or gain < _NO_GAIN * (after @ after):
                     break
             elif (damping := 10 * damping) > 1e6:
                 break
