@@ -19,7 +19,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
-from ballu_mjx import envmimic, simulation, windows
+from ballu_mjx import envmimic, robot_description, simulation, windows
+from ballu_mjx import robot as ballu
 from ballu_mjx.envmimic import ForcePolicy
 from ballu_mjx.errors import InputError
 from ballu_mjx.forces import Applied
@@ -171,13 +172,13 @@ def _updates(
     config: AnalyticConfig,
 ) -> Callable[..., Any]:
     """Gradient steps on linearized windows, compiled."""
+    start_spread = envmimic.start_spread(ballu.load_model(), robot_description.ballu())
 
     def window_loss(
         params: Any, key: Array, linear: Linearized, about: Float[Array, "windowsteps 3"], window: Windows
     ) -> tuple[Array, Array]:
-        free = linear.state.shape[1]
         key_start, key_noise = jax.random.split(key)
-        first = config.start_noise * envmimic.start_spread(free // 2) * jax.random.normal(key_start, (free,))
+        first = config.start_noise * start_spread * jax.random.normal(key_start, start_spread.shape)
 
         def step(carry: tuple, inputs: tuple) -> tuple[tuple, tuple]:
             moved, history = carry

@@ -22,10 +22,11 @@ from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
 from ballu_mjx import robot as ballu
-from ballu_mjx import simulation
+from ballu_mjx import robot_description, simulation
 from ballu_mjx.errors import InputError
 from ballu_mjx.forces import Applied, Fields
 from ballu_mjx.reconstruction import Motion
+from ballu_mjx.robot_description import RobotDescription
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,24 +97,26 @@ class Reference(NamedTuple):
     qpos: Float[Array, "recordings states nq"]
     qvel: Float[Array, "recordings states nv"]
     features: Float[Array, "recordings states features"]
-    command: Float[Array, "recordings steps 2"]
+    command: Float[Array, "recordings steps commands"]
     steps: Int[Array, " recordings"]
     """Control steps of each recording."""
 
 
 HISTORY = 3
 """Control steps that the policy sees: the current one and the last two (paper)."""
-_FEATURES = 27
 
 
-def features(data: mjx.Data, sites: Int[np.ndarray, " 4"], bodies: Int[np.ndarray, " 4"]) -> Float[Array, " 27"]:
+def features(
+    data: mjx.Data, sites: Int[np.ndarray, " sites"], bodies: Int[np.ndarray, " sites"], root: int = 1
+) -> Float[Array, " features"]:
     """What motion capture sees of a state, in the world frame.
 
-    Balloon position, velocity and Euler angles (roll, pitch, yaw), base position and velocity, positions and
-    velocities of the left and right foot; m, m/s, rad. `data` must hold current `com_vel`.
+    Position, velocity and Euler angles (roll, pitch, yaw) of the tracked body (the balloon), position and velocity of
+    each point (base, left and right foot); m, m/s, rad. `sites`, of `bodies` below the body `root` of the world, begin
+    with the tracked one. `data` must hold current `com_vel`.
     """
     position = data.site_xpos[sites]
-    offset = position - data.subtree_com[1]
+    offset = position - data.subtree_com[root]
     # cvel is the spatial velocity (angular, linear) about the whole robot's centre of mass.
     velocity = data.cvel[bodies, 3:] + jnp.cross(data.cvel[bodies, :3], offset)
     euler = euler_angles(data.xquat[bodies[0]])
@@ -141,28 +144,35 @@ def heading_rotation(yaw: Float[Array, ""]) -> Float[Array, "3 3"]:
     return jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def observation(history: Float[Array, "steps 27"]) -> Float[Array, " observations"]:
+def world_rotation(yaw: Float[Array, ""], anchored: bool) -> Float[Array, "3 3"]:
+    """Rotation that takes vectors in the frame of observations and forces to the world: by heading, or none."""
+    return heading_rotation(jnp.zeros_like(yaw) if anchored else yaw)
+
+
+def observation(history: Float[Array, "steps features"], anchored: bool = False) -> Float[Array, " observations"]:
     """The policy's state, from the features of the last control steps (three in the paper; the current one last).
 
     The paper's state, made independent of place and heading: horizontal positions are taken from the current
     balloon's, and positions, velocities and yaw from its heading. A force that depends on where in the room the
-    robot stands would fit the recordings and nothing else. Heights stay absolute, for the floor is.
+    robot stands would fit the recordings and nothing else. Heights stay absolute, for the floor is. Of an anchored
+    robot everything is absolute: its place and heading are part of its physics.
     """
     now = history[-1]
-    origin = now[:3] * jnp.array([1.0, 1.0, 0.0])
-    to_heading = heading_rotation(now[8]).T
+    origin = now[:3] * jnp.array([0.0, 0.0, 0.0] if anchored else [1.0, 1.0, 0.0])
+    heading = jnp.zeros_like(now[8]) if anchored else now[8]
+    to_heading = heading_rotation(heading).T
 
-    def relative(frame: Float[Array, " 27"]) -> Array:
+    def relative(frame: Float[Array, " features"]) -> Array:
         vectors = jnp.concatenate([frame[:6], frame[9:]]).reshape(-1, 3)
-        is_position = jnp.tile(jnp.array([True, False]), 4)
+        is_position = jnp.tile(jnp.array([True, False]), len(vectors) // 2)
         vectors = jnp.where(is_position[:, None], vectors - origin, vectors) @ to_heading.T
-        return jnp.concatenate([vectors.ravel(), frame[6:8], wrap_angle(frame[8:9] - now[8])])
+        return jnp.concatenate([vectors.ravel(), frame[6:8], wrap_angle(frame[8:9] - heading)])
 
     return jax.vmap(relative)(history).ravel()
 
 
 def reward_terms(
-    seen: Float[Array, " 27"], target: Float[Array, " 27"], config: EnvMimicConfig
+    seen: Float[Array, " features"], target: Float[Array, " features"], config: EnvMimicConfig
 ) -> dict[str, Float[Array, ""]]:
     """The paper's `r_pos` and `r_orn` (`position`, `orientation`) for simulated and recorded features, and the weighted
     sum of these and of their sharper twins (`tracking`)."""
@@ -186,14 +196,17 @@ def reward_terms(
 class Simulator:
     """The MJX robot between control steps: states in, states and features out."""
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    def __init__(self, model: mujoco.MjModel, robot: RobotDescription | None = None) -> None:
+        """`robot` says what is what in `model`; None: it is BALLU."""
+        robot = robot or robot_description.ballu()
+        self.robot = robot
         self.nv = model.nv
         self.model = mjx.put_model(model)
         self._template = mjx.make_data(model)
-        self._balloon = simulation.balloon_id(model)
         self._count = simulation.substeps(model)
-        names = ("balloon", "base", "foot_left", "foot_right")
-        sites = [model.site(name).id for name in names]
+        sites = [model.site(name).id for name in (robot.tracked, *robot.points)]
+        self._tracked = int(model.site_bodyid[sites[0]])
+        self._root = int(model.body_rootid[self._tracked])
         self._sites = tuple(zip(sites, model.site_bodyid[sites].tolist(), strict=True))
         self._masses = jnp.asarray(model.body_mass / model.body_mass.sum())
 
@@ -204,61 +217,64 @@ class Simulator:
         other.model = ballu.with_fields(self.model, dict(fields))
         return other
 
-    def observe(self, state: simulation.State) -> tuple[Float[Array, " 27"], Float[Array, " 3"]]:
+    def observe(self, state: simulation.State) -> tuple[Float[Array, " features"], Float[Array, " 3"]]:
         """Features and centre of mass (m, world) of a state."""
-        return _observe(self.model, self._template, state, self._masses, self._sites)
+        return _observe(self.model, self._template, state, self._masses, self._sites, self._root)
 
     def observe_all(
         self, qpos: Float[Array, "... nq"], qvel: Float[Array, "... nv"]
-    ) -> tuple[Float[Array, "... 27"], Float[Array, "... 3"]]:
+    ) -> tuple[Float[Array, "... features"], Float[Array, "... 3"]]:
         """`observe`, of any number of states; one compiled program serves them all."""
         shape, count = qpos.shape[:-1], math.prod(qpos.shape[:-1])
         filled = np.arange(-(-count // _CHUNK) * _CHUNK) % count
         flat = simulation.at(qpos.reshape(count, -1), qvel.reshape(count, -1))
         chunks = [simulation.State(*(x[part] for x in flat)) for part in filled.reshape(-1, _CHUNK)]
-        pieces = [_observe_chunk(self.model, self._template, chunk, self._masses, self._sites) for chunk in chunks]
+        fixed = self._masses, self._sites, self._root
+        pieces = [_observe_chunk(self.model, self._template, chunk, *fixed) for chunk in chunks]
         features, com = (jnp.concatenate(parts)[:count] for parts in zip(*pieces, strict=True))
         return features.reshape(*shape, -1), com.reshape(*shape, -1)
 
     def step(
-        self, state: simulation.State, command: Float[Array, "*parts 2"], wrench: Float[Array, " 6"]
+        self, state: simulation.State, command: Float[Array, "*parts commands"], wrench: Float[Array, " 6"]
     ) -> simulation.State:
         """One control step under a command, or one for each of equal parts of it; see `simulation.control_step`."""
-        parts = command.reshape(-1, 2)
+        parts = command.reshape(-1, command.shape[-1])
         commands = jnp.repeat(parts, self._count // len(parts), axis=0)
         return simulation.control_step(
-            self.model, self._template, state, commands, wrench, balloon=self._balloon, count=self._count
+            self.model, self._template, state, commands, wrench, balloon=self._tracked, count=self._count
         )
 
 
-@functools.partial(jax.jit, static_argnames="sites")
+@functools.partial(jax.jit, static_argnames=("sites", "root"))
 def _observe(
     model: mjx.Model,
     template: mjx.Data,
     state: simulation.State,
     masses: Float[Array, " bodies"],
     sites: tuple[tuple[int, int], ...],
-) -> tuple[Float[Array, " 27"], Float[Array, " 3"]]:
+    root: int,
+) -> tuple[Float[Array, " features"], Float[Array, " 3"]]:
     """`Simulator.observe`; `masses` are shares of the whole, `sites` ids of sites and of their bodies."""
     data = simulation.load(template, state)
     data = mjx.com_vel(model, mjx.com_pos(model, mjx.kinematics(model, data)))
     site, body = np.array(sites).T
-    return features(data, site, body), masses @ data.xipos
+    return features(data, site, body, root), masses @ data.xipos
 
 
 _CHUNK = 1024
 """States that `Simulator.observe_all` looks at in one go."""
 
 
-@functools.partial(jax.jit, static_argnames="sites")
+@functools.partial(jax.jit, static_argnames=("sites", "root"))
 def _observe_chunk(
     model: mjx.Model,
     template: mjx.Data,
     states: simulation.State,
     masses: Float[Array, " bodies"],
     sites: tuple[tuple[int, int], ...],
-) -> tuple[Float[Array, "states 27"], Float[Array, "states 3"]]:
-    return jax.vmap(lambda state: _observe(model, template, state, masses, sites))(states)
+    root: int,
+) -> tuple[Float[Array, "states features"], Float[Array, "states 3"]]:
+    return jax.vmap(lambda state: _observe(model, template, state, masses, sites, root))(states)
 
 
 def stack(simulator: Simulator, motions: Sequence[Motion]) -> tuple[Reference, Float[Array, "recordings states 3"]]:
@@ -280,25 +296,31 @@ def stack(simulator: Simulator, motions: Sequence[Motion]) -> tuple[Reference, F
 
 
 def policy_input(
-    history: Float[Array, "3 27"], commands: Float[Array, "3 2"], config: EnvMimicConfig
+    history: Float[Array, "3 features"],
+    commands: Float[Array, "3 commands"],
+    config: EnvMimicConfig,
+    anchored: bool = False,
 ) -> Float[Array, " inputs"]:
     """`observation`, with the commands (the coming one last) where the configuration asks for them."""
-    seen = observation(history)
+    seen = observation(history, anchored)
     return jnp.concatenate([seen, commands.ravel()]) if config.observe_command else seen
 
 
-def input_size(config: EnvMimicConfig) -> int:
+def input_size(config: EnvMimicConfig, robot: RobotDescription) -> int:
     """Numbers in `policy_input`."""
-    return HISTORY * (_FEATURES + 2 * config.observe_command)
+    return HISTORY * (robot.features + len(robot.commands) * config.observe_command)
 
 
-def world_force(action: Float[Array, " 3"], yaw: Float[Array, ""], config: EnvMimicConfig) -> Float[Array, " 3"]:
+def world_force(
+    action: Float[Array, " 3"], yaw: Float[Array, ""], config: EnvMimicConfig, anchored: bool = False
+) -> Float[Array, " 3"]:
     """The force (N, world) that an action stands for, within the limit along each axis.
 
     Actions are in the balloon's heading frame, like the observation: the same situation met in another direction
-    calls for the same force, turned.
+    calls for the same force, turned. Those on an anchored robot are in the world's.
     """
-    return heading_rotation(yaw) @ jnp.clip(config.force_scale * action, -config.force_limit, config.force_limit)
+    force = jnp.clip(config.force_scale * action, -config.force_limit, config.force_limit)
+    return world_rotation(yaw, anchored) @ force
 
 
 @dataclasses.dataclass(frozen=True)
@@ -310,30 +332,34 @@ class ForcePolicy:
     - `config`: what the policy sees, and what its actions mean.
     - `infer`: (parameters, observation) to the most likely action.
     - `sample`: (parameters, observation, key) to a drawn one; None: there is none to be had.
+    - `anchored`: whether the robot is (`robot_description.RobotDescription`).
     """
 
     config: EnvMimicConfig
     infer: Callable[[Any, Float[Array, " inputs"]], Float[Array, " 3"]]
     sample: Callable[[Any, Float[Array, " inputs"], Array], Float[Array, " 3"]] | None = None
     name: str = "envmimic"
+    anchored: bool = False
 
-    def inputs(self, history: Float[Array, "steps 27"], commands: Float[Array, "steps 2"]) -> Float[Array, " inputs"]:
+    def inputs(
+        self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]
+    ) -> Float[Array, " inputs"]:
         """What the policy sees."""
-        return policy_input(history, commands, self.config)
+        return policy_input(history, commands, self.config, self.anchored)
 
     def fields(self, params: Any) -> Fields:
         """None: forces are all there is."""
         return {}
 
-    def command(self, params: Any, commands: Float[Array, "steps 2"]) -> Float[Array, "1 2"]:
+    def command(self, params: Any, commands: Float[Array, "steps commands"]) -> Float[Array, "1 commands"]:
         """The command as it is."""
         return commands[-1:]
 
     def wrench(
         self,
         params: Any,
-        history: Float[Array, "steps 27"],
-        commands: Float[Array, "steps 2"],
+        history: Float[Array, "steps features"],
+        commands: Float[Array, "steps commands"],
         key: Array | None = None,
     ) -> Float[Array, " 6"]:
         """The policy's force, without a torque."""
@@ -341,12 +367,12 @@ class ForcePolicy:
         if key is None or self.sample is None:
             force = self.force(params, seen, yaw)
         else:
-            force = world_force(self.sample(params, seen, key), yaw, self.config)
+            force = world_force(self.sample(params, seen, key), yaw, self.config, self.anchored)
         return jnp.concatenate([force, jnp.zeros(3)])
 
     def force(self, params: Any, seen: Float[Array, " inputs"], yaw: Float[Array, ""]) -> Float[Array, " 3"]:
         """The most likely force (N, world) for what the policy sees, at a heading."""
-        return world_force(self.infer(params, seen), yaw, self.config)
+        return world_force(self.infer(params, seen), yaw, self.config, self.anchored)
 
 
 class EnvMimicEnv(Env):
@@ -358,15 +384,20 @@ class EnvMimicEnv(Env):
         motions: Sequence[Motion],
         config: EnvMimicConfig,
         beside: Applied | None = None,
+        robot: RobotDescription | None = None,
     ) -> None:
-        """`beside` is a residual that the simulator has already: the policy learns what it leaves."""
+        """`beside` is a residual that the simulator has already: the policy learns what it leaves. `robot` says what
+        is what in `model`; None: it is BALLU."""
         self.config, self.beside = config, beside
-        self.simulator = Simulator(model)
+        self.simulator = Simulator(model, robot)
+        self.robot = self.simulator.robot
+        self._held = np.array([model.joint(name).dofadr[0] for name in self.robot.held], int)
+        self._spread_of_starts = start_spread(model, self.robot)
         if beside is not None:
             self.simulator = self.simulator.altered(beside.model.fields(beside.params))
         self.reference, _ = stack(self.simulator, motions)
         self.episode_length = round(config.episode_seconds / ballu.CONTROL_TIMESTEP)
-        self.recorded_inputs = recorded_inputs(self.reference, config)
+        self.recorded_inputs = recorded_inputs(self.reference, config, self.robot.anchored)
         self._spread = jnp.std(self.recorded_inputs, axis=0)
         shapes = jax.eval_shape(self.reset, jax.random.key(0)).obs
         self._observation_size = {name: shape.shape for name, shape in shapes.items()}
@@ -377,9 +408,8 @@ class EnvMimicEnv(Env):
         reference = self.reference
         recording = jax.random.randint(key_recording, (), 0, len(reference.steps))
         time = jax.random.randint(key_time, (), HISTORY - 1, reference.steps[recording])
-        qpos, qvel = _perturb(
-            key_noise, reference.qpos[recording, time], reference.qvel[recording, time], self.config.start_noise
-        )
+        qpos, qvel = reference.qpos[recording, time], reference.qvel[recording, time]
+        qpos, qvel = self._perturb(key_noise, qpos, qvel, self.config.start_noise)
         history = jax.lax.dynamic_slice_in_dim(reference.features[recording], time - HISTORY + 1, HISTORY)
         simulation_state = {
             "physics": simulation.at(qpos, qvel),
@@ -406,7 +436,7 @@ class EnvMimicEnv(Env):
         """Advance one control step under the recording's command and the policy's force."""
         s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
         recording, time = s["recording"], s["time"]
-        force = world_force(action, s["history"][-1, 8], self.config)
+        force = world_force(action, s["history"][-1, 8], self.config, self.robot.anchored)
         command, wrench = self.reference.command[recording, time], jnp.concatenate([force, jnp.zeros(3)])
         if self.beside is not None:
             model, params = self.beside
@@ -447,6 +477,28 @@ class EnvMimicEnv(Env):
             info=state.info | {"truncation": jnp.asarray(timed_out & finite, jnp.float32)},
         )
 
+    def _perturb(
+        self, key: Array, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], scale: float
+    ) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
+        """A state within the reconstruction's uncertainty of the recorded one."""
+        key_base, key_turn, key_hinge, key_velocity = jax.random.split(key, 4)
+        position, velocity = np.split(scale * self._spread_of_starts, 2)
+        free = 0 if self.robot.anchored else 6
+        nv = qvel.shape[0]
+        root = []
+        if free:
+            base = qpos[:3] + position[:3] * jax.random.normal(key_base, (3,))
+            turn = position[3:6] * jax.random.normal(key_turn, (3,))
+            # A small rotation in the body frame: q (1, turn / 2), normalized.
+            w, v = qpos[3], qpos[4:7]
+            quaternion = jnp.concatenate([(w - v @ turn / 2)[None], v + (w * turn + jnp.cross(v, turn)) / 2])
+            root = [base, quaternion / jnp.linalg.norm(quaternion)]
+        recorded = qpos[len(qpos) - nv + free :]
+        hinges = recorded + position[free:] * jax.random.normal(key_hinge, (nv - free,))
+        hinges = hinges.at[self._held - free].set(recorded[self._held - free])
+        qvel = qvel + velocity * jax.random.normal(key_velocity, qvel.shape)
+        return jnp.concatenate([*root, hinges]), qvel
+
     @property
     def observation_size(self) -> dict[str, tuple[int, ...]]:  # pyright: ignore[reportIncompatibleMethodOverride]
         return self._observation_size
@@ -467,59 +519,56 @@ class EnvMimicEnv(Env):
         """
         recording, time = s["recording"], s["time"]
         commands = commands_seen(self.reference.command[recording], time)
-        seen = policy_input(s["history"], commands, self.config)
+        seen = policy_input(s["history"], commands, self.config, self.robot.anchored)
         noise = self.config.observation_noise * self._spread * jax.random.normal(s["key"], seen.shape)
         critic = [seen]
         if self.config.critic_sees_error:
             error = self.reference.features[recording, time] - s["history"][-1]
-            to_heading = heading_rotation(s["history"][-1, 8]).T
+            to_heading = world_rotation(s["history"][-1, 8], self.robot.anchored).T
             critic += [to_heading @ error[:3], to_heading @ error[3:6], wrap_angle(error[6:9])]
         return {"state": seen + noise, "critic": jnp.concatenate([*critic, commands.ravel()])}
 
 
-def recorded_inputs(reference: Reference, config: EnvMimicConfig) -> Float[Array, "states inputs"]:
+def recorded_inputs(
+    reference: Reference, config: EnvMimicConfig, anchored: bool = False
+) -> Float[Array, "states inputs"]:
     """What the policy would see of every recorded state."""
 
     def inputs(recording: Array, time: Array) -> Array:
         history = jax.lax.dynamic_slice_in_dim(reference.features[recording], time - HISTORY + 1, HISTORY)
-        return policy_input(history, commands_seen(reference.command[recording], time), config)
+        return policy_input(history, commands_seen(reference.command[recording], time), config, anchored)
 
     steps = np.asarray(reference.steps)
     pairs = np.array([(r, k) for r, count in enumerate(steps) for k in range(HISTORY - 1, count)])
     return jax.jit(jax.vmap(inputs))(*jnp.array(pairs).T)
 
 
-def commands_seen(commands: Float[Array, "steps 2"], time: Int[Array, ""]) -> Float[Array, "3 2"]:
+def commands_seen(commands: Float[Array, "steps commands"], time: Int[Array, ""]) -> Float[Array, "3 commands"]:
     """The commands of the last two control steps and the coming one."""
     start = jnp.clip(time - HISTORY + 1, 0, commands.shape[0] - HISTORY)
     return jax.lax.dynamic_slice_in_dim(commands, start, HISTORY)
 
 
-def start_spread(nv: int) -> Float[np.ndarray, " directions"]:
+def start_spread(model: mujoco.MjModel, robot: RobotDescription) -> Float[np.ndarray, " directions"]:
     """What reconstruction leaves uncertain of a state, as standard deviations of positions and velocities along the
-    directions of `qvel`: 1 mm, 0.5 deg; 1 cm/s, 2 deg/s for the base and 5 deg/s for joints.
+    directions of `qvel`: 1 mm and 0.5 deg; 1 cm/s, and 2 deg/s for the base and 5 deg/s for joints.
 
-    Motors hardly vary: the cable makes a degree of theirs a push on the knee that no reconstruction error is.
+    Held joints (BALLU's motors) hardly vary: the cable makes a degree of theirs a push on the knee that no
+    reconstruction error is.
     """
     degree = np.pi / 180
-    position = np.concatenate([np.full(3, 1e-3), np.full(nv - 3, 0.5 * degree)])
-    position[6:][ballu.MOTORS] = 1e-3 * degree
-    return np.concatenate([position, np.full(3, 0.01), np.full(3, 2 * degree), np.full(nv - 6, 5 * degree)])
+    slides = np.concatenate([_DIRECTIONS[kind] for kind in model.jnt_type]) == _ALONG
+    position, velocity = np.where(slides, 1e-3, 0.5 * degree), np.where(slides, 0.01, 5 * degree)
+    if not robot.anchored:
+        velocity[3:6] = 2 * degree
+    position[[model.joint(name).dofadr[0] for name in robot.held]] = 1e-3 * degree
+    return np.concatenate([position, velocity])
 
 
-def _perturb(
-    key: Array, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], scale: float
-) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
-    """A state within the reconstruction's uncertainty of the recorded one."""
-    key_base, key_turn, key_hinge, key_velocity = jax.random.split(key, 4)
-    nv = qvel.shape[0]
-    position, velocity = np.split(scale * start_spread(nv), 2)
-    base = qpos[:3] + position[:3] * jax.random.normal(key_base, (3,))
-    turn = position[3:6] * jax.random.normal(key_turn, (3,))
-    # A small rotation in the body frame: q (1, turn / 2), normalized.
-    w, v = qpos[3], qpos[4:7]
-    quaternion = jnp.concatenate([(w - v @ turn / 2)[None], v + (w * turn + jnp.cross(v, turn)) / 2])
-    hinges = qpos[7:] + position[6:] * jax.random.normal(key_hinge, (nv - 6,))
-    hinges = hinges.at[ballu.MOTORS].set(qpos[7:][ballu.MOTORS])
-    qvel = qvel + velocity * jax.random.normal(key_velocity, qvel.shape)
-    return jnp.concatenate([base, quaternion / jnp.linalg.norm(quaternion), hinges]), qvel
+_ALONG, _ABOUT = 0, 1
+_DIRECTIONS = {
+    int(mujoco.mjtJoint.mjJNT_FREE): [_ALONG] * 3 + [_ABOUT] * 3,
+    int(mujoco.mjtJoint.mjJNT_SLIDE): [_ALONG],
+    int(mujoco.mjtJoint.mjJNT_HINGE): [_ABOUT],
+}
+"""What the velocities of a joint are, by its type."""

@@ -54,16 +54,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _evaluate(options: Options) -> None:
-    from ballu_mjx import evaluation, residual, robot, runs
-    from ballu_mjx.reconstruction import reconstruct
+    from ballu_mjx import evaluation, residual, runs
+    from ballu_mjx.general_reconstruction import reconstruct
     from ballu_mjx.recording import read_recording
     from ballu_mjx.recording import recordings as expand
 
     config = runs.read_config(options.run, *residual.TASKS)
     which = "last" if options.last else "best"
-    loaded = residual.Residual.load(options.run, which)
+    robot = runs.robot_description(config, options.run)
+    loaded = residual.Residual.load(options.run, which, description=robot)
     paths = expand(options.recordings) or runs.find_recordings(config, "test", options.run)
-    recordings = [read_recording(path) for path in paths]
+    recordings = [read_recording(path, robot) for path in paths]
     for path, recording in zip(paths, recordings, strict=True):
         check_recording(path, recording, long_enough=True)
     if options.output is not None:
@@ -74,9 +75,9 @@ def _evaluate(options: Options) -> None:
         print(f"The {which} checkpoint of {options.run}: step {loaded.step:,}.", flush=True)
     print("Compiling: half a minute the first time ...", flush=True)
     model = robot.load_model(loaded.actuators)
-    motions = [reconstruct(recording, model) for recording in recordings]
+    motions = [reconstruct(recording, model, robot) for recording in recordings]
     base = evaluation.base_name(loaded.actuators is not None)
-    evaluator = evaluation.OpenLoopEvaluator(model, motions, loaded.model, base)
+    evaluator = evaluation.OpenLoopEvaluator(model, motions, loaded.model, base, robot)
     result = evaluator(loaded.params) if options.output is None else report(evaluator, loaded.params, options.output)
     print(result.table())
 
@@ -104,7 +105,8 @@ def load_params(folder: Path, which: Literal["best", "last"]) -> tuple[int, Para
 
 
 def report(evaluator: OpenLoopEvaluator, params: Any, folder: Path) -> Evaluation:
-    """Evaluate, and write `evaluation.txt`, `evaluation.json`, `tracking.png` and `replay.npz` into `folder`."""
+    """Evaluate, and write `evaluation.txt`, `evaluation.json`, `tracking.png` and, of BALLU, which alone can be drawn,
+    `replay.npz` into `folder`."""
     from ballu_mjx.evaluation import Evaluation
 
     names = evaluator.base, evaluator.name
@@ -113,7 +115,8 @@ def report(evaluator: OpenLoopEvaluator, params: Any, folder: Path) -> Evaluatio
     files.write(folder / "evaluation.txt", result.table() + "\n")
     files.write(folder / "evaluation.json", json.dumps(result.to_json(), indent=2) + "\n")
     tracking(evaluator, replays, folder / "tracking.png")
-    replay.write(folder / replay.NAME, takes(evaluator, replays))
+    if evaluator.robot.is_ballu:
+        replay.write(folder / replay.NAME, takes(evaluator, replays))
     return result
 
 

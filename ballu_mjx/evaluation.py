@@ -23,6 +23,7 @@ from ballu_mjx import robot as ballu
 from ballu_mjx.errors import InputError, is_number
 from ballu_mjx.forces import ForceModel
 from ballu_mjx.reconstruction import Motion
+from ballu_mjx.robot_description import RobotDescription
 
 HORIZONS = (1.0, 2.0, 5.0, 10.0, 20.0)
 """Seconds over which errors are taken."""
@@ -31,6 +32,8 @@ START_INTERVAL = 1.0
 SCORE_HORIZONS = (5.0, 10.0)
 """Horizons (s) that the validation score looks at."""
 _BALLOON_YAW = 8
+_LEAST = 1e-5
+"""m or deg: an error below is that of single precision."""
 
 
 class Replay(NamedTuple):
@@ -98,10 +101,10 @@ class Evaluation:
         return tuple(dict.fromkeys(errors.group for errors in self.vanilla))
 
     def ratio(self, group: str, quantity: str, horizon: float) -> float:
-        """Error with the residual over error without, each averaged over the group's recordings."""
-        return _group_mean(self.residual, group, quantity, horizon) / _group_mean(
-            self.vanilla, group, quantity, horizon
-        )
+        """Error with the residual over error without, each averaged over the group's recordings; 1 where there is none
+        either way, as of the yaw of a robot that cannot turn."""
+        with_it, without = (_group_mean(e, group, quantity, horizon) for e in (self.residual, self.vanilla))
+        return max(with_it, _LEAST) / max(without, _LEAST)
 
     @property
     def score(self) -> float:
@@ -203,8 +206,8 @@ class Evaluation:
             found = {float(horizon[:8]): (number(mean), number(spread)) for horizon, (mean, spread) in values.items()}
             if not all(horizon in HORIZONS for horizon in found):
                 raise ValueError(f"errors are taken over {HORIZONS} s, not {reprlib.repr(list(found))}")
-            if not all(1e-9 < error < 1e9 and spread >= 0 for error, spread in found.values()):
-                raise ValueError("errors are greater than 0, their spreads 0 or more")
+            if not all(0 <= error < 1e9 and spread >= 0 for error, spread in found.values()):
+                raise ValueError("errors and their spreads are 0 or more")
             return found
 
         def errors(row: Any) -> Errors:
@@ -250,12 +253,19 @@ class OpenLoopEvaluator:
     """Replays a set of recordings; compiles once, for any parameters of the residual."""
 
     def __init__(
-        self, model: mujoco.MjModel, motions: Sequence[Motion], residual: ForceModel, base: str = "vanilla"
+        self,
+        model: mujoco.MjModel,
+        motions: Sequence[Motion],
+        residual: ForceModel,
+        base: str = "vanilla",
+        robot: RobotDescription | None = None,
     ) -> None:
-        """`base` is what `model`, the simulator without the residual, is called."""
+        """`base` is what `model`, the simulator without the residual, is called; `robot` says what is what in it (None:
+        it is BALLU)."""
         self.base, self.name = base, residual.name
         self.motions = tuple(motions)
-        self._simulator = envmimic.Simulator(model)
+        self._simulator = envmimic.Simulator(model, robot)
+        self.robot = self._simulator.robot
         self._reference, com = envmimic.stack(self._simulator, motions)
         self._recorded_com = np.asarray(com)
         self._recorded = np.asarray(self._reference.features)

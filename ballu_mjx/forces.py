@@ -1,4 +1,5 @@
-"""What a residual is: model fields and commands that it changes, and a wrench on the balloon, held over a control step.
+"""What a residual is: model fields and commands that it changes, and a wrench on the tracked body (the balloon), held
+over a control step.
 
 Everything that simulates takes residuals by this one interface, whatever they were learned by.
 """
@@ -27,7 +28,9 @@ class ForceModel(Protocol):
         """What a simulator improved by it is called."""
         ...
 
-    def inputs(self, history: Float[Array, "steps 27"], commands: Float[Array, "steps 2"]) -> Float[Array, " inputs"]:
+    def inputs(
+        self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]
+    ) -> Float[Array, " inputs"]:
         """What it sees, independent of place and heading."""
         ...
 
@@ -35,19 +38,19 @@ class ForceModel(Protocol):
         """Model fields to simulate with instead of the model's own."""
         ...
 
-    def command(self, params: Any, commands: Float[Array, "steps 2"]) -> Float[Array, "parts 2"]:
-        """What the servos get over equal parts of the coming control step; a number of them that divides its physics
+    def command(self, params: Any, commands: Float[Array, "steps commands"]) -> Float[Array, "parts commands"]:
+        """What the actuators get over equal parts of the coming control step; a number of them that divides its physics
         steps."""
         ...
 
     def wrench(
         self,
         params: Any,
-        history: Float[Array, "steps 27"],
-        commands: Float[Array, "steps 2"],
+        history: Float[Array, "steps features"],
+        commands: Float[Array, "steps commands"],
         key: Array | None = None,
     ) -> Float[Array, " 6"]:
-        """Force (N) and torque (N m), world frame, at the balloon's centre of mass over the coming control step.
+        """Force (N) and torque (N m), world frame, at the tracked body's centre of mass over the coming control step.
 
         With `key`, drawn from the model's distribution, where it has one; without, the most likely.
         """
@@ -71,7 +74,9 @@ class Sum:
     def name(self) -> str:
         return "+".join(part.name for part in self.parts)
 
-    def inputs(self, history: Float[Array, "steps 27"], commands: Float[Array, "steps 2"]) -> Float[Array, " inputs"]:
+    def inputs(
+        self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]
+    ) -> Float[Array, " inputs"]:
         return self.parts[1].inputs(history, commands)
 
     def fields(self, params: Any) -> Fields:
@@ -81,15 +86,15 @@ class Sum:
             raise ValueError(f"Both residuals change {', '.join(shared)}.")
         return first | second
 
-    def command(self, params: Any, commands: Float[Array, "steps 2"]) -> Float[Array, "parts 2"]:
+    def command(self, params: Any, commands: Float[Array, "steps commands"]) -> Float[Array, "parts commands"]:
         changes = [part.command(own, commands) - commands[-1] for part, own in zip(self.parts, params, strict=True)]
         return commands[-1] + sum(changes)
 
     def wrench(
         self,
         params: Any,
-        history: Float[Array, "steps 27"],
-        commands: Float[Array, "steps 2"],
+        history: Float[Array, "steps features"],
+        commands: Float[Array, "steps commands"],
         key: Array | None = None,
     ) -> Float[Array, " 6"]:
         both = [part.wrench(own, history, commands, key) for part, own in zip(self.parts, params, strict=True)]

@@ -89,8 +89,8 @@ class Motion:
     """The recording's."""
     time: Float[np.ndarray, " states"]
     """s, from 0 in steps of `CONTROL_TIMESTEP`; one more entry than commands."""
-    command: Float[np.ndarray, "steps 2"]
-    """Mean over each control step of the held command (left, right), in [0, 1]."""
+    command: Float[np.ndarray, "steps commands"]
+    """Mean over each control step of the held commands, (left, right) for BALLU, in [0, 1]."""
     qpos: Float[np.ndarray, "states nq"]
     """MuJoCo's generalized positions (m, unit quaternion w x y z, rad)."""
     qvel: Float[np.ndarray, "states nv"]
@@ -147,7 +147,7 @@ def reconstruct(
     return Motion(
         name=recording.name,
         time=edges,
-        command=_mean_command(recording, edges),
+        command=mean_command(recording, edges),
         qpos=qpos[states],
         qvel=qvel[states],
         residual_mm=_residuals(skeleton, grid, fitted),
@@ -189,14 +189,7 @@ def _resample(recording: Recording) -> _Grid:
     ):
         raise ValueError(f"{recording.name}: a suspended recording has no walk to reconstruct; give a free one.")
     time = recording.time - recording.time[0]
-    control_steps = int(np.floor(time[-1] / CONTROL_TIMESTEP + 1e-6))
-    if control_steps < 2:
-        raise ValueError(
-            f"{recording.name}: {time[-1]:.3f} s is too short; at least {2 * CONTROL_TIMESTEP} s are needed."
-        )
-    per_step = max(2, round(CONTROL_TIMESTEP / float(np.median(np.diff(time)))))
-    step = CONTROL_TIMESTEP / per_step
-    grid = np.arange(control_steps * per_step + 1) * step
+    per_step, grid = control_grid(recording)
 
     def linear(values: np.ndarray) -> np.ndarray:
         columns = [np.interp(grid, time, column) for column in values.reshape(len(time), -1).T]
@@ -206,9 +199,9 @@ def _resample(recording: Recording) -> _Grid:
         values = linear(values)
         return values / np.linalg.norm(values, axis=-1, keepdims=True)
 
-    command = _mean_command(recording, grid)
+    command = mean_command(recording, grid)
     return _Grid(
-        step=step,
+        step=CONTROL_TIMESTEP / per_step,
         samples_per_step=per_step,
         command=np.concatenate([command, command[-1:]]),
         balloon_position=linear(balloon_position),
@@ -221,11 +214,26 @@ def _resample(recording: Recording) -> _Grid:
     )
 
 
-def _mean_command(recording: Recording, edges: Float[np.ndarray, " edges"]) -> Float[np.ndarray, "intervals 2"]:
+def control_grid(recording: Recording) -> tuple[int, Float[np.ndarray, " T"]]:
+    """Uniform times (s from the recording's start) at about its own rate, and how many of them make a control step.
+
+    **Raises** `ValueError` for a recording of less than two control steps.
+    """
+    time = recording.time - recording.time[0]
+    control_steps = int(np.floor(time[-1] / CONTROL_TIMESTEP + 1e-6))
+    if control_steps < 2:
+        raise ValueError(
+            f"{recording.name}: {time[-1]:.3f} s is too short; at least {2 * CONTROL_TIMESTEP} s are needed."
+        )
+    per_step = max(2, round(CONTROL_TIMESTEP / float(np.median(np.diff(time)))))
+    return per_step, np.arange(control_steps * per_step + 1) * (CONTROL_TIMESTEP / per_step)
+
+
+def mean_command(recording: Recording, edges: Float[np.ndarray, " edges"]) -> Float[np.ndarray, "intervals commands"]:
     """Mean of the held commands between neighbouring `edges` (s from the recording's start)."""
     time = recording.time - recording.time[0]
     integral = np.cumsum(np.diff(time)[:, None] * recording.command[:-1], axis=0)
-    integral = np.concatenate([np.zeros((1, 2)), integral])
+    integral = np.concatenate([np.zeros((1, integral.shape[1])), integral])
     at_edges = np.stack([np.interp(edges, time, column) for column in integral.T], axis=-1)
     return np.clip(np.diff(at_edges, axis=0) / np.diff(edges)[:, None], 0.0, 1.0)
 
@@ -479,7 +487,7 @@ def _base_pitch(
     armature, damping = model.dof_armature[dofs], model.dof_damping[dofs]
 
     def smooth(values: np.ndarray, width: float, derivative: int) -> np.ndarray:
-        return _filter(values, width, step, parameters.order, derivative)
+        return savitzky_golay(values, width, step, parameters.order, derivative)
 
     gravity = model.opt.gravity
     lifted = gravity * (1.0 - model.body_gravcomp[balloon])
@@ -575,7 +583,7 @@ def _window(width: float, step: float, order: int, count: int) -> int:
     return max(order + 1 + order % 2, min(2 * round((width / step - 1) / 2) + 1, (count - 1) // 2 * 2 + 1))
 
 
-def _filter(values: np.ndarray, width: float, step: float, order: int, derivative: int) -> np.ndarray:
+def savitzky_golay(values: np.ndarray, width: float, step: float, order: int, derivative: int) -> np.ndarray:
     """Savitzky-Golay smoothing (or a derivative) along the first axis; centred, so that nothing lags."""
     window = _window(width, step, order, len(values))
     return np.asarray(savgol_filter(values, window, order, deriv=derivative, delta=step, axis=0))
@@ -592,7 +600,7 @@ def _differentiate(
 
     def smooth(values: np.ndarray, width: float, rate_width: float) -> _Smoothing:
         order = parameters.order
-        return _filter(values, width, step, order, 0), _filter(values, rate_width, step, order, 1)
+        return savitzky_golay(values, width, step, order, 0), savitzky_golay(values, rate_width, step, order, 1)
 
     narrow, wide, rotation = parameters.position_window, parameters.rate_window, parameters.rotation_window
     hinges = qpos[:, 7:]
@@ -601,10 +609,7 @@ def _differentiate(
     balloon = (base * Rotation.from_rotvec(np.outer(hinges[:, 0], y))).as_quat(scalar_first=True)
 
     position, linear = smooth(qpos[:, :3], narrow, wide)
-    # Components of a quaternion are as smooth as the motion; the norm is restored after, and drops out of the rate.
-    quaternion, rate = smooth(_sign_continuous(balloon), rotation, rotation)
-    w, v, w_rate, v_rate = quaternion[:, :1], quaternion[:, 1:], rate[:, :1], rate[:, 1:]
-    angular = 2 * (w * v_rate - w_rate * v - np.cross(v, v_rate)) / np.sum(quaternion**2, axis=1, keepdims=True)
+    quaternion, angular = smooth_rotation(sign_continuous(balloon), rotation, step, parameters.order)
 
     to_balloon = hinges.copy()
     to_balloon[:, HIPS] -= hinges[:, :1]
@@ -616,12 +621,25 @@ def _differentiate(
     base_quaternion = (Rotation.from_quat(quaternion, scalar_first=True) * back).as_quat(scalar_first=True)
     base_angular = back.inv().apply(angular) - rates[:, :1] * y
     return (
-        np.concatenate([position, _sign_continuous(base_quaternion), angles], axis=1),
+        np.concatenate([position, sign_continuous(base_quaternion), angles], axis=1),
         np.concatenate([linear, base_angular, rates], axis=1),
     )
 
 
-def _sign_continuous(quaternion: Float[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 4"]:
+def smooth_rotation(
+    quaternion: Float[np.ndarray, "T 4"], width: float, step: float, order: int
+) -> tuple[Float[np.ndarray, "T 4"], Float[np.ndarray, "T 3"]]:
+    """Smoothed quaternions, not of unit length, and the angular velocity (rad/s) in the body's frame."""
+    # Components of a quaternion are as smooth as the motion; the norm is restored after, and drops out of the rate.
+    rate = savitzky_golay(quaternion, width, step, order, 1)
+    quaternion = savitzky_golay(quaternion, width, step, order, 0)
+    w, v, w_rate, v_rate = quaternion[:, :1], quaternion[:, 1:], rate[:, :1], rate[:, 1:]
+    angular = 2 * (w * v_rate - w_rate * v - np.cross(v, v_rate)) / np.sum(quaternion**2, axis=1, keepdims=True)
+    return quaternion, angular
+
+
+def sign_continuous(quaternion: Float[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 4"]:
+    """The same orientations without jumps to the opposite sign."""
     flips = np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0
     return quaternion * np.concatenate([[1.0], np.cumprod(np.where(flips, -1.0, 1.0))])[:, None]
 

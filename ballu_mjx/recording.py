@@ -10,6 +10,9 @@ the floor at 0, x forward and y left at the start. Columns, in any order:
 - `foot_left_x` ... `foot_right_z`: centres of the foot spheres;
 - optionally `motor_left`, `motor_right`, `knee_left`, `knee_right` (rad).
 
+Other robots (`robot_description.py`) have a command for each of theirs, the tracked site instead of the balloon's,
+their points instead of base and feet, and angles of joints by the joint's name.
+
 An empty cell is a missing sample. The JSON holds `format`, `kind` ("free", or "suspended": feet off the ground, where
 motor and knee are mandatory and balloon, base and feet optional), `robot` and `notes`; further keys are the user's own.
 """
@@ -34,6 +37,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ballu_mjx import files, robot
 from ballu_mjx.errors import InputError
+from ballu_mjx.robot_description import RobotDescription
 
 FORMAT = "ballu-recording/1"
 
@@ -57,7 +61,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "motor": tuple(f"motor_{side}" for side in robot.SIDES),
     "knee": tuple(f"knee_{side}" for side in robot.SIDES),
 }
-"""Columns of the CSV by field of `Recording`, in the order in which they are written."""
+"""Columns of BALLU's recordings by field of `Recording`, in the order in which they are written."""
 
 _POSITIONS = ("balloon_position", "base_position", "foot_position")
 _QUATERNIONS = ("balloon_quaternion", "base_quaternion")
@@ -86,6 +90,9 @@ _Column = Float[np.ndarray, " T"]
 class Recording:
     """One recording, T samples. World frame, SI units, radians; pairs are (left, right).
 
+    Of robots that are not built like BALLU, base, feet, motors and knees are None: their parts stand in `points` and
+    `angles`.
+
     `read_recording` promises: time strictly increasing, no missing values, quaternions of unit length and continuous
     in sign. A recording that is to be written may hold NaN for missing samples.
     """
@@ -97,10 +104,10 @@ class Recording:
     notes: str = ""
     time: Float[np.ndarray, " T"]
     """s, from any origin."""
-    command: Float[np.ndarray, "T 2"]
+    command: Float[np.ndarray, "T commands"]
     """In [0, 1], held until the next sample."""
     balloon_position: Float[np.ndarray, "T 3"] | None
-    """m, the model's site `balloon`. None only in suspended recordings, as are base and feet."""
+    """m, the model's site `balloon` (the tracked one). None only in suspended recordings, as are base and feet."""
     balloon_quaternion: Float[np.ndarray, "T 4"] | None
     """w, x, y, z: the balloon's frame in the world."""
     base_position: Float[np.ndarray, "T 3"] | None
@@ -113,14 +120,20 @@ class Recording:
     """rad."""
     knee: Float[np.ndarray, "T 2"] | None = None
     """rad."""
+    points: Mapping[str, Float[np.ndarray, "T 3"]] = dataclasses.field(default_factory=dict)
+    """m, by site."""
+    angles: Mapping[str, Float[np.ndarray, " T"]] = dataclasses.field(default_factory=dict)
+    """rad (hinges) or m (slides), by joint."""
     interpolated: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """Samples filled in, by column; columns without any are left out."""
     trimmed: tuple[int, int] = (0, 0)
     """Rows cut off the file's start and end, where some column has a gap with a sample on one side only."""
 
 
-def read_recording(path: Path | str) -> Recording:
+def read_recording(path: Path | str, robot: RobotDescription | None = None) -> Recording:
     """Read, validate and fill in the recording at `path`, a `.csv` or `.csv.gz` with its `.json` beside it.
+
+    `robot` is whose it is; None: BALLU's.
 
     Gaps of up to 0.5 s are interpolated, linearly or, for orientations, along the shortest rotation.
 
@@ -129,13 +142,16 @@ def read_recording(path: Path | str) -> Recording:
     """
     path = Path(path)
     description = description_path(path)
-    columns = _read_columns(path)
+    layout = _layout(robot)
+    columns = _read_columns(path, layout)
     kind, made_by, notes = _read_description(description)
-    groups = _present_groups(path, columns, kind)
+    if robot is not None and not robot.is_ballu and kind != "free":
+        _refuse(description, f'"kind" is "{kind}"', f'it must be "free" for {robot.name}: only BALLU is suspended')
+    groups = _present_groups(path, columns, layout, kind)
     _check_time(path, columns["time"])
-    _check_cells(path, columns, kind)
-    first, last = _check_gaps(path, columns, groups, kind)
-    fields, interpolated = _fill(columns, groups, slice(first, last + 1))
+    _check_cells(path, columns, layout, kind)
+    first, last = _check_gaps(path, columns, groups, layout, kind)
+    fields, interpolated = _fill(columns, layout, groups, slice(first, last + 1))
     rows = len(columns["time"])
     recording = Recording(
         name=name_of(path),
@@ -151,19 +167,24 @@ def read_recording(path: Path | str) -> Recording:
         foot_position=fields["foot_position"].reshape(-1, 2, 3) if "foot_position" in fields else None,
         motor=fields.get("motor"),
         knee=fields.get("knee"),
+        points={name: fields[_POINT + name] for name in layout.points},
+        angles={name: fields[_ANGLE + name][:, 0] for name in layout.joints if _ANGLE + name in fields},
         interpolated=interpolated,
         trimmed=(first, rows - 1 - last),
     )
-    if kind == "free":
+    if kind == "free" and layout.columns is COLUMNS:
         _check_frame(path, recording)
     return recording
 
 
-def write_recording(recording: Recording, path: Path | str, *, decimals: int = 5) -> None:
+def write_recording(
+    recording: Recording, path: Path | str, robot: RobotDescription | None = None, *, decimals: int = 5
+) -> None:
     """Write `recording` to `path` (`.csv`, or `.csv.gz`: compressed) and its description to the `.json` beside it.
 
     Positions and angles get `decimals`, quaternions one fewer, commands 4, time 3 to 6, as it needs; NaN becomes an
     empty cell. The same recording always gives the same bytes (compressed ones: with the same zlib).
+    `robot` is whose it is; None: BALLU's.
 
     **Raises** `ValueError` for infinite values or shapes that do not fit; `InputError` for another ending of `path`.
     """
@@ -172,8 +193,8 @@ def write_recording(recording: Recording, path: Path | str, *, decimals: int = 5
     length = len(recording.time)
     header: list[str] = []
     cells: list[list[str]] = []
-    for field, names in COLUMNS.items():
-        value = getattr(recording, field)
+    for field, names in _layout(robot).columns.items():
+        value = _value(recording, field)
         if value is None:
             continue
         value = np.asarray(value, float).reshape(length, len(names))
@@ -226,6 +247,50 @@ def recordings(paths: Iterable[Path | str]) -> list[Path]:
 def bundled(split: Split) -> list[Path]:
     """The recordings that come with the package, sorted by name."""
     return recordings([robot.assets() / "recordings" / split])
+
+
+# ---- robots ----
+
+_POINT, _ANGLE = "point ", "angle "
+"""What the fields of other robots' points and joints begin with."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Layout:
+    """Columns by field, and which fields are what: those of BALLU, or of another robot's description."""
+
+    columns: Mapping[str, tuple[str, ...]]
+    mandatory: Mapping[str, tuple[str, ...]]
+    positions: tuple[str, ...]
+    angles: tuple[str, ...]
+    points: tuple[str, ...] = ()
+    joints: tuple[str, ...] = ()
+
+
+def _layout(robot: RobotDescription | None) -> _Layout:
+    if robot is None or robot.is_ballu:
+        return _Layout(COLUMNS, _MANDATORY, _POSITIONS, _ANGLES)
+    columns = {
+        "time": ("time",),
+        "command": tuple(f"command_{name}" for name in robot.commands),
+        "balloon_position": tuple(f"{robot.tracked}_{axis}" for axis in "xyz"),
+        "balloon_quaternion": tuple(f"{robot.tracked}_q{axis}" for axis in "wxyz"),
+    }
+    columns |= {_POINT + name: tuple(f"{name}_{axis}" for axis in "xyz") for name in robot.points}
+    mandatory = {"free": tuple(columns)}
+    columns |= {_ANGLE + name: (name,) for name in robot.joints}
+    positions = ("balloon_position", *(_POINT + name for name in robot.points))
+    return _Layout(
+        columns, mandatory, positions, tuple(_ANGLE + name for name in robot.joints), robot.points, robot.joints
+    )
+
+
+def _value(recording: Recording, field: str) -> np.ndarray | None:
+    if field.startswith(_POINT):
+        return recording.points[field.removeprefix(_POINT)]
+    if field.startswith(_ANGLE):
+        return recording.angles.get(field.removeprefix(_ANGLE))
+    return getattr(recording, field)
 
 
 # ---- files ----
@@ -283,7 +348,7 @@ def _quote(keys: dict, key: str) -> str:
     return text if len(text) <= 40 else text[:40] + "..."
 
 
-def _read_columns(path: Path) -> dict[str, _Column]:
+def _read_columns(path: Path, layout: _Layout) -> dict[str, _Column]:
     """The CSV's columns by name, missing samples as NaN."""
     text = files.read_text(path)
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
@@ -293,7 +358,7 @@ def _read_columns(path: Path) -> dict[str, _Column]:
     try:
         for cells in reader:
             if header is None:
-                header = _check_header(path, [name.strip() for name in cells])
+                header = _check_header(path, layout, [name.strip() for name in cells])
                 continue
             if not any(map(str.strip, cells)):
                 blank += 1  # Blank lines at the end are no fault; one further up lacks its time.
@@ -313,8 +378,8 @@ def _read_columns(path: Path) -> dict[str, _Column]:
     return {name: table[:, i] for i, name in enumerate(header)}
 
 
-def _check_header(path: Path, header: list[str]) -> list[str]:
-    known = [name for names in COLUMNS.values() for name in names]
+def _check_header(path: Path, layout: _Layout, header: list[str]) -> list[str]:
+    known = [name for names in layout.columns.values() for name in names]
     if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
         _refuse(path, "the header has no commas", "save it with commas between cells and points in numbers", row=-1)
     for i, name in enumerate(header):
@@ -369,14 +434,14 @@ def _time_decimals(time: np.ndarray) -> int:
 # ---- validation ----
 
 
-def _present_groups(path: Path, columns: dict[str, _Column], kind: Kind) -> list[str]:
+def _present_groups(path: Path, columns: dict[str, _Column], layout: _Layout, kind: Kind) -> list[str]:
     """Fields of `Recording` that the file holds, each with all its columns."""
     present = []
-    for field, names in COLUMNS.items():
+    for field, names in layout.columns.items():
         missing = [name for name in names if name not in columns]
         if not missing:
             present.append(field)
-        elif field in _MANDATORY[kind]:
+        elif field in layout.mandatory[kind]:
             _refuse(path, f"the column is missing, and {kind} recordings need it", "add it", column=missing[0], row=-1)
         elif len(missing) < len(names):
             others = ", ".join(name for name in names if name in columns)
@@ -404,7 +469,7 @@ def _check_time(path: Path, time: _Column) -> None:
         _refuse(path, problem, "record longer or leave it out", column="time", row=len(time) - 1)
 
 
-def _check_cells(path: Path, columns: dict[str, _Column], kind: Kind) -> None:
+def _check_cells(path: Path, columns: dict[str, _Column], layout: _Layout, kind: Kind) -> None:
     """Ranges, steps and lengths that only wrong units or a wrong order explain. NaN passes."""
 
     def check(name: str, bad: np.ndarray, problem: str, mend: str) -> None:
@@ -413,25 +478,28 @@ def _check_cells(path: Path, columns: dict[str, _Column], kind: Kind) -> None:
             _refuse(path, f"{columns[name][row]:g} {problem}", mend, column=name, row=row)
 
     def held(fields: Iterable[str]) -> list[str]:
-        return [name for field in fields for name in COLUMNS[field] if name in columns]
+        return [name for field in fields for name in layout.columns.get(field, ()) if name in columns]
 
-    for name in COLUMNS["command"]:
+    for name in layout.columns["command"]:
         value = columns[name]
         row = _first(np.isnan(value))
         if row is not None:
             _refuse(path, "the command is missing", "fill in what was being sent", column=name, row=row)
-        check(name, (value < 0) | (value > 1), "is outside 0 to 1", "scale the commands to 0 for rest and 1 for 90 deg")
-    for name in held(_ANGLES):
+        most = "90 deg" if layout.columns is COLUMNS else "the most"
+        check(
+            name, (value < 0) | (value > 1), "is outside 0 to 1", f"scale the commands to 0 for rest and 1 for {most}"
+        )
+    for name in held(layout.angles):
         mend = "convert degrees to radians"
         check(name, np.abs(columns[name]) > _LARGEST_ANGLE, f"is beyond {_LARGEST_ANGLE:g} rad", mend)
     lowest, highest = _HEIGHTS[kind]
     mend = "convert millimetres to metres, or mend the frame: z up, the floor at 0"
-    for name in held(_POSITIONS):
+    for name in held(layout.positions):
         if name.endswith("_z"):
             value = columns[name]
             problem = f"m is not a height between {lowest:g} and {highest:g} m"
             check(name, (value < lowest) | (value > highest), problem, mend)
-    for name in held(_POSITIONS):
+    for name in held(layout.positions):
         far = np.abs(columns[name]) > _LARGEST_DISTANCE
         check(name, far, f"m is farther than {_LARGEST_DISTANCE:g} m", "convert millimetres to metres")
         seen = np.flatnonzero(~np.isnan(columns[name]))
@@ -452,7 +520,9 @@ def _check_cells(path: Path, columns: dict[str, _Column], kind: Kind) -> None:
                 _refuse(path, problem, "export unit quaternions in w, x, y, z order", column=names[0], row=row)
 
 
-def _check_gaps(path: Path, columns: dict[str, _Column], groups: list[str], kind: Kind) -> tuple[int, int]:
+def _check_gaps(
+    path: Path, columns: dict[str, _Column], groups: list[str], layout: _Layout, kind: Kind
+) -> tuple[int, int]:
     """First and last row between which every column can be interpolated."""
     time = columns["time"]
     spacing = float(np.median(np.diff(time)))
@@ -463,9 +533,9 @@ def _check_gaps(path: Path, columns: dict[str, _Column], groups: list[str], kind
         _refuse(path, problem, "cut the recording there", column="time", row=step + 1)
     first, last = 0, len(time) - 1
     for field in groups:
-        names = COLUMNS[field]
+        names = layout.columns[field]
         mend = "cut the recording there"
-        if field not in _MANDATORY[kind]:
+        if field not in layout.mandatory[kind]:
             mend += f", or delete {', '.join(names)}"
         # A quaternion is seen or missing as a whole, all else column by column.
         for together in [names] if field in _QUATERNIONS else [(name,) for name in names]:
@@ -524,14 +594,14 @@ def _check_frame(path: Path, recording: Recording) -> None:
 
 
 def _fill(
-    columns: dict[str, _Column], groups: list[str], rows: slice
+    columns: dict[str, _Column], layout: _Layout, groups: list[str], rows: slice
 ) -> tuple[dict[str, Float[np.ndarray, "_ _"]], dict[str, int]]:
     """Fields without gaps over `rows`, and the number of samples filled in by column."""
     time = columns["time"]
     fields: dict[str, np.ndarray] = {}
     interpolated: dict[str, int] = {}
     for field in groups:
-        names = COLUMNS[field]
+        names = layout.columns[field]
         value = np.stack([columns[name] for name in names], axis=1)
         if field in _QUATERNIONS:
             seen = _seen(columns, names)

@@ -83,8 +83,8 @@ def _report(options: Options) -> None:
     print(f"Written to {path}, {path.stat().st_size / 1e6:.1f} MB.")
     if not content.takes:
         print(
-            "It has no replay in 3D: an identification has none, and an EnvMimic's is written by "
-            "`python -m ballu_mjx.evaluate RUN --output RUN`."
+            "It has no replay in 3D: identifications have none, nor have robots but BALLU; an EnvMimic's is written "
+            "by `python -m ballu_mjx.evaluate RUN --output RUN`."
         )
     elif options.video:
         shown = next(take for take in content.takes if options.show in (None, take.name))

@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ballu_mjx import aerodynamics, envmimic, files, ppo, robot, runs
+from ballu_mjx import aerodynamics, envmimic, files, ppo, robot_description, runs
 from ballu_mjx.aerodynamics import Aerodynamics
 from ballu_mjx.envmimic import EnvMimicConfig, ForcePolicy
 from ballu_mjx.errors import InputError, is_number
 from ballu_mjx.forces import Applied, Fields, ForceModel, Sum
 from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.robot import ActuatorParameters
+from ballu_mjx.robot_description import RobotDescription
 
 ACTIONS = 3
 """Force along three axes."""
@@ -53,21 +54,31 @@ class Residual:
 
     @staticmethod
     def load(
-        folder: Path | str, which: Literal["best", "last"] = "best", *, beside: frozenset[Path] = frozenset()
+        folder: Path | str,
+        which: Literal["best", "last"] = "best",
+        *,
+        beside: frozenset[Path] = frozenset(),
+        description: RobotDescription | None = None,
     ) -> Residual:
         """The residual of a run; of a network that in the best (by validation error) or last checkpoint.
-        `beside`: runs of which it is a part.
+        `beside`: runs of which it is a part; `description`: the robot that it has to be of (None: BALLU).
 
-        **Raises** `InputError` where `folder` is no such run or has no such checkpoint.
+        **Raises** `InputError` where `folder` is no such run, is of another robot or has no such checkpoint.
         """
+        description = description or robot_description.ballu()
         folder = Path(folder)
         beside |= {folder.resolve()}
         stored = runs.read_config(folder, *TASKS)
+        own = runs.robot_description(stored, folder)
+        if own.sha256 != description.sha256:
+            raise InputError(
+                f"{folder}: is of the robot {own.name}, not of {description.name}; give one of the same robot."
+            )
         identified = runs.actuators(stored, folder)
         if stored["task"] == "aerodynamic":
-            step, model = 0, Aerodynamics(robot.load_model(identified))
+            step, model = 0, Aerodynamics(description.load_model(identified))
             params = aerodynamics.read(folder / aerodynamics.FILE)
-            inputs = envmimic.input_size(EnvMimicConfig())
+            inputs = envmimic.input_size(EnvMimicConfig(), description)
         else:
             step, tree = runs.restore(folder, which)
             params = ppo.from_tree(tree)
@@ -75,16 +86,16 @@ class Residual:
             sizes = inputs, ACTIONS, runs.typed(PPOConfig, stored, "ppo", folder, ppo.check_values)
             config = runs.typed(EnvMimicConfig, stored, "env", folder, envmimic.check)
             infer = ppo.make_inference(*sizes)
-            if not (inputs == envmimic.input_size(config) and ppo.fits(infer, params, inputs)):
+            if not (inputs == envmimic.input_size(config, description) and ppo.fits(infer, params, inputs)):
                 raise InputError(
                     f"{folder}: the stored parameters do not fit the networks in its config.json; restore one of them."
                 )
             sample = ppo.make_sampler(*sizes) if stored["task"] == "envmimic" else None
-            model = ForcePolicy(config, infer, sample, stored["task"])
+            model = ForcePolicy(config, infer, sample, stored["task"], description.anchored)
             if (where := runs.residual(stored, folder)) is not None:
                 if where.resolve() in beside:
                     raise InputError(f"{folder}: its residual stands beside itself; restore its config.json.")
-                other = Residual.load(where, beside=beside)
+                other = Residual.load(where, beside=beside, description=description)
                 model, params = Sum(other.model, model), (other.params, params)
         return Residual(model, params, _read_observed(folder / _OBSERVED, inputs), step, identified)
 
@@ -98,17 +109,22 @@ class Residual:
         """Model fields to simulate with; see `forces.ForceModel.fields`."""
         return self.model.fields(self.params)
 
-    def command(self, commands: Float[Array, "steps 2"]) -> Float[Array, "parts 2"]:
-        """What the servos get; see `forces.ForceModel.command`."""
+    def command(self, commands: Float[Array, "steps commands"]) -> Float[Array, "parts commands"]:
+        """What the actuators get; see `forces.ForceModel.command`."""
         return self.model.command(self.params, commands)
 
     def wrench(
-        self, history: Float[Array, "steps features"], commands: Float[Array, "steps 2"], key: Array | None = None
+        self,
+        history: Float[Array, "steps features"],
+        commands: Float[Array, "steps commands"],
+        key: Array | None = None,
     ) -> Float[Array, " 6"]:
-        """Force and torque on the balloon over the coming control step; see `forces.ForceModel.wrench`."""
+        """Force and torque on the tracked body over the coming control step; see `forces.ForceModel.wrench`."""
         return self.model.wrench(self.params, history, commands, key)
 
-    def excess(self, history: Float[Array, "steps features"], commands: Float[Array, "steps 2"]) -> Float[Array, ""]:
+    def excess(
+        self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]
+    ) -> Float[Array, ""]:
         """How far an observation lies outside of what the recordings showed: by the worst of its entries, in widths of
         that entry's range, `MARGIN` taken off; 0 inside."""
         seen = self.model.inputs(history, commands)

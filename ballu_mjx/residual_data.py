@@ -8,13 +8,15 @@ from pathlib import Path
 
 import mujoco
 
-from ballu_mjx import actuators, evaluate, loggers, robot, runs
+from ballu_mjx import actuators, evaluate, loggers, robot, robot_description, runs
 from ballu_mjx.errors import InputError
 from ballu_mjx.evaluation import base_name, group_of
-from ballu_mjx.reconstruction import Motion, reconstruct
+from ballu_mjx.general_reconstruction import reconstruct
+from ballu_mjx.reconstruction import Motion
 from ballu_mjx.recording import Recording, bundled, read_recording
 from ballu_mjx.recording import recordings as expand
 from ballu_mjx.robot import ActuatorParameters
+from ballu_mjx.robot_description import RobotDescription
 
 USES = ("training", "validation", "test")
 QUICK_RECORDINGS = 2
@@ -49,6 +51,7 @@ class Prepared:
 
     - `files`, `recordings`: by use, a key of `USES`.
     - `identified`: the simulator's actuators (None: nominal).
+    - `robot`: whose recordings they are.
     """
 
     files: Mapping[str, list[Path]]
@@ -56,16 +59,30 @@ class Prepared:
     identified: ActuatorParameters | None
     where: str
     """Where the actuators come from, for the user to read."""
+    robot: RobotDescription
 
     @staticmethod
-    def read(data: RecordingsData, earlier: Path | None = None) -> Prepared:
-        """Find and read everything, so that nothing wrong with it comes up later; `earlier` is the run that goes on.
+    def read(
+        data: RecordingsData, earlier: Path | None = None, description: RobotDescription | None = None
+    ) -> Prepared:
+        """Find and read everything, so that nothing wrong with it comes up later; `earlier` is the run that goes on,
+        `description` the robot (None: BALLU).
 
         **Raises** `InputError` for recordings or actuators that cannot be used, naming them.
         """
+        description = description or robot_description.ballu()
         files = _choose(data, earlier)
-        recordings = _read(files)
-        return Prepared(files, recordings, *_actuators(data, earlier, files["training"], recordings["training"]))
+        recordings = _read(files, description)
+        if description.is_ballu:
+            found = _actuators(data, earlier, files["training"], recordings["training"])
+        elif data.actuators in (None, Path("nominal")):
+            found = None, f"those of {description.model.name}"
+        else:
+            raise InputError(
+                f"{data.actuators}: only actuators of BALLU's legs can be identified, and {description.file} has none; "
+                "leave --actuators out."
+            )
+        return Prepared(files, recordings, *found, description)
 
     @property
     def base(self) -> str:
@@ -96,11 +113,11 @@ class Prepared:
     def reconstruct(self, model: mujoco.MjModel) -> dict[str, list[Motion]]:
         """States at the control rate, by use."""
         print("Reconstructing the recorded states ...", flush=True)
-        return {use: [reconstruct(recording, model) for recording in self.recordings[use]] for use in USES}
+        return {use: [reconstruct(each, model, self.robot) for each in self.recordings[use]] for use in USES}
 
     def load_model(self) -> mujoco.MjModel:
         """The robot with these actuators."""
-        return robot.load_model(self.identified)
+        return self.robot.load_model(self.identified)
 
 
 def _choose(data: RecordingsData, earlier: Path | None) -> dict[str, list[Path]]:
@@ -152,14 +169,14 @@ def _one_a_group(paths: Sequence[Path]) -> list[Path]:
     return sorted(first.values())[:QUICK_RECORDINGS]
 
 
-def _read(files: Mapping[str, Sequence[Path]]) -> dict[str, list[Recording]]:
+def _read(files: Mapping[str, Sequence[Path]], description: RobotDescription) -> dict[str, list[Recording]]:
     """All recordings, read and found fit for their use."""
     seen = {path.resolve() for path in files["training"]}
     for use in ("validation", "test"):
         for path in files[use]:
             if path.resolve() in seen and files[use] != files["training"]:
                 raise InputError(f"{path}: is among the training and the {use} recordings; take it out of one of them.")
-    read = {path: read_recording(path) for paths in files.values() for path in paths}
+    read = {path: read_recording(path, description) for paths in files.values() for path in paths}
     for path, recording in read.items():
         evaluate.check_recording(path, recording, long_enough=path in files["validation"] or path in files["test"])
     return {use: [read[path] for path in paths] for use, paths in files.items()}

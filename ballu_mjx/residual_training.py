@@ -11,7 +11,17 @@ from typing import Any
 
 import jax
 
-from ballu_mjx import distributed, envmimic, evaluate, evaluation, learner, loggers, ppo, runs
+from ballu_mjx import (
+    distributed,
+    envmimic,
+    evaluate,
+    evaluation,
+    learner,
+    loggers,
+    ppo,
+    robot_description,
+    runs,
+)
 from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv, ForcePolicy
 from ballu_mjx.errors import InputError
 from ballu_mjx.evaluation import OpenLoopEvaluator
@@ -19,6 +29,7 @@ from ballu_mjx.forces import ForceModel, Sum
 from ballu_mjx.ppo import Params, PPOConfig
 from ballu_mjx.residual import Residual, write_observed
 from ballu_mjx.residual_data import Prepared, RecordingsData
+from ballu_mjx.robot_description import RobotDescription
 from ballu_mjx.session import Session, start_from
 
 QUICK: Mapping[str, Any] = {"num_timesteps": 120_000, "num_envs": 256, "batch_size": 128}
@@ -32,6 +43,8 @@ class Data(RecordingsData, distributed.DistributedOptions):
     residual: Path | None = None
     """Folder of another residual's run, which acts beside the forces: these learn what it leaves. It must have
     been learned beside the same actuators. Without this option: none."""
+    robot_description: Path | None = None
+    """Description of another robot than BALLU (docs/own_robot.md), whose recordings --recordings are."""
     resume: Path | None = None
     """Go on with the run in this folder, from its last checkpoint, with its recordings and configuration; options
     given beside it change these. --num-timesteps counts from the run's start."""
@@ -50,9 +63,10 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     if data.validate_every < 1:
         raise InputError(f"--validate-every is {data.validate_every}: it must be 1 or more.")
     start = start_from("envmimic", data.resume, ppo_config, output=data.output, quick=data.quick)
+    description = _description(data)
     where = _where_beside(data)
-    beside = None if where is None else Residual.load(where)
-    prepared = Prepared.read(data, data.resume)
+    beside = None if where is None else Residual.load(where, description=description)
+    prepared = Prepared.read(data, data.resume, description)
     if beside is not None:
         prepared.check_beside(beside.actuators, where)
     first = distributed.is_first()
@@ -61,22 +75,23 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
         prepared.announce(folder, data.quick)
     model = prepared.load_model()
     motions = prepared.reconstruct(model)
-    env = EnvMimicEnv(model, motions["training"], env_config, None if beside is None else beside.applied)
+    env = EnvMimicEnv(model, motions["training"], env_config, None if beside is None else beside.applied, description)
     if start.params is not None and start.params.normalizer.mean["state"].shape != env.observation_size["state"]:
         raise InputError(
             f"{data.resume}: its policy was trained on other observations; leave the options of env as they were."
         )
-    forces: ForceModel = ForcePolicy(env_config, ppo.make_inference(env.observation_size, env.action_size, ppo_config))
+    infer = ppo.make_inference(env.observation_size, env.action_size, ppo_config)
+    forces: ForceModel = ForcePolicy(env_config, infer, anchored=description.anchored)
     whole = forces if beside is None else Sum(beside.model, forces)
 
     def all_params(params: Params) -> Any:
         return params if beside is None else (beside.params, params)
 
     def evaluator(use: str) -> OpenLoopEvaluator:
-        return evaluation.OpenLoopEvaluator(model, motions[use], whole, prepared.base)
+        return evaluation.OpenLoopEvaluator(model, motions[use], whole, prepared.base, description)
 
     sections = {"env": env_config, "ppo": ppo_config, "data": data}
-    config = runs.describe("envmimic", sections, prepared.files, devices, prepared.identified)
+    config = runs.describe("envmimic", sections, prepared.files, devices, prepared.identified, description)
     config["residual"] = None if where is None else str(where.resolve())
     validation = evaluator("validation")
 
@@ -106,6 +121,21 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
         print("\nThese numbers mean little: --quick trains for seconds.")
     print(f"\nWritten to {folder}. {time.perf_counter() - started:.0f} s in all.")
     return 0
+
+
+def _description(data: Data) -> RobotDescription:
+    """The robot: that of the run that goes on, or of the option, or BALLU."""
+    if data.resume is not None:
+        if data.robot_description is not None:
+            raise InputError("--robot-description does not go with --resume, which keeps the robot; leave one out.")
+        return runs.robot_description(runs.read_config(data.resume, "envmimic"), data.resume)
+    if data.robot_description is None:
+        return robot_description.ballu()
+    found = robot_description.read(data.robot_description)
+    robot_description.check_simulates(found)
+    if not data.recordings:
+        raise InputError(f"{found.file}: the bundled recordings are BALLU's; give those of {found.name}, --recordings.")
+    return found
 
 
 def _where_beside(data: Data) -> Path | None:

@@ -1,4 +1,6 @@
-"""The robot: names, model files, and the parameters that identification and randomization move.
+"""BALLU's legs: names, model files, and the parameters that identification and randomization move.
+
+What makes it this robot to motion capture and EnvMimic stands in `assets/ballu.robot.json` (`robot_description.py`).
 
 Frames: world z up; the robot's x forward, y left. SI units and radians throughout. Arrays with a pair of entries
 are ordered (left, right).
@@ -38,9 +40,12 @@ def assets() -> Path:
     return packaged if packaged.is_dir() else packaged.parents[1] / "assets"
 
 
-def load_model(actuators: ActuatorParameters | None = None) -> mujoco.MjModel:
-    """The robot for C MuJoCo: the nominal one ("vanilla"), or with identified actuators ("vanilla+sysid")."""
-    model = mujoco.MjModel.from_xml_path(str(assets() / "ballu.xml"))
+def load_model(actuators: ActuatorParameters | None = None, file: Path | None = None) -> mujoco.MjModel:
+    """The robot for C MuJoCo: the nominal one ("vanilla"), or with identified actuators ("vanilla+sysid").
+
+    `file` is the MJCF of another one.
+    """
+    model = mujoco.MjModel.from_xml_path(str(file or assets() / "ballu.xml"))
     if actuators is not None:
         set_fields(model, actuator_fields(model, actuators))
     return model

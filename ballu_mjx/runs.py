@@ -44,8 +44,10 @@ except ImportError:  # Windows, where runs are not locked
 
 from ballu_mjx import actuators as actuator_files
 from ballu_mjx import files, loggers, robot
+from ballu_mjx import robot_description as descriptions
 from ballu_mjx.errors import InputError, is_number
 from ballu_mjx.robot import ActuatorParameters
+from ballu_mjx.robot_description import RobotDescription
 
 FORMAT = "ballu-run/2"
 """Version 1 had checkpoints of parameters alone."""
@@ -124,6 +126,7 @@ _SHAPES: Mapping[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("env", "ppo", "data", "fit"), lambda value: isinstance(value, dict)),
     "actuators": lambda value: value is None or isinstance(value, dict),
     "residual": lambda value: value is None or isinstance(value, str),
+    "robot_description": lambda value: value is None or _is_description(value),
     "recordings": lambda value: (
         isinstance(value, dict) and all(_is_list_of(entries, _is_description) for entries in value.values())
     ),
@@ -175,6 +178,26 @@ def actuators(config: Mapping[str, Any], folder: Path) -> ActuatorParameters | N
     return None if stored is None else actuator_files.from_json(stored, folder / _CONFIG)
 
 
+def robot_description(config: Mapping[str, Any], folder: Path) -> RobotDescription:
+    """The robot of a run; BALLU where it names none.
+
+    **Raises** `InputError` where its description is gone, has changed, or its model has.
+    """
+    stored = config.get("robot_description")
+    if stored is None:
+        return descriptions.ballu()
+    mend = f"restore it: {folder / _CONFIG} names it"
+    there, path = False, Path(stored["path"])
+    with contextlib.suppress(OSError, ValueError):  # a name that no file can have
+        there = path.is_file()
+    if not there:
+        raise InputError(f"{_cut(stored['path'])}: the robot description is gone; {mend}.")
+    found = descriptions.read(path)
+    if found.sha256 != stored["sha256"]:
+        raise InputError(f"{path}: the robot description, or its model, has changed since the run began; {mend}.")
+    return found
+
+
 def residual(config: Mapping[str, Any], folder: Path) -> Path | None:
     """The run of the residual in a run's simulator; None where there is none.
 
@@ -197,15 +220,19 @@ def describe(
     recordings: Mapping[str, Sequence[Path]],
     devices: Sequence[str],
     identified: ActuatorParameters | None = None,
+    description: RobotDescription | None = None,
 ) -> dict[str, Any]:
     """What `config.json` holds: `sections` are configurations (dataclasses) by name, `recordings` files by use,
-    `identified` the simulator's actuators where they are not the nominal ones."""
+    `identified` the simulator's actuators where they are not the nominal ones, `description` the robot where it is not
+    BALLU."""
+    other = description is not None and description.sha256 != descriptions.ballu().sha256
     return {
         "format": FORMAT,
         "task": task,
         **{name: dataclasses.asdict(section) for name, section in sections.items()},
         "actuators": None if identified is None else actuator_files.as_json(identified),
         "recordings": {use: [describe_recording(path) for path in paths] for use, paths in recordings.items()},
+        **({"robot_description": _described(description)} if description is not None and other else {}),
         "starts": [
             {
                 "time": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
@@ -244,9 +271,9 @@ def find_recordings(config: Mapping[str, Any], use: str, folder: Path) -> list[P
         with contextlib.suppress(OSError):  # a name that no file can have
             there = path.is_file()
         if not there:
-            shown = place if len(place) < _LONGEST_PATH else place[:_LONGEST_PATH] + "..."
             raise InputError(
-                f"{shown}: the recording, which {folder / _CONFIG} names, is gone; restore it or give --recordings."
+                f"{_cut(place)}: the recording, which {folder / _CONFIG} names, is gone; restore it or give "
+                "--recordings."
             )
         if describe_recording(path)["sha256"] != entry["sha256"]:
             raise InputError(
@@ -255,6 +282,14 @@ def find_recordings(config: Mapping[str, Any], use: str, folder: Path) -> list[P
             )
         paths.append(path)
     return paths
+
+
+def _described(description: RobotDescription) -> dict[str, str]:
+    return {"path": str(description.file.resolve()), "sha256": description.sha256}
+
+
+def _cut(place: str) -> str:
+    return place if len(place) < _LONGEST_PATH else place[:_LONGEST_PATH] + "..."
 
 
 class Run:

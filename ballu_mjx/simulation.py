@@ -63,7 +63,7 @@ def control_step(
     model: mjx.Model,
     template: mjx.Data,
     state: State,
-    command: Float[Array, " 2"] | Float[Array, "count 2"],
+    command: Float[Array, " commands"] | Float[Array, "count commands"],
     wrench: Float[Array, " 6"],
     *,
     balloon: int,
@@ -74,10 +74,10 @@ def control_step(
     **Arguments**
 
     - `template`: data of the model, from `make_data`; of no influence but for what no step changes.
-    - `command`: servo commands (left, right) in [0, 1], held, or one pair for each physics step.
+    - `command`: actuators' commands in [0, 1], held, or a row for each physics step.
     - `wrench`: force (N) and torque (N m), world frame, at the centre of mass of the body with the id `balloon`.
     """
-    commands = jnp.broadcast_to(command, (count, 2))
+    commands = jnp.broadcast_to(command, (count, command.shape[-1]))
     template = template.replace(xfrc_applied=template.xfrc_applied.at[balloon].set(wrench))  # pyright: ignore
 
     def step(number: Array, state: State) -> State:

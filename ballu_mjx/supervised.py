@@ -19,7 +19,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float
 
-from ballu_mjx import envmimic, windows
+from ballu_mjx import envmimic, robot_description, windows
+from ballu_mjx import robot as ballu
 from ballu_mjx.errors import InputError
 from ballu_mjx.linearization import FORCE, Linearized
 from ballu_mjx.windows import Windows
@@ -82,7 +83,8 @@ def labels(
     difference[..., 3:] = np.arctan2(np.sin(difference[..., 3:]), np.cos(difference[..., 3:]))
 
     prior = np.zeros((unknowns, unknowns))
-    prior[:free, :free] = np.diag(1 / envmimic.start_spread(free // 2) ** 2)
+    start_spread = envmimic.start_spread(ballu.load_model(), robot_description.ballu())
+    prior[:free, :free] = np.diag(1 / start_spread**2)
     change = np.diff(np.eye(steps), axis=0)
     prior[free:, free:] = np.kron(
         np.eye(steps) / config.force_spread**2 + change.T @ change / config.force_change**2, np.eye(FORCE)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import tyro
 
 from ballu_mjx import runtime
+from ballu_mjx.errors import InputError
 
 if TYPE_CHECKING:
     from ballu_mjx.ppo import PPOConfig
@@ -29,6 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = _by_method(sys.argv[1:] if arguments is None else arguments)
 
     def run() -> int:
+        _check_robot(arguments)
         runtime.prepare()
         return tyro.extras.subcommand_cli_from_dict(
             subcommands(arguments),
@@ -146,6 +148,15 @@ def _by_method(arguments: Sequence[str]) -> list[str]:
     if rest[:1] == ["residual"] and first.method in ("envmimic", "supervised", "analytic"):
         return [first.method, *rest[1:]]
     return list(arguments)
+
+
+def _check_robot(arguments: Sequence[str]) -> None:
+    """**Raises** `InputError` where another robot is given to a command that is tied to BALLU's legs or balloon."""
+    named = [argument.split("=")[0].replace("_", "-") for argument in arguments]
+    if "--robot-description" in named and named[0] != "envmimic":
+        raise InputError(
+            f"--robot-description: `train {arguments[0]}` is for BALLU alone; leave it out, or train envmimic."
+        )
 
 
 def _defaults(

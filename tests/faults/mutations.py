@@ -295,6 +295,18 @@ def actuators_fault(found: Any) -> str | None:
     return None if finite(angles) and np.abs(angles).max() < 3.2 and printable(name) else "angle"
 
 
+def description_fault(found: Any) -> str | None:
+    """Everything that it names is in the model."""
+    model = found.load_model()
+    sites = {model.site(index).name for index in range(model.nsite)}
+    joints = {model.joint(index).name for index in range(model.njnt)}
+    if not {found.tracked, *found.points} <= sites or not {*found.joints, *found.held} <= joints:
+        return "names"
+    if len(found.commands) != model.nu or len(set(found.columns)) != len(found.columns):
+        return "commands"
+    return None if found.name.strip() and printable(found.name, *found.columns) else "text"
+
+
 def air_fault(found: Any) -> str | None:
     for name, value in dataclasses.asdict(found).items():
         if not finite(value) or (name not in ("lift", "centre") and (np.asarray(value) < 0).any()):
@@ -368,7 +380,7 @@ def transfers_fault(found: Any) -> str | None:
 
 def formats(work: Path) -> list[Format]:
     """Every format that is read, with a valid example of it in a folder of its own below `work`."""
-    from ballu_mjx import actuators, aerodynamics, pipeline, residual, robot, transfer
+    from ballu_mjx import actuators, aerodynamics, pipeline, residual, robot, robot_description, transfer
     from ballu_mjx.importers import mapping
     from ballu_mjx.recording import bundled, read_recording, write_recording
 
@@ -406,6 +418,11 @@ def formats(work: Path) -> list[Format]:
     path = folder / actuators.NAME
     shutil.copy(robot.assets() / "recordings" / actuators.NAME, path)
     add("actuators.json", path, JSON, lambda path=path: actuators.read(path), actuators_fault)
+    folder = place()
+    path = folder / "mine.robot.json"
+    path.write_bytes((robot.assets() / "ballu.robot.json").read_bytes())
+    shutil.copy(robot.assets() / "ballu.xml", folder)
+    add("robot description", path, JSON, lambda path=path: robot_description.read(path), description_fault)
     folder = place()
     path = folder / aerodynamics.FILE
     values = dict.fromkeys(("centre", "linear_drag", "quadratic_drag", "turning_drag"), [0.01, 0.02, 0.03])

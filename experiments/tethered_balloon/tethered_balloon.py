@@ -1,0 +1,204 @@
+# %% [markdown]
+# # Another robot: a tethered balloon in wind
+#
+# Not a biped: a balloon on a tether of two rods, with two propellers. Its model (`balloon.xml`) knows no air. The
+# "real" one flies in wind, with the drag of MuJoCo's ellipsoid fluid model and gusts that come and go. From recordings
+# of it, in the project's format, the project's own command learns the forces that its simulator lacks; all that it is
+# told of the robot stands in `balloon.robot.json`. The table gives errors on recordings that training never saw.
+#
+# `python experiments/tethered_balloon/tethered_balloon.py` takes a few minutes a seed on two cores; `--quick` shows
+# that it works.
+
+# %%
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+if "google.colab" in sys.modules:  # install, from a checkout in the current folder
+    if not Path("constraints.txt").exists():
+        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
+    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
+if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
+    sys.argv[1:] = []
+    sys.path[:0] = ["."]
+
+# %%
+import argparse
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
+
+from ballu_mjx import evaluation, plots, recording, robot, robot_description  # noqa: E402
+from ballu_mjx.evaluation import Evaluation  # noqa: E402
+from ballu_mjx.recording import Recording  # noqa: E402
+from ballu_mjx.robot_description import RobotDescription  # noqa: E402
+
+FOLDER = Path("experiments/tethered_balloon") if "ipykernel" in sys.modules else Path(__file__).parent
+DESCRIPTION = FOLDER / "balloon.robot.json"
+
+# %% [markdown]
+# ## The real balloon, and what motion capture sees of it
+
+# %%
+WIND = np.array([0.6, 0.3, 0.0])
+"""Mean wind, m/s."""
+GUSTS = 0.1
+"""Standard deviation of the wind's strength, as a part of it; gusts last some 4 s."""
+RATE = 100
+"""Hz, of capture and gusts."""
+POSITION_NOISE, ROTATION_NOISE = 5e-4, np.deg2rad(0.3)
+"""m and rad: standard deviations, each axis."""
+
+
+def real(description: RobotDescription) -> mujoco.MjModel:
+    """The same balloon in air, at a small time step."""
+    spec = mujoco.MjSpec.from_file(str(description.model))
+    spec.option.timestep, spec.option.density, spec.option.viscosity = 1e-3, 1.2, 1.8e-5
+    spec.geom("balloon").fluid_ellipsoid = 1
+    return spec.compile()
+
+
+def commands(rng: np.random.Generator, steps: int) -> np.ndarray:
+    """Levels between 0 and 1 for each propeller, of 0.5 to 2 s; (steps, 2)."""
+    lengths = rng.integers(10, 41, (steps, 2))
+    levels = rng.uniform(0, 1, (steps, 2)) * (rng.random((steps, 2)) < 0.7)
+    return np.stack([np.repeat(levels[:, side], lengths[:, side])[:steps] for side in range(2)], axis=1)
+
+
+def record(description: RobotDescription, name: str, seconds: float, seed: int) -> Recording:
+    """A flight in today's wind, after half a minute in which it has found its place there."""
+    rng = np.random.default_rng(seed)
+    model = real(description)
+    data = mujoco.MjData(model)
+    before, steps = 30 * RATE, round(seconds * RATE)
+    control = round(robot.CONTROL_TIMESTEP * RATE)
+    sent = np.repeat(commands(rng, (before + steps) // control), control, axis=0)
+    sites = [description.tracked, *description.points]
+    gust, decay = 0.0, np.exp(-1 / (4 * RATE))
+    places, turns = [], []
+    for row in range(before + steps):
+        gust = decay * gust + np.sqrt(1 - decay**2) * GUSTS * rng.normal()
+        model.opt.wind[:] = (1 + gust) * WIND
+        data.ctrl[:] = sent[row]
+        if row >= before:
+            mujoco.mj_kinematics(model, data)
+            places.append([data.site(site).xpos.copy() for site in sites])
+            turns.append(data.body("balloon").xquat.copy())
+        mujoco.mj_step(model, data, round(1 / (RATE * model.opt.timestep)))
+    seen = np.array(places) + rng.normal(0, POSITION_NOISE, (steps, len(sites), 3))
+    turn = Rotation.from_quat(turns, scalar_first=True)
+    turn = turn * Rotation.from_rotvec(rng.normal(0, ROTATION_NOISE, (steps, 3)))
+    return Recording(
+        name=name,
+        kind="free",
+        robot="tethered-balloon-0",
+        notes=f"Simulated; wind {WIND.tolist()} m/s.",
+        time=np.arange(steps) / RATE,
+        command=sent[before:],
+        balloon_position=seen[:, 0],
+        balloon_quaternion=turn.as_quat(scalar_first=True),
+        base_position=None,
+        foot_position=None,
+        points={point: seen[:, 1 + number] for number, point in enumerate(description.points)},
+    )
+
+
+def record_all(description: RobotDescription, folder: Path, quick: bool) -> None:
+    """Recordings for training, validation and test."""
+    first = 0
+    for use, count, seconds in (("training", 6, 20.0), ("validation", 2, 12.0), ("test", 3, 22.0)):
+        count, seconds = (1, 8.0) if quick else (count, seconds)
+        (folder / use).mkdir(parents=True, exist_ok=True)
+        for number in range(count):
+            flight = record(description, f"flight-{use}-{number}", seconds, first + number)
+            recording.write_recording(flight, folder / use / f"{flight.name}.csv.gz", description)
+        first += 100
+
+
+# %% [markdown]
+# ## EnvMimic, by the command
+
+# %%
+FULL = ["--num-timesteps", "600000", "--validate-every", "150000"]
+QUICK = ["--num-timesteps", "20000", "--num-envs", "64", "--batch-size", "64"]
+
+
+def learn(recordings: Path, run: Path, seed: int, quick: bool) -> Evaluation:
+    """Train, unless the run is there already; its evaluation on the test recordings."""
+    if not (run / "evaluation.json").exists():
+        command = [sys.executable, "-m", "ballu_mjx.train", "envmimic", "--robot-description", str(DESCRIPTION)]
+        for option, use in (("recordings", "training"), ("validation", "validation"), ("test", "test")):
+            command += [f"--{option}", str(recordings / use)]
+        command += QUICK if quick else FULL
+        subprocess.run([*command, "--seed", str(seed), "--output", str(run)], check=True)
+    return evaluation.read(run / "evaluation.json")
+
+
+def errors(found: tuple[evaluation.Errors, ...], quantity: str, horizon: float) -> float:
+    """Mean over recordings of the RMSE (m or deg) over a horizon (s)."""
+    return float(np.mean([getattr(each, quantity)[horizon][0] for each in found if horizon in each.position]))
+
+
+# %% [markdown]
+# ## Table and figure
+
+
+# %%
+def main() -> None:
+    parser = argparse.ArgumentParser(description="EnvMimic on a tethered balloon in wind.")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="seeds of the trainings")
+    parser.add_argument("--output", type=Path, default=Path("runs/tethered-balloon"), help="folder of all that is made")
+    parser.add_argument("--quick", action="store_true", help="one seed, for seconds; the numbers mean little")
+    options = parser.parse_args()
+
+    description = robot_description.read(DESCRIPTION)
+    recordings = options.output / "recordings"
+    record_all(description, recordings, options.quick)
+    seeds = options.seeds[:1] if options.quick else options.seeds
+    found = [learn(recordings, options.output / f"envmimic-{seed}", seed, options.quick) for seed in seeds]
+
+    horizons = [h for h in evaluation.HORIZONS if any(h in each.position for each in found[0].vanilla)]
+    lines = [
+        "| horizon (s) | vanilla: m, deg | EnvMimic: m, deg | ratio: position, yaw |",
+        "| ---: | --- | --- | --- |",
+    ]
+    curves: dict[str, list[list[float]]] = {"vanilla": [], "envmimic": []}
+    for horizon in horizons:
+        cells = []
+        for quantity in ("position", "yaw"):
+            without = errors(found[0].vanilla, quantity, horizon)
+            each = [errors(result.residual, quantity, horizon) for result in found]
+            cells.append((without, float(np.mean(each))))
+            if quantity == "position":
+                curves["vanilla"].append([without])
+                curves["envmimic"].append(each)
+        (place, place_with), (yaw, yaw_with) = cells
+        lines.append(
+            f"| {horizon:g} | {place:.3f}, {yaw:.1f} | {place_with:.3f}, {yaw_with:.1f} | {place_with / place:.2f}, "
+            f"{yaw_with / yaw:.2f} |"
+        )
+    text = "\n".join(lines)
+    (options.output / "table.md").write_text(text + "\n")
+    figure = Figure(figsize=(6.0, 4.0), layout="constrained")
+    axis = figure.subplots()
+    for name, values in curves.items():
+        mean, low, high = (reduce(np.array(values), axis=1) for reduce in (np.mean, np.min, np.max))
+        axis.plot(horizons, mean, color=plots.COLOURS[name], marker="o", label=plots.LABELS[name])
+        axis.fill_between(horizons, low, high, color=plots.COLOURS[name], alpha=0.2, linewidth=0)
+    axis.set(xlabel="horizon (s)", ylabel="position RMSE (m)", xscale="log", ylim=(0, None))
+    axis.grid(alpha=0.3)
+    axis.legend()
+    figure.savefig(options.output / "errors.png", dpi=120)
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
