@@ -6,7 +6,7 @@
 # of it, in the project's format, the project's own command learns the forces that its simulator lacks; all that it is
 # told of the robot stands in `balloon.robot.json`. The table gives errors on recordings that training never saw.
 #
-# `python experiments/tethered_balloon/tethered_balloon.py` takes a few minutes a seed on two cores; `--quick` shows
+# `python experiments/tethered_balloon/tethered_balloon.py` takes some minutes a seed on two cores; `--quick` shows
 # that it works.
 
 # %%
@@ -127,8 +127,7 @@ def record_all(description: RobotDescription, folder: Path, quick: bool) -> None
 # ## EnvMimic, by the command
 
 # %%
-FULL = ["--num-timesteps", "600000", "--validate-every", "150000"]
-QUICK = ["--num-timesteps", "20000", "--num-envs", "64", "--batch-size", "64"]
+QUICK: list[str] = ["--num-timesteps", "20000", "--num-envs", "64", "--batch-size", "64"]
 
 
 def learn(recordings: Path, run: Path, seed: int, quick: bool) -> Evaluation:
@@ -137,7 +136,7 @@ def learn(recordings: Path, run: Path, seed: int, quick: bool) -> Evaluation:
         command = [sys.executable, "-m", "ballu_mjx.train", "envmimic", "--robot-description", str(DESCRIPTION)]
         for option, use in (("recordings", "training"), ("validation", "validation"), ("test", "test")):
             command += [f"--{option}", str(recordings / use)]
-        command += QUICK if quick else FULL
+        command += QUICK if quick else []
         subprocess.run([*command, "--seed", str(seed), "--output", str(run)], check=True)
     return evaluation.read(run / "evaluation.json")
 
