@@ -18,7 +18,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballu_mjx import actuators, evaluate, residual, residual_data, residual_training, robot, runs, train
+from ballu_mjx import (
+    actuators,
+    evaluate,
+    residual,
+    residual_data,
+    residual_training,
+    robot,
+    robot_description,
+    runs,
+    train,
+)
 from ballu_mjx.recording import Recording, bundled, read_recording, write_recording
 from ballu_mjx.sweep import read_sweep
 
@@ -201,7 +211,7 @@ def test_damaged_actuators_are_refused(tmp_path: Path, folder: Path, change: dic
 def test_quick_validates_on_own_recordings_where_there_are_no_others(folder: Path):
     files = residual_data._choose(residual_training.Data(recordings=(folder / "data",), quick=True), None)
     assert len(files["training"]) == 2 and files["validation"] == files["training"] == files["test"]
-    residual_data._read(files)
+    residual_data._read(files, robot_description.ballu())
 
 
 def test_help_explains_every_option(folder: Path):

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from ballu_mjx import analytic, envmimic, ppo, robot, simulation, supervised, windows
+from ballu_mjx import analytic, envmimic, ppo, robot, robot_description, simulation, supervised, windows
 from ballu_mjx.analytic import AnalyticConfig
 from ballu_mjx.envmimic import EnvMimicConfig, ForcePolicy
 from ballu_mjx.errors import InputError
@@ -27,7 +27,7 @@ PUSH = np.array([0.02, -0.03, 0.015])
 """N, world."""
 CLOSE = 0.05 * float(np.linalg.norm(PUSH))
 SECONDS = 0.5
-INPUTS = envmimic.input_size(EnvMimicConfig())
+INPUTS = envmimic.input_size(EnvMimicConfig(), robot_description.ballu())
 NETWORK = PPOConfig(policy_layers=(16,), value_layers=(4,))
 FORCES = ForcePolicy(EnvMimicConfig(), ppo.make_inference({ppo.STATE: (INPUTS,)}, ACTIONS, NETWORK), name="analytic")
 

@@ -149,6 +149,7 @@ def test_recordings_go_through_files(flight: tuple[Recording, np.ndarray, np.nda
     recording.write_recording(flight[0], tmp_path / "flight.csv", DESCRIPTION)
     found = recording.read_recording(tmp_path / "flight.csv", DESCRIPTION)
     np.testing.assert_allclose(found.points["knot"], flight[0].points["knot"], atol=6e-6)
+    assert found.balloon_position is not None and flight[0].balloon_position is not None
     np.testing.assert_allclose(found.balloon_position, flight[0].balloon_position, atol=6e-6)
     with pytest.raises(InputError, match="unknown column"):
         recording.read_recording(tmp_path / "flight.csv")
