@@ -82,7 +82,7 @@ def tracking(path: Path, panels: Sequence[TrackingPanel]) -> None:
         column[-1].set_xlabel("time (s)")
         curves = {**panel.simulations, "recording": panel.recording}  # the recording last, on top
         for name, values in curves.items():
-            runs = unwrapped(values if values.ndim == 3 else values[None], panel.recording[0, 2])
+            runs = unwrapped(values if values.ndim == 3 else values[None], float(panel.recording[0, 2]))
             for index, axis in enumerate(column):
                 mean = runs[..., index].mean(axis=0)
                 axis.plot(panel.time, mean, color=COLOURS[name], label=LABELS[name], linewidth=1.5)

@@ -274,8 +274,9 @@ def test_envmimic_runs_from_files_to_an_evaluation(tmp_path: Path, capsys: pytes
     recording.write_recording(fly(7.0)[0], tmp_path / "flight.csv", DESCRIPTION)
     arguments = [
         "envmimic", "--robot-description", str(DESCRIPTION.file), "--recordings", str(tmp_path / "flight.csv"),
-        "--output", str(tmp_path / "run"), "--num-timesteps", "20000", "--num-envs", "64", "--batch-size", "64",
-        "--policy-hidden-layer-sizes", "16", "--value-hidden-layer-sizes", "16",
+        "--output", str(tmp_path / "run"), "--num-timesteps", "160", "--num-envs", "8", "--batch-size", "8",
+        "--num-minibatches", "2", "--unroll-length", "5", "--num-updates-per-batch", "1", "--validate-every", "160",
+        "--policy-layers", "16", "--value-layers", "16",
     ]  # fmt: skip
     assert train.main(arguments) == 0
     stored = json.loads((tmp_path / "run" / "evaluation.json").read_text())
