@@ -149,7 +149,8 @@ def comparison(results: Results, times: Mapping[str, list[float]]) -> str:
     """Markdown: RMSE of the simulators, what that leaves of vanilla's, and the range of that over seeds; and how long
     learning took."""
     nominal, identified = results["nominal"], results["identified"]
-    columns = [(group, horizon) for group in nominal[0].groups for horizon in evaluation.SCORE_HORIZONS]
+    groups = sorted(nominal[0].groups, reverse=True)  # near before far
+    columns = [(group, horizon) for group in groups for horizon in evaluation.SCORE_HORIZONS]
     head = [f"{group}, {horizon:g} s: m, deg" for group, horizon in columns]
     lines = ["| simulator | " + " | ".join(head) + " | learning (s) |", "| --- " * (2 + len(columns)) + "|"]
     rows = {"vanilla": [run.vanilla for run in nominal[:1]], "vanilla+sysid": [run.vanilla for run in identified[:1]]}
