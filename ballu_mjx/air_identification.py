@@ -165,8 +165,9 @@ def identify(
         best = np.where(np.isin(owner, aerodynamics.SIGNED), 0.0, scale)
     if "delay" in free:
         best = with_delay(best)
-    found = Optimum(best, np.zeros(len(start)), _cost(residuals(best)))
-    if len(places):
+    if not len(places):
+        found = Optimum(best, np.zeros(len(start)), _cost(residuals(best)))
+    else:
         found = fitted(best, config.evaluations)
         if "delay" in free:
             found = over_delays(found, owner == "delay", delays, lambda vector: fitted(vector, _AGAIN))

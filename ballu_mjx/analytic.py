@@ -20,7 +20,6 @@ import optax
 from jaxtyping import Array, Float, Int
 
 from ballu_mjx import envmimic, robot_description, simulation, windows
-from ballu_mjx import robot as ballu
 from ballu_mjx.envmimic import ForcePolicy
 from ballu_mjx.errors import InputError
 from ballu_mjx.forces import Applied
@@ -132,7 +131,8 @@ def train(
     """
     simulate, linearize = simulator(model, forces, beside), Linearizer(model, beside)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
-    some = _updates(forces, wrap, optimizer, spread, config)
+    starts = envmimic.start_spread(model, robot_description.ballu())
+    some = _updates(forces, wrap, optimizer, spread, starts, config)
     carry = (start, optimizer.init(start), start)
     key = jax.random.key(config.seed)
     done = 0
@@ -169,10 +169,10 @@ def _updates(
     wrap: Callable[[Any], Any],
     optimizer: optax.GradientTransformation,
     spread: Float[np.ndarray, " inputs"],
+    start_spread: Float[np.ndarray, " directions"],
     config: AnalyticConfig,
 ) -> Callable[..., Any]:
     """Gradient steps on linearized windows, compiled."""
-    start_spread = envmimic.start_spread(ballu.load_model(), robot_description.ballu())
 
     def window_loss(
         params: Any, key: Array, linear: Linearized, about: Float[Array, "windowsteps 3"], window: Windows

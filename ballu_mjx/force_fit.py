@@ -104,7 +104,7 @@ class _Supervised(_Fit):
             robots = envmimic.Simulator(setup.model)
             cut = windows.cut(robots, setup.motions[use], config.window_seconds, config.interval_seconds)
             steps, _ = simulate(setup.with_policy(self.still), cut)
-            force = supervised.labels(cut, linearize(steps), config)
+            force = supervised.labels(setup.model, cut, linearize(steps), config)
             found[use] = supervised.examples(cut, force, setup.forces.config)
             print(f"Labels, {use}: {_rms(force) * 1e3:.1f} mN (RMS along an axis).", flush=True)
         infer = jax.jit(lambda policy, seen: setup.forces.infer(setup.with_policy(policy), seen))

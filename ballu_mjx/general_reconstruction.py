@@ -8,6 +8,7 @@ has, a base that hardly shows its pitch and servos behind cables, is `reconstruc
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import mujoco
 import numpy as np
@@ -83,10 +84,7 @@ def _resample(recording: Recording, robot: RobotDescription) -> _Grid:
     per_step, grid = reconstruction.control_grid(recording)
     time = recording.time - recording.time[0]
 
-    def linear(values: np.ndarray) -> np.ndarray:
-        columns = [np.interp(grid, time, column) for column in values.reshape(len(time), -1).T]
-        return np.stack(columns, axis=-1).reshape(len(grid), *values.shape[1:])
-
+    linear = functools.partial(reconstruction.interpolate, grid, time)
     quaternion = linear(recording.balloon_quaternion)
     return _Grid(
         step=CONTROL_TIMESTEP / per_step,

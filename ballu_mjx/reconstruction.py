@@ -176,6 +176,14 @@ class _Grid:
     knee: Float[np.ndarray, "T 2"] | None
 
 
+def interpolate(
+    grid: Float[np.ndarray, " T"], time: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples ..."]
+) -> Float[np.ndarray, "T ..."]:
+    """Samples at `time` (s), linearly at the times of `grid`."""
+    columns = [np.interp(grid, time, column) for column in values.reshape(len(time), -1).T]
+    return np.stack(columns, axis=-1).reshape(len(grid), *values.shape[1:])
+
+
 def _resample(recording: Recording) -> _Grid:
     """Linear interpolation: with noise, jittered samples close together would make a spline overshoot."""
     balloon_position, balloon_quaternion = recording.balloon_position, recording.balloon_quaternion
@@ -191,9 +199,7 @@ def _resample(recording: Recording) -> _Grid:
     time = recording.time - recording.time[0]
     per_step, grid = control_grid(recording)
 
-    def linear(values: np.ndarray) -> np.ndarray:
-        columns = [np.interp(grid, time, column) for column in values.reshape(len(time), -1).T]
-        return np.stack(columns, axis=-1).reshape(len(grid), *values.shape[1:])
+    linear = partial(interpolate, grid, time)
 
     def unit(values: np.ndarray) -> np.ndarray:
         values = linear(values)

@@ -15,12 +15,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import optax
 from jaxtyping import Array, Float
 
 from ballu_mjx import envmimic, robot_description, windows
-from ballu_mjx import robot as ballu
 from ballu_mjx.errors import InputError
 from ballu_mjx.linearization import FORCE, Linearized
 from ballu_mjx.windows import Windows
@@ -67,7 +67,7 @@ def check(config: SupervisedConfig) -> None:
 
 
 def labels(
-    recorded: Windows, linearized: Linearized, config: SupervisedConfig
+    model: mujoco.MjModel, recorded: Windows, linearized: Linearized, config: SupervisedConfig
 ) -> Float[np.ndarray, "windows windowsteps 3"]:
     """The force (N, world) over each control step that explains the recorded windows.
 
@@ -83,7 +83,7 @@ def labels(
     difference[..., 3:] = np.arctan2(np.sin(difference[..., 3:]), np.cos(difference[..., 3:]))
 
     prior = np.zeros((unknowns, unknowns))
-    start_spread = envmimic.start_spread(ballu.load_model(), robot_description.ballu())
+    start_spread = envmimic.start_spread(model, robot_description.ballu())
     prior[:free, :free] = np.diag(1 / start_spread**2)
     change = np.diff(np.eye(steps), axis=0)
     prior[free:, free:] = np.kron(

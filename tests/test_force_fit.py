@@ -109,7 +109,7 @@ def test_derivatives_are_those_of_c_mujoco(unforced: ControlSteps, linearize: Li
 def test_labels_are_the_push(recorded: Windows, unforced: ControlSteps, linearize: Linearizer):
     """All of it in the air; on its legs the robot does not show what lifts it."""
     config = SupervisedConfig(window_seconds=SECONDS, force_spread=0.3, position_noise=2e-4, angle_noise=0.02)
-    labels = supervised.labels(recorded, linearize(unforced), config)
+    labels = supervised.labels(MODEL, recorded, linearize(unforced), config)
     stepping, falling = labels.reshape(2, -1, 3).mean(axis=1)
     np.testing.assert_allclose(falling, PUSH, atol=CLOSE)
     np.testing.assert_allclose(stepping[:2], PUSH[:2], atol=CLOSE)
