@@ -54,11 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def run() -> None:
         runtime.prepare()
-        _compare(
-            tyro.cli(
-                Options, args=arguments, prog="python -m ballu_mjx.compare", config=(tyro.conf.FlagCreatePairsOff,)
-            )
-        )
+        _compare(tyro.cli(Options, args=arguments, prog="python -m ballu_mjx.compare"))
 
     return runtime.exit_status(run, arguments)
 

@@ -32,7 +32,7 @@ def script(shell: str, commands: Sequence[str]) -> str:
             {name: _parser(name) for name in commands},
             prog=PROGRAM,
             args=["--tyro-print-completion", shell],
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes, tyro.conf.FlagCreatePairsOff),
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
         )
     if shell == "bash":  # tyro completes the paths of options alone
         text.write(f"complete -o default -F _tyro_{PROGRAM} {PROGRAM}\n")

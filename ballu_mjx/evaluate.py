@@ -45,9 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def run() -> None:
         runtime.prepare()
-        options = tyro.cli(
-            Options, args=arguments, prog="python -m ballu_mjx.evaluate", config=(tyro.conf.FlagCreatePairsOff,)
-        )
+        options = tyro.cli(Options, args=arguments, prog="python -m ballu_mjx.evaluate")
         _evaluate(options)
 
     return runtime.exit_status(run, arguments)

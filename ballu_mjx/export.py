@@ -44,8 +44,8 @@ class Options(runtime.CommandOptions):
     """Folder to write into, new or empty. Without this option: export/ in the run's folder."""
     seconds: float | None = None
     """Length of commands.csv, s. Without this option: that of a trial of the task."""
-    no_open_loop: bool = False
-    """Write no commands.csv: nothing is simulated."""
+    open_loop: bool = True
+    """Write commands.csv, the commands that the policy gives in its own simulator."""
     onnx: bool = False
     """Write policy.onnx too, for other runtimes: from observation to commands, without estimator, rate limit and
     time-out. Needs the extra onnx."""
@@ -60,9 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def run() -> None:
         runtime.prepare()
-        options = tyro.cli(
-            Options, args=arguments, prog="python -m ballu_mjx.export", config=(tyro.conf.FlagCreatePairsOff,)
-        )
+        options = tyro.cli(Options, args=arguments, prog="python -m ballu_mjx.export")
         export(options)
 
     return runtime.exit_status(run, arguments)
@@ -84,7 +82,7 @@ def export(options: Options) -> Path:
     policy = Policy.load(options.run)
     stored = weights(policy, ppo_config)
     commands = None
-    if not options.no_open_loop:
+    if options.open_loop:
         seconds = policy.task.trial_seconds if options.seconds is None else options.seconds
         print("Compiling: about a minute the first time ...", flush=True)
         commands = open_loop(policy, max(round(seconds / robot.CONTROL_TIMESTEP), 1))

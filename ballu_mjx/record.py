@@ -101,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             args=arguments,
             prog="python -m ballu_mjx.record",
             description="Make and check recordings of the robot. Each subcommand explains its options with --help.",
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+            config=(tyro.conf.OmitArgPrefixes,),
         )
         return _run(options)
 

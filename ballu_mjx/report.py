@@ -60,9 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status (`runtime.exit_status`)."""
 
     def run() -> None:
-        options = tyro.cli(
-            Options, args=arguments, prog="python -m ballu_mjx.report", config=(tyro.conf.FlagCreatePairsOff,)
-        )
+        options = tyro.cli(Options, args=arguments, prog="python -m ballu_mjx.report")
         if options.video:
             video.choose_renderer()
         runtime.prepare()

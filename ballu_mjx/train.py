@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             args=arguments,
             prog=_PROGRAM,
             description="Learn from recordings of the robot. Each subcommand explains its options with --help.",
-            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+            config=(tyro.conf.OmitArgPrefixes,),
         )
 
     return runtime.exit_status(run, arguments)

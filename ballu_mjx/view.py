@@ -50,9 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def run() -> None:
         try:
-            options = tyro.cli(
-                Options, args=arguments, prog="python -m ballu_mjx.view", config=(tyro.conf.FlagCreatePairsOff,)
-            )
+            options = tyro.cli(Options, args=arguments, prog="python -m ballu_mjx.view")
             if not 0 <= options.port <= 65535:
                 raise InputError(f"--port is {options.port}: it must be between 0 and 65535.")
             if options.mujoco:

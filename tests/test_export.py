@@ -67,7 +67,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def exported(run: Path) -> Path:
-    return export.export(Options(run, no_open_loop=True))
+    return export.export(Options(run, open_loop=False))
 
 
 def random_features(count: int) -> np.ndarray:
@@ -90,7 +90,7 @@ def frame_at(time: float) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("settings", [{}, {"activation": "tanh"}, {"normalize_observations": False}])
 def test_exported_policy_is_the_policy_without_its_libraries(settings: dict, tmp_path: Path):
-    folder = export.export(Options(write_run(tmp_path / "run", **settings), tmp_path / "robot", no_open_loop=True))
+    folder = export.export(Options(write_run(tmp_path / "run", **settings), tmp_path / "robot", open_loop=False))
     features = random_features(1000)
     np.save(tmp_path / "features.npy", features)
     line = [sys.executable, "-I", "-c", CLEAN, folder, tmp_path / "features.npy", tmp_path / "commands.npy"]
@@ -107,7 +107,7 @@ def test_onnx_is_the_policy(settings: dict, tmp_path: Path):
     import onnxruntime
 
     folder = export.export(
-        Options(write_run(tmp_path / "run", **settings), tmp_path / "robot", no_open_loop=True, onnx=True)
+        Options(write_run(tmp_path / "run", **settings), tmp_path / "robot", open_loop=False, onnx=True)
     )
     features = random_features(1000)
     observations = np.array([controller.observation(row) for row in features], np.float32)

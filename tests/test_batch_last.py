@@ -1,0 +1,123 @@
+"""Does a batch along the last axis give what `jax.vmap` gives?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg
+import numpy as np
+import pytest
+from mujoco import mjx
+
+from ballu_mjx import batch_last, robot, simulation
+
+SIZE = 5
+
+
+def symmetric(x: Any) -> Any:
+    return x.T @ x + 0.5 * jnp.eye(x.shape[1])
+
+
+def countdown(x: Any) -> Any:
+    """As many steps as the number says, another one for each of the batch."""
+    return jax.lax.while_loop(lambda c: c[0] > 0.3, lambda c: (c[0] - 0.2, c[1] + c[0] ** 2), (x[0, 0], 0.0))
+
+
+def halving(x: Any) -> Any:
+    def step(carry: Any, row: Any) -> Any:
+        larger = jax.lax.cond(row[0] > 0, lambda c: 2 * c, lambda c: c - row[1], carry)
+        return larger, larger.sum()
+
+    return jax.lax.scan(step, x[0], x)
+
+
+def chosen(x: Any) -> Any:
+    place = jnp.argmin(x[:, 0])
+    return x[place], jax.lax.dynamic_slice(x, (place, 0), (2, 2)), jax.lax.switch(place, [jnp.sin, jnp.cos, jnp.exp], x)
+
+
+def scattered(x: Any) -> Any:
+    rows = jnp.array([2, 0])
+    return x.at[rows].set(1.0).at[:, 1].add(x[:, 2]).at[rows, rows].mul(3.0), x[rows], x[::-1, jnp.array([1, 1])]
+
+
+FUNCTIONS: dict[str, Callable[[Any], Any]] = {
+    "elementwise": lambda x: jnp.where(x > 0, jnp.sqrt(jnp.abs(x)), jnp.clip(x, -0.5, 0.1) ** 3) + jnp.arctan2(x, 2.0),
+    "scalars": lambda x: jnp.where(x[0, 0] > 0, x, -x) * x[1, 2] + jnp.arange(3.0),
+    "shapes": lambda x: (jnp.concatenate([x, x.T]), jnp.tile(x[0], 2), jnp.pad(x, 1), x.ravel()[::-1], x[:, None, 1:]),
+    "reductions": lambda x: (x.sum(0), x.max(), jnp.argmax(x, axis=1), (x > 0).all(1), jnp.linalg.norm(x), jnp.sort(x)),
+    "products": lambda x: (x @ x, x.T @ x[0], jnp.einsum("ij,kj->ik", x, x), jnp.outer(x[0], x[1]), x @ jnp.ones(3)),
+    "batched product": lambda x: jnp.einsum("bij,bjk->bik", jnp.stack([x, 2 * x]), jnp.stack([x.T, x])),
+    "cholesky": lambda x: jnp.linalg.cholesky(symmetric(x)),
+    "solve": lambda x: jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(symmetric(x)), x[0]),
+    "solve, upper": lambda x: jax.scipy.linalg.solve_triangular(symmetric(x), x, lower=False),
+    "solve, transposed": lambda x: jax.scipy.linalg.solve_triangular(symmetric(x), x, lower=True, trans=1),
+    "inverse": lambda x: jnp.linalg.inv(symmetric(x)),
+    "while": countdown,
+    "fori": lambda x: jax.lax.fori_loop(0, 3, lambda i, y: y + x[i], x[0]),
+    "scan": halving,
+    "places": chosen,
+    "gather and scatter": scattered,
+    "nothing batched": lambda x: (jnp.ones(2), x),
+}
+
+
+def assert_same(found: Any, expected: Any, tolerance: float = 1e-5) -> None:
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance), found, expected)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_same_as_vmap(name: str):
+    function = FUNCTIONS[name]
+    x = jax.random.normal(jax.random.key(1), (SIZE, 3, 3))
+    assert_same(jax.jit(batch_last.vmap(function, [True], SIZE))(x), jax.vmap(function)(x))
+
+
+@pytest.mark.parametrize("name", ["products", "solve", "scan", "gather and scatter"])
+def test_derivatives_are_the_same(name: str):
+    function = FUNCTIONS[name]
+    x, change = jax.random.normal(jax.random.key(2), (2, SIZE, 3, 3))
+    ours, theirs = (jax.jvp(f, (x,), (change,)) for f in (batch_last.vmap(function, [True], SIZE), jax.vmap(function)))
+    assert_same(ours, theirs, 1e-4)
+
+
+def test_arguments_without_a_batch():
+    def function(shared: Any, own: Any) -> Any:
+        return {"sum": shared["a"] + own, "product": shared["m"] @ own, "shared": shared["m"].T}
+
+    shared = {"a": jnp.arange(3.0), "m": jax.random.normal(jax.random.key(3), (3, 3))}
+    own = jax.random.normal(jax.random.key(4), (SIZE, 3))
+    found = batch_last.vmap(function, [{"a": False, "m": False}, True], SIZE)(shared, own)
+    assert_same(found, jax.vmap(function, in_axes=(None, 0))(shared, own))
+
+
+@pytest.fixture(scope="module")
+def robots() -> tuple[mjx.Model, mjx.Data, simulation.State, Any, int]:
+    """Eight robots that stand, fall and fly, with their commands."""
+    model = robot.load_model()
+    rng = np.random.default_rng(0)
+    qpos = np.tile(robot.standing_qpos(model), (8, 1))
+    qpos[:, 2] += rng.uniform(-0.002, 0.01, 8)
+    state = simulation.at(jnp.asarray(qpos), jnp.asarray(0.3 * rng.normal(size=(8, model.nv))))
+    command = jnp.asarray(rng.uniform(size=(8, 2)))
+    return mjx.put_model(model), simulation.make_data(model), state, command, simulation.balloon_id(model)
+
+
+def test_a_batch_of_robots_moves_as_each_alone(robots: tuple[mjx.Model, mjx.Data, simulation.State, Any, int]):
+    model, template, state, command, balloon = robots
+
+    def step(model: mjx.Model, state: simulation.State, command: Any, lift: Any) -> simulation.State:
+        push = jnp.zeros(6).at[2].set(lift)
+        return simulation.control_step(model, template, state, command, push, balloon=balloon, count=1)
+
+    lift = jnp.linspace(-0.05, 0.05, 8)
+    together = jax.jit(jax.vmap(step, in_axes=(None, 0, 0, 0)))(model, state, command, lift)
+    step_one = jax.jit(step)
+    for number in range(8):
+        alone = step_one(model, *jax.tree.map(lambda x, n=number: x[n], (state, command, lift)))
+        moved = jax.tree.map(lambda x, n=number: x[n], together)
+        np.testing.assert_allclose(moved.qpos, alone.qpos, atol=2e-5)
+        np.testing.assert_allclose(moved.qvel, alone.qvel, atol=2e-3)
