@@ -11,6 +11,7 @@ Operations without a rule here are left to `jax.vmap`, which is as right and slo
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -31,7 +32,8 @@ def vmap(function: Callable[..., Any], in_batched: Sequence[PyTree[bool]], size:
     - `in_batched`: of each argument a tree of the same structure; which leaves have a batch, along their first axis.
     - `size`: of the batch.
 
-    **Returns** a function whose results all have the batch along their first axis.
+    **Returns** a function of the results, and of a tree that tells which of them have a batch, along their first axis:
+    those that depend on an argument that has one.
     """
     flags = jax.tree.leaves(list(in_batched))
 
@@ -42,11 +44,82 @@ def vmap(function: Callable[..., Any], in_batched: Sequence[PyTree[bool]], size:
             jax.ShapeDtypeStruct(x.shape[1:] if f else x.shape, x.dtype) for x, f in zip(arrays, flags, strict=True)
         ]
         recorded, shape = jax.make_jaxpr(function, return_shape=True)(*jax.tree.unflatten(tree, single))
-        values = [_Batched(jnp.moveaxis(x, 0, -1)) if f else x for x, f in zip(arrays, flags, strict=True)]
-        found = _evaluate(recorded, values, size)
-        return jax.tree.unflatten(jax.tree.structure(shape), [jnp.moveaxis(_full(x, size), -1, 0) for x in found])
+
+        depends = _depends(recorded, flags)
+
+        def part(width: int, own: Sequence[Array]) -> list[Array]:
+            rows = iter(own)
+            values = [_Batched(jnp.moveaxis(next(rows), 0, -1)) if f else x for x, f in zip(arrays, flags, strict=True)]
+            found = _unwrapped(_evaluate(recorded, values, width), depends, width)
+            return [jnp.moveaxis(x, -1, 0) if d else jnp.asarray(x) for x, d in zip(found, depends, strict=True)]
+
+        own = [x for x, f in zip(arrays, flags, strict=True) if f]
+        if size <= _WIDEST:
+            found = part(size, own)
+        else:
+            parts = -(-size // _WIDEST)
+            width = -(-size // parts)
+            rows = np.arange(parts * width).reshape(parts, width) % size
+            found = lax.map(functools.partial(part, width), [x[rows] for x in own])
+            found = [x.reshape(-1, *x.shape[2:])[:size] if d else x[0] for x, d in zip(found, depends, strict=True)]
+        tree = jax.tree.structure(shape)
+        return jax.tree.unflatten(tree, found), jax.tree.unflatten(tree, depends)
 
     return batched
+
+
+_WIDEST = 512
+"""More than so many run one part after the other: what a robot's step keeps at hand then stays in a core's cache
+(`benchmarks/step_profile.py`)."""
+
+
+def fast(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+    """`function`, of which `jax.vmap` makes a program with the batch last; of its forward derivatives too.
+
+    On the CPU alone: elsewhere a batch is what `jax.vmap` makes of any function.
+    """
+
+    def whole(*arguments: PyTree) -> PyTree:
+        leaves, tree = jax.tree.flatten(arguments)
+
+        def flat(leaves: list[Array]) -> PyTree:
+            return function(*jax.tree.unflatten(tree, leaves))
+
+        @jax.custom_jvp
+        def apply(*leaves: Array) -> PyTree:
+            return _with_batch_last(flat)(list(leaves))
+
+        @functools.partial(apply.defjvp, symbolic_zeros=True)
+        def _(leaves: Sequence[Array], changes: Sequence[Any]) -> tuple[PyTree, PyTree]:
+            # Most of a model does not change, and needs no derivatives.
+            places = [i for i, c in enumerate(changes) if not isinstance(c, jax.custom_derivatives.SymbolicZero)]
+
+            def along(leaves: list[Array], changes: list[Array]) -> tuple[PyTree, PyTree]:
+                def of(*moving: Array) -> PyTree:
+                    moved = dict(zip(places, moving, strict=True))
+                    return flat([moved.get(i, x) for i, x in enumerate(leaves)])
+
+                return jax.jvp(of, [leaves[i] for i in places], changes)
+
+            return _with_batch_last(along)(list(leaves), [changes[i] for i in places])
+
+        return apply(*leaves)
+
+    return whole
+
+
+def _with_batch_last(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+    whole = jax.custom_batching.custom_vmap(function)
+
+    @whole.def_vmap
+    def _(size: int, in_batched: Sequence[PyTree[bool]], *arguments: PyTree) -> tuple[PyTree, PyTree[bool]]:
+        if jax.default_backend() == "cpu":
+            return vmap(function, in_batched, size)(*arguments)
+        axes = jax.tree.map(lambda batched: 0 if batched else None, list(in_batched))
+        found = jax.vmap(function, in_axes=axes, axis_size=size)(*arguments)
+        return found, jax.tree.map(lambda _: True, found)
+
+    return whole
 
 
 @dataclasses.dataclass(frozen=True)
@@ -277,35 +350,38 @@ def _dot(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
     return [_Batched(jnp.sum(left * right, axis=0, dtype=dtype))]
 
 
+# Sums over what is solved already keep XLA from working out every earlier row again in each later one.
+
+
 @_rule("cholesky")
 def _cholesky(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any] | None:
-    rest = _bare(inputs[0])
-    if rest.ndim != 3:
+    matrix = _bare(inputs[0])
+    if matrix.ndim != 3:
         return None
-    columns, count = [], len(rest)
-    for number in range(count):
-        column = rest[:, 0] * lax.rsqrt(rest[0, 0])
-        columns.append(jnp.pad(column, ((number, 0), (0, 0))))
-        rest = rest[1:, 1:] - column[1:, None] * column[None, 1:]
-    return [_Batched(jnp.stack(columns, axis=1))]
+    lower = jnp.zeros_like(matrix)  # transposed: its rows are the columns found so far
+    for number in range(len(matrix)):
+        found = lower[:number, number:]
+        column = matrix[number:, number] - jnp.sum(found * found[:, :1], axis=0)
+        lower = lower.at[number, number:].set(column / jnp.sqrt(column[0]))
+    return [_Batched(jnp.swapaxes(lower, 0, 1))]
 
 
 @_rule("triangular_solve")
 def _triangular_solve(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any] | None:
-    matrix, rest = (_full(x, size) for x in inputs)
+    matrix, right = (_full(x, size) for x in inputs)
     params = equation.params
     if matrix.ndim != 3 or not params["left_side"] or params["unit_diagonal"]:
         return None
     lower = params["lower"]
     if params["transpose_a"]:
         matrix, lower = jnp.swapaxes(matrix, 0, 1), not lower
-    order = range(len(matrix)) if lower else reversed(range(len(matrix)))
-    solved: dict[int, Array] = {}
-    for row in order:
-        solved[row] = rest[0 if lower else -1] / matrix[row, row]
-        below = slice(row + 1, None) if lower else slice(None, row)
-        rest = (rest[1:] if lower else rest[:-1]) - matrix[below, row][:, None] * solved[row]
-    return [_Batched(jnp.stack([solved[row] for row in range(len(matrix))]))]
+    count = len(matrix)
+    solved = jnp.zeros_like(right)
+    for row in range(count) if lower else reversed(range(count)):
+        known = slice(None, row) if lower else slice(row + 1, None)
+        rest = right[row] - jnp.sum(matrix[row, known][:, None] * solved[known], axis=0)
+        solved = solved.at[row].set(rest / matrix[row, row])
+    return [_Batched(solved)]
 
 
 # 3. Control flow: a robot that is done keeps its values while others go on
@@ -315,10 +391,56 @@ def _depends(closed: ClosedJaxpr, batched: Iterable[bool]) -> list[bool]:
     """Which results have a batch, by which arguments do."""
     jaxpr: Jaxpr = closed.jaxpr
     known = dict(zip(jaxpr.invars, batched, strict=True))
+
+    def has(variable: Any) -> bool:
+        return not isinstance(variable, Literal) and known.get(variable, False)
+
     for equation in jaxpr.eqns:
-        any_batched = any(known.get(v, False) for v in equation.invars if not isinstance(v, Literal))
-        known.update(dict.fromkeys(equation.outvars, any_batched))
-    return [not isinstance(v, Literal) and known.get(v, False) for v in jaxpr.outvars]
+        inputs, name, params = [has(v) for v in equation.invars], equation.primitive.name, equation.params
+        if not any(inputs):
+            continue
+        if name in _CALLS:
+            results = _depends(params[_CALLS[name]], inputs)
+        elif name == "while":
+            results = _while_depends(equation, inputs)[0]
+        elif name == "scan":
+            results = _scan_depends(equation, inputs)
+        elif name == "cond" and not inputs[0]:
+            results = [any(each) for each in zip(*(_depends(b, inputs[1:]) for b in params["branches"]), strict=True)]
+        else:
+            results = [True] * len(equation.outvars)
+        known.update(zip(equation.outvars, results, strict=True))
+    return [has(v) for v in jaxpr.outvars]
+
+
+def _while_depends(equation: JaxprEqn, inputs: Sequence[bool]) -> tuple[list[bool], bool]:
+    """What of the loop's values has a batch, for it starts with one or is given one on the way; and whether each of the
+    batch ends in its own time."""
+    of_cond, of_body, batched = _parts(inputs, equation.params["cond_nconsts"], equation.params["body_nconsts"])
+    while True:
+        each = _depends(equation.params["cond_jaxpr"], [*of_cond, *batched])[0]
+        after = _depends(equation.params["body_jaxpr"], [*of_body, *batched])
+        grown = [b or a or each for b, a in zip(batched, after, strict=True)]
+        if grown == batched:
+            return batched, each
+        batched = grown
+
+
+def _scan_depends(equation: JaxprEqn, inputs: Sequence[bool]) -> list[bool]:
+    """Which of the last carry and of the results of all steps have a batch."""
+    carried = equation.params["num_carry"]
+    fixed, batched, rows = _parts(inputs, equation.params["num_consts"], carried)
+    while True:
+        after = _depends(equation.params["jaxpr"], [*fixed, *batched, *rows])
+        grown = [b or a for b, a in zip(batched, after[:carried], strict=True)]
+        if grown == batched:
+            return [*batched, *after[carried:]]
+        batched = grown
+
+
+def _parts(values: Sequence[Any], first: int, second: int) -> tuple[list[Any], list[Any], list[Any]]:
+    """The first so many, the next so many, and the rest."""
+    return list(values[:first]), list(values[first : first + second]), list(values[first + second :])
 
 
 def _wrapped(values: Iterable[Any], batched: Iterable[bool]) -> list[Any]:
@@ -337,27 +459,20 @@ def _cond(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
         cases = [_unwrapped(_evaluate(b, operands, size), [True] * len(equation.outvars), size) for b in branches]
         chosen = _bare(which) if len(branches) > 2 else _bare(which) != 0
         return [_Batched(lax.select_n(_ranked(chosen, case[0]), *case)) for case in zip(*cases, strict=True)]
-    batched = [_is_batched(x) for x in operands]
+    batched = list(map(_is_batched, operands))
+    after = [any(each) for each in zip(*(_depends(b, batched) for b in branches), strict=True)]
 
     def branch(closed: ClosedJaxpr) -> Callable[..., list[Array]]:
-        return lambda *values: [_full(x, size) for x in _evaluate(closed, _wrapped(values, batched), size)]
+        return lambda *values: _unwrapped(_evaluate(closed, _wrapped(values, batched), size), after, size)
 
-    return [_Batched(x) for x in lax.switch(which, [branch(b) for b in branches], *map(_bare, operands))]
+    return _wrapped(lax.switch(which, [branch(b) for b in branches], *map(_bare, operands)), after)
 
 
 @_rule("while")
 def _while(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
     cond, body = equation.params["cond_jaxpr"], equation.params["body_jaxpr"]
-    ends = np.cumsum([equation.params["cond_nconsts"], equation.params["body_nconsts"]])
-    of_cond, of_body, start = inputs[: ends[0]], inputs[ends[0] : ends[1]], inputs[ends[1] :]
-    batched, each = [_is_batched(x) for x in start], False
-    while True:  # what the loop carries has a batch where it starts with one or is given one on the way
-        each = _depends(cond, [*map(_is_batched, of_cond), *batched])[0]
-        after = _depends(body, [*map(_is_batched, of_body), *batched])
-        grown = [b or a or each for b, a in zip(batched, after, strict=True)]
-        if grown == batched:
-            break
-        batched = grown
+    of_cond, of_body, start = _parts(inputs, equation.params["cond_nconsts"], equation.params["body_nconsts"])
+    batched, each = _while_depends(equation, list(map(_is_batched, inputs)))
 
     def goes_on(carry: list[Any]) -> Any:
         return _bare(_evaluate(cond, [*of_cond, *_wrapped(carry, batched)], size)[0])
@@ -381,16 +496,9 @@ def _while(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
 @_rule("scan")
 def _scan(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
     closed, carried = equation.params["jaxpr"], equation.params["num_carry"]
-    ends = np.cumsum([equation.params["num_consts"], carried])
-    fixed, start, rows = inputs[: ends[0]], inputs[ends[0] : ends[1]], inputs[ends[1] :]
-    batched, of_rows = ([_is_batched(x) for x in values] for values in (start, rows))
-    while True:
-        after = _depends(closed, [*map(_is_batched, fixed), *batched, *of_rows])
-        grown = [b or a for b, a in zip(batched, after[:carried], strict=True)]
-        if grown == batched:
-            break
-        batched = grown
-    all_batched = [*batched, *after[carried:]]
+    fixed, start, rows = _parts(inputs, equation.params["num_consts"], carried)
+    of_rows, all_batched = list(map(_is_batched, rows)), _scan_depends(equation, list(map(_is_batched, inputs)))
+    batched = all_batched[:carried]
 
     def step(carry: list[Any], row: list[Any]) -> tuple[list[Any], list[Any]]:
         found = _evaluate(closed, [*fixed, *_wrapped(carry, batched), *_wrapped(row, of_rows)], size)

@@ -21,8 +21,8 @@ from brax.envs.base import Env, State
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
+from ballu_mjx import batch_last, robot_description, simulation
 from ballu_mjx import robot as ballu
-from ballu_mjx import robot_description, simulation
 from ballu_mjx.errors import InputError
 from ballu_mjx.forces import Applied, Fields
 from ballu_mjx.reconstruction import Motion
@@ -255,10 +255,14 @@ def _observe(
     root: int,
 ) -> tuple[Float[Array, " features"], Float[Array, " 3"]]:
     """`Simulator.observe`; `masses` are shares of the whole, `sites` ids of sites and of their bodies."""
-    data = simulation.load(template, state)
-    data = mjx.com_vel(model, mjx.com_pos(model, mjx.kinematics(model, data)))
     site, body = np.array(sites).T
-    return features(data, site, body, root), masses @ data.xipos
+
+    def seen(model: mjx.Model, template: mjx.Data, state: simulation.State, masses: Array) -> tuple[Array, Array]:
+        data = simulation.load(template, state)
+        data = mjx.com_vel(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+        return features(data, site, body, root), masses @ data.xipos
+
+    return batch_last.fast(seen)(model, template, state, masses)
 
 
 _CHUNK = 1024

@@ -65,6 +65,14 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
 }
 
 
+def together(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Of a batch of `SIZE`."""
+    batched = batch_last.vmap(lambda x: function(x), [True], SIZE)
+    return lambda x: jax.tree.map(
+        lambda y, has: y if has else jnp.broadcast_to(y, (SIZE, *y.shape)), *batched(x), is_leaf=None
+    )
+
+
 def assert_same(found: Any, expected: Any, tolerance: float = 1e-5) -> None:
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance), found, expected)
 
@@ -73,14 +81,23 @@ def assert_same(found: Any, expected: Any, tolerance: float = 1e-5) -> None:
 def test_same_as_vmap(name: str):
     function = FUNCTIONS[name]
     x = jax.random.normal(jax.random.key(1), (SIZE, 3, 3))
-    assert_same(jax.jit(batch_last.vmap(function, [True], SIZE))(x), jax.vmap(function)(x))
+    assert_same(jax.jit(together(function))(x), jax.vmap(function)(x))
+
+
+@pytest.mark.parametrize("size", [4, 7, 13])
+def test_large_batches_run_in_parts(size: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(batch_last, "_WIDEST", 4)
+    x, shared = jax.random.normal(jax.random.key(5), (size, 3, 3)), jnp.arange(3.0)
+    together = batch_last.vmap(lambda x, y: (x @ y, countdown(x)), [True, False], size)
+    found = jax.jit(lambda x, y: together(x, y)[0])(x, shared)
+    assert_same(found, jax.vmap(lambda x: (x @ shared, countdown(x)))(x))
 
 
 @pytest.mark.parametrize("name", ["products", "solve", "scan", "gather and scatter"])
 def test_derivatives_are_the_same(name: str):
     function = FUNCTIONS[name]
     x, change = jax.random.normal(jax.random.key(2), (2, SIZE, 3, 3))
-    ours, theirs = (jax.jvp(f, (x,), (change,)) for f in (batch_last.vmap(function, [True], SIZE), jax.vmap(function)))
+    ours, theirs = (jax.jvp(f, (x,), (change,)) for f in (together(function), jax.vmap(function)))
     assert_same(ours, theirs, 1e-4)
 
 
@@ -90,8 +107,31 @@ def test_arguments_without_a_batch():
 
     shared = {"a": jnp.arange(3.0), "m": jax.random.normal(jax.random.key(3), (3, 3))}
     own = jax.random.normal(jax.random.key(4), (SIZE, 3))
-    found = batch_last.vmap(function, [{"a": False, "m": False}, True], SIZE)(shared, own)
-    assert_same(found, jax.vmap(function, in_axes=(None, 0))(shared, own))
+    found, batched = batch_last.vmap(function, [{"a": False, "m": False}, True], SIZE)(shared, own)
+    assert batched == {"sum": True, "product": True, "shared": False}
+    assert_same(found["shared"], shared["m"].T)
+    expected = jax.vmap(function, in_axes=(None, 0))(shared, own)
+    assert_same((found["sum"], found["product"]), (expected["sum"], expected["product"]))
+
+
+def test_what_a_loop_leaves_alone_gets_no_batch():
+    def function(own: Any, shared: Any) -> Any:
+        def step(number: Any, carry: Any) -> Any:
+            return carry[0] + own * number, 2 * carry[1]
+
+        return jax.lax.fori_loop(0, 3, step, (own, shared))
+
+    (summed, doubled), batched = batch_last.vmap(function, [True, False], SIZE)(jnp.ones((SIZE, 2)), jnp.ones(2))
+    assert batched == (True, False)
+    assert summed.shape == (SIZE, 2) and doubled.tolist() == [8.0, 8.0]
+
+
+def test_derivatives_along_many_directions_leave_the_values_alone():
+    """As `jax.jacfwd` does, whose values must not get the directions' batch."""
+    x = jax.random.normal(jax.random.key(6), (3, 3))
+    jacobian, value = jax.jacfwd(lambda x: (batch_last.fast(halving)(x)[0],) * 2, has_aux=True)(x)
+    assert_same(value, halving(x)[0])
+    assert_same(jacobian, jax.jacfwd(lambda x: halving(x)[0])(x))
 
 
 @pytest.fixture(scope="module")

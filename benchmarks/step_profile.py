@@ -1,0 +1,159 @@
+"""Where does a physics step's time go? On one core, the batch first (`jax.vmap`) and last (`batch_last`).
+
+Parts are compiled alone and in growing chains, so that XLA can leave nothing out that a part needs; they do not add up
+exactly to the whole, in which XLA fuses across them. Beside the times stand XLA's own count of the whole step's
+arithmetic, which says what the floor would be, and C MuJoCo's step on one thread. For what each kernel takes,
+`--kernels` lists the longest by JAX's profiler.
+
+`python benchmarks/step_profile.py`: ten minutes, most of it compiling; `--quick` times the whole step alone.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import common
+
+from ballu_mjx import runtime
+
+FIRST, LAST, C = "batch first", "batch last", "C MuJoCo"
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Time of the parts of a physics step."""
+
+    batches: tuple[int, ...] = (64, 256, 512, 1024, 4096)
+    """Robots side by side, of the whole step; its parts are timed with 512."""
+    kernels: int = 0
+    """So many of the kernels that take longest, of the whole step."""
+    output: Path = Path("runs/bench-step-profile")
+    """Folder for step_profile.json."""
+    quick: bool = False
+    """The whole step of 512 robots alone."""
+
+
+def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any]:
+    """What a child process answers: microseconds per robot and physics step, by part."""
+    runtime.prepare()
+    import jax
+    import jax.numpy as jnp
+    import mujoco
+    import numpy as np
+    import throughput
+    from mujoco import mjx
+
+    from ballu_mjx import batch_last, robot, simulation
+
+    model, rng = robot.load_model(), np.random.default_rng(0)
+    if layout == C:
+        commands = rng.integers(0, 2, (64, 40, 2)).astype(float)
+        rates = throughput.rollout_rates(model, 1, 5, commands)
+        return {"whole": 1e6 / float(np.median(rates)) / simulation.substeps(model)}
+
+    mjx_model, template = mjx.put_model(model), simulation.make_data(model)
+    commands = jnp.asarray(rng.uniform(size=(batch, 2)), jnp.float32)
+    qpos = np.tile(robot.standing_qpos(model), (batch, 1))
+    state = simulation.at(jnp.asarray(qpos), jnp.zeros((batch, model.nv)))
+
+    def batched(function: Callable[..., Any]) -> Any:
+        if layout == LAST:
+            return jax.jit(batch_last.vmap(function, [simulation.State(True, True, True), True], batch))  # pyright: ignore
+        return jax.jit(jax.vmap(function))
+
+    def seconds(function: Callable[..., Any], state: simulation.State) -> float:
+        jax.block_until_ready(function(state, commands))
+        took = []
+        for _ in range(9):
+            began = time.perf_counter()
+            jax.block_until_ready(function(state, commands))
+            took.append(time.perf_counter() - began)
+        return float(np.median(took))
+
+    def step(state: simulation.State, command: Any) -> simulation.State:
+        return simulation.physics_step(mjx_model, template.replace(ctrl=command), state)  # pyright: ignore
+
+    whole = batched(step)
+    for _ in range(50):  # walking about, feet on the floor
+        state = whole(state, commands)
+    found: dict[str, Any] = {"whole": 1e6 * seconds(whole, state) / batch}
+    cost: Any = whole.lower(state, commands).compile().cost_analysis()
+    found["operations"] = float(cost.get("flops", 0.0)) / batch
+    if kernels:
+        found["kernels"] = _kernels(lambda: jax.block_until_ready(whole(state, commands)), kernels, batch)
+    if parts:
+        chain: list[Callable[..., Any]] = []
+        forward = mujoco.mjx._src.forward  # pyright: ignore
+        for name, part in (
+            ("positions", forward.fwd_position),
+            ("velocities", forward.fwd_velocity),
+            ("actuation", forward.fwd_actuation),
+            ("smooth acceleration", forward.fwd_acceleration),
+        ):
+            chain.append(part)
+
+            def so_far(state: simulation.State, command: Any, chain: tuple = tuple(chain)) -> Any:
+                data: Any = simulation.load(template, state).replace(ctrl=command)  # pyright: ignore
+                for function in chain:
+                    data = function(mjx_model, data)
+                inner = data._impl
+                return (inner.M, inner.qLD, inner.efc_J, inner.efc_aref, inner.efc_D, data.qfrc_bias, data.qacc_smooth)
+
+            found[f"up to {name}"] = 1e6 * seconds(batched(so_far), state) / batch
+    return found
+
+
+def _kernels(run: Callable[[], Any], count: int, batch: int) -> list[tuple[str, int, float]]:
+    """Name, executions and microseconds a robot of the longest."""
+    import jax
+
+    with tempfile.TemporaryDirectory() as folder:
+        with jax.profiler.trace(folder):
+            run()
+        file = next(Path(folder).rglob("*.xplane.pb"))
+        spent: collections.Counter[str] = collections.Counter()
+        times: collections.Counter[str] = collections.Counter()
+        for plane in jax.profiler.ProfileData.from_file(str(file)).planes:
+            for line in plane.lines:
+                for event in line.events:
+                    if "hlo_op" in dict(event.stats):
+                        spent[event.name] += event.duration_ns
+                        times[event.name] += 1
+    return [(name, times[name], ns / 1e3 / batch) for name, ns in spent.most_common(count)]
+
+
+def main(options: Options) -> None:
+    """Measure, print, write."""
+    core = common.cores()[:1]
+    batches = (512,) if options.quick else options.batches
+    result: dict[str, Any] = {
+        C: common.child(__file__, {"layout": C, "batch": 1, "parts": False, "kernels": 0}, cores=core)
+    }
+    print(f"{common.described(common.machine())}; one core, microseconds per robot and physics step")
+    print(f"{C + ', one thread':40}{result[C]['whole']:10.1f}")
+    for layout in (FIRST, LAST):
+        for batch in batches:
+            parts = batch == 512 and not options.quick
+            request = {"layout": layout, "batch": batch, "parts": parts, "kernels": options.kernels if parts else 0}
+            found = result[f"{layout}, {batch}"] = common.child(__file__, request, cores=core)
+            print(f"{f'{layout}, {batch:,} robots':40}{found['whole']:10.1f}")
+            for name, value in found.items():
+                if name.startswith("up to"):
+                    print(f"{'    ' + name:40}{value:10.1f}")
+            for name, times, microseconds in found.get("kernels", []):
+                print(f"        {microseconds:8.3f} x{times:4d}  {name}")
+    print(f"operations (XLA's count, a loop's body once): {found['operations']:,.0f}")
+    common.write(options.output, "step_profile", result)
+
+
+if __name__ == "__main__":
+    if not common.answer(measure):
+        import tyro
+
+        main(tyro.cli(Options, description=__doc__))
