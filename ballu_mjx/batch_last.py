@@ -44,7 +44,6 @@ def vmap(function: Callable[..., Any], in_batched: Sequence[PyTree[bool]], size:
             jax.ShapeDtypeStruct(x.shape[1:] if f else x.shape, x.dtype) for x, f in zip(arrays, flags, strict=True)
         ]
         recorded, shape = jax.make_jaxpr(function, return_shape=True)(*jax.tree.unflatten(tree, single))
-
         depends = _depends(recorded, flags)
 
         def part(width: int, own: Sequence[Array]) -> list[Array]:
@@ -76,10 +75,12 @@ _WIDEST = 512
 def fast(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """`function`, of which `jax.vmap` makes a program with the batch last; of its forward derivatives too.
 
-    On the CPU alone: elsewhere a batch is what `jax.vmap` makes of any function.
+    On the CPU alone: elsewhere it is `function` itself. There is no reverse mode.
     """
 
     def whole(*arguments: PyTree) -> PyTree:
+        if jax.default_backend() != "cpu":
+            return function(*arguments)
         leaves, tree = jax.tree.flatten(arguments)
 
         def flat(leaves: list[Array]) -> PyTree:
@@ -113,11 +114,7 @@ def _with_batch_last(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
 
     @whole.def_vmap
     def _(size: int, in_batched: Sequence[PyTree[bool]], *arguments: PyTree) -> tuple[PyTree, PyTree[bool]]:
-        if jax.default_backend() == "cpu":
-            return vmap(function, in_batched, size)(*arguments)
-        axes = jax.tree.map(lambda batched: 0 if batched else None, list(in_batched))
-        found = jax.vmap(function, in_axes=axes, axis_size=size)(*arguments)
-        return found, jax.tree.map(lambda _: True, found)
+        return vmap(function, in_batched, size)(*arguments)
 
     return whole
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -57,6 +58,15 @@ def test_nothing_appears_on_the_screen_with_a_cold_or_a_warm_cache(tmp_path: Pat
     for _ in range(2):
         done = python(code, tmp_path, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="0")
         assert (done.stdout, done.stderr) == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("flags", "cpu", "width"),
+    [("", "fma avx2 avx512f", "512"), ("", "fma avx2", None), ("--xla_cpu_prefer_vector_width=128", "avx512f", "128")],
+)
+def test_wide_vectors_are_used_where_there_are_some(flags: str, cpu: str, width: str | None) -> None:
+    found = re.findall(r"--xla_cpu_prefer_vector_width=(\d+)", runtime._with_flags(flags, 2, cpu))
+    assert found == ([] if width is None else [width])
 
 
 def test_programs_are_kept_where_the_cache_is(tmp_path: Path) -> None:
