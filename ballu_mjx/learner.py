@@ -168,7 +168,9 @@ class Learner:
         self._shardings: Any = TrainingState(*(NamedSharding(mesh, spec) for spec in specs))  # pyright: ignore
         self._begin = jax.jit(self._first, out_shardings=self._shardings)
         step = jax.shard_map(self._step, mesh=mesh, in_specs=(specs,), out_specs=(specs, each), check_vma=False)
-        self.step = jax.jit(step, donate_argnums=0)
+        # Placed as they go in; on one device they would come back with another description, and compile a second time.
+        placed = (self._shardings, NamedSharding(mesh, each))
+        self.step = jax.jit(step, donate_argnums=0, out_shardings=placed)
         """A training step: the state to the next one and its means, reward, metrics and losses. The memory of the state
         that goes in is used again."""
 

@@ -184,6 +184,16 @@ def test_the_training_step_is_compiled_once(short):
     assert short.step._cache_size() == 1
 
 
+def test_one_device_compiles_the_training_step_once_too(monkeypatch: pytest.MonkeyPatch):
+    first = jax.devices()[:1]
+    monkeypatch.setattr(jax, "devices", lambda: first)
+    monkeypatch.setattr(jax, "device_count", lambda: 1)
+    alone = Learner(Follower(), SMALL)
+    state, _ = alone.step(alone.begin(0))
+    alone.step(state)
+    assert alone.step._cache_size() == 1
+
+
 def test_copies_of_a_state_outlive_it(short):
     state = short.begin(0)
     copies = learner.stored(state), learner.params(state)
