@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jaxtyping import Array, PyTree
 
@@ -188,10 +189,10 @@ def _as_list(found: Any, equation: JaxprEqn) -> list[Any]:
     return list(found) if equation.primitive.multiple_results else [found]
 
 
-def _result(equation: JaxprEqn) -> jax.core.ShapedArray:
+def _result(equation: JaxprEqn) -> ShapedArray:
     """Shape and type of what an operation returns for one of the batch."""
     aval = equation.outvars[0].aval
-    assert isinstance(aval, jax.core.ShapedArray)
+    assert isinstance(aval, ShapedArray)
     return aval
 
 
@@ -344,7 +345,7 @@ def _dot(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
     first = 1 + len(together[0])
     left = jnp.expand_dims(left, tuple(range(first + left_others, first + left_others + right_others)))
     right = jnp.expand_dims(right, tuple(range(first, first + left_others)))
-    return [_Batched(jnp.sum(left * right, axis=0, dtype=dtype))]
+    return [_Batched(jnp.sum(left * right, axis=0, dtype=dtype))]  # pyright: ignore[reportArgumentType]
 
 
 # Sums over what is solved already keep XLA from working out every earlier row again in each later one.

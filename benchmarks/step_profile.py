@@ -14,7 +14,7 @@ import collections
 import dataclasses
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +63,7 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
     state = simulation.at(jnp.asarray(qpos), jnp.zeros((batch, model.nv)))
 
     def batched(function: Callable[..., Any]) -> Any:
-        if layout == LAST:
-            return jax.jit(batch_last.vmap(function, [simulation.State(True, True, True), True], batch))  # pyright: ignore
-        return jax.jit(jax.vmap(function))
+        return jax.jit(jax.vmap(batch_last.fast(function) if layout == LAST else function))
 
     def seconds(function: Callable[..., Any], state: simulation.State) -> float:
         jax.block_until_ready(function(state, commands))
@@ -98,7 +96,9 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
         ):
             chain.append(part)
 
-            def so_far(state: simulation.State, command: Any, chain: tuple = tuple(chain)) -> Any:
+            def so_far(
+                state: simulation.State, command: Any, chain: Sequence[Callable[..., Any]] = tuple(chain)
+            ) -> Any:
                 data: Any = simulation.load(template, state).replace(ctrl=command)  # pyright: ignore
                 for function in chain:
                     data = function(mjx_model, data)
