@@ -114,13 +114,17 @@ def main() -> int:
         sampler = Sampler(output / "metrics.jsonl", options.warm_up, 60 * options.minutes)
         sampler.start()
         data = residual_training.Data(output=output, quick=options.quick)
+        # Shells start what runs in the background with this signal ignored.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         status = residual_training.train(data, EnvMimicConfig(), config)
-        if status != 128 + signal.SIGINT:
-            print(f"The training ended before its time, with {status}.", file=sys.stderr)
-            return 1
-    sampler.join()
+    if len(sampler.samples) < 3:
+        print(f"The training ended before there was anything to see, with {status}.", file=sys.stderr)
+        return 1
     text, flat = table(sampler.times, sampler.samples)
     print(f"\n{len(sampler.samples)} samples over {sampler.times[-1] / 60:.1f} minutes\n\n{text}")
+    if status != 128 + signal.SIGINT:
+        print(f"The training ended before its time, with {status}.", file=sys.stderr)
+        return 1
     return 0 if flat else 1
 
 
