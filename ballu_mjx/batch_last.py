@@ -21,8 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import ShapedArray
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
 from jaxtyping import Array, PyTree
+
+from ballu_mjx import derivatives
 
 
 def vmap(function: Callable[..., Any], in_batched: Sequence[PyTree[bool]], size: int) -> Callable[..., Any]:
@@ -42,7 +44,8 @@ def vmap(function: Callable[..., Any], in_batched: Sequence[PyTree[bool]], size:
         leaves, tree = jax.tree.flatten(list(arguments))
         arrays = [jnp.asarray(leaf) for leaf in leaves]
         single = [
-            jax.ShapeDtypeStruct(x.shape[1:] if f else x.shape, x.dtype) for x, f in zip(arrays, flags, strict=True)
+            jax.ShapeDtypeStruct(x.shape[1:] if f else x.shape, x.dtype, weak_type=x.weak_type)
+            for x, f in zip(arrays, flags, strict=True)
         ]
         recorded, shape = jax.make_jaxpr(function, return_shape=True)(*jax.tree.unflatten(tree, single))
         depends = _depends(recorded, flags)
@@ -84,8 +87,7 @@ def fast(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
             return function(*arguments)
         leaves, tree = jax.tree.flatten(arguments)
 
-        def flat(leaves: list[Array]) -> PyTree:
-            return function(*jax.tree.unflatten(tree, leaves))
+        flat = _recorded(lambda leaves: function(*jax.tree.unflatten(tree, leaves)), leaves)
 
         @jax.custom_jvp
         def apply(*leaves: Array) -> PyTree:
@@ -94,20 +96,25 @@ def fast(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
         @functools.partial(apply.defjvp, symbolic_zeros=True)
         def _(leaves: Sequence[Array], changes: Sequence[Any]) -> tuple[PyTree, PyTree]:
             # Most of a model does not change, and needs no derivatives.
-            places = [i for i, c in enumerate(changes) if not isinstance(c, jax.custom_derivatives.SymbolicZero)]
+            places = derivatives.moving(changes)
 
             def along(leaves: list[Array], changes: list[Array]) -> tuple[PyTree, PyTree]:
-                def of(*moving: Array) -> PyTree:
-                    moved = dict(zip(places, moving, strict=True))
-                    return flat([moved.get(i, x) for i, x in enumerate(leaves)])
+                return derivatives.along(flat, leaves, places, changes)
 
-                return jax.jvp(of, [leaves[i] for i in places], changes)
-
-            return _with_batch_last(along)(list(leaves), [changes[i] for i in places])
+            moving = list(leaves), [changes[i] for i in places]
+            return _with_batch_last(_recorded(along, *moving))(*moving)
 
         return apply(*leaves)
 
     return whole
+
+
+def _recorded(function: Callable[..., PyTree], *arguments: PyTree) -> Callable[..., PyTree]:
+    """`function` for arguments of these shapes, run by JAX's record of it: MJX takes long to trace, and is traced more
+    than once here."""
+    record, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    run, tree = jaxpr_as_fun(record), jax.tree.structure(shape)
+    return lambda *arguments: jax.tree.unflatten(tree, run(*jax.tree.leaves(arguments)))
 
 
 def _with_batch_last(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
@@ -166,10 +173,10 @@ def _evaluate(closed: ClosedJaxpr, arguments: Iterable[Any], size: int) -> list[
 def _apply(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
     """One operation."""
     name, bind, params = equation.primitive.name, equation.primitive.bind, equation.params
-    if not any(map(_is_batched, inputs)):
-        return _as_list(bind(*inputs, **params), equation)
     if name in _CALLS:
         return _evaluate(params[_CALLS[name]], inputs, size)
+    if not any(map(_is_batched, inputs)):
+        return _as_list(bind(*inputs, **params), equation)
     if name in _ELEMENTWISE:
         full = [_full(x, size) for x in inputs]
         widest = max(full, key=jnp.ndim)
@@ -196,7 +203,7 @@ def _result(equation: JaxprEqn) -> ShapedArray:
     return aval
 
 
-_CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr"}
+_CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
 """Functions within functions, and which parameter holds them."""
 _ELEMENTWISE = frozenset(
     "abs acos add add_any and asin atan atan2 cbrt ceil clamp convert_element_type copy cos div eq erf exp exp2 floor "
@@ -368,18 +375,20 @@ def _cholesky(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any] | N
 def _triangular_solve(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any] | None:
     matrix, right = (_full(x, size) for x in inputs)
     params = equation.params
-    if matrix.ndim != 3 or not params["left_side"] or params["unit_diagonal"]:
+    if matrix.ndim != 3 or params["unit_diagonal"]:
         return None
-    lower = params["lower"]
-    if params["transpose_a"]:
+    lower, on_left = params["lower"], params["left_side"]
+    if params["transpose_a"] == on_left:  # the equation transposed has its matrix on the other side
         matrix, lower = jnp.swapaxes(matrix, 0, 1), not lower
+    if not on_left:
+        right = jnp.swapaxes(right, 0, 1)
     count = len(matrix)
     solved = jnp.zeros_like(right)
     for row in range(count) if lower else reversed(range(count)):
         known = slice(None, row) if lower else slice(row + 1, None)
         rest = right[row] - jnp.sum(matrix[row, known][:, None] * solved[known], axis=0)
         solved = solved.at[row].set(rest / matrix[row, row])
-    return [_Batched(solved)]
+    return [_Batched(solved if on_left else jnp.swapaxes(solved, 0, 1))]
 
 
 # 3. Control flow: a robot that is done keeps its values while others go on

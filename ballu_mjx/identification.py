@@ -93,9 +93,6 @@ class SuspendedLeg:
 
     def __init__(self) -> None:
         self.model = ballu.load_suspended_leg(SIDES[0])
-        # Every iteration of the solver carries the derivative on: it must not stop early where the value is right
-        # already (a warm start at rest), for the derivative is not.
-        self.model.opt.tolerance = 0.0
         self._mjx = mjx.put_model(self.model)
         self._data = mjx.make_data(self.model)
         names = [f"{kind}_{SIDES[0]}" for kind in ("motor", "knee")]

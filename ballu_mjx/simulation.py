@@ -11,8 +11,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 from mujoco import mjx
+from mujoco.mjx._src.solver import Context
 
-from ballu_mjx import batch_last
+from ballu_mjx import batch_last, derivatives
 from ballu_mjx.robot import CONTROL_TIMESTEP
 
 
@@ -53,9 +54,59 @@ def load(template: mjx.Data, state: State) -> mjx.Data:
 
 
 def physics_step(model: mjx.Model, held: mjx.Data, state: State) -> State:
-    """One physics step under the commands and forces of `held`, data of the model."""
-    data = mjx.step(model, load(held, state))
+    """One physics step under the commands and forces of `held`, data of the model: `mjx.step`."""
+    data = load(held, state)
+    for stage in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
+        data = stage(model, data)
+    qacc, force = _solved(model, data)
+    data = data.replace(qacc=qacc, qfrc_constraint=force)  # pyright: ignore
+    data = _INTEGRATORS[mujoco.mjtIntegrator(int(model.opt.integrator))](model, data)
     return State(data.qpos, data.qvel, data.qacc_warmstart)
+
+
+_INTEGRATORS = {mujoco.mjtIntegrator.mjINT_EULER: mjx.euler, mujoco.mjtIntegrator.mjINT_IMPLICITFAST: mjx.implicit}
+
+
+class _Solution(NamedTuple):
+    qacc: Float[Array, " nv"]
+    force: Float[Array, " nv"]
+    """Generalized, of the constraints."""
+
+
+def _solve(model: mjx.Model, data: mjx.Data) -> _Solution:
+    data = mjx.solve(model, data)
+    return _Solution(data.qacc, data.qfrc_constraint)
+
+
+def _derivative(along: derivatives.Along, found: _Solution) -> _Solution:
+    """That of the solver's iterations while they are on their way; once they have arrived, that of the place.
+
+    A line search with nothing left to find divides rounding errors by rounding errors, and a robot at rest, at which
+    the solver stops where it starts, would have the derivative of the step before.
+    """
+    (_, step), (at_place, _) = along(functools.partial(_newton_step, found))
+    arrived = jnp.linalg.norm(step) < _ARRIVED * (1.0 + jnp.linalg.norm(found.qacc))
+    on_the_way = along(_solve)[1]
+    return jax.tree.map(lambda x, y: jnp.where(arrived, x, y), at_place, on_the_way)
+
+
+_ARRIVED = 3e-4
+"""Of the accelerations."""
+
+
+def _newton_step(found: _Solution, model: mjx.Model, data: mjx.Data) -> tuple[_Solution, Float[Array, " nv"]]:
+    """From where the solver ended; and the step. The cost's Hessian is held: what multiplies its derivative is zero."""
+    data = data.replace(qacc=found.qacc)  # pyright: ignore
+    here = Context.create(model, data, grad=False)
+    slope = here.Ma - data.qfrc_smooth - here.qfrc_constraint
+    held_model, held = jax.lax.stop_gradient((model, data))
+    step = Context.create(held_model, held.replace(qfrc_smooth=held.qfrc_smooth - slope)).search
+    qacc = found.qacc + step
+    # Where the cost is least, forces are in balance.
+    return _Solution(qacc, mjx.mul_m(model, data, qacc) - data.qfrc_smooth), step
+
+
+_solved = derivatives.by_rule(_solve, _derivative)
 
 
 # Compiled as part of whatever calls it; jitted to be traced once, not once a program.

@@ -54,8 +54,13 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "cholesky": lambda x: jnp.linalg.cholesky(symmetric(x)),
     "solve": lambda x: jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(symmetric(x)), x[0]),
     "solve, upper": lambda x: jax.scipy.linalg.solve_triangular(symmetric(x), x, lower=False),
+    "solve, on the right": lambda x: jax.lax.linalg.triangular_solve(symmetric(x), x, left_side=False, lower=True),
+    "solve, on the right, transposed": lambda x: jax.lax.linalg.triangular_solve(
+        symmetric(x), x, left_side=False, lower=False, transpose_a=True
+    ),
     "solve, transposed": lambda x: jax.scipy.linalg.solve_triangular(symmetric(x), x, lower=True, trans=1),
     "inverse": lambda x: jnp.linalg.inv(symmetric(x)),
+    "custom derivative": jax.nn.relu,
     "while": countdown,
     "fori": lambda x: jax.lax.fori_loop(0, 3, lambda i, y: y + x[i], x[0]),
     "scan": halving,
