@@ -576,7 +576,8 @@ def _check_frame(path: Path, recording: Recording) -> None:
         problem = f"the feet come down to {lowest[side]:.3g} m and not to the floor at 0"
         sample = row + int(feet[:, side, 2].argmin())
         column = f"foot_{robot.SIDES[side]}_z"
-        _refuse(path, problem, "put the frame's origin on the floor", column=column, row=sample)
+        mend = "put the origin of the frame on the floor, or import with floor = 'feet' in the mapping file"
+        _refuse(path, problem, mend, column=column, row=sample)
     rotation = Rotation.from_quat(quaternion[0], scalar_first=True).as_matrix()
     if rotation[2, 2] < 0 or rotation[0, 0] < 0:
         problem = "at the start the balloon does not stand upright and look forward along x"
