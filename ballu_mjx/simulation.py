@@ -64,7 +64,12 @@ def physics_step(model: mjx.Model, held: mjx.Data, state: State) -> State:
     return State(data.qpos, data.qvel, data.qacc_warmstart)
 
 
-_INTEGRATORS = {mujoco.mjtIntegrator.mjINT_EULER: mjx.euler, mujoco.mjtIntegrator.mjINT_IMPLICITFAST: mjx.implicit}
+_INTEGRATORS = {
+    mujoco.mjtIntegrator.mjINT_EULER: mjx.euler,
+    mujoco.mjtIntegrator.mjINT_RK4: mjx.rungekutta4,
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: mjx.implicit,
+}
+"""All that MJX has; it refuses models with others."""
 
 
 class _Solution(NamedTuple):
@@ -74,6 +79,8 @@ class _Solution(NamedTuple):
 
 
 def _solve(model: mjx.Model, data: mjx.Data) -> _Solution:
+    if not data._impl.efc_J.size:  # nothing constrains this model  # pyright: ignore
+        return _Solution(data.qacc_smooth, jnp.zeros_like(data.qacc_smooth))
     data = mjx.solve(model, data)
     return _Solution(data.qacc, data.qfrc_constraint)
 
