@@ -22,6 +22,7 @@ import numpy as np
 from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, jaxpr_as_fun
+from jax.interpreters.partial_eval import dce_jaxpr
 from jaxtyping import Array, PyTree
 
 from ballu_mjx import derivatives
@@ -111,9 +112,10 @@ def fast(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
 
 def _recorded(function: Callable[..., PyTree], *arguments: PyTree) -> Callable[..., PyTree]:
     """`function` for arguments of these shapes, run by JAX's record of it: MJX takes long to trace, and is traced more
-    than once here."""
+    than once here. What its results do not need, a third of a physics step, is left out."""
     record, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
-    run, tree = jaxpr_as_fun(record), jax.tree.structure(shape)
+    needed, _ = dce_jaxpr(record.jaxpr, [True] * len(record.jaxpr.outvars), instantiate=True)
+    run, tree = jaxpr_as_fun(ClosedJaxpr(needed, record.consts)), jax.tree.structure(shape)
     return lambda *arguments: jax.tree.unflatten(tree, run(*jax.tree.leaves(arguments)))
 
 

@@ -1,8 +1,8 @@
 """Identification of the actuators from a suspended sweep (paper, section "System Identification", Algorithm 1).
 
-The legs hang from a base held still, so that each is identified by itself, both at once by `vmap`. Settled angles under
-a command are the root of MJX's inverse dynamics at rest, differentiated as an implicit function: no derivative through
-a simulation to rest. Transients between commands are simulated, and differentiated forwards.
+The legs hang from a base held still, so that each is identified by itself, both at once. Settled angles under a command
+are the root of MJX's inverse dynamics at rest, differentiated as an implicit function: no derivative through a
+simulation to rest. Transients between commands are simulated, and differentiated forwards.
 
 All functions compute in double precision and are to be called inside `jax.enable_x64(True)`, but for `identify`, which
 sees to it itself. A leg's parameters are a vector in the order of `NAMES`; a pair of angles is (motor, knee).
@@ -24,8 +24,8 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
+from ballu_mjx import batch_last, simulation
 from ballu_mjx import robot as ballu
-from ballu_mjx import simulation
 from ballu_mjx.errors import InputError
 from ballu_mjx.robot import SIDES, ActuatorParameters
 from ballu_mjx.simulation import State
@@ -88,7 +88,8 @@ RANGES: dict[str, _Range] = {
 class SuspendedLeg:
     """The nominal robot's leg in MJX, hanging from a base held still, for any actuator parameters.
 
-    The left leg, which serves for both: the right one is its mirror image, and moves alike.
+    The left leg, which serves for both: the right one is its mirror image, and moves alike. Legs come in one batch:
+    one for each command, parameters and direction of a derivative.
     """
 
     def __init__(self) -> None:
@@ -100,42 +101,43 @@ class SuspendedLeg:
         self._relaxation_damping = np.zeros(self.model.nv)
         for kind, damping in _RELAXATION_DAMPING.items():
             self._relaxation_damping[self.model.joint(f"{kind}_{SIDES[0]}").dofadr[0]] = damping
-        # Jitted to be traced once: each stands in several loops, and under several derivatives.
-        self.residual_torque = jax.jit(self._residual_torque)
-        self._step = jax.jit(self._one_step)
+        self.residual_torque = batch_last.fast(self._residual_torque)
 
-    def settled_qpos(self, vector: Float[Array, " parameters"], command: Float[Array, ""]) -> Float[Array, " nq"]:
-        """Generalized position at rest under a command; `[self.angles]` are motor and knee (rad). Differentiable, in
-        both modes."""
-
-        def residual(qpos: Array, arguments: tuple[Array, Array]) -> Array:
-            return self.residual_torque(qpos, *arguments)
-
-        close = self._relaxed_qpos(*jax.lax.stop_gradient((vector, command)))
-        return _implicit_root(residual, close, (vector, command))
+    def settled(
+        self, vectors: Float[Array, "legs parameters"], commands: Float[Array, " legs"]
+    ) -> tuple[Float[Array, "legs nq"], Float[Array, "legs nq parameters"]]:
+        """Generalized positions at rest under each leg's command; `[:, self.angles]` are motor and knee (rad). And
+        their derivatives, those of an implicit function."""
+        close = jax.vmap(batch_last.fast(self._relaxed_qpos))(vectors, commands)
+        qpos, jacobians = self._rest(close, vectors, commands)
+        nq = self.model.nq
+        return qpos, -jnp.linalg.solve(jacobians[..., :nq], jacobians[..., nq:])
 
     def transient(
         self,
         vector: Float[Array, " parameters"],
         qpos: Float[Array, " nq"],
-        command: Float[Array, ""],
         delay: Float[Array, ""],
+        command: Float[Array, ""],
         times: int,
     ) -> Float[Array, "times 2"]:
-        """Motor and knee angle (rad) every `SAMPLE_TIMESTEP` from the moment at which the command changes, from rest in
-        `qpos`; the motion starts `delay` (s) later. Differentiable forwards."""
-        model = self._with(vector)
-
-        def step(state: State, _: None) -> tuple[State, Array]:
-            state = self._step(model, state, command)
-            return state, state.qpos[self.angles]
-
+        """One leg's motor and knee angle (rad) every `SAMPLE_TIMESTEP` from the moment at which the command changes,
+        from rest in `qpos`; the motion starts `delay` (s) later. Differentiable forwards."""
         timestep = float(self.model.opt.timestep)
         count = int(np.ceil((times - 1) * SAMPLE_TIMESTEP / timestep))
-        _, path = jax.lax.scan(step, simulation.at(qpos, jnp.zeros(self.model.nv)), length=count)
-        path = jnp.concatenate([qpos[self.angles][None], path])
+
+        def path(vector: Array, qpos: Array, command: Array) -> Array:
+            model = self._with(vector)
+
+            def step(state: State, _: None) -> tuple[State, Array]:
+                state = self._step(model, state, command)
+                return state, state.qpos[self.angles]
+
+            return jax.lax.scan(step, simulation.at(qpos, jnp.zeros(self.model.nv)), length=count)[1]
+
+        moved = jnp.concatenate([qpos[self.angles][None], batch_last.fast(path)(vector, qpos, command)])
         seen = SAMPLE_TIMESTEP * jnp.arange(times) - delay
-        return jax.vmap(lambda column: jnp.interp(seen, timestep * jnp.arange(count + 1), column), 1, 1)(path)
+        return jax.vmap(lambda column: jnp.interp(seen, timestep * jnp.arange(count + 1), column), 1, 1)(moved)
 
     def _residual_torque(
         self, qpos: Float[Array, " nq"], vector: Float[Array, " parameters"], command: Float[Array, ""]
@@ -159,14 +161,53 @@ class SuspendedLeg:
         model = model.replace(dof_damping=jnp.asarray(self._relaxation_damping), opt=option)  # pyright: ignore
         rest = [vector[NAMES.index(name)] for name in ("default_motor_angle", "default_knee_angle")]
         qpos = jnp.zeros(self.model.nq).at[self.angles].set(jnp.stack(rest))
-        still = jnp.zeros(self.model.nv) + 0.0 * qpos[self.angles[0]]  # batched where the rest is, see `_root`
         step = lambda _, state: self._step(model, state, command)  # noqa: E731
-        return jax.lax.fori_loop(0, _RELAXATION_STEPS, step, State(qpos, still, still)).qpos
+        return jax.lax.fori_loop(0, _RELAXATION_STEPS, step, simulation.at(qpos, jnp.zeros(self.model.nv))).qpos
 
-    def _one_step(self, model: mjx.Model, state: State, command: Float[Array, ""]) -> State:
+    def _step(self, model: mjx.Model, state: State, command: Float[Array, ""]) -> State:
         """One physics step."""
         held = self._data.replace(ctrl=command[None])  # pyright: ignore
         return simulation.physics_step(model, held, state)
+
+    def _rest(
+        self,
+        close: Float[Array, "legs nq"],
+        vectors: Float[Array, "legs parameters"],
+        commands: Float[Array, " legs"],
+    ) -> tuple[Float[Array, "legs nq"], Float[Array, "legs nv nq+parameters"]]:
+        """Where nothing is left unbalanced, and the derivatives there of what is, by positions and parameters.
+
+        By Newton's method with Levenberg's damping, from close by. Optimistix has such solvers; each holds MJX's
+        program several times over, this one once.
+        """
+        nq = self.model.nq
+        every = jnp.eye(nq + vectors.shape[1])
+        directions = tuple(jnp.tile(x, (len(close), 1, 1)) for x in (every[:, :nq], every[:, nq:]))
+
+        def evaluate(qpos: Array) -> tuple[Array, Array]:
+            return along_directions(self.residual_torque, (qpos, vectors), directions, (commands,))
+
+        def body(state: tuple[Array, ...]) -> tuple[Array, ...]:
+            x, value, jacobian, damping, trial, count = state
+            new_value, new_jacobian = evaluate(trial)
+            better = jnp.sum(new_value**2, axis=1) < jnp.sum(value**2, axis=1)
+            x, value = (jnp.where(better[:, None], *pair) for pair in ((trial, x), (new_value, value)))
+            jacobian = jnp.where(better[:, None, None], new_jacobian, jacobian)
+            damping = jnp.where(better, damping / 100, damping * 10)
+            slope = jacobian[..., :nq]
+            normal = jnp.swapaxes(slope, 1, 2) @ slope
+            damped = normal * (1 + damping[:, None, None] * jnp.eye(nq))
+            step = jnp.linalg.solve(damped, jnp.swapaxes(slope, 1, 2) @ value[..., None])[..., 0]
+            return x, value, jacobian, damping, x - step, count + 1
+
+        def unfinished(state: tuple[Array, ...]) -> Array:
+            x, _, _, _, trial, count = state
+            return (count < _ROOT_STEPS) & ((count == 0) | (jnp.max(jnp.abs(trial - x)) > _ROOT_TOLERANCE))
+
+        legs, nv = len(close), self.model.nv
+        start = (close, jnp.full((legs, nv), jnp.inf), jnp.zeros((legs, nv, len(every))), jnp.full(legs, 1e-4), close)
+        x, _, jacobian, *_ = jax.lax.while_loop(unfinished, body, (*start, jnp.zeros((), int)))
+        return x, jacobian
 
 
 _RELAXATION_TIMESTEP = 0.05
@@ -175,50 +216,25 @@ _RELAXATION_DAMPING = {"hip": 0.1, "knee": 0.03, "motor": 0.05}
 """N m s/rad: more than half the time step times the stiffness of each joint, which keeps such long steps stable."""
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _implicit_root(residual: Callable[[Array, Any], Array], guess: Array, arguments: Any) -> Array:
-    """The root of `residual(x, arguments)` near `guess`, differentiable in `arguments` as an implicit function."""
-    return _root(residual, guess, arguments)[0]
+def along_directions(
+    function: Callable[..., Array],
+    points: tuple[Float[Array, "n _"] | Float[Array, " n"], ...],
+    directions: tuple[Float[Array, "n k _"] | Float[Array, "n k"], ...],
+    held: tuple[Float[Array, " n"], ...],
+) -> tuple[Float[Array, "n ..."], Float[Array, "n ... k"]]:
+    """Values of `function(*point, *held)` at n points, and how they change along k directions at each.
 
-
-@_implicit_root.defjvp
-def _implicit_root_jvp(
-    residual: Callable[[Array, Any], Array], primals: tuple[Array, Any], tangents: tuple[Array, Any]
-) -> tuple[Array, Array]:
-    guess, arguments = primals
-    root, jacobian = _root(residual, guess, arguments)
-    _, change = jax.jvp(lambda a: residual(root, a), (arguments,), (tangents[1],))
-    return root, -jnp.linalg.solve(jacobian, change)
-
-
-def _root(residual: Callable[[Array, Any], Array], guess: Array, arguments: Any) -> tuple[Array, Array]:
-    """Root and Jacobian there, by Newton's method with Levenberg's damping from a guess that is close.
-
-    Optimistix has such solvers; each holds MJX's program, 10 s to compile, several times over, this one once.
+    In one batch of n k: batches within batches are traced once more each, and run in shorter loops.
     """
+    n, k = directions[0].shape[:2]
+    points, held = (tuple(jnp.repeat(x, k, axis=0) for x in group) for group in (points, held))
+    directions = tuple(x.reshape(n * k, *x.shape[2:]) for x in directions)
 
-    def body(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        x, value, jacobian, damping, trial, count = state
-        trial_jacobian, trial_value = jax.jacfwd(lambda x: (residual(x, arguments),) * 2, has_aux=True)(trial)
-        better = jnp.sum(trial_value**2) < jnp.sum(value**2)
-        x, value, jacobian = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old), (trial, trial_value, trial_jacobian), (x, value, jacobian)
-        )
-        damping = jnp.where(better, damping / 100, damping * 10)
-        normal = jacobian.T @ jacobian
-        step = jnp.linalg.solve(normal + damping * jnp.diag(jnp.diag(normal)), jacobian.T @ value)
-        return x, value, jacobian, damping, x - step, count + 1
+    def one(point: tuple[Array, ...], direction: tuple[Array, ...], held: tuple[Array, ...]) -> tuple[Array, Array]:
+        return jax.jvp(lambda *point: function(*point, *held), point, direction)
 
-    def unfinished(state: tuple[Array, ...]) -> Array:
-        x, _, _, _, trial, count = state
-        return (count < _ROOT_STEPS) & ((count == 0) | (jnp.max(jnp.abs(trial - x)) > _ROOT_TOLERANCE))
-
-    # All of the state varies with the guess from the start: for a constant among it, vmap would trace the loop again at
-    # each level of batches.
-    size, zero = guess.shape[0], 0.0 * guess[0]
-    start = (guess, jnp.full(size, jnp.inf) + zero, jnp.eye(size) + zero, 1e-4 + zero, guess, zero.astype(int))
-    x, _, jacobian, *_ = jax.lax.while_loop(unfinished, body, start)
-    return x, jacobian
+    values, changes = jax.vmap(one)(points, directions, held)
+    return values[::k], jnp.moveaxis(changes.reshape(n, k, *changes.shape[1:]), 1, -1)
 
 
 _ROOT_STEPS = 40
@@ -347,30 +363,28 @@ class Physics:
         times = data.transient.shape[2]
 
         def settled(coordinates: Array, command: Array) -> tuple[Array, Array]:
-            def qpos(y: Array) -> tuple[Array, Array]:
-                at_rest = self.leg.settled_qpos(space.vector(y), command)
-                return at_rest, at_rest
-
-            slope, value = jax.jacfwd(qpos, has_aux=True)(coordinates)
-            return value, slope
+            vectors, by_coordinates = jax.vmap(lambda y: (space.vector(y), jax.jacfwd(space.vector)(y)))(coordinates)
+            qpos, slopes = self.leg.settled(jnp.repeat(vectors, holds, axis=0), command.ravel())
+            slopes = slopes.reshape(batch, holds, *slopes.shape[1:])
+            return qpos.reshape(batch, holds, -1), slopes @ by_coordinates[:, None]
 
         def transient(coordinates: Array, start: Array, slope: Array, command: Array) -> tuple[Array, Array]:
-            def path(y: Array, qpos: Array) -> Array:
-                return self.leg.transient(space.vector(y[:-1]), qpos, command, y[-1] * DELAY_UNIT, times)
+            def path(y: Array, qpos: Array, command: Array) -> Array:
+                return self.leg.transient(space.vector(y[:-1]), qpos, y[-1] * DELAY_UNIT, command, times)
 
-            tangents = (jnp.eye(size + 1), jnp.concatenate([slope.T, jnp.zeros((1, self.leg.model.nq))]))
-            push = lambda *tangent: jax.jvp(path, (coordinates, start), tangent)  # noqa: E731
-            values, slopes = jax.vmap(push, out_axes=(None, -1))(*tangents)
-            return values, slopes
+            every = jnp.tile(jnp.eye(size + 1), (legs * holds, 1, 1))
+            moved = jnp.pad(jnp.swapaxes(slope, 2, 3), [(0, 0), (0, 0), (0, 1), (0, 0)])
+            points = jnp.repeat(coordinates, holds, axis=0), start.reshape(legs * holds, nq)
+            directions = every, moved.reshape(legs * holds, size + 1, nq)
+            found = along_directions(path, points, directions, (command.ravel(),))
+            value, slopes = (x.reshape(legs, holds, *x.shape[1:]) for x in found)
+            return value, slopes
 
-        over_holds = jax.vmap(settled, (None, 0))
-        settled_program = jax.jit(jax.vmap(over_holds)).lower(jnp.zeros((batch, size)), jnp.zeros((batch, holds)))
         nq = self.leg.model.nq
-        programs = [settled_program]
+        programs = [jax.jit(settled).lower(jnp.zeros((batch, size)), jnp.zeros((batch, holds)))]
         if transients:
-            over_holds = jax.vmap(transient, (None, 0, 0, 0))
             shapes = ((legs, size + 1), (legs, holds, nq), (legs, holds, nq, size), (legs, holds))
-            programs.append(jax.jit(jax.vmap(over_holds)).lower(*(jnp.zeros(shape) for shape in shapes)))
+            programs.append(jax.jit(transient).lower(*(jnp.zeros(shape) for shape in shapes)))
         with ThreadPoolExecutor() as pool:
             self._compiled = list(pool.map(lambda program: program.compile(), programs))
 
