@@ -72,9 +72,9 @@ def train(folder: Path) -> None:
 
 def quietly(folder: Path, told: Path) -> None:
     """`train` as a command does it, with what it says in the file `told`."""
-    with told.open("a") as stream, contextlib.redirect_stdout(stream), contextlib.redirect_stderr(stream):
-        status = runtime.exit_status(lambda: train(folder), [])
-    sys.exit(status)
+    # To the process's end: threads that the command has silenced would otherwise be heard again after it.
+    sys.stdout = sys.stderr = told.open("a")
+    sys.exit(runtime.exit_status(lambda: train(folder), []))
 
 
 @dataclasses.dataclass
