@@ -36,8 +36,8 @@ class AirConfig:
     interval_seconds: float = 2.0
     """Time between the starts of two windows, s."""
     evaluations: int = 8
-    """Most steps of the least-squares solver with all parameters free, at the first delay; with fewer free, which cost
-    less a step, accordingly more."""
+    """Most steps of the least-squares solver with all parameters free; with fewer free, which cost less a step,
+    accordingly more."""
 
 
 class Scale(NamedTuple):
@@ -60,7 +60,7 @@ SCALES: dict[str, Scale] = {
 }
 """By name; SI units."""
 _AGAIN = 4
-"""Most steps of the solver for each further delay, from the best fit so far."""
+"""Most steps of the solver at each of the two whole delays beside the best."""
 _LOST = 20.0
 """What a simulation that broke down counts as, in expected errors."""
 
@@ -115,103 +115,84 @@ def identify(
     start = np.asarray(start, np.float64)
     owner = np.repeat(aerodynamics.NAMES, [getattr(none, name).size for name in aerodynamics.NAMES])
     scale, prior = np.array([SCALES[name] for name in owner]).T
-    step = ballu.CONTROL_TIMESTEP / simulation.substeps(model)
-    delays = np.arange(0.0, aerodynamics.LONGEST_DELAY + step / 2, step)
-    places = np.flatnonzero(np.isin(owner, [name for name in free if name != "delay"]))
-    low = np.where(np.isin(owner, aerodynamics.SIGNED), -np.inf, 0.0)[places]
+    is_delay = owner == "delay"
+    low = np.where(np.isin(owner, aerodynamics.SIGNED), -np.inf, 0.0)
+    high = np.where(is_delay, aerodynamics.LONGEST_DELAY, np.inf)
     evaluations = 0
 
-    def residuals(vector: np.ndarray) -> np.ndarray:
-        nonlocal evaluations
-        evaluations += 1
-        prior_part = (vector / (scale * prior))[places]
-        total = np.concatenate([_soften(simulated.errors(vector))[0].ravel(), prior_part])
-        report(evaluations, _cost(total))
-        return total
-
-    def with_delay(vector: np.ndarray) -> np.ndarray:
-        """With the best delay of whole physics steps: a cost that moves by steps has no derivative to follow."""
-        tried = [np.where(owner == "delay", delay, vector) for delay in delays]
-        return min(tried, key=lambda each: _cost(residuals(each)))
-
-    def fitted(vector: np.ndarray, most: int) -> Optimum:
-        """The best of the other parameters, in so many steps at most."""
+    def fitted(vector: np.ndarray, places: Int[np.ndarray, " free"], most: int) -> Optimum:
+        """The best of the parameters at `places`, in so many steps at most."""
 
         def whole(x: np.ndarray) -> np.ndarray:
             moved = vector.copy()
             moved[places] = x * scale[places]
             return moved
 
+        def residuals(x: np.ndarray) -> np.ndarray:
+            nonlocal evaluations
+            evaluations += 1
+            total = np.concatenate([_soften(simulated.errors(whole(x)))[0].ravel(), x / prior[places]])
+            report(evaluations, _cost(total))
+            return total
+
         def jacobian(x: np.ndarray) -> np.ndarray:
             here = whole(x)
-            along = [simulated.linear(here, scale[place] * np.eye(len(here))[place]) for place in places]
-            softened = _soften(along[0][0], np.stack([slopes for _, slopes in along], axis=-1))[1]
+            softened = _soften(simulated.errors(here), simulated.slopes(here, places) * scale[places])[1]
             return np.concatenate([softened.reshape(-1, len(x)), np.diag(1 / prior[places])])
 
+        if not len(places):
+            return Optimum(vector, np.zeros((len(vector), len(vector))), _cost(residuals(np.zeros(0))))
         solution = scipy.optimize.least_squares(
-            lambda x: residuals(whole(x)),
-            vector[places] / scale[places],
+            residuals,
+            np.clip(vector, low, high)[places] / scale[places],
             jacobian,  # pyright: ignore[reportArgumentType]
-            bounds=(low, np.inf),
+            bounds=(low[places] / scale[places], high[places] / scale[places]),
             max_nfev=most * len(start) // len(places),
         )
-        variance = np.zeros(len(start))
-        variance[places] = np.diag(np.linalg.pinv(solution.jac.T @ solution.jac)) * scale[places] ** 2
-        return Optimum(whole(solution.x), variance, _cost(solution.fun))
+        covariance = np.zeros((len(vector), len(vector)))
+        covariance[np.ix_(places, places)] = np.linalg.pinv(solution.jac.T @ solution.jac)
+        return Optimum(whole(solution.x), covariance * np.outer(scale, scale), _cost(solution.fun))
 
-    without = _cost(residuals(start))
-    best = start
+    without = fitted(start, np.zeros(0, int), 1).cost
     if known is None:  # not from the bounds, where what must be positive has nowhere to go but up
-        best = np.where(np.isin(owner, aerodynamics.SIGNED), 0.0, scale)
+        start = np.where(np.isin(owner, aerodynamics.SIGNED), 0.0, scale)
+    places = np.flatnonzero(np.isin(owner, list(free)))
+    found = fitted(start, places, config.evaluations)
     if "delay" in free:
-        best = with_delay(best)
-    if not len(places):
-        found = Optimum(best, np.zeros(len(start)), _cost(residuals(best)))
-    else:
-        found = fitted(best, config.evaluations)
-        if "delay" in free:
-            found = over_delays(found, owner == "delay", delays, lambda vector: fitted(vector, _AGAIN))
+        found = at_whole_delay(
+            found, is_delay, simulated.timestep, lambda vector: fitted(vector, places[~is_delay[places]], _AGAIN)
+        )
     return AirFit(
         parameters=unravel(jnp.asarray(found.vector, jnp.float32)),
-        standard_errors=unravel(jnp.asarray(np.sqrt(found.variance), jnp.float32)),
+        standard_errors=unravel(jnp.asarray(np.sqrt(np.diag(found.covariance)), jnp.float32)),
         cost=(without, found.cost),
         windows=simulated.count,
     )
 
 
 class Optimum(NamedTuple):
-    """Of a fit: all parameters, their variances, and the cost."""
+    """Of a fit: all parameters, their covariance, and the cost."""
 
     vector: Float[np.ndarray, " parameters"]
-    variance: Float[np.ndarray, " parameters"]
+    covariance: Float[np.ndarray, "parameters parameters"]
     cost: float
 
 
-def over_delays(
-    first: Optimum,
-    delay: Bool[np.ndarray, " parameters"],
-    delays: Float[np.ndarray, " delays"],
-    fitted: Callable[[np.ndarray], Optimum],
+def at_whole_delay(
+    found: Optimum, delay: Bool[np.ndarray, " parameters"], step: float, fitted: Callable[[np.ndarray], Optimum]
 ) -> Optimum:
-    """The best fit of all, found by walking from `first` along the delays, with all else fitted again at each: a delay
-    and an added mass explain much the same motion. To variances comes what the delay's own uncertainty, by the costs
-    beside the best, makes of them."""
-    place = int(np.argmin(np.abs(delays - first.vector[delay])))
-    fits = {place: first}
-    while True:
-        best = min(fits, key=lambda at: fits[at].cost)
-        missing = [at for at in (best - 1, best + 1) if 0 <= at < len(delays) and at not in fits]
-        if not missing:
-            break
-        fits[missing[0]] = fitted(np.where(delay, delays[missing[0]], fits[best].vector))
-    beside = [at for at in (best - 1, best + 1) if at in fits]
-    step = delays[1] - delays[0]
-    # Costs are half squares of expected errors: a parabola through three of them is a normal distribution's exponent.
-    curvature = 2 * np.mean([fits[at].cost - fits[best].cost for at in beside]) / step**2
-    variance = 1 / max(curvature, 1 / delays[-1] ** 2) + step**2 / 12
-    near = [*beside, best]
-    slope = (fits[max(near)].vector - fits[min(near)].vector) / (delays[max(near)] - delays[min(near)])
-    return fits[best]._replace(variance=fits[best].variance + slope**2 * variance)
+    """The better one of the two whole delays beside the one `found`, with all else fitted again. To the covariance of
+    `found` comes what rounding the delay does to it and to what passes for it."""
+    place = int(np.flatnonzero(delay)[0])
+    steps = found.vector[place] / step
+    beside = {int(np.floor(steps + _JUST)), int(np.ceil(steps - _JUST))}
+    best = min((fitted(np.where(delay, step * whole, found.vector)) for whole in beside), key=lambda fit: fit.cost)
+    with_it = found.covariance[place] / max(found.covariance[place, place], np.finfo(float).tiny)
+    return best._replace(covariance=found.covariance + np.outer(with_it, with_it) * step**2 / 12)
+
+
+_JUST = 1e-3
+"""Physics steps: so near, a delay is whole."""
 
 
 def _cost(residuals: np.ndarray) -> float:
@@ -240,9 +221,11 @@ class _Fit:
 
     def __init__(self, model: mujoco.MjModel, motions: Sequence[Motion], config: AirConfig) -> None:
         self._simulator, self._air = envmimic.Simulator(model), Aerodynamics(model)
-        _, self._unravel = ravel_pytree(AirParameters.none())
+        none, self._unravel = ravel_pytree(AirParameters.none())
+        self._delay = int(self._unravel(jnp.arange(len(none), dtype=none.dtype)).delay)
         self._windows = windows.cut(self._simulator, motions, config.window_seconds, config.interval_seconds)
         self._run = windows.spread(self._linear_one, shared=2)
+        self.timestep = ballu.CONTROL_TIMESTEP / simulation.substeps(model)
 
     @property
     def count(self) -> int:
@@ -250,13 +233,39 @@ class _Fit:
         return len(self._windows.qpos)
 
     def errors(self, vector: np.ndarray) -> Float[np.ndarray, "windows entries"]:
-        """Errors of the simulated windows, in expected ones."""
-        return self.linear(vector, np.zeros_like(vector))[0]
+        """Errors of the simulated windows, in expected ones. Commands arrive with a physics step; for a delay between
+        two, a mean of what the one and the other give."""
+        before, after, share = self._beside(vector)
+        errors = self._linear(before)[0]
+        return errors if share < _JUST else (1 - share) * errors + share * self._linear(after)[0]
 
-    def linear(
-        self, vector: np.ndarray, direction: np.ndarray
+    def slopes(self, vector: np.ndarray, places: Int[np.ndarray, " free"]) -> Float[np.ndarray, "windows entries free"]:
+        """Derivatives of `errors` by the parameters at `places`: by the delay, the change over the physics step that it
+        is in; by the others, at the nearest whole delay."""
+        before, after, share = self._beside(vector)
+        nearest = before if share < 0.5 else after
+
+        def column(place: int) -> Float[np.ndarray, "windows entries"]:
+            if place == self._delay:
+                return (self._linear(after)[0] - self._linear(before)[0]) / self.timestep
+            return self._linear(nearest, np.eye(len(vector))[place])[1]
+
+        return np.stack([column(int(place)) for place in places], axis=-1)
+
+    def _beside(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """With the two whole delays beside that of `vector`, and how far it is from the first to the second."""
+        most = round(aerodynamics.LONGEST_DELAY / self.timestep)
+        steps = vector[self._delay] / self.timestep
+        first = min(int(steps + _JUST), most - 1)
+        before, after = vector.copy(), vector.copy()
+        before[self._delay], after[self._delay] = first * self.timestep, (first + 1) * self.timestep
+        return before, after, float(np.clip(steps - first, 0.0, 1.0))
+
+    def _linear(
+        self, vector: np.ndarray, direction: np.ndarray | None = None
     ) -> tuple[Float[np.ndarray, "windows entries"], Float[np.ndarray, "windows entries"]]:
-        """`errors`, and their derivative along a direction of the parameters."""
+        """Errors at a whole delay, and their derivative along a direction of the parameters."""
+        direction = np.zeros_like(vector) if direction is None else direction
         found = self._run(np.float32(vector), np.float32(direction), self._windows)
         errors, slopes = (np.array(x, np.float64) for x in found)
         lost = ~(np.isfinite(errors).all(axis=1) & np.isfinite(slopes).all(axis=1))

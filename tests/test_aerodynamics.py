@@ -14,7 +14,7 @@ import pytest
 
 from ballu_mjx import aerodynamics, air_identification, envmimic, robot
 from ballu_mjx.aerodynamics import Aerodynamics, AirParameters
-from ballu_mjx.air_identification import AirConfig, AirFit, Optimum, over_delays
+from ballu_mjx.air_identification import AirConfig, AirFit, Optimum, at_whole_delay
 from ballu_mjx.errors import InputError
 from ballu_mjx.reconstruction import Motion
 
@@ -119,27 +119,21 @@ def test_late_commands_arrive_physics_step_by_physics_step():
         np.testing.assert_array_equal(air.command(late, sent), sent[2 - np.array(ages)])
 
 
-def test_a_delay_and_what_passes_for_it_are_found_together():
-    """On a quadratic cost, whose optimum and covariance are known: the first fit is at a wrong delay."""
+def test_rounding_a_delay_moves_what_passes_for_it():
+    """On a quadratic cost, whose optimum is known."""
     step, truth = 0.01, np.array([0.062, 0.12])
-    precision = np.linalg.inv(np.array([[4e-5, -9e-5], [-9e-5, 2.5e-4]]))  # of (delay, mass)
+    covariance = np.array([[4e-5, -9e-5], [-9e-5, 2.5e-4]])  # of (delay, mass)
+    precision = np.linalg.inv(covariance)
 
     def fitted(vector: np.ndarray) -> Optimum:
-        late = vector[0] - truth[0]
-        mass = truth[1] - precision[0, 1] / precision[1, 1] * late
-        moved = np.array([vector[0], mass])
-        return Optimum(
-            moved, np.array([0.0, 1 / precision[1, 1]]), float((moved - truth) @ precision @ (moved - truth)) / 2
-        )
+        mass = truth[1] - precision[0, 1] / precision[1, 1] * (vector[0] - truth[0])
+        off = np.array([vector[0], mass]) - truth
+        return Optimum(off + truth, np.zeros((2, 2)), float(off @ precision @ off) / 2)
 
-    delays = np.arange(11) * step
-    found = over_delays(fitted(np.array([0.02, 0.0])), np.array([True, False]), delays, fitted)
-    assert found.vector[0] == pytest.approx(0.06)
-    rounding = np.array([1.0, precision[0, 1] / precision[1, 1]]) ** 2 * step**2 / 12
-    np.testing.assert_allclose(found.variance, np.diag(np.linalg.inv(precision)) + rounding, rtol=1e-6)
-
-    at_an_end = over_delays(fitted(np.array([0.1, 0.0])), np.array([True, False]), delays[:4] + 0.07, fitted)
-    assert at_an_end.vector[0] == pytest.approx(0.07) and at_an_end.variance[0] > 0
+    found = at_whole_delay(Optimum(truth, covariance, 0.0), np.array([True, False]), step, fitted)
+    assert found.vector == pytest.approx(fitted(np.array([0.06, 0.0])).vector)
+    rounding = np.array([1.0, covariance[0, 1] / covariance[0, 0]]) ** 2 * step**2 / 12
+    np.testing.assert_allclose(np.diag(found.covariance), np.diag(covariance) + rounding, rtol=1e-6)
 
 
 def test_drag_opposes_the_motion_whatever_the_heading():
@@ -182,6 +176,15 @@ def test_known_air_is_found_again_in_another_simulator_s_motion(found: AirFit):
     assert drag[0] == pytest.approx(true[0], rel=0.15)  # forwards; hardly any of the motion is along the other axes
     assert found.cost[1] < 0.02 * found.cost[0]
     assert 0 < float(errors.added_mass) < 0.3 * float(got.added_mass)
+
+
+@pytest.mark.parametrize("delay", [0.01, 0.1])
+def test_wherever_the_search_begins_it_ends_at_the_same_air(motions: list[Motion], found: AirFit, delay: float):
+    """A delay and an added mass explain much the same motion: a search may walk from one to the other, or stop."""
+    began = dataclasses.replace(jax.tree.map(lambda x: x / 2, AIR), delay=jnp.array(delay))
+    again = air_identification.identify(MODEL, motions, CONFIG, known=began).parameters
+    assert float(again.delay) == pytest.approx(float(found.parameters.delay))
+    assert float(again.added_mass) == pytest.approx(float(found.parameters.added_mass), rel=0.01)
 
 
 def test_lost_lift_is_found_with_the_rest_kept(motions: list[Motion]):
