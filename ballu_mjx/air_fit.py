@@ -19,8 +19,8 @@ from ballu_mjx.errors import InputError
 from ballu_mjx.residual import Residual, write_observed
 from ballu_mjx.residual_data import Prepared, RecordingsData
 
-_BESIDE = 22
-"""Evaluations beside those of the first fit: a search for the delay, and fits for two to three delays beside it."""
+_BESIDE = 9
+"""Most evaluations beside those of the first fit: one without the air, and a fit at each whole delay beside the best."""
 QUICK: Mapping[str, Any] = {"window_seconds": 0.5, "interval_seconds": 2.0, "evaluations": 3}
 """Defaults of `AirConfig` under `--quick`."""
 
