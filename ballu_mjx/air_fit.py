@@ -20,7 +20,7 @@ from ballu_mjx.residual import Residual, write_observed
 from ballu_mjx.residual_data import Prepared, RecordingsData
 
 _BESIDE = 9
-"""Most evaluations beside those of the first fit: one without the air, and a fit at each whole delay beside the best."""
+"""Most evaluations beside those of the first fit: one without air, and a fit at each whole delay beside the best."""
 QUICK: Mapping[str, Any] = {"window_seconds": 0.5, "interval_seconds": 2.0, "evaluations": 3}
 """Defaults of `AirConfig` under `--quick`."""
 
