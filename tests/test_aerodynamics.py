@@ -178,10 +178,9 @@ def test_known_air_is_found_again_in_another_simulator_s_motion(found: AirFit):
     assert 0 < float(errors.added_mass) < 0.3 * float(got.added_mass)
 
 
-@pytest.mark.parametrize("delay", [0.01, 0.1])
-def test_wherever_the_search_begins_it_ends_at_the_same_air(motions: list[Motion], found: AirFit, delay: float):
+def test_a_search_begun_elsewhere_ends_at_the_same_air(motions: list[Motion], found: AirFit):
     """A delay and an added mass explain much the same motion: a search may walk from one to the other, or stop."""
-    began = dataclasses.replace(jax.tree.map(lambda x: x / 2, AIR), delay=jnp.array(delay))
+    began = dataclasses.replace(jax.tree.map(lambda x: x / 2, AIR), delay=jnp.array(0.1))
     again = air_identification.identify(MODEL, motions, CONFIG, known=began).parameters
     assert float(again.delay) == pytest.approx(float(found.parameters.delay))
     assert float(again.added_mass) == pytest.approx(float(found.parameters.added_mass), rel=0.01)
