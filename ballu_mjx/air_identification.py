@@ -20,7 +20,6 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from ballu_mjx import aerodynamics, envmimic, simulation, windows
-from ballu_mjx import robot as ballu
 from ballu_mjx.aerodynamics import Aerodynamics, AirParameters
 from ballu_mjx.errors import InputError
 from ballu_mjx.reconstruction import Motion
@@ -136,8 +135,8 @@ def identify(
             return total
 
         def jacobian(x: np.ndarray) -> np.ndarray:
-            here = whole(x)
-            softened = _soften(simulated.errors(here), simulated.slopes(here, places) * scale[places])[1]
+            errors, slopes = simulated.linear(whole(x), places)
+            softened = _soften(errors, slopes * scale[places])[1]
             return np.concatenate([softened.reshape(-1, len(x)), np.diag(1 / prior[places])])
 
         if not len(places):
@@ -225,7 +224,7 @@ class _Fit:
         self._delay = int(self._unravel(jnp.arange(len(none), dtype=none.dtype)).delay)
         self._windows = windows.cut(self._simulator, motions, config.window_seconds, config.interval_seconds)
         self._run = windows.spread(self._linear_one, shared=2)
-        self.timestep = ballu.CONTROL_TIMESTEP / simulation.substeps(model)
+        self.timestep = float(model.opt.timestep)
 
     @property
     def count(self) -> int:
@@ -233,24 +232,29 @@ class _Fit:
         return len(self._windows.qpos)
 
     def errors(self, vector: np.ndarray) -> Float[np.ndarray, "windows entries"]:
-        """Errors of the simulated windows, in expected ones. Commands arrive with a physics step; for a delay between
-        two, a mean of what the one and the other give."""
-        before, after, share = self._beside(vector)
-        errors = self._linear(before)[0]
-        return errors if share < _JUST else (1 - share) * errors + share * self._linear(after)[0]
+        """Errors of the simulated windows, in expected ones."""
+        return self.linear(vector, np.zeros(0, int))[0]
 
-    def slopes(self, vector: np.ndarray, places: Int[np.ndarray, " free"]) -> Float[np.ndarray, "windows entries free"]:
-        """Derivatives of `errors` by the parameters at `places`: by the delay, the change over the physics step that it
-        is in; by the others, at the nearest whole delay."""
+    def linear(
+        self, vector: np.ndarray, places: Int[np.ndarray, " free"]
+    ) -> tuple[Float[np.ndarray, "windows entries"], Float[np.ndarray, "windows entries free"]]:
+        """`errors`, and their derivatives by the parameters at `places`.
+
+        Commands arrive with a physics step; for a delay between two, errors are a mean of what the one and the other
+        give, and change by it as from the one to the other. By other parameters: at the nearest whole delay.
+        """
         before, after, share = self._beside(vector)
         nearest = before if share < 0.5 else after
-
-        def column(place: int) -> Float[np.ndarray, "windows entries"]:
+        first = self._linear(before)[0]
+        between = share >= _JUST
+        second = self._linear(after)[0] if between or self._delay in places else first
+        slopes = np.zeros((*first.shape, len(places)))
+        for column, place in enumerate(places):
             if place == self._delay:
-                return (self._linear(after)[0] - self._linear(before)[0]) / self.timestep
-            return self._linear(nearest, np.eye(len(vector))[place])[1]
-
-        return np.stack([column(int(place)) for place in places], axis=-1)
+                slopes[..., column] = (second - first) / self.timestep
+            else:
+                slopes[..., column] = self._linear(nearest, np.eye(len(vector))[place])[1]
+        return (1 - share) * first + share * second if between else first, slopes
 
     def _beside(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """With the two whole delays beside that of `vector`, and how far it is from the first to the second."""
