@@ -320,10 +320,11 @@ class Learner:
         """Learn once from all that was collected, in minibatches drawn anew."""
         optimizer, networks, key = carry
         key, key_shuffle, key_loss = jax.random.split(key, 3)
+        # Once for all arrays: each shuffle is a sort and a dozen kernels to compile.
+        order = jax.random.permutation(key_shuffle, len(data.reward))
 
         def minibatches(x: Array) -> Array:
-            x = jax.random.permutation(key_shuffle, x)
-            return x.reshape(self._config.num_minibatches, -1, *x.shape[1:])
+            return x[order].reshape(self._config.num_minibatches, -1, *x.shape[1:])
 
         (optimizer, networks, _), losses = jax.lax.scan(
             functools.partial(self._update, normalizer=normalizer),
