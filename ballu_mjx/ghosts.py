@@ -12,7 +12,6 @@ import mujoco
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int
-from matplotlib.colors import to_rgb
 
 from ballu_mjx import plots
 from ballu_mjx.replay import Take
@@ -48,16 +47,6 @@ class Poses(NamedTuple):
     """The site `balloon` (m), the balloon's centre of mass, at which the residual force acts."""
     yaw: Float[np.ndarray, " states"]
     """Of the balloon (rad), not unwrapped."""
-
-
-def colour(name: str) -> tuple[float, float, float]:
-    """Red, green and blue in [0, 1] of a robot of a take: the recording's or its simulator's, grey for unknown ones."""
-    return to_rgb(plots.COLOURS.get(name, "grey"))
-
-
-def label(name: str) -> str:
-    """What a robot of a take is called in print."""
-    return plots.LABELS.get(name, name)
 
 
 def parts(model: mujoco.MjModel) -> list[Part]:
@@ -127,7 +116,7 @@ def draw(
         for geom in scene.geoms[first : scene.ngeom]:
             opacity = BALLOON_OPACITY if geom.rgba[3] < 1 else OPACITY
             geom.matid = -1
-            geom.rgba[:] = (*colour(name), opacity)
+            geom.rgba[:] = (*plots.colour_of(name), opacity)
     if force is not None and np.linalg.norm(force) > SMALLEST_FORCE and scene.ngeom < scene.maxgeom:
         start = data.site("balloon").xpos
         arrow = scene.geoms[scene.ngeom]

@@ -2,7 +2,8 @@
 
 Stages, in the paper's order: an actuator sweep and its identification; vanilla policies; their actions replayed on the
 robot, several times each; one EnvMimic a task, and beyond the paper the air identified from the same recordings;
-policies in all simulators; trials on the robot; tables. Every stage is a folder, and beside it stands the key of what
+policies in all simulators; trials on the robot; tables. With `--rounds`, EnvMimic learns again from the robot under its
+own policies, and they in the simulator that this makes. Every stage is a folder, and beside it stands the key of what
 it was made from (options, and the keys of the stages it needs): an interrupted run goes on where it was, and a changed
 option redoes what depends on it and nothing else.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 import hashlib
+import itertools
 import json
 import re
 import shutil
@@ -38,6 +40,7 @@ from ballu_mjx import (
     virtual_robot,
 )
 from ballu_mjx.air_identification import AirConfig
+from ballu_mjx.deployment import PolicyController
 from ballu_mjx.envmimic import EnvMimicConfig
 from ballu_mjx.errors import InputError
 from ballu_mjx.identification import IdentificationConfig
@@ -47,11 +50,15 @@ from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.recording import write_recording
 from ballu_mjx.tasks import TASKS
 from ballu_mjx.transfer import Transfer, turning_table, walking_table
+from ballu_mjx.virtual_robot import Controller
 
 TABLES = {"walk": walking_table, "turn": turning_table}
 """The paper's tables, by task."""
 SETTINGS = ("vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic", "aerodynamic")
 """The paper's four simulators, and one with the identified air instead of EnvMimic's forces."""
+ROUNDS = "envmimic"
+"""The setting that `Options.rounds` repeats. Nothing of an earlier round is replaced: later ones have their number
+behind the name."""
 _DECIMALS = 4
 _KEY = re.compile("[0-9a-f]{16}")
 
@@ -76,6 +83,9 @@ class Options(loggers.LoggingOptions):
     """Control steps to train each policy for."""
     residual_steps: int = 1_500_000
     """Control steps to train each EnvMimic for."""
+    rounds: int = 1
+    """How often EnvMimic learns. From the second time on, its recordings are joined by the robot's motion under the
+    policies trained the time before, in closed loop; then policies are trained anew: `envmimic-2`, and so on."""
     quick: bool = False
     """Every stage within five minutes in all, for one task and two simulators; the tables mean nothing."""
 
@@ -84,9 +94,8 @@ def run(options: Options) -> int:
     """Run what is missing, print the tables; returns the exit status."""
     started = time.perf_counter()
     _check(options)
-    settings = SETTINGS
+    settings = settings_of(options)
     if options.quick:
-        settings = ("vanilla+dr", "envmimic")
         options = dataclasses.replace(options, trials=min(options.trials, 2), takes=1, tasks=options.tasks[:1])
     results: dict[str, dict[str, list[list[Transfer]]]] = {
         task: {setting: [] for setting in settings} for task in options.tasks
@@ -104,6 +113,29 @@ def run(options: Options) -> int:
         print("These numbers mean nothing: --quick trains for seconds.")
     print(f"Written to {options.output}. {time.perf_counter() - started:.0f} s in all.")
     return 0
+
+
+def settings_of(options: Options) -> tuple[str, ...]:
+    """The simulators that policies are trained in, in the tables' order."""
+    first = ("vanilla+dr", ROUNDS) if options.quick else SETTINGS
+    return (*first, *(_again(number) for number in range(2, options.rounds + 1)))
+
+
+def later_rounds(folder: Path, task: str) -> tuple[str, ...]:
+    """The settings of later rounds that a seed's folder has policies of."""
+    names = map(_again, itertools.count(2))
+    return tuple(itertools.takewhile(lambda name: (folder / f"{task}-{name}").is_dir(), names))
+
+
+def _again(number: int) -> str:
+    """What EnvMimic's setting is called in a round."""
+    return f"{ROUNDS}-{number}" if number > 1 else ROUNDS
+
+
+def _round(setting: str) -> tuple[str, int]:
+    """The setting of the first round, and which round `setting` is."""
+    name, _, number = setting.partition("-")
+    return name, int(number or 1)
 
 
 def table_file(output: Path, task: str) -> Path:
@@ -143,7 +175,8 @@ class Story:
 
     def policy(self, task: str, setting: str) -> Path:
         """The run of a policy's training."""
-        learned = setting in ("envmimic", "aerodynamic")
+        method, number = _round(setting)
+        learned = method in ("envmimic", "aerodynamic")
         config = LocomotionConfig(domain_randomization=learned or setting.endswith("+dr"))
         quick = policy_training.QUICK if self.options.quick else {"num_timesteps": self.options.policy_steps}
         ppo = policy_training.defaults(seed=self.seed, **quick)
@@ -151,7 +184,7 @@ class Story:
         # Six checkpoints in all, or one a training step: the last three are what is replayed on the robot.
         data = policy_training.Data(keep_every=max(ppo.num_timesteps // 6, 1), wandb=self.options.wandb)
         if learned:
-            needs = [self.residual(task, setting)]
+            needs = [self.residual(task, method, number)]
             data = dataclasses.replace(data, residual=needs[0])
         elif "+sysid" in setting:
             needs = [self.identified()]
@@ -182,30 +215,49 @@ class Story:
                 for take in range(takes):
                     jobs.append((use, f"actions-{index}-take-{take + 1}", played))
             for number, (use, name, commands) in enumerate(jobs):
-                recording = virtual_robot.record(
-                    self._robot,
-                    virtual_robot.draw_trial(_draw(self.seed, task, "recordings", number)),
-                    virtual_robot.open_loop(commands),
-                    len(commands) * robot.CONTROL_TIMESTEP,
-                    name,
-                    f"Actions of a vanilla policy for {task}, open loop.",
-                )
-                (folder / use).mkdir(exist_ok=True)
-                write_recording(recording, folder / use / f"{name}.csv.gz", decimals=_DECIMALS)
+                controller, length = virtual_robot.open_loop(commands), len(commands) * robot.CONTROL_TIMESTEP
+                draw, notes = _draw(self.seed, task, "recordings", number), f"Actions of a vanilla policy for {task}."
+                self._record(folder / use, name, controller, length, draw, notes)
                 print(f"Recorded {name} ({use}), {number + 1} of {len(jobs)}", flush=True)
 
         options = {"robot": self.options.robot, "seed": self.seed, "takes": takes, "seconds": seconds}
         return _stage(self._own / f"recordings-{task}", options, sources, make)
 
-    def residual(self, task: str, method: str) -> Path:
-        """The run of a residual, learned from the recordings of the task."""
-        recordings, identified = self.recordings(task), self.identified()
+    def trained_last(self, task: str, number: int) -> Path:
+        """The robot's motion under the policies of the round before, in closed loop: those of the last checkpoints,
+        each several times; and the last one's once more, a little longer, which validates."""
+        source = self.policy(task, _again(number - 1))
+        takes, seconds = self.options.takes, 6.0 if self.options.quick else 20.0
+
+        def make(folder: Path) -> None:
+            steps = [step for step in runs.checkpoints(source) if step > 0]
+            jobs = [("training", step, take, seconds) for step in steps for take in range(takes)]
+            jobs.append(("validation", steps[-1], takes, seconds + 5.0))
+            for job, (use, step, take, length) in enumerate(jobs):
+                name = f"round-{number}-policy-{step}-take-{take + 1}"
+                controller = PolicyController(Policy.load(source, step).act())
+                draw, notes = _draw(self.seed, task, f"round {number}", job), f"A policy for {task}, closed loop."
+                self._record(folder / use, name, controller, length, draw, notes)
+                print(f"Recorded {name} ({use}), {job + 1} of {len(jobs)}", flush=True)
+
+        options = {"robot": self.options.robot, "seed": self.seed, "takes": takes, "seconds": seconds}
+        return _stage(self._own / f"recordings-{task}-{number}", options, [source], make)
+
+    def _record(self, folder: Path, name: str, controller: Controller, seconds: float, draw: int, notes: str) -> None:
+        recording = virtual_robot.record(self._robot, virtual_robot.draw_trial(draw), controller, seconds, name, notes)
+        folder.mkdir(exist_ok=True)
+        write_recording(recording, folder / f"{name}.csv.gz", decimals=_DECIMALS)
+
+    def residual(self, task: str, method: str, number: int = 1) -> Path:
+        """The run of a residual, learned from the recordings of the task, those of all rounds up to this one."""
+        recordings = [self.recordings(task), *(self.trained_last(task, n) for n in range(2, number + 1))]
+        identified = self.identified()
         options = self._air() if method == "aerodynamic" else self._envmimic()
 
         def make(folder: Path) -> None:
             sources: dict[str, Any] = {
-                "recordings": (recordings / "training",),
-                "validation": (recordings / "validation",),
+                "recordings": tuple(each / "training" for each in recordings),
+                "validation": tuple(each / "validation" for each in recordings),
                 "actuators": identified / actuators.NAME,
                 "output": folder,
                 "wandb": self.options.wandb,
@@ -218,7 +270,8 @@ class Story:
                 data = residual_training.Data(resume=folder, wandb=data.wandb)
             _stop_unless_done(residual_training.train(data, *options))
 
-        return _stage(self._own / f"{method}-{task}", options, [recordings, identified], make)
+        name = f"{method}-{task}" if number == 1 else f"{method}-{task}-{number}"
+        return _stage(self._own / name, options, [*recordings, identified], make)
 
     def _air(self) -> AirConfig:
         return AirConfig(**air_fit.QUICK if self.options.quick else {})
@@ -339,7 +392,7 @@ def _stop_unless_done(status: int) -> None:
 
 
 def _check(options: Options) -> None:
-    for name in ("trials", "takes", "policy_steps", "residual_steps"):
+    for name in ("trials", "takes", "policy_steps", "residual_steps", "rounds"):
         if getattr(options, name) < 1:
             raise InputError(f"--{name.replace('_', '-')} is {getattr(options, name)}: it must be 1 or more.")
     if not options.seeds or min(options.seeds) < 0 or options.robot < 0:

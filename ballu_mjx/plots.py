@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
@@ -47,6 +48,28 @@ LABELS: Mapping[str, str] = {
     "aerodynamic+envmimic": "aerodynamic+EnvMimic",
     "aerodynamic+analytic": "aerodynamic+analytic",
 }
+
+
+def colour_of(simulator: str) -> tuple[float, float, float]:
+    """Of a simulator (a key of `COLOURS`), paler in each later round (`envmimic-2`); grey for a name unknown."""
+    name, number = _round(simulator)
+    own = np.array(to_rgb(COLOURS.get(name, "grey")))
+    red, green, blue = 1 - (1 - own) * _PALER ** (number - 1)
+    return red, green, blue
+
+
+def label_of(simulator: str) -> str:
+    """A simulator's name in figures; one unknown is its own."""
+    name, number = _round(simulator)
+    return LABELS.get(name, name) + (f", round {number}" if number > 1 else "")
+
+
+def _round(simulator: str) -> tuple[str, int]:
+    name, _, number = simulator.rpartition("-")
+    return (name, int(number)) if name in COLOURS and number.isdecimal() else (simulator, 1)
+
+
+_PALER = 0.55
 _QUANTITIES = ("x (m)", "y (m)", "yaw (deg)")
 _DOTS_PER_INCH = 120
 SIDE_COLOURS = ("#1f77b4", "#d64d1f")

@@ -189,7 +189,8 @@ def _story(folder: Path, tables: Mapping[str, str]) -> Content:
     for seed in sorted(path for path in folder.glob("seed-*") if path.is_dir()):
         for task in tables:
             where = f"{task}, {seed.name}"
-            policies = {setting: seed / f"{task}-{setting}" for setting in ("vanilla", *pipeline.SETTINGS)}
+            settings = ("vanilla", *pipeline.SETTINGS, *pipeline.later_rounds(seed, task))
+            policies = {setting: seed / f"{task}-{setting}" for setting in settings}
             policies = {setting: path for setting, path in policies.items() if (path / "config.json").is_file()}
             content.curves += [dataclasses.replace(c, title=f"{c.title} ({where})") for c in _curves(policies)]
             own = {s: replay.read(p / replay.NAME)[0] for s, p in policies.items() if (p / replay.NAME).is_file()}
@@ -199,14 +200,17 @@ def _story(folder: Path, tables: Mapping[str, str]) -> Content:
                 image = seed / f"trials-{task}-{setting}" / "trials.png"
                 if image.is_file():
                     content.images.append((f"Trials on the robot: {where}, {setting}", image.read_bytes()))
-            learned = seed / f"envmimic-{task}"
-            if (learned / "config.json").is_file():
-                _add_evaluation(content, learned, f"EnvMimic for {where}: ")
-                if (learned / replay.NAME).is_file():
-                    content.takes += [
-                        dataclasses.replace(take, name=f"EnvMimic for {where}: {take.name}")
-                        for take in replay.read(learned / replay.NAME)
-                    ]
+            again = [name.partition("-")[2] for name in pipeline.later_rounds(seed, task)]
+            for number in ("1", *again):
+                name = f"EnvMimic for {where}" if number == "1" else f"EnvMimic for {where}, round {number}"
+                learned = seed / (f"envmimic-{task}" if number == "1" else f"envmimic-{task}-{number}")
+                if (learned / "config.json").is_file():
+                    _add_evaluation(content, learned, f"{name}: ")
+                    if (learned / replay.NAME).is_file():
+                        content.takes += [
+                            dataclasses.replace(take, name=f"{name}: {take.name}")
+                            for take in replay.read(learned / replay.NAME)
+                        ]
     return content
 
 
@@ -226,7 +230,7 @@ def _add_evaluation(content: Content, folder: Path, prefix: str = "") -> None:
     from ballu_mjx import evaluation, plots
 
     found = evaluation.read(path)
-    base, name = found.base, plots.LABELS.get(found.name, found.name)
+    base, name = found.base, plots.label_of(found.name)
     pairs = list(zip(found.vanilla, found.residual, strict=True))
     content.facts.append((f"{prefix}score", f"{found.score:.3f} (mean ratio to {base})"))
     content.tables += [
@@ -300,7 +304,7 @@ def render(content: Content) -> str:
         import markupsafe
         from plotly.offline import get_plotlyjs
 
-        from ballu_mjx import ghosts, stage
+        from ballu_mjx import ghosts, plots, stage
     except ImportError as error:
         raise InputError(
             f"The report needs {error.name}, which comes with the extra report: pip install -c constraints.txt -e "
@@ -322,7 +326,7 @@ def render(content: Content) -> str:
         content=content,
         markdown=[(title, markupsafe.Markup(markdown.render(text))) for title, text in content.markdown],
         images=[(title, base64.b64encode(png).decode()) for title, png in content.images],
-        legends=[[(ghosts.label(name), _hex(name)) for name in take.qpos] for take in takes],
+        legends=[[(plots.label_of(name), _hex(name)) for name in take.qpos] for take in takes],
         arrow=ghosts.ARROW_LENGTH / 10,
         with_force=any(ghosts.pushed(take) for take in takes),
         shown=shown,
@@ -345,16 +349,16 @@ _Rows = Sequence[tuple[str, Sequence[_Line]]]
 def _hex(name: str) -> str:
     from matplotlib.colors import to_hex
 
-    from ballu_mjx import ghosts
+    from ballu_mjx import plots
 
-    return to_hex(ghosts.colour(name))
+    return to_hex(plots.colour_of(name))
 
 
 def _curve_rows(curves: Sequence[Curve]) -> _Rows:
-    from ballu_mjx import ghosts
+    from ballu_mjx import plots
 
     return [
-        (c.title, [_Line(ghosts.label(name), _hex(name), x / 1e6, y) for name, (x, y) in c.values.items()])
+        (c.title, [_Line(plots.label_of(name), _hex(name), x / 1e6, y) for name, (x, y) in c.values.items()])
         for c in curves
     ]
 
@@ -370,7 +374,7 @@ def _take_rows(take: Take) -> _Rows:
         name: plots.unwrapped(np.column_stack([p.balloon[:, :2], p.yaw])[None], start)[0] for name, p in poses.items()
     }
     rows: list[tuple[str, Sequence[_Line]]] = [
-        (title, [_Line(ghosts.label(name), _hex(name), take.time, way[:, i]) for name, way in ways.items()])
+        (title, [_Line(plots.label_of(name), _hex(name), take.time, way[:, i]) for name, way in ways.items()])
         for i, title in enumerate(("x (m)", "y (m)", "yaw (deg)"))
     ]
     steps = take.time[:-1]

@@ -14,7 +14,7 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from ballu_mjx import ghosts, robot
+from ballu_mjx import ghosts, plots, robot
 from ballu_mjx.errors import InputError
 from ballu_mjx.replay import Take
 
@@ -42,9 +42,9 @@ class Stage:
         )
         self.robots: dict[str, viser.FrameHandle] = {}
         for name, poses in self.poses.items():
-            colour = ghosts.colour(name)
+            colour = plots.colour_of(name)
             # A slash would start another level of the scene's tree.
-            top = f"/world/{ghosts.label(name).replace('/', '_')}"
+            top = f"/world/{plots.label_of(name).replace('/', '_')}"
             self.robots[name] = scene.add_frame(top, show_axes=False)
             paths, self._handles[name] = [top], []
             for body in range(1, model.nbody):
@@ -68,7 +68,7 @@ class Stage:
         self._arrow: viser.ArrowsHandle | None = None
         if pushed is not None:
             self._arrow = scene.add_arrows(
-                f"/world/{ghosts.label(pushed)}/force",
+                f"/world/{plots.label_of(pushed)}/force",
                 np.zeros((1, 2, 3)),
                 ghosts.ARROW_COLOUR,
                 shaft_radius=0.008,

@@ -173,7 +173,7 @@ class Player:
         return 0 if self._shown is None else self._shown[1]
 
     def _load(self) -> None:
-        from ballu_mjx import ghosts
+        from ballu_mjx import plots
         from ballu_mjx.stage import Stage
 
         take = self._takes[self._names.index(self.take.value)]
@@ -190,7 +190,7 @@ class Player:
             self._folder.remove()
         self._folder = self._server.gui.add_folder("robots")
         with self._folder:
-            self._boxes = [self._server.gui.add_checkbox(ghosts.label(name), True) for name in take.qpos]
+            self._boxes = [self._server.gui.add_checkbox(plots.label_of(name), True) for name in take.qpos]
         self._show(0)
 
     def _close(self) -> tuple[np.ndarray, np.ndarray]:

@@ -32,6 +32,7 @@ def options(description: str, task: str) -> tuple[pipeline.Options, bool]:
     parser.add_argument(
         "--output", type=Path, help=f"folder of `train all`'s stages ({OUTPUT}, or {QUICK_OUTPUT} under --quick)"
     )
+    parser.add_argument("--rounds", type=int, default=1, help="how often EnvMimic learns; see `train all --help` (1)")
     parser.add_argument("--quick", action="store_true", help="train for seconds; the numbers mean nothing")
     parser.add_argument("--figure-only", action="store_true", help="draw from the trials that are there; run nothing")
     given = parser.parse_args()
@@ -42,6 +43,7 @@ def options(description: str, task: str) -> tuple[pipeline.Options, bool]:
         seeds=tuple(given.seeds),
         tasks=(task,),  # pyright: ignore[reportArgumentType]  # a literal at every call
         quick=given.quick,
+        rounds=given.rounds,
     )
     return chosen, given.figure_only
 
@@ -52,7 +54,7 @@ def read_ways(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[l
     **Raises** `InputError` where `folder` holds no such trials.
     """
     found = {}
-    for setting in pipeline.SETTINGS:
+    for setting in (*pipeline.SETTINGS, *pipeline.later_rounds(folder / f"seed-{seeds[0]}", task)):
         trials = [folder / f"seed-{seed}" / f"trials-{task}-{setting}" for seed in seeds]
         if all(_finished(trial) for trial in trials):
             found[setting] = [[_way(path) for path in sorted(trial.glob("trial-*.csv.gz"))] for trial in trials]
@@ -98,10 +100,10 @@ def draw(ways: dict[str, list[list[Way]]], seeds: Sequence[int], path: Path) -> 
         axis.axvline(0.0, color="grey", linewidth=0.8)
         for style, trials in zip(styles, runs, strict=True):
             for way in trials:
-                axis.plot(*way.T, style, color=plots.COLOURS[setting], linewidth=1.2, alpha=0.85)
-                axis.plot(*way[-1], "o", color=plots.COLOURS[setting], markersize=4)
+                axis.plot(*way.T, style, color=plots.colour_of(setting), linewidth=1.2, alpha=0.85)
+                axis.plot(*way[-1], "o", color=plots.colour_of(setting), markersize=4)
         axis.plot(0.0, 0.0, "o", color="black", markersize=5)
-        axis.set(title=plots.LABELS[setting], xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        axis.set(title=plots.label_of(setting), xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axis.set_aspect("equal")
         axis.grid(alpha=0.3)
     for axis in axes.flat[len(ways) - columns : len(ways)]:  # the lowest of each column

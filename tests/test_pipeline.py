@@ -66,7 +66,7 @@ def test_trials_of_all_settings_meet_the_same_draughts_and_no_two_are_alike():
         pipeline._draw(seed, task, use, number)
         for seed in (0, 1)
         for task in ("walk", "turn")
-        for use in ("recordings", "trials")
+        for use in ("recordings", "trials", "round 2")
         for number in range(10)
     ]
     assert len(set(draws)) == len(draws)
@@ -86,3 +86,26 @@ def test_options_out_of_range_are_refused_before_anything_is_written(options, wo
     with pytest.raises(InputError, match=words):
         pipeline.run(Options(output=tmp_path / "out", **options))
     assert not (tmp_path / "out").exists()
+
+
+def test_each_round_learns_from_all_recordings_so_far_and_keeps_what_came_before(tmp_path, monkeypatch):
+    """Which stage needs which, without making any: a stage is a folder whose needs stand beside it."""
+    needs: dict[str, list[str]] = {}
+
+    def stage(folder, options, sources, make):
+        needs[folder.name] = [source.name for source in sources]
+        return folder
+
+    monkeypatch.setattr(pipeline, "_stage", stage)
+    options = Options(output=tmp_path, rounds=3)
+    told = pipeline.Story(options, seed=0)
+    for setting in pipeline.settings_of(options):
+        told.policy("walk", setting)
+    assert pipeline.settings_of(options) == (*pipeline.SETTINGS, "envmimic-2", "envmimic-3")
+    recorded = ["recordings-walk", "recordings-walk-2", "recordings-walk-3"]
+    for number, name in enumerate(("envmimic-walk", "envmimic-walk-2", "envmimic-walk-3"), 1):
+        assert needs[name] == [*recorded[:number], "sysid"]
+    assert needs["recordings-walk-3"] == ["walk-envmimic-2"]
+    assert needs["walk-envmimic-3"] == ["envmimic-walk-3"]
+    assert needs["walk-envmimic"] == ["envmimic-walk"]
+    assert needs["aerodynamic-walk"] == ["recordings-walk", "sysid"]
