@@ -166,23 +166,24 @@ def main() -> None:
 
     horizons = [h for h in evaluation.HORIZONS if any(h in each.position for each in found[0].vanilla)]
     lines = [
-        "| horizon (s) | vanilla: m, deg | EnvMimic: m, deg | ratio: position, yaw |",
-        "| ---: | --- | --- | --- |",
+        "| horizon (s) | vanilla: m, deg | EnvMimic: m, deg | left of vanilla's: position | yaw |",
+        "| ---: | --- | --- | --- | --- |",
     ]
     curves: dict[str, list[list[float]]] = {"vanilla": [], "envmimic": []}
     for horizon in horizons:
-        cells = []
+        absolute, left = [], []
         for quantity in ("position", "yaw"):
             without = errors(found[0].vanilla, quantity, horizon)
             each = [errors(result.residual, quantity, horizon) for result in found]
-            cells.append((without, float(np.mean(each))))
+            absolute.append((without, float(np.mean(each))))
+            low, mean, high = np.array([np.min(each), np.mean(each), np.max(each)]) / without
+            left.append(f"{mean:.2f} [{low:.2f}, {high:.2f}]")
             if quantity == "position":
                 curves["vanilla"].append([without])
                 curves["envmimic"].append(each)
-        (place, place_with), (yaw, yaw_with) = cells
+        (place, place_with), (yaw, yaw_with) = absolute
         lines.append(
-            f"| {horizon:g} | {place:.3f}, {yaw:.1f} | {place_with:.3f}, {yaw_with:.1f} | {place_with / place:.2f}, "
-            f"{yaw_with / yaw:.2f} |"
+            f"| {horizon:g} | {place:.3f}, {yaw:.1f} | {place_with:.3f}, {yaw_with:.1f} | {' | '.join(left)} |"
         )
     text = "\n".join(lines)
     (options.output / "table.md").write_text(text + "\n")
@@ -193,6 +194,8 @@ def main() -> None:
         axis.plot(horizons, mean, color=plots.COLOURS[name], marker="o", label=plots.LABELS[name])
         axis.fill_between(horizons, low, high, color=plots.COLOURS[name], alpha=0.2, linewidth=0)
     axis.set(xlabel="horizon (s)", ylabel="position RMSE (m)", xscale="log", ylim=(0, None))
+    axis.set_xticks(horizons, [f"{horizon:g}" for horizon in horizons])
+    axis.minorticks_off()
     axis.grid(alpha=0.3)
     axis.legend()
     figure.savefig(options.output / "errors.png", dpi=120)
