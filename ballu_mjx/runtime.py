@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import gc
 import hashlib
 import importlib
 import importlib.metadata
@@ -26,6 +27,8 @@ _DEVICE_COUNT_FLAG = "--xla_force_host_platform_device_count"
 _VECTOR_WIDTH_FLAG = "--xla_cpu_prefer_vector_width"
 _MIN_COMPILE_SECONDS = 1.0
 """Programs that compile faster than this are not worth a file in the cache."""
+_ALLOCATIONS = 100_000
+"""More objects made than freed, between two looks for garbage (Python's own: 700)."""
 _MOST_SAID = 300
 """Characters of an unexpected error's message: XLA's fill pages."""
 
@@ -40,6 +43,8 @@ def prepare() -> None:
     - XLA's log is quietened on machines without an accelerator, unless `TF_CPP_MIN_LOG_LEVEL` is set: every program
       loaded from the cache otherwise prints pages about tuning flags that are no fault. Failures still arrive as
       exceptions.
+    - Python looks for garbage less often: tracing MJX makes millions of objects that stay, and looking through all of
+      them again and again takes time.
     - A JAX that would hang is refused (`check_jax`), and MJX's report that Warp is not installed kept off the screen.
 
     Where JAX is imported already (a notebook, say), its settings stay as they are.
@@ -58,6 +63,7 @@ def prepare() -> None:
                 cache_dir().mkdir(parents=True, exist_ok=True)
                 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache_dir())
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(_MIN_COMPILE_SECONDS))
+    gc.set_threshold(_ALLOCATIONS, *gc.get_threshold()[1:])
     check_jax()
     _import_mjx()
 
