@@ -266,22 +266,27 @@ def test_story_shows_its_tables_and_policies_over_each_other(tmp_path: Path):
     transfer = Transfer(*np.arange(1.0, 10.0))
     results = {"vanilla+dr": [[transfer]], "envmimic": [[transfer]], HOSTILE: [[transfer]]}
     pipeline.table_file(tmp_path, "walk").write_text(walking_table(results))
-    for setting, states in (("vanilla+dr", 30), ("envmimic", 25)):
+    for setting, states in (("vanilla+dr", 30), ("envmimic", 25), ("envmimic-2", 28)):
         folder = tmp_path / "seed-0" / f"walk-{setting}"
         sections = {"env": LocomotionConfig(), "ppo": policy_training.defaults(), "data": policy_training.Data()}
         with runs.Run(folder, runs.describe("walk", sections, {}, [])) as run:
             run.log(100, {"reward": 0.1})
-        episode = Take(name="walk", time=np.arange(states) * 0.05, qpos={setting: walk(states, 0.2, 0.0, 1)})
+        episode = Take(
+            name="walk", time=np.arange(states) * 0.05, qpos={setting.removesuffix("-2"): walk(states, 0.2, 0.0, 1)}
+        )
         replay.write(folder / replay.NAME, [episode])
     write_run(tmp_path / "seed-0" / "envmimic-walk", [take("actions-1", 21)])
+    write_run(tmp_path / "seed-0" / "envmimic-walk-2", [take("actions-1", 22)])
 
     content = report.collect(tmp_path)
     assert [(t.name, list(t.qpos), len(t.time)) for t in content.takes] == [
-        ("policies: walk, seed-0", ["vanilla+dr", "envmimic"], 25),
+        ("policies: walk, seed-0", ["vanilla+dr", "envmimic", "envmimic-2"], 25),
         ("EnvMimic for walk, seed-0: actions-1", ["recording", "vanilla", "envmimic"], 21),
+        ("EnvMimic for walk, seed-0, round 2: actions-1", ["recording", "vanilla", "envmimic"], 22),
     ]
-    assert [list(curve.values) for curve in content.curves] == [["vanilla+dr", "envmimic"]]
+    assert [list(curve.values) for curve in content.curves] == [["vanilla+dr", "envmimic", "envmimic-2"]]
     text = report.render(content)
+    assert "EnvMimic, round 2" in text
     assert re.search(r"<td>vanilla\+dr</td>\s*<td[^>]*>1\.00</td>\s*<td[^>]*>1\.24</td>", text)  # ours, and the paper's
     assert "hacked" not in " ".join(str(a) for tag, a in Elements(text).elements if tag == "img")
     assert "<img src=x" not in text
