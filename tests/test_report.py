@@ -23,7 +23,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ballu_mjx import ghosts, pipeline, policy_training, replay, report, residual_training, robot, runs, video, view
+from ballu_mjx import (
+    ghosts,
+    pipeline,
+    plots,
+    policy_training,
+    replay,
+    report,
+    residual_training,
+    robot,
+    runs,
+    video,
+    view,
+)
 from ballu_mjx import stage as stages
 from ballu_mjx.envmimic import EnvMimicConfig
 from ballu_mjx.evaluation import HORIZONS, Errors, Evaluation
@@ -328,7 +340,7 @@ def test_mujoco_scene_holds_every_robot_in_its_colour_and_the_force():
     ghosts.draw(scene, model, data, robots, np.array([0.0, 0.1, 0.0]))
     geoms = scene.geoms[: scene.ngeom]
     for name in robots:
-        own = [geom for geom in geoms if np.allclose(geom.rgba[:3], ghosts.colour(name), atol=1e-3)]
+        own = [geom for geom in geoms if np.allclose(geom.rgba[:3], plots.colour_of(name), atol=1e-3)]
         balloons = [geom for geom in own if geom.type == mujoco.mjtGeom.mjGEOM_ELLIPSOID]
         assert len(balloons) == 6 and all(geom.rgba[3] < 0.3 for geom in balloons)
         base = min(balloons, key=lambda geom: geom.pos[2]).pos[0]
