@@ -31,6 +31,7 @@ from ballu_mjx import (
     air_fit,
     files,
     loggers,
+    plots,
     policy_training,
     residual_training,
     robot,
@@ -132,12 +133,6 @@ def _again(number: int) -> str:
     return f"{ROUNDS}-{number}" if number > 1 else ROUNDS
 
 
-def _round(setting: str) -> tuple[str, int]:
-    """The setting of the first round, and which round `setting` is."""
-    name, _, number = setting.partition("-")
-    return name, int(number or 1)
-
-
 def table_file(output: Path, task: str) -> Path:
     """Where the table of a task is written."""
     return output / f"table-{task}.md"
@@ -175,7 +170,7 @@ class Story:
 
     def policy(self, task: str, setting: str) -> Path:
         """The run of a policy's training."""
-        method, number = _round(setting)
+        method, number = plots.round_of(setting)
         learned = method in ("envmimic", "aerodynamic")
         config = LocomotionConfig(domain_randomization=learned or setting.endswith("+dr"))
         quick = policy_training.QUICK if self.options.quick else {"num_timesteps": self.options.policy_steps}

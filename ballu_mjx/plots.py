@@ -52,7 +52,7 @@ LABELS: Mapping[str, str] = {
 
 def colour_of(simulator: str) -> tuple[float, float, float]:
     """Of a simulator (a key of `COLOURS`), paler in each later round (`envmimic-2`); grey for a name unknown."""
-    name, number = _round(simulator)
+    name, number = round_of(simulator)
     own = np.array(to_rgb(COLOURS.get(name, "grey")))
     red, green, blue = 1 - (1 - own) * _PALER ** (number - 1)
     return red, green, blue
@@ -60,11 +60,12 @@ def colour_of(simulator: str) -> tuple[float, float, float]:
 
 def label_of(simulator: str) -> str:
     """A simulator's name in figures; one unknown is its own."""
-    name, number = _round(simulator)
+    name, number = round_of(simulator)
     return LABELS.get(name, name) + (f", round {number}" if number > 1 else "")
 
 
-def _round(simulator: str) -> tuple[str, int]:
+def round_of(simulator: str) -> tuple[str, int]:
+    """Its name in the first round, and which round it is."""
     name, _, number = simulator.rpartition("-")
     return (name, int(number)) if name in COLOURS and number.isdecimal() else (simulator, 1)
 
