@@ -217,6 +217,12 @@ class Simulator:
         other.model = ballu.with_fields(self.model, dict(fields))
         return other
 
+    def strained(self, generalized: Float[Array, " nv"]) -> Simulator:
+        """The same under generalized forces (N, N m, along `mjx.Data.qvel`), which may be traced."""
+        other = copy.copy(self)
+        other._template = self._template.replace(qfrc_applied=generalized)  # pyright: ignore
+        return other
+
     def observe(self, state: simulation.State) -> tuple[Float[Array, " features"], Float[Array, " 3"]]:
         """Features and centre of mass (m, world) of a state."""
         return _observe(self.model, self._template, state, self._masses, self._sites, self._root)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from jaxtyping import Float
 from ballu_mjx import analytic, envmimic, evaluate, evaluation, loggers, plots, ppo, runs, supervised, windows
 from ballu_mjx.analytic import AnalyticConfig
 from ballu_mjx.envmimic import EnvMimicConfig, ForcePolicy
-from ballu_mjx.forces import Sum
+from ballu_mjx.forces import Applied, Sum
 from ballu_mjx.linearization import Linearizer
 from ballu_mjx.ppo import Params, PPOConfig
 from ballu_mjx.reconstruction import Motion
@@ -26,14 +27,14 @@ from ballu_mjx.runs import Run
 from ballu_mjx.supervised import SupervisedConfig
 
 QUICK: Mapping[str, Mapping[str, Any]] = {
-    "supervised": {"window_seconds": 0.5, "updates": 400},
+    "supervised": {"updates": 400},
     "analytic": {"window_seconds": 0.5, "rounds": 1, "updates": 50},
 }
 """Defaults of the methods' configurations under `--quick`."""
 
 
 @dataclasses.dataclass(frozen=True)
-class AnalyticData(RecordingsData):
+class ForcesData(RecordingsData):
     """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
     residual: Path | None = None
@@ -41,17 +42,16 @@ class AnalyticData(RecordingsData):
     learned beside the same actuators. Without this option: none."""
 
 
-def fit_supervised(data: RecordingsData, config: SupervisedConfig) -> int:
+def fit_supervised(data: ForcesData, config: SupervisedConfig) -> int:
     """Read and check everything, label, regress, evaluate; returns the exit status."""
     supervised.check(config)
-    return _fit("supervised", data, config, None, _Supervised)
+    return _fit("supervised", data, config, _Supervised)
 
 
-def fit_analytic(data: AnalyticData, config: AnalyticConfig) -> int:
+def fit_analytic(data: ForcesData, config: AnalyticConfig) -> int:
     """Read and check everything, learn, evaluate; returns the exit status."""
     analytic.check(config)
-    beside = None if data.residual is None else Residual.load(data.residual)
-    return _fit("analytic", data, config, beside, _Analytic)
+    return _fit("analytic", data, config, _Analytic)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +63,7 @@ class _Setup:
     forces: ForcePolicy
     start: Params
     inputs: Float[np.ndarray, "states inputs"]
-    beside: Residual | None
+    beside: Applied | None
 
     def with_policy(self, policy: Any) -> Params:
         """Parameters of `forces`."""
@@ -78,6 +78,10 @@ class _Fit:
     def __init__(self, setup: _Setup, config: Any, run: Run, validate: Callable[[Any], float]) -> None:
         self.setup, self.config, self.run, self.validate = setup, config, run, validate
         self.stages, self.began = runs.Stages(), time.perf_counter()
+
+    def learn(self) -> None:
+        """From beginning to end."""
+        raise NotImplementedError
 
     @property
     def still(self) -> Any:
@@ -98,15 +102,18 @@ class _Supervised(_Fit):
     def learn(self) -> None:
         """Labels for training and validation, and the regression."""
         setup, config = self.setup, self.config
-        simulate, linearize = analytic.simulator(setup.model, setup.forces), Linearizer(setup.model)
+        simulator = envmimic.Simulator(setup.model)
+        linearize = Linearizer(setup.model, setup.beside, simulator.robot.joints)
+        label = supervised.Labeller(setup.model, simulator.robot, linearize, config)
         found = {}
         for use in ("training", "validation"):
-            robots = envmimic.Simulator(setup.model)
-            cut = windows.cut(robots, setup.motions[use], config.window_seconds, config.interval_seconds)
-            steps, _ = simulate(setup.with_policy(self.still), cut)
-            force = supervised.labels(setup.model, cut, linearize(steps), config)
-            found[use] = supervised.examples(cut, force, setup.forces.config)
-            print(f"Labels, {use}: {_rms(force) * 1e3:.1f} mN (RMS along an axis).", flush=True)
+            motions, force = setup.motions[use], []
+            for motion in motions:
+                force.append(label(motion))
+                self.stages.update(f"labels, {use}", len(force), len(motions), math.nan)
+            found[use] = supervised.examples(simulator, motions, force, setup.forces.config)
+            self.stages.close()
+            print(f"Labels, {use}: {_rms(np.concatenate(force)) * 1e3:.1f} mN (RMS along an axis).", flush=True)
         infer = jax.jit(lambda policy, seen: setup.forces.infer(setup.with_policy(policy), seen))
         seen, actions = found["validation"]
 
@@ -139,7 +146,7 @@ class _Analytic(_Fit):
             np.std(setup.inputs, axis=0),
             config,
             report,
-            None if setup.beside is None else setup.beside.applied,
+            setup.beside,
         )
 
 
@@ -147,12 +154,13 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _fit(task: str, data: RecordingsData, config: Any, beside: Residual | None, method: type) -> int:
+def _fit(task: str, data: ForcesData, config: Any, method: type[_Fit]) -> int:
     started = time.perf_counter()
     loggers.check(data.wandb)
+    beside = None if data.residual is None else Residual.load(data.residual)
     prepared = Prepared.read(data)
     if beside is not None:
-        prepared.check_beside(beside.actuators, data.residual)  # pyright: ignore[reportAttributeAccessIssue]
+        prepared.check_beside(beside.actuators, data.residual)
     folder = runs.new_folder(data.output, task)
     prepared.announce(folder, data.quick)
     model = prepared.load_model()
@@ -162,7 +170,9 @@ def _fit(task: str, data: RecordingsData, config: Any, beside: Residual | None, 
     inputs = np.asarray(envmimic.recorded_inputs(reference, env))
     infer = ppo.make_inference({ppo.STATE: (inputs.shape[1],)}, ACTIONS, network)
     forces = ForcePolicy(env, infer, name=task)
-    setup = _Setup(model, motions, forces, ppo.initial_policy(inputs, ACTIONS, network), inputs, beside)
+    setup = _Setup(
+        model, motions, forces, ppo.initial_policy(inputs, ACTIONS, network), inputs, beside and beside.applied
+    )
     whole = forces if beside is None else Sum(beside.model, forces)
 
     def all_params(params: Params) -> Any:
@@ -174,7 +184,7 @@ def _fit(task: str, data: RecordingsData, config: Any, beside: Residual | None, 
     sections = {"env": env, "ppo": network, "fit": config, "data": data}
     devices = [str(device) for device in jax.local_devices()]
     description = runs.describe(task, sections, prepared.files, devices, prepared.identified)
-    description["residual"] = None if beside is None else str(data.residual.resolve())  # pyright: ignore
+    description["residual"] = None if data.residual is None else str(data.residual.resolve())
     validation = evaluator("validation")
     with Run(folder, description, wandb=data.wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)

@@ -1,12 +1,14 @@
-"""Control steps to first order: what a small change of the state before, or of the force on the balloon, changes after.
+"""Control steps to first order: what a small change of the state before, of the force on the balloon, or of joints'
+torques changes after.
 
 Derivatives are taken forward, direction by direction, through the same accurate physics that everything else is
 simulated with: the solver's loop has no reverse mode, and a reverse mode of its own would be that of another model.
-Twenty-nine directions a control step are few beside the thousands of gradients that can then be had without simulating.
+Some thirty directions a control step are few beside the thousands of gradients that can then be had without simulating.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -38,22 +40,27 @@ class ControlSteps(NamedTuple):
 
 class Linearized(NamedTuple):
     """Control steps to first order. The state's directions are those of `mjx.Data.qvel` for positions (the base turns
-    about its own axes), then the velocities'."""
+    about its own axes), then the velocities'; the inputs are the force (N) and then the joints' torques (N m)."""
 
+    qpos: Float[Array | np.ndarray, "steps nq"]
+    """After the step."""
+    qvel: Float[Array | np.ndarray, "steps nv"]
+    """After the step."""
     features: Float[Array | np.ndarray, "steps 27"]
     """After the step."""
-    state: Float[Array | np.ndarray, "steps 2nv 2nv+3"]
-    """Derivative of the state after by the state before and the force (N)."""
-    seen: Float[Array | np.ndarray, "steps 27 2nv+3"]
+    state: Float[Array | np.ndarray, "steps 2nv 2nv+inputs"]
+    """Derivative of the state after by the state before and the inputs."""
+    seen: Float[Array | np.ndarray, "steps 27 2nv+inputs"]
     """Derivative of the features after, likewise."""
 
 
 class Linearizer:
     """The robot's control steps, to first order; compiles once."""
 
-    def __init__(self, model: mujoco.MjModel, beside: Applied | None = None) -> None:
-        """`beside` is a residual that the simulator has already."""
+    def __init__(self, model: mujoco.MjModel, beside: Applied | None = None, joints: Sequence[str] = ()) -> None:
+        """`beside` is a residual that the simulator has already; `joints` are those whose torques are inputs too."""
         self._nv, self._beside = model.nv, beside
+        self._joints = np.array([model.joint(name).dofadr[0] for name in joints], int)
         self._simulator = envmimic.Simulator(model)
         if beside is not None:
             self._simulator = self._simulator.altered(beside.model.fields(beside.params))
@@ -61,8 +68,8 @@ class Linearizer:
 
     @property
     def directions(self) -> int:
-        """Of the state before and the force."""
-        return 2 * self._nv + FORCE
+        """Of the state before and the inputs."""
+        return 2 * self._nv + FORCE + len(self._joints)
 
     def __call__(self, steps: ControlSteps) -> Linearized:
         """Linearize; a step whose derivatives are no numbers comes back with zeros."""
@@ -73,12 +80,12 @@ class Linearizer:
             place = np.repeat(np.arange(first, first + _CHUNK) % count, every)
             chunk = jax.tree.map(lambda x, place=place: np.asarray(x, np.float32)[place], steps)
             found.append([x.reshape(_CHUNK, every, -1) for x in self._along(chunk, units)])
-        features, state, seen = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
+        qpos, qvel, features, state, seen = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
         good = np.isfinite(state).all(axis=(1, 2)) & np.isfinite(seen).all(axis=(1, 2))
         state, seen = (np.where(good.reshape(-1, 1, 1), x, 0.0).transpose(0, 2, 1) for x in (state, seen))
-        return Linearized(features[:, 0], state, seen)
+        return Linearized(qpos[:, 0], qvel[:, 0], features[:, 0], state, seen)
 
-    def _one(self, step: ControlSteps, direction: Float[Array, " directions"]) -> tuple[Array, Array, Array]:
+    def _one(self, step: ControlSteps, direction: Float[Array, " directions"]) -> tuple[Array, ...]:
         nv, physics = self._nv, step.physics
         turned = _expand(physics.qpos, direction[:nv])
 
@@ -88,19 +95,21 @@ class Linearizer:
                 physics.qvel + amount * direction[nv : 2 * nv],
                 physics.warmstart + 0.0 * amount,
             )
-            commands, force = jnp.asarray(step.commands), step.force + amount * direction[2 * nv :]
-            command, wrench = commands[-1], jnp.concatenate([force, jnp.zeros(3)])
+            commands, inputs = jnp.asarray(step.commands), amount * direction[2 * nv :]
+            command, wrench = commands[-1], jnp.concatenate([step.force + inputs[:FORCE], jnp.zeros(3)])
+            simulator = self._simulator.strained(jnp.zeros(nv).at[self._joints].set(inputs[FORCE:]))
             if self._beside is not None:
                 model, params = self._beside
-                seen, _ = self._simulator.observe(moved)
+                seen, _ = simulator.observe(moved)
                 history = jnp.concatenate([step.history[:-1], seen[None]])
                 command = model.command(params, commands)
                 wrench += model.wrench(params, history, commands)
-            state = self._simulator.step(moved, command, wrench)
-            return state, self._simulator.observe(state)[0]
+            state = simulator.step(moved, command, wrench)
+            return state, simulator.observe(state)[0]
 
         (state, features), (change, seen) = jax.jvp(after, (jnp.zeros(()),), (jnp.ones(()),))
-        return features, jnp.concatenate([_compress(state.qpos, change.qpos), change.qvel]), seen
+        moved = jnp.concatenate([_compress(state.qpos, change.qpos), change.qvel])
+        return state.qpos, state.qvel, features, moved, seen
 
 
 def _expand(qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:

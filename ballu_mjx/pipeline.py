@@ -133,6 +133,12 @@ def _again(number: int) -> str:
     return f"{ROUNDS}-{number}" if number > 1 else ROUNDS
 
 
+def residual_folder(seed: Path, task: str, setting: str) -> Path:
+    """Where, in a seed's folder, the residual of a setting is learned."""
+    method, number = plots.round_of(setting)
+    return seed / (f"{method}-{task}" if number == 1 else f"{method}-{task}-{number}")
+
+
 def table_file(output: Path, task: str) -> Path:
     """Where the table of a task is written."""
     return output / f"table-{task}.md"
@@ -170,7 +176,7 @@ class Story:
 
     def policy(self, task: str, setting: str) -> Path:
         """The run of a policy's training."""
-        method, number = plots.round_of(setting)
+        method, _ = plots.round_of(setting)
         learned = method in ("envmimic", "aerodynamic")
         config = LocomotionConfig(domain_randomization=learned or setting.endswith("+dr"))
         quick = policy_training.QUICK if self.options.quick else {"num_timesteps": self.options.policy_steps}
@@ -179,7 +185,7 @@ class Story:
         # Six checkpoints in all, or one a training step: the last three are what is replayed on the robot.
         data = policy_training.Data(keep_every=max(ppo.num_timesteps // 6, 1), wandb=self.options.wandb)
         if learned:
-            needs = [self.residual(task, method, number)]
+            needs = [self.residual(task, setting)]
             data = dataclasses.replace(data, residual=needs[0])
         elif "+sysid" in setting:
             needs = [self.identified()]
@@ -225,12 +231,12 @@ class Story:
         takes, seconds = self.options.takes, 6.0 if self.options.quick else 20.0
 
         def make(folder: Path) -> None:
-            steps = [step for step in runs.checkpoints(source) if step > 0]
-            jobs = [("training", step, take, seconds) for step in steps for take in range(takes)]
-            jobs.append(("validation", steps[-1], takes, seconds + 5.0))
+            act = {step: Policy.load(source, step).act() for step in runs.checkpoints(source) if step > 0}
+            jobs = [("training", step, take, seconds) for step in act for take in range(takes)]
+            jobs.append(("validation", max(act), takes, seconds + 5.0))
             for job, (use, step, take, length) in enumerate(jobs):
                 name = f"round-{number}-policy-{step}-take-{take + 1}"
-                controller = PolicyController(Policy.load(source, step).act())
+                controller = PolicyController(act[step])
                 draw, notes = _draw(self.seed, task, f"round {number}", job), f"A policy for {task}, closed loop."
                 self._record(folder / use, name, controller, length, draw, notes)
                 print(f"Recorded {name} ({use}), {job + 1} of {len(jobs)}", flush=True)
@@ -243,8 +249,10 @@ class Story:
         folder.mkdir(exist_ok=True)
         write_recording(recording, folder / f"{name}.csv.gz", decimals=_DECIMALS)
 
-    def residual(self, task: str, method: str, number: int = 1) -> Path:
-        """The run of a residual, learned from the recordings of the task, those of all rounds up to this one."""
+    def residual(self, task: str, setting: str) -> Path:
+        """The run of a setting's residual, learned from the recordings of the task, those of all rounds up to its
+        own."""
+        method, number = plots.round_of(setting)
         recordings = [self.recordings(task), *(self.trained_last(task, n) for n in range(2, number + 1))]
         identified = self.identified()
         options = self._air() if method == "aerodynamic" else self._envmimic()
@@ -265,8 +273,7 @@ class Story:
                 data = residual_training.Data(resume=folder, wandb=data.wandb)
             _stop_unless_done(residual_training.train(data, *options))
 
-        name = f"{method}-{task}" if number == 1 else f"{method}-{task}-{number}"
-        return _stage(self._own / name, options, [*recordings, identified], make)
+        return _stage(residual_folder(self._own, task, setting), options, [*recordings, identified], make)
 
     def _air(self) -> AirConfig:
         return AirConfig(**air_fit.QUICK if self.options.quick else {})

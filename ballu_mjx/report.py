@@ -182,7 +182,7 @@ def _run(folder: Path) -> Content:
 
 def _story(folder: Path, tables: Mapping[str, str]) -> Content:
     """A folder of `train all`: its tables, and of each seed and task the policies over each other."""
-    from ballu_mjx import pipeline
+    from ballu_mjx import pipeline, plots
 
     content = Content(f"train all: {folder.resolve().name}", facts=[("folder", str(folder.resolve()))])
     content.markdown = [(f"Transfer, {task}", text) for task, text in tables.items()]
@@ -200,10 +200,10 @@ def _story(folder: Path, tables: Mapping[str, str]) -> Content:
                 image = seed / f"trials-{task}-{setting}" / "trials.png"
                 if image.is_file():
                     content.images.append((f"Trials on the robot: {where}, {setting}", image.read_bytes()))
-            again = [name.partition("-")[2] for name in pipeline.later_rounds(seed, task)]
-            for number in ("1", *again):
-                name = f"EnvMimic for {where}" if number == "1" else f"EnvMimic for {where}, round {number}"
-                learned = seed / (f"envmimic-{task}" if number == "1" else f"envmimic-{task}-{number}")
+            for setting in (pipeline.ROUNDS, *pipeline.later_rounds(seed, task)):
+                number = plots.round_of(setting)[1]
+                name = f"EnvMimic for {where}" if number == 1 else f"EnvMimic for {where}, round {number}"
+                learned = pipeline.residual_folder(seed, task, setting)
                 if (learned / "config.json").is_file():
                     _add_evaluation(content, learned, f"{name}: ")
                     if (learned / replay.NAME).is_file():

@@ -1,16 +1,16 @@
 """Residual forces by regression, the paper's baseline: which force explains each recorded control step, and a network
 for it.
 
-One control step alone says nothing: half a millimetre of motion capture's noise over 0.05 s looks like a tenth of a
-newton, and the forces sought are hundredths. A label is therefore the smoothest, smallest force over a whole window
-that makes its simulation pass through the recorded motion, with the starting state free within what reconstruction
-leaves uncertain. Simulated without force and linearized, a window is a small least-squares problem with a prior.
+One control step alone says little: half a millimetre of motion capture's noise over 0.05 s looks like a tenth of a
+newton. And not all that a recorded step differs in from the simulated one is a matter of the force: servos are late,
+legs slip, air turns the balloon. A label is therefore the most likely force given the whole recording, where capture,
+joints' torques and the motion itself err as well: a smoothing problem, linear along the recorded motion.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -18,32 +18,41 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import optax
+import scipy.linalg
 from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
 
-from ballu_mjx import envmimic, robot_description, windows
+from ballu_mjx import envmimic, simulation
 from ballu_mjx.errors import InputError
-from ballu_mjx.linearization import FORCE, Linearized
-from ballu_mjx.windows import Windows
+from ballu_mjx.linearization import FORCE, ControlSteps, Linearizer
+from ballu_mjx.reconstruction import Motion
+from ballu_mjx.robot_description import RobotDescription
 
 
 @dataclasses.dataclass(frozen=True)
 class SupervisedConfig:
     """Labels and regression."""
 
-    window_seconds: float = 2.0
-    """Length of the windows that labels come from, s."""
-    interval_seconds: float = 2.0
-    """Time between the starts of two windows, s."""
-    force_spread: float = 0.05
+    force_spread: float = 0.3
     """Standard deviation of the prior on the force along each axis, N."""
-    force_change: float = 0.01
-    """Standard deviation of the prior on how it changes from one control step to the next, N: this smooths labels."""
-    position_noise: float = 0.002
-    """Standard deviation of the recorded balloon's position about the explained motion, m: capture and what a force on
-    the balloon cannot explain."""
-    angle_noise: float = 0.5
-    """Likewise of its orientation, deg."""
-    observation_noise: float = 0.3
+    force_change: float = 0.1
+    """Standard deviation of the prior on how it changes from one control step to the next, N. Air that the balloon
+    drags along pushes back at every footfall: a prior that smooths more takes most of that away."""
+    torque_spread: float = 0.05
+    """Standard deviation of what motors and knees pull beyond the model, N m."""
+    position_noise: float = 0.0005
+    """Standard deviation of the recorded place, m."""
+    angle_noise: float = 0.3
+    """Likewise of recorded angles, deg."""
+    held_angle_noise: float = 10.0
+    """Likewise of the joints that motion capture does not show (BALLU's motors), deg."""
+    velocity_noise: float = 0.01
+    """Standard deviation of what a control step changes the base's velocity by beyond all this, m/s."""
+    rotation_noise: float = 3.0
+    """Likewise of the base's angular velocity and the balloon's against it, deg/s."""
+    joint_noise: float = 20.0
+    """Likewise of the legs' joints, deg/s."""
+    observation_noise: float = 1.0
     """Noise on what the network sees in training, in multiples of each entry's spread over the recordings."""
     updates: int = 4000
     """Gradient steps."""
@@ -59,70 +68,117 @@ class SupervisedConfig:
 
 def check(config: SupervisedConfig) -> None:
     """**Raises** `InputError` for options out of range, naming the option."""
-    windows.check(config.window_seconds, config.interval_seconds)
-    positive = ("force_spread", "force_change", "position_noise", "angle_noise", "learning_rate")
-    for name in (*positive, "updates", "validate_every", "batch_size"):
-        if not getattr(config, name) > 0:
-            raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name)}: it must be greater than 0.")
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if field.name not in ("observation_noise", "seed") and not value > 0:
+            raise InputError(f"--{field.name.replace('_', '-')} is {value}: it must be greater than 0.")
 
 
-def labels(
-    model: mujoco.MjModel, recorded: Windows, linearized: Linearized, config: SupervisedConfig
-) -> Float[np.ndarray, "windows windowsteps 3"]:
-    """The force (N, world) over each control step that explains the recorded windows.
+class Labeller:
+    """Labels recorded motions."""
 
-    `linearized` holds the control steps of the windows' simulation without force, window after window.
-    """
-    count, steps = recorded.features.shape[:2]
-    features, state, seen = (np.asarray(x, np.float64).reshape(count, steps, *x.shape[1:]) for x in linearized)
-    free = state.shape[2]
-    unknowns = free + FORCE * steps
-    noise = np.array([config.position_noise] * 3 + [np.deg2rad(config.angle_noise)] * 3)
-    pose = np.r_[0:3, 6:9]
-    difference = (recorded.features - features)[:, :, pose]
-    difference[..., 3:] = np.arctan2(np.sin(difference[..., 3:]), np.cos(difference[..., 3:]))
+    def __init__(
+        self, model: mujoco.MjModel, robot: RobotDescription, linearize: Linearizer, config: SupervisedConfig
+    ) -> None:
+        """`linearize` is that of the same model, with the torques of the robot's joints; where it has a residual
+        beside, labels are what that leaves."""
+        self._model, self._config, self._linearize = model, config, linearize
+        self._simulator = envmimic.Simulator(model, robot)
+        self._measured, self._process = _noise(model, robot, config)
 
-    prior = np.zeros((unknowns, unknowns))
-    start_spread = envmimic.start_spread(model, robot_description.ballu())
-    prior[:free, :free] = np.diag(1 / start_spread**2)
-    change = np.diff(np.eye(steps), axis=0)
-    prior[free:, free:] = np.kron(
-        np.eye(steps) / config.force_spread**2 + change.T @ change / config.force_change**2, np.eye(FORCE)
-    )
-    hessian, gradient = np.tile(prior, (count, 1, 1)), np.zeros((count, unknowns))
-    moved = np.tile(np.eye(free, unknowns), (count, 1, 1))  # the state before a step, by the unknowns
-    for step in range(steps):
-        force = np.zeros((FORCE, unknowns))
-        force[:, free + FORCE * step : free + FORCE * (step + 1)] = np.eye(FORCE)
-        both = np.concatenate([moved, np.tile(force, (count, 1, 1))], axis=1)
-        rows = seen[:, step, pose] @ both / noise[:, None]
-        hessian += rows.transpose(0, 2, 1) @ rows
-        gradient += np.einsum("wru,wr->wu", rows, difference[:, step] / noise)
-        moved = state[:, step] @ both
-    solved = np.linalg.solve(hessian, gradient[..., None])[..., 0]
-    return solved[:, free:].reshape(count, steps, FORCE)
+    def __call__(self, motion: Motion) -> Float[np.ndarray, "steps 3"]:
+        """The force (N, world) over each control step that explains the recorded motion."""
+        count, past = len(motion.command), envmimic.HISTORY - 1
+        reference, _ = envmimic.stack(self._simulator, [motion])
+        states = simulation.at(reference.qpos[0, :-1], reference.qvel[0, :-1])
+        history, commands = (
+            np.lib.stride_tricks.sliding_window_view(
+                np.pad(x, [(past, 0), (0, 0)], mode="edge"), envmimic.HISTORY, axis=0
+            ).swapaxes(1, 2)
+            for x in (np.asarray(reference.features[0, :-1]), motion.command)
+        )
+        linear = self._linearize(ControlSteps(states, history, commands, np.zeros((count, FORCE))))
+        defect = np.zeros((count, 2 * self._model.nv))
+        for step in range(count):
+            recorded, after = motion.qpos[step + 1], np.asarray(linear.qpos[step], np.float64)
+            mujoco.mj_differentiatePos(self._model, defect[step, : self._model.nv], 1.0, recorded, after)
+        defect[:, self._model.nv :] = linear.qvel - motion.qvel[1:]
+        return self._explain(np.asarray(linear.state, np.float64), defect)
+
+    def _explain(
+        self, state: Float[np.ndarray, "steps states directions"], defect: Float[np.ndarray, "steps states"]
+    ) -> Float[np.ndarray, "steps 3"]:
+        """The most likely inputs of control steps that end `defect` off the recorded state after, to first order.
+
+        Unknown at each time are the state's deviation from the recorded one and the step's inputs; each time is tied to
+        the next alone, so that one banded factorization solves for a whole recording.
+        """
+        config, (count, after, every) = self._config, state.shape
+        force = np.arange(after, after + FORCE)
+        known = np.any(state, axis=(1, 2), keepdims=True)[:, 0]  # zeros where there are no derivatives
+        weight = known / self._process**2
+        spread = np.r_[
+            self._measured,
+            np.full(self._model.nv, _ANY_VELOCITY),
+            np.full(FORCE, config.force_spread),
+            np.full(every - after - FORCE, config.torque_spread),
+        ]
+        here = np.tile(np.diag(spread**-2.0), (count + 1, 1, 1))
+        here[:-1] += state.transpose(0, 2, 1) @ (weight[:, :, None] * state)
+        here[1:, range(after), range(after)] += weight
+        towards = np.zeros_like(here)  # rows of the time after, columns of this one
+        towards[:-1, :after] -= weight[:, :, None] * state
+        change = config.force_change**-2.0
+        here[:-1, force, force] += change
+        here[1:, force, force] += change
+        towards[:-1, force, force] -= change
+        right = np.zeros((count + 1, every))
+        right[:-1] -= np.einsum("tsd,ts->td", state, weight * defect)
+        right[1:, :after] += weight * defect
+
+        columns = np.concatenate([here, towards], axis=1)
+        lower = np.zeros((2 * every, count + 1, every))
+        for place in range(every):
+            lower[: 2 * every - place, :, place] = columns[:, place:, place].T
+        found = scipy.linalg.solveh_banded(lower.reshape(2 * every, -1), right.ravel(), lower=True)
+        return found.reshape(count + 1, every)[:-1, force]
+
+
+_ANY_VELOCITY = 10.0
+"""m/s and rad/s: recorded velocities are differences of recorded places, and say nothing of their own."""
+
+
+def _noise(
+    model: mujoco.MjModel, robot: RobotDescription, config: SupervisedConfig
+) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, " 2*nv"]]:
+    """Standard deviations of recorded positions, and of what a control step is off by beyond its inputs; both along the
+    directions of `mjx.Data.qvel`, of the second also the velocities'."""
+    degree = np.pi / 180
+    trunk, body = [], int(model.site_bodyid[model.site(robot.tracked).id])
+    while body:  # from the tracked body down to the root
+        trunk.append(body)
+        body = int(model.body_parentid[body])
+    velocity = np.where(np.isin(model.dof_bodyid, trunk), config.rotation_noise, config.joint_noise) * degree
+    measured = np.full(model.nv, config.angle_noise * degree)
+    velocity[:3], measured[:3] = config.velocity_noise, config.position_noise
+    measured[[model.joint(name).dofadr[0] for name in robot.held]] = config.held_angle_noise * degree
+    return measured, np.concatenate([velocity * model.opt.timestep, velocity])
 
 
 def examples(
-    recorded: Windows, force: Float[np.ndarray, "windows windowsteps 3"], config: envmimic.EnvMimicConfig
+    simulator: envmimic.Simulator,
+    motions: Sequence[Motion],
+    force: Sequence[Float[np.ndarray, "steps 3"]],
+    config: envmimic.EnvMimicConfig,
 ) -> tuple[Float[np.ndarray, "examples inputs"], Float[np.ndarray, "examples 3"]]:
-    """What the network sees of each recorded state, and the action (see `envmimic.world_force`) that is its label."""
-    history = envmimic.HISTORY
-    steps = recorded.features.shape[1]
-
-    def one(window: Windows, force: Array) -> tuple[Array, Array]:
-        seen = jnp.concatenate([window.history, window.features])
-
-        def at(time: Array) -> tuple[Array, Array]:
-            past = jax.lax.dynamic_slice_in_dim(seen, time, history)
-            commands = jax.lax.dynamic_slice_in_dim(window.commands, time, history)
-            turned = envmimic.heading_rotation(past[-1, 8]).T @ force[time]
-            return envmimic.policy_input(past, commands, config), turned / config.force_scale
-
-        return jax.vmap(at)(jnp.arange(steps))
-
-    inputs, actions = windows.spread(one, shared=0)(recorded, np.asarray(force, np.float32))
-    return inputs.reshape(-1, inputs.shape[-1]), actions.reshape(-1, FORCE)
+    """What the network sees of each recorded state that has a history, and the action (see `envmimic.world_force`) that
+    is its label."""
+    reference, _ = envmimic.stack(simulator, motions)
+    first = envmimic.HISTORY - 1
+    yaw = [np.asarray(seen[first:count, 8]) for seen, count in zip(reference.features, reference.steps, strict=True)]
+    labels = np.concatenate([each[first:] for each in force])
+    turned = Rotation.from_euler("z", -np.concatenate(yaw)[:, None]).apply(labels)
+    return np.asarray(envmimic.recorded_inputs(reference, config)), np.asarray(turned / config.force_scale, np.float32)
 
 
 Validate = Callable[[int, Any, float], None]

@@ -52,7 +52,6 @@ def subcommands(arguments: Sequence[str] = ()) -> dict[str, Callable[..., int]]:
     from ballu_mjx.identification import IdentificationConfig
     from ballu_mjx.locomotion import LocomotionConfig
     from ballu_mjx.ppo import PPOConfig
-    from ballu_mjx.residual_data import RecordingsData
     from ballu_mjx.supervised import SupervisedConfig
     from ballu_mjx.tasks import TASKS, Task
 
@@ -90,14 +89,14 @@ def subcommands(arguments: Sequence[str] = ()) -> dict[str, Callable[..., int]]:
         return air_fit.fit(data, fit)
 
     def residual_supervised(
-        data: RecordingsData = RecordingsData(),  # noqa: B008
+        data: force_fit.ForcesData = force_fit.ForcesData(),  # noqa: B008
         fit: SupervisedConfig = supervised_defaults,
     ) -> int:
         """Learn residual forces by regression on the forces that explain the recordings."""
         return force_fit.fit_supervised(data, fit)
 
     def residual_analytic(
-        data: force_fit.AnalyticData = force_fit.AnalyticData(),  # noqa: B008
+        data: force_fit.ForcesData = force_fit.ForcesData(),  # noqa: B008
         fit: AnalyticConfig = analytic_defaults,
     ) -> int:
         """Learn residual forces by gradients of the tracking error through the simulation."""

@@ -1,0 +1,159 @@
+# %% [markdown]
+# # Regression: are the forces right, and does it help?
+#
+# The paper's supervised baseline fits a network to the force that explains each recorded control step. Whether that
+# regression is a good one can be asked here, for the virtual robot can be recorded without noise: the same trials as
+# the validation recordings, with true states instead of motion capture's. The force that explains *these* is what the
+# network should have said.
+#
+# `python experiments/force_labels.py RUN [RUN ...]`, of `train residual --method supervised` on the bundled recordings,
+# takes two minutes. The table is in docs/fidelity.md, beside what the same networks do in open loop.
+
+# %%
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+if "google.colab" in sys.modules:  # install, from a checkout in the current folder
+    if not Path("constraints.txt").exists():
+        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
+    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
+if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
+    sys.argv[1:] = []
+    sys.path[:0] = [".", "experiments"]
+
+# %%
+import argparse
+import dataclasses
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+import bundled_recordings  # noqa: E402
+import jax  # noqa: E402
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+from jaxtyping import Float  # noqa: E402
+
+from ballu_mjx import envmimic, reconstruction, recording, robot, robot_description, runs, virtual_robot  # noqa: E402
+from ballu_mjx.linearization import Linearizer  # noqa: E402
+from ballu_mjx.reconstruction import Motion  # noqa: E402
+from ballu_mjx.residual import Residual  # noqa: E402
+from ballu_mjx.supervised import Labeller, SupervisedConfig  # noqa: E402
+
+# %% [markdown]
+# ## The same trials, with true states
+
+# %%
+SEEN_WELL = {"position_noise": 2e-5, "angle_noise": 0.01, "held_angle_noise": 0.01}
+"""Of `SupervisedConfig`: there is no motion capture between the robot and its twin."""
+
+
+def twin(job: bundled_recordings.Job) -> Motion:
+    """What the virtual robot really did, at the control rate."""
+    steps = len(job.commands)
+    qpos, qvel = virtual_robot.record_truth(
+        virtual_robot.draw_robot(bundled_recordings.ROBOT_SEED),
+        virtual_robot.draw_trial(job.trial),
+        virtual_robot.open_loop(job.commands),
+        steps * robot.CONTROL_TIMESTEP,
+    )
+    every = round(robot.CONTROL_TIMESTEP / virtual_robot.CAPTURE_TIMESTEP)
+    time = np.arange(steps + 1) * robot.CONTROL_TIMESTEP
+    return Motion(job.name, time, job.commands, qpos[::every], qvel[::every], {})
+
+
+# %% [markdown]
+# ## Labels and networks against it
+
+
+# %%
+def forces(simulator: envmimic.Simulator, residual: Residual, motion: Motion) -> Float[np.ndarray, "steps 3"]:
+    """What a network pushes with (N, world) along a motion, from the first state with a history on."""
+    reference, _ = envmimic.stack(simulator, [motion])
+
+    def at(time: jax.Array) -> jax.Array:
+        history = jax.lax.dynamic_slice_in_dim(reference.features[0], time - envmimic.HISTORY + 1, envmimic.HISTORY)
+        return residual.wrench(history, envmimic.commands_seen(reference.command[0], time))[:3]
+
+    return np.asarray(jax.jit(jax.vmap(at))(np.arange(envmimic.HISTORY - 1, len(motion.command))))
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def row(name: str, found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> str:
+    """Markdown: the error of `found`, over that of no force at all."""
+    cells = []
+    for group in ("near", "far"):
+        ours, exact = (
+            np.concatenate([each for motion, each in forces.items() if motion.startswith(group)])
+            for forces in (found, true)
+        )
+        cells.append(f"{rms(ours - exact) / rms(exact):.2f}")
+        cells.append(", ".join(f"{rms(ours[:, i] - exact[:, i]) / rms(exact[:, i]):.2f}" for i in range(3)))
+    return f"| {name} | " + " | ".join(cells) + " |"
+
+
+def figure(shown: dict[str, np.ndarray], title: str, path: Path, seconds: float = 6.0) -> None:
+    """Forces along the three axes over time."""
+    styles = {"true": ("black", 1.6), "label": ("#e69f00", 1.0), "network": ("#56b4e9", 1.6)}
+    _, axes = plt.subplots(3, 1, figsize=(8, 6), sharex=True, layout="constrained")
+    count = round(seconds / robot.CONTROL_TIMESTEP)
+    for axis, ax in enumerate(axes):
+        for name, force in shown.items():
+            color, width = styles[name]
+            time = (np.arange(len(force)) + envmimic.HISTORY - 1) * robot.CONTROL_TIMESTEP
+            ax.plot(time[:count], 1e3 * force[:count, axis], color=color, linewidth=width, label=name)
+        ax.set_ylabel(f"force along {'xyz'[axis]} (mN)")
+        ax.grid(alpha=0.3)
+    axes[0].set_title(title)
+    axes[0].legend(ncols=3, loc="upper right")
+    axes[-1].set_xlabel("time (s)")
+    plt.savefig(path, dpi=130)
+    plt.close()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Are the forces that regression finds the right ones?")
+    parser.add_argument("runs", type=Path, nargs="+", help="of train residual --method supervised")
+    parser.add_argument("--output", type=Path, default=Path("runs/force_labels"), help="folder of table and figure")
+    arguments = parser.parse_args()
+    networks = {folder.name: Residual.load(folder) for folder in arguments.runs}
+    first = next(iter(networks.values()))
+    model, ballu = robot.load_model(first.actuators), robot_description.ballu()
+    config = runs.typed(SupervisedConfig, runs.read_config(arguments.runs[0], "supervised"), "fit", arguments.runs[0])
+    simulator, linearize = envmimic.Simulator(model), Linearizer(model, joints=ballu.joints)
+    label = Labeller(model, ballu, linearize, config)
+    label_well = Labeller(model, ballu, linearize, dataclasses.replace(config, **SEEN_WELL))
+
+    recordings = {path.name: path for path in recording.recordings([robot.assets() / "recordings" / "validation"])}
+    true, labels, twins = {}, {}, {}
+    for job in bundled_recordings.jobs():
+        if job.split == "validation":
+            twins[job.name] = twin(job)
+            true[job.name] = label_well(twins[job.name])[envmimic.HISTORY - 1 :]
+            seen = recording.read_recording(recordings[f"{job.name}.csv.gz"])
+            labels[job.name] = label(reconstruction.reconstruct(seen, model))[envmimic.HISTORY - 1 :]
+            print(f"{job.name}: true forces {1e3 * rms(true[job.name]):.0f} mN (RMS along an axis)", flush=True)
+    lines = ["| error over that of no force | near | x, y, z | far | x, y, z |", "| --- " * 5 + "|"]
+    lines.append(row("labels from motion capture", labels, true))
+    for name, network in networks.items():
+        found = {each: forces(simulator, network, motion) for each, motion in twins.items()}
+        lines.append(row(name, found, true))
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    shown = next(iter(true))
+    series = {"true": true[shown], "label": labels[shown], "network": forces(simulator, first, twins[shown])}
+    figure(series, f"{shown}: the force that explains each control step", arguments.output / "force_labels.png")
+    text = "\n".join(lines)
+    (arguments.output / "table.md").write_text(text + "\n")
+    print(text)
+    print(f"\nWritten to {arguments.output}.")
+
+
+if __name__ == "__main__":
+    main()
