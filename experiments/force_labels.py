@@ -102,7 +102,7 @@ def row(name: str, found: dict[str, np.ndarray], true: dict[str, np.ndarray]) ->
 def figure(shown: dict[str, np.ndarray], title: str, path: Path, seconds: float = 6.0) -> None:
     """Forces along the three axes over time."""
     styles = {"true": ("black", 1.6), "label": ("#e69f00", 1.0), "network": ("#56b4e9", 1.6)}
-    _, axes = plt.subplots(3, 1, figsize=(8, 6), sharex=True, layout="constrained")
+    whole, axes = plt.subplots(3, 1, figsize=(8, 6.4), sharex=True, layout="constrained")
     count = round(seconds / robot.CONTROL_TIMESTEP)
     for axis, ax in enumerate(axes):
         for name, force in shown.items():
@@ -112,10 +112,10 @@ def figure(shown: dict[str, np.ndarray], title: str, path: Path, seconds: float 
         ax.set_ylabel(f"force along {'xyz'[axis]} (mN)")
         ax.grid(alpha=0.3)
     axes[0].set_title(title)
-    axes[0].legend(ncols=3, loc="upper right")
+    whole.legend(*axes[0].get_legend_handles_labels(), ncols=3, loc="outside lower center")
     axes[-1].set_xlabel("time (s)")
-    plt.savefig(path, dpi=130)
-    plt.close()
+    whole.savefig(path, dpi=130)
+    plt.close(whole)
 
 
 def main() -> None:
