@@ -20,7 +20,6 @@ import numpy as np
 import optax
 import scipy.linalg
 from jaxtyping import Array, Float
-from scipy.spatial.transform import Rotation
 
 from ballu_mjx import envmimic, simulation
 from ballu_mjx.errors import InputError
@@ -177,7 +176,8 @@ def examples(
     first = envmimic.HISTORY - 1
     yaw = [np.asarray(seen[first:count, 8]) for seen, count in zip(reference.features, reference.steps, strict=True)]
     labels = np.concatenate([each[first:] for each in force])
-    turned = Rotation.from_euler("z", -np.concatenate(yaw)[:, None]).apply(labels)
+    to_world = np.asarray(jax.vmap(envmimic.heading_rotation)(jnp.asarray(np.concatenate(yaw))))
+    turned = np.einsum("nji,nj->ni", to_world, labels)
     return np.asarray(envmimic.recorded_inputs(reference, config)), np.asarray(turned / config.force_scale, np.float32)
 
 
