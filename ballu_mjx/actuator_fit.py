@@ -14,7 +14,7 @@ from ballu_mjx.recording import bundled, read_recording
 from ballu_mjx.recording import recordings as expand
 from ballu_mjx.sweep import read_sweep
 
-QUICK: Mapping[str, Any] = {"transients": False, "draws": 32, "starts": 4, "steps": 12}
+QUICK: Mapping[str, Any] = {"motion": False, "starts": 4}
 """Defaults of `IdentificationConfig` under `--quick`."""
 
 

@@ -1,8 +1,9 @@
 """Files of identified actuators, format `ballu-actuators/1`: what `train sysid` writes and `--actuators` reads.
 
 JSON with the keys `format`; `robot`, the name that its recordings carry; `parameters`, each field of
-`robot.ActuatorParameters` as [left, right] in SI units and radians; and optionally `standard_errors` alike, `delay`
-(s, [left, right], null where unknown), `source` (the recordings) and whatever else the user wants to keep there.
+`robot.ActuatorParameters` as [left, right] in SI units and radians (`cable_slack` may be missing: nominal); and
+optionally `standard_errors` alike, `drivetrain` (delay, friction and backlash, which no simulator takes from here; null
+where unknown), `source` (the recordings) and whatever else the user wants to keep there.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 
 from ballu_mjx import files
 from ballu_mjx.errors import InputError, is_number
-from ballu_mjx.robot import ActuatorParameters
+from ballu_mjx.robot import CABLE_SLACK, ActuatorParameters
 
 FORMAT = "ballu-actuators/1"
 NAME = "actuators.json"
@@ -28,6 +29,8 @@ NAME = "actuators.json"
 _FIELDS = tuple(field.name for field in dataclasses.fields(ActuatorParameters))
 _POSITIVE = ("knee_spring_stiffness", "motor_gain", "torque_limit")
 _LARGEST_ANGLE = math.pi
+_LARGEST_SLACK = 0.05
+"""m: more than a motor arm of 16 mm can take up."""
 _SMALLEST, _LARGEST = 1e-9, 1e3
 """Springs, gains and torques beyond this are no robot's of 0.3 kg."""
 
@@ -77,11 +80,13 @@ def from_json(values: Mapping[str, Any], path: Path) -> ActuatorParameters:
     """
     pairs = []
     for name in _FIELDS:
-        pair = values.get(name)
+        pair = values.get(name, [CABLE_SLACK] * 2 if name == "cable_slack" else None)
         if not (isinstance(pair, list) and len(pair) == 2 and all(is_number(x) for x in pair)):
             raise InputError(f"{path}: {name} must be two numbers, [left, right]; it is {reprlib.repr(pair)}.")
         if name in _POSITIVE and not _SMALLEST <= min(pair) <= max(pair) <= _LARGEST:
             raise InputError(f"{path}: {name} is {pair}; it must be greater than 0, and in SI units.")
+        if name == "cable_slack" and not 0 <= min(pair) <= max(pair) <= _LARGEST_SLACK:
+            raise InputError(f"{path}: {name} is {pair}; it must be 0 or more, in metres.")
         if name not in _POSITIVE and max(map(abs, pair)) > _LARGEST_ANGLE:
             raise InputError(f"{path}: {name} is {pair}: give it in radians, not degrees.")
         pairs.append(jnp.array(pair, jnp.float32))

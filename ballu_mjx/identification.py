@@ -2,7 +2,9 @@
 
 The legs hang from a base held still, so that each is identified by itself, both at once. Settled angles under a command
 are the root of MJX's inverse dynamics at rest, differentiated as an implicit function: no derivative through a
-simulation to rest. Transients between commands are simulated, and differentiated forwards.
+simulation to rest. They are where the search begins. What decides is the whole motion, simulated from the first command
+to the last and differentiated forwards, with what a command meets on its way: delay, backlash and dry friction
+(`Drivetrain`), under which no leg is ever quite at rest.
 
 All functions compute in double precision and are to be called inside `jax.enable_x64(True)`, but for `identify`, which
 sees to it itself. A leg's parameters are a vector in the order of `NAMES`; a pair of angles is (motor, knee).
@@ -10,6 +12,7 @@ sees to it itself. A leg's parameters are a vector in the order of `NAMES`; a pa
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from mujoco import mjx
 
 from ballu_mjx import batch_last, simulation
@@ -47,12 +50,14 @@ class IdentificationConfig:
     torque_limit: bool = True
     """Identify the servos' torque limits too. The paper's eight parameters alone can tell a weak servo only by a spring
     stiffer than the robot's."""
-    transients: bool = True
-    """Learn from the motion between two commands too, not from settled angles alone; the delay from a command to its
-    motion is then a further unknown."""
+    cable_slack: bool = True
+    """Identify the cables' slack too. Without it, springs and servos come out up to three times too strong."""
+    motion: bool = True
+    """Learn from the whole motion, not from settled angles alone; delay, backlash and dry friction are then further
+    unknowns."""
     objective: Literal["pointwise", "hausdorff"] = "pointwise"
     """`pointwise`: least squares over all angles (Levenberg-Marquardt). `hausdorff`: the paper's distance between
-    curves (L-BFGS), started from the pointwise solution; transients have no part in it."""
+    curves (L-BFGS), started from the pointwise solution; motion has no part in it."""
     degree: int = 7
     """Degree of the polynomials fitted to the curves of angle over command."""
     draws: int = 128
@@ -70,19 +75,61 @@ class _Range(NamedTuple):
 
     factor: float | None
     """Bounds are the nominal value divided and multiplied by this; or else:"""
-    reach: float
-    """Bounds (rad) are the nominal value less and plus this."""
+    reach: tuple[float, float]
+    """Bounds are the nominal value less and plus these (rad, or m)."""
     prior: float
-    """How much robots differ (standard deviation): relative to the nominal value, or rad."""
+    """How much robots differ (standard deviation): relative to the nominal value, or rad, or m."""
 
 
 RANGES: dict[str, _Range] = {
-    "knee_spring_stiffness": _Range(4.0, 0.0, 0.3),
-    "motor_gain": _Range(4.0, 0.0, 0.3),
-    "default_motor_angle": _Range(None, 20 * _DEGREE, 5 * _DEGREE),
-    "default_knee_angle": _Range(None, 15 * _DEGREE, 3 * _DEGREE),
-    "torque_limit": _Range(4.0, 0.0, 0.3),
+    "knee_spring_stiffness": _Range(4.0, (0.0, 0.0), 0.3),
+    "motor_gain": _Range(4.0, (0.0, 0.0), 0.3),
+    "default_motor_angle": _Range(None, (20 * _DEGREE, 20 * _DEGREE), 5 * _DEGREE),
+    "default_knee_angle": _Range(None, (15 * _DEGREE, 15 * _DEGREE), 3 * _DEGREE),
+    "torque_limit": _Range(4.0, (0.0, 0.0), 0.3),
+    "cable_slack": _Range(None, (9e-5, 5e-3), 5e-4),
 }
+
+
+class Drivetrain(NamedTuple):
+    """What a command meets on its way to the joints, and what the simulators leave out: identified with the parameters,
+    so that it does not pass for them, and reported."""
+
+    delay: Any
+    """Seconds from a command to the servo's target."""
+    motor_friction: Any
+    """Dry friction (N m)."""
+    knee_friction: Any
+    """Dry friction (N m)."""
+    backlash: Any
+    """Width (rad) of the play between command and motor arm."""
+
+
+_FIRST = Drivetrain(0.03, 2e-3, 5e-4, 1 * _DEGREE)
+"""Where the search begins."""
+
+
+def drivetrain_coordinates(values: Drivetrain) -> Float[np.ndarray, " 4"]:
+    """Unbounded coordinates: of the delay linear, of the others logarithms; 0 where the search begins."""
+    others = np.log(np.array(values[1:]) / np.array(_FIRST[1:]))
+    return np.array([(values.delay - _FIRST.delay) / DELAY_UNIT, *others])
+
+
+def drivetrain(coordinates: Float[Array, " 4"]) -> Drivetrain:
+    """The inverse of `drivetrain_coordinates`."""
+    delay, *others = coordinates
+    return Drivetrain(
+        _FIRST.delay + DELAY_UNIT * delay, *(f * jnp.exp(x) for f, x in zip(_FIRST[1:], others, strict=True))
+    )
+
+
+DELAY_UNIT = 0.01
+"""Seconds of delay that a coordinate of 1 stands for."""
+
+
+def _actuators(vector: Float[Array, " parameters"]) -> ActuatorParameters:
+    """Of a model with one leg."""
+    return ActuatorParameters(*vector[:, None])
 
 
 class SuspendedLeg:
@@ -94,10 +141,15 @@ class SuspendedLeg:
 
     def __init__(self) -> None:
         self.model = ballu.load_suspended_leg(SIDES[0])
+        joints = [self.model.joint(f"{kind}_{SIDES[0]}") for kind in ("motor", "knee")]
+        self.angles = np.array([joint.qposadr[0] for joint in joints])
+        self._dofs = np.array([joint.dofadr[0] for joint in joints])
         self._mjx = mjx.put_model(self.model)
         self._data = mjx.make_data(self.model)
-        names = [f"{kind}_{SIDES[0]}" for kind in ("motor", "knee")]
-        self.angles = np.array([self.model.joint(name).qposadr[0] for name in names])
+        rubbing = copy.copy(self.model)
+        rubbing.dof_frictionloss[self._dofs] = _FIRST.motor_friction, _FIRST.knee_friction  # MJX leaves out those of 0
+        self._rubbing = mjx.put_model(rubbing)
+        self._rubbing_data = mjx.make_data(rubbing)
         self._relaxation_damping = np.zeros(self.model.nv)
         for kind, damping in _RELAXATION_DAMPING.items():
             self._relaxation_damping[self.model.joint(f"{kind}_{SIDES[0]}").dofadr[0]] = damping
@@ -113,31 +165,47 @@ class SuspendedLeg:
         nq = self.model.nq
         return qpos, -jnp.linalg.solve(jacobians[..., :nq], jacobians[..., nq:])
 
-    def transient(
+    def motion(
         self,
         vector: Float[Array, " parameters"],
-        qpos: Float[Array, " nq"],
-        delay: Float[Array, ""],
-        command: Float[Array, ""],
-        times: int,
+        drivetrain: Drivetrain,
+        command: Float[Array, " times"],
+        begins: Bool[np.ndarray, " times"],
     ) -> Float[Array, "times 2"]:
-        """One leg's motor and knee angle (rad) every `SAMPLE_TIMESTEP` from the moment at which the command changes,
-        from rest in `qpos`; the motion starts `delay` (s) later. Differentiable forwards."""
-        timestep = float(self.model.opt.timestep)
-        count = int(np.ceil((times - 1) * SAMPLE_TIMESTEP / timestep))
+        """One leg's motor and knee angle (rad) every `SAMPLE_TIMESTEP`, each as it was the delay before.
 
-        def path(vector: Array, qpos: Array, command: Array) -> Array:
-            model = self._with(vector)
+        **Arguments**
 
-            def step(state: State, _: None) -> tuple[State, Array]:
-                state = self._step(model, state, command)
-                return state, state.qpos[self.angles]
+        - `command`: held from each time to the next.
+        - `begins`: where the leg is set to rest at the default angles, and the play to its middle.
 
-            return jax.lax.scan(step, simulation.at(qpos, jnp.zeros(self.model.nv)), length=count)[1]
+        Differentiable forwards.
+        """
+        inner = round(SAMPLE_TIMESTEP / float(self.model.opt.timestep))
 
-        moved = jnp.concatenate([qpos[self.angles][None], batch_last.fast(path)(vector, qpos, command)])
-        seen = SAMPLE_TIMESTEP * jnp.arange(times) - delay
-        return jax.vmap(lambda column: jnp.interp(seen, timestep * jnp.arange(count + 1), column), 1, 1)(moved)
+        def path(vector: Array, drivetrain: Drivetrain, command: Array) -> Array:
+            friction = jnp.zeros(self.model.nv)
+            friction = friction.at[self._dofs].set(jnp.stack([drivetrain.motor_friction, drivetrain.knee_friction]))
+            fields = ballu.actuator_fields(self.model, _actuators(vector)) | {"dof_frictionloss": friction}
+            model = ballu.with_fields(self._rubbing, fields)
+            start = simulation.at(self._default_qpos(vector), jnp.zeros(self.model.nv))
+            half = drivetrain.backlash / 2 / ballu.SERVO_RANGE
+
+            def step(carry: tuple[State, Array], now: tuple[Array, Array]) -> tuple[tuple[State, Array], Array]:
+                (state, play), (command, begins) = carry, now
+                state = jax.tree.map(partial(jnp.where, begins), start, state)
+                play = jnp.where(begins, command, jnp.clip(play, command - half, command + half))
+                held = self._rubbing_data.replace(ctrl=play[None])  # pyright: ignore
+                for _ in range(inner):
+                    state = simulation.physics_step(model, held, state)
+                return (state, play), state.qpos[self.angles]
+
+            after = jax.lax.scan(step, (start, command[0]), (command, jnp.asarray(begins)))[1]
+            return jnp.concatenate([start.qpos[self.angles][None], after[:-1]])
+
+        moved = batch_last.fast(path)(vector, drivetrain, command)
+        times = SAMPLE_TIMESTEP * jnp.arange(len(begins))
+        return jax.vmap(lambda column: jnp.interp(times - drivetrain.delay, times, column), 1, 1)(moved)
 
     def _residual_torque(
         self, qpos: Float[Array, " nq"], vector: Float[Array, " parameters"], command: Float[Array, ""]
@@ -150,7 +218,11 @@ class SuspendedLeg:
         return data.qfrc_actuator - data.qfrc_inverse
 
     def _with(self, vector: Float[Array, " parameters"]) -> mjx.Model:
-        return ballu.with_fields(self._mjx, ballu.actuator_fields(self.model, ActuatorParameters(*vector[:, None])))
+        return ballu.with_fields(self._mjx, ballu.actuator_fields(self.model, _actuators(vector)))
+
+    def _default_qpos(self, vector: Float[Array, " parameters"]) -> Float[Array, " nq"]:
+        rest = [vector[NAMES.index(name)] for name in ("default_motor_angle", "default_knee_angle")]
+        return jnp.zeros(self.model.nq).at[self.angles].set(jnp.stack(rest))
 
     def _relaxed_qpos(self, vector: Float[Array, " parameters"], command: Float[Array, ""]) -> Float[Array, " nq"]:
         """Close to rest, by simulating the way there from command 0, heavily damped and in long steps: whether the
@@ -159,15 +231,10 @@ class SuspendedLeg:
         # One iteration will do here: what is not exact is Newton's to mend.
         option = model.opt.replace(timestep=jnp.asarray(_RELAXATION_TIMESTEP), iterations=1, ls_iterations=4)
         model = model.replace(dof_damping=jnp.asarray(self._relaxation_damping), opt=option)  # pyright: ignore
-        rest = [vector[NAMES.index(name)] for name in ("default_motor_angle", "default_knee_angle")]
-        qpos = jnp.zeros(self.model.nq).at[self.angles].set(jnp.stack(rest))
-        step = lambda _, state: self._step(model, state, command)  # noqa: E731
-        return jax.lax.fori_loop(0, _RELAXATION_STEPS, step, simulation.at(qpos, jnp.zeros(self.model.nv))).qpos
-
-    def _step(self, model: mjx.Model, state: State, command: Float[Array, ""]) -> State:
-        """One physics step."""
+        start = simulation.at(self._default_qpos(vector), jnp.zeros(self.model.nv))
         held = self._data.replace(ctrl=command[None])  # pyright: ignore
-        return simulation.physics_step(model, held, state)
+        step = lambda _, state: simulation.physics_step(model, held, state)  # noqa: E731
+        return jax.lax.fori_loop(0, _RELAXATION_STEPS, step, start).qpos
 
     def _rest(
         self,
@@ -220,7 +287,7 @@ def along_directions(
     function: Callable[..., Array],
     points: tuple[Float[Array, "n _"] | Float[Array, " n"], ...],
     directions: tuple[Float[Array, "n k _"] | Float[Array, "n k"], ...],
-    held: tuple[Float[Array, " n"], ...],
+    held: tuple[Float[Array, "n ..."], ...],
 ) -> tuple[Float[Array, "n ..."], Float[Array, "n ... k"]]:
     """Values of `function(*point, *held)` at n points, and how they change along k directions at each.
 
@@ -284,19 +351,20 @@ class Space:
     """Between a leg's parameters in their units and the unbounded coordinates that are searched.
 
     A coordinate runs through a logistic function from the lower to the upper bound: of the logarithm for stiffness,
-    gain and torque limit, of the angle itself for angles. Parameters that are not free keep their nominal value.
+    gain and torque limit, of the value itself for angles and slack. Parameters that are not free keep their nominal
+    value.
     """
 
     def __init__(self, nominal: Float[np.ndarray, " parameters"], config: IdentificationConfig) -> None:
         ranges = [RANGES[name] for name in NAMES]
         factors = np.array([r.factor or 1.0 for r in ranges])
-        reaches = np.array([r.reach for r in ranges])
+        below, above = np.array([r.reach for r in ranges]).T
         self.nominal = nominal
         self.relative = np.array([r.factor is not None for r in ranges])
-        self.lower, self.upper = nominal / factors - reaches, nominal * factors + reaches
+        self.lower, self.upper = nominal / factors - below, nominal * factors + above
         self.prior = np.array([r.prior for r in ranges]) * np.where(self.relative, nominal, 1.0)
         """Standard deviation of each parameter among robots, in its units."""
-        self.free = np.array([config.torque_limit or name != "torque_limit" for name in NAMES])
+        self.free = np.isin(NAMES, _free_names(config))
 
     def vector(self, coordinates: Float[Array, " free"]) -> Float[Array, " parameters"]:
         """A leg's parameters, in their units."""
@@ -321,15 +389,18 @@ class Space:
         return np.concatenate([self.coordinates(self.nominal)[None], np.log(shares / (1 - shares))])
 
 
-class _Data(NamedTuple):
-    """A `Sweep` with the legs (left, right) first and (motor, knee) last; rad."""
+class LegData(NamedTuple):
+    """A `Sweep` with the legs (left, right) first and (motor, knee) last; rad. In its motion each recording is preceded
+    by a stretch under its first command, in which the leg comes to rest."""
 
     command: Float[np.ndarray, "legs holds"]
     settled: Float[np.ndarray, "legs holds 2"]
-    weights: Float[np.ndarray, " holds"]
-    """Root of the samples in each mean: a mean of n samples counts as n of them."""
-    previous: Int[np.ndarray, " holds"]
-    transient: Float[np.ndarray, "legs holds times 2"]
+    weights: Float[np.ndarray, "legs holds 2"]
+    """Root of the samples in each mean: a mean of n samples counts as n of them, if the joint was at rest."""
+    commanded: Float[np.ndarray, "legs times"]
+    motion: Float[np.ndarray, "legs times 2"]
+    counts: Bool[np.ndarray, " times"]
+    begins: Bool[np.ndarray, " times"]
 
 
 def nominal_leg() -> Float[np.ndarray, " parameters"]:
@@ -338,29 +409,36 @@ def nominal_leg() -> Float[np.ndarray, " parameters"]:
     return np.concatenate([np.asarray(getattr(nominal, name), float) for name in NAMES])
 
 
-def _data(sweep: Sweep) -> _Data:
-    return _Data(
+def leg_data(sweep: Sweep) -> LegData:
+    """As the fit takes it."""
+    firsts = np.flatnonzero(sweep.begins)
+    rows = np.insert(np.arange(len(sweep.hold)), np.repeat(firsts, _AT_REST), np.repeat(firsts, _AT_REST))
+    before = np.insert(np.zeros(len(sweep.hold), bool), np.repeat(firsts, _AT_REST), True)
+    still = np.moveaxis(1 / np.hypot(1, sweep.drift / _DRIFT), -1, 0)
+    return LegData(
         command=sweep.command.T,
         settled=np.moveaxis(sweep.settled, -1, 0),
-        weights=np.sqrt(sweep.samples),
-        previous=sweep.previous,
-        transient=np.moveaxis(sweep.transient, -1, 0),
+        weights=np.sqrt(sweep.samples)[:, None] * still,
+        commanded=sweep.command[sweep.hold[rows]].T,
+        motion=np.moveaxis(sweep.motion[rows], -1, 0),
+        counts=~before,
+        begins=before & ~np.roll(before, 1),
     )
 
 
-DELAY_UNIT = 0.01
-"""Seconds of delay that a coordinate of 1 stands for."""
-_FIRST_DELAY = 3.0
+_AT_REST = round(2.0 / SAMPLE_TIMESTEP)
+_DRIFT = 0.05 * _DEGREE
+"""A joint that creeps on by more has not arrived, and its angle counts for less."""
 
 
 class Physics:
     """The two programs that hold MJX, compiled side by side: values and Jacobians in a `Space`'s coordinates, for
-    batches of fixed sizes. The second, of the transients, only where it is wanted."""
+    batches of fixed sizes. The second, of the motion, only where it is wanted."""
 
-    def __init__(self, space: Space, batch: int, data: _Data, *, transients: bool) -> None:
+    def __init__(self, space: Space, batch: int, data: LegData, *, motion: bool) -> None:
         self.leg, self.batch = SuspendedLeg(), batch
         size, (legs, holds) = int(space.free.sum()), data.command.shape
-        times = data.transient.shape[2]
+        every = size + len(_FIRST)
 
         def settled(coordinates: Array, command: Array) -> tuple[Array, Array]:
             vectors, by_coordinates = jax.vmap(lambda y: (space.vector(y), jax.jacfwd(space.vector)(y)))(coordinates)
@@ -368,23 +446,16 @@ class Physics:
             slopes = slopes.reshape(batch, holds, *slopes.shape[1:])
             return qpos.reshape(batch, holds, -1), slopes @ by_coordinates[:, None]
 
-        def transient(coordinates: Array, start: Array, slope: Array, command: Array) -> tuple[Array, Array]:
-            def path(y: Array, qpos: Array, command: Array) -> Array:
-                return self.leg.transient(space.vector(y[:-1]), qpos, y[-1] * DELAY_UNIT, command, times)
+        def moving(coordinates: Array, command: Array) -> tuple[Array, Array]:
+            def path(y: Array, command: Array) -> Array:
+                return self.leg.motion(space.vector(y[:size]), drivetrain(y[size:]), command, data.begins)
 
-            every = jnp.tile(jnp.eye(size + 1), (legs * holds, 1, 1))
-            moved = jnp.pad(jnp.swapaxes(slope, 2, 3), [(0, 0), (0, 0), (0, 1), (0, 0)])
-            points = jnp.repeat(coordinates, holds, axis=0), start.reshape(legs * holds, nq)
-            directions = every, moved.reshape(legs * holds, size + 1, nq)
-            found = along_directions(path, points, directions, (command.ravel(),))
-            value, slopes = (x.reshape(legs, holds, *x.shape[1:]) for x in found)
-            return value, slopes
+            directions = jnp.tile(jnp.eye(every), (legs, 1, 1))
+            return along_directions(path, (coordinates,), (directions,), (command,))
 
-        nq = self.leg.model.nq
         programs = [jax.jit(settled).lower(jnp.zeros((batch, size)), jnp.zeros((batch, holds)))]
-        if transients:
-            shapes = ((legs, size + 1), (legs, holds, nq), (legs, holds, nq, size), (legs, holds))
-            programs.append(jax.jit(transient).lower(*(jnp.zeros(shape) for shape in shapes)))
+        if motion:
+            programs.append(jax.jit(moving).lower(jnp.zeros((legs, every)), jnp.zeros(data.commanded.shape)))
         with ThreadPoolExecutor() as pool:
             self._compiled = list(pool.map(lambda program: program.compile(), programs))
 
@@ -401,11 +472,11 @@ class Physics:
             slopes.append(np.asarray(slope)[:count])
         return np.concatenate(values), np.concatenate(slopes)
 
-    def transient(
-        self, coordinates: np.ndarray, start: np.ndarray, slope: np.ndarray, command: np.ndarray
-    ) -> tuple[Float[np.ndarray, "legs holds times 2"], Float[np.ndarray, "legs holds times 2 size"]]:
-        """Transients of both legs and their derivatives; `start` and `slope` from `settled`."""
-        value, jacobian = self._compiled[1](*map(jnp.asarray, (coordinates, start, slope, command)))
+    def motion(
+        self, coordinates: Float[np.ndarray, "legs _"], commanded: Float[np.ndarray, "legs times"]
+    ) -> tuple[Float[np.ndarray, "legs times 2"], Float[np.ndarray, "legs times 2 _"]]:
+        """Both legs' motion and its derivatives; coordinates end with those of `drivetrain`."""
+        value, jacobian = self._compiled[1](jnp.asarray(coordinates), jnp.asarray(commanded))
         return np.asarray(value), np.asarray(jacobian)
 
 
@@ -429,10 +500,9 @@ class Fit:
     correlations: Float[np.ndarray, "free free"]
     directions: tuple[Direction, ...]
     """From the best to the least determined."""
-    delay: float | None
-    """Seconds from a command to the motion's start."""
+    drivetrain: Drivetrain | None
     residual: float
-    """Root mean square (rad) of all residuals, each sample counted once."""
+    """Root mean square (rad) of all residuals."""
     losses: Float[np.ndarray, " starts"]
     """Sums of squares (rad^2, settled angles) that the starts ended at, in ascending order."""
 
@@ -449,8 +519,10 @@ class Identification:
     fits: tuple[Fit, Fit]
     settled: Float[np.ndarray, "holds 2 2"]
     """Settled angles (rad) of the identified robot; (motor, knee), (left, right) last, as in `Sweep`."""
+    with_drivetrain: Float[np.ndarray, "holds 2 2"] | None
+    """What its motion comes to with the identified drivetrain."""
     nominal_settled: Float[np.ndarray, "holds 2 2"]
-    """The same of the nominal robot."""
+    """The same as `settled`, of the nominal robot."""
     config: IdentificationConfig
 
     @property
@@ -471,7 +543,7 @@ def identify(
 
     1. Settled angles alone, from several starts side by side, the best of many draws: searches that start with a servo
        that never saturates, say, end in a valley of their own.
-    2. From the best of these, transients too.
+    2. From the best of these, the whole motion.
     3. Directions that the data leave open, if any, are drawn to the nominal values, and to nothing else.
     4. With `objective="hausdorff"`, the paper's distance between curves, from there.
 
@@ -500,11 +572,11 @@ class Identifier:
 
     def __init__(self, config: IdentificationConfig, sweep: Sweep, report: Report) -> None:
         self.config = config
-        data = _data(sweep)
+        data = leg_data(sweep)
         starts = min(config.starts, config.draws + 1)
         report("compiling", 0, 1, float("nan"))
         self.space = Space(nominal_leg(), config)
-        self.physics = Physics(self.space, starts * len(SIDES), data, transients=config.transients)
+        self.physics = Physics(self.space, starts * len(SIDES), data, motion=config.motion)
         report("compiling", 1, 1, float("nan"))
         self._starts, self._size = starts, int(self.space.free.sum())
         self._squares = _Search(optx.LevenbergMarquardt(rtol=1e-5, atol=1e-5))
@@ -517,7 +589,7 @@ class Identifier:
         self._curve_gradients = jax.jit(jax.vmap(lambda command, angles, measured: gradient(angles, command, measured)))
 
     def run(self, sweep: Sweep, report: Report) -> Identification:
-        config, size, data = self.config, self._size, _data(sweep)
+        config, size, data = self.config, self._size, leg_data(sweep)
         legs = np.arange(len(SIDES))
 
         draws = self.space.draw(config.seed, config.draws)
@@ -533,10 +605,10 @@ class Identifier:
         ended = ended.reshape(len(legs), -1)
         coordinates = found.reshape(len(legs), -1, size)[legs, np.argmin(ended, axis=1)]
 
-        if config.transients:
-            coordinates = np.concatenate([coordinates, np.full((len(legs), 1), _FIRST_DELAY)], axis=1)
+        if config.motion:
+            coordinates = np.concatenate([coordinates, np.zeros((len(legs), len(_FIRST)))], axis=1)
             coordinates, _ = self._squares(
-                lambda y: self._residuals(y, data), coordinates, config.steps, partial(report, "transients")
+                lambda y: self._residuals(y, data), coordinates, config.steps, partial(report, "motion")
             )
         analyses = self._analyse(coordinates, data)
         if any(direction.standard_error > 1 for a in analyses for direction in a.directions):
@@ -566,14 +638,20 @@ class Identifier:
                 standard_errors=analysis.standard_errors,
                 correlations=analysis.correlations,
                 directions=analysis.directions,
-                delay=float(coordinates[leg, -1]) * DELAY_UNIT if config.transients else None,
+                drivetrain=Drivetrain(*map(float, drivetrain(jnp.asarray(coordinates[leg, size:]))))
+                if config.motion
+                else None,
                 residual=analysis.scatter,
                 losses=np.sort(ended[leg]),
             )
             for leg, analysis in enumerate(analyses)
         ]
         after, nominal = (np.moveaxis(angles, 0, -1) for angles in settled)
-        return Identification((fits[0], fits[1]), after, nominal, config)
+        moving = None
+        if config.motion:
+            paths, _ = self.physics.motion(coordinates, data.commanded)
+            moving = sweep.means(np.moveaxis(paths[:, data.counts], 0, -1))
+        return Identification((fits[0], fits[1]), after, moving, nominal, config)
 
     def _angles(
         self, coordinates: Float[np.ndarray, "n size"], command: Float[np.ndarray, "n holds"]
@@ -583,11 +661,11 @@ class Identifier:
         return qpos[:, :, self.physics.leg.angles], slope[:, :, self.physics.leg.angles]
 
     def _settled_residuals(
-        self, coordinates: Float[np.ndarray, "n size"], leg: Int[np.ndarray, " n"], data: _Data
+        self, coordinates: Float[np.ndarray, "n size"], leg: Int[np.ndarray, " n"], data: LegData
     ) -> tuple[Float[np.ndarray, "n residuals"], Float[np.ndarray, "n residuals size"]]:
         """Simulated less measured settled angles, weighted, and their Jacobians."""
         angles, slope = self._angles(coordinates, data.command[leg])
-        weights = data.weights[:, None]
+        weights = data.weights[leg]
         count = len(coordinates)
         return (
             (weights * (angles - data.settled[leg])).reshape(count, -1),
@@ -595,28 +673,18 @@ class Identifier:
         )
 
     def _residuals(
-        self, coordinates: Float[np.ndarray, "legs size"], data: _Data
+        self, coordinates: Float[np.ndarray, "legs size"], data: LegData
     ) -> tuple[Float[np.ndarray, "legs residuals"], Float[np.ndarray, "legs residuals size"]]:
-        """The same for both legs, followed by the transients' (0 where the command did not change)."""
-        legs, size = len(coordinates), self._size
-        if not self.config.transients:
+        """The same for both legs, or the whole motion's."""
+        legs = len(coordinates)
+        if not self.config.motion:
             return self._settled_residuals(coordinates, np.arange(legs), data)
-        qpos, slope = self.physics.settled(coordinates[:, :size], data.command)
-        paths, path_slopes = self.physics.transient(
-            coordinates, qpos[:, data.previous], slope[:, data.previous], data.command
-        )
-        moved = (data.previous != np.arange(len(data.previous)))[:, None, None]
-        weights, angles = data.weights[:, None], self.physics.leg.angles
-        values = (weights * (qpos[:, :, angles] - data.settled), moved * (paths - data.transient))
-        still = np.pad(weights[..., None] * slope[:, :, angles], [(0, 0)] * 3 + [(0, 1)])
-        jacobians = (still, moved[..., None] * path_slopes)
-        return (
-            np.concatenate([value.reshape(legs, -1) for value in values], axis=1),
-            np.concatenate([jacobian.reshape(legs, -1, size + 1) for jacobian in jacobians], axis=1),
-        )
+        paths, slopes = self.physics.motion(coordinates, data.commanded)
+        values = (paths - data.motion)[:, data.counts]
+        return values.reshape(legs, -1), slopes[:, data.counts].reshape(legs, -1, slopes.shape[-1])
 
     def _drawn(
-        self, coordinates: Float[np.ndarray, "legs size"], data: _Data, analyses: list[_Analysis]
+        self, coordinates: Float[np.ndarray, "legs size"], data: LegData, analyses: list[_Analysis]
     ) -> tuple[Float[np.ndarray, "legs residuals"], Float[np.ndarray, "legs residuals size"]]:
         """All residuals over their scatter, then how far from nominal along open directions, in units of the prior."""
         values, jacobians = self._residuals(coordinates, data)
@@ -635,7 +703,7 @@ class Identifier:
         )
 
     def _distance(
-        self, coordinates: Float[np.ndarray, "n size"], leg: Int[np.ndarray, " n"], data: _Data
+        self, coordinates: Float[np.ndarray, "n size"], leg: Int[np.ndarray, " n"], data: LegData
     ) -> tuple[Float[np.ndarray, "n 1"], Float[np.ndarray, "n 1 size"]]:
         """The legs' parts of the paper's objective."""
         angles, slope = self._angles(coordinates, data.command[leg])
@@ -647,17 +715,18 @@ class Identifier:
         vector = self.space.vector(jnp.asarray(coordinates))
         return np.asarray(vector), np.asarray(jax.jacfwd(self.space.vector)(jnp.asarray(coordinates)))[self.space.free]
 
-    def _analyse(self, coordinates: Float[np.ndarray, "legs size"], data: _Data) -> list[_Analysis]:
+    def _analyse(self, coordinates: Float[np.ndarray, "legs size"], data: LegData) -> list[_Analysis]:
         space, size = self.space, self._size
         results = []
         for y, value, jacobian in zip(coordinates, *self._residuals(coordinates, data), strict=True):
             scatter = float(np.sqrt(np.sum(value**2) / max(np.count_nonzero(value) - len(y), 1)))
             prior = space.prior[space.free]
-            # In units of the prior, whatever the coordinates; the delay, of which nobody knows anything, projected out.
+            # In units of the prior, whatever the coordinates; the drivetrain, of which nobody knows anything, projected
+            # out.
             known = jacobian[:, :size] / np.diag(self._parameters(y[:size])[1]) * prior / scatter
-            for nuisance in jacobian[:, size:].T:
-                unit = nuisance / np.linalg.norm(nuisance)
-                known = known - np.outer(unit, unit @ known)
+            unknown, singular, _ = np.linalg.svd(jacobian[:, size:], full_matrices=False)
+            unknown = unknown[:, singular > 1e-9 * singular.max(initial=0.0)]
+            known = known - unknown @ (unknown.T @ known)
             _, singular, right = np.linalg.svd(known, full_matrices=False)
             errors = 1 / np.maximum(singular, 1e-12)
             variances = np.where(errors > 1, 1 / (1 + singular**2), errors**2)
@@ -738,6 +807,13 @@ _UNITS = {
     "default_motor_angle": ("deg", 1 / _DEGREE),
     "default_knee_angle": ("deg", 1 / _DEGREE),
     "torque_limit": ("N m", 1.0),
+    "cable_slack": ("mm", 1e3),
+}
+_DRIVETRAIN_UNITS = {
+    "delay": ("s", 1.0),
+    "motor_friction": ("N m", 1.0),
+    "knee_friction": ("N m", 1.0),
+    "backlash": ("deg", 1 / _DEGREE),
 }
 
 
@@ -759,10 +835,21 @@ def table(sweep: Sweep, result: Identification) -> str:
             value = f"{fit.vector[index] * scale:.4g}"
             lines.append(f"{label:33}{nominal[index] * scale:>10.4g}{value:>12}{error:>16} {unit}")
     for side, fit in zip(SIDES, result.fits, strict=True):
-        if fit.delay is not None:
-            lines.append(f"{'delay of the command, ' + side:33}{'':10}{fit.delay:>12.3f}{'':16} s (reported only)")
+        for name, value in fit.drivetrain._asdict().items() if fit.drivetrain else ():
+            unit, scale = _DRIVETRAIN_UNITS[name]
+            label = f"{name.replace('_', ' ')}, {side}"
+            lines.append(f"{label:33}{'':10}{value * scale:>12.4g}{'':16} {unit} (reported only)")
     before, after = (mean_error(angles, sweep) for angles in (result.nominal_settled, result.settled))
     lines += ["", f"Mean error of the settled angles: {before:.2f} deg before, {after:.2f} deg after."]
+    if result.with_drivetrain is not None:
+        scatter = ", ".join(
+            f"{np.rad2deg(fit.residual):.2f} deg ({side})" for side, fit in zip(SIDES, result.fits, strict=True)
+        )
+        lines.append(
+            f"With delay, friction and backlash {mean_error(result.with_drivetrain, sweep):.2f} deg. Of the whole "
+            f"motion is left, root mean square: {scatter}; if that is more than your capture's noise, this model lacks "
+            "something."
+        )
     with jax.enable_x64(True):
         for label, angles in (("before", result.nominal_settled), ("after", result.settled)):
             distances = np.zeros((2, 2))
@@ -771,9 +858,7 @@ def table(sweep: Sweep, result: Identification) -> str:
                 distances += np.asarray(curve_distances(sweep.command[:, side], *pair, result.config.degree))
             there, back = distances.sum(axis=1)
             lines.append(f"Curves {label}: Hausdorff distance {there:.4f} simulated to measured, {back:.4f} back.")
-    lines.append(
-        "Standard errors take the residuals for white noise; what the model lacks (backlash, friction) is none."
-    )
+    lines.append("Standard errors take the residuals for white noise; what the model lacks is none.")
     for side, fit in zip(SIDES, result.fits, strict=True):
         singular = ", ".join(f"{1 / d.standard_error:.3g}" for d in fit.directions)
         lines.append(f"Singular values, {side} (Jacobian over noise, in units of what robots differ by): {singular}")
@@ -807,13 +892,17 @@ def details(result: Identification, source: Any) -> dict[str, Any]:
             "parameters": list(_free_names(result.config)),
             **{side: np.round(fit.correlations, 3).tolist() for side, fit in zip(SIDES, result.fits, strict=True)},
         },
-        "delay": [None if fit.delay is None else round(fit.delay, 4) for fit in result.fits],
+        "drivetrain": {
+            name: [float(f"{getattr(fit.drivetrain, name):.4g}") if fit.drivetrain else None for fit in result.fits]
+            for name in Drivetrain._fields
+        },
         "source": source,
     }
 
 
 def _free_names(config: IdentificationConfig) -> tuple[str, ...]:
-    return tuple(name for name in NAMES if config.torque_limit or name != "torque_limit")
+    """All but those that have an option of their name which is off."""
+    return tuple(name for name in NAMES if getattr(config, name, True))
 
 
 def _in_words(direction: Direction, config: IdentificationConfig) -> str:

@@ -294,7 +294,7 @@ def _sticks(qpos: Float[np.ndarray, "states nq"]) -> tuple[dict[str, np.ndarray]
 
 def actuator_curves(path: Path, sweep: Sweep, result: Identification) -> None:
     """Settled angles over commands, a panel for each joint: measured, nominal and identified (the paper's figure of the
-    actuators)."""
+    actuators); dotted, identified with the drivetrain that belongs to it."""
     figure = Figure(figsize=(9.0, 6.5), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True, sharey="row")
     simulations = {"vanilla": result.nominal_settled, "vanilla+sysid": result.settled}
@@ -305,6 +305,10 @@ def actuator_curves(path: Path, sweep: Sweep, result: Identification) -> None:
             for name, angles in simulations.items():
                 curve = np.rad2deg(angles[order, row, column])
                 axis.plot(command, curve, color=COLOURS[name], label=LABELS[name], linewidth=1.5)
+            if result.with_drivetrain is not None:
+                curve = np.rad2deg(result.with_drivetrain[order, row, column])
+                label = f"{LABELS['vanilla+sysid']}, with friction and backlash"
+                axis.plot(command, curve, ":", color=COLOURS["vanilla+sysid"], label=label, linewidth=1.5)
             measured = np.rad2deg(sweep.settled[order, row, column])
             axis.plot(command, measured, "o", color=COLOURS["recording"], label="measured", markersize=3.5)
             axis.set_title(f"{joint}, {side}")
@@ -312,7 +316,7 @@ def actuator_curves(path: Path, sweep: Sweep, result: Identification) -> None:
         axes[row, 0].set_ylabel("angle (deg)")
     for axis in axes[-1]:
         axis.set_xlabel("command")
-    axes[0, 0].legend()
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     _save(figure, path)
 
 

@@ -29,7 +29,7 @@ HIPS, KNEES, MOTORS = (slice(1, None, 3), slice(2, None, 3), slice(3, None, 3))
 CONTROL_TIMESTEP = 0.05
 """Seconds between two commands (20 Hz)."""
 CABLE_SLACK = 1e-4
-"""Slack of the cable (m) with the motor at 0 and the knee at its stop."""
+"""The nominal robot's slack of the cable (m) with the motor at 0 and the knee at its stop."""
 SERVO_RANGE = np.pi / 2
 """Motor angle (rad) that a command of 1 asks for."""
 
@@ -82,10 +82,12 @@ class ActuatorParameters:
     - `knee_spring_stiffness` (N m/rad): `jnt_stiffness` of the knees; the spring's zero, -45 deg, stays.
     - `motor_gain` (N m/rad): the servo's position gain, in `actuator_gainprm` and `actuator_biasprm`.
     - `default_motor_angle` (rad): the motor angle that command 0 asks for, `actuator_biasprm[:, 0]`.
-    - `default_knee_angle` (rad): the knee's stop, `jnt_range[:, 0]`; the cable's rest length follows, so that
-      `CABLE_SLACK` is left with the motor at 0 and the knee at this angle.
+    - `default_knee_angle` (rad): the knee's stop, `jnt_range[:, 0]`; the cable's rest length follows it.
     - `torque_limit` (N m): where the servo saturates, `actuator_forcerange`. Not among the paper's eight, by which a
       servo weaker than nominal can be told only by a spring stiffer than the robot's.
+    - `cable_slack` (m): what is left of the cable's rest length, `tendon_lengthspring[:, 1]`, with the motor at 0 and
+      the knee at its stop. Not among the paper's eight either: without it, a cable that bends the knee late passes for
+      one that stretches, under torques up to three times the robot's.
     """
 
     knee_spring_stiffness: Float[Array, " sides"]
@@ -93,18 +95,21 @@ class ActuatorParameters:
     default_motor_angle: Float[Array, " sides"]
     default_knee_angle: Float[Array, " sides"]
     torque_limit: Float[Array, " sides"]
+    cable_slack: Float[Array, " sides"]
 
     @staticmethod
     def nominal(model: mujoco.MjModel) -> ActuatorParameters:
         """The values that stand in `model`."""
         knees, servos = _knee_ids(model), _servo_ids(model)
         gain = -model.actuator_biasprm[servos, 1]
+        taut = cable_length(model, model.jnt_range[knees, 0], np.zeros(len(knees)))
         return ActuatorParameters(
             knee_spring_stiffness=jnp.asarray(model.jnt_stiffness[knees], jnp.float32),
             motor_gain=jnp.asarray(gain, jnp.float32),
             default_motor_angle=jnp.asarray(model.actuator_biasprm[servos, 0] / gain, jnp.float32),
             default_knee_angle=jnp.asarray(model.jnt_range[knees, 0], jnp.float32),
             torque_limit=jnp.asarray(model.actuator_forcerange[servos, 1], jnp.float32),
+            cable_slack=jnp.asarray(model.tendon_lengthspring[_cable_ids(model), 1] - taut, jnp.float32),
         )
 
 
@@ -144,7 +149,7 @@ def actuator_fields(model: mujoco.MjModel, parameters: ActuatorParameters) -> di
     """Model fields that carry `parameters`, by name; for `mjx.Model.replace` or, as NumPy, for an `MjModel`."""
     knees, servos = _knee_ids(model), _servo_ids(model)
     gain = parameters.motor_gain
-    rest = cable_length(model, parameters.default_knee_angle, jnp.zeros_like(gain)) + CABLE_SLACK
+    rest = cable_length(model, parameters.default_knee_angle, jnp.zeros_like(gain)) + parameters.cable_slack
     return {
         "jnt_stiffness": jnp.asarray(model.jnt_stiffness).at[knees].set(parameters.knee_spring_stiffness),
         "jnt_range": jnp.asarray(model.jnt_range).at[knees, 0].set(parameters.default_knee_angle),

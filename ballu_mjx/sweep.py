@@ -1,7 +1,7 @@
 """Actuator sweeps: what a suspended recording says about the way from commands to joint angles.
 
 A sweep holds one pair of commands after the other, each until the joints have settled. Identification reads from it
-the settled angles (the paper's data, section "System Identification") and the transients on the way there.
+the settled angles (the paper's data, section "System Identification") and the whole motion.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ballu_mjx.errors import InputError
 from ballu_mjx.recording import Recording
@@ -20,10 +20,9 @@ from ballu_mjx.robot import SIDES
 LEVELS = 20
 """Command levels of a sweep (paper)."""
 SAMPLE_TIMESTEP = 0.01
-"""Seconds between two samples of a transient."""
+"""Seconds between two samples of the motion."""
 SHORTEST_HOLD = 0.6
 """Seconds for which each command must be held at least."""
-_TRANSIENT_SECONDS = 0.8
 _SETTLED_SECONDS = 0.5
 _SETTLED_WITHIN = float(np.deg2rad(0.5))
 """Drift (rad) within the settled window above which the joints were still moving."""
@@ -39,24 +38,30 @@ class Sweep:
     robot: str
     command: Float[np.ndarray, "holds 2"]
     """Commands held (left, right)."""
-    previous: Int[np.ndarray, " holds"]
-    """Index of the hold before; for the first of a recording, its own."""
     settled: Float[np.ndarray, "holds 2 2"]
     """Means over the last stretch of each hold."""
+    drift: Float[np.ndarray, "holds 2 2"]
+    """How far the second half of that stretch lies from its first."""
     samples: Int[np.ndarray, " holds"]
     """Samples in each of those means."""
-    transient: Float[np.ndarray, "holds times 2 2"]
-    """Angles after the command changed, at multiples of `SAMPLE_TIMESTEP` from 0 on."""
+    motion: Float[np.ndarray, "times 2 2"]
+    """All angles, every `SAMPLE_TIMESTEP`, one recording after the other."""
+    hold: Int[np.ndarray, " times"]
+    """The hold at each of these times."""
+    begins: Bool[np.ndarray, " times"]
+    """Where a recording begins: what was before has no part in what follows."""
 
-    def without(self, left_out: Sequence[int]) -> Sweep:
-        """The same without some of its holds."""
+    def means(self, motion: Float[np.ndarray, "times 2 2"]) -> Float[np.ndarray, "holds 2 2"]:
+        """Of a motion like this one: what it comes to at the end of each hold."""
+        count = min(round(_SETTLED_SECONDS / SAMPLE_TIMESTEP), int(np.bincount(self.hold).min()) // 3)
+        return np.array([motion[self.hold == hold][-count:].mean(axis=0) for hold in range(len(self.command))])
+
+    def settled_without(self, left_out: Sequence[int]) -> Sweep:
+        """The settled angles of all other holds, and no motion."""
         kept = np.setdiff1d(np.arange(len(self.command)), left_out)
-        # A hold whose predecessor is gone keeps its settled angles, and loses its transient.
-        place = np.full(len(self.command), -1)
-        place[kept] = np.arange(len(kept))
-        previous = np.where(place[self.previous[kept]] < 0, np.arange(len(kept)), place[self.previous[kept]])
-        fields = (self.settled, self.samples, self.transient)
-        return Sweep(self.robot, self.command[kept], previous, *(field[kept] for field in fields))
+        settled = {name: getattr(self, name)[kept] for name in ("command", "settled", "drift", "samples")}
+        motion = {name: getattr(self, name)[:0] for name in ("motion", "hold", "begins")}
+        return dataclasses.replace(self, **settled, **motion)
 
 
 def read_sweep(recordings: Mapping[Path, Recording], *, levels: int = LEVELS) -> Sweep:
@@ -85,14 +90,13 @@ def read_sweep(recordings: Mapping[Path, Recording], *, levels: int = LEVELS) ->
                 'ground, "kind": "suspended").'
             )
         parts.append(_holds(path, recording))
-    length = min(part[4].shape[1] for part in parts)
     firsts = np.cumsum([0] + [len(part[0]) for part in parts])
-    previous = np.concatenate([part[1] + first for part, first in zip(parts, firsts, strict=False)])
-    command, settled, samples = (np.concatenate([part[i] for part in parts]) for i in (0, 2, 3))
-    transient = np.concatenate([part[4][:, :length] for part in parts])
+    command, settled, drift, samples, motion = (np.concatenate([part[i] for part in parts]) for i in range(5))
+    hold = np.concatenate([part[5] + first for part, first in zip(parts, firsts, strict=False)])
+    begins = np.concatenate([np.arange(len(part[5])) == 0 for part in parts])
     for index, side in enumerate(SIDES):
         _check_levels(names, side, command[:, index], levels)
-    return Sweep(robots[0], command, previous, settled, samples, transient)
+    return Sweep(robots[0], command, settled, drift, samples, motion, hold, begins)
 
 
 def _check_levels(names: str, side: str, command: Float[np.ndarray, " holds"], levels: int) -> None:
@@ -115,7 +119,8 @@ def _check_levels(names: str, side: str, command: Float[np.ndarray, " holds"], l
 
 
 def _holds(path: Path, recording: Recording) -> tuple[np.ndarray, ...]:
-    """Command, index of the hold before, settled angles, samples and transient of each hold of one recording."""
+    """Command, settled angles, drift and samples of each hold of one recording; its motion, and the hold at each
+    time."""
     assert recording.motor is not None and recording.knee is not None  # mandatory in suspended recordings
     time, angles = recording.time, np.stack([recording.motor, recording.knee], axis=1)
     changes = 1 + np.flatnonzero(np.any(np.abs(np.diff(recording.command, axis=0)) > 1e-9, axis=1))
@@ -128,30 +133,22 @@ def _holds(path: Path, recording: Recording) -> tuple[np.ndarray, ...]:
             f"until the joints settle, {SHORTEST_HOLD:g} s or more (2 s is good)."
         )
     settled_seconds = min(_SETTLED_SECONDS, durations.min() / 3)
-    transient_seconds = min(_TRANSIENT_SECONDS, durations.min() - settled_seconds)
-    grid = SAMPLE_TIMESTEP * np.arange(int(transient_seconds / SAMPLE_TIMESTEP + 1e-9))
-
-    settled, samples, transient = [], [], []
+    settled, drifts, samples = [], [], []
     for start, end in zip(starts, ends, strict=True):
         window = angles[start:end][time[start:end] > time[end - 1] - settled_seconds]
         half = len(window) // 2
-        drift = np.abs(window[half:].mean(axis=0) - window[:half].mean(axis=0)).max()
-        if drift > _SETTLED_WITHIN:
+        drift = window[half:].mean(axis=0) - window[:half].mean(axis=0)
+        if np.abs(drift).max() > _SETTLED_WITHIN:
             raise InputError(
-                f"{path}: a joint still moves by {np.rad2deg(drift):.1f} deg at the end of the hold from "
+                f"{path}: a joint still moves by {np.rad2deg(np.abs(drift).max()):.1f} deg at the end of the hold from "
                 f"{time[start]:.2f} s; hold each command for longer."
             )
         settled.append(window.mean(axis=0))
+        drifts.append(drift)
         samples.append(len(window))
-        flat = angles.reshape(len(time), 4)
-        transient.append(
-            np.stack([np.interp(time[start] + grid, time, column) for column in flat.T], axis=1).reshape(-1, 2, 2)
-        )
+    grid = np.arange(time[0], time[-1] + 1e-9, SAMPLE_TIMESTEP)
+    flat = angles.reshape(len(time), 4)
+    motion = np.stack([np.interp(grid, time, column) for column in flat.T], axis=1).reshape(-1, 2, 2)
+    hold = np.searchsorted(time[starts], grid + 1e-9, side="right") - 1
     command = recording.command[starts]
-    return (
-        command,
-        np.maximum(np.arange(len(starts)) - 1, 0),
-        np.array(settled),
-        np.array(samples),
-        np.array(transient),
-    )
+    return command, np.array(settled), np.array(drifts), np.array(samples), motion, hold

@@ -165,6 +165,7 @@ def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
         default_motor_angle=jnp.array(virtual.default_motor_angle),
         default_knee_angle=jnp.array(virtual.default_knee_angle),
         torque_limit=jnp.array(virtual.torque_limit),
+        cable_slack=jnp.full(2, ballu.CABLE_SLACK),
     )
     ballu.set_fields(model, ballu.actuator_fields(model, parameters))
     model.actuator_forcerange[:] = np.outer(virtual.torque_limit, [-1.0, 1.0])  # in full precision

@@ -1,14 +1,19 @@
 """What a sweep can tell: `python benchmarks/identifiability.py`.
 
-On sweeps simulated with known parameters: are they found from ten different draws of starts, without noise; and with
-0.5 deg of noise, how often does the truth lie within two standard errors, and what do the motions between commands add
-to the settled angles? Takes about five minutes on two cores; `--quick` a tenth of it after compiling.
+1. On sweeps simulated with known parameters: are they found from different draws of starts, without noise; and with
+   0.5 deg of noise, how often does the truth lie within two standard errors?
+2. On sweeps of virtual robots, of which identification knows nothing: how far from the truth is what it finds; and how
+   far without what it has beyond settled angles and torque limits: first without the motion, and so without delay, play
+   and friction, then without the cables' slack too.
+
+Takes about a quarter of an hour; `--quick` a third of it.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+from pathlib import Path
 
 from ballu_mjx import runtime
 
@@ -17,43 +22,52 @@ runtime.prepare()
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
 
-from ballu_mjx import identification  # noqa: E402
-from ballu_mjx.identification import NAMES, IdentificationConfig  # noqa: E402
+from ballu_mjx import identification, virtual_robot  # noqa: E402
+from ballu_mjx.identification import NAMES, Drivetrain, Fit, IdentificationConfig  # noqa: E402
 from ballu_mjx.robot import SIDES  # noqa: E402
-from ballu_mjx.sweep import Sweep  # noqa: E402
+from ballu_mjx.sweep import Sweep, read_sweep  # noqa: E402
 
 NOISE = float(np.deg2rad(0.5))
-SAMPLES, TIMES, LEVELS, DELAY = 50, 80, 20, 0.04
-CHANGES = ([1.3, 0.7, 0.05, 0.06, 0.75], [0.8, 1.2, -0.08, -0.03, 0.6])
-"""Left and right: times the nominal parameters; angles (rad) added."""
+SAMPLES, TIMES, LEVELS = 30, 60, 20
+"""Of a hold: samples of its mean, and of its motion; and holds."""
+TRAIN = Drivetrain(delay=0.043, motor_friction=3e-3, knee_friction=8e-4, backlash=float(np.deg2rad(2.0)))
+CHANGES = ([1.3, 0.7, 0.05, 0.06, 0.75, 1.2e-3], [0.8, 1.2, -0.08, -0.03, 0.6, 2e-4])
+"""Left and right: times the nominal parameters; angles (rad) and slack (m) added."""
+WIDTHS = (14, 14, 15, 20, 16)
+RATIOS = ("knee_spring_stiffness", "motor_gain", "torque_limit")
 
 
-def truth() -> np.ndarray:
-    """Parameters of both legs."""
-    nominal = identification.nominal_leg()
-    relative = np.array([not name.startswith("default") for name in NAMES])
-    return np.stack([np.where(relative, nominal * change, nominal + change) for change in np.array(CHANGES)])
+def silent(stage: str, iteration: int, steps: int, value: float) -> None:
+    """No report."""
 
 
 def simulate(identifier: identification.Identifier, vectors: np.ndarray) -> Sweep:
     """A sweep of the model itself, without noise."""
-    physics = identifier.physics
-    command, previous = np.linspace(0, 1, LEVELS), np.maximum(np.arange(LEVELS) - 1, 0)
+    physics, data = identifier.physics, identification.leg_data(blank())
     y = np.stack([identifier.space.coordinates(vector) for vector in vectors])
-    qpos, slope = physics.settled(y, np.tile(command, (2, 1)))
-    delayed = np.concatenate([y, np.full((2, 1), DELAY / identification.DELAY_UNIT)], axis=1)
-    paths, _ = physics.transient(delayed, qpos[:, previous], slope[:, previous], np.tile(command, (2, 1)))
+    qpos, _ = physics.settled(y, data.command)
+    train = np.tile(identification.drivetrain_coordinates(TRAIN), (len(SIDES), 1))
+    motion, _ = physics.motion(np.concatenate([y, train], axis=1), data.commanded)
     return dataclasses.replace(
-        blank(), settled=np.moveaxis(qpos[:, :, physics.leg.angles], 0, -1), transient=np.moveaxis(paths, 0, -1)
+        blank(),
+        settled=np.moveaxis(qpos[:, :, physics.leg.angles], 0, -1),
+        motion=np.moveaxis(motion[:, data.counts], 0, -1),
     )
 
 
 def blank() -> Sweep:
     """Of the right sizes."""
-    command = np.repeat(np.linspace(0, 1, LEVELS)[:, None], len(SIDES), axis=1)
-    previous = np.maximum(np.arange(LEVELS) - 1, 0)
-    sizes = (np.zeros((LEVELS, 2, 2)), np.full(LEVELS, SAMPLES), np.zeros((LEVELS, TIMES, 2, 2)))
-    return Sweep("model", command, previous, *sizes)
+    times = LEVELS * TIMES
+    return Sweep(
+        robot="model",
+        command=np.repeat(np.linspace(0, 1, LEVELS)[:, None], len(SIDES), axis=1),
+        settled=np.zeros((LEVELS, 2, 2)),
+        drift=np.zeros((LEVELS, 2, 2)),
+        samples=np.full(LEVELS, SAMPLES),
+        motion=np.zeros((times, 2, 2)),
+        hold=np.repeat(np.arange(LEVELS), TIMES),
+        begins=np.arange(times) == 0,
+    )
 
 
 def with_noise(sweep: Sweep, seed: int) -> Sweep:
@@ -62,47 +76,71 @@ def with_noise(sweep: Sweep, seed: int) -> Sweep:
     return dataclasses.replace(
         sweep,
         settled=sweep.settled + rng.normal(size=sweep.settled.shape) * NOISE / np.sqrt(SAMPLES),
-        transient=sweep.transient + rng.normal(size=sweep.transient.shape) * NOISE,
+        motion=sweep.motion + rng.normal(size=sweep.motion.shape) * NOISE,
     )
+
+
+def of_the_model_itself(seeds: int, draws: int) -> None:
+    """Starts and noise."""
+    identifier = identification.Identifier(IdentificationConfig(), blank(), silent)
+    space = identifier.space
+    changes = np.array(CHANGES)
+    vectors = np.where(space.relative, space.nominal * changes, space.nominal + changes)
+    clean = simulate(identifier, vectors)
+    worst = np.zeros(len(NAMES))
+    for seed in range(seeds):
+        identifier.config = IdentificationConfig(seed=seed)
+        found = np.stack([fit.vector for fit in identifier.run(clean, silent).fits])
+        worst = np.maximum(worst, np.abs(found - vectors).max(axis=0))
+    print(f"Without noise, worst of {seeds} draws of starts:")
+    for name, error, value, relative in zip(NAMES, worst, vectors.min(axis=0), space.relative, strict=True):
+        shown = f"{error / value:.1e} relative" if relative else f"{error:.1e} {'m' if 'slack' in name else 'rad'}"
+        print(f"  {name:24}{shown}")
+    within = []
+    for seed in range(draws):
+        identifier.config = IdentificationConfig(draws=32)
+        for fit, vector in zip(identifier.run(with_noise(clean, seed), silent).fits, vectors, strict=True):
+            within += list(np.abs(fit.vector - vector) < 2 * fit.standard_errors)
+    print(f"With 0.5 deg of noise, {draws} draws: within two standard errors {np.mean(within):.1%} of the parameters")
+
+
+def of_virtual_robots(robots: int) -> None:
+    """Against their truth."""
+    ways = {
+        "as it is": IdentificationConfig(),
+        "settled angles alone": IdentificationConfig(motion=False),
+        "and no slack": IdentificationConfig(motion=False, cable_slack=False),
+    }
+    for way, config in ways.items():
+        print(f"\nVirtual robots, {way}: identified over true, (left, right)")
+        heads = ("springs", "gains", "torque limits", "slack - true (mm)", "scatter (deg)")
+        print("robot " + "".join(f"{head:>{width}}" for head, width in zip(heads, WIDTHS, strict=True)))
+        identifier = None
+        for number in range(robots):
+            virtual = virtual_robot.draw_robot(number)
+            sweep = read_sweep({Path("sweep"): virtual_robot.record_sweep(virtual, number, "sweep")})
+            identifier = identifier or identification.Identifier(config, sweep, silent)
+            fits = identifier.run(sweep, silent).fits
+            print(f"{number:<6}{row(virtual, fits)}", flush=True)
+
+
+def row(virtual: virtual_robot.VirtualRobot, fits: tuple[Fit, Fit]) -> str:
+    """One robot's line."""
+    found = {name: [fit.vector[index] for fit in fits] for index, name in enumerate(NAMES)}
+    ratios = [np.array(found[name]) / np.array(getattr(virtual, name)) for name in RATIOS]
+    slack = 1e3 * (np.array(found["cable_slack"]) - np.array(virtual.cable_slack))
+    scatter = np.rad2deg([fit.residual for fit in fits])
+    cells = [f"{left:.2f}, {right:.2f}" for left, right in (*ratios, slack, scatter)]
+    return "".join(f"{cell:>{width}}" for cell, width in zip(cells, WIDTHS, strict=True))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a tenth of the draws")
-    seeds, draws = (1, 5) if parser.parse_args().quick else (10, 50)
-    vectors, silent = truth(), lambda *_: None
+    parser.add_argument("--quick", action="store_true", help="a few draws, two robots")
+    seeds, draws, robots = (1, 2, 2) if parser.parse_args().quick else (2, 8, 3)
     with jax.enable_x64(True):
-        identifier = identification.Identifier(IdentificationConfig(), blank(), silent)
-        clean = simulate(identifier, vectors)
-
-        worst = np.zeros(len(NAMES))
-        for seed in range(seeds):
-            identifier.config = IdentificationConfig(seed=seed)
-            found = np.stack([fit.vector for fit in identifier.run(clean, silent).fits])
-            worst = np.maximum(worst, np.abs(found - vectors).max(axis=0))
-        print(f"Without noise, worst of {seeds} draws of starts:")
-        for name, error, value in zip(NAMES, worst, vectors.min(axis=0), strict=True):
-            shown = f"{np.rad2deg(error):.1e} deg" if name.startswith("default") else f"{error / value:.1e} relative"
-            print(f"  {name:24}{shown}")
-
-        within, singular = [], {}
-        for transients in (True, False):
-            inside = []
-            for seed in range(draws):
-                identifier.config = IdentificationConfig(draws=32, steps=15, transients=transients)
-                result = identifier.run(with_noise(clean, seed), silent)
-                for fit, vector in zip(result.fits, vectors, strict=True):
-                    inside += list(np.abs(fit.vector - vector) < 2 * fit.standard_errors)
-                singular[transients] = [[1 / d.standard_error for d in fit.directions] for fit in result.fits]
-            within.append(np.mean(inside))
-        print(f"With 0.5 deg of noise, {draws} draws: within two standard errors {within[0]:.1%} of the parameters")
-        print(f"  (from settled angles alone: {within[1]:.1%})")
-        for side, still, moving in zip(SIDES, singular[False], singular[True], strict=True):
-            print(
-                f"Singular values, {side} (1 is what is known of robots beforehand; each above 1 is a dimension known):"
-            )
-            print(f"  settled angles  {', '.join(f'{value:.3g}' for value in still)}")
-            print(f"  and transients  {', '.join(f'{value:.3g}' for value in moving)}")
+        of_the_model_itself(seeds, draws)
+        of_virtual_robots(robots)
 
 
 if __name__ == "__main__":

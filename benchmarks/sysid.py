@@ -1,8 +1,8 @@
 """How good and how fast is identification? Three ways, on the bundled sweep, by the paper's objective, in one run.
 
 The objective is the sum over both legs of the directed Hausdorff distances from simulated to measured curves, for motor
-and knee, of settled angles. All three know the same bounds, for the paper's eight parameters and for ten (with the
-torque limits):
+and knee, of settled angles. All three know the same bounds, for the paper's eight parameters and for twelve (with
+torque limits and slack):
 
 - ours: `ballu_mjx.identification` from settled angles alone, with either objective. The time is a second run's;
   compiling, once for each size of sweep, stands apart.
@@ -16,8 +16,8 @@ One judge for all: C MuJoCo, simulated until nothing moves. Mean angle errors ar
 over every fourth hold after a fit to the others.
 
     python benchmarks/sysid.py
-    python benchmarks/sysid.py --quick                  # ten parameters, fewer draws and iterations, nothing left out
-    python benchmarks/sysid.py --output FOLDER          # numbers and traces as FOLDER/sysid.json too
+    python benchmarks/sysid.py --quick           # twelve parameters, fewer draws and iterations, nothing left out
+    python benchmarks/sysid.py --output FOLDER   # numbers and traces as FOLDER/sysid.json too
 """
 
 from __future__ import annotations
@@ -332,7 +332,7 @@ def toolbox(
             initial_params=parameters, residual_fn=noting, verbose=False, max_iters=iterations, x_scale="jac"
         )
     elapsed = time.perf_counter() - began
-    fitted = data.without(np.setdiff1d(np.arange(len(data.command)), kept).tolist())
+    fitted = data.settled_without(np.setdiff1d(np.arange(len(data.command)), kept).tolist())
     angles = Legs(SEARCH_STEPS).settled(np.stack([as_vectors(x) for _, x in visited]), fitted.command)
     trace = [(when, float(value)) for (when, _), value in zip(visited, distances(fitted)(angles)[:, 0], strict=True)]
     return as_vectors(found.as_vector()), elapsed, _lowest_so_far(trace)
@@ -366,7 +366,7 @@ def compare(one: list[Row], other: Row) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="ten parameters only, fewer draws and iterations")
+    parser.add_argument("--quick", action="store_true", help="twelve parameters only, fewer draws and iterations")
     parser.add_argument("--output", type=Path, help="folder for sysid.json")
     arguments = parser.parse_args()
     with jax.enable_x64(True):
@@ -384,7 +384,7 @@ def measure(quick: bool) -> list[Row]:
     everything = np.arange(len(whole.command))
     out = everything[LEFT_OUT_EVERY - 1 :: LEFT_OUT_EVERY]
     kept = np.setdiff1d(everything, out)
-    part, left_out = whole.without(out.tolist()), whole.without(kept.tolist())
+    part, left_out = whole.settled_without(out.tolist()), whole.settled_without(kept.tolist())
 
     judge, distance = Legs(JUDGE_STEPS, exact=True), distances(whole)
     iterations = 10 if quick else 60
@@ -418,9 +418,9 @@ def measure(quick: bool) -> list[Row]:
     nominal = np.tile(identification.nominal_leg(), (len(SIDES), 1))
     add("nominal", 0, nominal, 0.0, None, nominal, [])
     comparisons = []
-    for limit in (True,) if quick else (False, True):
+    for beyond in (True,) if quick else (False, True):
         # As many starts as by default: the compiled program's size depends on them.
-        config = IdentificationConfig(transients=False, torque_limit=limit)
+        config = IdentificationConfig(motion=False, torque_limit=beyond, cable_slack=beyond)
         if quick:
             config = dataclasses.replace(config, draws=15, steps=8)
         space = Space(identification.nominal_leg(), config)

@@ -10,12 +10,12 @@ from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-_OUTSIDE = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md"}
+_OUTSIDE = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "benchmarks/README.md": "benchmarks.md"}
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add README and CONTRIBUTING, their links as seen from docs/."""
+    """Add README, CONTRIBUTING and the benchmarks' README, their links as seen from docs/."""
     root = Path(config.config_file_path).parent
     for source, page in _OUTSIDE.items():
         text = (root / source).read_text(encoding="utf-8").replace("](docs/", "](")

@@ -7,10 +7,11 @@
 # simulator until its four curves lie on the measured ones: directed Hausdorff distance between fitted polynomials,
 # L-BFGS-B. Its figure shows the four curves against the command.
 #
-# Here on the bundled sweep of the virtual robot, hung up by its base, with ten parameters (a torque limit a leg is
-# added) and least squares over all angles; the README tells why, and what the paper's objective gives instead.
+# Here on the bundled sweep of the virtual robot, hung up by its base, with twelve parameters (torque limits and
+# the cables' slack are added), delay, friction and backlash beside them, and least squares over the whole motion; the
+# README tells why, and what the paper's objective gives instead.
 #
-# `python experiments/actuator_curves.py` takes about two minutes, most of it compiling; `--quick` fits settled angles
+# `python experiments/actuator_curves.py` takes about five minutes, half of it compiling; `--quick` fits settled angles
 # alone, from fewer starts.
 
 # %%
@@ -72,8 +73,9 @@ def identify(folder: Path, config: IdentificationConfig) -> None:
 # %% [markdown]
 # ## All of it: table and figure
 #
-# Dots are measured, lines are the nominal and the identified simulator. A command lifts the motor's arm and bends the
-# knee; where the servo is at its limit, curves flatten.
+# Dots are measured, lines are the nominal and the identified simulator, dotted is the identified one with the robot's
+# friction and backlash. A command lifts the motor's arm and bends the knee; where the servo is at its limit, curves
+# flatten.
 
 
 # %%

@@ -183,6 +183,13 @@ def test_envmimic_takes_identified_actuators_from_beside_the_recordings(trained:
     assert "vanilla+sysid" in (trained / "evaluation.txt").read_text()
 
 
+def test_actuators_from_before_slack_was_identified_have_the_nominal_one(tmp_path: Path):
+    content = json.loads((robot.assets() / "recordings" / actuators.NAME).read_text())
+    del content["parameters"]["cable_slack"]
+    (tmp_path / "old.json").write_text(json.dumps(content))
+    assert actuators.read(tmp_path / "old.json")[1].cable_slack == pytest.approx(robot.CABLE_SLACK)
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -192,6 +199,7 @@ def test_envmimic_takes_identified_actuators_from_beside_the_recordings(trained:
         ({"motor_gain": [0.5]}, "motor_gain must be two numbers"),
         ({"motor_gain": [0.5, -0.5]}, "must be greater than 0"),
         ({"default_knee_angle": [27.0, 27.0]}, "give it in radians"),
+        ({"cable_slack": [1.0, 1.0]}, "in metres"),
         ({"gain": [1.0, 1.0]}, "there is no parameter 'gain'"),
     ],
 )

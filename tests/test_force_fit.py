@@ -140,14 +140,15 @@ def test_labels_are_the_push(motions: list[Motion], linearize: Linearizer):
 
 
 def test_legs_that_differ_are_not_taken_for_forces(linearize: Linearizer):
-    """Knee springs by a fifth stiffer than the model's: their torques are unknowns of their own."""
+    """Knee springs by a fifth stiffer than the model's: their torques are unknowns of their own. In the median step:
+    where a foot lands within a step, derivatives are none, and a single label may be far off."""
     nominal = robot.ActuatorParameters.nominal(MODEL)
     stiffer = dataclasses.replace(nominal, knee_spring_stiffness=1.2 * nominal.knee_spring_stiffness)
     motion = pushed("stiff knees", 0.0, robot.load_model(stiffer))
 
     def wrong(config: SupervisedConfig) -> float:
         labels = supervised.Labeller(MODEL, BALLU, linearize, config)(motion)
-        return float(np.sqrt(np.mean((labels - PUSH) ** 2)))
+        return float(np.median(np.linalg.norm(labels - PUSH, axis=1)))
 
     assert wrong(SupervisedConfig()) < 0.5 * wrong(SupervisedConfig(torque_spread=1e-5))
 

@@ -193,8 +193,13 @@ def test_cable_length_is_the_models_own() -> None:
 
 def test_the_cables_rest_length_leaves_the_stated_slack() -> None:
     model = robot.load_model()
-    rest = robot.actuator_fields(model, robot.ActuatorParameters.nominal(model))["tendon_lengthspring"][:, 1]
-    np.testing.assert_allclose(model.tendon_lengthspring[:, 1], rest, atol=1e-5)
+    nominal = robot.ActuatorParameters.nominal(model)
+    np.testing.assert_allclose(nominal.cable_slack, robot.CABLE_SLACK, atol=1e-5)
+    rest = robot.actuator_fields(model, nominal)["tendon_lengthspring"][:, 1]
+    np.testing.assert_allclose(model.tendon_lengthspring[:, 1], rest, atol=1e-7)
+    looser = dataclasses.replace(nominal, cable_slack=nominal.cable_slack + jnp.array([1e-3, 0.0]))
+    longer = robot.actuator_fields(model, looser)["tendon_lengthspring"][:, 1] - rest
+    np.testing.assert_allclose(longer, [1e-3, 0.0], atol=1e-7)
 
 
 def test_the_servo_saturates_at_its_torque() -> None:
@@ -333,12 +338,12 @@ def test_settled_knees_and_their_derivatives_agree_with_c_mujoco(case: int) -> N
     for f, name in enumerate(FIELDS):
         for side in range(2):
             value = getattr(parameters, name)
-            delta = 0.02 * abs(float(value[side])) or 5e-3
+            delta = 5e-5 if name == "cable_slack" else 0.02 * abs(float(value[side])) or 5e-3
             high, low = (
                 settled_in_c(dataclasses.replace(parameters, **{name: value.at[side].add(sign * delta)}), command).qpos
                 for sign in (1, -1)
             )
-            # Per 1 % of the parameter (of 1 rad, where it is an angle of 0), in rad at the knee.
+            # Per 1 % of the parameter (of 1 rad, where it is an angle of 0; 0.025 mm of slack), in rad at the knee.
             scale = delta / 0.02 * 0.01
             np.testing.assert_allclose(
                 derivatives[case, f, side] * scale,
@@ -359,7 +364,7 @@ def test_each_parameter_moves_its_own_side_as_described() -> None:
     for f, name in enumerate(FIELDS):
         if f == limit:
             continue
-        sign = -1 if name == "knee_spring_stiffness" else 1
+        sign = -1 if name in ("knee_spring_stiffness", "cable_slack") else 1
         assert np.all(sign * taut[f][own] > 1e-2), name
         assert np.abs(taut[f][other]).max() < 0.1 * np.abs(taut[f][own]).min(), name
     np.testing.assert_allclose(at_stop[FIELDS.index("default_knee_angle")][own], 1, atol=0.05)

@@ -35,15 +35,18 @@ def both(count: int = 20) -> np.ndarray:
     return np.repeat(np.linspace(0, 1, count)[:, None], 2, axis=1)
 
 
-def test_finds_holds_settled_angles_and_transients() -> None:
+def test_finds_holds_settled_angles_and_motion() -> None:
     sweep = read_sweep({PATH: made(both())})
     assert sweep.command == pytest.approx(both())
-    assert sweep.previous.tolist() == [0, *range(19)]
     assert sweep.settled[:, 0] == pytest.approx(0.5 + both(), abs=1e-4)
     assert sweep.settled[:, 1] == pytest.approx(0.6 + both(), abs=1e-4)
+    assert sweep.drift == pytest.approx(0, abs=1e-4)
+    assert sweep.means(sweep.motion) == pytest.approx(sweep.settled, abs=1e-4)
     # From the angle of the hold before to its own.
-    assert sweep.transient[1:, 0] == pytest.approx(sweep.settled[:-1], abs=1e-4)
-    assert sweep.transient[:, -1] == pytest.approx(sweep.settled, abs=1e-4)
+    first = np.flatnonzero(np.diff(sweep.hold, prepend=-1))
+    assert sweep.motion[first[1:]] == pytest.approx(sweep.settled[:-1], abs=1e-4)
+    assert sweep.motion[first[1:] - 1] == pytest.approx(sweep.settled[:-1], abs=1e-4)
+    assert sweep.motion[first[1:] + 20, 0] == pytest.approx(0.5 + both()[1:] - np.exp(-4) / 19, abs=1e-3)
 
 
 def test_a_jittered_clock_from_any_origin_changes_nothing() -> None:
@@ -54,9 +57,9 @@ def test_a_jittered_clock_from_any_origin_changes_nothing() -> None:
     jittered = dataclasses.replace(steady, **{**values, "time": values["time"] + 1234.5})
     expected, sweep = read_sweep({PATH: steady}), read_sweep({PATH: jittered})
     assert sweep.settled == pytest.approx(expected.settled, abs=1e-3)
-    length = min(sweep.transient.shape[1], expected.transient.shape[1])
+    length = min(len(sweep.motion), len(expected.motion))
     # Samples dropped at a change of command move that change, by 5 ms each: a step of 0.053 rad decays in 50 ms.
-    assert sweep.transient[:, :length] == pytest.approx(expected.transient[:, :length], abs=0.02)
+    assert sweep.motion[:length] == pytest.approx(expected.motion[:length], abs=0.02)
 
 
 def test_legs_swept_one_after_the_other_make_one_sweep() -> None:
@@ -64,16 +67,25 @@ def test_legs_swept_one_after_the_other_make_one_sweep() -> None:
     left, right = made(np.stack([up, zero], 1)), made(np.stack([zero, up], 1))
     sweep = read_sweep({Path("left.csv"): left, Path("right.csv"): right})
     assert len(sweep.command) == 40
-    assert sweep.previous[20] == 20, "the second recording's first hold comes after none of the first's"
+    assert sweep.hold[np.flatnonzero(sweep.begins)].tolist() == [0, 20], "a motion each, and none from one to the other"
     assert sweep.settled[19, 0] == pytest.approx([1.5, 0.5], abs=1e-4)
 
 
-def test_leaving_out_a_hold_takes_the_transient_after_it() -> None:
+def test_a_joint_that_creeps_on_is_told_by_its_drift() -> None:
+    sweep = read_sweep({PATH: made(both(), hold=1.5, settle=0.4)})
+    # Means of exp(-t / 0.4 s) over the halves of the last half of a second, of a step of 1/19 rad.
+    expected = (1 / 19) * 0.4 * (np.exp(-2.5) - 2 * np.exp(-3.125) + np.exp(-3.75)) / 0.25
+    assert sweep.drift[1:] == pytest.approx(expected, rel=0.05)
+    assert sweep.drift[0] == pytest.approx(0, abs=1e-9)
+
+
+def test_leaving_out_a_hold_leaves_the_settled_angles_of_the_others() -> None:
     sweep = read_sweep({PATH: made(both())})
-    shorter = sweep.without([3])
+    shorter = sweep.settled_without([3])
     assert len(shorter.command) == 19
     assert shorter.command == pytest.approx(np.delete(both(), 3, axis=0))
-    assert shorter.previous.tolist() == [0, 0, 1, 3, *range(3, 18)]
+    assert shorter.settled == pytest.approx(np.delete(sweep.settled, 3, axis=0))
+    assert len(shorter.motion) == 0
 
 
 @pytest.mark.parametrize(

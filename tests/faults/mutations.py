@@ -291,6 +291,8 @@ def actuators_fault(found: Any) -> str | None:
         value = np.asarray(getattr(parameters, field))
         if not (finite(value) and value.shape == (2,) and (value > 0).all() and (value < 1e4).all()):
             return field
+    if not 0 <= np.min(parameters.cable_slack) <= np.max(parameters.cable_slack) < 0.1:
+        return "cable_slack"
     angles = np.concatenate([parameters.default_motor_angle, parameters.default_knee_angle])
     return None if finite(angles) and np.abs(angles).max() < 3.2 and printable(name) else "angle"
 
