@@ -108,7 +108,7 @@ class Aerodynamics:
         history: Float[Array, "steps 27"],
         commands: Float[Array, "steps 2"],
         key: Array | None = None,
-    ) -> Float[Array, " 6"]:
+    ) -> Float[Array, "1 6"]:
         """Drag in still air, by the velocities in the middle of the coming control step, extrapolated from the last."""
         del commands, key
         earlier, before, now = (rotation(seen[6:9]) for seen in history[-3:])
@@ -117,7 +117,7 @@ class Aerodynamics:
         speed = jnp.sqrt(jnp.sum(velocity**2) + _SLOW**2)
         force = -(params.linear_drag + params.quadratic_drag * speed) * velocity
         torque = -params.turning_drag * turned / ballu.CONTROL_TIMESTEP
-        return jnp.concatenate([now @ force, now @ torque])
+        return jnp.concatenate([now @ force, now @ torque])[None]
 
 
 _JUST = 1e-3

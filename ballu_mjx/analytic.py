@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 from ballu_mjx import envmimic, robot_description, simulation, windows
 from ballu_mjx.envmimic import ForcePolicy
 from ballu_mjx.errors import InputError
-from ballu_mjx.forces import Applied
+from ballu_mjx.forces import Applied, placed, together
 from ballu_mjx.linearization import ControlSteps, Linearized, Linearizer
 from ballu_mjx.windows import Windows
 
@@ -81,14 +81,14 @@ def simulator(
         def step(carry: tuple, time: Int[Array, ""]) -> tuple[tuple, tuple]:
             state, history = carry
             commands = jax.lax.dynamic_slice_in_dim(window.commands, time, envmimic.HISTORY)
-            force = forces.wrench(params, history, commands)[:3]
-            command, wrench = commands[-1], jnp.concatenate([force, jnp.zeros(3)])
+            loads = forces.loads(params, forces.inputs(history, commands), history[-1, 8])
+            command, wrench = commands[-1], placed(loads, forces.config.forces)
             if beside is not None:
                 command = beside.model.command(beside.params, commands)
-                wrench += beside.model.wrench(beside.params, history, commands)
+                wrench = together(wrench, beside.model.wrench(beside.params, history, commands))
             after = robot.step(state, command, wrench)
             features, _ = robot.observe(after)
-            done = ControlSteps(state, history, commands, force), features
+            done = ControlSteps(state, history, commands, loads), features
             return (after, jnp.concatenate([history[1:], features[None]])), done
 
         first = simulation.at(jnp.asarray(window.qpos), jnp.asarray(window.qvel)), window.history
@@ -129,7 +129,7 @@ def train(
     - `report`: told every `validate_every` gradient steps.
     - `beside`: a residual that the simulator has already.
     """
-    simulate, linearize = simulator(model, forces, beside), Linearizer(model, beside)
+    simulate, linearize = simulator(model, forces, beside), Linearizer(model, beside, forces=forces.config.forces)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
     starts = envmimic.start_spread(model, robot_description.ballu())
     some = _updates(forces, wrap, optimizer, spread, starts, config)
@@ -138,7 +138,7 @@ def train(
     done = 0
     for _ in range(config.rounds):
         steps, features = simulate(wrap(jax.device_get(carry[0])), recorded)
-        data = _in_windows(linearize(steps), steps.force, recorded)
+        data = _in_windows(linearize(steps), steps.loads, recorded)
         loss = float(np.mean(jax.vmap(_loss)(features, recorded.features)))
         for first in range(0, config.updates, config.validate_every):
             key, own = jax.random.split(key)
@@ -150,10 +150,10 @@ def train(
 
 
 def _in_windows(
-    linearized: Linearized, force: Float[Array | np.ndarray, "steps 3"], recorded: Windows
-) -> tuple[Linearized, Float[Array, "windows windowsteps 3"], Windows]:
+    linearized: Linearized, loads: Float[Array | np.ndarray, "steps loads"], recorded: Windows
+) -> tuple[Linearized, Float[Array, "windows windowsteps loads"], Windows]:
     shape = recorded.features.shape[:2]
-    parts = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32).reshape(*shape, *x.shape[1:]), (linearized, force))
+    parts = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32).reshape(*shape, *x.shape[1:]), (linearized, loads))
     return *parts, jax.tree.map(jnp.asarray, recorded)
 
 
@@ -175,7 +175,7 @@ def _updates(
     """Gradient steps on linearized windows, compiled."""
 
     def window_loss(
-        params: Any, key: Array, linear: Linearized, about: Float[Array, "windowsteps 3"], window: Windows
+        params: Any, key: Array, linear: Linearized, about: Float[Array, "windowsteps loads"], window: Windows
     ) -> tuple[Array, Array]:
         key_start, key_noise = jax.random.split(key)
         first = config.start_noise * start_spread * jax.random.normal(key_start, start_spread.shape)
@@ -185,16 +185,17 @@ def _updates(
             linear, about, time, key = inputs
             commands = jax.lax.dynamic_slice_in_dim(window.commands, time, envmimic.HISTORY)
             noise = config.observation_noise * spread * jax.random.normal(key, spread.shape)
-            force = forces.force(wrap(params), forces.inputs(history, commands) + noise, history[-1, 8])
-            both = jnp.concatenate([moved, force - about])
+            loads = forces.loads(wrap(params), forces.inputs(history, commands) + noise, history[-1, 8])
+            both = jnp.concatenate([moved, loads - about])
             features = linear.features + linear.seen @ both
-            return (linear.state @ both, jnp.concatenate([history[1:], features[None]])), (features, force)
+            return (linear.state @ both, jnp.concatenate([history[1:], features[None]])), (features, loads)
 
         steps = len(window.features)
         through = linear, about, jnp.arange(steps), jax.random.split(key_noise, steps)
-        _, (features, force) = jax.lax.scan(step, (first, window.history), through)
+        _, (features, loads) = jax.lax.scan(step, (first, window.history), through)
         tracking = _loss(features, window.features)
-        return tracking + config.force_cost * jnp.mean(jnp.sum(force**2, axis=-1)), tracking
+        in_newtons = loads / envmimic.units(forces.config, loads.shape[-1]) * forces.config.force_scale
+        return tracking + config.force_cost * jnp.mean(jnp.sum(in_newtons**2, axis=-1)), tracking
 
     @jax.jit
     def some(carry: tuple, keys: Array, data: tuple) -> tuple[tuple, tuple]:

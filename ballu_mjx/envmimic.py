@@ -24,7 +24,7 @@ from mujoco import mjx
 from ballu_mjx import batch_last, robot_description, simulation
 from ballu_mjx import robot as ballu
 from ballu_mjx.errors import InputError
-from ballu_mjx.forces import Applied, Fields
+from ballu_mjx.forces import Applied, Fields, ForceSet, placed, together, vectors
 from ballu_mjx.reconstruction import Motion
 from ballu_mjx.robot_description import RobotDescription
 
@@ -52,11 +52,17 @@ class EnvMimicConfig:
     """Sharpness of the added position term, 1/m^2."""
     fine_orientation_scale: float = 200.0
     """Sharpness of the added orientation term, 1/rad^2: at 20 it still pays 0.92 for 6 deg of yaw."""
+    forces: ForceSet = "force"
+    """What the policy pushes with: a force on the balloon (the paper's), a force and a torque there (wrench), or forces
+    at balloon, base and feet (multi)."""
     force_limit: float = 1.0
     """Largest force along each axis, N (paper: 1)."""
     force_scale: float = 0.05
     """Force, N, that one unit of the policy's output stands for. The forces that close the gap are hundredths of a
     newton: with 1 N a unit, PPO's first steps throw the robot over, with a constant learning rate for good."""
+    torque_scale: float = 0.005
+    """Torque, N m, that one unit of the policy's output stands for, where it pushes with one. Limit and cost are, unit
+    for unit, those of a force."""
     force_cost: float = 20.0
     """Reward lost per N^2 of force."""
     episode_seconds: float = 3.0
@@ -80,7 +86,9 @@ def check(config: EnvMimicConfig) -> None:
         option, value = f"--{field.name.replace('_', '-')}", getattr(config, field.name)
         if isinstance(value, bool):
             continue
-        if field.name in ("force_limit", "force_scale"):
+        if isinstance(value, str):
+            continue
+        if field.name in ("force_limit", "force_scale", "torque_scale"):
             if not (value > 0 and math.isfinite(value)):
                 raise InputError(f"{option} is {value:g}: it must be greater than 0; {field.default:g} is usual.")
         elif field.name == "episode_seconds":
@@ -205,8 +213,7 @@ class Simulator:
         self._template = mjx.make_data(model)
         self._count = simulation.substeps(model)
         sites = [model.site(name).id for name in (robot.tracked, *robot.points)]
-        self._tracked = int(model.site_bodyid[sites[0]])
-        self._root = int(model.body_rootid[self._tracked])
+        self._root = int(model.body_rootid[model.site_bodyid[sites[0]]])
         self._sites = tuple(zip(sites, model.site_bodyid[sites].tolist(), strict=True))
         self._masses = jnp.asarray(model.body_mass / model.body_mass.sum())
 
@@ -241,13 +248,15 @@ class Simulator:
         return features.reshape(*shape, -1), com.reshape(*shape, -1)
 
     def step(
-        self, state: simulation.State, command: Float[Array, "*parts commands"], wrench: Float[Array, " 6"]
+        self, state: simulation.State, command: Float[Array, "*parts commands"], wrench: Float[Array, "loaded 6"]
     ) -> simulation.State:
-        """One control step under a command, or one for each of equal parts of it; see `simulation.control_step`."""
+        """One control step under a command, or one for each of equal parts of it; wrenches are on the tracked body
+        and, if more, at the robot's points. See `simulation.control_step`."""
         parts = command.reshape(-1, command.shape[-1])
         commands = jnp.repeat(parts, self._count // len(parts), axis=0)
+        sites, bodies = zip(*self._sites[: len(wrench)], strict=True)
         return simulation.control_step(
-            self.model, self._template, state, commands, wrench, balloon=self._tracked, count=self._count
+            self.model, self._template, state, commands, wrench, bodies=bodies, points=sites[1:], count=self._count
         )
 
 
@@ -321,21 +330,35 @@ def input_size(config: EnvMimicConfig, robot: RobotDescription) -> int:
     return HISTORY * (robot.features + len(robot.commands) * config.observe_command)
 
 
-def world_force(
-    action: Float[Array, " 3"], yaw: Float[Array, ""], config: EnvMimicConfig, anchored: bool = False
-) -> Float[Array, " 3"]:
-    """The force (N, world) that an action stands for, within the limit along each axis.
+def action_size(config: EnvMimicConfig, robot: RobotDescription) -> int:
+    """Numbers in an action."""
+    return 3 * vectors(config.forces, len(robot.points))
+
+
+def units(config: EnvMimicConfig, size: int) -> Float[np.ndarray, " loads"]:
+    """What one unit of each number of an action stands for, N or N m."""
+    scale = np.full(size, config.force_scale)
+    if config.forces == "wrench":
+        scale[3:] = config.torque_scale
+    return scale
+
+
+def world_loads(
+    action: Float[Array, " loads"], yaw: Float[Array, ""], config: EnvMimicConfig, anchored: bool = False
+) -> Float[Array, " loads"]:
+    """The loads (N, N m; world; see `forces.placed`) that an action stands for, within the limit along each axis.
 
     Actions are in the balloon's heading frame, like the observation: the same situation met in another direction
     calls for the same force, turned. Those on an anchored robot are in the world's.
     """
-    force = jnp.clip(config.force_scale * action, -config.force_limit, config.force_limit)
-    return world_rotation(yaw, anchored) @ force
+    most = config.force_limit / config.force_scale
+    loads = jnp.asarray(units(config, len(action))) * jnp.clip(action, -most, most)
+    return (loads.reshape(-1, 3) @ world_rotation(yaw, anchored).T).ravel()
 
 
 @dataclasses.dataclass(frozen=True)
 class ForcePolicy:
-    """EnvMimic's kind of residual (see `forces.ForceModel`): a policy's action is the force on the balloon.
+    """EnvMimic's kind of residual (see `forces.ForceModel`): a policy's action is what pushes the robot.
 
     **Fields**
 
@@ -346,8 +369,8 @@ class ForcePolicy:
     """
 
     config: EnvMimicConfig
-    infer: Callable[[Any, Float[Array, " inputs"]], Float[Array, " 3"]]
-    sample: Callable[[Any, Float[Array, " inputs"], Array], Float[Array, " 3"]] | None = None
+    infer: Callable[[Any, Float[Array, " inputs"]], Float[Array, " loads"]]
+    sample: Callable[[Any, Float[Array, " inputs"], Array], Float[Array, " loads"]] | None = None
     name: str = "envmimic"
     anchored: bool = False
 
@@ -371,22 +394,22 @@ class ForcePolicy:
         history: Float[Array, "steps features"],
         commands: Float[Array, "steps commands"],
         key: Array | None = None,
-    ) -> Float[Array, " 6"]:
-        """The policy's force, without a torque."""
+    ) -> Float[Array, "loaded 6"]:
+        """The policy's loads, where they act."""
         seen, yaw = self.inputs(history, commands), history[-1, 8]
         if key is None or self.sample is None:
-            force = self.force(params, seen, yaw)
+            loads = self.loads(params, seen, yaw)
         else:
-            force = world_force(self.sample(params, seen, key), yaw, self.config, self.anchored)
-        return jnp.concatenate([force, jnp.zeros(3)])
+            loads = world_loads(self.sample(params, seen, key), yaw, self.config, self.anchored)
+        return placed(loads, self.config.forces)
 
-    def force(self, params: Any, seen: Float[Array, " inputs"], yaw: Float[Array, ""]) -> Float[Array, " 3"]:
-        """The most likely force (N, world) for what the policy sees, at a heading."""
-        return world_force(self.infer(params, seen), yaw, self.config, self.anchored)
+    def loads(self, params: Any, seen: Float[Array, " inputs"], yaw: Float[Array, ""]) -> Float[Array, " loads"]:
+        """The most likely loads (N, N m; world) for what the policy sees, at a heading."""
+        return world_loads(self.infer(params, seen), yaw, self.config, self.anchored)
 
 
 class EnvMimicEnv(Env):
-    """Tracking of recorded motions by a force on the balloon; Brax's environment interface, one robot, unbatched."""
+    """Tracking of recorded motions by forces on the robot; Brax's environment interface, one robot, unbatched."""
 
     def __init__(
         self,
@@ -446,13 +469,13 @@ class EnvMimicEnv(Env):
         """Advance one control step under the recording's command and the policy's force."""
         s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
         recording, time = s["recording"], s["time"]
-        force = world_force(action, s["history"][-1, 8], self.config, self.robot.anchored)
-        command, wrench = self.reference.command[recording, time], jnp.concatenate([force, jnp.zeros(3)])
+        loads = world_loads(action, s["history"][-1, 8], self.config, self.robot.anchored)
+        command, wrench = self.reference.command[recording, time], placed(loads, self.config.forces)
         if self.beside is not None:
             model, params = self.beside
             commands = commands_seen(self.reference.command[recording], time)
             command = model.command(params, commands)
-            wrench += model.wrench(params, s["history"], commands)
+            wrench = together(wrench, model.wrench(params, s["history"], commands))
         before: simulation.State = s["physics"]
         after = self.simulator.step(before, command, wrench)
         seen, _ = self.simulator.observe(after)
@@ -461,7 +484,8 @@ class EnvMimicEnv(Env):
         finite = jnp.all(jnp.isfinite(seen)) & jnp.all(jnp.isfinite(after.qvel))
         seen = jnp.where(finite, seen, target)
         terms = reward_terms(seen, target, self.config)
-        reward = jnp.where(finite, terms["tracking"] - self.config.force_cost * jnp.sum(force**2), 0.0)
+        in_newtons = loads / units(self.config, len(loads)) * self.config.force_scale
+        reward = jnp.where(finite, terms["tracking"] - self.config.force_cost * jnp.sum(in_newtons**2), 0.0)
 
         remaining = s["remaining"] - 1
         timed_out = (remaining <= 0) | (time + 1 >= self.reference.steps[recording])
@@ -475,7 +499,7 @@ class EnvMimicEnv(Env):
         metrics = {
             "reward_position": terms["position"],
             "reward_orientation": terms["orientation"],
-            "force": jnp.linalg.norm(force),
+            "force": jnp.linalg.norm(loads[:3]),
             "diverged": jnp.asarray(~finite, jnp.float32),
         }
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
@@ -515,7 +539,7 @@ class EnvMimicEnv(Env):
 
     @property
     def action_size(self) -> int:
-        return 3
+        return action_size(self.config, self.robot)
 
     @property
     def backend(self) -> str:

@@ -347,7 +347,7 @@ class OpenLoopEvaluator:
             state = simulator.step(state, command, wrench)
             seen, com = simulator.observe(state)
             history = jnp.concatenate([history[1:], seen[None]])
-            return (state, history), (seen, com, wrench[:3], state.qpos)
+            return (state, history), (seen, com, wrench[0, :3], state.qpos)
 
         first_state = simulation.at(reference.qpos[recording, start], reference.qvel[recording, start])
         first, first_com = simulator.observe(first_state)

@@ -17,11 +17,11 @@ from jaxtyping import Float
 from ballu_mjx import analytic, envmimic, evaluate, evaluation, loggers, plots, ppo, runs, supervised, windows
 from ballu_mjx.analytic import AnalyticConfig
 from ballu_mjx.envmimic import EnvMimicConfig, ForcePolicy
-from ballu_mjx.forces import Applied, Sum
+from ballu_mjx.forces import Applied, ForceSet, Sum
 from ballu_mjx.linearization import Linearizer
 from ballu_mjx.ppo import Params, PPOConfig
 from ballu_mjx.reconstruction import Motion
-from ballu_mjx.residual import ACTIONS, Residual, write_observed
+from ballu_mjx.residual import Residual, write_observed
 from ballu_mjx.residual_data import Prepared, RecordingsData
 from ballu_mjx.runs import Run
 from ballu_mjx.supervised import SupervisedConfig
@@ -37,6 +37,9 @@ QUICK: Mapping[str, Mapping[str, Any]] = {
 class ForcesData(RecordingsData):
     """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
+    forces: ForceSet = "force"
+    """What the network pushes with: a force on the balloon (the paper's), a force and a torque there (wrench), or
+    forces at balloon, base and feet (multi)."""
     residual: Path | None = None
     """Folder of another residual's run, which acts beside the forces: these learn what it leaves. It must have been
     learned beside the same actuators. Without this option: none."""
@@ -103,17 +106,19 @@ class _Supervised(_Fit):
         """Labels for training and validation, and the regression."""
         setup, config = self.setup, self.config
         simulator = envmimic.Simulator(setup.model)
-        linearize = Linearizer(setup.model, setup.beside, simulator.robot.joints)
-        label = supervised.Labeller(setup.model, simulator.robot, linearize, config)
+        env = setup.forces.config
+        linearize = Linearizer(setup.model, setup.beside, simulator.robot.joints, env.forces)
+        label = supervised.Labeller(setup.model, simulator.robot, linearize, config, env)
         found = {}
         for use in ("training", "validation"):
-            motions, force = setup.motions[use], []
+            motions, loads = setup.motions[use], []
             for motion in motions:
-                force.append(label(motion))
-                self.stages.update(f"labels, {use}", len(force), len(motions), math.nan)
-            found[use] = supervised.examples(simulator, motions, force, setup.forces.config)
+                loads.append(label(motion))
+                self.stages.update(f"labels, {use}", len(loads), len(motions), math.nan)
+            found[use] = supervised.examples(simulator, motions, loads, env)
             self.stages.close()
-            print(f"Labels, {use}: {_rms(np.concatenate(force)) * 1e3:.1f} mN (RMS along an axis).", flush=True)
+            force = _rms(np.concatenate(loads)[:, :3])
+            print(f"Labels, {use}: {force * 1e3:.1f} mN on the balloon (RMS along an axis).", flush=True)
         infer = jax.jit(lambda policy, seen: setup.forces.infer(setup.with_policy(policy), seen))
         seen, actions = found["validation"]
 
@@ -165,14 +170,13 @@ def _fit(task: str, data: ForcesData, config: Any, method: type[_Fit]) -> int:
     prepared.announce(folder, data.quick)
     model = prepared.load_model()
     motions = prepared.reconstruct(model)
-    env, network = EnvMimicConfig(), dataclasses.replace(PPOConfig(), seed=config.seed)
+    env, network = EnvMimicConfig(forces=data.forces), dataclasses.replace(PPOConfig(), seed=config.seed)
     reference, _ = envmimic.stack(envmimic.Simulator(model), motions["training"])
-    inputs = np.asarray(envmimic.recorded_inputs(reference, env))
-    infer = ppo.make_inference({ppo.STATE: (inputs.shape[1],)}, ACTIONS, network)
+    inputs, actions = np.asarray(envmimic.recorded_inputs(reference, env)), envmimic.action_size(env, prepared.robot)
+    infer = ppo.make_inference({ppo.STATE: (inputs.shape[1],)}, actions, network)
     forces = ForcePolicy(env, infer, name=task)
-    setup = _Setup(
-        model, motions, forces, ppo.initial_policy(inputs, ACTIONS, network), inputs, beside and beside.applied
-    )
+    start = ppo.initial_policy(inputs, actions, network)
+    setup = _Setup(model, motions, forces, start, inputs, None if beside is None else beside.applied)
     whole = forces if beside is None else Sum(beside.model, forces)
 
     def all_params(params: Params) -> Any:

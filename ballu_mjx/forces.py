@@ -1,18 +1,41 @@
-"""What a residual is: model fields and commands that it changes, and a wrench on the tracked body (the balloon), held
-over a control step.
+"""What a residual is: model fields and commands that it changes, and wrenches on the robot's bodies, held over a
+control step.
 
 Everything that simulates takes residuals by this one interface, whatever they were learned by.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 Fields = dict[str, Array]
 """Fields of `mjx.Model` by name."""
+ForceSet = Literal["force", "wrench", "multi"]
+"""What a network pushes with: a force on the tracked body, the balloon (the paper's); a force and a torque on it; or
+forces on it and at every measured point (BALLU's base and feet)."""
+
+
+def vectors(forces: ForceSet, points: int) -> int:
+    """Vectors in the loads of a robot with so many points."""
+    return {"force": 1, "wrench": 2, "multi": 1 + points}[forces]
+
+
+def placed(loads: Float[Array, " loads"], forces: ForceSet) -> Float[Array, "loaded 6"]:
+    """Loads, vector after vector (N, N m; world), as wrenches on the bodies that they act on; the tracked one first,
+    then those of the points."""
+    if forces == "wrench":
+        return loads[None]
+    return jnp.pad(loads.reshape(-1, 3), [(0, 0), (0, 3)])
+
+
+def together(one: Float[Array, "loaded 6"], other: Float[Array, "others 6"]) -> Float[Array, "bodies 6"]:
+    """Wrenches of two residuals, on as many bodies as the one that acts on more."""
+    most = max(len(one), len(other))
+    one, other = (jnp.pad(wrench, [(0, most - len(wrench)), (0, 0)]) for wrench in (one, other))
+    return one + other
 
 
 @runtime_checkable
@@ -49,8 +72,9 @@ class ForceModel(Protocol):
         history: Float[Array, "steps features"],
         commands: Float[Array, "steps commands"],
         key: Array | None = None,
-    ) -> Float[Array, " 6"]:
-        """Force (N) and torque (N m), world frame, at the tracked body's centre of mass over the coming control step.
+    ) -> Float[Array, "loaded 6"]:
+        """Force (N) and torque (N m), world frame, over the coming control step: at the tracked body's centre of mass,
+        and, if on more bodies than that, at the robot's points, in order.
 
         With `key`, drawn from the model's distribution, where it has one; without, the most likely.
         """
@@ -96,6 +120,7 @@ class Sum:
         history: Float[Array, "steps features"],
         commands: Float[Array, "steps commands"],
         key: Array | None = None,
-    ) -> Float[Array, " 6"]:
-        both = [part.wrench(own, history, commands, key) for part, own in zip(self.parts, params, strict=True)]
-        return jnp.sum(jnp.stack(both), axis=0)
+    ) -> Float[Array, "loaded 6"]:
+        return together(
+            *(part.wrench(own, history, commands, key) for part, own in zip(self.parts, params, strict=True))
+        )

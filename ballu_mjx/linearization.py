@@ -1,4 +1,4 @@
-"""Control steps to first order: what a small change of the state before, of the force on the balloon, or of joints'
+"""Control steps to first order: what a small change of the state before, of the forces on the robot, or of joints'
 torques changes after.
 
 Derivatives are taken forward, direction by direction, through the same accurate physics that everything else is
@@ -18,10 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ballu_mjx import envmimic, simulation, windows
-from ballu_mjx.forces import Applied
+from ballu_mjx.forces import Applied, ForceSet, placed, together, vectors
 
-FORCE = 3
-"""Directions of the force on the balloon."""
 _CHUNK = 64
 """Control steps that are linearized in one go."""
 
@@ -34,13 +32,13 @@ class ControlSteps(NamedTuple):
     """`envmimic.features` of the last three control steps, the state's own last: what a residual beside sees."""
     commands: Float[Array | np.ndarray, "steps 3 2"]
     """Commands of the last two control steps and the coming one."""
-    force: Float[Array | np.ndarray, "steps 3"]
-    """On the balloon (N, world)."""
+    loads: Float[Array | np.ndarray, "steps loads"]
+    """What pushes the robot (N, N m; world), of the linearizer's force set."""
 
 
 class Linearized(NamedTuple):
     """Control steps to first order. The state's directions are those of `mjx.Data.qvel` for positions (the base turns
-    about its own axes), then the velocities'; the inputs are the force (N) and then the joints' torques (N m)."""
+    about its own axes), then the velocities'; the inputs are the loads (N, N m) and then the joints' torques (N m)."""
 
     qpos: Float[Array | np.ndarray, "steps nq"]
     """After the step."""
@@ -57,11 +55,19 @@ class Linearized(NamedTuple):
 class Linearizer:
     """The robot's control steps, to first order; compiles once."""
 
-    def __init__(self, model: mujoco.MjModel, beside: Applied | None = None, joints: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        beside: Applied | None = None,
+        joints: Sequence[str] = (),
+        forces: ForceSet = "force",
+    ) -> None:
         """`beside` is a residual that the simulator has already; `joints` are those whose torques are inputs too."""
         self._nv, self._beside = model.nv, beside
+        self._forces: ForceSet = forces
         self._joints = np.array([model.joint(name).dofadr[0] for name in joints], int)
         self._simulator = envmimic.Simulator(model)
+        self.loads = 3 * vectors(forces, len(self._simulator.robot.points))
         if beside is not None:
             self._simulator = self._simulator.altered(beside.model.fields(beside.params))
         self._along = windows.spread(self._one, shared=0)
@@ -69,11 +75,11 @@ class Linearizer:
     @property
     def directions(self) -> int:
         """Of the state before and the inputs."""
-        return 2 * self._nv + FORCE + len(self._joints)
+        return 2 * self._nv + self.loads + len(self._joints)
 
     def __call__(self, steps: ControlSteps) -> Linearized:
         """Linearize; a step whose derivatives are no numbers comes back with zeros."""
-        count, every = len(steps.force), self.directions
+        count, every = len(steps.loads), self.directions
         units = np.tile(np.eye(every, dtype=np.float32), (_CHUNK, 1))
         found = []
         for first in range(0, count, _CHUNK):
@@ -96,14 +102,14 @@ class Linearizer:
                 physics.warmstart + 0.0 * amount,
             )
             commands, inputs = jnp.asarray(step.commands), amount * direction[2 * nv :]
-            command, wrench = commands[-1], jnp.concatenate([step.force + inputs[:FORCE], jnp.zeros(3)])
-            simulator = self._simulator.strained(jnp.zeros(nv).at[self._joints].set(inputs[FORCE:]))
+            command, wrench = commands[-1], placed(jnp.asarray(step.loads) + inputs[: self.loads], self._forces)
+            simulator = self._simulator.strained(jnp.zeros(nv).at[self._joints].set(inputs[self.loads :]))
             if self._beside is not None:
                 model, params = self._beside
                 seen, _ = simulator.observe(moved)
                 history = jnp.concatenate([step.history[:-1], seen[None]])
                 command = model.command(params, commands)
-                wrench += model.wrench(params, history, commands)
+                wrench = together(wrench, model.wrench(params, history, commands))
             state = simulator.step(moved, command, wrench)
             return state, simulator.observe(state)[0]
 

@@ -174,7 +174,7 @@ class LocomotionEnv(Env):
         metrics = {
             "velocity_x": velocity[0],
             "velocity_y": velocity[1],
-            "force": jnp.linalg.norm(wrench[:3]),
+            "force": jnp.linalg.norm(wrench[0, :3]),
             "outside": jnp.asarray(excess > 0.0, jnp.float32),
             "excess": excess,
             "diverged": jnp.asarray(~finite, jnp.float32),
@@ -244,10 +244,10 @@ class LocomotionEnv(Env):
 
     def _wrench(
         self, history: Float[Array, "3 27"], commands: Float[Array, "3 2"], key: Array
-    ) -> tuple[Float[Array, " 6"], Float[Array, ""]]:
-        """The residual's wrench (N, N m; world), and how far its observation lies outside of its data."""
+    ) -> tuple[Float[Array, "loaded 6"], Float[Array, ""]]:
+        """The residual's wrenches (N, N m; world), and how far its observation lies outside of its data."""
         if self.residual is None:
-            return jnp.zeros(6), jnp.zeros(())
+            return jnp.zeros((1, 6)), jnp.zeros(())
         excess = self.residual.excess(history, commands)
         wrench = self.residual.wrench(history, commands, key if self.config.sampled_residual else None)
         return wrench * jnp.exp(-self.config.residual_decay * excess), excess

@@ -20,8 +20,6 @@ from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.robot import ActuatorParameters
 from ballu_mjx.robot_description import RobotDescription
 
-ACTIONS = 3
-"""Force along three axes."""
 NETWORKS = ("envmimic", "supervised", "analytic")
 """Runs that leave a network of forces."""
 TASKS = (*NETWORKS, "aerodynamic")
@@ -83,8 +81,9 @@ class Residual:
             step, tree = runs.restore(folder, which)
             params = ppo.from_tree(tree)
             inputs = params.normalizer.mean["state"].shape[0]
-            sizes = inputs, ACTIONS, runs.typed(PPOConfig, stored, "ppo", folder, ppo.check_values)
             config = runs.typed(EnvMimicConfig, stored, "env", folder, envmimic.check)
+            network = runs.typed(PPOConfig, stored, "ppo", folder, ppo.check_values)
+            sizes = inputs, envmimic.action_size(config, description), network
             infer = ppo.make_inference(*sizes)
             if not (inputs == envmimic.input_size(config, description) and ppo.fits(infer, params, inputs)):
                 raise InputError(
@@ -118,8 +117,8 @@ class Residual:
         history: Float[Array, "steps features"],
         commands: Float[Array, "steps commands"],
         key: Array | None = None,
-    ) -> Float[Array, " 6"]:
-        """Force and torque on the tracked body over the coming control step; see `forces.ForceModel.wrench`."""
+    ) -> Float[Array, "loaded 6"]:
+        """Forces and torques over the coming control step; see `forces.ForceModel.wrench`."""
         return self.model.wrench(self.params, history, commands, key)
 
     def excess(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -53,10 +54,15 @@ def load(template: mjx.Data, state: State) -> mjx.Data:
     return template.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart)  # pyright: ignore
 
 
-def physics_step(model: mjx.Model, held: mjx.Data, state: State) -> State:
-    """One physics step under the commands and forces of `held`, data of the model: `mjx.step`."""
-    data = load(held, state)
-    for stage in (mjx.fwd_position, mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
+def physics_step(
+    model: mjx.Model, held: mjx.Data, state: State, load_by_place: Callable[[mjx.Data], mjx.Data] | None = None
+) -> State:
+    """One physics step under the commands and forces of `held`, data of the model: `mjx.step`. `load_by_place` adds
+    external forces that depend on where bodies are."""
+    data = mjx.fwd_position(model, load(held, state))
+    if load_by_place is not None:
+        data = load_by_place(data)
+    for stage in (mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
         data = stage(model, data)
     qacc, force = _solved(model, data)
     data = data.replace(qacc=qacc, qfrc_constraint=force)  # pyright: ignore
@@ -118,25 +124,29 @@ _solved = derivatives.by_rule(_solve, _derivative)
 
 
 # Compiled as part of whatever calls it; jitted to be traced once, not once a program.
-@functools.partial(jax.jit, static_argnames=("balloon", "count"))
+@functools.partial(jax.jit, static_argnames=("bodies", "points", "count"))
 def control_step(
     model: mjx.Model,
     template: mjx.Data,
     state: State,
     command: Float[Array, " commands"] | Float[Array, "count commands"],
-    wrench: Float[Array, " 6"],
+    wrench: Float[Array, "loaded 6"],
     *,
-    balloon: int,
+    bodies: tuple[int, ...],
+    points: tuple[int, ...] = (),
     count: int,
 ) -> State:
-    """Advance by `count` physics steps, the external wrench held.
+    """Advance by `count` physics steps, the external wrenches held.
 
     **Arguments**
 
     - `template`: data of the model, from `make_data`; of no influence but for what no step changes.
     - `command`: actuators' commands in [0, 1], held, or a row for each physics step.
-    - `wrench`: force (N) and torque (N m), world frame, at the centre of mass of the body with the id `balloon`.
+    - `wrench`: force (N) and torque (N m), world frame, on the bodies of the ids `bodies`: at the first one's centre of
+      mass, and on each of the others at the site of its id in `points`, wherever that moves.
     """
+    if not len(bodies) == len(points) + 1 == wrench.shape[0]:
+        raise ValueError(f"{wrench.shape[0]} wrenches for {len(bodies)} bodies with {len(points)} points.")
     commands = jnp.broadcast_to(command, (count, command.shape[-1]))
 
     def steps(
@@ -144,12 +154,23 @@ def control_step(
         template: mjx.Data,
         state: State,
         commands: Float[Array, "count commands"],
-        wrench: Float[Array, " 6"],
+        wrench: Float[Array, "loaded 6"],
     ) -> State:
-        held = template.replace(xfrc_applied=template.xfrc_applied.at[balloon].set(wrench))  # pyright: ignore
+        # Added one by one: two points may be of the same body.
+        pushed = template.xfrc_applied
+        for number, body in enumerate(bodies):
+            pushed = pushed.at[body].add(wrench[number])
+        held = template.replace(xfrc_applied=pushed)  # pyright: ignore
+
+        def at_points(data: mjx.Data) -> mjx.Data:
+            pushed = data.xfrc_applied
+            for force, body, site in zip(wrench[1:, :3], bodies[1:], points, strict=True):
+                pushed = pushed.at[body, 3:].add(jnp.cross(data.site_xpos[site] - data.xipos[body], force))
+            return data.replace(xfrc_applied=pushed)  # pyright: ignore
 
         def step(number: Array, state: State) -> State:
-            return physics_step(model, held.replace(ctrl=commands[number]), state)  # pyright: ignore
+            now = held.replace(ctrl=commands[number])  # pyright: ignore
+            return physics_step(model, now, state, at_points if points else None)
 
         return jax.lax.fori_loop(0, count, step, state)
 

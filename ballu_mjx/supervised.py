@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from ballu_mjx import envmimic, simulation
 from ballu_mjx.errors import InputError
-from ballu_mjx.linearization import FORCE, ControlSteps, Linearizer
+from ballu_mjx.linearization import ControlSteps, Linearizer
 from ballu_mjx.reconstruction import Motion
 from ballu_mjx.robot_description import RobotDescription
 
@@ -33,7 +33,8 @@ class SupervisedConfig:
     """Labels and regression."""
 
     force_spread: float = 0.3
-    """Standard deviation of the prior on the force along each axis, N."""
+    """Standard deviation of the prior on the force along each axis, N. That on a torque is, in units of the network's
+    output, as wide."""
     force_change: float = 0.1
     """Standard deviation of the prior on how it changes from one control step to the next, N. Air that the balloon
     drags along pushes back at every footfall: a prior that smooths more takes most of that away."""
@@ -77,16 +78,23 @@ class Labeller:
     """Labels recorded motions."""
 
     def __init__(
-        self, model: mujoco.MjModel, robot: RobotDescription, linearize: Linearizer, config: SupervisedConfig
+        self,
+        model: mujoco.MjModel,
+        robot: RobotDescription,
+        linearize: Linearizer,
+        config: SupervisedConfig,
+        env: envmimic.EnvMimicConfig | None = None,
     ) -> None:
-        """`linearize` is that of the same model, with the torques of the robot's joints; where it has a residual
-        beside, labels are what that leaves."""
+        """`linearize` is that of the same model and force set, with the torques of the robot's joints; where it has a
+        residual beside, labels are what that leaves. `env`: of the network to be (None: its defaults)."""
+        env = env or envmimic.EnvMimicConfig()
         self._model, self._config, self._linearize = model, config, linearize
+        self._in_newtons = envmimic.units(env, linearize.loads) / env.force_scale
         self._simulator = envmimic.Simulator(model, robot)
         self._measured, self._process = _noise(model, robot, config)
 
-    def __call__(self, motion: Motion) -> Float[np.ndarray, "steps 3"]:
-        """The force (N, world) over each control step that explains the recorded motion."""
+    def __call__(self, motion: Motion) -> Float[np.ndarray, "steps loads"]:
+        """The loads (N, N m; world) over each control step that explain the recorded motion."""
         count, past = len(motion.command), envmimic.HISTORY - 1
         reference, _ = envmimic.stack(self._simulator, [motion])
         states = simulation.at(reference.qpos[0, :-1], reference.qvel[0, :-1])
@@ -96,7 +104,7 @@ class Labeller:
             ).swapaxes(1, 2)
             for x in (np.asarray(reference.features[0, :-1]), motion.command)
         )
-        linear = self._linearize(ControlSteps(states, history, commands, np.zeros((count, FORCE))))
+        linear = self._linearize(ControlSteps(states, history, commands, np.zeros((count, self._linearize.loads))))
         defect = np.zeros((count, 2 * self._model.nv))
         for step in range(count):
             recorded, after = motion.qpos[step + 1], np.asarray(linear.qpos[step], np.float64)
@@ -106,28 +114,28 @@ class Labeller:
 
     def _explain(
         self, state: Float[np.ndarray, "steps states directions"], defect: Float[np.ndarray, "steps states"]
-    ) -> Float[np.ndarray, "steps 3"]:
-        """The most likely inputs of control steps that end `defect` off the recorded state after, to first order.
+    ) -> Float[np.ndarray, "steps loads"]:
+        """The most likely loads of control steps that end `defect` off the recorded state after, to first order.
 
         Unknown at each time are the state's deviation from the recorded one and the step's inputs; each time is tied to
         the next alone, so that one banded factorization solves for a whole recording.
         """
-        config, (count, after, every) = self._config, state.shape
-        force = np.arange(after, after + FORCE)
+        config, (count, after, every), loads = self._config, state.shape, self._linearize.loads
+        force = np.arange(after, after + loads)
         known = np.any(state, axis=(1, 2), keepdims=True)[:, 0]  # zeros where there are no derivatives
         weight = known / self._process**2
         spread = np.r_[
             self._measured,
             np.full(self._model.nv, _ANY_VELOCITY),
-            np.full(FORCE, config.force_spread),
-            np.full(every - after - FORCE, config.torque_spread),
+            config.force_spread * self._in_newtons,
+            np.full(every - after - loads, config.torque_spread),
         ]
         here = np.tile(np.diag(spread**-2.0), (count + 1, 1, 1))
         here[:-1] += state.transpose(0, 2, 1) @ (weight[:, :, None] * state)
         here[1:, range(after), range(after)] += weight
         towards = np.zeros_like(here)  # rows of the time after, columns of this one
         towards[:-1, :after] -= weight[:, :, None] * state
-        change = config.force_change**-2.0
+        change = (config.force_change * self._in_newtons) ** -2.0
         here[:-1, force, force] += change
         here[1:, force, force] += change
         towards[:-1, force, force] -= change
@@ -167,18 +175,19 @@ def _noise(
 def examples(
     simulator: envmimic.Simulator,
     motions: Sequence[Motion],
-    force: Sequence[Float[np.ndarray, "steps 3"]],
+    loads: Sequence[Float[np.ndarray, "steps loads"]],
     config: envmimic.EnvMimicConfig,
-) -> tuple[Float[np.ndarray, "examples inputs"], Float[np.ndarray, "examples 3"]]:
-    """What the network sees of each recorded state that has a history, and the action (see `envmimic.world_force`) that
+) -> tuple[Float[np.ndarray, "examples inputs"], Float[np.ndarray, "examples loads"]]:
+    """What the network sees of each recorded state that has a history, and the action (see `envmimic.world_loads`) that
     is its label."""
     reference, _ = envmimic.stack(simulator, motions)
     first = envmimic.HISTORY - 1
     yaw = [np.asarray(seen[first:count, 8]) for seen, count in zip(reference.features, reference.steps, strict=True)]
-    labels = np.concatenate([each[first:] for each in force])
+    labels = np.concatenate([each[first:] for each in loads])
     to_world = np.asarray(jax.vmap(envmimic.heading_rotation)(jnp.asarray(np.concatenate(yaw))))
-    turned = np.einsum("nji,nj->ni", to_world, labels)
-    return np.asarray(envmimic.recorded_inputs(reference, config)), np.asarray(turned / config.force_scale, np.float32)
+    turned = np.einsum("nji,nvj->nvi", to_world, labels.reshape(len(labels), -1, 3)).reshape(labels.shape)
+    actions = turned / envmimic.units(config, labels.shape[1])
+    return np.asarray(envmimic.recorded_inputs(reference, config)), np.asarray(actions, np.float32)
 
 
 Validate = Callable[[int, Any, float], None]
@@ -186,9 +195,9 @@ Validate = Callable[[int, Any, float], None]
 
 
 def regress(
-    infer: Callable[[Any, Float[Array, "batch inputs"]], Float[Array, "batch 3"]],
+    infer: Callable[[Any, Float[Array, "batch inputs"]], Float[Array, "batch loads"]],
     start: Any,
-    learned: tuple[Float[np.ndarray, "examples inputs"], Float[np.ndarray, "examples 3"]],
+    learned: tuple[Float[np.ndarray, "examples inputs"], Float[np.ndarray, "examples loads"]],
     config: SupervisedConfig,
     validate: Validate,
 ) -> None:

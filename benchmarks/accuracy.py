@@ -195,9 +195,9 @@ def mjx_program(
 
     def one(command: Float[Array, "steps 2"]) -> Float[Array, " nq"]:
         def step(state: State, command: Float[Array, " 2"]) -> tuple[State, None]:
-            no_force = jnp.zeros(6)
+            no_force = jnp.zeros((1, 6))
             state = simulation.control_step(
-                mjx_model, template, state, command, no_force, balloon=balloon, count=step_count
+                mjx_model, template, state, command, no_force, bodies=(balloon,), count=step_count
             )
             return state, None
 

@@ -48,7 +48,7 @@ def main(
         environments, duration = 100, 5.0
         print("--quick: these numbers mean little")
     model = robot.load_model()
-    substeps, balloon, devices = simulation.substeps(model), simulation.balloon_id(model), jax.device_count()
+    substeps, bodies, devices = simulation.substeps(model), (simulation.balloon_id(model),), jax.device_count()
     steps = round(duration / robot.CONTROL_TIMESTEP)
     mjx_model = mjx.put_model(model)
     template = simulation.make_data(model)
@@ -61,10 +61,10 @@ def main(
             command_key, force_key = jax.random.split(key)
             command = jax.random.uniform(command_key, (2,))
             push = jax.random.uniform(force_key, (3,), minval=-force, maxval=force)
-            push = jnp.concatenate([push, jnp.zeros(3)])
+            push = jnp.concatenate([push, jnp.zeros(3)])[None]
 
             def physics(state: State, _: None) -> tuple[State, tuple[Array, Array]]:
-                state = simulation.control_step(mjx_model, template, state, command, push, balloon=balloon, count=1)
+                state = simulation.control_step(mjx_model, template, state, command, push, bodies=bodies, count=1)
                 finite = jnp.isfinite(state.qpos).all() & jnp.isfinite(state.qvel).all()
                 return state, (finite, jnp.abs(state.qvel[6:]))
 

@@ -77,7 +77,7 @@ def forces(simulator: envmimic.Simulator, residual: Residual, motion: Motion) ->
 
     def at(time: jax.Array) -> jax.Array:
         history = jax.lax.dynamic_slice_in_dim(reference.features[0], time - envmimic.HISTORY + 1, envmimic.HISTORY)
-        return residual.wrench(history, envmimic.commands_seen(reference.command[0], time))[:3]
+        return residual.wrench(history, envmimic.commands_seen(reference.command[0], time))[0, :3]
 
     return np.asarray(jax.jit(jax.vmap(at))(np.arange(envmimic.HISTORY - 1, len(motion.command))))
 

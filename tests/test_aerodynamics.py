@@ -139,7 +139,7 @@ def test_rounding_a_delay_moves_what_passes_for_it():
 def test_drag_opposes_the_motion_whatever_the_heading():
     air = Aerodynamics(MODEL)
     velocity, turning = np.array([0.4, -0.3, 0.2]), np.array([0.3, -0.5, 0.7])
-    level = np.asarray(air.wrench(AIR, history(np.zeros(3), velocity, turning), COMMANDS))
+    level = np.asarray(air.wrench(AIR, history(np.zeros(3), velocity, turning), COMMANDS))[0]
     speed = np.linalg.norm(velocity)
     expected = -(np.array(AIR.linear_drag) + np.array(AIR.quadratic_drag) * speed) * velocity
     np.testing.assert_allclose(level[:3], expected, rtol=1e-4)
@@ -148,7 +148,7 @@ def test_drag_opposes_the_motion_whatever_the_heading():
     yaw = 2.0
     turned = np.asarray(envmimic.heading_rotation(jnp.array(yaw)))
     seen = history(np.array([0.0, 0.0, yaw]), turned @ velocity, turning)
-    wrench = np.asarray(air.wrench(AIR, seen, COMMANDS))
+    wrench = np.asarray(air.wrench(AIR, seen, COMMANDS))[0]
     np.testing.assert_allclose(wrench[:3], turned @ level[:3], rtol=1e-4)
     np.testing.assert_allclose(wrench[3:], turned @ level[3:], rtol=2e-2, atol=1e-6)
 

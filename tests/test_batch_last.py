@@ -155,8 +155,8 @@ def test_a_batch_of_robots_moves_as_each_alone(robots: tuple[mjx.Model, mjx.Data
     model, template, state, command, balloon = robots
 
     def step(model: mjx.Model, state: simulation.State, command: Any, lift: Any) -> simulation.State:
-        push = jnp.zeros(6).at[2].set(lift)
-        return simulation.control_step(model, template, state, command, push, balloon=balloon, count=1)
+        push = jnp.zeros((1, 6)).at[0, 2].set(lift)
+        return simulation.control_step(model, template, state, command, push, bodies=(balloon,), count=1)
 
     lift = jnp.linspace(-0.05, 0.05, 8)
     together = jax.jit(jax.vmap(step, in_axes=(None, 0, 0, 0)))(model, state, command, lift)

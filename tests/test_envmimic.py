@@ -114,15 +114,15 @@ def test_observation_and_force_turn_with_the_robot(still: Motion, seed: int):
     np.testing.assert_allclose(envmimic.observation(here), envmimic.observation(there), atol=2e-4)
     config, action = EnvMimicConfig(), jnp.array([1.0, -0.5, 0.3])
     np.testing.assert_allclose(
-        turn.apply(envmimic.world_force(action, here[-1, 8], config)),
-        envmimic.world_force(action, there[-1, 8], config),
+        turn.apply(envmimic.world_loads(action, here[-1, 8], config)),
+        envmimic.world_loads(action, there[-1, 8], config),
         atol=1e-5,
     )
 
 
 def test_force_stays_within_its_limit():
     config = EnvMimicConfig()
-    force = envmimic.world_force(jnp.array([1e6, -1e6, 0.0]), jnp.zeros(()), config)
+    force = envmimic.world_loads(jnp.array([1e6, -1e6, 0.0]), jnp.zeros(()), config)
     np.testing.assert_allclose(force, [1.0, -1.0, 0.0])
 
 
@@ -176,8 +176,9 @@ def test_time_limits_truncate_and_divergence_terminates(still: Motion):
 
 
 def test_the_missing_force_earns_more_than_none_and_its_opposite_less(pushed: Motion):
-    """A constant force on the reference robot: would catch a sign or frame error."""
-    env = EnvMimicEnv(robot.load_model(), [pushed], EnvMimicConfig(start_noise=0.0, force_cost=0.0))
+    """A constant force on the reference robot: would catch a sign or frame error. Of forces at balloon, base and feet,
+    only the first is not zero."""
+    env = EnvMimicEnv(robot.load_model(), [pushed], EnvMimicConfig(start_noise=0.0, force_cost=0.0, forces="multi"))
     state = jax.jit(env.reset)(jax.random.key(5))
     s = state.pipeline_state
     start = 2
@@ -195,7 +196,8 @@ def test_the_missing_force_earns_more_than_none_and_its_opposite_less(pushed: Mo
         run, reward = state, 0.0
         for _ in range(20):
             heading = np.asarray(envmimic.heading_rotation(run.pipeline_state["history"][-1, 8]))
-            run = step(run, jnp.asarray(heading.T @ force / env.config.force_scale, jnp.float32))
+            action = jnp.zeros(env.action_size).at[:3].set(heading.T @ force / env.config.force_scale)
+            run = step(run, action)
             reward += float(run.reward)
         return reward
 

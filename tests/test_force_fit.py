@@ -19,7 +19,7 @@ from ballu_mjx.errors import InputError
 from ballu_mjx.linearization import ControlSteps, Linearizer
 from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.reconstruction import Motion
-from ballu_mjx.residual import ACTIONS, Residual
+from ballu_mjx.residual import Residual
 from ballu_mjx.supervised import SupervisedConfig
 from ballu_mjx.windows import Windows
 
@@ -27,20 +27,26 @@ MODEL = robot.load_model()
 BALLU = robot_description.ballu()
 PUSH = np.array([0.02, -0.03, 0.015])
 """N, world."""
+TWIST = np.array([1e-3, -1.5e-3, 2e-3])
+"""N m, world."""
 CLOSE = 0.05 * float(np.linalg.norm(PUSH))
+CLOSE_TWIST = 0.05 * float(np.linalg.norm(TWIST))
 SECONDS = 0.5
 INPUTS = envmimic.input_size(EnvMimicConfig(), robot_description.ballu())
 NETWORK = PPOConfig(policy_layers=(16,), value_layers=(4,))
-FORCES = ForcePolicy(EnvMimicConfig(), ppo.make_inference({ppo.STATE: (INPUTS,)}, ACTIONS, NETWORK), name="analytic")
+ENV, WRENCH = EnvMimicConfig(), EnvMimicConfig(forces="wrench")
+ACTIONS = envmimic.action_size(ENV, BALLU)
+FORCES = ForcePolicy(ENV, ppo.make_inference({ppo.STATE: (INPUTS,)}, ACTIONS, NETWORK), name="analytic")
 
 
-def pushed(name: str, height: float, model: mujoco.MjModel = MODEL, steps: int = 60) -> Motion:
-    """The nominal robot in C MuJoCo, stepping or, above the floor, falling, with `PUSH` on the balloon."""
+def pushed(name: str, height: float, model: mujoco.MjModel = MODEL, twist: float = 0.0, steps: int = 60) -> Motion:
+    """The nominal robot in C MuJoCo, stepping or, above the floor, falling, with `PUSH` and `twist` times `TWIST` on
+    the balloon."""
     data = mujoco.MjData(model)
     data.qpos[:] = robot.standing_qpos(model)
     mujoco.mj_step(model, data, 100)
     data.qpos[2] += height
-    data.xfrc_applied[simulation.balloon_id(model), :3] = PUSH
+    data.xfrc_applied[simulation.balloon_id(model)] = np.r_[PUSH, twist * TWIST]
     time = np.arange(steps) * robot.CONTROL_TIMESTEP
     command = np.where((time[:, None] / 1.2 + np.array([0.0, 0.5])) % 1.0 < 0.4, 0.7, 0.0)
     states = [(data.qpos.copy(), data.qvel.copy())]
@@ -65,7 +71,7 @@ def recorded(motions: list[Motion]) -> Windows:
 
 @pytest.fixture(scope="module")
 def linearize() -> Linearizer:
-    return Linearizer(MODEL, joints=BALLU.joints)
+    return Linearizer(MODEL, joints=BALLU.joints, forces="wrench")
 
 
 @pytest.fixture(scope="module")
@@ -92,10 +98,10 @@ def test_derivatives_are_those_of_c_mujoco(unforced: ControlSteps, linearize: Li
     """Through contacts and taut cables; where a foot lands within the step, differences of any size are no derivative,
     so most steps must agree, not all."""
     few = jax.tree.map(lambda x: x[::4], unforced)
-    linear = linearize(few)
+    linear = linearize(few._replace(loads=np.zeros((len(few.loads), linearize.loads))))
     data, body, nv = mujoco.MjData(MODEL), simulation.balloon_id(MODEL), MODEL.nv
     joints = [MODEL.joint(name).dofadr[0] for name in BALLU.joints]
-    sizes = np.r_[np.full(nv, 1e-5), np.full(nv, 1e-4), np.full(3, 1e-3), np.full(len(joints), 1e-5)]
+    sizes = np.r_[np.full(nv, 1e-5), np.full(nv, 1e-4), np.full(3, 1e-3), np.full(3 + len(joints), 1e-5)]
     rng = np.random.default_rng(0)
 
     def after(place: int, change: np.ndarray) -> np.ndarray:
@@ -103,13 +109,13 @@ def test_derivatives_are_those_of_c_mujoco(unforced: ControlSteps, linearize: Li
         data.qpos[:], data.qvel[:] = few.physics.qpos[place], few.physics.qvel[place] + change[nv : 2 * nv]
         data.qacc_warmstart[:] = few.physics.warmstart[place]
         mujoco.mj_integratePos(MODEL, data.qpos, change[:nv], 1.0)
-        data.ctrl[:], data.xfrc_applied[body, :3] = few.commands[place, -1], change[2 * nv :][:3]
-        data.qfrc_applied[joints] = change[2 * nv + 3 :]
+        data.ctrl[:], data.xfrc_applied[body] = few.commands[place, -1], change[2 * nv :][:6]
+        data.qfrc_applied[joints] = change[2 * nv + 6 :]
         mujoco.mj_step(MODEL, data, simulation.substeps(MODEL))
         return np.concatenate([data.qpos, data.qvel])
 
     wrong = []
-    for place in range(len(few.force)):
+    for place in range(len(few.loads)):
         direction = rng.normal(size=linearize.directions) * sizes
         plus, minus = after(place, direction), after(place, -direction)
         difference = np.zeros(nv)
@@ -121,7 +127,7 @@ def test_derivatives_are_those_of_c_mujoco(unforced: ControlSteps, linearize: Li
     assert np.quantile(wrong, 0.75) < 0.1
 
 
-def test_labels_are_the_push(motions: list[Motion], linearize: Linearizer):
+def test_labels_are_the_push(linearize: Linearizer):
     """Of motions seen without noise, by a model that is right in all else. All of it in the air; on its legs the robot
     does not show what lifts it."""
     config = SupervisedConfig(
@@ -133,9 +139,11 @@ def test_labels_are_the_push(motions: list[Motion], linearize: Linearizer):
         joint_noise=1.0,
         torque_spread=1e-4,
     )
-    label = supervised.Labeller(MODEL, BALLU, linearize, config)
+    label = supervised.Labeller(MODEL, BALLU, linearize, config, WRENCH)
+    motions = [pushed("stepping", 0.0, twist=1.0), pushed("falling", 10.0, twist=1.0)]
     stepping, falling = (label(motion).mean(axis=0) for motion in motions)
-    np.testing.assert_allclose(falling, PUSH, atol=CLOSE)
+    np.testing.assert_allclose(falling[:3], PUSH, atol=CLOSE)
+    np.testing.assert_allclose(falling[3:], TWIST, atol=CLOSE_TWIST)
     np.testing.assert_allclose(stepping[:2], PUSH[:2], atol=CLOSE)
 
 
@@ -147,8 +155,8 @@ def test_legs_that_differ_are_not_taken_for_forces(linearize: Linearizer):
     motion = pushed("stiff knees", 0.0, robot.load_model(stiffer))
 
     def wrong(config: SupervisedConfig) -> float:
-        labels = supervised.Labeller(MODEL, BALLU, linearize, config)(motion)
-        return float(np.median(np.linalg.norm(labels - PUSH, axis=1)))
+        labels = supervised.Labeller(MODEL, BALLU, linearize, config, WRENCH)(motion)
+        return float(np.median(np.linalg.norm(labels[:, :3] - PUSH, axis=1)))
 
     assert wrong(SupervisedConfig()) < 0.5 * wrong(SupervisedConfig(torque_spread=1e-5))
 
@@ -156,14 +164,16 @@ def test_legs_that_differ_are_not_taken_for_forces(linearize: Linearizer):
 def test_examples_are_in_the_balloon_s_heading(motions: list[Motion]):
     """Seen by a robot that has turned, a force keeps its side."""
     simulator = envmimic.Simulator(MODEL)
-    force = [np.tile(PUSH, (len(motion.command), 1)) for motion in motions]
-    seen, actions = supervised.examples(simulator, motions, force, EnvMimicConfig())
+    loads = [np.tile(np.r_[PUSH, TWIST], (len(motion.command), 1)) for motion in motions]
+    seen, actions = supervised.examples(simulator, motions, loads, WRENCH)
     features, _ = simulator.observe_all(jnp.asarray(motions[0].qpos[40:41]), jnp.asarray(motions[0].qvel[40:41]))
     yaw = float(features[0, 8])
     assert abs(yaw) > 1e-3
     x = np.cos(yaw) * PUSH[0] + np.sin(yaw) * PUSH[1]
     y = np.cos(yaw) * PUSH[1] - np.sin(yaw) * PUSH[0]
-    np.testing.assert_allclose(0.05 * actions[40 - envmimic.HISTORY + 1], [x, y, PUSH[2]], rtol=1e-4)
+    action = actions[40 - envmimic.HISTORY + 1]
+    np.testing.assert_allclose(0.05 * action[:3], [x, y, PUSH[2]], rtol=1e-4)
+    np.testing.assert_allclose(0.005 * np.linalg.norm(action[3:]), np.linalg.norm(TWIST), rtol=1e-4)
     assert len(seen) == len(actions)
 
 
@@ -183,8 +193,8 @@ def test_gradients_find_the_push(recorded: Windows, inputs: np.ndarray, start: p
         lambda step, policy, metrics: found.append((policy, metrics)),
     )
     policy, metrics = found[-1]
-    force = 0.05 * np.asarray(FORCES.infer(start._replace(policy=policy), jnp.asarray(inputs)))
-    stepping, falling = force.reshape(2, -1, 3).mean(axis=1)
+    loads = envmimic.units(ENV, ACTIONS) * np.asarray(FORCES.infer(start._replace(policy=policy), jnp.asarray(inputs)))
+    stepping, falling = loads.reshape(2, -1, ACTIONS).mean(axis=1)
     np.testing.assert_allclose(falling, PUSH, atol=CLOSE)
     np.testing.assert_allclose(stepping[:2], PUSH[:2], atol=CLOSE)
     assert metrics["loss"] < 0.2 * found[0][1]["loss"]  # of the second simulation, beside the first
@@ -209,7 +219,7 @@ def test_a_run_is_read_as_its_kind(tmp_path: Path, start: ppo.Params):
     from ballu_mjx import runs
     from ballu_mjx.residual import write_observed
 
-    sections = {"env": EnvMimicConfig(), "ppo": NETWORK, "fit": SupervisedConfig()}
+    sections = {"env": ENV, "ppo": NETWORK, "fit": SupervisedConfig()}
     with runs.Run(tmp_path, runs.describe("supervised", sections, {}, []) | {"residual": None}) as run:
         write_observed(run, np.zeros((2, INPUTS)))
         run.save(5, ppo.as_tree(start), 0.5)

@@ -144,9 +144,9 @@ def test_residual_pushes_in_the_balloon_s_heading_and_only_so_hard():
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
     force = turn @ (EnvMimicConfig().force_scale * action)
     pushed = jax.jit(lambda wrench: simulator.step(simulation.at(qpos, zeros), jnp.zeros(2), wrench))
-    expected = pushed(jnp.asarray([*force, 0, 0, 0], jnp.float32))
+    expected = pushed(jnp.asarray([[*force, 0, 0, 0]], jnp.float32))
     np.testing.assert_allclose(inner(state)["physics"].qvel, expected.qvel, atol=1e-5)
-    assert np.abs(np.asarray(expected.qvel - pushed(jnp.zeros(6)).qvel)).max() > 1e-3
+    assert np.abs(np.asarray(expected.qvel - pushed(jnp.zeros((1, 6))).qvel)).max() > 1e-3
     assert float(state.metrics["force"]) == pytest.approx(np.linalg.norm(force), rel=1e-5)
 
 

@@ -13,7 +13,7 @@ import pytest
 from jaxtyping import Array, Float
 from mujoco import mjx
 
-from ballu_mjx import robot, simulation
+from ballu_mjx import robot, robot_description, simulation
 
 CABLES = [f"cable_{side}" for side in robot.SIDES]
 FIELDS = [field.name for field in dataclasses.fields(robot.ActuatorParameters)]
@@ -99,27 +99,38 @@ def test_samples_visit_every_regime() -> None:
 
 
 def test_mjx_follows_c_mujoco_over_a_control_step() -> None:
-    """The same step in float32 and in double precision."""
+    """The same step in float32 and in double precision, under a wrench on the balloon and forces at base and feet."""
     s, model = samples(), robot.load_model()
     count, balloon = simulation.substeps(model), simulation.balloon_id(model)
+    points = tuple(model.site(name).id for name in robot_description.ballu().points)
+    bodies = (balloon, *model.site_bodyid[list(points)].tolist())
     mjx_model, template = mjx.put_model(model), simulation.make_data(model)
 
     @jax.jit
     @jax.vmap
     def step(qpos: Array, qvel: Array, command: Array, wrench: Array) -> tuple[Array, Array]:
         state = simulation.at(qpos, qvel)
-        state = simulation.control_step(mjx_model, template, state, command, wrench, balloon=balloon, count=count)
+        state = simulation.control_step(
+            mjx_model, template, state, command, wrench, bodies=bodies, points=points, count=count
+        )
         return state.qpos, state.qvel
 
-    wrench = np.concatenate([s.force, 0.1 * s.force[:, ::-1]], axis=1)
+    wrench = np.zeros((len(s.force), len(bodies), 6))
+    wrench[:, 0] = np.concatenate([s.force, 0.1 * s.force[:, ::-1]], axis=1)
+    wrench[:, 1:, :3] = np.random.default_rng(1).uniform(-0.05, 0.05, (len(s.force), len(points), 3))
     inputs = [jnp.asarray(x, jnp.float32) for x in (s.qpos, s.qvel, s.command, wrench)]
     qpos, qvel = (np.asarray(x) for x in step(*inputs))
     expected_qpos, expected_qvel = [], []
     for i in range(len(s.qpos)):
         data = mujoco.MjData(model)
         data.qpos[:], data.qvel[:] = s.qpos[i], s.qvel[i]
-        data.xfrc_applied[balloon] = wrench[i]
-        advance(model, data, s.command[i], robot.CONTROL_TIMESTEP)
+        data.ctrl[:], data.xfrc_applied[balloon] = s.command[i], wrench[i, 0]
+        for _ in range(count):
+            mujoco.mj_step1(model, data)
+            data.qfrc_applied[:] = 0
+            for point, body, push in zip(points, bodies[1:], wrench[i, 1:, :3], strict=True):
+                mujoco.mj_applyFT(model, data, push, np.zeros(3), data.site_xpos[point], body, data.qfrc_applied)
+            mujoco.mj_step2(model, data)
         expected_qpos.append(data.qpos.copy())
         expected_qvel.append(data.qvel.copy())
     position = np.abs(qpos - expected_qpos).max(axis=1)
@@ -280,10 +291,8 @@ def settled_derivatives() -> tuple[np.ndarray, np.ndarray]:
 
     def knees(parameters: robot.ActuatorParameters, command: Float[Array, " 2"]) -> Array:
         moved = robot.with_fields(mjx_model, robot.actuator_fields(model, parameters))
-        balloon, no_force = simulation.balloon_id(model), jnp.zeros(6)
-        state = simulation.control_step(
-            moved, template, start, command, no_force, balloon=balloon, count=SETTLING_STEPS
-        )
+        bodies, no_force = (simulation.balloon_id(model),), jnp.zeros((1, 6))
+        state = simulation.control_step(moved, template, start, command, no_force, bodies=bodies, count=SETTLING_STEPS)
         return state.qpos[7:][robot.KNEES]
 
     def along(parameters: robot.ActuatorParameters, command: Array, change: robot.ActuatorParameters) -> Array:

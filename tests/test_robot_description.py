@@ -263,7 +263,7 @@ def test_an_anchored_robot_sees_the_world(motion: Motion, env: EnvMimicEnv):
     changed = np.flatnonzero(np.abs(seen - other) > 1e-6)
     assert len(changed) == envmimic.HISTORY, "the yaw alone"
     np.testing.assert_allclose(np.sort(np.asarray(seen)[:3]), np.sort(np.asarray(history[0, :3])), atol=1e-6)
-    force = envmimic.world_force(jnp.array([1.0, 2.0, 3.0]), turned[-1, 8], EnvMimicConfig(), anchored=True)
+    force = envmimic.world_loads(jnp.array([1.0, 2.0, 3.0]), turned[-1, 8], EnvMimicConfig(), anchored=True)
     np.testing.assert_allclose(force, [0.05, 0.1, 0.15], atol=1e-6)
 
 
