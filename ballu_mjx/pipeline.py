@@ -3,9 +3,9 @@
 Stages, in the paper's order: an actuator sweep and its identification; vanilla policies; their actions replayed on the
 robot, several times each; one EnvMimic a task, and beyond the paper the air identified from the same recordings;
 policies in all simulators; trials on the robot; tables. With `--rounds`, EnvMimic learns again from the robot under its
-own policies, and they in the simulator that this makes. Every stage is a folder, and beside it stands the key of what
-it was made from (options, and the keys of the stages it needs): an interrupted run goes on where it was, and a changed
-option redoes what depends on it and nothing else.
+own policies, and they in the simulator that this makes; `--also` adds simulators. Every stage is a folder, and beside
+it stands the key of what it was made from (options, and the keys of the stages it needs): an interrupted run goes on
+where it was, and a changed option redoes what depends on it and nothing else.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from ballu_mjx import (
     actuators,
     air_fit,
     files,
+    force_fit,
     loggers,
     plots,
     policy_training,
@@ -41,6 +42,7 @@ from ballu_mjx import (
     virtual_robot,
 )
 from ballu_mjx.air_identification import AirConfig
+from ballu_mjx.analytic import AnalyticConfig
 from ballu_mjx.deployment import PolicyController
 from ballu_mjx.envmimic import EnvMimicConfig
 from ballu_mjx.errors import InputError
@@ -49,6 +51,7 @@ from ballu_mjx.locomotion import LocomotionConfig, Setting
 from ballu_mjx.policy import ClosedLoop, Policy
 from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.recording import write_recording
+from ballu_mjx.supervised import SupervisedConfig
 from ballu_mjx.tasks import TASKS
 from ballu_mjx.transfer import Transfer, turning_table, walking_table
 from ballu_mjx.virtual_robot import Controller
@@ -57,6 +60,10 @@ TABLES = {"walk": walking_table, "turn": turning_table}
 """The paper's tables, by task."""
 SETTINGS = ("vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic", "aerodynamic")
 """The paper's four simulators, and one with the identified air instead of EnvMimic's forces."""
+SHARED = "envmimic-shared"
+"""The setting of one EnvMimic for all tasks."""
+MORE_SETTINGS = (SHARED, "supervised", "analytic")
+"""Settings that are run on request; the last two are networks that regression and gradients learn."""
 ROUNDS = "envmimic"
 """The setting that `Options.rounds` repeats. Nothing of an earlier round is replaced: later ones have their number
 behind the name."""
@@ -87,6 +94,9 @@ class Options(loggers.LoggingOptions):
     rounds: int = 1
     """How often EnvMimic learns. From the second time on, its recordings are joined by the robot's motion under the
     policies trained the time before, in closed loop; then policies are trained anew: `envmimic-2`, and so on."""
+    also: tuple[Literal["envmimic-shared", "supervised", "analytic"], ...] = ()
+    """Further simulators to train policies in: with one EnvMimic that learns from the recordings of both tasks, instead
+    of one a task; with the forces that regression, and that gradients through the simulation, learn from the task's."""
     quick: bool = False
     """Every stage within five minutes in all, for one task and two simulators; the tables mean nothing."""
 
@@ -119,13 +129,16 @@ def run(options: Options) -> int:
 def settings_of(options: Options) -> tuple[str, ...]:
     """The simulators that policies are trained in, in the tables' order."""
     first = ("vanilla+dr", ROUNDS) if options.quick else SETTINGS
-    return (*first, *(_again(number) for number in range(2, options.rounds + 1)))
+    return (*first, *(_again(number) for number in range(2, options.rounds + 1)), *options.also)
 
 
-def later_rounds(folder: Path, task: str) -> tuple[str, ...]:
-    """The settings of later rounds that a seed's folder has policies of."""
-    names = map(_again, itertools.count(2))
-    return tuple(itertools.takewhile(lambda name: (folder / f"{task}-{name}").is_dir(), names))
+def settings_beyond(folder: Path, task: str) -> tuple[str, ...]:
+    """The settings beyond `SETTINGS` that a seed's folder has policies of: of later rounds, and on request."""
+
+    def there(name: str) -> bool:
+        return (folder / f"{task}-{name}").is_dir()
+
+    return (*itertools.takewhile(there, map(_again, itertools.count(2))), *filter(there, MORE_SETTINGS))
 
 
 def _again(number: int) -> str:
@@ -135,6 +148,8 @@ def _again(number: int) -> str:
 
 def residual_folder(seed: Path, task: str, setting: str) -> Path:
     """Where, in a seed's folder, the residual of a setting is learned."""
+    if setting == SHARED:
+        return seed / SHARED
     method, number = plots.round_of(setting)
     return seed / (f"{method}-{task}" if number == 1 else f"{method}-{task}-{number}")
 
@@ -177,7 +192,7 @@ class Story:
     def policy(self, task: str, setting: str) -> Path:
         """The run of a policy's training."""
         method, _ = plots.round_of(setting)
-        learned = method in ("envmimic", "aerodynamic")
+        learned = method in ("envmimic", "aerodynamic", *MORE_SETTINGS)
         config = LocomotionConfig(domain_randomization=learned or setting.endswith("+dr"))
         quick = policy_training.QUICK if self.options.quick else {"num_timesteps": self.options.policy_steps}
         ppo = policy_training.defaults(seed=self.seed, **quick)
@@ -253,9 +268,13 @@ class Story:
         """The run of a setting's residual, learned from the recordings of the task, those of all rounds up to its
         own."""
         method, number = plots.round_of(setting)
-        recordings = [self.recordings(task), *(self.trained_last(task, n) for n in range(2, number + 1))]
+        if method == SHARED:
+            recordings = [self.recordings(each) for each in TABLES]
+        else:
+            recordings = [self.recordings(task), *(self.trained_last(task, n) for n in range(2, number + 1))]
         identified = self.identified()
-        options = self._air() if method == "aerodynamic" else self._envmimic()
+        fits = {"aerodynamic": self._air, "supervised": self._supervised, "analytic": self._analytic}
+        options = fits.get(method, self._envmimic)()
 
         def make(folder: Path) -> None:
             sources: dict[str, Any] = {
@@ -267,13 +286,24 @@ class Story:
             }
             if isinstance(options, AirConfig):
                 air_fit.fit(air_fit.AirData(**sources), options)
-                return
-            data = residual_training.Data(**sources)
-            if runs.checkpoints(folder):
-                data = residual_training.Data(resume=folder, wandb=data.wandb)
-            _stop_unless_done(residual_training.train(data, *options))
+            elif isinstance(options, SupervisedConfig):
+                force_fit.fit_supervised(force_fit.ForcesData(**sources), options)
+            elif isinstance(options, AnalyticConfig):
+                force_fit.fit_analytic(force_fit.ForcesData(**sources), options)
+            else:
+                data = residual_training.Data(**sources)
+                if runs.checkpoints(folder):
+                    data = residual_training.Data(resume=folder, wandb=data.wandb)
+                _stop_unless_done(residual_training.train(data, *options))
 
-        return _stage(residual_folder(self._own, task, setting), options, [*recordings, identified], make)
+        needs = [*recordings, identified]
+        return _stage(residual_folder(self._own, task, setting), options, needs, make, goes_on=method not in fits)
+
+    def _supervised(self) -> SupervisedConfig:
+        return SupervisedConfig(seed=self.seed, **force_fit.QUICK["supervised"] if self.options.quick else {})
+
+    def _analytic(self) -> AnalyticConfig:
+        return AnalyticConfig(seed=self.seed, **force_fit.QUICK["analytic"] if self.options.quick else {})
 
     def _air(self) -> AirConfig:
         return AirConfig(**air_fit.QUICK if self.options.quick else {})
@@ -325,10 +355,13 @@ def _draw(seed: int, task: str, use: str, number: int) -> int:
     return int.from_bytes(digest[:4], "big")
 
 
-def _stage(folder: Path, options: Any, needs: Sequence[Path], make: Callable[[Path], None]) -> Path:
+def _stage(
+    folder: Path, options: Any, needs: Sequence[Path], make: Callable[[Path], None], *, goes_on: bool = True
+) -> Path:
     """`folder` as `make` leaves it, made unless it is there with the key of `options` and `needs`.
 
-    A folder with another key is set aside. One with the same key that was not finished is handed to `make` as it is.
+    A folder with another key is set aside. One with the same key that was not finished is handed to `make` as it is, if
+    that `goes_on` from checkpoints and there are any.
     """
     content = {
         "options": options if isinstance(options, dict) else _plain(options),
@@ -346,8 +379,8 @@ def _stage(folder: Path, options: Any, needs: Sequence[Path], make: Callable[[Pa
             folder.rename(aside)
         print(f"{folder}: made with other options; set aside as {aside.name}.")
         found = None
-    print(f"\n== {folder.name}" + (" (goes on)" if found is not None else ""), flush=True)
-    if folder.exists() and not (found is not None and runs.checkpoints(folder)):
+    print(f"\n== {folder.name}" + (" (goes on)" if goes_on and found is not None else ""), flush=True)
+    if folder.exists() and not (goes_on and found is not None and runs.checkpoints(folder)):
         shutil.rmtree(folder)  # a beginning of nothing
     folder.mkdir(parents=True, exist_ok=True)
     _write_mark(mark, key, content, done=False)

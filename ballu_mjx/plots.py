@@ -32,6 +32,7 @@ COLOURS: Mapping[str, str] = {
     "analytic": "#999933",
     "aerodynamic+envmimic": "#332288",
     "aerodynamic+analytic": "#aa4499",
+    "envmimic-shared": "#117733",
 }
 """One colour for each simulator in all figures (Okabe and Ito's, four of Tol's: the colour-blind tell them apart)."""
 
@@ -47,6 +48,7 @@ LABELS: Mapping[str, str] = {
     "analytic": "analytic",
     "aerodynamic+envmimic": "aerodynamic+EnvMimic",
     "aerodynamic+analytic": "aerodynamic+analytic",
+    "envmimic-shared": "EnvMimic, one for all tasks",
 }
 
 

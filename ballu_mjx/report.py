@@ -189,7 +189,7 @@ def _story(folder: Path, tables: Mapping[str, str]) -> Content:
     for seed in sorted(path for path in folder.glob("seed-*") if path.is_dir()):
         for task in tables:
             where = f"{task}, {seed.name}"
-            settings = ("vanilla", *pipeline.SETTINGS, *pipeline.later_rounds(seed, task))
+            settings = ("vanilla", *pipeline.SETTINGS, *pipeline.settings_beyond(seed, task))
             policies = {setting: seed / f"{task}-{setting}" for setting in settings}
             policies = {setting: path for setting, path in policies.items() if (path / "config.json").is_file()}
             content.curves += [dataclasses.replace(c, title=f"{c.title} ({where})") for c in _curves(policies)]
@@ -200,9 +200,8 @@ def _story(folder: Path, tables: Mapping[str, str]) -> Content:
                 image = seed / f"trials-{task}-{setting}" / "trials.png"
                 if image.is_file():
                     content.images.append((f"Trials on the robot: {where}, {setting}", image.read_bytes()))
-            for setting in (pipeline.ROUNDS, *pipeline.later_rounds(seed, task)):
-                number = plots.round_of(setting)[1]
-                name = f"EnvMimic for {where}" if number == 1 else f"EnvMimic for {where}, round {number}"
+            for setting in (pipeline.ROUNDS, *pipeline.settings_beyond(seed, task)):
+                name = f"{plots.label_of(setting)}: {where}"
                 learned = pipeline.residual_folder(seed, task, setting)
                 if (learned / "config.json").is_file():
                     _add_evaluation(content, learned, f"{name}: ")

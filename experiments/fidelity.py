@@ -3,12 +3,13 @@
 #
 # Section "Improved Simulation Fidelity" of the paper, open loop: recorded commands are replayed from recorded states in
 # several simulators, on recordings that training never saw: vanilla, vanilla with identified actuators (vanilla+sysid),
-# either with EnvMimic's forces, and the second with what the other methods learn: regression on the forces that explain
-# the recordings (supervised), gradients through the simulator (analytic), the air's parameters (aerodynamic), and
-# networks for what the air leaves (aerodynamic+analytic, aerodynamic+EnvMimic). One training a method and seed; runs
-# that are there already are not repeated.
+# either with EnvMimic's forces, and the second with what else pushes (a wrench on the balloon; forces at balloon, base
+# and feet) and with what the other methods learn: regression on the forces that explain the recordings (supervised),
+# gradients through the simulator (analytic), the air's parameters (aerodynamic), and networks for what the air leaves
+# (aerodynamic+analytic, aerodynamic+EnvMimic). One training a method and seed; runs that are there already are not
+# repeated.
 #
-# `python experiments/fidelity.py` takes about three quarters of an hour on two cores; `--robot N` does the same on
+# `python experiments/fidelity.py` takes hours on two cores, `--methods` names some of it; `--robot N` does the same on
 # another virtual robot, recorded and its actuators identified first; `--quick` shows that it works.
 
 # %%
@@ -65,6 +66,8 @@ AIR = "aerodynamic"
 METHODS = {
     "nominal": Method("EnvMimic", ("envmimic",), nominal=True),
     "identified": Method("EnvMimic on identified actuators", ("envmimic",)),
+    "wrench": Method("EnvMimic, wrench", ("envmimic", "--forces", "wrench")),
+    "multi": Method("EnvMimic, forces at balloon, base and feet", ("envmimic", "--forces", "multi")),
     "supervised": Method("supervised", ("residual", "--method", "supervised")),
     "analytic": Method("analytic", ("residual", "--method", "analytic")),
     AIR: Method("aerodynamic", ("residual", "--method", "aerodynamic"), seeded=False),

@@ -54,7 +54,7 @@ def read_ways(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[l
     **Raises** `InputError` where `folder` holds no such trials.
     """
     found = {}
-    for setting in (*pipeline.SETTINGS, *pipeline.later_rounds(folder / f"seed-{seeds[0]}", task)):
+    for setting in (*pipeline.SETTINGS, *pipeline.settings_beyond(folder / f"seed-{seeds[0]}", task)):
         trials = [folder / f"seed-{seed}" / f"trials-{task}-{setting}" for seed in seeds]
         if all(_finished(trial) for trial in trials):
             found[setting] = [[_way(path) for path in sorted(trial.glob("trial-*.csv.gz"))] for trial in trials]

@@ -92,20 +92,22 @@ def test_each_round_learns_from_all_recordings_so_far_and_keeps_what_came_before
     """Which stage needs which, without making any: a stage is a folder whose needs stand beside it."""
     needs: dict[str, list[str]] = {}
 
-    def stage(folder, options, sources, make):
+    def stage(folder, options, sources, make, goes_on=True):
         needs[folder.name] = [source.name for source in sources]
         return folder
 
     monkeypatch.setattr(pipeline, "_stage", stage)
-    options = Options(output=tmp_path, rounds=3)
+    options = Options(output=tmp_path, rounds=3, also=("envmimic-shared", "supervised"))
     told = pipeline.Story(options, seed=0)
     for setting in pipeline.settings_of(options):
         told.policy("walk", setting)
-    assert pipeline.settings_of(options) == (*pipeline.SETTINGS, "envmimic-2", "envmimic-3")
+    assert pipeline.settings_of(options) == (*pipeline.SETTINGS, "envmimic-2", "envmimic-3", *options.also)
     recorded = ["recordings-walk", "recordings-walk-2", "recordings-walk-3"]
     for number, name in enumerate(("envmimic-walk", "envmimic-walk-2", "envmimic-walk-3"), 1):
         assert needs[name] == [*recorded[:number], "sysid"]
     assert needs["recordings-walk-3"] == ["walk-envmimic-2"]
     assert needs["walk-envmimic-3"] == ["envmimic-walk-3"]
     assert needs["walk-envmimic"] == ["envmimic-walk"]
-    assert needs["aerodynamic-walk"] == ["recordings-walk", "sysid"]
+    assert needs["aerodynamic-walk"] == needs["supervised-walk"] == ["recordings-walk", "sysid"]
+    assert needs["envmimic-shared"] == ["recordings-walk", "recordings-turn", "sysid"]
+    assert needs["walk-envmimic-shared"] == ["envmimic-shared"]

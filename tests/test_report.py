@@ -293,8 +293,8 @@ def test_story_shows_its_tables_and_policies_over_each_other(tmp_path: Path):
     content = report.collect(tmp_path)
     assert [(t.name, list(t.qpos), len(t.time)) for t in content.takes] == [
         ("policies: walk, seed-0", ["vanilla+dr", "envmimic", "envmimic-2"], 25),
-        ("EnvMimic for walk, seed-0: actions-1", ["recording", "vanilla", "envmimic"], 21),
-        ("EnvMimic for walk, seed-0, round 2: actions-1", ["recording", "vanilla", "envmimic"], 22),
+        ("EnvMimic: walk, seed-0: actions-1", ["recording", "vanilla", "envmimic"], 21),
+        ("EnvMimic, round 2: walk, seed-0: actions-1", ["recording", "vanilla", "envmimic"], 22),
     ]
     assert [list(curve.values) for curve in content.curves] == [["vanilla+dr", "envmimic", "envmimic-2"]]
     text = report.render(content)
