@@ -93,6 +93,26 @@ def seconds(folder: Path) -> float:
     return float(runs.column(folder, "seconds")[1][-1])
 
 
+def race(folders: Mapping[str, list[Path]]) -> str:
+    """Markdown: how soon methods whose progress is measured open loop are as good on the validation recordings as
+    EnvMimic on identified actuators ever is; means over seeds."""
+
+    def curve(folder: Path) -> tuple[Float[np.ndarray, " steps"], Float[np.ndarray, " steps"]]:
+        steps, error = runs.column(folder, "validation_error")
+        return np.interp(steps, *runs.column(folder, "seconds")), error
+
+    goal = float(np.mean([curve(folder)[1].min() for folder in folders["identified"]]))
+    lines = ["| method | lowest validation error (score) | seconds to EnvMimic's lowest |", "| --- | ---: | ---: |"]
+    for name, members in folders.items():
+        if METHODS[name].nominal or name in ("supervised", AIR):
+            continue
+        curves = [curve(folder) for folder in members]
+        first = [float(seconds[np.argmax(error <= goal)]) for seconds, error in curves if np.any(error <= goal)]
+        when = f"{np.mean(first):.0f} ({len(first)} of {len(curves)} seeds)" if first else "never"
+        lines.append(f"| {METHODS[name].label} | {spread([float(e.min()) for _, e in curves])} | {when} |")
+    return "\n".join(lines)
+
+
 @dataclasses.dataclass(frozen=True)
 class Recorded:
     """A virtual robot's recordings, and its identified actuators."""
@@ -342,6 +362,7 @@ def main() -> None:
             parts += [f"{METHODS[name].label}. " + worst_case(evaluations, "vanilla")]
         for name in ("identified", AIR, "nominal"):
             parts += [table(found[name], "vanilla" if METHODS[name].nominal else "vanilla+sysid", METHODS[name].label)]
+    parts += ["### Progress", race(folders)]
     text = "\n\n".join(parts)
     (options.output / "table.md").write_text(text + "\n")
     figure(folders["identified"], folders[AIR][0], recorded.test, options.output / "tracking.png")
