@@ -112,6 +112,8 @@ def figure(found: dict[str, dict[int, list[Path]]], path: Path) -> None:
             ax.axhline(1.0, color=plots.colour_of("vanilla+sysid"), linestyle="--", label="vanilla+sysid")
             ax.set_xscale("log", base=2)
             ax.set_yscale("log")
+            ax.yaxis.set_major_formatter("{x:g}")
+            ax.yaxis.set_minor_formatter("{x:g}")
             ax.grid(alpha=0.3, which="both")
             ax.set_title(f"{title}, {group}, {HORIZON:g} s")
         row[0].set_ylabel("error over that of vanilla+sysid")
@@ -137,6 +139,8 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("runs/recording_counts"), help="folder of the runs")
     parser.add_argument("--quick", action="store_true", help="learn for seconds; the numbers mean nothing")
     arguments = parser.parse_args()
+    if arguments.quick:
+        arguments.counts, arguments.seeds = arguments.counts[:2], arguments.seeds[:1]
     found = learn(arguments)
     text = table(found)
     (arguments.output / "table.md").write_text(text + "\n")
