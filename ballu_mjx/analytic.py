@@ -194,8 +194,7 @@ def _updates(
         through = linear, about, jnp.arange(steps), jax.random.split(key_noise, steps)
         _, (features, loads) = jax.lax.scan(step, (first, window.history), through)
         tracking = _loss(features, window.features)
-        in_newtons = loads / envmimic.units(forces.config, loads.shape[-1]) * forces.config.force_scale
-        return tracking + config.force_cost * jnp.mean(jnp.sum(in_newtons**2, axis=-1)), tracking
+        return tracking + config.force_cost * jnp.mean(envmimic.square_newtons(loads, forces.config)), tracking
 
     @jax.jit
     def some(carry: tuple, keys: Array, data: tuple) -> tuple[tuple, tuple]:

@@ -84,9 +84,7 @@ def check(config: EnvMimicConfig) -> None:
     """**Raises** `InputError` for options out of range, naming the option and the nearest value that fits."""
     for field in dataclasses.fields(config):
         option, value = f"--{field.name.replace('_', '-')}", getattr(config, field.name)
-        if isinstance(value, bool):
-            continue
-        if isinstance(value, str):
+        if isinstance(value, bool | str):
             continue
         if field.name in ("force_limit", "force_scale", "torque_scale"):
             if not (value > 0 and math.isfinite(value)):
@@ -343,6 +341,12 @@ def units(config: EnvMimicConfig, size: int) -> Float[np.ndarray, " loads"]:
     return scale
 
 
+def square_newtons(loads: Float[Array, "*batch loads"], config: EnvMimicConfig) -> Float[Array, "*batch"]:
+    """What loads cost force for (N^2): their squares, a torque counted as the force that takes as many units."""
+    in_newtons = loads / units(config, loads.shape[-1]) * config.force_scale
+    return jnp.sum(in_newtons**2, axis=-1)
+
+
 def world_loads(
     action: Float[Array, " loads"], yaw: Float[Array, ""], config: EnvMimicConfig, anchored: bool = False
 ) -> Float[Array, " loads"]:
@@ -484,8 +488,8 @@ class EnvMimicEnv(Env):
         finite = jnp.all(jnp.isfinite(seen)) & jnp.all(jnp.isfinite(after.qvel))
         seen = jnp.where(finite, seen, target)
         terms = reward_terms(seen, target, self.config)
-        in_newtons = loads / units(self.config, len(loads)) * self.config.force_scale
-        reward = jnp.where(finite, terms["tracking"] - self.config.force_cost * jnp.sum(in_newtons**2), 0.0)
+        cost = self.config.force_cost * square_newtons(loads, self.config)
+        reward = jnp.where(finite, terms["tracking"] - cost, 0.0)
 
         remaining = s["remaining"] - 1
         timed_out = (remaining <= 0) | (time + 1 >= self.reference.steps[recording])

@@ -325,17 +325,22 @@ def parse() -> Options:
     return Options(methods, arguments.seeds, arguments.robot, arguments.fresh, arguments.output, arguments.quick)
 
 
+def arguments_of(method: Method, recorded: Recorded, training: list[Path], quick: bool) -> list[str]:
+    """Of `python -m ballu_mjx.train`, to learn by a method from some of the recordings."""
+    arguments = [*method.arguments, *(["--quick"] if quick else [])]
+    for use, paths in (("recordings", training), ("validation", recorded.validation), ("test", recorded.test)):
+        arguments += [f"--{use}", *map(str, paths)]
+    return [*arguments, "--actuators", "nominal" if method.nominal else str(recorded.actuators)]
+
+
 def learn(options: Options, recorded: Recorded) -> dict[str, list[Path]]:
     """All runs of all methods; the air first, beside which others learn."""
     folders = {}
     for name in sorted(options.methods, key=lambda name: name != AIR):
         method = METHODS[name]
-        arguments = [*method.arguments, *(["--quick"] if options.quick else [])]
         # A quick training would test on what it validates on: the tables need the test recordings.
         training = recorded.training[:2] if options.quick else recorded.training
-        for use, paths in (("recordings", training), ("validation", recorded.validation), ("test", recorded.test)):
-            arguments += [f"--{use}", *map(str, paths)]
-        arguments += ["--actuators", "nominal" if method.nominal else str(recorded.actuators)]
+        arguments = arguments_of(method, recorded, training, options.quick)
         arguments += ["--residual", str(options.output / AIR)] if method.beside_air else []
         runs = [(options.output / f"{name}-seed-{seed}", ["--seed", str(seed)]) for seed in options.seeds]
         for folder, seed in runs if method.seeded else [(options.output / name, [])]:

@@ -60,14 +60,7 @@ def learn(arguments: argparse.Namespace) -> dict[str, dict[int, list[Path]]]:
     for name in arguments.methods:
         method = fidelity.METHODS[name]
         for count in sorted({min(count, len(ordered)) for count in arguments.counts}):
-            given = [*method.arguments, "--actuators", str(recorded.actuators)]
-            given += ["--quick"] if arguments.quick else []
-            for use, paths in (
-                ("recordings", ordered[:count]),
-                ("validation", recorded.validation),
-                ("test", recorded.test),
-            ):
-                given += [f"--{use}", *map(str, paths)]
+            given = fidelity.arguments_of(method, recorded, ordered[:count], arguments.quick)
             for seed in arguments.seeds if method.seeded else [None]:
                 folder = arguments.output / (f"{name}-of-{count}" + ("" if seed is None else f"-seed-{seed}"))
                 fidelity.train(folder, *given, *([] if seed is None else ["--seed", str(seed)]))
