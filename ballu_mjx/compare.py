@@ -165,7 +165,11 @@ def _compare(options: Options) -> None:
         return
     options.output.mkdir(parents=True, exist_ok=True)
     (options.output / "compare.md").write_text(text + "\n", encoding="utf-8")
-    measured = {"reward per control step": "reward", "validation error (ratio to vanilla)": "validation_error"}
+    measured = {
+        "reward per control step": "reward",
+        "validation error (ratio to vanilla)": "validation_error",
+        "reward per control step, without exploration (m/s)": "validation_reward",
+    }
     curves = {
         title: {row.label: line for row in found if (line := curve(row.folders, name)) is not None}
         for title, name in measured.items()

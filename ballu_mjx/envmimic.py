@@ -130,6 +130,11 @@ def features(
     return jnp.concatenate([kinematics[0], euler, kinematics[1:].ravel()])
 
 
+def feet(features: Float[np.ndarray, "*states 27"]) -> Float[np.ndarray, "*states 2 3"]:
+    """Positions (m, world) of BALLU's left and right foot in `features`."""
+    return np.stack([features[..., 15:18], features[..., 21:24]], axis=-2)
+
+
 def euler_angles(quaternion: Float[Array, " 4"]) -> Float[Array, " 3"]:
     """Roll, pitch and yaw (rad; intrinsic z-y-x) of a unit quaternion (w, x, y, z)."""
     w, x, y, z = quaternion

@@ -246,7 +246,7 @@ class Story:
         takes, seconds = self.options.takes, 6.0 if self.options.quick else 20.0
 
         def make(folder: Path) -> None:
-            act = {step: Policy.load(source, step).act() for step in runs.checkpoints(source) if step > 0}
+            act = {step: Policy.load(source, step).act() for step in _last_steps(source)}
             jobs = [("training", step, take, seconds) for step in act for take in range(takes)]
             jobs.append(("validation", max(act), takes, seconds + 5.0))
             for job, (use, step, take, length) in enumerate(jobs):
@@ -329,7 +329,7 @@ class Story:
 
     def _actions(self, run: Path, seconds: float) -> list[np.ndarray]:
         """Commands of each of a policy's kept checkpoints over `seconds`, in its own simulator from standing."""
-        policies = [Policy.load(run, step) for step in runs.checkpoints(run) if step > 0]
+        policies = [Policy.load(run, step) for step in _last_steps(run)]
         loop, setting = self._simulator(policies[0])
         start, count = loop.standing(), round(seconds / robot.CONTROL_TIMESTEP)
         return [np.round(loop(p.params, *start, count, setting).command[0], 3).astype(float) for p in policies]
@@ -341,6 +341,11 @@ class Story:
         if self._loop is None:
             self._loop = simulator(policy)[0]
         return self._loop, policy.environment().setting
+
+
+def _last_steps(run: Path) -> list[int]:
+    """Of a run's last checkpoints; the best may be an earlier one, and the first is of no training at all."""
+    return [step for step in runs.checkpoints(run)[-runs.KEPT :] if step > 0]
 
 
 def simulator(policy: Policy) -> tuple[ClosedLoop, Setting]:

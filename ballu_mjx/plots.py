@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx import robot
+from ballu_mjx import robot, stepping
 from ballu_mjx.identification import Identification
 from ballu_mjx.recording import Recording
 from ballu_mjx.robot import SIDES
@@ -77,8 +77,6 @@ _QUANTITIES = ("x (m)", "y (m)", "yaw (deg)")
 _DOTS_PER_INCH = 120
 SIDE_COLOURS = ("#1f77b4", "#d64d1f")
 """Left and right, as in the model."""
-_STANCE_HEIGHT, _STANCE_SPEED = 0.012, 0.1
-"""A planted foot's greatest height (m) and horizontal speed (m/s)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,11 +190,21 @@ def compared(path: Path, panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.
     _save(figure, path)
 
 
-def reward_curve(path: Path, steps: Float[np.ndarray, " n"], reward: Float[np.ndarray, " n"], simulator: str) -> None:
-    """Mean reward per control step (m/s) against control steps, in the simulator's colour."""
+def reward_curve(
+    path: Path,
+    steps: Float[np.ndarray, " n"],
+    reward: Float[np.ndarray, " n"],
+    validation_steps: Float[np.ndarray, " m"],
+    validation_reward: Float[np.ndarray, " m"],
+    simulator: str,
+) -> None:
+    """Mean reward per control step (m/s) against control steps, in the simulator's colour: of training, and of the
+    policy without exploration."""
     figure = Figure(figsize=(7.0, 3.5), layout="constrained")
     axis = figure.subplots()
-    axis.plot(steps / 1e6, reward, color=COLOURS[simulator], label=LABELS[simulator])
+    axis.plot(steps / 1e6, reward, color=COLOURS[simulator], label=f"{LABELS[simulator]}, training")
+    validated = "without exploration, whole trials"
+    axis.plot(validation_steps / 1e6, validation_reward, "o--", color=COLOURS[simulator], markersize=4, label=validated)
     axis.set_xlabel("control steps (millions)")
     axis.set_ylabel("reward per control step (m/s)")
     axis.grid(alpha=0.3)
@@ -218,8 +226,7 @@ def gait(
     first = min(round(start / period), max(len(qpos) - 2, 0))
     shown = slice(first, min(first + round(8.0 / period), len(command)))
     time = np.arange(len(qpos)) * period
-    speed = np.linalg.norm(np.gradient(feet[..., :2], period, axis=0), axis=-1)
-    planted = (feet[..., 2] < _STANCE_HEIGHT) & (speed < _STANCE_SPEED)
+    planted = stepping.planted(feet)
     figure = Figure(figsize=(12.0, 10.0), layout="constrained")
     strip, heights, commands, above = figure.subplots(4, 1, height_ratios=(1.6, 1.0, 1.0, 1.4))
     for state in range(shown.start, shown.stop, round(0.25 / period)):

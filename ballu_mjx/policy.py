@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -47,8 +47,8 @@ class Policy:
     step: int
 
     @staticmethod
-    def load(folder: Path | str, which: Literal["last"] | int = "last") -> Policy:
-        """The policy in a run's last checkpoint, or in that of a step.
+    def load(folder: Path | str, which: runs.Which = "best") -> Policy:
+        """The policy in a run's best checkpoint, by its reward without exploration; in the last, or that of a step.
 
         **Raises** `InputError` where `folder` is no run of a locomotion task, or has no such checkpoint.
         """
@@ -121,6 +121,8 @@ class Rollout(NamedTuple):
     """Servo commands."""
     outside: Float[np.ndarray, "runs steps"]
     """1 where the residual's observation lay outside of what its training had seen."""
+    reward: Float[np.ndarray, "runs steps"]
+    """The task's."""
 
     @property
     def yaw(self) -> Float[np.ndarray, "runs states"]:
@@ -131,7 +133,7 @@ class Rollout(NamedTuple):
 _CHUNK = 100
 """Control steps that the compiled program does at a time."""
 _BATCH = 8
-"""Runs that it does side by side; others are filled up to a multiple."""
+"""Runs that it does side by side; fewer are filled up, more are done one batch after another."""
 
 
 class ClosedLoop:
@@ -149,7 +151,7 @@ class ClosedLoop:
             def advance(state: State, _: None) -> tuple[State, Any]:
                 action = infer(params, state.obs)  # pyright: ignore[reportArgumentType]
                 after = env.step(state, action)
-                return after, (*look(after), locomotion.command_of(action), after.metrics["outside"])
+                return after, (*look(after), locomotion.command_of(action), after.metrics["outside"], after.reward)
 
             return jax.lax.scan(advance, state, None, _CHUNK)
 
@@ -167,20 +169,27 @@ class ClosedLoop:
         setting: Setting | None = None,
     ) -> Rollout:
         """Simulate `steps` control steps from each of the given states, in `setting` (None: the environment's own)."""
+        setting = self._setting if setting is None else setting
+        batches = [slice(first, first + _BATCH) for first in range(0, len(qpos), _BATCH)]
+        rollouts = [self._batch(params, qpos[batch], qvel[batch], steps, setting) for batch in batches]
+        return Rollout(*(np.concatenate(parts) for parts in zip(*rollouts, strict=True)))
+
+    def _batch(self, params: Params, qpos: np.ndarray, qvel: np.ndarray, steps: int, setting: Setting) -> Rollout:
         runs = len(qpos)
-        filled = np.arange(-(-runs // _BATCH) * _BATCH) % runs
-        keys = jax.random.split(jax.random.key(0), len(filled))
+        filled = np.arange(_BATCH) % runs
+        keys = jax.random.split(jax.random.key(0), _BATCH)
         start = (jnp.asarray(x[filled], jnp.float32) for x in (qpos, qvel))
-        state = self._at(self._setting if setting is None else setting, *start, keys)
+        state = self._at(setting, *start, keys)
         pieces = [tuple(np.asarray(x)[:, None] for x in self._look(state))]
         outcomes = []
         for _ in range(-(-steps // _CHUNK)):
-            state, (*seen, command, outside) = self._run(params, state)
-            pieces.append(tuple(np.asarray(x) for x in seen))
-            outcomes.append((np.asarray(command), np.asarray(outside)))
-        joined = (np.concatenate(parts, axis=1)[:runs, : steps + 1] for parts in zip(*pieces, strict=True))
-        command, outside = (np.concatenate(p, axis=1)[:runs, :steps] for p in zip(*outcomes, strict=True))
-        return Rollout(*joined, command, outside)  # pyright: ignore[reportCallIssue]
+            state, seen = self._run(params, state)
+            state_parts, step_parts = seen[: len(pieces[0])], seen[len(pieces[0]) :]
+            pieces.append(tuple(np.asarray(x) for x in state_parts))
+            outcomes.append(tuple(np.asarray(x) for x in step_parts))
+        states = (np.concatenate(parts, axis=1)[:runs, : steps + 1] for parts in zip(*pieces, strict=True))
+        per_step = (np.concatenate(parts, axis=1)[:runs, :steps] for parts in zip(*outcomes, strict=True))
+        return Rollout(*states, *per_step)
 
     def standing(self, count: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """`count` starting states, (qpos, qvel), as training draws them."""

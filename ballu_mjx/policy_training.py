@@ -12,10 +12,12 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from ballu_mjx import (
     actuators,
     distributed,
+    envmimic,
     learner,
     locomotion,
     loggers,
@@ -26,6 +28,7 @@ from ballu_mjx import (
     residual,
     robot,
     runs,
+    stepping,
 )
 from ballu_mjx.errors import InputError
 from ballu_mjx.locomotion import LocomotionConfig
@@ -33,7 +36,7 @@ from ballu_mjx.policy import ClosedLoop, Policy, Rollout
 from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.replay import Take
 from ballu_mjx.robot import ActuatorParameters
-from ballu_mjx.session import Session, start_from
+from ballu_mjx.session import Session, Validation, start_from
 from ballu_mjx.tasks import Task
 
 defaults = functools.partial(
@@ -53,6 +56,7 @@ defaults = functools.partial(
 """`PPOConfig` for locomotion: rewards are of the order of 0.1 m/s, and a turn pays only after seconds."""
 QUICK: Mapping[str, Any] = {"num_timesteps": 60_000, "num_envs": 256, "batch_size": 128}
 """Defaults of `PPOConfig` under `--quick`."""
+_VALIDATION_STARTS = 16
 NOMINAL = Path("nominal")
 """What `--actuators` takes beside a file."""
 
@@ -75,7 +79,8 @@ class Data(loggers.LoggingOptions, distributed.DistributedOptions):
     quick: bool = False
     """See everything work within two minutes; the policy will not walk."""
     keep_every: int = 500_000
-    """Control steps between two checkpoints; the last three are kept."""
+    """Control steps between two checkpoints; the last three are kept, and the best, whose policy earns most in whole
+    trials without exploration."""
 
 
 def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfig) -> int:
@@ -97,8 +102,14 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
 
     content = runs.describe(task.name, {"env": config, "ppo": ppo_config, "data": data}, {}, devices, identified)
     content["residual"] = None if forces is None else str(forces.resolve())
+    loop = ClosedLoop(env, ppo.make_inference(env.observation_size, env.action_size, ppo_config))
+    starts, steps = loop.standing(_VALIDATION_STARTS), round(task.trial_seconds / robot.CONTROL_TIMESTEP)
+    # Of training's reward exploration is a part: it frees a robot that would rest without.
+    validation = Validation(
+        lambda params: float(loop(params, *starts, steps).reward.mean()), "validation_reward", greatest=True
+    )
     if not distributed.is_first():
-        return Session(None, None, data.keep_every).follow(env, ppo_config, start, content)
+        return Session(None, None, data.keep_every, validation).follow(env, ppo_config, start, content)
 
     folder = data.resume or runs.new_folder(data.output, task.name)
     print(f"Run folder: {folder}")
@@ -108,18 +119,17 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
     with runs.Run(folder, content, resumed_at=start.resumed_at, wandb=data.wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)
         progress = runs.Progress(learner.total_timesteps(ppo_config, start.step), start.step)
-        session = Session(run, progress, data.keep_every)
+        session = Session(run, progress, data.keep_every, validation)
         try:
             session.train(env, ppo_config, start, content)
         except KeyboardInterrupt:
             print(f"To go on: python -m ballu_mjx.train {task.name} --resume {folder}", file=sys.stderr)
             return session.exit_status
 
-    steps, rewards = runs.column(folder, "reward")
-    plots.reward_curve(folder / "learning_curve.png", steps, rewards, setting)
+    curves = (*runs.column(folder, "reward"), *runs.column(folder, validation.name))
+    plots.reward_curve(folder / "learning_curve.png", *curves, setting)
     trained = Policy.load(folder)
-    loop = ClosedLoop(env, trained.infer)
-    rollout = loop(trained.params, *loop.standing(), round(task.trial_seconds / robot.CONTROL_TIMESTEP))
+    rollout = loop(trained.params, *starts, steps)
     plots.gait(folder / "gait.png", rollout.qpos[0], rollout.command[0])
     time_axis = np.arange(len(rollout.qpos[0])) * robot.CONTROL_TIMESTEP
     episode = Take(name=task.name, time=time_axis, qpos={setting: rollout.qpos[0]}, command=rollout.command[0])
@@ -130,12 +140,17 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
 
 
 def summary(task: Task, rollout: Rollout, with_residual: bool) -> str:
-    """What the first of some runs did, in words."""
-    way = rollout.com[0, -1] - rollout.com[0, 0]
-    yaw = np.rad2deg(np.unwrap(rollout.yaw[0]))
+    """What some runs did, in words: means and ranges."""
+    way = rollout.com[:, -1] - rollout.com[:, 0]
+    yaw = np.rad2deg(np.unwrap(rollout.yaw, axis=1))
+    steps = np.array([stepping.steps(feet) for feet in envmimic.feet(rollout.features)])
+
+    def spread(values: Float[np.ndarray, " runs"], digits: int) -> str:
+        return f"{values.mean():.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
+
     text = (
-        f"In its own simulator, from standing, {task.trial_seconds:g} s: x {way[0]:.2f} m, y {way[1]:.2f} m, "
-        f"yaw {yaw[-1] - yaw[0]:.0f} deg."
+        f"In its own simulator, {len(way)} times {task.trial_seconds:g} s from standing: x {spread(way[:, 0], 2)} m, "
+        f"y {spread(way[:, 1], 2)} m, yaw {spread(yaw[:, -1] - yaw[:, 0], 0)} deg, {spread(steps, 0)} steps."
     )
     if with_residual:
         text += (

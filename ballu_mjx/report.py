@@ -33,6 +33,7 @@ _IMAGES = ("gait.png", "actuator_curves.png")
 _CURVES = {
     "reward": "reward per control step",
     "validation_error": "validation error (ratio to vanilla)",
+    "validation_reward": "reward per control step, without exploration (m/s)",
 }
 _QUANTITIES = (("position", "position RMSE (m)", 3), ("yaw", "yaw RMSE (deg)", 1))
 _WHOLE = (("mean_com_error", "mean CoM error (m)", 3), ("final_yaw_error", "final yaw error (deg)", 1))

@@ -30,7 +30,7 @@ from ballu_mjx.ppo import Params, PPOConfig
 from ballu_mjx.residual import Residual, write_observed
 from ballu_mjx.residual_data import Prepared, RecordingsData
 from ballu_mjx.robot_description import RobotDescription
-from ballu_mjx.session import Session, start_from
+from ballu_mjx.session import Session, Validation, start_from
 
 QUICK: Mapping[str, Any] = {"num_timesteps": 120_000, "num_envs": 256, "batch_size": 128}
 """Defaults of `PPOConfig` under `--quick`."""
@@ -95,16 +95,14 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     config["residual"] = None if where is None else str(where.resolve())
     validation = evaluator("validation")
 
-    def validate(params: Params) -> float:
-        return validation(all_params(params)).score
-
+    tells_best = Validation(lambda params: validation(all_params(params)).score)
     if not first:
-        return Session(None, None, data.validate_every, validate).follow(env, ppo_config, start, config)
+        return Session(None, None, data.validate_every, tells_best).follow(env, ppo_config, start, config)
     with runs.Run(folder, config, resumed_at=start.resumed_at, wandb=data.wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)
         progress = runs.Progress(learner.total_timesteps(ppo_config, start.step), start.step)
         write_observed(run, env.recorded_inputs)
-        session = Session(run, progress, data.validate_every, validate)
+        session = Session(run, progress, data.validate_every, tells_best)
         try:
             session.train(env, ppo_config, start, config)
         except KeyboardInterrupt:

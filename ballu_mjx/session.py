@@ -110,6 +110,17 @@ def start_from(task: str, folder: Path | None, config: PPOConfig, *, output: Pat
     return Start(folder, checkpoint)
 
 
+@dataclasses.dataclass(frozen=True)
+class Validation:
+    """What tells the best checkpoint."""
+
+    measure: Callable[[Params], float]
+    name: str = "validation_error"
+    """Of the metric."""
+    greatest: bool = False
+    """Whether the greatest is the best, not the smallest."""
+
+
 def _made_with(config: Mapping[str, Any]) -> dict[str, Any]:
     """What of a run's `config.json` a training state depends on beyond its shapes. Kept with every checkpoint: the
     `config.json` beside it may be that of a later start."""
@@ -190,17 +201,17 @@ class Session:
         run: Run | None,
         progress: Progress | None,
         keep_every: int,
-        validate: Callable[[Params], float] | None = None,
+        validation: Validation | None = None,
     ) -> None:
-        """A checkpoint is kept every `keep_every` control steps, with the validation error that `validate` gives, the
-        smallest being the best; without it the greatest reward is. Processes that write nothing (see
-        `ballu_mjx.distributed`) have neither `run` nor `progress`."""
-        self._run, self._progress, self._validate = run, progress, validate
+        """A checkpoint is kept every `keep_every` control steps, with what `validation` measures, which tells the best;
+        without it the greatest reward does. Processes that write nothing (see `ballu_mjx.distributed`) have neither
+        `run` nor `progress`."""
+        self._run, self._progress, self._validation = run, progress, validation
         self._every = keep_every
         self._due: int | None = None  # step of the last checkpoint that was not an interruption's
         self._made_with: dict[str, Any] = {}
         self._saved = 0
-        self._score: float | None = None
+        self._validated: float | None = None
         self._warned = False
         self._started = time.perf_counter()
         self._watchdog = Watchdog(Path("RUN") if run is None else run.folder)
@@ -265,8 +276,8 @@ class Session:
             self._keep(step, state, metrics)
         if metrics and self._progress is not None:
             shown = f"reward {metrics['reward']:.3f}"
-            if self._score is not None:
-                shown += f", validation error {self._score:.3f}"
+            if self._validation is not None and self._validated is not None:
+                shown += f", {self._validation.name.replace('_', ' ')} {self._validated:.3f}"
             self._progress.update(step, metrics["steps_per_second"], shown)
         if distributed.anywhere(bool(self.interrupted)):
             self._save(step, state, None)
@@ -276,10 +287,11 @@ class Session:
     def _keep(self, step: int, state: TrainingState, metrics: Mapping[str, float]) -> None:
         self._due = step
         score = -metrics.get("reward", -math.inf)
-        if self._validate is not None:
+        if self._validation is not None:
             began = time.perf_counter()
-            score = self._score = self._validate(learner.params(state))
-            self._log(step, {"validation_error": score, "validation_seconds": time.perf_counter() - began})
+            measured = self._validated = self._validation.measure(learner.params(state))
+            self._log(step, {self._validation.name: measured, "validation_seconds": time.perf_counter() - began})
+            score = -measured if self._validation.greatest else measured
         self._save(step, state, score)
 
     def _save(self, step: int, state: TrainingState, score: float | None) -> None:

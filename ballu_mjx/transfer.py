@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx import files
+from ballu_mjx import files, stepping
 from ballu_mjx.errors import InputError, is_number
 from ballu_mjx.robot import CONTROL_TIMESTEP
 
@@ -45,6 +45,8 @@ class Path:
     """Centre of mass (m, world)."""
     yaw: Float[np.ndarray, " T"]
     """Of the balloon (rad, world), not unwrapped."""
+    feet: Float[np.ndarray, "T 2 3"]
+    """Left and right (m, world)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +71,10 @@ class Transfer:
     """Simulation (m)."""
     sim_yaw_change: float
     """Simulation (deg); full turns count."""
+    steps: float
+    """Robot: see `stepping.steps`."""
+    sim_steps: float
+    """Simulation."""
 
     def to_json(self) -> dict[str, float]:
         """All figures, as plain numbers."""
@@ -113,11 +119,12 @@ def compare(simulation: Path, robot: Path) -> Transfer:
     Both must start from (nearly) the same state: nothing is aligned, and an offset at the start counts as error. Only
     yaws at the start on either side of the half turn are taken as the near neighbours that they are.
 
-    **Raises** `ValueError` where a path has fewer than 2 states, or not as many yaws as centres of mass.
+    **Raises** `ValueError` where a path has fewer than 2 states, or not as many yaws or feet as centres of mass.
     """
     for name, path in (("simulation", simulation), ("robot", robot)):
-        if len(path.com) != len(path.yaw):
-            raise ValueError(f"The {name} has {len(path.com)} centres of mass, but {len(path.yaw)} yaws.")
+        for what, states in (("yaws", path.yaw), ("pairs of feet", path.feet)):
+            if len(path.com) != len(states):
+                raise ValueError(f"The {name} has {len(path.com)} centres of mass, but {len(states)} {what}.")
         if len(path.com) < 2:
             raise ValueError(f"The {name} has {len(path.com)} states: a path needs 2 or more.")
     states = min(len(simulation.com), len(robot.com))
@@ -135,6 +142,8 @@ def compare(simulation: Path, robot: Path) -> Transfer:
         sim_x_distance=float(sim_way[0]),
         sim_y_distance=float(sim_way[1]),
         sim_yaw_change=float(sim_turn),
+        steps=stepping.steps(robot.feet[:states]),
+        sim_steps=stepping.steps(simulation.feet[:states]),
     )
 
 
@@ -215,7 +224,8 @@ def walking_table(results: Mapping[str, Sequence[Sequence[Transfer]]]) -> str:
     """Table I in Markdown, `results[setting][seed][trial]`: `mean [low, high]` of `bootstrap`, and the paper's number.
 
     Rows in the order given. A setting that the paper does not have shows `-` for its numbers, and a mean over one
-    trial has no interval.
+    trial has no interval. The last column, which the paper does not have, tells gaits from what is none: mean and range
+    of `stepping.steps` over all trials, on the robot and in the policies' own simulators.
     """
     return _table(results, _WALKING, PAPER_WALKING)
 
@@ -234,12 +244,15 @@ def _table(
     paper: Mapping[str, tuple[float, float, float]],
 ) -> str:
     titles = ["setting", *(title for column in columns for title in (column.title, column.paper))]
+    titles.append("steps; in simulation")
     lines = [titles, ["---"] + ["---:"] * (len(titles) - 1)]
     for setting, seeds in results.items():
         cells = [setting]
         for index, column in enumerate(columns):
             cells.append(_cell([[column.of(trial) for trial in trials] for trials in seeds], column.digits))
             cells.append(f"{paper[setting][index]:.2f}" if setting in paper else "-")
+        trials = [trial for trials in seeds for trial in trials]
+        cells.append(f"{_range([each.steps for each in trials])}; {_range([each.sim_steps for each in trials])}")
         lines.append(cells)
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
@@ -249,6 +262,11 @@ def _cell(values: Sequence[Sequence[float]], digits: int) -> str:
     if sum(len(trials) for trials in values) == 1:
         return f"{mean:.{digits}f}"
     return f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+
+
+def _range(values: Sequence[float]) -> str:
+    mean, low, high = (round(float(f(values))) for f in (np.mean, np.min, np.max))
+    return str(mean) if low == high else f"{mean} ({low} to {high})"
 
 
 def _turn(yaw: Float[np.ndarray, " T"]) -> float:

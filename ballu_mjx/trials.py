@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from ballu_mjx import plots, robot, virtual_robot
 from ballu_mjx.deployment import PolicyController
-from ballu_mjx.envmimic import Simulator, stack
+from ballu_mjx.envmimic import Simulator, feet, stack
 from ballu_mjx.locomotion import Setting
 from ballu_mjx.policy import ClosedLoop, Policy
 from ballu_mjx.reconstruction import reconstruct
@@ -43,13 +44,16 @@ def run(
     reference, com = stack(Simulator(model), motions)
     starts = [np.stack([getattr(motion, name)[0] for motion in motions]) for name in ("qpos", "qvel")]
     rollout = loop(policy.params, starts[0], starts[1], len(motions[0].command), setting)
-    hardware_ways = [
-        Way(np.asarray(com[i])[: len(m.qpos)], np.asarray(reference.features)[i, : len(m.qpos), 8])
-        for i, m in enumerate(motions)
-    ]
-    simulated = [Way(rollout.com[i], rollout.yaw[i]) for i in range(len(motions))]
+    recorded = np.asarray(com), np.asarray(reference.features)
+    hardware_ways = [_way(*(x[i, : len(motion.qpos)] for x in recorded)) for i, motion in enumerate(motions)]
+    simulated = [_way(*states) for states in zip(rollout.com, rollout.features, strict=True)]
     plots.ways(
         folder / "trials.png", [way.com for way in hardware_ways], [way.com for way in simulated], policy.setting
     )
     plots.gait(folder / "gait.png", motions[0].qpos, motions[0].command)
     return [compare(sim, real) for sim, real in zip(simulated, hardware_ways, strict=True)]
+
+
+def _way(com: Float[np.ndarray, "T 3"], features: Float[np.ndarray, "T 27"]) -> Way:
+    """Of states as `envmimic.features` sees them."""
+    return Way(com, features[:, 8], feet(features))

@@ -275,7 +275,7 @@ def test_damaged_evaluation_is_refused(short: Path, tmp_path: Path, capsys):
 
 
 def test_story_shows_its_tables_and_policies_over_each_other(tmp_path: Path):
-    transfer = Transfer(*np.arange(1.0, 10.0))
+    transfer = Transfer(*np.arange(1.0, 12.0))
     results = {"vanilla+dr": [[transfer]], "envmimic": [[transfer]], HOSTILE: [[transfer]]}
     pipeline.table_file(tmp_path, "walk").write_text(walking_table(results))
     for setting, states in (("vanilla+dr", 30), ("envmimic", 25), ("envmimic-2", 28)):

@@ -128,6 +128,18 @@ def test_without_validation_the_greatest_reward_is_the_best_checkpoint(tmp_path)
     assert runs.restore(tmp_path / "run", "last")[0] == 300
 
 
+@pytest.mark.parametrize(("greatest", "best"), [(False, 100), (True, 200)])
+def test_validation_tells_the_best_checkpoint_whatever_the_reward(tmp_path, greatest: bool, best: int):
+    with open_run(tmp_path / "run") as run:
+        validation = Validation(lambda params: float(params.policy["w"][0] % 200), "measured", greatest=greatest)
+        session = session_in(run, validation=validation)
+        session._step_done(0, state(99.0), {})
+        for step, reward in ((100, 0.3), (200, 0.1), (300, 0.2)):
+            session._step_done(step, state(-step if greatest else 1.5 * step), GOOD | {"reward": reward})
+    assert runs.restore(tmp_path / "run", "best")[0] == best
+    assert [row["measured"] for row in runs.read_metrics(tmp_path / "run") if "measured" in row]
+
+
 @pytest.fixture(scope="module")
 def small() -> Learner:
     return Learner(Follower(), CONFIG)

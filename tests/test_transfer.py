@@ -32,17 +32,22 @@ def clock(seconds: float) -> Float[np.ndarray, " T"]:
     return np.arange(round(seconds / CONTROL_TIMESTEP) + 1) * CONTROL_TIMESTEP
 
 
+def resting(com: Float[np.ndarray, "T 3"], yaw: Float[np.ndarray, " T"]) -> Path:
+    """Feet stay where they are."""
+    return Path(com, yaw, np.zeros((len(com), 2, 3)))
+
+
 def straight(seconds: float, speed: float, yaw: float = 0.0) -> Path:
     """Along x from the origin, 1 m high."""
     time = clock(seconds)
-    return Path(np.stack([speed * time, 0 * time, 0 * time + 1.0], axis=1), np.full(len(time), yaw))
+    return resting(np.stack([speed * time, 0 * time, 0 * time + 1.0], axis=1), np.full(len(time), yaw))
 
 
 def circle(seconds: float, turns: float, radius: float = 1.0) -> Path:
     """Leftwards from the origin, heading along x; yaw as a sensor gives it, within half a turn."""
     angle = 2 * np.pi * turns * clock(seconds) / seconds
     com = radius * np.stack([np.sin(angle), 1 - np.cos(angle), 0 * angle], axis=1)
-    return Path(com, np.arctan2(np.sin(angle), np.cos(angle)))
+    return resting(com, np.arctan2(np.sin(angle), np.cos(angle)))
 
 
 def trial(value: float) -> Transfer:
@@ -58,7 +63,7 @@ def test_straight_walk() -> None:
 
 def test_constant_offset_is_the_com_error_in_three_dimensions() -> None:
     robot = straight(5, 0.1)
-    found = compare(Path(robot.com + np.array([0.2, -0.3, 0.6]), robot.yaw), robot)
+    found = compare(resting(robot.com + np.array([0.2, -0.3, 0.6]), robot.yaw), robot)
     assert found.com_error == pytest.approx(0.7)
     assert found.sim_x_distance == pytest.approx(found.x_distance)
 
@@ -80,7 +85,7 @@ def test_starts_on_either_side_of_the_half_turn_are_near() -> None:
 
 def test_looks_at_the_shorter_path_whichever_it_is() -> None:
     short, long = straight(4, 0.1), circle(20, 1.0)
-    cut = Path(long.com[: len(short.com)], long.yaw[: len(short.yaw)])
+    cut = resting(long.com[: len(short.com)], long.yaw[: len(short.yaw)])
     assert compare(short, long) == compare(short, cut)
     assert compare(long, short) == compare(cut, short)
 
@@ -104,18 +109,18 @@ def test_path_length_of_a_circle() -> None:
 
 def test_single_precision_serves() -> None:
     way = straight(10, 0.1)
-    single = Path(way.com.astype(np.float32), way.yaw.astype(np.float32))
+    single = resting(way.com.astype(np.float32), way.yaw.astype(np.float32))
     assert compare(single, single).x_distance == pytest.approx(1.0, rel=1e-5)
 
 
 def test_refuses_paths_that_are_none() -> None:
     way = straight(1, 0.1)
-    point = Path(way.com[:1], way.yaw[:1])
+    point = resting(way.com[:1], way.yaw[:1])
     for pair, name in (((point, way), "simulation"), ((way, point), "robot")):
         with pytest.raises(ValueError, match=f"The {name} has 1 states"):
             compare(*pair)
     with pytest.raises(ValueError, match="21 centres of mass, but 20 yaws"):
-        compare(way, Path(way.com, way.yaw[:-1]))
+        compare(way, Path(way.com, way.yaw[:-1], way.feet))
 
 
 def test_json_round_trip() -> None:
@@ -173,22 +178,22 @@ def test_table_has_the_papers_rows_and_numbers(
     names = (*SETTINGS, "envmimic, other draughts")
     results = {name: [[trial(0.1), trial(0.3)], [trial(0.2), trial(0.4)]] for name in names}
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table(results).splitlines()]
-    assert [len(row) for row in rows] == [7] * 7
+    assert [len(row) for row in rows] == [8] * 7
     assert [row[0] for row in rows[2:]] == list(names)
     for row in rows[2:6]:
-        assert row[2::2] == [f"{value:.2f}" for value in paper[row[0]]]
-    assert rows[6][2::2] == ["-"] * 3
-    assert all(cell.startswith(("0.25 [0.", "0.2 [0.")) for row in rows[2:] for cell in row[1::2])
+        assert row[2:7:2] == [f"{value:.2f}" for value in paper[row[0]]]
+    assert rows[6][2:7:2] == ["-"] * 3
+    assert all(cell.startswith(("0.25 [0.", "0.2 [0.")) for row in rows[2:] for cell in row[1:6:2])
     assert table(results).isascii()
 
 
 def test_tables_numbers() -> None:
     """Absolute yaw errors, for those of +10 and -10 do not make a perfect policy; no interval about one trial."""
-    errors = [dataclasses.replace(trial(0.0), yaw_error=value) for value in (10.0, -10.0)]
+    errors = [dataclasses.replace(trial(0.0), yaw_error=value, steps=20 + value) for value in (10.0, -10.0)]
     assert turning_table({"envmimic": [errors]}).splitlines()[-1] == (
-        "| envmimic | 10.0 [10.0, 10.0] | 3.50 | 0.00 [0.00, 0.00] | 0.29 | 0.0 [0.0, 0.0] | 36.42 |"
+        "| envmimic | 10.0 [10.0, 10.0] | 3.50 | 0.00 [0.00, 0.00] | 0.29 | 0.0 [0.0, 0.0] | 36.42 | 20 (10 to 30); 0 |"
     )
     walk = dataclasses.replace(trial(0.0), com_error=0.5, x_distance=1.234, total_distance=2.0)
     assert walking_table({"vanilla+dr": [[walk]]}).splitlines()[-1] == (
-        "| vanilla+dr | 0.50 | 1.24 | 1.23 | 0.32 | 2.00 | 0.60 |"
+        "| vanilla+dr | 0.50 | 1.24 | 1.23 | 0.32 | 2.00 | 0.60 | 0; 0 |"
     )

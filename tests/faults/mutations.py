@@ -445,7 +445,7 @@ def formats(work: Path) -> list[Format]:
         lambda mark: None if type(mark["done"]) is bool and len(mark["key"]) == 16 else "key", share=5)  # fmt: skip
     folder = place()
     path = folder / "transfer.json"
-    transfer.write(path, [transfer.Transfer(*np.arange(9.0) / 7), transfer.Transfer(*np.arange(9.0))])
+    transfer.write(path, [transfer.Transfer(*np.arange(11.0) / 7), transfer.Transfer(*np.arange(11.0))])
     add("transfer.json", path, JSON, lambda path=path: transfer.read(path), transfers_fault, share=5)
 
     folder = place()
