@@ -4,7 +4,7 @@ config.json         all it takes to repeat the run
 metrics.jsonl       one JSON object a line: `step` (control steps) and what was measured there
 tensorboard/        the same for TensorBoard
 wandb/              the same for Weights & Biases, on demand
-checkpoints/STEP/   the last three, and the best by validation error (orbax): `params`, all it takes to use what was
+checkpoints/STEP/   the last three, and the best by validation (orbax): `params`, all it takes to use what was
                     learned; `training`, what else it takes to go on; `record.json`, checksums of all files
 evaluation.txt, evaluation.json, learning_curve.png, tracking.png
 replay.npz          what the robots did, for `ballu_mjx.report` and `ballu_mjx.view`
@@ -384,7 +384,7 @@ class Run:
         **Arguments**
 
         - `params`: nested dictionaries of arrays.
-        - `score`: validation error, the smallest is the best; None where there is none.
+        - `score`: by validation, the smallest is the best; None where there is none.
         - `training`: what else it takes to go on.
         - `notes`: what whoever goes on wants to know beside it; goes into JSON and back.
         """

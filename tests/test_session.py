@@ -24,7 +24,7 @@ from ballu_mjx.errors import InputError
 from ballu_mjx.learner import Learner, TrainingState
 from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.runs import Progress, Run
-from ballu_mjx.session import Session, Start, Watchdog, _made_with, start_from
+from ballu_mjx.session import Session, Start, Validation, Watchdog, _made_with, start_from
 
 GOOD = {"reward": 0.1, "diverged": 0.0, "steps_per_second": 100.0, "total_loss": 0.5}
 
@@ -128,16 +128,16 @@ def test_without_validation_the_greatest_reward_is_the_best_checkpoint(tmp_path)
     assert runs.restore(tmp_path / "run", "last")[0] == 300
 
 
-@pytest.mark.parametrize(("greatest", "best"), [(False, 100), (True, 200)])
-def test_validation_tells_the_best_checkpoint_whatever_the_reward(tmp_path, greatest: bool, best: int):
+@pytest.mark.parametrize(("greatest", "best"), [(False, 300), (True, 100)])
+def test_validation_tells_the_best_checkpoint_whatever_the_reward(tmp_path: Path, greatest: bool, best: int):
+    measured = {100: 3.0, 200: 2.0, 300: 1.0}
     with open_run(tmp_path / "run") as run:
-        validation = Validation(lambda params: float(params.policy["w"][0] % 200), "measured", greatest=greatest)
-        session = session_in(run, validation=validation)
-        session._step_done(0, state(99.0), {})
-        for step, reward in ((100, 0.3), (200, 0.1), (300, 0.2)):
-            session._step_done(step, state(-step if greatest else 1.5 * step), GOOD | {"reward": reward})
+        session = session_in(run, validation=Validation(lambda params: float(params.policy["w"][0]), "way", greatest))
+        session._step_done(0, state(2.5), {})
+        for step, reward in ((100, 0.1), (200, 0.3), (300, 0.2)):
+            session._step_done(step, state(measured[step]), GOOD | {"reward": reward})
     assert runs.restore(tmp_path / "run", "best")[0] == best
-    assert [row["measured"] for row in runs.read_metrics(tmp_path / "run") if "measured" in row]
+    assert [row["way"] for row in runs.read_metrics(tmp_path / "run") if "way" in row] == [2.5, *measured.values()]
 
 
 @pytest.fixture(scope="module")
