@@ -31,18 +31,18 @@ from ballu_mjx.windows import Windows
 class AnalyticConfig:
     """How to learn by gradients through the simulation."""
 
-    window_seconds: float = 2.0
+    window_seconds: float = 8.0
     """Length of a window, s."""
-    interval_seconds: float = 2.0
+    interval_seconds: float = 8.0
     """Time between the starts of two windows, s."""
-    rounds: int = 2
-    """Simulations of all windows, each linearized and then learned on."""
-    updates: int = 200
-    """Gradient steps in a round."""
-    validate_every: int = 50
+    rounds: int = 8
+    """Simulations of windows, each linearized and then learned on."""
+    windows: int = 16
+    """Windows in a round, drawn anew for each."""
+    updates: int = 20
+    """Gradient steps in a round, each on all its windows."""
+    validate_every: int = 20
     """Gradient steps between two validations, each of which leaves a checkpoint."""
-    batch_size: int = 64
-    """Windows in a gradient step."""
     learning_rate: float = 1e-3
     """Adam's."""
     max_grad_norm: float = 1.0
@@ -52,7 +52,7 @@ class AnalyticConfig:
     """Gradient steps over which the network that is handed out is averaged (exponentially)."""
     force_cost: float = 0.0
     """Loss for each N^2 of force."""
-    observation_noise: float = 0.3
+    observation_noise: float = 1.0
     """Noise on what the network sees in training, in multiples of each entry's spread over the recordings."""
     start_noise: float = 0.0
     """Perturbation of a window's first state, in multiples of what reconstruction leaves uncertain."""
@@ -63,7 +63,7 @@ class AnalyticConfig:
 def check(config: AnalyticConfig) -> None:
     """**Raises** `InputError` for options out of range, naming the option."""
     windows.check(config.window_seconds, config.interval_seconds)
-    for name in ("rounds", "updates", "validate_every", "batch_size", "learning_rate", "max_grad_norm", "averaging"):
+    for name in ("rounds", "windows", "updates", "validate_every", "learning_rate", "max_grad_norm", "averaging"):
         if not getattr(config, name) > 0:
             raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name)}: it must be greater than 0.")
 
@@ -132,18 +132,21 @@ def train(
     simulate, linearize = simulator(model, forces, beside), Linearizer(model, beside, forces=forces.config.forces)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
     starts = envmimic.start_spread(model, robot_description.ballu())
-    some = _updates(forces, wrap, optimizer, spread, starts, config)
+    update = _updates(forces, wrap, optimizer, spread, starts, config)
     carry = (start, optimizer.init(start), start)
     key = jax.random.key(config.seed)
     done = 0
     for _ in range(config.rounds):
-        steps, features = simulate(wrap(jax.device_get(carry[0])), recorded)
-        data = _in_windows(linearize(steps), steps.loads, recorded)
-        loss = float(np.mean(jax.vmap(_loss)(features, recorded.features)))
+        key, own = jax.random.split(key)
+        drawn = np.asarray(jax.random.permutation(own, len(recorded.qpos)))[: config.windows]
+        taken = jax.tree.map(lambda x, drawn=drawn: np.asarray(x)[drawn], recorded)
+        steps, features = simulate(wrap(jax.device_get(carry[0])), taken)
+        data = _in_windows(linearize(steps), steps.loads, taken)
+        loss = float(np.mean(jax.vmap(_loss)(features, taken.features)))
         for first in range(0, config.updates, config.validate_every):
             key, own = jax.random.split(key)
             count = min(config.validate_every, config.updates - first)
-            carry, (linear, gradient) = some(carry, jax.random.split(own, count), data)
+            carry, (linear, gradient) = update(carry, jax.random.split(own, count), data)
             done += count
             found = {"loss": loss, "linear_loss": float(jnp.mean(linear)), "gradient": float(jnp.median(gradient))}
             report(done, jax.device_get(carry[2]), found)
@@ -199,18 +202,12 @@ def _updates(
     @jax.jit
     def some(carry: tuple, keys: Array, data: tuple) -> tuple[tuple, tuple]:
         count = len(data[1])
-        size = min(config.batch_size, count)
 
         def update(carry: tuple, key: Array) -> tuple[tuple, tuple]:
             params, state, average = carry
-            key_choice, key_noise = jax.random.split(key)
-            chosen = jax.random.permutation(key_choice, count)[:size]
-            batch = jax.tree.map(lambda x: x[chosen], data)
 
             def loss(params: Any) -> tuple[Array, Array]:
-                both = jax.vmap(lambda key, *own: window_loss(params, key, *own))(
-                    jax.random.split(key_noise, size), *batch
-                )
+                both = jax.vmap(lambda key, *own: window_loss(params, key, *own))(jax.random.split(key, count), *data)
                 return jnp.mean(both[0]), jnp.mean(both[1])
 
             (_, tracking), slope = jax.value_and_grad(loss, has_aux=True)(params)

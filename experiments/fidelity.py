@@ -70,6 +70,7 @@ METHODS = {
     "multi": Method("EnvMimic, forces at balloon, base and feet", ("envmimic", "--forces", "multi")),
     "supervised": Method("supervised", ("residual", "--method", "supervised")),
     "analytic": Method("analytic", ("residual", "--method", "analytic")),
+    "analytic-wrench": Method("analytic, wrench", ("residual", "--method", "analytic", "--forces", "wrench")),
     AIR: Method("aerodynamic", ("residual", "--method", "aerodynamic"), seeded=False),
     "air-analytic": Method("aerodynamic+analytic", ("residual", "--method", "analytic"), beside_air=True),
     "air-envmimic": Method("aerodynamic+EnvMimic", ("envmimic",), beside_air=True),
