@@ -87,9 +87,9 @@ class Options(loggers.LoggingOptions):
     """Trials on the robot for each policy, each in a draught of its own."""
     takes: int = 2
     """Recordings of each sequence of actions, each in a draught of its own."""
-    policy_steps: int = 1_500_000
+    policy_steps: int = 3_000_000
     """Control steps to train each policy for."""
-    residual_steps: int = 1_500_000
+    residual_steps: int = 3_000_000
     """Control steps to train each EnvMimic for."""
     rounds: int = 1
     """How often EnvMimic learns. From the second time on, its recordings are joined by the robot's motion under the
