@@ -3,7 +3,7 @@
 Windows of the recordings are simulated with the network's forces, and every control step of them is linearized
 (`linearization`). Backpropagation through these derivatives, in time order, is backpropagation through the accurate
 simulator, contacts included; and for small changes of the forces the linearized windows go on standing in for it, so
-that one simulation serves hundreds of gradients. Then all is simulated and linearized afresh.
+that one simulation serves some gradient steps. Then other windows are simulated and linearized.
 """
 
 from __future__ import annotations

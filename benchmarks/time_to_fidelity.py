@@ -151,7 +151,7 @@ def plot(path: Path, entries: list[dict[str, Any]], target: float, machine: str)
         left += values
     reached = all(entry["seconds_to_target"] is not None for entry in entries)
     below.set_xlabel(f"time (s) to {'the target' if reached else 'the last validation (target not reached by all)'}")
-    below.legend(ncols=len(STAGES), fontsize=8)
+    figure.legend(*below.get_legend_handles_labels(), ncols=len(STAGES), fontsize=8, loc="outside lower center")
     above.set_title(machine, fontsize=9)
     common.save(figure, path)
 
