@@ -33,7 +33,7 @@ from ballu_mjx import (
 from ballu_mjx.errors import InputError
 from ballu_mjx.locomotion import LocomotionConfig
 from ballu_mjx.policy import ClosedLoop, Policy, Rollout
-from ballu_mjx.ppo import PPOConfig
+from ballu_mjx.ppo import Params, PPOConfig
 from ballu_mjx.replay import Take
 from ballu_mjx.robot import ActuatorParameters
 from ballu_mjx.session import Session, Validation, start_from
@@ -103,11 +103,13 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
     content = runs.describe(task.name, {"env": config, "ppo": ppo_config, "data": data}, {}, devices, identified)
     content["residual"] = None if forces is None else str(forces.resolve())
     loop = ClosedLoop(env, ppo.make_inference(env.observation_size, env.action_size, ppo_config))
-    starts, steps = loop.standing(_VALIDATION_STARTS), round(task.trial_seconds / robot.CONTROL_TIMESTEP)
-    # Of training's reward exploration is a part: it frees a robot that would rest without.
-    validation = Validation(
-        lambda params: float(loop(params, *starts, steps).reward.mean()), "validation_reward", greatest=True
-    )
+
+    def trials(params: Params) -> Rollout:
+        steps = round(task.trial_seconds / robot.CONTROL_TIMESTEP)
+        return loop(params, *loop.standing(_VALIDATION_STARTS), steps)
+
+    # Training's reward says too little: exploration frees a robot that would rest without.
+    validation = Validation(lambda params: float(trials(params).reward.mean()), "validation_reward", greatest=True)
     if not distributed.is_first():
         return Session(None, None, data.keep_every, validation).follow(env, ppo_config, start, content)
 
@@ -129,7 +131,7 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
     curves = (*runs.column(folder, "reward"), *runs.column(folder, validation.name))
     plots.reward_curve(folder / "learning_curve.png", *curves, setting)
     trained = Policy.load(folder)
-    rollout = loop(trained.params, *starts, steps)
+    rollout = trials(trained.params)
     plots.gait(folder / "gait.png", rollout.qpos[0], rollout.command[0])
     time_axis = np.arange(len(rollout.qpos[0])) * robot.CONTROL_TIMESTEP
     episode = Take(name=task.name, time=time_axis, qpos={setting: rollout.qpos[0]}, command=rollout.command[0])

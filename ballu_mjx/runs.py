@@ -442,7 +442,8 @@ def restore(folder: Path, which: Which) -> tuple[int, dict[str, Any]]:
             raise _no_checkpoint(folder, "validated checkpoint" if which == "best" else "checkpoint")
         return step, _read(folder, step, training=False).params
     except _DamagedError as error:
-        raise InputError(f"{error}; restore it from a copy, or use the run's last checkpoint.") from error
+        mend = "restore it from a copy, or delete its folder: then the next best is taken"
+        raise InputError(f"{error}; {mend}.") from error
 
 
 def last_checkpoint(folder: Path, *, training: bool = False) -> Checkpoint:
