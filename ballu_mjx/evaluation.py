@@ -85,6 +85,12 @@ def base_name(identified: bool) -> str:
     return "vanilla+sysid" if identified else "vanilla"
 
 
+def quotient(with_it: float, without: float) -> float:
+    """Error with a residual over error without; 1 where there is none either way, as of the yaw of a robot that cannot
+    turn."""
+    return max(with_it, _LEAST) / max(without, _LEAST)
+
+
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
     """A simulator's errors beside vanilla's, on the same recordings and starts."""
@@ -101,10 +107,9 @@ class Evaluation:
         return tuple(dict.fromkeys(errors.group for errors in self.vanilla))
 
     def ratio(self, group: str, quantity: str, horizon: float) -> float:
-        """Error with the residual over error without, each averaged over the group's recordings; 1 where there is none
-        either way, as of the yaw of a robot that cannot turn."""
+        """`quotient` of the errors with the residual and without, each averaged over the group's recordings."""
         with_it, without = (_group_mean(e, group, quantity, horizon) for e in (self.residual, self.vanilla))
-        return max(with_it, _LEAST) / max(without, _LEAST)
+        return quotient(with_it, without)
 
     @property
     def score(self) -> float:

@@ -248,6 +248,8 @@ def _add_evaluation(content: Content, folder: Path, prefix: str = "") -> None:
 
 def _horizons(title: str, names: tuple[str, str], without: Errors, mimic: Errors) -> Table:
     """One recording's errors by horizon: mean over the starts, without and with the residual, and their ratio."""
+    from ballu_mjx.evaluation import quotient
+
     header = ["horizon (s)"]
     for key, quantity, _ in _QUANTITIES:
         header += [*(f"{quantity}, {name}" for name in names), f"{key}, ratio"]
@@ -256,7 +258,7 @@ def _horizons(title: str, names: tuple[str, str], without: Errors, mimic: Errors
         row = [Cell(f"{horizon:g}")]
         for key, _, digits in _QUANTITIES:
             one, other = getattr(without, key)[horizon][0], getattr(mimic, key)[horizon][0]
-            row += [_cell(one, digits), _cell(other, digits), _cell(other / one, 2)]
+            row += [_cell(one, digits), _cell(other, digits), _cell(quotient(other, one), 2)]
         rows.append(row)
     return Table(title, header, rows)
 

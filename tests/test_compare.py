@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from ballu_mjx import compare, runs
-from ballu_mjx.evaluation import HORIZONS, Errors, Evaluation
+from ballu_mjx.evaluation import HORIZONS, Errors, Evaluation, quotient
 
 REWARD = {"a0": 1.0, "a1": 1.2, "a2": 1.1, "b0": 0.5, "b1": 0.7}
 
@@ -89,3 +89,9 @@ def test_what_cannot_be_compared_is_refused(folders: list[Path], tmp_path: Path,
         assert compare.main([str(folder) for folder in given]) == 2
         error = capsys.readouterr().err
         assert sentence in error and error.count("\n") == 1
+
+
+def test_a_ratio_of_errors_is_a_number_where_there_is_no_error() -> None:
+    assert quotient(0.0, 0.0) == 1.0
+    assert quotient(0.2, 0.1) == pytest.approx(2.0)
+    assert 1.0 < quotient(0.1, 0.0) < np.inf
