@@ -187,3 +187,8 @@ def test_closed_loop_is_the_environment_step_by_step():
         np.testing.assert_allclose(rollout.com[-1, number + 1], inner(state)["com"], atol=1e-4)
         assert rollout.reward[-1, number] == pytest.approx(float(state.reward), abs=1e-3)
     assert rollout.qpos.shape == (9, 6, MODEL.nq) and rollout.reward.shape == (9, 5)
+    data = mujoco.MjData(MODEL)
+    data.qpos[:] = rollout.qpos[-1, -1]
+    mujoco.mj_kinematics(MODEL, data)
+    standing = [data.site(f"foot_{side}").xpos for side in ("left", "right")]
+    np.testing.assert_allclose(envmimic.feet(rollout.features)[-1, -1], standing, atol=1e-4)
