@@ -201,11 +201,10 @@ class Session:
         run: Run | None,
         progress: Progress | None,
         keep_every: int,
-        validation: Validation | None = None,
+        validation: Validation,
     ) -> None:
-        """A checkpoint is kept every `keep_every` control steps, with what `validation` measures, which tells the best;
-        without it the greatest reward does. Processes that write nothing (see `ballu_mjx.distributed`) have neither
-        `run` nor `progress`."""
+        """A checkpoint is kept every `keep_every` control steps, with what `validation` measures, which tells the best.
+        Processes that write nothing (see `ballu_mjx.distributed`) have neither `run` nor `progress`."""
         self._run, self._progress, self._validation = run, progress, validation
         self._every = keep_every
         self._due: int | None = None  # step of the last checkpoint that was not an interruption's
@@ -228,11 +227,11 @@ class Session:
             self._due = start.checkpoint.notes.get("due", self._saved)
         try:
             with self._interrupts_noted(), self._watchdog:
-                state, metrics = learner.train(
+                state, _ = learner.train(
                     env, config, self._step_done, start=lambda new: start.state(new, config, self._made_with)
                 )
                 if self._due != int(state.steps):
-                    self._keep(int(state.steps), state, metrics)
+                    self._keep(int(state.steps), state)
         except KeyboardInterrupt:
             self._close()
             if self._run is not None:
@@ -273,10 +272,10 @@ class Session:
         if metrics:
             self._log(step, metrics | {"seconds": time.perf_counter() - self._started})
         if self._due is None or step - self._due >= self._every:
-            self._keep(step, state, metrics)
+            self._keep(step, state)
         if metrics and self._progress is not None:
             shown = f"reward {metrics['reward']:.3f}"
-            if self._validation is not None and self._validated is not None:
+            if self._validated is not None:
                 shown += f", {self._validation.name.replace('_', ' ')} {self._validated:.3f}"
             self._progress.update(step, metrics["steps_per_second"], shown)
         if distributed.anywhere(bool(self.interrupted)):
@@ -284,15 +283,12 @@ class Session:
             raise KeyboardInterrupt
         self._watchdog.step_done(step if metrics else None)
 
-    def _keep(self, step: int, state: TrainingState, metrics: Mapping[str, float]) -> None:
+    def _keep(self, step: int, state: TrainingState) -> None:
         self._due = step
-        score = -metrics.get("reward", -math.inf)
-        if self._validation is not None:
-            began = time.perf_counter()
-            measured = self._validated = self._validation.measure(learner.params(state))
-            self._log(step, {self._validation.name: measured, "validation_seconds": time.perf_counter() - began})
-            score = -measured if self._validation.greatest else measured
-        self._save(step, state, score)
+        began = time.perf_counter()
+        measured = self._validated = self._validation.measure(learner.params(state))
+        self._log(step, {self._validation.name: measured, "validation_seconds": time.perf_counter() - began})
+        self._save(step, state, -measured if self._validation.greatest else measured)
 
     def _save(self, step: int, state: TrainingState, score: float | None) -> None:
         params, training = ppo.as_tree(learner.params(state)), learner.stored(state)

@@ -23,8 +23,8 @@ from ballu_mjx import runtime
 runtime.prepare()
 from pathlib import Path
 from ballu_mjx import distributed, ppo, runs
-from ballu_mjx.session import Session, Start
-from follower import Follower
+from ballu_mjx.session import Session, Start, Validation
+from follower import Follower, weight
 
 options, folder = json.loads(sys.argv[1]), Path(sys.argv[2])
 distributed.join(distributed.DistributedOptions(**options))
@@ -34,9 +34,9 @@ sections = {"env": Follower.limit, "ppo": config}
 content = {"task": "follow", "starts": [], "recordings": {}, "ppo": {"learning_rate": 1e-4, "seed": 0}}
 if distributed.is_first():
     with runs.Run(folder, content) as run:
-        Session(run, None, 320).train(Follower(), config, Start(), content)
+        Session(run, None, 320, Validation(weight)).train(Follower(), config, Start(), content)
 else:
-    sys.exit(Session(None, None, 320).follow(Follower(), config, Start(), content))
+    sys.exit(Session(None, None, 320, Validation(weight)).follow(Follower(), config, Start(), content))
 """
 
 
@@ -68,7 +68,8 @@ def test_two_processes_learn_what_one_with_two_devices_does(tmp_path: Path) -> N
     finish(*both, start(tmp_path / "alone", 2))
 
     def curve(folder: str) -> list[list[float]]:
-        return [[row["reward"], row["total_loss"], row["distance"]] for row in runs.read_metrics(tmp_path / folder)]
+        rows = runs.read_metrics(tmp_path / folder)
+        return [[row["reward"], row["total_loss"], row["distance"]] for row in rows if "reward" in row]
 
     assert len(curve("process-0")) == 6
     np.testing.assert_allclose(curve("process-0"), curve("alone"), rtol=1e-6)

@@ -45,11 +45,11 @@ TIMINGS = ("seconds", "steps_per_second", "validation_seconds")
 
 def train(folder: Path) -> None:
     """Begin the training in `folder`, or go on with it, to its end."""
-    from follower import Follower
+    from follower import Follower, weight
 
     from ballu_mjx import learner, runs
     from ballu_mjx.ppo import PPOConfig
-    from ballu_mjx.session import Session, start_from
+    from ballu_mjx.session import Session, Validation, start_from
 
     config = PPOConfig(
         num_timesteps=STEPS * STEP,
@@ -67,7 +67,7 @@ def train(folder: Path) -> None:
     content = runs.describe(TASK, {"ppo": config}, {}, [])
     with runs.Run(folder, content, resumed_at=start.resumed_at) as run:
         progress = runs.Progress(learner.total_timesteps(config), start.step, stream=io.StringIO())
-        Session(run, progress, EVERY * STEP).train(Follower(), config, start, content)
+        Session(run, progress, EVERY * STEP, Validation(weight)).train(Follower(), config, start, content)
 
 
 def quietly(folder: Path, told: Path) -> None:
