@@ -31,7 +31,8 @@ from ballu_mjx.robot_description import RobotDescription
 
 @dataclasses.dataclass(frozen=True)
 class EnvMimicConfig:
-    """The residual-force task. Defaults of the reward are the paper's; the rest was chosen by ablation (README)."""
+    """The residual-force task. Defaults of the reward are the paper's; the rest was chosen by ablation
+    (docs/envmimic.md)."""
 
     position_weight: float = 0.7
     """Weight of the position term (paper: 0.7)."""

@@ -45,7 +45,7 @@ _DEGREE = float(np.pi / 180)
 
 @dataclasses.dataclass(frozen=True)
 class IdentificationConfig:
-    """How actuators are identified. The defaults were chosen by measurement (README)."""
+    """How actuators are identified. The defaults were chosen by measurement (docs/actuators.md)."""
 
     torque_limit: bool = True
     """Identify the servos' torque limits too. The paper's eight parameters alone can tell a weak servo only by a spring

@@ -31,6 +31,7 @@ from ballu_mjx import (
     air_fit,
     files,
     force_fit,
+    locomotion,
     loggers,
     plots,
     policy_training,
@@ -62,7 +63,9 @@ SETTINGS = ("vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic", "aero
 """The paper's four simulators, and one with the identified air instead of EnvMimic's forces."""
 SHARED = "envmimic-shared"
 """The setting of one EnvMimic for all tasks."""
-MORE_SETTINGS = (SHARED, "supervised", "analytic")
+NEAR = "envmimic-near"
+"""The setting with EnvMimic's forces whose policies pay for leaving what these were learned from."""
+MORE_SETTINGS = (NEAR, SHARED, "supervised", "analytic")
 """Settings that are run on request; the last two are networks that regression and gradients learn."""
 ROUNDS = "envmimic"
 """The setting that `Options.rounds` repeats. Nothing of an earlier round is replaced: later ones have their number
@@ -94,9 +97,12 @@ class Options(loggers.LoggingOptions):
     rounds: int = 1
     """How often EnvMimic learns. From the second time on, its recordings are joined by the robot's motion under the
     policies trained the time before, in closed loop; then policies are trained anew: `envmimic-2`, and so on."""
-    also: tuple[Literal["envmimic-shared", "supervised", "analytic"], ...] = ()
-    """Further simulators to train policies in: with one EnvMimic that learns from the recordings of both tasks, instead
-    of one a task; with the forces that regression, and that gradients through the simulation, learn from the task's."""
+    also: tuple[Literal["envmimic-near", "envmimic-shared", "supervised", "analytic"], ...] = ()
+    """Further simulators to train policies in: with EnvMimic's forces, and policies that pay for leaving what these
+    were learned from; with one EnvMimic that learns from the recordings of both tasks, instead of one a task; with the
+    forces that regression, and that gradients through the simulation, learn from the task's."""
+    outside_cost: float = 0.5
+    """What they pay in `envmimic-near`; see `train walk --help`."""
     quick: bool = False
     """Every stage within five minutes in all, for one task and two simulators; the tables mean nothing."""
 
@@ -193,7 +199,10 @@ class Story:
         """The run of a policy's training."""
         method, _ = plots.round_of(setting)
         learned = method in ("envmimic", "aerodynamic", *MORE_SETTINGS)
-        config = LocomotionConfig(domain_randomization=learned or setting.endswith("+dr"))
+        config = LocomotionConfig(
+            domain_randomization=learned or setting.endswith("+dr"),
+            outside_cost=self.options.outside_cost if setting == NEAR else 0.0,
+        )
         quick = policy_training.QUICK if self.options.quick else {"num_timesteps": self.options.policy_steps}
         ppo = policy_training.defaults(seed=self.seed, **quick)
         needs = []
@@ -267,6 +276,8 @@ class Story:
     def residual(self, task: str, setting: str) -> Path:
         """The run of a setting's residual, learned from the recordings of the task, those of all rounds up to its
         own."""
+        if setting == NEAR:
+            return self.residual(task, ROUNDS)
         method, number = plots.round_of(setting)
         if method == SHARED:
             recordings = [self.recordings(each) for each in TABLES]
@@ -439,6 +450,7 @@ def _check(options: Options) -> None:
         raise InputError("--seeds and --robot take numbers of 0 or more; give at least one seed.")
     if not options.tasks:
         raise InputError("--tasks is empty; name walk, turn, or both.")
+    locomotion.check(LocomotionConfig(outside_cost=options.outside_cost))
     if options.output.exists() and not options.output.is_dir():
         raise InputError(f"{options.output}: is a file; give --output a folder.")
     files.check_folder(options.output)

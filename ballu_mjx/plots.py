@@ -33,8 +33,9 @@ COLOURS: Mapping[str, str] = {
     "aerodynamic+envmimic": "#332288",
     "aerodynamic+analytic": "#aa4499",
     "envmimic-shared": "#117733",
+    "envmimic-near": "#88ccee",
 }
-"""One colour for each simulator in all figures (Okabe and Ito's, four of Tol's: the colour-blind tell them apart)."""
+"""One colour for each simulator in all figures (Okabe and Ito's, five of Tol's: the colour-blind tell them apart)."""
 
 LABELS: Mapping[str, str] = {
     "recording": "recording",
@@ -49,6 +50,7 @@ LABELS: Mapping[str, str] = {
     "aerodynamic+envmimic": "aerodynamic+EnvMimic",
     "aerodynamic+analytic": "aerodynamic+analytic",
     "envmimic-shared": "EnvMimic, one for all tasks",
+    "envmimic-near": "EnvMimic, near its data",
 }
 
 

@@ -80,6 +80,7 @@ def test_trials_of_all_settings_meet_the_same_draughts_and_no_two_are_alike():
         ({"policy_steps": -5}, "--policy-steps is -5"),
         ({"seeds": ()}, "at least one seed"),
         ({"tasks": ()}, "--tasks is empty"),
+        ({"outside_cost": -1.0}, "--outside-cost is -1"),
     ],
 )
 def test_options_out_of_range_are_refused_before_anything_is_written(options, words, tmp_path):
@@ -91,13 +92,18 @@ def test_options_out_of_range_are_refused_before_anything_is_written(options, wo
 def test_each_round_learns_from_all_recordings_so_far_and_keeps_what_came_before(tmp_path, monkeypatch):
     """Which stage needs which, without making any: a stage is a folder whose needs stand beside it."""
     needs: dict[str, list[str]] = {}
+    costs: dict[str, float] = {}
 
     def stage(folder, options, sources, make, goes_on=True):
         needs[folder.name] = [source.name for source in sources]
+        if folder.name.startswith("walk-"):
+            costs[folder.name] = options[0].outside_cost
         return folder
 
     monkeypatch.setattr(pipeline, "_stage", stage)
-    options = Options(output=tmp_path, rounds=3, also=("envmimic-shared", "supervised"))
+    options = Options(
+        output=tmp_path, rounds=3, also=("envmimic-near", "envmimic-shared", "supervised"), outside_cost=2.0
+    )
     told = pipeline.Story(options, seed=0)
     for setting in pipeline.settings_of(options):
         told.policy("walk", setting)
@@ -107,7 +113,8 @@ def test_each_round_learns_from_all_recordings_so_far_and_keeps_what_came_before
         assert needs[name] == [*recorded[:number], "sysid"]
     assert needs["recordings-walk-3"] == ["walk-envmimic-2"]
     assert needs["walk-envmimic-3"] == ["envmimic-walk-3"]
-    assert needs["walk-envmimic"] == ["envmimic-walk"]
+    assert needs["walk-envmimic"] == needs["walk-envmimic-near"] == ["envmimic-walk"]
+    assert {name: cost for name, cost in costs.items() if cost} == {"walk-envmimic-near": 2.0}
     assert needs["aerodynamic-walk"] == needs["supervised-walk"] == ["recordings-walk", "sysid"]
     assert needs["envmimic-shared"] == ["recordings-walk", "recordings-turn", "sysid"]
     assert needs["walk-envmimic-shared"] == ["envmimic-shared"]
