@@ -5,7 +5,8 @@ tells control steps per second, learning included (medians of five training step
 the seconds that the first one took, and the most memory it ever held (resident):
 
 - cores: kept to one, two, ... cores, with a host device for each;
-- devices: all cores, split into one, two, ... host devices;
+- devices: all cores, split into one, two, ... host devices; these two several times in turn, for what is compared must
+  meet the machine in the same mood;
 - environments: from 64 to 8,192, a training step with as many pieces of experience;
 - episode length: from 1 to 10 s;
 - recordings: from one to sixteen, the bundled ones again and again.
@@ -20,6 +21,7 @@ import itertools
 import resource
 import sys
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,8 @@ AXES = {
     "recordings": "recordings",
 }
 """What is varied, and how its axis is called."""
+IN_TURN = ("cores", "devices")
+"""Whose values are measured one after the other, and all again."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +56,8 @@ class Options:
     """Numbers of recordings."""
     repeats: int = 5
     """Training steps that are timed."""
+    turns: int = 3
+    """How often cores and devices are measured in turn."""
     only: tuple[str, ...] = ()
     """Vary these alone, of cores, devices, environments, episode_seconds and recordings. Without this option: all."""
     output: Path = Path("runs/bench-scaling")
@@ -97,6 +103,25 @@ def measure(environments: int, episode_seconds: float | None, recordings: int | 
     }
 
 
+def merged(answers: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Of all turns; compiled was in the first."""
+    return {
+        "steps_per_second": [rate for answer in answers for rate in answer["steps_per_second"]],
+        "first_seconds": answers[0]["first_seconds"],
+        "peak_bytes": max(answer["peak_bytes"] for answer in answers),
+        "devices": answers[0]["devices"],
+    }
+
+
+def speedups(fewest: Sequence[Mapping[str, Any]], most: Sequence[Mapping[str, Any]]) -> list[float]:
+    """Of each turn."""
+
+    def speed(answer: Mapping[str, Any]) -> float:
+        return float(np.median(answer["steps_per_second"]))
+
+    return [speed(b) / speed(a) for a, b in zip(fewest, most, strict=True)]
+
+
 def plot_speed(path: Path, rows: list[dict[str, Any]], machine: str) -> None:
     """A panel for each thing varied."""
     shown = [axis for axis in AXES if any(row["axis"] == axis for row in rows)]
@@ -131,7 +156,7 @@ def plot_memory(path: Path, rows: list[dict[str, Any]], machine: str) -> None:
 def main(options: Options) -> None:
     usual = 1024
     if options.quick:
-        options = dataclasses.replace(options, repeats=2, only=options.only or ("cores",), environments=(64,))
+        options = dataclasses.replace(options, repeats=2, turns=1, only=options.only or ("cores",), environments=(64,))
         usual = 64
     counts = common.core_counts()
     varied: dict[str, tuple[float, ...]] = {
@@ -146,7 +171,8 @@ def main(options: Options) -> None:
     for axis, values in varied.items():
         if options.only and axis not in options.only:
             continue
-        for value in values:
+        answers: dict[float, list[dict[str, Any]]] = {value: [] for value in values}
+        for value in values * (options.turns if axis in IN_TURN else 1):
             request: dict[str, Any] = {"environments": usual, "episode_seconds": None, "recordings": None}
             if axis in request:
                 request[axis] = value
@@ -154,10 +180,14 @@ def main(options: Options) -> None:
             used = common.cores()[: int(value)] if axis == "cores" else None
             flags = f"--xla_force_host_platform_device_count={int(value)}" if axis == "devices" else ""
             found = common.child(__file__, request, cores=used, env={"XLA_FLAGS": flags} if flags else None)
-            rows.append({"axis": axis, "value": value, **found})
+            answers[value].append(found)
             speed = common.spread(found["steps_per_second"])
             memory = f"{found['peak_bytes'] / 1e9:.2f} GB"
             print(f"{f'{value:g} {AXES[axis]}':42}{speed:>32}{found['first_seconds']:>10.0f} s{memory:>10}", flush=True)
+        rows += [{"axis": axis, "value": value, **merged(each)} for value, each in answers.items()]
+        if axis in IN_TURN and len(values) > 1:
+            ratios = speedups(answers[values[0]], answers[values[-1]])
+            print(f"{values[-1]:g} against {values[0]:g} {AXES[axis]}: {common.spread(ratios, 2)}, by turn", flush=True)
     common.write(options.output, "scaling", {"quick": options.quick, "environments": usual, "rows": rows})
     machine = common.described(common.machine())
     plot_speed(options.output / "scaling.png", rows, machine)

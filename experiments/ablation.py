@@ -1,9 +1,9 @@
 # %% [markdown]
 # # What EnvMimic's options are worth
 #
-# Each row of the README's ablation table is the default configuration with one thing changed, trained over seeds and
-# measured on twelve recordings of their own, six near and six far, drawn at random (neither those that the main job
-# validates on, which are too few, nor any test recording). Actuators are the identified ones.
+# Each row of the ablation table in docs/envmimic.md is the default configuration with one thing changed, trained over
+# seeds and measured on twelve recordings of their own, six near and six far, drawn at random (neither those that the
+# main job validates on, which are too few, nor any test recording). Actuators are the identified ones.
 #
 # `python experiments/ablation.py` takes about an hour on two cores; what is there already is not trained again.
 # `--quick` shows that it works.

@@ -8,8 +8,8 @@
 # L-BFGS-B. Its figure shows the four curves against the command.
 #
 # Here on the bundled sweep of the virtual robot, hung up by its base, with twelve parameters (torque limits and
-# the cables' slack are added), delay, friction and backlash beside them, and least squares over the whole motion; the
-# README tells why, and what the paper's objective gives instead.
+# the cables' slack are added), delay, friction and backlash beside them, and least squares over the whole motion;
+# docs/actuators.md tells why, and what the paper's objective gives instead.
 #
 # `python experiments/actuator_curves.py` takes about five minutes, half of it compiling; `--quick` fits settled angles
 # alone, from fewer starts.

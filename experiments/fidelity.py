@@ -31,7 +31,7 @@ if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a co
 # %%
 import argparse
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from ballu_mjx import runtime
 
@@ -64,8 +64,8 @@ class Method:
 
 AIR = "aerodynamic"
 METHODS = {
-    "nominal": Method("EnvMimic", ("envmimic",), nominal=True),
-    "identified": Method("EnvMimic on identified actuators", ("envmimic",)),
+    "nominal": Method("EnvMimic on nominal actuators", ("envmimic",), nominal=True),
+    "identified": Method("EnvMimic", ("envmimic",)),
     "wrench": Method("EnvMimic, wrench", ("envmimic", "--forces", "wrench")),
     "multi": Method("EnvMimic, forces at balloon, base and feet", ("envmimic", "--forces", "multi")),
     "supervised": Method("supervised", ("residual", "--method", "supervised")),
@@ -96,7 +96,7 @@ def seconds(folder: Path) -> float:
 
 def race(folders: Mapping[str, list[Path]]) -> str:
     """Markdown: how soon methods whose progress is measured open loop are as good on the validation recordings as
-    EnvMimic on identified actuators ever is; means over seeds."""
+    EnvMimic ever is; means over seeds."""
 
     def curve(folder: Path) -> tuple[Float[np.ndarray, " steps"], Float[np.ndarray, " steps"]]:
         steps, error = runs.column(folder, "validation_error")
@@ -169,33 +169,34 @@ Results = Mapping[str, list[evaluation.Evaluation]]
 """Of each method of `METHODS`, those of all seeds."""
 
 
-def comparison(results: Results, times: Mapping[str, list[float]]) -> str:
-    """Markdown: RMSE of the simulators, what that leaves of vanilla's, and the range of that over seeds; and how long
-    learning took."""
+def comparison(results: Results, times: Mapping[str, list[float]], horizon: float) -> str:
+    """Markdown: what simulators leave of vanilla's RMSE over `horizon` s, the range of that over seeds, and how long
+    learning took. In vanilla's row stand its errors themselves; the least of a column is bold."""
     nominal, identified = results["nominal"], results["identified"]
     groups = sorted(nominal[0].groups, reverse=True)  # near before far
-    columns = [(group, horizon) for group in groups for horizon in evaluation.SCORE_HORIZONS]
-    head = [f"{group}, {horizon:g} s: m, deg" for group, horizon in columns]
-    lines = ["| simulator | " + " | ".join(head) + " | learning (s) |", "| --- " * (2 + len(columns)) + "|"]
-    rows = {"vanilla": [run.vanilla for run in nominal[:1]], "vanilla+sysid": [run.vanilla for run in identified[:1]]}
+    columns = [(group, quantity) for group in groups for quantity in ("position", "yaw")]
+    rows = {"vanilla+sysid": [run.vanilla for run in identified[:1]]}
     rows |= {METHODS[name].label: [run.residual for run in found] for name, found in results.items()}
     took = {METHODS[name].label: f"{np.mean(values):.0f}" for name, values in times.items()}
 
-    def means(row: str, group: str, quantity: str, horizon: float) -> Float[np.ndarray, " seeds"]:
-        return np.array(
-            [np.mean([getattr(e, quantity)[horizon][0] for e in run if e.group == group]) for run in rows[row]]
-        )
+    def mean(run: Sequence[evaluation.Errors], group: str, quantity: str) -> float:
+        return float(np.mean([getattr(e, quantity)[horizon][0] for e in run if e.group == group]))
 
-    for row in rows:
-        cells = []
-        for group, horizon in columns:
-            parts = []
-            for quantity, digits in (("position", 3), ("yaw", 1)):
-                values = means(row, group, quantity, horizon)
-                left = ratios(list(values / means("vanilla", group, quantity, horizon)))
-                parts.append(f"{np.mean(values):.{digits}f}: {left}")
-            cells.append(", ".join(parts))
-        lines.append(f"| {row} | " + " | ".join([*cells, took.get(row, "")]) + " |")
+    head = [f"{group}: {quantity}" for group, quantity in columns]
+    lines = [
+        f"| {horizon:g} s | " + " | ".join(head) + " | learning (s) |",
+        "| --- " + "| ---: " * (1 + len(head)) + "|",
+    ]
+    whole = {column: mean(nominal[0].vanilla, *column) for column in columns}
+    errors = [f"{whole[c]:.3f} m" if c[1] == "position" else f"{whole[c]:.1f} deg" for c in columns]
+    lines.append("| vanilla | " + " | ".join(errors) + " | |")
+    left = {
+        row: [[mean(run, *column) / whole[column] for run in runs] for column in columns] for row, runs in rows.items()
+    }
+    least = [min(np.mean(cells[place]) for cells in left.values()) for place in range(len(columns))]
+    for row, cells in left.items():
+        said = [f"**{ratios(c)}**" if np.mean(c) == low else ratios(c) for c, low in zip(cells, least, strict=True)]
+        lines.append(f"| {row} | " + " | ".join([*said, took.get(row, "")]) + " |")
     return "\n".join(lines)
 
 
@@ -361,7 +362,7 @@ def main() -> None:
     larger = {name: evaluate(members, paths) for name, members in folders.items()}
     parts = []
     for title, found in (("Bundled test recordings", results), ("Fresh test recordings", larger)):
-        parts += [f"### {title}", comparison(found, times)]
+        parts += [f"### {title}", *(comparison(found, times, horizon) for horizon in evaluation.SCORE_HORIZONS)]
         nominal = found["nominal"]
         for name in options.methods:
             evaluations = found[name] if METHODS[name].nominal else against(nominal, found[name])

@@ -33,6 +33,13 @@ def options(description: str, task: str) -> tuple[pipeline.Options, bool]:
         "--output", type=Path, help=f"folder of `train all`'s stages ({OUTPUT}, or {QUICK_OUTPUT} under --quick)"
     )
     parser.add_argument("--rounds", type=int, default=1, help="how often EnvMimic learns; see `train all --help` (1)")
+    parser.add_argument(
+        "--also",
+        nargs="+",
+        choices=pipeline.MORE_SETTINGS,
+        default=[],
+        help="further simulators; see `train all --help` (none)",
+    )
     parser.add_argument("--quick", action="store_true", help="train for seconds; the numbers mean nothing")
     parser.add_argument("--figure-only", action="store_true", help="draw from the trials that are there; run nothing")
     given = parser.parse_args()
@@ -44,6 +51,7 @@ def options(description: str, task: str) -> tuple[pipeline.Options, bool]:
         tasks=(task,),  # pyright: ignore[reportArgumentType]  # a literal at every call
         quick=given.quick,
         rounds=given.rounds,
+        also=tuple(given.also),
     )
     return chosen, given.figure_only
 
