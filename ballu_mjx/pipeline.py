@@ -156,7 +156,7 @@ def residual_folder(seed: Path, task: str, setting: str) -> Path:
     """Where, in a seed's folder, the residual of a setting is learned."""
     if setting == SHARED:
         return seed / SHARED
-    method, number = plots.round_of(setting)
+    method, number = plots.round_of(ROUNDS if setting == NEAR else setting)
     return seed / (f"{method}-{task}" if number == 1 else f"{method}-{task}-{number}")
 
 
@@ -276,8 +276,6 @@ class Story:
     def residual(self, task: str, setting: str) -> Path:
         """The run of a setting's residual, learned from the recordings of the task, those of all rounds up to its
         own."""
-        if setting == NEAR:
-            return self.residual(task, ROUNDS)
         method, number = plots.round_of(setting)
         if method == SHARED:
             recordings = [self.recordings(each) for each in TABLES]

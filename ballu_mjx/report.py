@@ -201,9 +201,11 @@ def _story(folder: Path, tables: Mapping[str, str]) -> Content:
                 image = seed / f"trials-{task}-{setting}" / "trials.png"
                 if image.is_file():
                     content.images.append((f"Trials on the robot: {where}, {setting}", image.read_bytes()))
+            residuals: dict[Path, str] = {}  # two settings may have one
             for setting in (pipeline.ROUNDS, *pipeline.settings_beyond(seed, task)):
+                residuals.setdefault(pipeline.residual_folder(seed, task, setting), setting)
+            for learned, setting in residuals.items():
                 name = f"{plots.label_of(setting)}: {where}"
-                learned = pipeline.residual_folder(seed, task, setting)
                 if (learned / "config.json").is_file():
                     _add_evaluation(content, learned, f"{name}: ")
                     if (learned / replay.NAME).is_file():

@@ -17,7 +17,7 @@ import pytest
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo.losses import PPONetworkParams
 from brax.training.types import UInt64
-from follower import Follower
+from follower import Follower, weight
 
 from ballu_mjx import files, learner, ppo, runs
 from ballu_mjx.errors import InputError
@@ -65,8 +65,7 @@ def open_run(folder: Path) -> Run:
 
 
 def session_in(run: Run, *, greatest: bool = False) -> Session:
-    validation = Validation(lambda params: float(params.policy["w"][0]), "way", greatest)
-    return Session(run, Progress(1000, stream=io.StringIO()), 100, validation)
+    return Session(run, Progress(1000, stream=io.StringIO()), 100, Validation(weight, "way", greatest))
 
 
 def test_a_run_is_written_by_one_process_at_a_time(tmp_path):
