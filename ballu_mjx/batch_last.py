@@ -72,6 +72,20 @@ def vmap(function: Callable[..., Any], in_batched: Sequence[PyTree[bool]], size:
     return batched
 
 
+def over(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+    """`jax.vmap(function)`, of which everything has a batch; on the CPU with the batch last, also of what `function`
+    has batches of itself."""
+    if jax.default_backend() != "cpu":
+        return jax.vmap(function)
+
+    def whole(*arguments: PyTree) -> PyTree:
+        size = len(jax.tree.leaves(arguments)[0])
+        found, depends = vmap(function, jax.tree.map(lambda _: True, arguments), size)(*arguments)
+        return jax.tree.map(lambda x, d: x if d else jnp.broadcast_to(x, (size, *x.shape)), found, depends)
+
+    return whole
+
+
 _WIDEST = 512
 """More than so many run one part after the other: what a robot's step keeps at hand then stays in a core's cache
 (`benchmarks/step_profile.py`)."""

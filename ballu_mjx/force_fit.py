@@ -74,9 +74,11 @@ class _Setup:
 
 
 class _Fit:
-    """A method at work: what it learned goes to `save` with its validation error, relative to no force."""
+    """A method at work, which logs and saves what it learns."""
 
-    error = "validation error (ratio)"
+    curve = "validation_error"
+    """The metric that tells the best."""
+    curve_label = "validation error (ratio)"
 
     def __init__(self, setup: _Setup, config: Any, run: Run, validate: Callable[[Any], float]) -> None:
         self.setup, self.config, self.run, self.validate = setup, config, run, validate
@@ -91,19 +93,21 @@ class _Fit:
         """A policy without force, which whatever is learned has to beat."""
         return jax.tree.map(np.zeros_like, jax.device_get(self.setup.start.policy))
 
-    def save(self, step: int, total: int, policy: Any, error: float, metrics: Mapping[str, float]) -> None:
-        """Keep what was learned, and tell."""
-        seconds = time.perf_counter() - self.began
-        self.run.log(step, {**metrics, "validation_error": error, "seconds": seconds})
+    def log(self, step: int, metrics: Mapping[str, float]) -> None:
+        """With the time so far."""
+        self.run.log(step, {**metrics, "seconds": time.perf_counter() - self.began})
+
+    def save(self, step: int, policy: Any, error: float) -> None:
+        """Keep what was learned; `error` is the validation's, open loop."""
         self.run.save(step, ppo.as_tree(self.setup.with_policy(jax.device_get(policy))), error)
-        self.stages.update("learning", step, total, error)
 
 
 class _Supervised(_Fit):
-    error = "error of validation forces (ratio)"
+    curve = "force_error"
+    curve_label = "error of validation forces (ratio)"
 
     def learn(self) -> None:
-        """Labels for training and validation, and the regression."""
+        """Labels for training and validation, the regression, and which share of its forces to take."""
         setup, config = self.setup, self.config
         simulator = envmimic.Simulator(setup.model)
         env = setup.forces.config
@@ -121,13 +125,28 @@ class _Supervised(_Fit):
             print(f"Labels, {use}: {force * 1e3:.1f} mN on the balloon (RMS along an axis).", flush=True)
         infer = jax.jit(lambda policy, seen: setup.forces.infer(setup.with_policy(policy), seen))
         seen, actions = found["validation"]
+        best = math.inf, 0, self.still
 
         def validate(step: int, policy: Any, loss: float) -> None:
+            nonlocal best
             error = _rms(np.asarray(infer(policy, seen)) - actions) / _rms(actions)
-            self.save(step, config.updates, policy, error, {"loss": loss})
+            best = min(best, (error, step, jax.device_get(policy)), key=lambda found: found[0])
+            self.log(step, {"loss": loss, "force_error": error})
+            self.stages.update("learning", step, config.updates, error)
 
         validate(0, self.still, float(np.mean(found["training"][1] ** 2)))
         supervised.regress(infer, setup.start.policy, found["training"], config, validate)
+        self.stages.close()
+        _, step, policy = best
+        parts = {share: ppo.with_share(policy, share) for share in config.shares}
+        errors = {share: self.validate(setup.with_policy(part)) for share, part in parts.items()}
+        told = ", ".join(f"{share:.0%}: {error:.2f}" for share, error in errors.items())
+        print(f"Validation error by the share of the forces that acts (ratio): {told}.", flush=True)
+        share = min(errors, key=lambda share: errors[share])
+        if share == 0.0:
+            print("No share of them is better than none: the residual is without force.", flush=True)
+        self.log(config.updates + 1, {"share": share, "validation_error": errors[share]})
+        self.save(step, parts[share], errors[share])
 
 
 class _Analytic(_Fit):
@@ -139,7 +158,10 @@ class _Analytic(_Fit):
         total = config.rounds * config.updates
 
         def report(step: int, policy: Any, metrics: dict[str, float]) -> None:
-            self.save(step, total, policy, self.validate(setup.with_policy(policy)), metrics)
+            error = self.validate(setup.with_policy(policy))
+            self.log(step, {**metrics, "validation_error": error})
+            self.save(step, policy, error)
+            self.stages.update("learning", step, total, error)
 
         report(0, self.still, {})
         analytic.train(
@@ -199,8 +221,8 @@ def _fit(task: str, data: ForcesData, config: Any, method: type[_Fit]) -> int:
     best_step, params = evaluate.load_params(folder, "best")
     names = [name for name in ("loss", "linear_loss") if len(runs.column(folder, name)[0])]
     losses = {name.replace("_", " "): runs.column(folder, name) for name in names}
-    validated = runs.column(folder, "validation_error")
-    plots.fit_curve(folder / "learning_curve.png", losses, validated, method.error, task, best_step)
+    validated = runs.column(folder, method.curve)
+    plots.fit_curve(folder / "learning_curve.png", losses, validated, method.curve_label, task, best_step)
     test = validation if prepared.one_set else evaluator("test")
     print(f"Best checkpoint: gradient step {best_step:,}. Open-loop replay of the test recordings:\n")
     print(evaluate.report(test, all_params(params), folder).table())

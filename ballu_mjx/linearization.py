@@ -17,10 +17,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from ballu_mjx import envmimic, simulation, windows
+from ballu_mjx import batch_last, envmimic, simulation, windows
 from ballu_mjx.forces import Applied, ForceSet, placed, together, vectors
 
-_CHUNK = 64
+_CHUNK = 32
 """Control steps that are linearized in one go."""
 
 
@@ -70,7 +70,7 @@ class Linearizer:
         self.loads = 3 * vectors(forces, len(self._simulator.robot.points))
         if beside is not None:
             self._simulator = self._simulator.altered(beside.model.fields(beside.params))
-        self._along = windows.spread(self._one, shared=0)
+        self._each = windows.spread(self._one, shared=0, over=batch_last.over)
 
     @property
     def directions(self) -> int:
@@ -79,29 +79,26 @@ class Linearizer:
 
     def __call__(self, steps: ControlSteps) -> Linearized:
         """Linearize; a step whose derivatives are no numbers comes back with zeros."""
-        count, every = len(steps.loads), self.directions
-        units = np.tile(np.eye(every, dtype=np.float32), (_CHUNK, 1))
+        count = len(steps.loads)
         found = []
         for first in range(0, count, _CHUNK):
-            place = np.repeat(np.arange(first, first + _CHUNK) % count, every)
-            chunk = jax.tree.map(lambda x, place=place: np.asarray(x, np.float32)[place], steps)
-            found.append([x.reshape(_CHUNK, every, -1) for x in self._along(chunk, units)])
+            place = np.arange(first, first + _CHUNK) % count
+            found.append(self._each(jax.tree.map(lambda x, place=place: np.asarray(x, np.float32)[place], steps)))
         qpos, qvel, features, state, seen = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
         good = np.isfinite(state).all(axis=(1, 2)) & np.isfinite(seen).all(axis=(1, 2))
         state, seen = (np.where(good.reshape(-1, 1, 1), x, 0.0).transpose(0, 2, 1) for x in (state, seen))
-        return Linearized(qpos[:, 0], qvel[:, 0], features[:, 0], state, seen)
+        return Linearized(qpos, qvel, features, state, seen)
 
-    def _one(self, step: ControlSteps, direction: Float[Array, " directions"]) -> tuple[Array, ...]:
+    def _one(self, step: ControlSteps) -> tuple[Array, ...]:
+        """A control step and its derivatives, those along one direction in a row."""
         nv, physics = self._nv, step.physics
-        turned = _expand(physics.qpos, direction[:nv])
+        units = jnp.eye(self.directions)
+        turned = jax.vmap(lambda change: _expand(physics.qpos, change))(units[:, :nv])
+        start = simulation.State(*map(jnp.asarray, physics)), jnp.zeros(self.directions - 2 * nv)
+        moves = simulation.State(turned, units[:, nv : 2 * nv], jnp.zeros_like(turned[:, :nv])), units[:, 2 * nv :]
 
-        def after(amount: Float[Array, ""]) -> tuple[simulation.State, Array]:
-            moved = simulation.State(
-                physics.qpos + amount * turned,
-                physics.qvel + amount * direction[nv : 2 * nv],
-                physics.warmstart + 0.0 * amount,
-            )
-            commands, inputs = jnp.asarray(step.commands), amount * direction[2 * nv :]
+        def after(moved: simulation.State, inputs: Float[Array, " inputs"]) -> tuple[simulation.State, Array]:
+            commands = jnp.asarray(step.commands)
             command, wrench = commands[-1], placed(jnp.asarray(step.loads) + inputs[: self.loads], self._forces)
             simulator = self._simulator.strained(jnp.zeros(nv).at[self._joints].set(inputs[self.loads :]))
             if self._beside is not None:
@@ -113,9 +110,10 @@ class Linearizer:
             state = simulator.step(moved, command, wrench)
             return state, simulator.observe(state)[0]
 
-        (state, features), (change, seen) = jax.jvp(after, (jnp.zeros(()),), (jnp.ones(()),))
-        moved = jnp.concatenate([_compress(state.qpos, change.qpos), change.qvel])
-        return state.qpos, state.qvel, features, moved, seen
+        # The step itself is the same for all directions, and simulated once for all.
+        (state, features), (change, seen) = jax.vmap(lambda *move: jax.jvp(after, start, move))(*moves)
+        moved = jnp.concatenate([jax.vmap(_compress)(state.qpos, change.qpos), change.qvel], axis=1)
+        return state.qpos[0], state.qvel[0], features[0], moved, seen
 
 
 def _expand(qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:

@@ -309,7 +309,10 @@ class Story:
         return _stage(residual_folder(self._own, task, setting), options, needs, make, goes_on=method not in fits)
 
     def _supervised(self) -> SupervisedConfig:
-        return SupervisedConfig(seed=self.seed, **force_fit.QUICK["supervised"] if self.options.quick else {})
+        # All of its forces: the paper's baseline, not what is left of it where they do not help.
+        return SupervisedConfig(
+            shares=(1.0,), seed=self.seed, **force_fit.QUICK["supervised"] if self.options.quick else {}
+        )
 
     def _analytic(self) -> AnalyticConfig:
         return AnalyticConfig(seed=self.seed, **force_fit.QUICK["analytic"] if self.options.quick else {})

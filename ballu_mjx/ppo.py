@@ -241,6 +241,16 @@ def initial_policy(inputs: Float[Array | np.ndarray, "states inputs"], action_si
     return Params(normalizer, policy.init(jax.random.key(config.seed)), {})
 
 
+def with_share(policy: Mapping[str, Any], share: float) -> Mapping[str, Any]:
+    """A policy network whose most likely actions are `share` times those of `policy`."""
+    layers = policy["params"]
+    return {**policy, "params": {**layers, _MEAN: jax.tree.map(lambda x: share * x, layers[_MEAN])}}
+
+
+_MEAN = "Dense_0"
+"""Brax's name for the layer that makes the mean of the actions' distribution."""
+
+
 def as_tree(params: Params) -> dict[str, Any]:
     """Nested dictionaries of arrays, for writing."""
     return {"normalizer": params.normalizer._asdict(), "policy": params.policy, "value": params.value}

@@ -62,6 +62,10 @@ class SupervisedConfig:
     """Labels in a gradient step."""
     learning_rate: float = 1e-3
     """Adam's."""
+    shares: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
+    """Of the forces, of which the one that acts is chosen: whose simulation follows the validation recordings best. A
+    force that is right in recorded states may lead astray in simulated ones. `--shares 1`: all of them, as in the
+    paper."""
     seed: int = 0
     """Seeds network and batches."""
 
@@ -70,8 +74,10 @@ def check(config: SupervisedConfig) -> None:
     """**Raises** `InputError` for options out of range, naming the option."""
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        if field.name not in ("observation_noise", "seed") and not value > 0:
+        if field.name not in ("observation_noise", "shares", "seed") and not value > 0:
             raise InputError(f"--{field.name.replace('_', '-')} is {value}: it must be greater than 0.")
+    if not config.shares or not all(0.0 <= share <= 1.0 for share in config.shares):
+        raise InputError(f"--shares is {' '.join(map(str, config.shares))}: give one or more from 0 to 1.")
 
 
 class Labeller:

@@ -98,8 +98,10 @@ def soften(squared: Any) -> Any:
     return 2 * OUTLYING**2 * ((1 + squared / OUTLYING**2) ** 0.5 - 1)
 
 
-def spread(function: Callable[..., Any], shared: int) -> Callable[..., Any]:
-    """`function`, compiled for batches and spread over the devices.
+def spread(
+    function: Callable[..., Any], shared: int, over: Callable[[Callable[..., Any]], Callable[..., Any]] = jax.vmap
+) -> Callable[..., Any]:
+    """`function`, compiled for batches (by `over`) and spread over the devices.
 
     Of its arguments the first `shared` are the same for all; the others, like what it returns, are arrays (or trees of
     them), along whose first axis it runs.
@@ -111,7 +113,7 @@ def spread(function: Callable[..., Any], shared: int) -> Callable[..., Any]:
     @jax.jit
     def run(common: tuple, batch: tuple) -> Any:
         return jax.shard_map(
-            lambda common, batch: jax.vmap(lambda *own: function(*common, *own))(*batch),
+            lambda common, batch: over(lambda *own: function(*common, *own))(*batch),
             mesh=mesh,
             in_specs=(spec(), spec("batch")),
             out_specs=spec("batch"),

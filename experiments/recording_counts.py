@@ -39,7 +39,7 @@ from jaxtyping import Float  # noqa: E402
 
 from ballu_mjx import plots  # noqa: E402
 
-METHODS = {"identified": "envmimic", "supervised": "supervised", "analytic": "analytic", "aerodynamic": "aerodynamic"}
+METHODS = {"identified": "envmimic", "regression": "supervised", "analytic": "analytic", "aerodynamic": "aerodynamic"}
 """Of `fidelity.METHODS`, and what they are called in figures."""
 GROUPS = ("near", "far")
 HORIZON = 5.0

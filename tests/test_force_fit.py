@@ -179,7 +179,7 @@ def test_examples_are_in_the_balloon_s_heading(motions: list[Motion]):
 
 def test_gradients_find_the_push(recorded: Windows, inputs: np.ndarray, start: ppo.Params):
     config = AnalyticConfig(
-        window_seconds=SECONDS, rounds=2, updates=300, validate_every=300, learning_rate=3e-3, observation_noise=0.0
+        window_seconds=SECONDS, rounds=4, updates=150, validate_every=150, learning_rate=1e-3, observation_noise=0.0
     )
     found: list[tuple[object, dict[str, float]]] = []
     analytic.train(
@@ -196,8 +196,9 @@ def test_gradients_find_the_push(recorded: Windows, inputs: np.ndarray, start: p
     loads = envmimic.units(ENV, ACTIONS) * np.asarray(FORCES.infer(start._replace(policy=policy), jnp.asarray(inputs)))
     stepping, falling = loads.reshape(2, -1, ACTIONS).mean(axis=1)
     np.testing.assert_allclose(falling, PUSH, atol=CLOSE)
-    np.testing.assert_allclose(stepping[:2], PUSH[:2], atol=CLOSE)
-    assert metrics["loss"] < 0.2 * found[0][1]["loss"]  # of the second simulation, beside the first
+    # On legs, forces that change from step to step move the balloon almost as a steady one does.
+    np.testing.assert_allclose(stepping[:2], PUSH[:2], atol=2 * CLOSE)
+    assert metrics["loss"] < 0.05 * found[0][1]["loss"]  # of the last simulation, beside the first
 
 
 @pytest.mark.parametrize(
@@ -206,12 +207,21 @@ def test_gradients_find_the_push(recorded: Windows, inputs: np.ndarray, start: p
         (AnalyticConfig(rounds=0), "--rounds is 0"),
         (AnalyticConfig(window_seconds=0.01), "--window-seconds"),
         (SupervisedConfig(force_change=-1.0), "--force-change is -1"),
+        (SupervisedConfig(shares=(0.5, 1.5)), "--shares is 0.5 1.5"),
+        (SupervisedConfig(shares=()), "--shares"),
         (AnalyticConfig(interval_seconds=float("inf")), "--interval-seconds"),
     ],
 )
 def test_options_out_of_range_are_refused(config: AnalyticConfig | SupervisedConfig, says: str):
     with pytest.raises(InputError, match=says):
         (analytic if isinstance(config, AnalyticConfig) else supervised).check(config)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_share_of_a_policy_s_forces(start: ppo.Params, inputs: np.ndarray):
+    whole = np.asarray(FORCES.infer(start, jnp.asarray(inputs)))
+    half = np.asarray(FORCES.infer(start._replace(policy=ppo.with_share(start.policy, 0.5)), jnp.asarray(inputs)))
+    assert np.abs(whole).max() > 0
+    np.testing.assert_allclose(half, 0.5 * whole, rtol=1e-5)
 
 
 def test_a_run_is_read_as_its_kind(tmp_path: Path, start: ppo.Params):
