@@ -11,6 +11,7 @@ where it was, and a changed option redoes what depends on it and nothing else.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import gc
 import hashlib
 import itertools
@@ -47,6 +48,7 @@ from ballu_mjx.analytic import AnalyticConfig
 from ballu_mjx.deployment import PolicyController
 from ballu_mjx.envmimic import EnvMimicConfig
 from ballu_mjx.errors import InputError
+from ballu_mjx.forces import ForceSet
 from ballu_mjx.identification import IdentificationConfig
 from ballu_mjx.locomotion import LocomotionConfig, Setting
 from ballu_mjx.policy import ClosedLoop, Policy
@@ -65,7 +67,9 @@ SHARED = "envmimic-shared"
 """The setting of one EnvMimic for all tasks."""
 NEAR = "envmimic-near"
 """The setting with EnvMimic's forces whose policies pay for leaving what these were learned from."""
-MORE_SETTINGS = (NEAR, SHARED, "supervised", "analytic")
+WRENCH = "envmimic-wrench"
+"""The setting of an EnvMimic that pushes with a torque too."""
+MORE_SETTINGS = (NEAR, SHARED, WRENCH, "supervised", "analytic")
 """Settings that are run on request; the last two are networks that regression and gradients learn."""
 ROUNDS = "envmimic"
 """The setting that `Options.rounds` repeats. Nothing of an earlier round is replaced: later ones have their number
@@ -97,10 +101,11 @@ class Options(loggers.LoggingOptions):
     rounds: int = 1
     """How often EnvMimic learns. From the second time on, its recordings are joined by the robot's motion under the
     policies trained the time before, in closed loop; then policies are trained anew: `envmimic-2`, and so on."""
-    also: tuple[Literal["envmimic-near", "envmimic-shared", "supervised", "analytic"], ...] = ()
+    also: tuple[Literal["envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised", "analytic"], ...] = ()
     """Further simulators to train policies in: with EnvMimic's forces, and policies that pay for leaving what these
-    were learned from; with one EnvMimic that learns from the recordings of both tasks, instead of one a task; with the
-    forces that regression, and that gradients through the simulation, learn from the task's."""
+    were learned from; with one EnvMimic that learns from the recordings of both tasks, instead of one a task; with one
+    that pushes with a torque too; with the forces that regression (all of them, the paper's baseline), and that
+    gradients through the simulation, learn from the task's."""
     outside_cost: float = 0.5
     """What they pay in `envmimic-near`; see `train walk --help`."""
     quick: bool = False
@@ -283,7 +288,8 @@ class Story:
             recordings = [self.recordings(task), *(self.trained_last(task, n) for n in range(2, number + 1))]
         identified = self.identified()
         fits = {"aerodynamic": self._air, "supervised": self._supervised, "analytic": self._analytic}
-        options = fits.get(method, self._envmimic)()
+        envmimic = functools.partial(self._envmimic, "wrench" if method == WRENCH else "force")
+        options = fits.get(method, envmimic)()
 
         def make(folder: Path) -> None:
             sources: dict[str, Any] = {
@@ -320,9 +326,9 @@ class Story:
     def _air(self) -> AirConfig:
         return AirConfig(**air_fit.QUICK if self.options.quick else {})
 
-    def _envmimic(self) -> tuple[EnvMimicConfig, PPOConfig]:
+    def _envmimic(self, forces: ForceSet) -> tuple[EnvMimicConfig, PPOConfig]:
         quick = residual_training.QUICK if self.options.quick else {"num_timesteps": self.options.residual_steps}
-        return EnvMimicConfig(), PPOConfig(seed=self.seed, **quick)
+        return EnvMimicConfig(forces=forces), PPOConfig(seed=self.seed, **quick)
 
     def transfers(self, task: str, setting: str) -> list[Transfer]:
         """How the policy's trials on the robot compare with its own simulator."""

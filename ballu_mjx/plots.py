@@ -34,8 +34,9 @@ COLOURS: Mapping[str, str] = {
     "aerodynamic+analytic": "#aa4499",
     "envmimic-shared": "#117733",
     "envmimic-near": "#88ccee",
+    "envmimic-wrench": "#44aa99",
 }
-"""One colour for each simulator in all figures (Okabe and Ito's, five of Tol's: the colour-blind tell them apart)."""
+"""One colour for each simulator in all figures (Okabe and Ito's, six of Tol's: the colour-blind tell them apart)."""
 
 LABELS: Mapping[str, str] = {
     "recording": "recording",
@@ -51,6 +52,7 @@ LABELS: Mapping[str, str] = {
     "aerodynamic+analytic": "aerodynamic+analytic",
     "envmimic-shared": "EnvMimic, one for all tasks",
     "envmimic-near": "EnvMimic, near its data",
+    "envmimic-wrench": "EnvMimic, wrench",
 }
 
 

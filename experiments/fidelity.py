@@ -78,9 +78,11 @@ METHODS = {
 }
 
 
-def train(folder: Path, *arguments: str) -> None:
-    """Run `python -m ballu_mjx.train` into `folder`, unless its evaluation is there."""
-    if not (folder / "evaluation.json").exists():
+def train(folder: Path, *arguments: str, result: str = "evaluation.json") -> None:
+    """Run `python -m ballu_mjx.train` into `folder`, unless its result is there; what was interrupted begins anew."""
+    if not (folder / result).exists():
+        if (folder / "config.json").exists():
+            shutil.rmtree(folder)
         command = [sys.executable, "-m", "ballu_mjx.train", *arguments, "--output", str(folder)]
         subprocess.run(command, check=True)
 
@@ -133,8 +135,7 @@ def record(robot_seed: int, folder: Path) -> Recorded:
         if not (place / "suspended" / "sweep.csv.gz").exists():
             bundled_recordings.data_set(robot_seed, place)
         if not (place / "actuators.json").exists():
-            sysid = [sys.executable, "-m", "ballu_mjx.train", "sysid", "--recordings", str(place / "suspended")]
-            subprocess.run([*sysid, "--output", str(folder / "sysid")], check=True)
+            train(folder / "sysid", "sysid", "--recordings", str(place / "suspended"), result="actuators.json")
             shutil.copy(folder / "sysid" / "actuators.json", place)
     training, validation, test = (recording.recordings([place / use]) for use in ("training", "validation", "test"))
     return Recorded(training, validation, test, place / "actuators.json")

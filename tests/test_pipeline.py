@@ -93,17 +93,19 @@ def test_each_round_learns_from_all_recordings_so_far_and_keeps_what_came_before
     """Which stage needs which, without making any: a stage is a folder whose needs stand beside it."""
     needs: dict[str, list[str]] = {}
     costs: dict[str, float] = {}
+    forces: dict[str, str] = {}
 
     def stage(folder, options, sources, make, goes_on=True):
         needs[folder.name] = [source.name for source in sources]
         if folder.name.startswith("walk-"):
             costs[folder.name] = options[0].outside_cost
+        if folder.name.startswith("envmimic-"):
+            forces[folder.name] = options[0].forces
         return folder
 
     monkeypatch.setattr(pipeline, "_stage", stage)
-    options = Options(
-        output=tmp_path, rounds=3, also=("envmimic-near", "envmimic-shared", "supervised"), outside_cost=2.0
-    )
+    also = "envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised"
+    options = Options(output=tmp_path, rounds=3, also=also, outside_cost=2.0)
     told = pipeline.Story(options, seed=0)
     for setting in pipeline.settings_of(options):
         told.policy("walk", setting)
@@ -116,5 +118,7 @@ def test_each_round_learns_from_all_recordings_so_far_and_keeps_what_came_before
     assert needs["walk-envmimic"] == needs["walk-envmimic-near"] == ["envmimic-walk"]
     assert {name: cost for name, cost in costs.items() if cost} == {"walk-envmimic-near": 2.0}
     assert needs["aerodynamic-walk"] == needs["supervised-walk"] == ["recordings-walk", "sysid"]
+    assert {name for name, kind in forces.items() if kind != "force"} == {"envmimic-wrench-walk"}
+    assert forces["envmimic-wrench-walk"] == "wrench"
     assert needs["envmimic-shared"] == ["recordings-walk", "recordings-turn", "sysid"]
     assert needs["walk-envmimic-shared"] == ["envmimic-shared"]
