@@ -8,6 +8,7 @@ squares with a loss that a slipped foot does not rule.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ import scipy.optimize
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from ballu_mjx import aerodynamics, envmimic, simulation, windows
+from ballu_mjx import aerodynamics, batch_last, envmimic, simulation, windows
 from ballu_mjx.aerodynamics import Aerodynamics, AirParameters
 from ballu_mjx.errors import InputError
 from ballu_mjx.reconstruction import Motion
@@ -223,7 +224,9 @@ class _Fit:
         none, self._unravel = ravel_pytree(AirParameters.none())
         self._delay = int(self._unravel(jnp.arange(len(none), dtype=none.dtype)).delay)
         self._windows = windows.cut(self._simulator, motions, config.window_seconds, config.interval_seconds)
-        self._run = windows.spread(self._linear_one, shared=2)
+        self._run = windows.spread(self._one, shared=1)
+        over = functools.partial(batch_last.over, inner=len(none))
+        self._run_linear = windows.spread(self._linear_one, shared=1, over=over)
         self.timestep = float(model.opt.timestep)
 
     @property
@@ -244,16 +247,15 @@ class _Fit:
         give, and change by it as from the one to the other. By other parameters: at the nearest whole delay.
         """
         before, after, share = self._beside(vector)
-        nearest = before if share < 0.5 else after
-        first = self._linear(before)[0]
-        between = share >= _JUST
-        second = self._linear(after)[0] if between or self._delay in places else first
+        nearest, other = (before, after) if share < 0.5 else (after, before)
+        between, moved = share >= _JUST, places[places != self._delay]
+        near, slopes_near = self._linear(nearest) if len(moved) else (self._errors(nearest), None)
+        far = self._errors(other) if between or len(moved) < len(places) else near
+        first, second = (near, far) if share < 0.5 else (far, near)
         slopes = np.zeros((*first.shape, len(places)))
-        for column, place in enumerate(places):
-            if place == self._delay:
-                slopes[..., column] = (second - first) / self.timestep
-            else:
-                slopes[..., column] = self._linear(nearest, np.eye(len(vector))[place])[1]
+        if slopes_near is not None:
+            slopes[..., places != self._delay] = slopes_near[..., moved]
+        slopes[..., places == self._delay] = ((second - first) / self.timestep)[..., None]
         return (1 - share) * first + share * second if between else first, slopes
 
     def _beside(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -265,19 +267,30 @@ class _Fit:
         before[self._delay], after[self._delay] = first * self.timestep, (first + 1) * self.timestep
         return before, after, float(np.clip(steps - first, 0.0, 1.0))
 
+    def _errors(self, vector: np.ndarray) -> Float[np.ndarray, "windows entries"]:
+        """At a whole delay."""
+        errors = np.array(self._run(np.float32(vector), self._windows), np.float64)
+        errors[~np.isfinite(errors).all(axis=1)] = _LOST / np.sqrt(errors.shape[1])
+        return errors
+
     def _linear(
-        self, vector: np.ndarray, direction: np.ndarray | None = None
-    ) -> tuple[Float[np.ndarray, "windows entries"], Float[np.ndarray, "windows entries"]]:
-        """Errors at a whole delay, and their derivative along a direction of the parameters."""
-        direction = np.zeros_like(vector) if direction is None else direction
-        found = self._run(np.float32(vector), np.float32(direction), self._windows)
+        self, vector: np.ndarray
+    ) -> tuple[Float[np.ndarray, "windows entries"], Float[np.ndarray, "windows entries parameters"]]:
+        """`_errors`, and their derivatives by all parameters but the delay."""
+        found = self._run_linear(np.float32(vector), self._windows)
         errors, slopes = (np.array(x, np.float64) for x in found)
-        lost = ~(np.isfinite(errors).all(axis=1) & np.isfinite(slopes).all(axis=1))
+        lost = ~(np.isfinite(errors).all(axis=1) & np.isfinite(slopes).all(axis=(1, 2)))
         errors[lost], slopes[lost] = _LOST / np.sqrt(errors.shape[1]), 0.0
         return errors, slopes
 
-    def _linear_one(self, vector: Array, direction: Array, window: Windows) -> tuple[Array, Array]:
-        return jax.jvp(lambda vector: self._one(vector, window), (vector,), (direction,))
+    def _linear_one(self, vector: Float[Array, " parameters"], window: Windows) -> tuple[Array, Array]:
+        def along(direction: Float[Array, " parameters"]) -> tuple[Array, Array]:
+            return jax.jvp(lambda vector: self._one(vector, window), (vector,), (direction,))
+
+        moved = np.arange(len(vector)) != self._delay
+        # The window itself is the same for all directions, and simulated once for all.
+        errors, slopes = jax.vmap(along)(jnp.eye(len(vector))[moved])
+        return errors[0], jnp.zeros((errors.shape[1], len(vector))).at[:, moved].set(slopes.T)
 
     def _one(self, vector: Float[Array, " parameters"], window: Windows) -> Float[Array, " entries"]:
         air = self._unravel(vector)

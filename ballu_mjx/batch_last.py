@@ -28,18 +28,21 @@ from jaxtyping import Array, PyTree
 from ballu_mjx import derivatives
 
 
-def vmap(function: Callable[..., Any], in_batched: Sequence[PyTree[bool]], size: int) -> Callable[..., Any]:
+def vmap(
+    function: Callable[..., Any], in_batched: Sequence[PyTree[bool]], size: int, widest: int | None = None
+) -> Callable[..., Any]:
     """Like `jax.vmap(function)`, for functions of arrays and trees of them.
 
     **Arguments**
 
     - `in_batched`: of each argument a tree of the same structure; which leaves have a batch, along their first axis.
     - `size`: of the batch.
+    - `widest`: more than so many run one part after the other; None: 512.
 
     **Returns** a function of the results, and of a tree that tells which of them have a batch, along their first axis:
     those that depend on an argument that has one.
     """
-    flags = jax.tree.leaves(list(in_batched))
+    flags, widest = jax.tree.leaves(list(in_batched)), widest or _WIDEST
 
     def batched(*arguments: Any) -> Any:
         leaves, tree = jax.tree.flatten(list(arguments))
@@ -58,10 +61,10 @@ def vmap(function: Callable[..., Any], in_batched: Sequence[PyTree[bool]], size:
             return [jnp.moveaxis(x, -1, 0) if d else jnp.asarray(x) for x, d in zip(found, depends, strict=True)]
 
         own = [x for x, f in zip(arrays, flags, strict=True) if f]
-        if size <= _WIDEST:
+        if size <= widest:
             found = part(size, own)
         else:
-            parts = -(-size // _WIDEST)
+            parts = -(-size // widest)
             width = -(-size // parts)
             rows = np.arange(parts * width).reshape(parts, width) % size
             found = lax.map(functools.partial(part, width), [x[rows] for x in own])
@@ -72,23 +75,23 @@ def vmap(function: Callable[..., Any], in_batched: Sequence[PyTree[bool]], size:
     return batched
 
 
-def over(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """`jax.vmap(function)`, of which everything has a batch; on the CPU with the batch last, also of what `function`
-    has batches of itself."""
+_WIDEST = 512
+"""What a robot's step keeps at hand then stays in a core's cache (`benchmarks/step_profile.py`)."""
+
+
+def over(function: Callable[..., PyTree], inner: int = 1) -> Callable[..., PyTree]:
+    """`jax.vmap(function)`; on the CPU with the batch last, also of what `function` has batches of itself (of about
+    `inner`)."""
     if jax.default_backend() != "cpu":
         return jax.vmap(function)
 
     def whole(*arguments: PyTree) -> PyTree:
         size = len(jax.tree.leaves(arguments)[0])
-        found, depends = vmap(function, jax.tree.map(lambda _: True, arguments), size)(*arguments)
+        everything = jax.tree.map(lambda _: True, arguments)
+        found, depends = vmap(function, everything, size, max(_WIDEST // inner, 1))(*arguments)
         return jax.tree.map(lambda x, d: x if d else jnp.broadcast_to(x, (size, *x.shape)), found, depends)
 
     return whole
-
-
-_WIDEST = 512
-"""More than so many run one part after the other: what a robot's step keeps at hand then stays in a core's cache
-(`benchmarks/step_profile.py`)."""
 
 
 def fast(function: Callable[..., PyTree]) -> Callable[..., PyTree]:

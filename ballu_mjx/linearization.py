@@ -8,6 +8,7 @@ Some thirty directions a control step are few beside the thousands of gradients 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from jaxtyping import Array, Float
 from ballu_mjx import batch_last, envmimic, simulation, windows
 from ballu_mjx.forces import Applied, ForceSet, placed, together, vectors
 
-_CHUNK = 32
+_CHUNK = 64
 """Control steps that are linearized in one go."""
 
 
@@ -70,7 +71,8 @@ class Linearizer:
         self.loads = 3 * vectors(forces, len(self._simulator.robot.points))
         if beside is not None:
             self._simulator = self._simulator.altered(beside.model.fields(beside.params))
-        self._each = windows.spread(self._one, shared=0, over=batch_last.over)
+        over = functools.partial(batch_last.over, inner=self.directions)
+        self._each = windows.spread(self._one, shared=0, over=over)
 
     @property
     def directions(self) -> int:

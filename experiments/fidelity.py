@@ -366,6 +366,8 @@ def main() -> None:
     for title, found in (("Bundled test recordings", results), ("Fresh test recordings", larger)):
         parts += [f"### {title}", *(comparison(found, times, horizon) for horizon in evaluation.SCORE_HORIZONS)]
         nominal = found["nominal"]
+        legs = [evaluation.Evaluation(nominal[0].vanilla, found["identified"][0].vanilla)]
+        parts += ["vanilla+sysid. " + worst_case(legs, "vanilla")]
         for name in options.methods:
             evaluations = found[name] if METHODS[name].nominal else against(nominal, found[name])
             parts += [f"{METHODS[name].label}. " + worst_case(evaluations, "vanilla")]

@@ -70,14 +70,6 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
 }
 
 
-def together(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Of a batch of `SIZE`."""
-    batched = batch_last.vmap(lambda x: function(x), [True], SIZE)
-    return lambda x: jax.tree.map(
-        lambda y, has: y if has else jnp.broadcast_to(y, (SIZE, *y.shape)), *batched(x), is_leaf=None
-    )
-
-
 def assert_same(found: Any, expected: Any, tolerance: float = 1e-5) -> None:
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance), found, expected)
 
@@ -86,7 +78,7 @@ def assert_same(found: Any, expected: Any, tolerance: float = 1e-5) -> None:
 def test_same_as_vmap(name: str):
     function = FUNCTIONS[name]
     x = jax.random.normal(jax.random.key(1), (SIZE, 3, 3))
-    assert_same(jax.jit(together(function))(x), jax.vmap(function)(x))
+    assert_same(jax.jit(batch_last.over(function))(x), jax.vmap(function)(x))
 
 
 @pytest.mark.parametrize("size", [4, 7, 13])
@@ -102,8 +94,20 @@ def test_large_batches_run_in_parts(size: int, monkeypatch: pytest.MonkeyPatch):
 def test_derivatives_are_the_same(name: str):
     function = FUNCTIONS[name]
     x, change = jax.random.normal(jax.random.key(2), (2, SIZE, 3, 3))
-    ours, theirs = (jax.jvp(f, (x,), (change,)) for f in (together(function), jax.vmap(function)))
+    ours, theirs = (jax.jvp(f, (x,), (change,)) for f in (batch_last.over(function), jax.vmap(function)))
     assert_same(ours, theirs, 1e-4)
+
+
+@pytest.mark.parametrize("name", ["products", "solve", "scan", "gather and scatter"])
+def test_batches_within_a_batch(name: str, monkeypatch: pytest.MonkeyPatch):
+    """Derivatives of each along many directions; in parts."""
+    monkeypatch.setattr(batch_last, "_WIDEST", 8)
+    x, changes = jax.random.normal(jax.random.key(7), (SIZE, 3, 3)), jax.random.normal(jax.random.key(8), (4, 3, 3))
+
+    def function(x: Any) -> Any:
+        return jax.vmap(lambda change: jax.jvp(FUNCTIONS[name], (x,), (change,)))(changes)
+
+    assert_same(jax.jit(batch_last.over(function, inner=4))(x), jax.vmap(function)(x), 1e-4)
 
 
 def test_arguments_without_a_batch():
