@@ -116,6 +116,7 @@ def train(
     spread: Float[np.ndarray, " inputs"],
     config: AnalyticConfig,
     report: Report,
+    linearize: Linearizer,
     beside: Applied | None = None,
 ) -> None:
     """Learn the parameters of `forces`.
@@ -127,9 +128,10 @@ def train(
     - `recorded`: windows of the training recordings.
     - `spread`: of each of the network's inputs over the recordings.
     - `report`: told every `validate_every` gradient steps.
+    - `linearize`: that of the same model, force set and residual beside; joints' torques are left alone.
     - `beside`: a residual that the simulator has already.
     """
-    simulate, linearize = simulator(model, forces, beside), Linearizer(model, beside, forces=forces.config.forces)
+    simulate = simulator(model, forces, beside)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
     starts = envmimic.start_spread(model, robot_description.ballu())
     update = _updates(forces, wrap, optimizer, spread, starts, config)
@@ -155,7 +157,8 @@ def train(
 def _in_windows(
     linearized: Linearized, loads: Float[Array | np.ndarray, "steps loads"], recorded: Windows
 ) -> tuple[Linearized, Float[Array, "windows windowsteps loads"], Windows]:
-    shape = recorded.features.shape[:2]
+    shape, inputs = recorded.features.shape[:2], linearized.state.shape[1] + loads.shape[1]
+    linearized = linearized._replace(state=linearized.state[..., :inputs], seen=linearized.seen[..., :inputs])
     parts = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32).reshape(*shape, *x.shape[1:]), (linearized, loads))
     return *parts, jax.tree.map(jnp.asarray, recorded)
 

@@ -173,6 +173,7 @@ class _Analytic(_Fit):
             np.std(setup.inputs, axis=0),
             config,
             report,
+            Linearizer(setup.model, setup.beside, forces=setup.forces.config.forces),
             setup.beside,
         )
 
