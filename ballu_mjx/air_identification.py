@@ -248,14 +248,15 @@ class _Fit:
         """
         before, after, share = self._beside(vector)
         nearest, other = (before, after) if share < 0.5 else (after, before)
-        between, moved = share >= _JUST, places[places != self._delay]
+        between, is_delay = share >= _JUST, places == self._delay
+        moved = places[~is_delay]
         near, slopes_near = self._linear(nearest) if len(moved) else (self._errors(nearest), None)
-        far = self._errors(other) if between or len(moved) < len(places) else near
+        far = self._errors(other) if between or is_delay.any() else near
         first, second = (near, far) if share < 0.5 else (far, near)
         slopes = np.zeros((*first.shape, len(places)))
         if slopes_near is not None:
-            slopes[..., places != self._delay] = slopes_near[..., moved]
-        slopes[..., places == self._delay] = ((second - first) / self.timestep)[..., None]
+            slopes[..., ~is_delay] = slopes_near[..., moved]
+        slopes[..., is_delay] = ((second - first) / self.timestep)[..., None]
         return (1 - share) * first + share * second if between else first, slopes
 
     def _beside(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:

@@ -117,7 +117,6 @@ def train(
     config: AnalyticConfig,
     report: Report,
     linearize: Linearizer,
-    beside: Applied | None = None,
 ) -> None:
     """Learn the parameters of `forces`.
 
@@ -128,10 +127,10 @@ def train(
     - `recorded`: windows of the training recordings.
     - `spread`: of each of the network's inputs over the recordings.
     - `report`: told every `validate_every` gradient steps.
-    - `linearize`: that of the same model, force set and residual beside; joints' torques are left alone.
-    - `beside`: a residual that the simulator has already.
+    - `linearize`: that of the same model and force set, with the residual that the simulator has already; joints'
+      torques are left alone.
     """
-    simulate = simulator(model, forces, beside)
+    simulate = simulator(model, forces, linearize.beside)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
     starts = envmimic.start_spread(model, robot_description.ballu())
     update = _updates(forces, wrap, optimizer, spread, starts, config)

@@ -174,7 +174,6 @@ class _Analytic(_Fit):
             config,
             report,
             Linearizer(setup.model, setup.beside, forces=setup.forces.config.forces),
-            setup.beside,
         )
 
 

@@ -64,7 +64,7 @@ class Linearizer:
         forces: ForceSet = "force",
     ) -> None:
         """`beside` is a residual that the simulator has already; `joints` are those whose torques are inputs too."""
-        self._nv, self._beside = model.nv, beside
+        self._nv, self.beside = model.nv, beside
         self._forces: ForceSet = forces
         self._joints = np.array([model.joint(name).dofadr[0] for name in joints], int)
         self._simulator = envmimic.Simulator(model)
@@ -103,8 +103,8 @@ class Linearizer:
             commands = jnp.asarray(step.commands)
             command, wrench = commands[-1], placed(jnp.asarray(step.loads) + inputs[: self.loads], self._forces)
             simulator = self._simulator.strained(jnp.zeros(nv).at[self._joints].set(inputs[self.loads :]))
-            if self._beside is not None:
-                model, params = self._beside
+            if self.beside is not None:
+                model, params = self.beside
                 seen, _ = simulator.observe(moved)
                 history = jnp.concatenate([step.history[:-1], seen[None]])
                 command = model.command(params, commands)

@@ -34,6 +34,7 @@ from ballu_mjx import runtime
 
 runtime.prepare()
 
+import fidelity  # noqa: E402
 import numpy as np  # noqa: E402
 
 from ballu_mjx import air_fit, air_identification, evaluation, reconstruction, recording, residual, robot, virtual_robot  # noqa: E402
@@ -94,18 +95,7 @@ def main() -> None:
     air = options.air
     if air is None:
         air = options.output / "aerodynamic"
-        if not (air / "evaluation.json").exists():
-            command = [
-                sys.executable,
-                "-m",
-                "ballu_mjx.train",
-                "residual",
-                "--method",
-                "aerodynamic",
-                "--output",
-                str(air),
-            ]
-            subprocess.run(command + (["--quick"] if options.quick else []), check=True)
+        fidelity.train(air, "residual", "--method", "aerodynamic", *(["--quick"] if options.quick else []))
     known = residual.Residual.load(air)
     model = robot.load_model(known.actuators)
     full = virtual_robot.draw_robot(0)
