@@ -4,10 +4,9 @@ The recordings are cut into short windows. Each is simulated from its recorded f
 what the simulated balloon's place and orientation differ by from the recorded ones is made small, by nonlinear least
 squares with a loss that a slipped foot does not rule.
 
-Slopes are taken over a parameter's order of magnitude, not at a point. Through steps that come down too early or too
-late derivatives are right for hundredths of a millinewton and point nowhere beyond, while errors over ten times as much
-change smoothly: with 5 % of the lift gone, derivatives end halfway (`docs/white_box.md`). It also takes a tenth of the
-time for one parameter, half of it for all.
+Slopes are taken over a parameter's order of magnitude, not at a point. Where feet come down at other times than in the
+recording, derivatives hold for less than a millinewton of lift and point nowhere beyond, while errors over thirty change
+smoothly (`docs/white_box.md`, "Why not derivatives").
 """
 
 from __future__ import annotations
@@ -45,8 +44,8 @@ class AirConfig:
 
 
 class Scale(NamedTuple):
-    """A parameter's order of magnitude: where the solver looks first, over what it takes slopes, and how far a weak prior
-    lets it go."""
+    """A parameter's order of magnitude: where the solver looks first, over what it takes slopes, and how far a weak
+    prior lets it go."""
 
     typical: float
     prior: float = 3.0
@@ -68,7 +67,7 @@ _AGAIN = 4
 """Most steps of the solver at each of the two whole delays beside the best."""
 _INSIDE = 0.01
 """Of `typical`: so far from its bounds a search begins. On one, the solver takes its first steps for nothing."""
-_ENOUGH = {"ftol": 1e-4, "xtol": 1e-3}
+_GAIN, _STEP = 1e-4, 1e-3
 """Steps that gain less than that share of the cost, or are that short, are the contacts' noise."""
 _LOST = 20.0
 """What a simulation that broke down counts as, in expected errors."""
@@ -118,7 +117,7 @@ def identify(
     **Raises** `InputError` where no recording is as long as a window.
     """
     check(config)
-    simulated = _Fit(model, motions, config)
+    simulated = AirWindows(model, motions, config)
     none = AirParameters.none()
     start, unravel = ravel_pytree(none if known is None else known)
     start = np.asarray(start, np.float64)
@@ -161,7 +160,8 @@ def identify(
             jacobian,  # pyright: ignore[reportArgumentType]
             bounds=((low[places] - middle) / spread, (high[places] - middle) / spread),
             max_nfev=most * len(start) // len(places),
-            **_ENOUGH,
+            ftol=_GAIN,
+            xtol=_STEP,
         )
         covariance = np.zeros((len(vector), len(vector)))
         covariance[np.ix_(places, places)] = np.linalg.pinv(solution.jac.T @ solution.jac)
@@ -230,21 +230,22 @@ def _soften(
     return factor * errors, factor[..., None] * slopes + change[..., None] * along * errors[..., None]
 
 
-class _Fit:
-    """Windows of recorded motions, and their simulation; compiles once."""
+class AirWindows:
+    """Windows of recorded motions, and their simulation in any air; compiles once. A vector is a flattened
+    `AirParameters`."""
 
     def __init__(self, model: mujoco.MjModel, motions: Sequence[Motion], config: AirConfig) -> None:
         self._simulator, self._air = envmimic.Simulator(model), Aerodynamics(model)
         none, self._unravel = ravel_pytree(AirParameters.none())
         self._delay = int(self._unravel(jnp.arange(len(none), dtype=none.dtype)).delay)
-        self._windows = windows.cut(self._simulator, motions, config.window_seconds, config.interval_seconds)
-        self._run = windows.spread(self._one, shared=1)
+        self.windows = windows.cut(self._simulator, motions, config.window_seconds, config.interval_seconds)
+        self._run = windows.spread(self.simulate, shared=1)
         self.timestep = float(model.opt.timestep)
 
     @property
     def count(self) -> int:
         """Of the windows."""
-        return len(self._windows.qpos)
+        return len(self.windows.qpos)
 
     def errors(self, vector: np.ndarray) -> Float[np.ndarray, "windows entries"]:
         """Errors of the simulated windows, in expected ones."""
@@ -285,11 +286,12 @@ class _Fit:
 
     def _whole(self, vector: np.ndarray) -> Float[np.ndarray, "windows entries"]:
         """`errors`, at a whole delay."""
-        errors = np.array(self._run(np.float32(vector), self._windows), np.float64)
+        errors = np.array(self._run(np.float32(vector), self.windows), np.float64)
         errors[~np.isfinite(errors).all(axis=1)] = _LOST / np.sqrt(errors.shape[1])
         return errors
 
-    def _one(self, vector: Float[Array, " parameters"], window: Windows) -> Float[Array, " entries"]:
+    def simulate(self, vector: Float[Array, " parameters"], window: Windows) -> Float[Array, " entries"]:
+        """`errors` of one window, at a whole delay; JAX's own transformations apply."""
         air = self._unravel(vector)
         simulator = self._simulator.altered(self._air.fields(air))
         state = simulation.at(jnp.asarray(window.qpos), jnp.asarray(window.qvel))

@@ -1,0 +1,151 @@
+# %% [markdown]
+# # Why the air's search takes slopes over a step, not derivatives
+#
+# MJX can be differentiated: what a window of motion makes of a parameter's smallest change is known exactly. Is that of
+# use to a search? Here the robot has lost 5 % of its lift, the model has not, and one recording of 20 s is to say so.
+# For windows of half a second to two seconds: which way errors go by their derivative, and which way they go indeed
+# over steps of a millinewton to all that was lost. The figure is the cost that the search sees, along the lift.
+#
+# `python experiments/air_slopes.py` takes about seven minutes on one core, most of them compiling; `--quick` takes the
+# shortest windows alone.
+
+# %%
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+if "google.colab" in sys.modules:  # install, from a checkout in the current folder
+    if not Path("constraints.txt").exists():
+        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
+    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
+if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
+    sys.argv[1:] = []
+    sys.path[:0] = [".", "experiments"]
+
+# %%
+import argparse
+import dataclasses
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+import deflation  # noqa: E402
+import jax  # noqa: E402
+import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+from jax.flatten_util import ravel_pytree  # noqa: E402
+from jaxtyping import Array, Float  # noqa: E402
+
+from ballu_mjx import reconstruction, recording, residual, robot, virtual_robot, windows  # noqa: E402
+from ballu_mjx.air_identification import AirConfig, AirWindows  # noqa: E402
+
+STEPS = (0.1e-3, 1e-3, 3e-3, 10e-3, 30e-3, 100e-3)
+"""Of the lift (N)."""
+LOSS = 0.05
+"""Share of the lift that the robot has lost."""
+
+# %% [markdown]
+# ## Derivatives, and differences
+
+
+# %%
+def cosines(
+    one: Float[np.ndarray, "windows entries"], other: Float[np.ndarray, "windows entries"]
+) -> Float[np.ndarray, " windows"]:
+    """Of the angle between two changes of each window's errors; 1: the same way, 0: nothing in common."""
+    norms = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
+    return np.sum(one * other, axis=1) / np.maximum(norms, np.finfo(float).tiny)
+
+
+@dataclasses.dataclass(frozen=True)
+class Slopes:
+    """At the old lift, for windows of one length; changes of errors per newton that is lost."""
+
+    derivative: Float[np.ndarray, "windows entries"]
+    differences: dict[float, Float[np.ndarray, "windows entries"]]
+    """By the step (N)."""
+    loss: Float[np.ndarray, "grid 2"]
+    """Lift lost (N), and the softened cost there."""
+
+
+def slopes(simulated: AirWindows, known: Float[np.ndarray, " parameters"], lift: int, lost: float) -> Slopes:
+    def cost(errors: np.ndarray) -> float:
+        return float(np.sum(windows.soften(np.sum(errors**2, axis=1)))) / 2
+
+    def at(less: float) -> np.ndarray:
+        vector = known.copy()
+        vector[lift] -= less
+        return simulated.errors(vector)
+
+    def along(vector: Array, direction: Array, window: windows.Windows) -> Array:
+        return jax.jvp(lambda vector: simulated.simulate(vector, window), (vector,), (direction,))[1]
+
+    direction = np.zeros_like(known, np.float32)
+    direction[lift] = -1.0
+    derivative = windows.spread(along, shared=2)(np.float32(known), direction, simulated.windows)
+    grid = np.linspace(-0.2 * lost, 1.6 * lost, 37)
+    return Slopes(
+        derivative=np.asarray(derivative, np.float64),
+        differences={step: (at(step) - at(0.0)) / step for step in STEPS},
+        loss=np.stack([grid, [cost(at(less)) for less in grid]], axis=1),
+    )
+
+
+# %% [markdown]
+# ## Table and figure
+
+
+# %%
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Derivatives and differences of windows of motion, by the lift.")
+    parser.add_argument("--air", type=Path, required=True, help="run of `train residual`, before the loss")
+    parser.add_argument("--output", type=Path, default=Path("runs/air-slopes"), help="folder of the table and figure")
+    parser.add_argument("--quick", action="store_true", help="windows of half a second alone")
+    options = parser.parse_args()
+
+    known = residual.Residual.load(options.air)
+    model = robot.load_model(known.actuators)
+    full = virtual_robot.draw_robot(0)
+    deflated = dataclasses.replace(full, buoyancy=full.buoyancy * (1 - LOSS))
+    lost = LOSS * full.buoyancy * float(robot.load_model().body_mass.sum()) * 9.81
+    recorded = deflation.replayed(recording.bundled("training")[0], deflated, 2000, options.output / "recordings")
+    motions = [reconstruction.reconstruct(recorded, model)]
+    # At a whole delay, where errors can be differentiated.
+    timestep = float(model.opt.timestep)
+    delay = np.round(float(known.params.delay) / timestep) * timestep
+    vector, unravel = ravel_pytree(dataclasses.replace(known.params, delay=jax.numpy.float32(delay)))
+    lift = int(unravel(jax.numpy.arange(len(vector), dtype=vector.dtype)).lift)
+
+    lines = [
+        "| window (s) | " + " | ".join(f"{step * 1e3:g} mN" for step in STEPS) + " | length, of that over 30 mN |",
+        "| --- " + "| ---: " * (len(STEPS) + 1) + "|",
+    ]
+    lengths = (0.5,) if options.quick else (0.5, 1.0, 2.0)
+    figure, axes = plt.subplots(1, len(lengths), figsize=(3.6 * len(lengths), 3.2), layout="constrained", squeeze=False)
+    for length, axis in zip(lengths, axes[0], strict=True):
+        config = AirConfig(window_seconds=length, interval_seconds=1.0)
+        found = slopes(AirWindows(model, motions, config), np.asarray(vector, np.float64), lift, lost)
+        same = [float(np.median(cosines(found.derivative, found.differences[step]))) for step in STEPS]
+        smooth = np.linalg.norm(found.differences[30e-3], axis=1)
+        ratio = np.median(np.linalg.norm(found.derivative, axis=1) / smooth)
+        lines.append(f"| {length:g} | " + " | ".join(f"{cosine:.2f}" for cosine in same) + f" | {ratio:.1f} |")
+        axis.plot(found.loss[:, 0] * 1e3, found.loss[:, 1], color="0.2")
+        axis.axvline(lost * 1e3, color="0.6", linestyle=":", label="truth")
+        axis.set_title(f"windows of {length:g} s")
+        axis.set_xlabel("lift lost (mN)")
+    axes[0, 0].set_ylabel("cost")
+    axes[0, 0].legend(frameon=False)
+    text = "\n".join(lines)
+    figure.savefig(options.output / "cost.png", dpi=150)
+    plt.close(figure)
+    (options.output / "table.md").write_text(text + "\n")
+    print("How far errors change as their derivative says: median cosine over windows, by the size of the step\n")
+    print(text)
+    print(f"\nWritten to {options.output}.")
+
+
+if __name__ == "__main__":
+    main()
