@@ -5,8 +5,8 @@ what the simulated balloon's place and orientation differ by from the recorded o
 squares with a loss that a slipped foot does not rule.
 
 Slopes are taken over a parameter's order of magnitude, not at a point. Where feet come down at other times than in the
-recording, derivatives hold for less than a millinewton of lift and point nowhere beyond, while errors over thirty change
-smoothly (`docs/white_box.md`, "Why not derivatives").
+recording, derivatives hold for less than a millinewton of lift and point nowhere beyond, while errors over thirty
+change smoothly (`docs/white_box.md`, "Why not derivatives").
 """
 
 from __future__ import annotations
