@@ -79,12 +79,16 @@ METHODS = {
 
 
 def train(folder: Path, *arguments: str, result: str = "evaluation.json") -> None:
-    """Run `python -m ballu_mjx.train` into `folder`, unless its result is there; what was interrupted begins anew."""
-    if not (folder / result).exists():
-        if (folder / "config.json").exists():
-            shutil.rmtree(folder)
-        command = [sys.executable, "-m", "ballu_mjx.train", *arguments, "--output", str(folder)]
-        subprocess.run(command, check=True)
+    """Run `python -m ballu_mjx.train` into `folder`, unless its result is there. Of what was interrupted, reinforcement
+    learning goes on from its last checkpoint; all else, which takes minutes, begins anew."""
+    if (folder / result).exists():
+        return
+    options = [*arguments, "--output", str(folder)]
+    if arguments[0] == "envmimic" and runs.checkpoints(folder):
+        options = ["envmimic", "--resume", str(folder)]
+    elif (folder / "config.json").exists():
+        shutil.rmtree(folder)
+    subprocess.run([sys.executable, "-m", "ballu_mjx.train", *options], check=True)
 
 
 def load(folder: Path) -> evaluation.Evaluation:

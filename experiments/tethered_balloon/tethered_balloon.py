@@ -26,6 +26,7 @@ if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a co
 
 # %%
 import argparse
+import shutil
 
 from ballu_mjx import runtime
 
@@ -36,7 +37,7 @@ import numpy as np  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
-from ballu_mjx import evaluation, plots, recording, robot, robot_description  # noqa: E402
+from ballu_mjx import evaluation, plots, recording, robot, robot_description, runs  # noqa: E402
 from ballu_mjx.evaluation import Evaluation  # noqa: E402
 from ballu_mjx.recording import Recording  # noqa: E402
 from ballu_mjx.robot_description import RobotDescription  # noqa: E402
@@ -131,13 +132,18 @@ QUICK: list[str] = ["--num-timesteps", "20000", "--num-envs", "64", "--batch-siz
 
 
 def learn(recordings: Path, run: Path, seed: int, quick: bool) -> Evaluation:
-    """Train, unless the run is there already; its evaluation on the test recordings."""
+    """Train, unless the run is there already, or go on with it; its evaluation on the test recordings."""
     if not (run / "evaluation.json").exists():
-        command = [sys.executable, "-m", "ballu_mjx.train", "envmimic", "--robot-description", str(DESCRIPTION)]
-        for option, use in (("recordings", "training"), ("validation", "validation"), ("test", "test")):
-            command += [f"--{option}", str(recordings / use)]
-        command += QUICK if quick else []
-        subprocess.run([*command, "--seed", str(seed), "--output", str(run)], check=True)
+        command = [sys.executable, "-m", "ballu_mjx.train", "envmimic"]
+        if runs.checkpoints(run):
+            command += ["--resume", str(run)]
+        else:
+            shutil.rmtree(run, ignore_errors=True)
+            command += ["--robot-description", str(DESCRIPTION), "--seed", str(seed), "--output", str(run)]
+            for option, use in (("recordings", "training"), ("validation", "validation"), ("test", "test")):
+                command += [f"--{option}", str(recordings / use)]
+            command += QUICK if quick else []
+        subprocess.run(command, check=True)
     return evaluation.read(run / "evaluation.json")
 
 
