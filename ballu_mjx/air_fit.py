@@ -34,7 +34,8 @@ class AirData(RecordingsData):
     `--known RUN --free lift` finds how much from one recording. Without this option: nothing is
     known."""
     free: tuple[Literal[aerodynamics.NAMES], ...] = aerodynamics.NAMES  # pyright: ignore[reportInvalidTypeForm]
-    """Parameters to identify."""
+    """Parameters to identify; the others are as in --known, or 0. Leave the lift out where the model's was weighed: what
+    the model of the legs lacks can pass for it."""
 
 
 def fit(data: AirData, config: AirConfig) -> int:
@@ -42,8 +43,8 @@ def fit(data: AirData, config: AirConfig) -> int:
     started = time.perf_counter()
     air_identification.check(config)
     loggers.check(data.wandb)
-    if not data.free or (data.known is None and set(data.free) != set(aerodynamics.NAMES)):
-        raise InputError("--free: name one or more, and beside fewer than all the run that knows the others, --known.")
+    if not data.free:
+        raise InputError(f"--free names no parameter; there are {', '.join(aerodynamics.NAMES)}.")
     known = None if data.known is None else Residual.load(data.known)
     if known is not None and not isinstance(known.model, Aerodynamics):
         raise InputError(f"{data.known}: is no run of --method aerodynamic; give one.")

@@ -168,9 +168,9 @@ def identify(
         return Optimum(whole(solution.x), covariance * np.outer(scale, scale), _cost(solution.fun))
 
     without = fitted(start, np.zeros(0, int), 1).cost
-    if known is None:  # not from the bounds, where what must be positive has nowhere to go but up
-        start = np.where(np.isin(owner, aerodynamics.SIGNED), 0.0, scale)
     places = np.flatnonzero(np.isin(owner, list(free)))
+    if known is None:  # not from the bounds, where what must be positive has nowhere to go but up
+        start[places] = np.where(np.isin(owner, aerodynamics.SIGNED), 0.0, scale)[places]
     found = fitted(start, places, config.evaluations)
     if "delay" in free:
         found = at_whole_delay(

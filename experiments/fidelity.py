@@ -6,8 +6,9 @@
 # either with EnvMimic's forces, and the second with what else pushes (a wrench on the balloon; forces at balloon, base
 # and feet) and with what the other methods learn: regression on the forces that explain the recordings (supervised;
 # with all of its forces, as in the paper, and with the share of them that helps), gradients through the simulator
-# (analytic), the air's parameters (aerodynamic), and networks for what the air leaves (aerodynamic+analytic,
-# aerodynamic+EnvMimic). One training a method and seed; runs that are there already are not repeated.
+# (analytic), the air's parameters (aerodynamic; all, or all but the lift), and networks for what the air leaves
+# (aerodynamic+analytic, aerodynamic+EnvMimic). One training a method and seed; runs that are there already are not
+# repeated.
 #
 # `python experiments/fidelity.py` takes hours on two cores, `--methods` names some of it; `--robot N` does the same on
 # another virtual robot, recorded and its actuators identified first; `--quick` shows that it works.
@@ -41,7 +42,7 @@ import bundled_recordings  # noqa: E402
 import numpy as np  # noqa: E402
 from jaxtyping import Float  # noqa: E402
 
-from ballu_mjx import evaluation, plots, reconstruction, recording, residual, robot, runs  # noqa: E402
+from ballu_mjx import aerodynamics, evaluation, plots, reconstruction, recording, residual, robot, runs  # noqa: E402
 
 # %% [markdown]
 # ## Train
@@ -73,6 +74,11 @@ METHODS = {
     "analytic": Method("analytic", ("residual", "--method", "analytic")),
     "analytic-wrench": Method("analytic, wrench", ("residual", "--method", "analytic", "--forces", "wrench")),
     AIR: Method("aerodynamic", ("residual", "--method", "aerodynamic"), seeded=False),
+    "air-lift": Method(
+        "aerodynamic, the model's lift",
+        ("residual", "--method", "aerodynamic", "--free", *(name for name in aerodynamics.NAMES if name != "lift")),
+        seeded=False,
+    ),
     "air-analytic": Method("aerodynamic+analytic", ("residual", "--method", "analytic"), beside_air=True),
     "air-envmimic": Method("aerodynamic+EnvMimic", ("envmimic",), beside_air=True),
 }
@@ -112,7 +118,7 @@ def race(folders: Mapping[str, list[Path]]) -> str:
     goal = float(np.mean([curve(folder)[1].min() for folder in folders["identified"]]))
     lines = ["| method | lowest validation error (score) | seconds to EnvMimic's lowest |", "| --- | ---: | ---: |"]
     for name, members in folders.items():
-        if METHODS[name].nominal or name in ("regression", "supervised", AIR):
+        if METHODS[name].nominal or name in ("regression", "supervised", AIR, "air-lift"):
             continue
         curves = [curve(folder) for folder in members]
         first = [float(seconds[np.argmax(error <= goal)]) for seconds, error in curves if np.any(error <= goal)]

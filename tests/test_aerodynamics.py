@@ -196,6 +196,13 @@ def test_lost_lift_is_found_with_the_rest_kept(motions: list[Motion]):
     assert float(fit.standard_errors.turning_drag[0]) == 0.0
 
 
+def test_what_is_not_free_stays_nominal(motions: list[Motion]):
+    """Lift that was weighed; what nothing is known of is no air."""
+    fit = air_identification.identify(MODEL, motions, CONFIG, free=("added_mass",))
+    assert float(fit.parameters.added_mass) > 0
+    assert not any(np.any(getattr(fit.parameters, name)) for name in aerodynamics.NAMES if name != "added_mass")
+
+
 def test_recordings_shorter_than_a_window_are_refused(motions: list[Motion]):
     with pytest.raises(InputError, match="--window-seconds"):
         air_identification.identify(MODEL, motions[:1], AirConfig(window_seconds=30.0))
