@@ -34,8 +34,8 @@ class AirData(RecordingsData):
     `--known RUN --free lift` finds how much from one recording. Without this option: nothing is
     known."""
     free: tuple[Literal[aerodynamics.NAMES], ...] = aerodynamics.NAMES  # pyright: ignore[reportInvalidTypeForm]
-    """Parameters to identify; the others are as in --known, or 0. Leave the lift out where the model's was weighed: what
-    the model of the legs lacks can pass for it."""
+    """Parameters to identify; the others are as in --known, or 0. Leave the lift out where the model's was weighed:
+    what the legs' model lacks can pass for it."""
 
 
 def fit(data: AirData, config: AirConfig) -> int:
