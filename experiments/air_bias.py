@@ -1,0 +1,87 @@
+# %% [markdown]
+# # What the legs lack passes for air
+#
+# The air is identified beside legs that have neither dry friction nor backlash and slack; the robot's have both. Here
+# the bundled robot's training gaits are recorded anew on robots without one or both of these, and the air identified
+# from each: what it finds beside the truth that no robot's legs change.
+#
+# `python experiments/air_bias.py` takes about ten minutes on one core; `--quick` takes three gaits of two robots.
+
+# %%
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+if "google.colab" in sys.modules:  # install, from a checkout in the current folder
+    if not Path("constraints.txt").exists():
+        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
+    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
+if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
+    sys.argv[1:] = []
+    sys.path[:0] = [".", "experiments"]
+
+# %%
+import argparse
+import dataclasses
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+import deflation  # noqa: E402
+
+from ballu_mjx import actuators, air_fit, air_identification, reconstruction, recording, robot, virtual_robot  # noqa: E402
+from ballu_mjx.air_identification import AirConfig  # noqa: E402
+
+NONE = (0.0, 0.0)
+FRICTION = {"knee_friction": NONE, "motor_friction": NONE}
+PLAY = {"backlash": NONE, "cable_slack": NONE}
+ROBOTS = {
+    "all of its legs": {},
+    "no dry friction": FRICTION,
+    "no backlash or slack": PLAY,
+    "neither": FRICTION | PLAY,
+}
+"""What is another, of the virtual robot."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="What the legs lack, found as air.")
+    parser.add_argument("--output", type=Path, default=Path("runs/air-bias"), help="folder of recordings and table")
+    parser.add_argument("--quick", action="store_true", help="three gaits of two robots; the numbers mean little")
+    options = parser.parse_args()
+
+    model = robot.load_model(actuators.read(robot.assets() / "recordings" / actuators.NAME)[1])
+    full = virtual_robot.draw_robot(0)
+    lift = (full.buoyancy - robot.buoyancy_ratio(model)) * float(model.body_mass.sum()) * 9.81
+    lines = [
+        "| robot | lift (mN) | added mass (kg) | added inertia (kg m^2) | delay (ms) | cost |",
+        "| --- | ---: | ---: | ---: | ---: | ---: |",
+        f"| truth | {lift * 1e3:.0f} | {full.added_mass:.3f} | {full.added_inertia:.4f} | {full.latency * 1e3:.0f} | |",
+    ]
+    config = AirConfig(**air_fit.QUICK) if options.quick else AirConfig()
+    training = recording.bundled("training")[: 3 if options.quick else None]
+    for name, changes in list(ROBOTS.items())[: 2 if options.quick else None]:
+        legs = dataclasses.replace(full, **changes)
+        folder = options.output / name.replace(" ", "-")
+        gaits = [deflation.replayed(path, legs, 2000 + number, folder) for number, path in enumerate(training)]
+        motions = [reconstruction.reconstruct(gait, model) for gait in gaits]
+        fit = air_identification.identify(model, motions, config)
+        air, error = fit.parameters, fit.standard_errors
+        lines.append(
+            f"| {name} | {float(air.lift) * 1e3:.0f} ({float(error.lift) * 1e3:.0f}) | "
+            f"{float(air.added_mass):.3f} ({float(error.added_mass):.3f}) | "
+            f"{float(air.added_inertia):.4f} ({float(error.added_inertia):.4f}) | "
+            f"{float(air.delay) * 1e3:.0f} ({float(error.delay) * 1e3:.0f}) | {fit.cost[1]:.0f} |"
+        )
+        print(lines[-1], flush=True)
+    text = "\n".join(lines)
+    (options.output / "table.md").write_text(text + "\n")
+    print(text)
+    print(f"\nIn brackets standard errors. Written to {options.output}.")
+
+
+if __name__ == "__main__":
+    main()
