@@ -43,7 +43,7 @@ except ImportError:  # Windows, where runs are not locked
     fcntl = None
 
 from ballu_mjx import actuators as actuator_files
-from ballu_mjx import files, loggers, robot
+from ballu_mjx import files, loggers, robot, runtime
 from ballu_mjx import robot_description as descriptions
 from ballu_mjx.errors import InputError, is_number
 from ballu_mjx.robot import ActuatorParameters
@@ -407,6 +407,7 @@ class Run:
         record = {"step": step, "score": finite, "notes": dict(notes or {}), "files": _checksums(place)}
         files.write(place / _RECORD, json.dumps({**record, "sha256": _checksum(record)}, indent=2) + "\n")
         self._whole = step
+        runtime.release_memory()
 
     def write(self, name: str, text: str) -> None:
         """Write a text file into the folder."""

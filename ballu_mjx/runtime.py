@@ -6,6 +6,7 @@ This module imports neither JAX nor anything that does, so that a command's `mai
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import dataclasses
 import gc
 import hashlib
@@ -31,6 +32,8 @@ _ALLOCATIONS = 100_000
 """More objects made than freed, between two looks for garbage (Python's own: 700)."""
 _MOST_SAID = 300
 """Characters of an unexpected error's message: XLA's fill pages."""
+_M_ARENA_MAX = -8
+"""Of glibc's `mallopt`."""
 
 
 def prepare() -> None:
@@ -45,6 +48,8 @@ def prepare() -> None:
       exceptions.
     - Python looks for garbage less often: tracing MJX makes millions of objects that stay, and looking through all of
       them again and again takes time.
+    - glibc keeps one heap a core (its own limit: eight a core), unless `MALLOC_ARENA_MAX` is set. Every checkpoint is
+      written by threads of its own, which otherwise leave ever more heaps in pieces.
     - A JAX that would hang is refused (`check_jax`), and MJX's report that Warp is not installed kept off the screen.
 
     Where JAX is imported already (a notebook, say), its settings stay as they are.
@@ -64,6 +69,8 @@ def prepare() -> None:
                 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache_dir())
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", str(_MIN_COMPILE_SECONDS))
     gc.set_threshold(_ALLOCATIONS, *gc.get_threshold()[1:])
+    if "MALLOC_ARENA_MAX" not in os.environ:
+        _libc("mallopt", _M_ARENA_MAX, _cores())
     check_jax()
     _import_mjx()
 
@@ -136,6 +143,17 @@ def cache_dir() -> Path:
         base = Path.home() / ".cache"
     cpu = hashlib.sha256(_cpu_description().encode()).hexdigest()[:12]
     return base / "ballu_mjx" / f"jaxlib-{importlib.metadata.version('jaxlib')}-{cpu}"
+
+
+def release_memory() -> None:
+    """Give memory that is free, such as compiling leaves, back to the system, where glibc otherwise keeps it."""
+    _libc("malloc_trim", 0)
+
+
+def _libc(name: str, *arguments: int) -> None:
+    """Call a function of glibc, where there is one."""
+    if platform.libc_ver()[0] == "glibc":
+        getattr(ctypes.CDLL(None), name)(*arguments)
 
 
 def _told(error: Exception) -> str:

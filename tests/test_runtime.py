@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import re
 import subprocess
 import sys
@@ -18,7 +19,10 @@ SETTLED_BY_PREPARE = (
     "TF_CPP_MIN_LOG_LEVEL",
     "JAX_COMPILATION_CACHE_DIR",
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",
+    "MALLOC_ARENA_MAX",
 )
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+THREADS = 2 * CORES + 5
 PREPARE = "from ballu_mjx import runtime; runtime.prepare(); import jax\n"
 COMPILE = "import jax.numpy as jnp; jax.jit(lambda x: jnp.linalg.cholesky(x @ x.T + jnp.eye(3)))(jnp.ones((3, 3)))"
 
@@ -38,7 +42,7 @@ def python(code: str, cache: Path, **environment: str) -> subprocess.CompletedPr
 @pytest.mark.parametrize(
     ("flags", "expected"),
     [
-        ("", len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()),
+        ("", CORES),
         ("--xla_force_host_platform_device_count=3 --xla_cpu_enable_fast_math=false", 3),
     ],
 )
@@ -51,6 +55,29 @@ def test_other_xla_flags_of_the_user_stay(tmp_path: Path) -> None:
     flag = "--xla_cpu_enable_fast_math=false"
     out = python(PREPARE + "import os; print(os.environ['XLA_FLAGS'])", tmp_path, XLA_FLAGS=flag).stdout
     assert out.startswith(f"{flag} --xla_force_host_platform_device_count=")
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries have one heap")
+@pytest.mark.parametrize(("environment", "most"), [({}, CORES), ({"MALLOC_ARENA_MAX": "5"}, 5)])
+def test_threads_share_heaps(environment: dict[str, str], most: int, tmp_path: Path) -> None:
+    report = tmp_path / "heaps.xml"
+    code = PREPARE + (
+        "import ctypes, threading\n"
+        "libc = ctypes.CDLL(None)\n"
+        "libc.fopen.restype = libc.malloc.restype = ctypes.c_void_p\n"
+        f"together = threading.Barrier({THREADS})\n"
+        "def allocate():\n"
+        "    libc.malloc(5000)\n"
+        "    together.wait()\n"
+        f"threads = [threading.Thread(target=allocate) for _ in range({THREADS})]\n"
+        "for thread in threads: thread.start()\n"
+        "for thread in threads: thread.join()\n"
+        f"file = ctypes.c_void_p(libc.fopen({str(report)!r}.encode(), b'w'))\n"
+        "libc.malloc_info(0, file)\n"
+        "libc.fclose(file)\n"
+    )
+    python(code, tmp_path, **environment)
+    assert report.read_text().count("<heap ") == most
 
 
 def test_nothing_appears_on_the_screen_with_a_cold_or_a_warm_cache(tmp_path: Path) -> None:
