@@ -31,8 +31,7 @@ class AirData(RecordingsData):
 
     known: Path | None = None
     """Folder of an earlier run whose parameters are kept but for those of --free: balloons lose lift over weeks, and
-    `--known RUN --free lift` finds how much from one recording. Without this option: nothing is
-    known."""
+    `--known RUN --free lift` finds how much from one recording. Without this option nothing is known."""
     free: tuple[Literal[aerodynamics.NAMES], ...] = aerodynamics.NAMES  # pyright: ignore[reportInvalidTypeForm]
     """Parameters to identify; the others are as in --known, or 0. Leave the lift out where the model's was weighed:
     what the legs' model lacks can pass for it."""

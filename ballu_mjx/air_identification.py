@@ -130,10 +130,9 @@ def identify(
 
     def fitted(vector: np.ndarray, places: Int[np.ndarray, " free"], most: int) -> Optimum:
         """The best of the parameters at `places`, in so many steps at most."""
-
         spread, middle = scale[places], np.clip(vector, low + _INSIDE * scale, high - _INSIDE * scale)[places]
 
-        # The solver's first step is as long as where it starts is far from nothing, and 1 from there.
+        # Counted from the start: the solver first trusts a region as large as what it starts with, 1 where that is 0.
         def whole(x: np.ndarray) -> np.ndarray:
             moved = vector.copy()
             moved[places] = middle + x * spread

@@ -55,7 +55,7 @@ def main() -> None:
 
     model = robot.load_model(actuators.read(robot.assets() / "recordings" / actuators.NAME)[1])
     full = virtual_robot.draw_robot(0)
-    lift = (full.buoyancy - robot.buoyancy_ratio(model)) * float(model.body_mass.sum()) * 9.81
+    lift = deflation.lift(full.buoyancy - robot.buoyancy_ratio(model))
     lines = [
         "| robot | lift (mN) | added mass (kg) | added inertia (kg m^2) | delay (ms) | cost |",
         "| --- | ---: | ---: | ---: | ---: | ---: |",

@@ -110,7 +110,7 @@ def main() -> None:
     model = robot.load_model(known.actuators)
     full = virtual_robot.draw_robot(0)
     deflated = dataclasses.replace(full, buoyancy=full.buoyancy * (1 - LOSS))
-    lost = LOSS * full.buoyancy * float(robot.load_model().body_mass.sum()) * 9.81
+    lost = deflation.lift(LOSS * full.buoyancy)
     recorded = deflation.replayed(recording.bundled("training")[0], deflated, 2000, options.output / "recordings")
     motions = [reconstruction.reconstruct(recorded, model)]
     # At a whole delay, where errors can be differentiated.

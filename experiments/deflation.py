@@ -66,6 +66,12 @@ def replayed(path: Path, virtual: VirtualRobot, trial: int, folder: Path) -> rec
     return recording.read_recording(folder / f"{bundled.name}.csv.gz")  # which fills the gaps of hidden markers
 
 
+def lift(buoyancy: float) -> float:
+    """Force (N) of balloons that carry this share of BALLU's weight."""
+    model = robot.load_model()
+    return buoyancy * float(model.body_mass.sum() * np.linalg.norm(model.opt.gravity))
+
+
 # %% [markdown]
 # ## Table
 
@@ -130,15 +136,15 @@ def main() -> None:
         rows.append(
             row(f"{options.loss:.0%} less, all of the air, {len(every)} recordings", evaluator(anew.parameters))
         )
+    lost, found = lift(options.loss * full.buoyancy), float(known.params.lift - fit.parameters.lift)
     groups = " | ".join(f"{group}, 5 s" for group in sound.groups)
-    lift = options.loss * full.buoyancy * float(robot.load_model().body_mass.sum()) * 9.81
     text = "\n".join(
         [
             f"| | {groups} |",
             "| --- " * (1 + len(sound.groups)) + "|",
             *rows,
             "",
-            f"Lift lost: {lift * 1e3:.0f} mN; found: {float(known.params.lift - fit.parameters.lift) * 1e3:.0f} mN "
+            f"Lift lost: {lost * 1e3:.0f} mN; found: {found * 1e3:.0f} mN "
             f"(standard error {float(fit.standard_errors.lift) * 1e3:.1f}), in {seconds[1]:.0f} s beside compiling.",
         ]
     )
