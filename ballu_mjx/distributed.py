@@ -12,9 +12,13 @@ from typing import Any
 import jax
 import numpy as np
 from jax.experimental import multihost_utils
+from orbax.checkpoint import multihost
 
 from ballu_mjx import runtime
 from ballu_mjx.errors import InputError
+
+_PATIENCE = 3_600_000
+"""Milliseconds that processes wait for each other; one that died is found by its silence, much sooner."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,15 +66,23 @@ def is_first() -> bool:
     return jax.process_index() == 0
 
 
+def meet() -> None:
+    """Wait until all processes are here. Do so before they exchange anything after work of unequal length: one may find
+    compiled what another must compile, and an exchange begun alone gives up after half a minute."""
+    multihost.get_barrier_sync_fn()(key="ballu_mjx", timeout_ms=_PATIENCE)
+
+
 def anywhere(flag: bool) -> bool:
     """Whether `flag` is set in any process. All of them must ask."""
     if jax.process_count() == 1:
         return flag
+    meet()
     return bool(np.any(multihost_utils.process_allgather(np.array(flag))))
 
 
 def on_host(value: Any) -> np.ndarray:
     """A copy of an array on the host, of all its parts. All processes must ask for one that is spread over them."""
     if isinstance(value, jax.Array) and not (value.is_fully_addressable or value.is_fully_replicated):
+        meet()
         return np.asarray(multihost_utils.process_allgather(value, tiled=True))
     return np.array(value)

@@ -213,8 +213,8 @@ class Simulator:
         robot = robot or robot_description.ballu()
         self.robot = robot
         self.nv = model.nv
-        self.model = mjx.put_model(model)
-        self._template = mjx.make_data(model)
+        self.model = simulation.put_model(model)
+        self._template = simulation.make_data(model)
         self._count = simulation.substeps(model)
         sites = [model.site(name).id for name in (robot.tracked, *robot.points)]
         self._root = int(model.body_rootid[model.site_bodyid[sites[0]]])

@@ -144,12 +144,12 @@ class SuspendedLeg:
         joints = [self.model.joint(f"{kind}_{SIDES[0]}") for kind in ("motor", "knee")]
         self.angles = np.array([joint.qposadr[0] for joint in joints])
         self._dofs = np.array([joint.dofadr[0] for joint in joints])
-        self._mjx = mjx.put_model(self.model)
-        self._data = mjx.make_data(self.model)
+        self._mjx = simulation.put_model(self.model)
+        self._data = simulation.make_data(self.model)
         rubbing = copy.copy(self.model)
         rubbing.dof_frictionloss[self._dofs] = _FIRST.motor_friction, _FIRST.knee_friction  # MJX leaves out those of 0
-        self._rubbing = mjx.put_model(rubbing)
-        self._rubbing_data = mjx.make_data(rubbing)
+        self._rubbing = simulation.put_model(rubbing)
+        self._rubbing_data = simulation.make_data(rubbing)
         self._relaxation_damping = np.zeros(self.model.nv)
         for kind, damping in _RELAXATION_DAMPING.items():
             self._relaxation_damping[self.model.joint(f"{kind}_{SIDES[0]}").dofadr[0]] = damping

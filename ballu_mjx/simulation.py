@@ -177,9 +177,15 @@ def control_step(
     return batch_last.fast(steps)(model, template, state, commands, wrench)
 
 
+def put_model(model: mujoco.MjModel) -> mjx.Model:
+    """`model` for MJX, on this process's first device: MJX's own choice is the first of all processes that train
+    together (see `ballu_mjx.distributed`), whose memory the others cannot read."""
+    return mjx.put_model(model, device=jax.local_devices()[0])
+
+
 def make_data(model: mujoco.MjModel) -> mjx.Data:
-    """MJX data of `model` at its reference pose, on the default device."""
-    return mjx.make_data(model)
+    """MJX data of `model` at its reference pose, on this process's first device."""
+    return mjx.make_data(model, device=jax.local_devices()[0])
 
 
 def balloon_id(model: mujoco.MjModel) -> int:

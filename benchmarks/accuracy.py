@@ -35,7 +35,6 @@ import numpy as np
 import tyro
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float
-from mujoco import mjx
 
 from ballu_mjx import robot, simulation
 from ballu_mjx.simulation import State
@@ -190,7 +189,7 @@ def mjx_program(
 ) -> Callable[[Float[Array, "batch steps 2"]], Float[Array, "batch nq"]]:
     """The same by MJX in float32: from commands to final generalized positions, the batch sharded over `devices`."""
     step_count, balloon = simulation.substeps(model), simulation.balloon_id(model)
-    mjx_model, template = mjx.put_model(model), simulation.make_data(model)
+    mjx_model, template = simulation.put_model(model), simulation.make_data(model)
     start = simulation.at(jnp.asarray(qpos, jnp.float32), jnp.zeros(model.nv))
 
     def one(command: Float[Array, "steps 2"]) -> Float[Array, " nq"]:

@@ -23,7 +23,6 @@ import numpy as np
 import tyro
 from jax import Array
 from jax.sharding import PartitionSpec
-from mujoco import mjx
 
 from ballu_mjx import robot, simulation
 from ballu_mjx.simulation import State
@@ -50,7 +49,7 @@ def main(
     model = robot.load_model()
     substeps, bodies, devices = simulation.substeps(model), (simulation.balloon_id(model),), jax.device_count()
     steps = round(duration / robot.CONTROL_TIMESTEP)
-    mjx_model = mjx.put_model(model)
+    mjx_model = simulation.put_model(model)
     template = simulation.make_data(model)
     start = simulation.at(jnp.asarray(robot.standing_qpos(model), jnp.float32), jnp.zeros(model.nv))
 

@@ -47,7 +47,6 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
     import mujoco
     import numpy as np
     import throughput
-    from mujoco import mjx
 
     from ballu_mjx import batch_last, robot, simulation
 
@@ -57,7 +56,7 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
         rates = throughput.rollout_rates(model, 1, 5, commands)
         return {"whole": 1e6 / float(np.median(rates)) / simulation.substeps(model)}
 
-    mjx_model, template = mjx.put_model(model), simulation.make_data(model)
+    mjx_model, template = simulation.put_model(model), simulation.make_data(model)
     commands = jnp.asarray(rng.uniform(size=(batch, 2)), jnp.float32)
     qpos = np.tile(robot.standing_qpos(model), (batch, 1))
     state = simulation.at(jnp.asarray(qpos), jnp.zeros((batch, model.nv)))

@@ -152,7 +152,7 @@ def robots() -> tuple[mjx.Model, mjx.Data, simulation.State, Any, int]:
     qpos[:, 2] += rng.uniform(-0.002, 0.01, 8)
     state = simulation.at(jnp.asarray(qpos), jnp.asarray(0.3 * rng.normal(size=(8, model.nv))))
     command = jnp.asarray(rng.uniform(size=(8, 2)))
-    return mjx.put_model(model), simulation.make_data(model), state, command, simulation.balloon_id(model)
+    return simulation.put_model(model), simulation.make_data(model), state, command, simulation.balloon_id(model)
 
 
 def test_a_batch_of_robots_moves_as_each_alone(robots: tuple[mjx.Model, mjx.Data, simulation.State, Any, int]):

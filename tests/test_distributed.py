@@ -40,8 +40,23 @@ else:
 """
 
 
-def start(folder: Path, devices: int, **options: Any) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", TRAINING, json.dumps(options), str(folder)]
+PHYSICS = """
+import json, sys
+from ballu_mjx import runtime
+runtime.prepare()
+from ballu_mjx import distributed, robot, simulation
+import jax
+
+distributed.join(distributed.DistributedOptions(**json.loads(sys.argv[1])))
+model = robot.load_model()
+for leaf in jax.tree.leaves((simulation.put_model(model), simulation.make_data(model))):
+    jax.device_get(leaf)
+distributed.meet()
+"""
+
+
+def start(code: str, folder: Path, devices: int, **options: Any) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", code, json.dumps(options), str(folder)]
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     flags = f"--xla_force_host_platform_device_count={devices}"
     environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": path}
@@ -59,13 +74,17 @@ def finish(*processes: subprocess.Popen[str]) -> None:
             process.communicate()
 
 
-def test_two_processes_learn_what_one_with_two_devices_does(tmp_path: Path) -> None:
+def together() -> dict[str, Any]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    together = {"coordinator": f"127.0.0.1:{port}", "num_processes": 2}
-    both = [start(tmp_path / f"process-{i}", 1, **together, process_id=i) for i in range(2)]
-    finish(*both, start(tmp_path / "alone", 2))
+    return {"coordinator": f"127.0.0.1:{port}", "num_processes": 2}
+
+
+def test_two_processes_learn_what_one_with_two_devices_does(tmp_path: Path) -> None:
+    options = together()
+    both = [start(TRAINING, tmp_path / f"process-{i}", 1, **options, process_id=i) for i in range(2)]
+    finish(*both, start(TRAINING, tmp_path / "alone", 2))
 
     def curve(folder: str) -> list[list[float]]:
         rows = runs.read_metrics(tmp_path / folder)
@@ -79,6 +98,11 @@ def test_two_processes_learn_what_one_with_two_devices_does(tmp_path: Path) -> N
     assert kept.training is not None and expected.training is not None
     for name, values in expected.training.items():  # the environments of both processes among them
         np.testing.assert_allclose(kept.training[name], values, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+def test_every_process_reads_the_robot_it_simulates(tmp_path: Path) -> None:
+    options = together()
+    finish(*(start(PHYSICS, tmp_path, 1, **options, process_id=i) for i in range(2)))
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
-from mujoco import mjx
 
 from ballu_mjx import robot, robot_description, simulation
 
@@ -104,7 +103,7 @@ def test_mjx_follows_c_mujoco_over_a_control_step() -> None:
     count, balloon = simulation.substeps(model), simulation.balloon_id(model)
     points = tuple(model.site(name).id for name in robot_description.ballu().points)
     bodies = (balloon, *model.site_bodyid[list(points)].tolist())
-    mjx_model, template = mjx.put_model(model), simulation.make_data(model)
+    mjx_model, template = simulation.put_model(model), simulation.make_data(model)
 
     @jax.jit
     @jax.vmap
@@ -285,7 +284,7 @@ def settled_derivatives() -> tuple[np.ndarray, np.ndarray]:
     Cases are rows of `CASES`: vmapped, with a set of parameters each.
     """
     model = weightless()
-    mjx_model = mjx.put_model(model)
+    mjx_model = simulation.put_model(model)
     data = afloat(model)
     template, start = simulation.make_data(model), simulation.at(jnp.asarray(data.qpos), jnp.zeros(model.nv))
 

@@ -1,0 +1,160 @@
+"""One training in several processes: does it learn the same, and as fast?
+
+`python -m ballu_mjx.train envmimic` runs twice for every seed: in one process that has all cores, and in a process a
+core (two at least), each kept to its own, which find each other over the loopback interface (`--coordinator`). Shown
+are both learning curves, mean and range over seeds. Where several processes learn what one does, the means differ by
+less than the seeds do: the largest difference over all training steps is told in ranges of the seeds, beside the rates.
+
+`python benchmarks/processes.py`; `--quick` shows within minutes that it works, and its numbers mean little.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import common
+import numpy as np
+import tyro
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from ballu_mjx import runtime
+
+KINDS = {"one": "one process", "several": "a process a core"}
+COLOURS = {"one": "#0072b2", "several": "#d55e00"}
+CURVES = {"reward": "reward per control step", "validation_error": "validation error"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """The main job, in one process and in several."""
+
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """A training of each kind for every seed."""
+    steps: int = 1_000_000
+    """Control steps of each."""
+    output: Path = Path("runs/bench-processes")
+    """Folder for processes.json, processes.png and the runs. Runs that are there already are made again."""
+    quick: bool = False
+    """One seed, `train envmimic --quick`."""
+
+
+@contextlib.contextmanager
+def started(command: list[str], log: Path, cores: list[int]) -> Iterator[subprocess.Popen[bytes]]:
+    """A process kept to `cores`, and ended with whoever started it."""
+
+    def keep() -> None:
+        if hasattr(os, "sched_setaffinity"):
+            os.sched_setaffinity(0, cores)
+
+    with log.open("wb") as file:
+        process = subprocess.Popen(
+            command, stdout=file, stderr=subprocess.STDOUT, env=common.unprepared(), preexec_fn=keep
+        )
+        try:
+            yield process
+        finally:
+            process.kill()
+            process.wait()
+
+
+def train(kind: str, seed: int, options: Options) -> list[dict[str, Any]]:
+    """Rows of the run's `metrics.jsonl`.
+
+    **Raises** `SystemExit` naming the log of a process that failed.
+    """
+    from ballu_mjx import runs
+
+    folder = options.output / f"{kind}-seed-{seed}"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-m", "ballu_mjx.train", "envmimic", "--seed", str(seed), "--output", str(folder)]
+    sizes = ["--num-timesteps", str(options.steps), "--validate-every", str(max(options.steps // 8, 1))]
+    command += ["--quick"] if options.quick else sizes
+    cores, each = common.cores(), [[]]
+    if kind == "several":
+        count = max(2, len(cores))
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            coordinator = f"127.0.0.1:{free.getsockname()[1]}"
+        together = ["--coordinator", coordinator, "--num-processes", str(count)]
+        each = [[*together, "--process-id", str(number)] for number in range(count)]
+    with contextlib.ExitStack() as running:
+        processes = []
+        for number, more in enumerate(each):
+            log = options.output / f"{folder.name}-{number}.log"
+            kept = cores if kind == "one" else [cores[number % len(cores)]]
+            processes.append((running.enter_context(started([*command, *more], log, kept)), log))
+        for process, log in processes:
+            if process.wait():
+                raise SystemExit(f"The training failed with status {process.returncode}; {log} says why.")
+    return runs.read_metrics(folder)
+
+
+def curve(rows: list[dict[str, Any]], name: str) -> tuple[Float[np.ndarray, " steps"], Float[np.ndarray, " steps"]]:
+    """Control steps, and what was measured there."""
+    found = [(row["step"], row[name]) for row in rows if name in row]
+    steps, values = np.array(found, float).T
+    return steps, values
+
+
+def apart(one: Float[np.ndarray, "seeds steps"], several: Float[np.ndarray, "seeds steps"]) -> float:
+    """Largest difference of the means over seeds, in ranges over seeds (of one process; the median over steps)."""
+    spread = np.median(np.ptp(one, axis=0))
+    return float(np.max(np.abs(one.mean(axis=0) - several.mean(axis=0))) / spread)
+
+
+def plot(path: Path, found: dict[str, list[list[dict[str, Any]]]], machine: str) -> None:
+    """A panel a curve: mean and range over seeds."""
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    for axes, (name, label) in zip(figure.subplots(1, len(CURVES)), CURVES.items(), strict=True):
+        for kind, runs_of_kind in found.items():
+            steps = curve(runs_of_kind[0], name)[0]
+            values = np.array([curve(rows, name)[1] for rows in runs_of_kind])
+            axes.plot(steps, values.mean(axis=0), color=COLOURS[kind], label=KINDS[kind])
+            axes.fill_between(steps, values.min(axis=0), values.max(axis=0), color=COLOURS[kind], alpha=0.2)
+        axes.set(xlabel="control steps", ylabel=label)
+        axes.grid(alpha=0.3)
+        axes.legend()
+    figure.suptitle(f"{machine}, train envmimic, mean and range over seeds", fontsize=9)
+    common.save(figure, path)
+
+
+def main(options: Options) -> None:
+    runtime.prepare()
+    if options.quick:
+        options = dataclasses.replace(options, seeds=options.seeds[:1])
+    found: dict[str, list[list[dict[str, Any]]]] = {kind: [] for kind in KINDS}
+    rates: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    for seed in options.seeds:
+        for kind in KINDS:
+            rows = train(kind, seed, options)
+            found[kind].append(rows)
+            rates[kind].append(float(np.median(curve(rows, "steps_per_second")[1][1:])))
+            last = ", ".join(f"{name.replace('_', ' ')} {curve(rows, name)[1][-1]:.3f}" for name in CURVES)
+            print(
+                f"{KINDS[kind]:18} seed {seed}: {rates[kind][-1]:,.0f} control steps/s, at the end {last}", flush=True
+            )
+    result: dict[str, Any] = {"quick": options.quick, "steps_per_second": rates, "runs": found}
+    ratios = [several / one for one, several in zip(*rates.values(), strict=True)]
+    print(f"A process a core against one: {common.spread(ratios, 2)} of its rate")
+    if len(options.seeds) > 1:
+        for name in CURVES:
+            one, several = (np.array([curve(rows, name)[1] for rows in found[kind]]) for kind in KINDS)
+            result[f"{name}_apart"] = apart(one, several)
+            print(f"{CURVES[name]}: the means are at most {result[f'{name}_apart']:.2f} of the seeds' range apart")
+    common.write(options.output, "processes", result)
+    plot(options.output / "processes.png", found, common.described(common.machine()))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
