@@ -23,6 +23,8 @@ Data = TypeVar("Data")
 _KEPT = ("validate_every", "keep_every", "wandb")
 """Options of the training commands' data that a run keeps."""
 _PROGRAM = "python -m ballu_mjx.train"
+_SIGNALS = 128
+"""Statuses from here on are of processes that were interrupted, all of them together."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -40,7 +42,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             config=(tyro.conf.OmitArgPrefixes,),
         )
 
-    return runtime.exit_status(run, arguments)
+    status = runtime.exit_status(run, arguments)
+    if 0 < status < _SIGNALS and "jax" in sys.modules:
+        from ballu_mjx import distributed
+
+        distributed.leave(status)
+    return status
 
 
 def subcommands(arguments: Sequence[str] = ()) -> dict[str, Callable[..., int]]:
@@ -80,7 +87,7 @@ def subcommands(arguments: Sequence[str] = ()) -> dict[str, Callable[..., int]]:
     ) -> int:
         """Learn a residual from recordings, and measure it on recordings that training never saw.
 
-        --method aerodynamic identifies the air around the balloon (added mass, drag, lift, its centre) by derivatives
+        --method aerodynamic identifies the air around the balloon (added mass, drag, lift, its centre) by least squares
         through the simulation. The others learn a network of forces on the balloon: supervised by regression on the
         forces that explain the recordings, analytic by gradients of the tracking error through the simulation, envmimic
         by reinforcement learning (it is `train envmimic`). Each has options of its own: see its --help.

@@ -50,7 +50,18 @@ import jax
 distributed.join(distributed.DistributedOptions(**json.loads(sys.argv[1])))
 model = robot.load_model()
 for leaf in jax.tree.leaves((simulation.put_model(model), simulation.make_data(model))):
-    jax.device_get(leaf)
+    assert not isinstance(leaf, jax.Array) or leaf.is_fully_addressable, leaf.sharding
+distributed.meet()
+"""
+
+FAILURE = """
+import json, sys
+from ballu_mjx import distributed
+
+options = json.loads(sys.argv[1])
+distributed.join(distributed.DistributedOptions(**options))
+if options["process_id"] == 1:
+    distributed.leave(2)
 distributed.meet()
 """
 
@@ -103,6 +114,18 @@ def test_two_processes_learn_what_one_with_two_devices_does(tmp_path: Path) -> N
 def test_every_process_reads_the_robot_it_simulates(tmp_path: Path) -> None:
     options = together()
     finish(*(start(PHYSICS, tmp_path, 1, **options, process_id=i) for i in range(2)))
+
+
+def test_a_process_that_fails_does_not_wait_for_those_that_wait_for_it(tmp_path: Path) -> None:
+    options = together()
+    waiting, failing = (start(FAILURE, tmp_path, 1, **options, process_id=i) for i in range(2))
+    try:
+        assert failing.wait(60) == 2
+        assert waiting.poll() is None
+    finally:
+        for process in (waiting, failing):
+            process.kill()
+            process.communicate()
 
 
 @pytest.mark.parametrize(
