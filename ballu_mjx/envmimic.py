@@ -224,8 +224,12 @@ class Simulator:
     def altered(self, fields: Mapping[str, Array]) -> Simulator:
         """The same with other model fields, which may be traced. The centre of mass stays that of the model's own
         masses: air that the robot drags along is no part of it."""
+        return self.of(ballu.with_fields(self.model, dict(fields)))
+
+    def of(self, model: mjx.Model) -> Simulator:
+        """The same of another model of this structure, which may be traced."""
         other = copy.copy(self)
-        other.model = ballu.with_fields(self.model, dict(fields))
+        other.model = model
         return other
 
     def strained(self, generalized: Float[Array, " nv"]) -> Simulator:
@@ -316,6 +320,26 @@ def stack(simulator: Simulator, motions: Sequence[Motion]) -> tuple[Reference, F
 
     feature, com = simulator.observe_all(qpos, qvel)
     return Reference(qpos, qvel, feature, command, steps), com
+
+
+def roomy(reference: Reference) -> Reference:
+    """`reference` with room for more: recordings of no steps, and states behind the last ones, up to the next powers of
+    two. Programs are compiled for sizes, and recordings made anew are seldom just as many and as long."""
+    recordings, states = reference.qpos.shape[:2]
+    more = (
+        max(1 << (recordings - 1).bit_length(), _ROOM[0]) - recordings,
+        max(1 << (states - 1).bit_length(), _ROOM[1]) - states,
+    )
+
+    def filled(x: Array) -> Array:
+        return jnp.pad(x, [(0, more[0]), (0, more[1]), (0, 0)], mode="edge")
+
+    motion = Reference(*map(filled, reference[:-1]), steps=reference.steps)  # pyright: ignore[reportCallIssue]
+    return motion._replace(steps=jnp.pad(reference.steps, (0, more[0])))
+
+
+_ROOM = (16, 512)
+"""Recordings and states (25 s) that there is always room for."""
 
 
 def policy_input(
@@ -435,21 +459,44 @@ class EnvMimicEnv(Env):
         self.simulator = Simulator(model, robot)
         self.robot = self.simulator.robot
         self._held = np.array([model.joint(name).dofadr[0] for name in self.robot.held], int)
-        self._spread_of_starts = start_spread(model, self.robot)
+        self._spread_of_starts = jnp.asarray(start_spread(model, self.robot), jnp.float32)
         if beside is not None:
             self.simulator = self.simulator.altered(beside.model.fields(beside.params))
-        self.reference, _ = stack(self.simulator, motions)
+        reference, _ = stack(self.simulator, motions)
+        self.reference = roomy(reference)
         self.episode_length = round(config.episode_seconds / ballu.CONTROL_TIMESTEP)
-        self.recorded_inputs = recorded_inputs(self.reference, config, self.robot.anchored)
+        self.recorded_inputs = recorded_inputs(reference, config, self.robot.anchored)
         self._spread = jnp.std(self.recorded_inputs, axis=0)
         shapes = jax.eval_shape(self.reset, jax.random.key(0)).obs
         self._observation_size = {name: shape.shape for name, shape in shapes.items()}
+
+    @property
+    def contents(self) -> dict[str, Any]:
+        """What tells one environment from another of the same configuration, as arrays: the model's numbers, the
+        recordings, and what a residual beside has learned. Programs that take it as an argument (see
+        `learner.wrap_for_training`) serve them all."""
+        return {
+            "model": self.simulator.model,
+            "reference": self.reference,
+            "spread": self._spread,
+            "spread of starts": self._spread_of_starts,
+            "beside": None if self.beside is None else self.beside.params,
+        }
+
+    def with_contents(self, contents: Mapping[str, Any]) -> EnvMimicEnv:
+        """The same with other contents, which may be traced."""
+        other = copy.copy(self)
+        other.simulator = self.simulator.of(contents["model"])
+        other.reference = contents["reference"]
+        other._spread, other._spread_of_starts = contents["spread"], contents["spread of starts"]
+        other.beside = None if self.beside is None else self.beside._replace(params=contents["beside"])
+        return other
 
     def reset(self, rng: Array) -> State:
         """Reference state initialization: a uniformly drawn time of a uniformly drawn recording, history included."""
         key_recording, key_time, key_noise, key_sensor, key_length = jax.random.split(rng, 5)
         reference = self.reference
-        recording = jax.random.randint(key_recording, (), 0, len(reference.steps))
+        recording = jax.random.randint(key_recording, (), 0, jnp.sum(reference.steps > 0))
         time = jax.random.randint(key_time, (), HISTORY - 1, reference.steps[recording])
         qpos, qvel = reference.qpos[recording, time], reference.qvel[recording, time]
         qpos, qvel = self._perturb(key_noise, qpos, qvel, self.config.start_noise)
@@ -526,7 +573,7 @@ class EnvMimicEnv(Env):
     ) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
         """A state within the reconstruction's uncertainty of the recorded one."""
         key_base, key_turn, key_hinge, key_velocity = jax.random.split(key, 4)
-        position, velocity = np.split(scale * self._spread_of_starts, 2)
+        position, velocity = jnp.split(scale * self._spread_of_starts, 2)
         free = 0 if self.robot.anchored else 6
         nv = qvel.shape[0]
         root = []

@@ -6,6 +6,7 @@ a whole recording small errors only compound. The paper's whole-recording figure
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import reprlib
 from collections.abc import Mapping, Sequence
@@ -17,6 +18,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int
+from mujoco import mjx
 
 from ballu_mjx import envmimic, files, simulation
 from ballu_mjx import robot as ballu
@@ -34,10 +36,15 @@ SCORE_HORIZONS = (5.0, 10.0)
 _BALLOON_YAW = 8
 _LEAST = 1e-5
 """m or deg: an error below is that of single precision."""
+_RUNS = {True: 64, False: 1024}
+"""Runs side by side on each device; on a CPU, and elsewhere. Fewer are filled up, more go batch after batch."""
+_CHUNK = 100
+"""Control steps that the compiled program does at a time: one program for recordings of all lengths."""
 
 
 class Replay(NamedTuple):
-    """Simulated runs from recorded states, time first point included."""
+    """Simulated runs from recorded states, time first point included; what stands behind a recording's end means
+    nothing."""
 
     position: Float[np.ndarray, "runs states 3"]
     """Balloon (m, world)."""
@@ -255,7 +262,8 @@ def read(path: Path) -> Evaluation:
 
 
 class OpenLoopEvaluator:
-    """Replays a set of recordings; compiles once, for any parameters of the residual."""
+    """Replays a set of recordings; one compiled program for any parameters of the residual, any recordings and
+    actuators."""
 
     def __init__(
         self,
@@ -268,51 +276,84 @@ class OpenLoopEvaluator:
         """`base` is what `model`, the simulator without the residual, is called; `robot` says what is what in it (None:
         it is BALLU)."""
         self.base, self.name = base, residual.name
-        self.motions = tuple(motions)
+        self._residual = residual
         self._simulator = envmimic.Simulator(model, robot)
         self.robot = self._simulator.robot
-        self._reference, com = envmimic.stack(self._simulator, motions)
-        self._recorded_com = np.asarray(com)
-        self._recorded = np.asarray(self._reference.features)
+        devices = jax.local_devices()
+        self._size = len(devices) * _RUNS[devices[0].platform == "cpu"]
+        mesh = jax.sharding.Mesh(np.array(devices), ("batch",))
+        spec = jax.sharding.PartitionSpec
+        self._everywhere = jax.sharding.NamedSharding(mesh, spec())
+        self._split = jax.sharding.NamedSharding(mesh, spec("batch"))
+        # XLA splits the batch over the devices: one core a device.
+        split = jax.shard_map(
+            jax.vmap(self._advance, in_axes=(None, None, None, None, 0, 0)),
+            mesh=mesh,
+            in_specs=(spec(), spec(), spec(), spec(), spec("batch"), spec("batch")),
+            out_specs=spec("batch"),
+            check_vma=False,
+        )
+        self._chunk = jax.jit(split)
+        self._look_at(motions)
+
+    def on(self, motions: Sequence[Motion]) -> OpenLoopEvaluator:
+        """The same for other recordings, with the program that is compiled already."""
+        other = copy.copy(self)
+        other._look_at(motions)
+        return other
+
+    def _look_at(self, motions: Sequence[Motion]) -> None:
+        self.motions = tuple(motions)
+        reference, com = envmimic.stack(self._simulator, motions)
+        self._recorded, self._recorded_com = np.asarray(reference.features), np.asarray(com)
+        self._reference = jax.device_get(envmimic.roomy(reference))
+        self._fixed = jax.device_put((jax.device_get(self._simulator.model), self._reference), self._everywhere)
         interval = round(START_INTERVAL / ballu.CONTROL_TIMESTEP)
         self.starts = [
             (index, start)
             for index, motion in enumerate(self.motions)
             for start in range(envmimic.HISTORY - 1, len(motion.command) - interval + 1, interval)
         ]
-        self._vanilla: tuple[Errors, ...] | None = None
-        length = max(len(motion.command) for motion in motions) - (envmimic.HISTORY - 1)
-        # Pad the batch to the devices, and let XLA split it: one core a device.
-        devices = jax.local_devices()
-        padded = self.starts + [self.starts[0]] * (-len(self.starts) % len(devices))
-        mesh = jax.sharding.Mesh(np.array(devices), ("batch",))
-        sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("batch"))
-        self._batch = jax.device_put(jnp.array(padded, jnp.int32), sharding)
-
-        def replay(params: Any, scale: Array, batch: Int[Array, "runs 2"]) -> Any:
-            return jax.vmap(lambda run: self._replay_one(residual, params, scale, run[0], run[1], length))(batch)
-
-        spec = jax.sharding.PartitionSpec
-        split = jax.shard_map(
-            replay, mesh=mesh, in_specs=(spec(), spec(), spec("batch")), out_specs=spec("batch"), check_vma=False
-        )
         recordings = [recording for recording, _ in self.starts]
         # Of each recording, the place in `starts` of the run over (nearly) all of it.
         self.first_runs = [recordings.index(index) for index in range(len(self.motions))]
-
-        def replay_all(params: Any, scale: Array, batch: Int[Array, "runs 2"]) -> Any:
-            # Positions of every start would be as much again as all else that comes back.
-            *seen, qpos = split(params, scale, batch)
-            return *seen, qpos[jnp.array(self.first_runs)]
-
-        self._replay = jax.jit(replay_all)
+        self._vanilla: tuple[Errors, ...] | None = None
 
     def replay(self, params: Any, *, scale: float = 1.0) -> Replay:
-        """Simulate every start to the end; `scale` is the residual's share (0: none, 1: all of it)."""
+        """Simulate every start to its recording's end; `scale` is the residual's share (0: none, 1: all of it)."""
         params = jax.device_get(params)  # they may live on one device; the batch is spread over all
-        features, com, force, qpos = jax.device_get(self._replay(params, np.float32(scale), self._batch))
-        runs = len(self.starts)
-        return Replay(features[:runs, :, :3], features[:runs, :, _BALLOON_YAW], com[:runs], force[:runs], qpos)
+        starts = np.array(self.starts, np.int32)
+        steps = np.array([len(self.motions[recording].command) - start for recording, start in self.starts])
+        shape, longest = (len(starts),), int(steps.max())
+        features = np.zeros((*shape, longest + 1, self._recorded.shape[-1]), np.float32)
+        com, force = np.zeros((*shape, longest + 1, 3), np.float32), np.zeros((*shape, longest, 3), np.float32)
+        qpos = np.zeros((*shape, longest + 1, self._reference.qpos.shape[-1]), np.float32)
+        recording, first = starts.T
+        features[:, 0], com[:, 0] = self._recorded[recording, first], self._recorded_com[recording, first]
+        qpos[:, 0] = self._reference.qpos[recording, first]
+
+        order = np.argsort(-steps, kind="stable")  # batches of runs that end at about the same time
+        for batch in np.split(order, range(self._size, len(order), self._size)):
+            places = starts[batch[np.arange(self._size) % len(batch)]]
+            carry = self._begin(places)
+            for done in range(0, int(steps[batch].max()), _CHUNK):
+                now = places + np.array([0, done], np.int32)
+                carry, seen = self._chunk(params, np.float32(scale), *self._fixed, carry, now)
+                part = slice(done, min(done + _CHUNK, longest))
+                after = slice(part.start + 1, part.stop + 1)
+                for array, where, values in zip(
+                    (features, com, force, qpos), (after, after, part, after), jax.device_get(seen), strict=True
+                ):
+                    array[batch, where] = values[: len(batch), : part.stop - part.start]
+        return Replay(features[..., :3], features[..., _BALLOON_YAW], com, force, qpos[self.first_runs])
+
+    def _begin(self, places: Int[np.ndarray, "runs 2"]) -> tuple[simulation.State, Float[Array, "runs 3 features"]]:
+        """States at their places (recording, control step), and what was seen of the last three."""
+        recording, first = places.T
+        earlier = first[:, None] + np.arange(1 - envmimic.HISTORY, 1)
+        qvel = self._reference.qvel[recording, first]
+        state = simulation.State(self._reference.qpos[recording, first], qvel, np.zeros_like(qvel))  # pyright: ignore
+        return jax.device_put((state, self._reference.features[recording[:, None], earlier]), self._split)
 
     def recorded(self, run: int) -> tuple[Float[np.ndarray, "states 3"], Float[np.ndarray, " states"]]:
         """Recorded balloon position (m) and yaw (rad) from the start of `run` to the recording's end."""
@@ -326,23 +367,23 @@ class OpenLoopEvaluator:
             self._vanilla = self.errors(self.replay(params, scale=0.0))
         return Evaluation(self._vanilla, self.errors(self.replay(params)), self.base, self.name)
 
-    def _replay_one(
+    def _advance(
         self,
-        residual: ForceModel,
         params: Any,
         scale: Array,
-        recording: Array,
-        start: Array,
-        length: int,
-    ) -> tuple[Array, Array, Array, Array]:
-        reference, own = self._reference, self._simulator.model
+        model: mjx.Model,
+        reference: envmimic.Reference,
+        carry: tuple[simulation.State, Array],
+        place: Int[Array, " 2"],
+    ) -> tuple[Any, tuple[Array, Array, Array, Array]]:
+        """One run, on by `_CHUNK` control steps: what the next ones start from, and features, centre of mass, force and
+        generalized positions after each."""
+        residual = self._residual
+        recording, start = place
         fields = {
-            name: (1 - scale) * getattr(own, name) + scale * value for name, value in residual.fields(params).items()
+            name: (1 - scale) * getattr(model, name) + scale * value for name, value in residual.fields(params).items()
         }
-        simulator = self._simulator.altered(fields)
-        history = jax.lax.dynamic_slice_in_dim(
-            reference.features[recording], start - envmimic.HISTORY + 1, envmimic.HISTORY
-        )
+        simulator = self._simulator.of(model).altered(fields)
 
         def step(carry: tuple, time: Array) -> tuple[tuple, tuple]:
             state, history = carry
@@ -354,13 +395,7 @@ class OpenLoopEvaluator:
             history = jnp.concatenate([history[1:], seen[None]])
             return (state, history), (seen, com, wrench[0, :3], state.qpos)
 
-        first_state = simulation.at(reference.qpos[recording, start], reference.qvel[recording, start])
-        first, first_com = simulator.observe(first_state)
-        _, (features, com, force, qpos) = jax.lax.scan(step, (first_state, history), start + jnp.arange(length))
-        features, com, qpos = (
-            jnp.concatenate([x[None], xs]) for x, xs in ((first, features), (first_com, com), (first_state.qpos, qpos))
-        )
-        return features, com, force, qpos
+        return jax.lax.scan(step, carry, start + jnp.arange(_CHUNK))
 
     def errors(self, replay: Replay) -> tuple[Errors, ...]:
         """Errors of a replay, by recording."""

@@ -174,9 +174,7 @@ def sources() -> dict[str, str]:
 
 def open_loop(policy: Policy, steps: int) -> Float[np.ndarray, "steps 2"]:
     """The policy's commands in its own simulator, from standing."""
-    from ballu_mjx.policy import ClosedLoop
-
-    loop = ClosedLoop(policy.environment(), policy.infer)
+    loop = policy.closed_loop()
     return np.asarray(loop(policy.params, *loop.standing(), steps).command[0], float)
 
 

@@ -204,14 +204,11 @@ def _fit(task: str, data: ForcesData, config: Any, method: type[_Fit]) -> int:
     def all_params(params: Params) -> Any:
         return params if beside is None else (beside.params, params)
 
-    def evaluator(use: str) -> evaluation.OpenLoopEvaluator:
-        return evaluation.OpenLoopEvaluator(model, motions[use], whole, prepared.base)
-
     sections = {"env": env, "ppo": network, "fit": config, "data": data}
     devices = [str(device) for device in jax.local_devices()]
     description = runs.describe(task, sections, prepared.files, devices, prepared.identified)
     description["residual"] = None if data.residual is None else str(data.residual.resolve())
-    validation = evaluator("validation")
+    validation = evaluation.OpenLoopEvaluator(model, motions["validation"], whole, prepared.base)
     with Run(folder, description, wandb=data.wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)
         write_observed(run, inputs)
@@ -223,7 +220,7 @@ def _fit(task: str, data: ForcesData, config: Any, method: type[_Fit]) -> int:
     losses = {name.replace("_", " "): runs.column(folder, name) for name in names}
     validated = runs.column(folder, method.curve)
     plots.fit_curve(folder / "learning_curve.png", losses, validated, method.curve_label, task, best_step)
-    test = validation if prepared.one_set else evaluator("test")
+    test = validation if prepared.one_set else validation.on(motions["test"])
     print(f"Best checkpoint: gradient step {best_step:,}. Open-loop replay of the test recordings:\n")
     print(evaluate.report(test, all_params(params), folder).table())
     if data.quick:

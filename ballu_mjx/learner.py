@@ -69,11 +69,14 @@ _MEASURED = "measured"
 _MAX_CALLS = 400
 
 
-def wrap_for_training(env: Env) -> Env:
+def wrap_for_training(env: Env) -> Wrapper:
     """`env` vectorized, with every finished environment reset to a newly drawn state.
 
     Brax's own auto-reset goes back to a cached first state for ever. Here all environments are reset in every step,
     and the finished ones take the result: for environments whose reset costs nothing beside their step.
+
+    An `env` may have `contents`, a tree of arrays, and a method `with_contents(contents)` that gives the same with
+    others: a `Learner` hands them to its program, which so serves all environments that differ in nothing else.
 
     An `env` with a method `renew(state, key)` is reset by it: what tells one variant of an environment from another can
     then be handed on from state to state, instead of being a constant of the compiled program.
@@ -141,11 +144,11 @@ class Learner:
         """**Raises** `InputError` from `ppo.check`."""
         self._devices = jax.device_count()
         ppo.check(config, self._devices)
-        self._config, self._env = config, wrap_for_training(env)
-        shapes = jax.eval_shape(self._env.reset, jax.random.split(jax.random.PRNGKey(0), 1)).obs
+        self._config, self._env = config, env
+        shapes = jax.eval_shape(wrap_for_training(env).reset, jax.random.split(jax.random.PRNGKey(0), 1)).obs
         self._observation = {name: jax.ShapeDtypeStruct(x.shape[1:], jnp.float32) for name, x in shapes.items()}
         sizes = {name: x.shape for name, x in self._observation.items()}
-        self._networks = ppo.make_networks(sizes, self._env.action_size, config)
+        self._networks = ppo.make_networks(sizes, env.action_size, config)
         # The learning rate is part of the state also where it stays: one program for all of them.
         self._optimizer = optax.chain(
             optax.clip_by_global_norm(config.max_grad_norm),
@@ -166,13 +169,15 @@ class Learner:
         each: Any = PartitionSpec()
         specs = TrainingState(*[each] * len(TrainingState._fields))._replace(environments=PartitionSpec(_AXIS))
         self._shardings: Any = TrainingState(*(NamedSharding(mesh, spec) for spec in specs))  # pyright: ignore
-        self._begin = jax.jit(self._first, out_shardings=self._shardings)
-        step = jax.shard_map(self._step, mesh=mesh, in_specs=(specs,), out_specs=(specs, each), check_vma=False)
+        everywhere = NamedSharding(mesh, each)
+        # From the host: an array of one device is not for all processes.
+        self._contents = jax.device_put(jax.device_get(getattr(env, "contents", ())), everywhere)
+        self._first = jax.jit(self._make_first, out_shardings=self._shardings)
+        step = jax.shard_map(
+            self._make_step, mesh=mesh, in_specs=(specs, each), out_specs=(specs, each), check_vma=False
+        )
         # Placed as they go in; on one device they would come back with another description, and compile a second time.
-        placed = (self._shardings, NamedSharding(mesh, each))
-        self.step = jax.jit(step, donate_argnums=0, out_shardings=placed)
-        """A training step: the state to the next one and its means, reward, metrics and losses. The memory of the state
-        that goes in is used again."""
+        self._step = jax.jit(step, donate_argnums=0, out_shardings=(self._shardings, everywhere))
 
     @property
     def steps_each(self) -> int:
@@ -181,7 +186,12 @@ class Learner:
 
     def begin(self, seed: int) -> TrainingState:
         """A fresh state; Brax's with this seed."""
-        return self._begin(np.array(jax.random.PRNGKey(seed)))  # an array of one device is not for all processes
+        return self._first(np.array(jax.random.PRNGKey(seed)), self._contents)
+
+    def step(self, state: TrainingState) -> tuple[TrainingState, dict[str, Array]]:
+        """A training step: the state to the next one and its means, reward, metrics and losses. The memory of the state
+        that goes in is used again."""
+        return self._step(state, self._contents)
 
     def go_on(self, stored: Stored, *, environments: bool = True) -> tuple[TrainingState, bool]:
         """The state that `stored` was made of, and whether all of it could be used.
@@ -191,7 +201,7 @@ class Learner:
 
         **Raises** `ValueError` naming what is missing or has another shape in the rest of it.
         """
-        shapes = jax.eval_shape(self._begin, jax.random.PRNGKey(0))
+        shapes = jax.eval_shape(self._first, jax.random.PRNGKey(0), self._contents)
         fits, drawn = {}, set()
         for path, leaf in jax.tree.leaves_with_path(shapes):
             name = _name(path)
@@ -235,10 +245,15 @@ class Learner:
         """From the host to where `step` wants it."""
         return jax.device_put(state, self._shardings)
 
-    def _first(self, key: UInt32[Array, 2]) -> TrainingState:
+    def _with_contents(self, contents: Any) -> Wrapper:
+        env: Any = self._env
+        return wrap_for_training(env.with_contents(contents) if hasattr(env, "with_contents") else env)
+
+    def _make_first(self, key: UInt32[Array, 2], contents: Any) -> TrainingState:
         key_networks, key = jax.random.split(key)
         key, key_environments, _ = jax.random.split(jax.random.fold_in(key, 0), 3)
         key_policy, key_value = jax.random.split(key_networks)
+        env = self._with_contents(contents)
         networks = PPONetworkParams(
             policy=self._networks.policy_network.init(key_policy),  # pyright: ignore[reportCallIssue]
             value=self._networks.value_network.init(key_value),  # pyright: ignore[reportCallIssue]
@@ -250,20 +265,20 @@ class Learner:
                 averaged_steps=jnp.zeros((), jnp.int32),
                 optimizer=self._optimizer.init(networks),  # pyright: ignore[reportArgumentType]
                 normalizer=running_statistics.init_state(self._observation),
-                environments=self._env.reset(jax.random.split(key_environments, self._config.num_envs)),
+                environments=env.reset(jax.random.split(key_environments, self._config.num_envs)),
                 key=key,
                 steps=_uint64(0),
             )
         )
 
-    def _step(self, state: TrainingState) -> tuple[TrainingState, dict[str, Array]]:
+    def _make_step(self, state: TrainingState, contents: Any) -> tuple[TrainingState, dict[str, Array]]:
         """On one device, with its share of the environments; random numbers are split as Brax splits them."""
         config = self._config
         key_step, key = jax.random.split(state.key)
         key_device = jax.random.split(key_step, self._devices)[jax.lax.axis_index(_AXIS)]
         key_learn, key_act, _ = jax.random.split(key_device, 3)
 
-        environments, data, measured = self._act(state, key_act)
+        environments, data, measured = self._act(self._with_contents(contents), state, key_act)
 
         # Where the learning rate adapts, the old policy must still be what acted when the change is measured.
         adaptive = config.desired_kl > 0
@@ -292,7 +307,7 @@ class Learner:
         )
         return _settled(after), jax.lax.pmean(jax.tree.map(jnp.mean, measured | losses), _AXIS)
 
-    def _act(self, state: TrainingState, key: Array) -> tuple[State, Transition, dict[str, Array]]:
+    def _act(self, env: Wrapper, state: TrainingState, key: Array) -> tuple[State, Transition, dict[str, Array]]:
         """Environments one unroll or several on, the pieces of experience, leaves (pieces, unroll_length, ...), and
         rewards and metrics."""
         config = self._config
@@ -303,7 +318,7 @@ class Learner:
             environments, key = carry
             key, key_next = jax.random.split(key)
             environments, data = acting.generate_unroll(
-                self._env, environments, policy, key, config.unroll_length, extra_fields=("truncation", _MEASURED)
+                env, environments, policy, key, config.unroll_length, extra_fields=("truncation", _MEASURED)
             )
             return (environments, key_next), data
 

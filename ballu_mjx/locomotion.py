@@ -2,11 +2,13 @@
 (paper, section "Improved Sim-to-real Transfer").
 
 What tells one simulator from another (actuators, friction, starting states) travels in the environment's state, as
-data: settings share a compiled program. Only the residual, which adds a network, makes another one.
+data: settings share a compiled program. A residual adds a network, and so makes another one, but one for all residuals
+of its kind.
 """
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from typing import Any
@@ -82,6 +84,8 @@ def setting_name(config: LocomotionConfig, identified: bool, residual: str | Non
 
 Setting = dict[str, Any]
 """What tells one simulator from another, as arrays; see `setting_of`."""
+Contents = dict[str, Any]
+"""See `LocomotionEnv.contents`."""
 OBSERVATIONS = 28
 _METRICS = ("velocity_x", "velocity_y", "force", "outside", "excess", "diverged")
 
@@ -125,6 +129,23 @@ class LocomotionEnv(Env):
         self._friction = jnp.asarray(model.geom_friction)
         self._knees = jnp.asarray(np.arange(model.nq)[7:][ballu.KNEES])
 
+    @property
+    def contents(self) -> Contents:
+        """The model's numbers, and what the residual has learned and seen: what tells one environment from another of
+        the same task, configuration and kind of residual, as arrays (beside the setting, which may differ from robot to
+        robot). Programs that take it as an argument serve them all."""
+        residual = None if self.residual is None else (self.residual.params, self.residual.observed)
+        return {"model": self.simulator.model, "setting": self.setting, "residual": residual}
+
+    def with_contents(self, contents: Contents) -> LocomotionEnv:
+        """The same with other contents, which may be traced."""
+        other = copy.copy(self)
+        other.simulator, other.setting = self.simulator.of(contents["model"]), contents["setting"]
+        if self.residual is not None:
+            params, observed = contents["residual"]
+            other.residual = dataclasses.replace(self.residual, params=params, observed=observed)
+        return other
+
     def reset(self, rng: Array) -> State:
         """Standing, at the origin, facing x; with domain randomization, nearly so."""
         return self._start(self.setting, rng)
@@ -134,9 +155,9 @@ class LocomotionEnv(Env):
         s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
         return self._start(s["setting"], rng)
 
-    def at(self, setting: Setting, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], rng: Array) -> State:
-        """Start from a given state in the simulator that `setting` makes, with nominal friction, and without an end."""
-        state = self._begin(setting, qpos, qvel, jnp.asarray(self._friction[self._feet[0], 0]), rng)
+    def at(self, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], rng: Array) -> State:
+        """Start from a given state, with nominal friction, and without an end."""
+        state = self._begin(self.setting, qpos, qvel, jnp.asarray(self._friction[self._feet[0], 0]), rng)
         s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
         return dataclasses.replace(state, pipeline_state=s | {"remaining": jnp.asarray(2**30, jnp.int32)})  # pyright: ignore
 

@@ -50,8 +50,8 @@ from ballu_mjx.envmimic import EnvMimicConfig
 from ballu_mjx.errors import InputError
 from ballu_mjx.forces import ForceSet
 from ballu_mjx.identification import IdentificationConfig
-from ballu_mjx.locomotion import LocomotionConfig, Setting
-from ballu_mjx.policy import ClosedLoop, Policy
+from ballu_mjx.locomotion import LocomotionConfig
+from ballu_mjx.policy import Policy
 from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.recording import write_recording
 from ballu_mjx.supervised import SupervisedConfig
@@ -176,7 +176,6 @@ class Story:
     def __init__(self, options: Options, seed: int) -> None:
         self.options, self.seed = options, seed
         self._robot = virtual_robot.draw_robot(options.robot)
-        self._loop: ClosedLoop | None = None
         self._shared, self._own = options.output, options.output / f"seed-{seed}"
 
     def sweep(self) -> Path:
@@ -338,7 +337,7 @@ class Story:
         def make(folder: Path) -> None:
             policy = Policy.load(source)
             draws = [virtual_robot.draw_trial(_draw(self.seed, task, "trials", number)) for number in range(count)]
-            found = trials.run(policy, self._robot, draws, folder, *self._simulator(policy))
+            found = trials.run(policy, self._robot, draws, folder)
             transfer.write(folder / "transfer.json", found)
 
         options = {"robot": self.options.robot, "seed": self.seed, "trials": count}
@@ -348,28 +347,14 @@ class Story:
     def _actions(self, run: Path, seconds: float) -> list[np.ndarray]:
         """Commands of each of a policy's kept checkpoints over `seconds`, in its own simulator from standing."""
         policies = [Policy.load(run, step) for step in _last_steps(run)]
-        loop, setting = self._simulator(policies[0])
+        loop = policies[0].closed_loop()
         start, count = loop.standing(), round(seconds / robot.CONTROL_TIMESTEP)
-        return [np.round(loop(p.params, *start, count, setting).command[0], 3).astype(float) for p in policies]
-
-    def _simulator(self, policy: Policy) -> tuple[ClosedLoop, Setting]:
-        """A policy's own simulator; those without residual share one program, whatever the task."""
-        if policy.residual is not None:
-            return simulator(policy)
-        if self._loop is None:
-            self._loop = simulator(policy)[0]
-        return self._loop, policy.environment().setting
+        return [np.round(loop(p.params, *start, count).command[0], 3).astype(float) for p in policies]
 
 
 def _last_steps(run: Path) -> list[int]:
     """Of a run's last checkpoints; the best may be an earlier one, and the first is of no training at all."""
     return [step for step in runs.checkpoints(run)[-runs.KEPT :] if step > 0]
-
-
-def simulator(policy: Policy) -> tuple[ClosedLoop, Setting]:
-    """A policy's own simulator, in closed loop."""
-    env = policy.environment()
-    return ClosedLoop(env, policy.infer), env.setting
 
 
 def _draw(seed: int, task: str, use: str, number: int) -> int:

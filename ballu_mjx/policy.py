@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from ballu_mjx import locomotion, ppo, robot, runs
 from ballu_mjx.errors import InputError
-from ballu_mjx.locomotion import LocomotionConfig, LocomotionEnv, Setting
+from ballu_mjx.locomotion import Contents, LocomotionConfig, LocomotionEnv
 from ballu_mjx.ppo import Inference, Params, PPOConfig
 from ballu_mjx.residual import Residual
 from ballu_mjx.robot import ActuatorParameters
@@ -83,6 +83,10 @@ class Policy:
         """The simulator that the policy was trained in."""
         return environment(self.task, self.config, self.actuators, self.residual)
 
+    def closed_loop(self) -> ClosedLoop:
+        """That simulator, for any parameters of the policy."""
+        return ClosedLoop(self.environment(), self.infer)
+
     def act(self) -> Callable[[Float[np.ndarray, " 27"]], Float[np.ndarray, " 2"]]:
         """`envmimic.features` to servo commands, for use outside of JAX, step by step."""
 
@@ -138,27 +142,35 @@ _BATCH = 8
 
 class ClosedLoop:
     """Runs policies in closed loop; one compiled program for any number of runs and steps, any parameters, and all
-    simulators that differ in their setting alone."""
+    simulators that differ in their contents alone (`LocomotionEnv.contents`)."""
 
     def __init__(self, env: LocomotionEnv, infer: Inference) -> None:
-        self._setting = env.setting
+        self._contents = env.contents
 
         def look(state: State) -> tuple[Array, ...]:
             s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
             return s["physics"].qpos, s["history"][-1], s["com"]
 
-        def run(params: Params, state: State) -> Any:
+        def run(params: Params, contents: Contents, state: State) -> Any:
+            here = env.with_contents(contents)
+
             def advance(state: State, _: None) -> tuple[State, Any]:
                 action = infer(params, state.obs)  # pyright: ignore[reportArgumentType]
-                after = env.step(state, action)
+                after = here.step(state, action)
                 return after, (*look(after), locomotion.command_of(action), after.metrics["outside"], after.reward)
 
             return jax.lax.scan(advance, state, None, _CHUNK)
 
-        self._run = jax.jit(jax.vmap(run, in_axes=(None, 0)))
-        self._at = jax.jit(jax.vmap(env.at, in_axes=(None, 0, 0, 0)))
+        def at(contents: Contents, qpos: Array, qvel: Array, key: Array) -> State:
+            return env.with_contents(contents).at(qpos, qvel, key)
+
+        def reset(contents: Contents, key: Array) -> State:
+            return env.with_contents(contents).reset(key)
+
+        self._run = jax.jit(jax.vmap(run, in_axes=(None, None, 0)))
+        self._at = jax.jit(jax.vmap(at, in_axes=(None, 0, 0, 0)))
         self._look = jax.vmap(look)
-        self._reset = jax.jit(jax.vmap(env.reset))
+        self._reset = jax.jit(jax.vmap(reset, in_axes=(None, 0)))
 
     def __call__(
         self,
@@ -166,24 +178,22 @@ class ClosedLoop:
         qpos: Float[np.ndarray, "runs nq"],
         qvel: Float[np.ndarray, "runs nv"],
         steps: int,
-        setting: Setting | None = None,
     ) -> Rollout:
-        """Simulate `steps` control steps from each of the given states, in `setting` (None: the environment's own)."""
-        setting = self._setting if setting is None else setting
+        """Simulate `steps` control steps from each of the given states."""
         batches = [slice(first, first + _BATCH) for first in range(0, len(qpos), _BATCH)]
-        rollouts = [self._batch(params, qpos[batch], qvel[batch], steps, setting) for batch in batches]
+        rollouts = [self._batch(params, qpos[batch], qvel[batch], steps) for batch in batches]
         return Rollout(*(np.concatenate(parts) for parts in zip(*rollouts, strict=True)))
 
-    def _batch(self, params: Params, qpos: np.ndarray, qvel: np.ndarray, steps: int, setting: Setting) -> Rollout:
+    def _batch(self, params: Params, qpos: np.ndarray, qvel: np.ndarray, steps: int) -> Rollout:
         runs = len(qpos)
         filled = np.arange(_BATCH) % runs
         keys = jax.random.split(jax.random.key(0), _BATCH)
         start = (jnp.asarray(x[filled], jnp.float32) for x in (qpos, qvel))
-        state = self._at(setting, *start, keys)
+        state = self._at(self._contents, *start, keys)
         pieces = [tuple(np.asarray(x)[:, None] for x in self._look(state))]
         outcomes = []
         for _ in range(-(-steps // _CHUNK)):
-            state, seen = self._run(params, state)
+            state, seen = self._run(params, self._contents, state)
             state_parts, step_parts = seen[: len(pieces[0])], seen[len(pieces[0]) :]
             pieces.append(tuple(np.asarray(x) for x in state_parts))
             outcomes.append(tuple(np.asarray(x) for x in step_parts))
@@ -193,5 +203,5 @@ class ClosedLoop:
 
     def standing(self, count: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """`count` starting states, (qpos, qvel), as training draws them."""
-        state: Any = self._reset(jax.random.split(jax.random.key(seed), count)).pipeline_state
+        state: Any = self._reset(self._contents, jax.random.split(jax.random.key(seed), count)).pipeline_state
         return np.asarray(state["physics"].qpos), np.asarray(state["physics"].qvel)

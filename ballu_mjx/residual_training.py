@@ -24,7 +24,6 @@ from ballu_mjx import (
 )
 from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv, ForcePolicy
 from ballu_mjx.errors import InputError
-from ballu_mjx.evaluation import OpenLoopEvaluator
 from ballu_mjx.forces import ForceModel, Sum
 from ballu_mjx.ppo import Params, PPOConfig
 from ballu_mjx.residual import Residual, write_observed
@@ -87,14 +86,10 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     def all_params(params: Params) -> Any:
         return params if beside is None else (beside.params, params)
 
-    def evaluator(use: str) -> OpenLoopEvaluator:
-        return evaluation.OpenLoopEvaluator(model, motions[use], whole, prepared.base, description)
-
     sections = {"env": env_config, "ppo": ppo_config, "data": data}
     config = runs.describe("envmimic", sections, prepared.files, devices, prepared.identified, description)
     config["residual"] = None if where is None else str(where.resolve())
-    validation = evaluator("validation")
-
+    validation = evaluation.OpenLoopEvaluator(model, motions["validation"], whole, prepared.base, description)
     tells_best = Validation(lambda params: validation(all_params(params)).score)
     if not first:
         return Session(None, None, data.validate_every, tells_best).follow(env, ppo_config, start, config)
@@ -111,7 +106,7 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
 
     best_step, params = evaluate.load_params(folder, "best")
     evaluate.learning_curve(folder, best_step)
-    test = validation if prepared.one_set else evaluator("test")
+    test = validation if prepared.one_set else validation.on(motions["test"])
     untrained = "" if best_step else ", before any training: no later one validated better"
     print(f"Best checkpoint: step {best_step:,}{untrained}. Open-loop replay of the test recordings:\n")
     print(evaluate.report(test, all_params(params), folder).table())

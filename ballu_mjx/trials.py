@@ -11,7 +11,6 @@ from jaxtyping import Float
 from ballu_mjx import plots, robot, virtual_robot
 from ballu_mjx.deployment import PolicyController
 from ballu_mjx.envmimic import Simulator, feet, stack
-from ballu_mjx.locomotion import Setting
 from ballu_mjx.policy import ClosedLoop, Policy
 from ballu_mjx.reconstruction import reconstruct
 from ballu_mjx.recording import read_recording, write_recording
@@ -21,10 +20,10 @@ from ballu_mjx.virtual_robot import Trial, VirtualRobot
 
 
 def run(
-    policy: Policy, hardware: VirtualRobot, draws: Sequence[Trial], folder: Path, loop: ClosedLoop, setting: Setting
+    policy: Policy, hardware: VirtualRobot, draws: Sequence[Trial], folder: Path, loop: ClosedLoop | None = None
 ) -> list[Transfer]:
-    """Run each trial in closed loop from motion capture alone, and compare it with simulation (`loop` in `setting`, the
-    policy's own) from the same state.
+    """Run each trial in closed loop from motion capture alone, and compare it with the policy's own simulator (`loop`,
+    where that is at hand already) from the same state.
 
     Leaves in `folder` a recording a trial, and `trials.png`: the ways from above, on the robot and in simulation.
     """
@@ -43,7 +42,7 @@ def run(
     motions = [reconstruct(recording, model) for recording in recordings]
     reference, com = stack(Simulator(model), motions)
     starts = [np.stack([getattr(motion, name)[0] for motion in motions]) for name in ("qpos", "qvel")]
-    rollout = loop(policy.params, starts[0], starts[1], len(motions[0].command), setting)
+    rollout = (loop or policy.closed_loop())(policy.params, starts[0], starts[1], len(motions[0].command))
     recorded = np.asarray(com), np.asarray(reference.features)
     hardware_ways = [_way(*(x[i, : len(motion.qpos)] for x in recorded)) for i, motion in enumerate(motions)]
     simulated = [_way(*states) for states in zip(rollout.com, rollout.features, strict=True)]

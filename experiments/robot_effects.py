@@ -101,13 +101,13 @@ def still(trial: Trial) -> Trial:
 
 def measure(policy: Policy, robots: dict[str, VirtualRobot], count: int, folder: Path) -> dict[str, list[Transfer]]:
     """Trials of a policy on every variant."""
-    loop, setting = pipeline.simulator(policy)
+    loop = policy.closed_loop()
     draws = [still(virtual_robot.draw_trial(5_000_000 + number)) for number in range(count)]
     results = {}
     for name, variant in robots.items():
         place = folder / name.replace(" ", "-")
         place.mkdir(parents=True, exist_ok=True)
-        results[name] = trials.run(policy, variant, draws, place, loop, setting)
+        results[name] = trials.run(policy, variant, draws, place, loop)
     return results
 
 

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from ballu_mjx import envmimic, evaluate, evaluation, ghosts, robot, simulation
 from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv, ForcePolicy
+from ballu_mjx.learner import Learner
+from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.reconstruction import Motion
 
 STEPS = 30
@@ -229,6 +231,30 @@ def test_evaluator_finds_no_error_in_its_own_physics_and_some_in_pushed_ones(eva
     # The force that made the recording explains it; on the other recording it does harm, and the bound says so.
     assert result.ratio("far", "position", 2.0) < 0.1
     assert result.excess()[0] > 0 and "near-own" in result.excess()[1]
+
+
+def test_one_program_serves_all_recordings_and_actuators(still: Motion, pushed: Motion):
+    other = robot.load_model()
+    nominal = robot.ActuatorParameters.nominal(other)
+    stiffer = dataclasses.replace(nominal, knee_spring_stiffness=1.2 * nominal.knee_spring_stiffness)
+    cases = [
+        (robot.load_model(), [still]),
+        (robot.load_model(stiffer), [make_motion(FORCE, steps=50), pushed, still]),
+    ]
+    sizes = PPOConfig(num_envs=8, batch_size=8, num_minibatches=1, unroll_length=2, num_updates_per_batch=1)
+    training, replaying = [], []
+    for model, motions in cases:
+        learner = Learner(EnvMimicEnv(model, motions, EnvMimicConfig()), sizes)
+        state = jax.eval_shape(learner._first, jax.random.PRNGKey(0), learner._contents)
+        training.append(learner._step.lower(state, learner._contents).as_text())
+        evaluator = evaluation.OpenLoopEvaluator(
+            model, motions, ForcePolicy(EnvMimicConfig(), lambda params, _: params)
+        )
+        places = np.tile(np.array([0, 2], np.int32), (evaluator._size, 1))
+        carry = evaluator._begin(places)
+        replaying.append(evaluator._chunk.lower(np.zeros(3), 1.0, *evaluator._fixed, carry, places).as_text())
+    assert training[0] == training[1]
+    assert replaying[0] == replaying[1]
 
 
 def test_replays_kept_to_be_looked_at_are_those_evaluated(evaluator: evaluation.OpenLoopEvaluator):

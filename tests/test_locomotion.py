@@ -11,8 +11,10 @@ import pytest
 
 from ballu_mjx import envmimic, locomotion, ppo, robot, simulation
 from ballu_mjx.envmimic import HISTORY, EnvMimicConfig, ForcePolicy
+from ballu_mjx.learner import Learner
 from ballu_mjx.locomotion import LocomotionConfig, LocomotionEnv
 from ballu_mjx.policy import ClosedLoop
+from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.residual import MARGIN, Residual
 from ballu_mjx.robot import ActuatorParameters
 from ballu_mjx.tasks import TASKS, Step
@@ -139,7 +141,7 @@ def test_residual_pushes_in_the_balloon_s_heading_and_only_so_hard():
     qpos = robot.standing_qpos(MODEL)
     qpos[3:7] = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
     qpos = jnp.asarray(qpos, jnp.float32)
-    state = jax.jit(lambda qpos: env.step(env.at(env.setting, qpos, zeros, jax.random.key(0)), -jnp.ones(2)))(qpos)
+    state = jax.jit(lambda qpos: env.step(env.at(qpos, zeros, jax.random.key(0)), -jnp.ones(2)))(qpos)
 
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
     force = turn @ (EnvMimicConfig().force_scale * action)
@@ -171,15 +173,43 @@ def test_force_fades_outside_of_what_the_residual_has_seen():
     assert forces[1] == pytest.approx(forces[0] * np.exp(-3.0 * expected), rel=1e-5)
 
 
+GAIN = ppo.Params(ppo.Normalizer(np.zeros(()), {}, {}, {}), None, np.float32(0.8))
+"""Of policies that are no network."""
+
+
+def test_one_program_serves_all_residuals_of_a_kind():
+    action, network = 3, PPOConfig(policy_layers=(4,), value_layers=(4,))
+    infer = ppo.make_inference({ppo.STATE: (INPUTS,)}, action, network)
+    nominal = ActuatorParameters.nominal(MODEL)
+    weak = dataclasses.replace(nominal, torque_limit=0.5 * nominal.torque_limit)
+    sizes = dataclasses.replace(
+        network, num_envs=8, batch_size=8, num_minibatches=1, unroll_length=2, num_updates_per_batch=1
+    )
+    training, closed_loop = [], []
+    for seed, actuators in ((0, nominal), (1, weak)):
+        inputs = np.random.default_rng(seed).normal(size=(50, INPUTS)).astype(np.float32)
+        params = ppo.initial_policy(inputs, action, dataclasses.replace(network, seed=seed))
+        seen = inputs.min(axis=0), inputs.max(axis=0)
+        learned = Residual(ForcePolicy(EnvMimicConfig(), infer), params, seen, 0, actuators)
+        env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(), actuators=actuators, residual=learned)
+        learner = Learner(env, sizes)
+        state = jax.eval_shape(learner._first, jax.random.PRNGKey(0), learner._contents)
+        training.append(learner._step.lower(state, learner._contents).as_text())
+        loop = ClosedLoop(env, lambda params, seen: params.value * seen[:2])
+        state = jax.eval_shape(loop._reset, env.contents, jax.random.split(jax.random.key(0), 8))
+        closed_loop.append(loop._run.lower(GAIN, env.contents, state).as_text())
+    assert training[0] == training[1]
+    assert closed_loop[0] == closed_loop[1]
+
+
 def test_closed_loop_is_the_environment_step_by_step():
     infer = lambda params, seen: params.value * jnp.sin(10 * seen[:2])  # noqa: E731
-    params = ppo.Params(ppo.Normalizer(np.zeros(()), {}, {}, {}), None, np.float32(0.8))
-    loop = ClosedLoop(PLAIN, infer)
-    setting = locomotion.setting_of(MODEL, LocomotionConfig(domain_randomization=True), None)
-    still, start = (inner(RESET(x, jax.random.key(k)))["physics"] for x, k in ((PLAIN.setting, 0), (setting, 3)))
+    env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(domain_randomization=True))
+    loop = ClosedLoop(env, infer)
+    still, start = (inner(RESET(x.setting, jax.random.key(k)))["physics"] for x, k in ((PLAIN, 0), (env, 3)))
     qpos, qvel = (np.stack([x] * 8 + [y]) for x, y in ((still.qpos, start.qpos), (still.qvel, start.qvel)))
-    rollout = loop(params, qpos, qvel, 5, setting)  # the last one is of a batch of its own
-    state = jax.jit(PLAIN.at)(setting, jnp.asarray(qpos[-1]), jnp.asarray(qvel[-1]), jax.random.key(0))
+    rollout = loop(GAIN, qpos, qvel, 5)  # the last one is of a batch of its own
+    state = jax.jit(env.at)(jnp.asarray(qpos[-1]), jnp.asarray(qvel[-1]), jax.random.key(0))
     for number in range(5):
         action = 0.8 * jnp.sin(10 * jnp.asarray(state.obs)[:2])
         np.testing.assert_allclose(rollout.command[-1, number], (action + 1) / 2, atol=1e-5)

@@ -181,7 +181,7 @@ def test_the_training_step_is_compiled_once(short):
     short.step(state)
     state = short.begin_from(learner.params(short.begin(1)), 100)
     short.step(state)
-    assert short.step._cache_size() == 1
+    assert short._step._cache_size() == 1
 
 
 def test_one_device_compiles_the_training_step_once_too(monkeypatch: pytest.MonkeyPatch):
@@ -191,7 +191,7 @@ def test_one_device_compiles_the_training_step_once_too(monkeypatch: pytest.Monk
     alone = Learner(Follower(), SMALL)
     state, _ = alone.step(alone.begin(0))
     alone.step(state)
-    step: Any = alone.step
+    step: Any = alone._step
     assert step._cache_size() == 1
 
 
