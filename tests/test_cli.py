@@ -29,11 +29,15 @@ from ballu_mjx import (
     runs,
     train,
 )
+from ballu_mjx.ppo import PPOConfig
 from ballu_mjx.recording import Recording, bundled, read_recording, write_recording
 from ballu_mjx.sweep import read_sweep
 
-SIZES = ("--num-envs 8 --batch-size 8 --num-minibatches 2 --unroll-length 5 --num-updates-per-batch 1").split()
-STEPS = 80
+SIZES = {name: value for name, value in residual_training.QUICK.items() if name != "num_timesteps"}
+"""Those of --quick, which then finds its programs compiled, wherever these tests ran before."""
+OPTIONS = [text for name, value in SIZES.items() for text in (f"--{name.replace('_', '-')}", str(value))]
+_PPO = PPOConfig(**SIZES)
+STEPS = _PPO.batch_size * _PPO.unroll_length * _PPO.num_minibatches
 """Control steps of a training step of that size."""
 
 
@@ -75,7 +79,7 @@ class Stopped:
 def stopped(folder: Path) -> Stopped:
     """A run interrupted after its first training step, validated at each."""
     line = [sys.executable, "-m", "ballu_mjx.train", "envmimic", "--recordings", "data", "--output", "run"]
-    line += ["--num-timesteps", str(400 * STEPS), "--validate-every", str(STEPS), "--seed", "3", *SIZES]
+    line += ["--num-timesteps", str(400 * STEPS), "--validate-every", str(STEPS), "--seed", "3", *OPTIONS]
     # A shell's background jobs ignore SIGINT, and so would the tests' children there.
     heed = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
     line = [sys.executable, "-c", heed, *line]
@@ -115,7 +119,7 @@ def test_interrupted_run_goes_on_where_it_stopped(stopped: Stopped, trained: Pat
     assert rows[: len(stopped.rows)] == stopped.rows
     assert [row["step"] for row in rows if "reward" in row] == list(range(STEPS, total + STEPS, STEPS))
     config = json.loads((trained / "config.json").read_text())
-    assert config["ppo"]["seed"] == 3 and config["ppo"]["num_envs"] == 8  # given once, kept
+    assert config["ppo"]["seed"] == 3 and config["ppo"]["num_envs"] == SIZES["num_envs"]  # given once, kept
     beside = trained.parent / "data" / actuators.NAME
     assert config["actuators"] == json.loads(beside.read_text())["parameters"]  # likewise
     assert len(config["starts"]) == 2
