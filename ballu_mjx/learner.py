@@ -15,11 +15,12 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import optax
 from brax.envs.base import Env, State, Wrapper
-from brax.training import acting, gradients
+from brax.training import acting
 from brax.training.acme import running_statistics
 from brax.training.acme.running_statistics import RunningStatisticsState
 from brax.training.agents.ppo import networks as brax_networks
@@ -163,7 +164,7 @@ class Learner:
             gae_lambda=config.gae_lambda,
             clipping_epsilon=config.clipping_epsilon,
         )
-        self._gradient = gradients.loss_and_pgrad(loss, pmap_axis_name=_AXIS, has_aux=True)  # pyright: ignore
+        self._gradient = jax.grad(loss, has_aux=True)
 
         mesh = Mesh(np.array(jax.devices()), (_AXIS,))
         each: Any = PartitionSpec()
@@ -354,10 +355,12 @@ class Learner:
         """Learn from one minibatch."""
         optimizer, networks, key = carry
         key, key_loss = jax.random.split(key)
-        (_, losses), gradient = self._gradient(networks, normalizer, data, key_loss)
+        # All that devices must tell each other, in one exchange: each has its price, small or large.
+        own, losses = self._gradient(networks, normalizer, data, key_loss)
+        flat, apart = jax.flatten_util.ravel_pytree((own, losses["kl_mean"]))
+        gradient, change = apart(jax.lax.pmean(flat, _AXIS))
         rate = optimizer[-1].hyperparams["learning_rate"]
         if self._config.desired_kl > 0:
-            change = jax.lax.pmean(losses["kl_mean"], _AXIS)
             optimizer, rate = adaptive_kl_learning_rate(optimizer, change, self._config.desired_kl)
         update, optimizer = self._optimizer.update(gradient, optimizer)
         return (optimizer, optax.apply_updates(networks, update), key), {**losses, "learning_rate": rate}

@@ -3,7 +3,7 @@
 `python -m ballu_mjx.train envmimic` runs twice for every seed: in one process that has all cores, and in a process a
 core (two at least), each kept to its own, which find each other over the loopback interface (`--coordinator`). Shown
 are both learning curves, mean and range over seeds. Where several processes learn what one does, the means differ by
-less than the seeds do: the largest difference over all training steps is told in ranges of the seeds, beside the rates.
+about a standard error, which the seeds' spread tells: the difference is told in these, beside the rates.
 
 `python benchmarks/processes.py`; `--quick` shows within minutes that it works, and its numbers mean little.
 """
@@ -108,9 +108,11 @@ def curve(rows: list[dict[str, Any]], name: str) -> tuple[Float[np.ndarray, " st
 
 
 def apart(one: Float[np.ndarray, "seeds steps"], several: Float[np.ndarray, "seeds steps"]) -> float:
-    """Largest difference of the means over seeds, in ranges over seeds (of one process; the median over steps)."""
-    spread = np.median(np.ptp(one, axis=0))
-    return float(np.max(np.abs(one.mean(axis=0) - several.mean(axis=0))) / spread)
+    """Difference of the means over seeds in its standard errors, both as root mean squares over steps: about 1 where
+    both are draws of the same."""
+    variance = sum(values.var(axis=0, ddof=1) / len(values) for values in (one, several))
+    difference = one.mean(axis=0) - several.mean(axis=0)
+    return float(np.sqrt(np.mean(difference**2) / np.mean(variance)))
 
 
 def plot(path: Path, found: dict[str, list[list[dict[str, Any]]]], machine: str) -> None:
@@ -120,9 +122,9 @@ def plot(path: Path, found: dict[str, list[list[dict[str, Any]]]], machine: str)
         for kind, runs_of_kind in found.items():
             steps = curve(runs_of_kind[0], name)[0]
             values = np.array([curve(rows, name)[1] for rows in runs_of_kind])
-            axes.plot(steps, values.mean(axis=0), color=COLOURS[kind], label=KINDS[kind])
-            axes.fill_between(steps, values.min(axis=0), values.max(axis=0), color=COLOURS[kind], alpha=0.2)
-        axes.set(xlabel="control steps", ylabel=label)
+            axes.plot(steps / 1e3, values.mean(axis=0), color=COLOURS[kind], label=KINDS[kind])
+            axes.fill_between(steps / 1e3, values.min(axis=0), values.max(axis=0), color=COLOURS[kind], alpha=0.2)
+        axes.set(xlabel="control steps (thousands)", ylabel=label)
         axes.grid(alpha=0.3)
         axes.legend()
     figure.suptitle(f"{machine}, train envmimic, mean and range over seeds", fontsize=9)
@@ -151,7 +153,7 @@ def main(options: Options) -> None:
         for name in CURVES:
             one, several = (np.array([curve(rows, name)[1] for rows in found[kind]]) for kind in KINDS)
             result[f"{name}_apart"] = apart(one, several)
-            print(f"{CURVES[name]}: the means are at most {result[f'{name}_apart']:.2f} of the seeds' range apart")
+            print(f"{CURVES[name]}: the means are {result[f'{name}_apart']:.2f} standard errors apart")
     common.write(options.output, "processes", result)
     plot(options.output / "processes.png", found, common.described(common.machine()))
 
