@@ -34,9 +34,9 @@ CLOSE_TWIST = 0.05 * float(np.linalg.norm(TWIST))
 SECONDS = 0.5
 INPUTS = envmimic.input_size(EnvMimicConfig(), robot_description.ballu())
 NETWORK = PPOConfig(policy_layers=(16,), value_layers=(4,))
-ENV, WRENCH = EnvMimicConfig(), EnvMimicConfig(forces="wrench")
-ACTIONS = envmimic.action_size(ENV, BALLU)
-FORCES = ForcePolicy(ENV, ppo.make_inference({ppo.STATE: (INPUTS,)}, ACTIONS, NETWORK), name="analytic")
+WRENCH = EnvMimicConfig(forces="wrench")
+ACTIONS = envmimic.action_size(WRENCH, BALLU)
+FORCES = ForcePolicy(WRENCH, ppo.make_inference({ppo.STATE: (INPUTS,)}, ACTIONS, NETWORK), name="analytic")
 
 
 def pushed(name: str, height: float, model: mujoco.MjModel = MODEL, twist: float = 0.0, steps: int = 60) -> Motion:
@@ -177,17 +177,14 @@ def test_examples_are_in_the_balloon_s_heading(motions: list[Motion]):
     assert len(seen) == len(actions)
 
 
-def test_gradients_find_the_push(recorded: Windows, inputs: np.ndarray, linearize: Linearizer):
-    actions = envmimic.action_size(WRENCH, BALLU)
-    forces = ForcePolicy(WRENCH, ppo.make_inference({ppo.STATE: (INPUTS,)}, actions, NETWORK), name="analytic")
-    start = ppo.initial_policy(inputs, actions, NETWORK)
+def test_gradients_find_the_push(recorded: Windows, inputs: np.ndarray, start: ppo.Params, linearize: Linearizer):
     config = AnalyticConfig(
         window_seconds=SECONDS, rounds=4, updates=150, validate_every=150, learning_rate=1e-3, observation_noise=0.0
     )
     found: list[tuple[object, dict[str, float]]] = []
     analytic.train(
         MODEL,
-        forces,
+        FORCES,
         lambda policy: start._replace(policy=policy),
         start.policy,
         recorded,
@@ -197,8 +194,8 @@ def test_gradients_find_the_push(recorded: Windows, inputs: np.ndarray, lineariz
         linearize,
     )
     policy, metrics = found[-1]
-    actions_found = np.asarray(forces.infer(start._replace(policy=policy), jnp.asarray(inputs)))
-    stepping, falling = (envmimic.units(WRENCH, actions) * actions_found).reshape(2, -1, actions).mean(axis=1)
+    actions_found = np.asarray(FORCES.infer(start._replace(policy=policy), jnp.asarray(inputs)))
+    stepping, falling = (envmimic.units(WRENCH, ACTIONS) * actions_found).reshape(2, -1, ACTIONS).mean(axis=1)
     np.testing.assert_allclose(falling[:3], PUSH, atol=CLOSE)
     np.testing.assert_allclose(falling[3:], 0.0, atol=CLOSE_TWIST)
     # On legs other forces and torques, which change from step to step, move the balloon almost as this force does.
@@ -234,7 +231,7 @@ def test_a_run_is_read_as_its_kind(tmp_path: Path, start: ppo.Params):
     from ballu_mjx import runs
     from ballu_mjx.residual import write_observed
 
-    sections = {"env": ENV, "ppo": NETWORK, "fit": SupervisedConfig()}
+    sections = {"env": WRENCH, "ppo": NETWORK, "fit": SupervisedConfig()}
     with runs.Run(tmp_path, runs.describe("supervised", sections, {}, []) | {"residual": None}) as run:
         write_observed(run, np.zeros((2, INPUTS)))
         run.save(5, ppo.as_tree(start), 0.5)
