@@ -9,8 +9,8 @@ core.
 What is measured, from the start of the process on (imports and compiling included): wall time until the mean reward of
 the last 100,000 control steps, exploration included, reaches the target; and control steps per second, learning
 included, the median over batches. Ours is timed with an empty cache of compiled programs (cold) and with a full one
-(warm). Who is slow waits long for those 100,000 steps; so the times until a single batch reaches the target are compared
-as well.
+(warm). Who is slow waits long for those 100,000 steps; so the times until a single batch reaches the target are
+compared as well.
 
 Where MuJoCo Playground is installed (`pip install playground`), its training on its nearest task that needs no download
 stands beside it for the rate alone: the planar walker of DeepMind's Control Suite, brax's PPO, batches of our size.
