@@ -12,6 +12,7 @@ import functools
 import math
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -146,7 +147,15 @@ class Learner:
         self._devices = jax.device_count()
         ppo.check(config, self._devices)
         self._config, self._env = config, env
-        shapes = jax.eval_shape(wrap_for_training(env).reset, jax.random.split(jax.random.PRNGKey(0), 1)).obs
+        mesh = Mesh(np.array(jax.devices()), (_AXIS,))
+        each: Any = PartitionSpec()
+        everywhere = NamedSharding(mesh, each)
+        # From the host: an array of one device is not for all processes.
+        self._contents = jax.device_put(jax.device_get(getattr(env, "contents", ())), everywhere)
+        # A program of its own, for its shapes are asked for before it is part of another: traced once.
+        self._reset = jax.jit(lambda keys, contents: self._with_contents(contents).reset(keys))
+        keys = jax.ShapeDtypeStruct((config.num_envs, 2), jnp.uint32)
+        shapes = jax.eval_shape(self._reset, keys, self._contents).obs
         self._observation = {name: jax.ShapeDtypeStruct(x.shape[1:], jnp.float32) for name, x in shapes.items()}
         sizes = {name: x.shape for name, x in self._observation.items()}
         self._networks = ppo.make_networks(sizes, env.action_size, config)
@@ -166,13 +175,8 @@ class Learner:
         )
         self._gradient = jax.grad(loss, has_aux=True)
 
-        mesh = Mesh(np.array(jax.devices()), (_AXIS,))
-        each: Any = PartitionSpec()
         specs = TrainingState(*[each] * len(TrainingState._fields))._replace(environments=PartitionSpec(_AXIS))
         self._shardings: Any = TrainingState(*(NamedSharding(mesh, spec) for spec in specs))  # pyright: ignore
-        everywhere = NamedSharding(mesh, each)
-        # From the host: an array of one device is not for all processes.
-        self._contents = jax.device_put(jax.device_get(getattr(env, "contents", ())), everywhere)
         self._first = jax.jit(self._make_first, out_shardings=self._shardings)
         step = jax.shard_map(
             self._make_step, mesh=mesh, in_specs=(specs, each), out_specs=(specs, each), check_vma=False
@@ -187,7 +191,19 @@ class Learner:
 
     def begin(self, seed: int) -> TrainingState:
         """A fresh state; Brax's with this seed."""
-        return self._first(np.array(jax.random.PRNGKey(seed)), self._contents)
+        arguments = np.array(jax.random.PRNGKey(seed)), self._contents
+        first = self._first.lower(*arguments)
+        state = jax.tree.map(
+            lambda x, sharding: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding),
+            first.out_info,
+            jax.tree.broadcast(self._shardings, first.out_info),
+        )
+        # XLA compiles this program while Python traces the next.
+        with ThreadPoolExecutor(1) as pool:
+            compiled = pool.submit(first.compile)
+            self._step.lower(state, self._contents)
+            compiled.result()
+        return self._first(*arguments)
 
     def step(self, state: TrainingState) -> tuple[TrainingState, dict[str, Array]]:
         """A training step: the state to the next one and its means, reward, metrics and losses. The memory of the state
@@ -254,7 +270,6 @@ class Learner:
         key_networks, key = jax.random.split(key)
         key, key_environments, _ = jax.random.split(jax.random.fold_in(key, 0), 3)
         key_policy, key_value = jax.random.split(key_networks)
-        env = self._with_contents(contents)
         networks = PPONetworkParams(
             policy=self._networks.policy_network.init(key_policy),  # pyright: ignore[reportCallIssue]
             value=self._networks.value_network.init(key_value),  # pyright: ignore[reportCallIssue]
@@ -266,7 +281,7 @@ class Learner:
                 averaged_steps=jnp.zeros((), jnp.int32),
                 optimizer=self._optimizer.init(networks),  # pyright: ignore[reportArgumentType]
                 normalizer=running_statistics.init_state(self._observation),
-                environments=env.reset(jax.random.split(key_environments, self._config.num_envs)),
+                environments=self._reset(jax.random.split(key_environments, self._config.num_envs), contents),
                 key=key,
                 steps=_uint64(0),
             )

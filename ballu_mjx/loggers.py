@@ -12,10 +12,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from tensorboardX import summary
-from tensorboardX.event_file_writer import EventsWriter
-from tensorboardX.proto.event_pb2 import Event, SessionLog  # pyright: ignore[reportAttributeAccessIssue]
-
 from ballu_mjx import files, runtime
 from ballu_mjx.errors import InputError
 
@@ -62,18 +58,25 @@ class TensorBoard:
 
     def __init__(self, folder: Path, first_step: int | None = None) -> None:
         """Write into `folder`; `first_step` of a run that goes on: what is there from that step on is hidden."""
+        # Brings PyTorch along where that is installed: most of a second that commands without a log need not wait.
+        from tensorboardX import summary
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto import event_pb2
+
         folder.mkdir(parents=True, exist_ok=True)
+        self._scalar, self._event = summary.scalar, event_pb2.Event  # pyright: ignore[reportAttributeAccessIssue]
         self._writer = EventsWriter(str(folder / "events"))
         if first_step is not None:
-            self._write(first_step, session_log=SessionLog(status=SessionLog.START))
+            status = event_pb2.SessionLog.START  # pyright: ignore[reportAttributeAccessIssue]
+            self._write(first_step, session_log={"status": status})
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
         for name, value in _finite(metrics).items():
-            self._write(step, summary=summary.scalar(name, value))
+            self._write(step, summary=self._scalar(name, value))
         self._writer.flush()
 
     def _write(self, step: int, **content: Any) -> None:
-        self._writer.write_event(Event(wall_time=time.time(), step=step, **content))
+        self._writer.write_event(self._event(wall_time=time.time(), step=step, **content))
 
     def close(self, *, failed: bool = False) -> None:
         self._writer.close()
