@@ -9,7 +9,6 @@ are ordered (left, right).
 from __future__ import annotations
 
 import dataclasses
-import functools
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -103,7 +102,7 @@ class ActuatorParameters:
         """The values that stand in `model`."""
         knees, servos = _knee_ids(model), _servo_ids(model)
         gain = -model.actuator_biasprm[servos, 1]
-        taut = jax.jit(functools.partial(cable_length, model))(model.jnt_range[knees, 0], np.zeros(len(knees)))
+        taut = cable_length(model, model.jnt_range[knees, 0], np.zeros(len(knees)))
         return ActuatorParameters(
             knee_spring_stiffness=jnp.asarray(model.jnt_stiffness[knees], jnp.float32),
             motor_gain=jnp.asarray(gain, jnp.float32),
