@@ -242,8 +242,6 @@ def _simulate(
     capture = Capture([], [], [], [], [], [], [])
     hidden = _hidden(rng, round(duration / CAPTURE_TIMESTEP) + 1)
     frames_per_control = round(ballu.CONTROL_TIMESTEP / CAPTURE_TIMESTEP)
-    ticks_per_frame = round(CAPTURE_TIMESTEP / _TICK)
-    steps_per_tick = round(_TICK / PHYSICS_TIMESTEP)
     command = np.zeros(2)
     truth = []
     for frame in range(len(hidden)):
@@ -257,12 +255,51 @@ def _simulate(
         capture.command.append(command)
         if frame == len(hidden) - 1:
             break
-        model.opt.wind[:] = _wind(trial, time)
-        for tick in range(ticks_per_frame):
-            data.ctrl[:] = servos.at(time + tick * _TICK)
-            mujoco.mj_step(model, data, steps_per_tick)
+        _advance(model, data, servos, trial, time)
     qpos, qvel = (np.array(x) for x in zip(*truth, strict=True))
     return capture, qpos, qvel
+
+
+def _advance(model: mujoco.MjModel, data: mujoco.MjData, servos: _Servos, trial: Trial, time: float) -> None:
+    """On from one frame of the capture, at `time` (s), to the next. Commands arrive with a tick, or with the nearest
+    physics step where these are longer."""
+    model.opt.wind[:] = _wind(trial, time)
+    tick = max(_TICK, model.opt.timestep)
+    for start in time + tick * np.arange(round(CAPTURE_TIMESTEP / tick)):
+        data.ctrl[:] = servos.at(start + (tick - _TICK) / 2)
+        mujoco.mj_step(model, data, round(tick / model.opt.timestep))
+
+
+def carry_on(
+    virtual: VirtualRobot,
+    trial: Trial,
+    commands: Float[np.ndarray, "steps 2"],
+    first: int,
+    state: tuple[Float[np.ndarray, " nq"], Float[np.ndarray, " nv"]],
+    count: int,
+    model: mujoco.MjModel | None = None,
+) -> Float[np.ndarray, "count nq"]:
+    """Take a trial up at its control step `first`, in a given state (qpos, qvel) and with the servos as the commands
+    before have left them: generalized positions after each of `count` control steps.
+
+    `model`: another than the robot's own, of a time step up to the capture's.
+    """
+    model = build(virtual) if model is None else model
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = state
+    servos = _Servos(virtual.latency, np.array(virtual.backlash), [], np.zeros(2))
+    frames = round(ballu.CONTROL_TIMESTEP / CAPTURE_TIMESTEP)
+    qpos = []
+    for step, command in enumerate(commands[: first + count]):
+        time = step * ballu.CONTROL_TIMESTEP
+        servos.send(time, command)
+        if step < first:
+            servos.at(time)
+            continue
+        for frame in range(frames):
+            _advance(model, data, servos, trial, time + frame * CAPTURE_TIMESTEP)
+        qpos.append(data.qpos.copy())
+    return np.array(qpos)
 
 
 def record_sweep(virtual: VirtualRobot, seed: int, name: str, *, commands: int = 20, hold: float = 2.0) -> Recording:

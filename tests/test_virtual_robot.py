@@ -89,6 +89,20 @@ def test_commands_arrive_late_and_through_play():
     assert servos.at(0.2)[0] == up[0] and servos.at(0.2)[1] == 0.48
 
 
+def test_a_trial_taken_up_in_its_true_state_goes_on_as_it_went(virtual: virtual_robot.VirtualRobot):
+    """In the middle of a gait, with commands under way, the play of the motors on one side, and in a draught."""
+    trial, phases = virtual_robot.draw_trial(3), np.arange(60)[:, None] / 13 + np.array([0.0, 0.4])
+    commands = np.where(phases % 1.0 < 0.45, 0.9, 0.0)
+    qpos, qvel = virtual_robot.record_truth(virtual, trial, virtual_robot.open_loop(commands), 3.0)
+    start, ends = 27, slice(5 * 28, 5 * 58, 5)
+    state = qpos[5 * start], qvel[5 * start]
+    again = virtual_robot.carry_on(virtual, trial, commands, start, state, 30)
+    np.testing.assert_allclose(again, qpos[ends], atol=1e-5)
+    loose = dataclasses.replace(virtual, backlash=(0.0, 0.0), latency=0.0)
+    other = virtual_robot.carry_on(loose, trial, commands, start, state, 30)
+    assert np.abs(other - qpos[ends]).max() > 0.05
+
+
 def test_capture_is_as_noisy_and_as_patchy_as_stated(virtual: virtual_robot.VirtualRobot):
     commands = np.zeros((400, 2))
     trial = virtual_robot.draw_trial(7)

@@ -1,0 +1,194 @@
+# %% [markdown]
+# # What no simulator could do better, and what each shortcut costs
+#
+# Every error of a simulator includes that of the state it starts from: motion capture shows that to half a millimetre,
+# reconstruction to a millimetre and a degree or so. Here the virtual robot itself is started from reconstructed states,
+# a second apart, under the commands and in the draught of the recording. What it is off by after 5 s no simulator can
+# do without. Then one thing at a time is as training simulators have it: the air stands still, physics steps are long,
+# joints have no friction. What the error rises by is what that is worth.
+#
+# `python experiments/fidelity_limits.py` takes ten minutes on two cores; `--quick` takes two recordings.
+
+# %%
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+if "google.colab" in sys.modules:  # install, from a checkout in the current folder
+    if not Path("constraints.txt").exists():
+        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
+    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
+if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
+    sys.argv[1:] = []
+    sys.path[:0] = [".", "experiments"]
+
+# %%
+import argparse
+import dataclasses
+import multiprocessing
+import tempfile
+
+from ballu_mjx import runtime
+
+runtime.prepare()
+
+import bundled_recordings  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+from bundled_recordings import Job  # noqa: E402
+from jaxtyping import Float  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
+
+from ballu_mjx import evaluation, reconstruction, recording, robot, virtual_robot  # noqa: E402
+from ballu_mjx.virtual_robot import Trial, VirtualRobot  # noqa: E402
+
+HORIZON = 5.0
+"""Seconds from each start."""
+
+
+# %% [markdown]
+# ## What is another in each row
+
+
+# %%
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """The robot, or a simulator that differs from it by as much."""
+
+    label: str
+    robot: tuple[str, ...] = ()
+    """Fields of `VirtualRobot` that are 0, for both legs."""
+    still: bool = False
+    """No draught."""
+    timestep: float = 0.0
+    """s, with the integrator and solver of the training simulator; 0: the robot's own of both."""
+    iterations: int = 0
+    """Of the solver and of its line search; 0: those of the training simulator."""
+    fluid: bool = True
+    """Drag and lift of the balloons; their added mass stays."""
+
+
+FRICTION, PLAY = ("knee_friction", "motor_friction"), ("backlash",)
+VARIANTS = (
+    Variant("the robot itself"),
+    Variant("in still air", still=True),
+    Variant("physics steps of 2 ms", timestep=0.002),
+    Variant("physics steps of 5 ms", timestep=0.005),
+    Variant("physics steps of 10 ms, the training simulator's", timestep=0.01),
+    Variant("the same, the solver run to its end", timestep=0.01, iterations=50),
+    Variant("no dry friction", robot=FRICTION),
+    Variant("no backlash", robot=PLAY),
+    Variant("no drag and lift", fluid=False),
+    Variant("still air, 10 ms", still=True, timestep=0.01),
+    Variant("still air, 10 ms, no dry friction, no backlash", robot=FRICTION + PLAY, still=True, timestep=0.01),
+    Variant("still air, 5 ms, no dry friction, no backlash", robot=FRICTION + PLAY, still=True, timestep=0.005),
+)
+
+
+def simulator(virtual: VirtualRobot, variant: Variant) -> mujoco.MjModel:
+    """The model of a variant."""
+    model = virtual_robot.build(virtual)
+    if variant.timestep:
+        training = robot.load_model().opt
+        model.opt.timestep, model.opt.integrator = variant.timestep, training.integrator
+        model.opt.iterations = variant.iterations or training.iterations
+        model.opt.ls_iterations = variant.iterations or training.ls_iterations
+    if not variant.fluid:
+        model.opt.density = model.opt.viscosity = 0.0
+    return model
+
+
+def known(virtual: VirtualRobot) -> mujoco.MjModel:
+    """The training simulator with the robot's own actuators, which identification comes near."""
+    names = [field.name for field in dataclasses.fields(robot.ActuatorParameters)]
+    return robot.load_model(robot.ActuatorParameters(**{name: jnp.array(getattr(virtual, name)) for name in names}))
+
+
+# %% [markdown]
+# ## Errors from every second of a recording on
+
+
+# %%
+def seen(model: mujoco.MjModel, qpos: Float[np.ndarray, "states nq"]) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (m) of the balloon and its yaw (rad)."""
+    data, places, turns = mujoco.MjData(model), [], []
+    for each in qpos:
+        data.qpos[:] = each
+        mujoco.mj_kinematics(model, data)
+        places.append(data.site("balloon").xpos.copy())
+        turns.append(data.body("balloon").xquat.copy())
+    return np.array(places), Rotation.from_quat(np.array(turns), scalar_first=True).as_euler("ZYX")[:, 0]
+
+
+def errors(virtual: VirtualRobot, job: Job) -> tuple[str, Float[np.ndarray, "variants 2"]]:
+    """Group of a recording; RMSE of position (m) and yaw (deg) over the horizon, mean over starts, by variant."""
+    trial = virtual_robot.draw_trial(job.trial)
+    seconds = len(job.commands) * robot.CONTROL_TIMESTEP
+    recorded = virtual_robot.record(virtual, trial, virtual_robot.open_loop(job.commands), seconds, job.name)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{job.name}.csv.gz"
+        recording.write_recording(recorded, path)
+        motion = reconstruction.reconstruct(recording.read_recording(path), known(virtual))
+    steps, interval = (round(s / robot.CONTROL_TIMESTEP) for s in (HORIZON, evaluation.START_INTERVAL))
+    starts = range(2, len(job.commands) - steps + 1, interval)
+    nominal = robot.load_model()
+    place, turn = seen(nominal, motion.qpos)
+    rows = []
+    for variant in VARIANTS:
+        legs = dataclasses.replace(virtual, **dict.fromkeys(variant.robot, (0.0, 0.0)))
+        air = _still(trial) if variant.still else trial
+        model, found = simulator(legs, variant), []
+        for start in starts:
+            state = motion.qpos[start], motion.qvel[start]
+            ran = seen(nominal, virtual_robot.carry_on(legs, air, job.commands, start, state, steps, model))
+            after = slice(start + 1, start + steps + 1)
+            away = np.sum((ran[0] - place[after]) ** 2, axis=1)
+            turned = np.angle(np.exp(1j * (ran[1] - turn[after])))
+            found.append([np.sqrt(np.mean(away)), np.rad2deg(np.sqrt(np.mean(turned**2)))])
+        rows.append(np.mean(found, axis=0))
+    return evaluation.group_of(job.name), np.array(rows)
+
+
+def _still(trial: Trial) -> Trial:
+    return dataclasses.replace(trial, draught=(0.0, 0.0, 0.0), draught_swing=(0.0, trial.draught_swing[1]))
+
+
+# %% [markdown]
+# ## Table
+
+
+# %%
+def main() -> None:
+    parser = argparse.ArgumentParser(description="What no simulator could do better, and what each shortcut costs.")
+    parser.add_argument("--robot", type=int, default=bundled_recordings.ROBOT_SEED, help="seed of the virtual robot")
+    parser.add_argument("--lift", type=float, default=1.0, help="share of the robot's lift that it has left")
+    parser.add_argument("--fresh", type=int, default=2026, help="seed of the twelve recordings beside the bundled ones")
+    parser.add_argument("--output", type=Path, default=Path("runs/fidelity-limits"), help="folder of the table")
+    parser.add_argument("--quick", action="store_true", help="two recordings; the numbers mean little")
+    options = parser.parse_args()
+
+    whole = virtual_robot.draw_robot(options.robot)
+    virtual = dataclasses.replace(whole, buoyancy=whole.buoyancy * options.lift)
+    held_out = [job for job in bundled_recordings.jobs() if job.split in ("validation", "test")]
+    jobs = [*held_out, *bundled_recordings.fresh_jobs(options.fresh)]
+    jobs = jobs[1:3] if options.quick else jobs
+    with multiprocessing.get_context("spawn").Pool() as pool:
+        found = pool.starmap(errors, [(virtual, job) for job in jobs], chunksize=1)
+    groups = sorted({group for group, _ in found}, reverse=True)  # near before far
+    means = {group: np.mean([rows for of, rows in found if of == group], axis=0) for group in groups}
+    lines = [f"| {HORIZON:g} s | " + " | ".join(groups) + " |", "| --- " + "| ---: " * len(groups) + "|"]
+    for place, variant in enumerate(VARIANTS):
+        cells = [f"{1e3 * means[group][place, 0]:.0f} mm, {means[group][place, 1]:.1f} deg" for group in groups]
+        lines.append(f"| {variant.label} | " + " | ".join(cells) + " |")
+    text = "\n".join(lines)
+    options.output.mkdir(parents=True, exist_ok=True)
+    (options.output / "table.md").write_text(text + "\n")
+    print(text)
+    print(f"\n{len(jobs)} recordings. Written to {options.output}.")
+
+
+if __name__ == "__main__":
+    main()
