@@ -61,13 +61,17 @@ def fit(data: AirData, config: AirConfig) -> int:
         print("Compiling: about a minute the first time ...", flush=True)
         stages, began = runs.Stages(), time.perf_counter()
 
+        done = 0
+
         def report(evaluation: int, cost: float) -> None:
+            nonlocal done
             done = stages.update("air", evaluation, _BESIDE + config.evaluations, cost)
             run.log(done, {"cost": cost, "seconds": time.perf_counter() - began})
 
         values = None if known is None else known.params
         result = air_identification.identify(model, motions["training"], config, report, known=values, free=data.free)
         stages.close()
+        run.log(done, {"control_steps": result.control_steps})
         text = table(result)
         run.write("identification.txt", text + "\n")
         run.write(aerodynamics.FILE, json.dumps(details(result), indent=2) + "\n")

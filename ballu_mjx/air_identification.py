@@ -12,6 +12,7 @@ change smoothly (`docs/white_box.md`, "Why not derivatives").
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -83,6 +84,8 @@ class AirFit:
     cost: tuple[float, float]
     """Half the sum of squares, softened, without the residual and at the end."""
     windows: int
+    control_steps: int
+    """Simulated for it."""
 
 
 Report = Callable[[int, float], None]
@@ -180,6 +183,7 @@ def identify(
         standard_errors=unravel(jnp.asarray(np.sqrt(np.diag(found.covariance)), jnp.float32)),
         cost=(without, found.cost),
         windows=simulated.count,
+        control_steps=simulated.control_steps,
     )
 
 
@@ -240,6 +244,8 @@ class AirWindows:
         self.windows = windows.cut(self._simulator, motions, config.window_seconds, config.interval_seconds)
         self._run = windows.spread(self.simulate, shared=1)
         self.timestep = float(model.opt.timestep)
+        self.control_steps = 0
+        """Simulated so far, in all windows."""
 
     @property
     def count(self) -> int:
@@ -286,6 +292,7 @@ class AirWindows:
     def _whole(self, vector: np.ndarray) -> Float[np.ndarray, "windows entries"]:
         """`errors`, at a whole delay."""
         errors = np.array(self._run(np.float32(vector), self.windows), np.float64)
+        self.control_steps += math.prod(np.shape(self.windows.features)[:2])
         errors[~np.isfinite(errors).all(axis=1)] = _LOST / np.sqrt(errors.shape[1])
         return errors
 

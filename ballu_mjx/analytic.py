@@ -136,13 +136,14 @@ def train(
     update = _updates(forces, wrap, optimizer, spread, starts, config)
     carry = (start, optimizer.init(start), start)
     key = jax.random.key(config.seed)
-    done = 0
+    done = simulated = 0
     for _ in range(config.rounds):
         key, own = jax.random.split(key)
         drawn = np.asarray(jax.random.permutation(own, len(recorded.qpos)))[: config.windows]
         taken = jax.tree.map(lambda x, drawn=drawn: np.asarray(x)[drawn], recorded)
         steps, features = simulate(wrap(jax.device_get(carry[0])), taken)
         data = _in_windows(linearize(steps), steps.loads, taken)
+        simulated += len(steps.loads) * (2 + linearize.directions)
         loss = float(np.mean(jax.vmap(_loss)(features, taken.features)))
         for first in range(0, config.updates, config.validate_every):
             key, own = jax.random.split(key)
@@ -150,7 +151,7 @@ def train(
             carry, (linear, gradient) = update(carry, jax.random.split(own, count), data)
             done += count
             found = {"loss": loss, "linear_loss": float(jnp.mean(linear)), "gradient": float(jnp.median(gradient))}
-            report(done, jax.device_get(carry[2]), found)
+            report(done, jax.device_get(carry[2]), {**found, "control_steps": simulated})
 
 
 def _in_windows(

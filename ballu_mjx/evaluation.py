@@ -132,6 +132,14 @@ class Evaluation:
                 ratios += [self.ratio(group, quantity, horizon) for quantity in ("position", "yaw")]
         return float(np.mean(ratios))
 
+    def grouped(self) -> Evaluation:
+        """The means of each group's recordings, as one recording named after it."""
+
+        def means(found: Sequence[Errors]) -> tuple[Errors, ...]:
+            return tuple(_mean([e for e in found if e.group == group]) for group in self.groups)
+
+        return dataclasses.replace(self, vanilla=means(self.vanilla), residual=means(self.residual))
+
     def excess(self) -> tuple[float, str]:
         """Worst case over recordings and horizons of the residual's error beyond 1.2 vanilla + (2 cm or 3 deg).
 
@@ -434,6 +442,23 @@ class OpenLoopEvaluator:
                 )
             )
         return tuple(results)
+
+
+def _mean(errors: Sequence[Errors]) -> Errors:
+    """Of recordings of one group; named after it."""
+    group = errors[0].group
+
+    def over(quantity: str) -> dict[float, tuple[float, float]]:
+        reached = [horizon for horizon in HORIZONS if any(horizon in e.position for e in errors)]
+        return {
+            h: (_group_mean(errors, group, quantity, h), _group_mean(errors, group, quantity, h, 1)) for h in reached
+        }
+
+    whole = (float(np.mean([getattr(e, name) for e in errors])) for name in _WHOLE)
+    return Errors(group, group, over("position"), over("yaw"), *whole)
+
+
+_WHOLE = ("mean_com_error", "final_yaw_error", "mean_force")
 
 
 def _rms(values: np.ndarray) -> float:

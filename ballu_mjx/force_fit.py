@@ -145,7 +145,9 @@ class _Supervised(_Fit):
         share = min(errors, key=lambda share: errors[share])
         if share == 0.0:
             print("No share of them is better than none: the residual is without force.", flush=True)
-        self.log(config.updates + 1, {"share": share, "validation_error": errors[share]})
+        labelled = sum(len(motion.command) for use in found for motion in setup.motions[use])
+        simulated = labelled * (1 + linearize.directions)
+        self.log(config.updates + 1, {"share": share, "validation_error": errors[share], "control_steps": simulated})
         self.save(step, parts[share], errors[share])
 
 

@@ -30,9 +30,10 @@ from ballu_mjx import runtime
 
 runtime.prepare()
 
+import bundled_recordings  # noqa: E402
 import deflation  # noqa: E402
 
-from ballu_mjx import actuators, air_fit, air_identification, reconstruction, recording, robot, virtual_robot  # noqa: E402
+from ballu_mjx import actuators, air_fit, air_identification, reconstruction, robot, virtual_robot  # noqa: E402
 from ballu_mjx.air_identification import AirConfig  # noqa: E402
 
 NONE = (0.0, 0.0)
@@ -62,11 +63,11 @@ def main() -> None:
         f"| truth | {lift * 1e3:.0f} | {full.added_mass:.3f} | {full.added_inertia:.4f} | {full.latency * 1e3:.0f} | |",
     ]
     config = AirConfig(**air_fit.QUICK) if options.quick else AirConfig()
-    training = recording.bundled("training")[: 3 if options.quick else None]
+    training = [job for job in bundled_recordings.jobs() if job.split == "training"][: 3 if options.quick else None]
     for name, changes in list(ROBOTS.items())[: 2 if options.quick else None]:
         legs = dataclasses.replace(full, **changes)
         folder = options.output / name.replace(" ", "-")
-        gaits = [deflation.replayed(path, legs, 2000 + number, folder) for number, path in enumerate(training)]
+        gaits = [deflation.recorded(job, legs, 2000 + number, folder) for number, job in enumerate(training)]
         motions = [reconstruction.reconstruct(gait, model) for gait in gaits]
         fit = air_identification.identify(model, motions, config)
         air, error = fit.parameters, fit.standard_errors

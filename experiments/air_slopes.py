@@ -32,6 +32,7 @@ from ballu_mjx import runtime
 
 runtime.prepare()
 
+import bundled_recordings  # noqa: E402
 import deflation  # noqa: E402
 import jax  # noqa: E402
 import matplotlib.pyplot as plt  # noqa: E402
@@ -39,7 +40,7 @@ import numpy as np  # noqa: E402
 from jax.flatten_util import ravel_pytree  # noqa: E402
 from jaxtyping import Array, Float  # noqa: E402
 
-from ballu_mjx import reconstruction, recording, residual, robot, virtual_robot, windows  # noqa: E402
+from ballu_mjx import reconstruction, residual, robot, virtual_robot, windows  # noqa: E402
 from ballu_mjx.air_identification import AirConfig, AirWindows  # noqa: E402
 
 STEPS = (0.1e-3, 1e-3, 3e-3, 10e-3, 30e-3, 100e-3)
@@ -111,7 +112,8 @@ def main() -> None:
     full = virtual_robot.draw_robot(0)
     deflated = dataclasses.replace(full, buoyancy=full.buoyancy * (1 - LOSS))
     lost = deflation.lift(LOSS * full.buoyancy)
-    recorded = deflation.replayed(recording.bundled("training")[0], deflated, 2000, options.output / "recordings")
+    gait = next(job for job in bundled_recordings.jobs() if job.split == "training")
+    recorded = deflation.recorded(gait, deflated, 2000, options.output / "recordings")
     motions = [reconstruction.reconstruct(recorded, model)]
     # At a whole delay, where errors can be differentiated.
     timestep = float(model.opt.timestep)

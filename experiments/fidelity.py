@@ -8,7 +8,8 @@
 # with all of its forces, as in the paper, and with the share of them that helps), gradients through the simulator
 # (analytic), the air's parameters (aerodynamic; all, or all but the lift), and networks for what the air leaves
 # (aerodynamic+analytic, aerodynamic+EnvMimic). One training a method and seed; runs that are there already are not
-# repeated.
+# repeated. Beside gaits and commands unlike any, the actions of a walking policy that was trained in vanilla are
+# replayed, as in the paper.
 #
 # `python experiments/fidelity.py` takes hours on two cores, `--methods` names some of it; `--robot N` does the same on
 # another virtual robot, recorded and its actuators identified first; `--quick` shows that it works.
@@ -40,9 +41,11 @@ runtime.prepare()
 
 import bundled_recordings  # noqa: E402
 import numpy as np  # noqa: E402
+from bundled_recordings import Job  # noqa: E402
 from jaxtyping import Float  # noqa: E402
 
 from ballu_mjx import aerodynamics, evaluation, plots, reconstruction, recording, residual, robot, runs  # noqa: E402
+from ballu_mjx.policy import Policy  # noqa: E402
 
 # %% [markdown]
 # ## Train
@@ -107,6 +110,13 @@ def seconds(folder: Path) -> float:
     return float(runs.column(folder, "seconds")[1][-1])
 
 
+def simulated(folder: Path) -> float:
+    """Control steps that a run simulated to learn, validations left out; a derivative along one direction counts as one
+    more."""
+    counted = runs.column(folder, "control_steps")[1]
+    return float(counted[-1] if len(counted) else runs.column(folder, "reward")[0][-1])
+
+
 def race(folders: Mapping[str, list[Path]]) -> str:
     """Markdown: how soon methods whose progress is measured open loop are as good on the validation recordings as
     EnvMimic ever is; means over seeds."""
@@ -151,6 +161,20 @@ def record(robot_seed: int, folder: Path) -> Recorded:
     return Recorded(training, validation, test, place / "actuators.json")
 
 
+def replayed_policy(options: Options) -> Path:
+    """The robot under the actions of a walking policy that was trained in vanilla, replayed open loop (paper)."""
+    source, seconds = options.output / "walk-vanilla", bundled_recordings.SECONDS["test"]
+    train(source, "walk", *(["--quick"] if options.quick else []), result="replay.npz")
+    path = options.output / "policy" / "policy.csv.gz"
+    if not path.exists():
+        policy = Policy.load(source)
+        loop = policy.closed_loop()
+        actions = loop(policy.params, *loop.standing(), round(seconds / robot.CONTROL_TIMESTEP)).command[0]
+        job = Job(path.parent.name, "policy", np.round(actions, 3).astype(float), 300, "Actions of a vanilla policy.")
+        bundled_recordings.make(job, options.robot, options.output)
+    return path
+
+
 def evaluate(folders: list[Path], paths: list[Path]) -> list[evaluation.Evaluation]:
     """Runs of the same configuration and actuators, on other recordings than their own."""
     policies = [residual.Residual.load(folder) for folder in folders]
@@ -158,6 +182,14 @@ def evaluate(folders: list[Path], paths: list[Path]) -> list[evaluation.Evaluati
     motions = [reconstruction.reconstruct(recording.read_recording(path), model) for path in paths]
     evaluator = evaluation.OpenLoopEvaluator(model, motions, policies[0].model)
     return [evaluator(policy.params) for policy in policies]
+
+
+def vanilla_errors(folder: Path, paths: list[Path]) -> tuple[evaluation.Errors, ...]:
+    """Of the nominal robot without residual. `folder` is any residual's run: none of it acts."""
+    kind, model = residual.Residual.load(folder), robot.load_model()
+    motions = [reconstruction.reconstruct(recording.read_recording(path), model) for path in paths]
+    evaluator = evaluation.OpenLoopEvaluator(model, motions, kind.model)
+    return evaluator.errors(evaluator.replay(kind.params, scale=0.0))
 
 
 # %% [markdown]
@@ -177,38 +209,75 @@ def ratios(values: list[float]) -> str:
     return f"{np.mean(values):.2f}" + ("" if len(values) == 1 else f" [{min(values):.2f}, {max(values):.2f}]")
 
 
-Results = Mapping[str, list[evaluation.Evaluation]]
-"""Of each method of `METHODS`, those of all seeds."""
+Rows = Mapping[str, list[tuple[evaluation.Errors, ...]]]
+"""Of each simulator, by its label, what it is off by on a set of recordings, those of all seeds; vanilla first."""
 
 
-def comparison(results: Results, times: Mapping[str, list[float]], horizon: float) -> str:
-    """Markdown: what simulators leave of vanilla's RMSE over `horizon` s, the range of that over seeds, and how long
-    learning took. In vanilla's row stand its errors themselves; the least of a column is bold."""
-    nominal, identified = results["nominal"], results["identified"]
-    groups = sorted(nominal[0].groups, reverse=True)  # near before far
-    columns = [(group, quantity) for group in groups for quantity in ("position", "yaw")]
-    rows = {"vanilla+sysid": [run.vanilla for run in identified[:1]]}
-    rows |= {METHODS[name].label: [run.residual for run in found] for name, found in results.items()}
-    took = {METHODS[name].label: f"{np.mean(values):.0f}" for name, values in times.items()}
+def rows_of(vanilla: tuple[evaluation.Errors, ...], results: Mapping[str, list[evaluation.Evaluation]]) -> Rows:
+    """`results`: of each method of `METHODS`, those of all seeds."""
+    rows = {"vanilla": [vanilla], "vanilla+sysid": [results["identified"][0].vanilla]}
+    return rows | {METHODS[name].label: [run.residual for run in found] for name, found in results.items()}
+
+
+def groups_of(rows: Rows) -> list[str]:
+    """Near before far."""
+    return sorted({errors.group for errors in rows["vanilla"][0]}, reverse=True)
+
+
+def comparison(rows: Rows, effort: Mapping[str, str], horizon: float) -> str:
+    """Markdown: what simulators leave of vanilla's RMSE over `horizon` s, the range of that over seeds, and `effort`,
+    what learning took. In vanilla's row stand its errors themselves; the least of a column is bold."""
+    columns = [(group, quantity) for group in groups_of(rows) for quantity in ("position", "yaw")]
 
     def mean(run: Sequence[evaluation.Errors], group: str, quantity: str) -> float:
         return float(np.mean([getattr(e, quantity)[horizon][0] for e in run if e.group == group]))
 
-    head = [f"{group}: {quantity}" for group, quantity in columns]
+    head = [quantity if group == "all" else f"{group}: {quantity}" for group, quantity in columns]
     lines = [
-        f"| {horizon:g} s | " + " | ".join(head) + " | learning (s) |",
-        "| --- " + "| ---: " * (1 + len(head)) + "|",
+        f"| {horizon:g} s | " + " | ".join(head) + " | learning (s) | thousand control steps |",
+        "| --- " + "| ---: " * (2 + len(head)) + "|",
     ]
-    whole = {column: mean(nominal[0].vanilla, *column) for column in columns}
+    whole = {column: mean(rows["vanilla"][0], *column) for column in columns}
     errors = [f"{whole[c]:.3f} m" if c[1] == "position" else f"{whole[c]:.1f} deg" for c in columns]
-    lines.append("| vanilla | " + " | ".join(errors) + " | |")
+    lines.append("| vanilla | " + " | ".join(errors) + " | | |")
     left = {
-        row: [[mean(run, *column) / whole[column] for run in runs] for column in columns] for row, runs in rows.items()
+        row: [[mean(run, *column) / whole[column] for run in runs] for column in columns]
+        for row, runs in rows.items()
+        if row != "vanilla"
     }
     least = [min(np.mean(cells[place]) for cells in left.values()) for place in range(len(columns))]
     for row, cells in left.items():
         said = [f"**{ratios(c)}**" if np.mean(c) == low else ratios(c) for c, low in zip(cells, least, strict=True)]
-        lines.append(f"| {row} | " + " | ".join([*said, took.get(row, "")]) + " |")
+        lines.append(f"| {row} | " + " | ".join([*said, effort.get(row, " | ")]) + " |")
+    return "\n".join(lines)
+
+
+def final_yaw(rows: Rows) -> str:
+    """Markdown: final yaw error (deg, absolute) after whole recordings, mean over a group's; mean and range over
+    seeds."""
+    groups = groups_of(rows)
+    lines = ["| final yaw error (deg) | " + " | ".join(groups) + " |", "| --- " + "| ---: " * len(groups) + "|"]
+    for row, found in rows.items():
+        cells = [
+            spread([float(np.mean([abs(e.final_yaw_error) for e in run if e.group == group])) for run in found], 0)
+            for group in groups
+        ]
+        lines.append(f"| {row} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def worst_cases(rows: Rows) -> str:
+    """Markdown: how near each simulator comes to making things worse than vanilla: the largest excess over 1.2 times
+    vanilla's error plus 2 cm and 3 deg, over horizons and seeds (negative: within), of a group's mean and of a single
+    recording."""
+    lines = [
+        "| largest excess over 1.2 times vanilla + 2 cm, 3 deg | of a group's mean | of a single recording |",
+        "| --- | --- | --- |",
+    ]
+    for row, found in list(rows.items())[1:]:
+        beside = [evaluation.Evaluation(rows["vanilla"][0], errors) for errors in found]
+        worst = [max(each.excess() for each in some) for some in ([e.grouped() for e in beside], beside)]
+        lines.append(f"| {row} | " + " | ".join(f"{relative:+.0%}: {place}" for relative, place in worst) + " |")
     return "\n".join(lines)
 
 
@@ -245,42 +314,34 @@ def table(runs: list[evaluation.Evaluation], base: str, name: str) -> str:
     return "\n".join(lines)
 
 
-def worst_case(runs: list[evaluation.Evaluation], base: str) -> str:
-    """Markdown: how near a run comes to the bound on what it may make worse than the simulator `base`."""
-    bound = f"1.2 times {base} plus 2 cm and 3 deg"
-    lines = [f"Worst case against {bound}, over recordings and horizons, by seed (negative: within):", ""]
-    lines += [f"- {relative:+.0%} of the bound, {place}" for relative, place in (run.excess() for run in runs)]
-    return "\n".join(lines)
-
-
-def against(nominal: list[evaluation.Evaluation], runs: list[evaluation.Evaluation]) -> list[evaluation.Evaluation]:
-    """`runs` on identified actuators, beside vanilla instead of vanilla+sysid."""
-    return [evaluation.Evaluation(nominal[0].vanilla, run.residual) for run in runs]
-
-
 # %% [markdown]
 # ## Figure: whole recordings, mean and range over seeds
 
 
 # %%
-def figure(folders: list[Path], air: Path, paths: list[Path], path: Path) -> None:
-    """Replay recordings in vanilla, with identified actuators, with every seed's forces beside these, and with the
-    identified air."""
-    policies, blown = [residual.Residual.load(folder) for folder in folders], residual.Residual.load(air)
+DRAWN = ("regression", "identified", "analytic", AIR)
+"""Methods that the figure shows, where they were run, beside vanilla with and without identified actuators."""
 
-    def simulator(actuators: robot.ActuatorParameters | None, kind: residual.Residual) -> evaluation.OpenLoopEvaluator:
-        model = robot.load_model(actuators)
+
+def figure(folders: Mapping[str, list[Path]], paths: list[Path], path: Path) -> None:
+    """Replay recordings in every simulator, with every seed's forces."""
+    found = {name: [residual.Residual.load(folder) for folder in folders[name]] for name in DRAWN if name in folders}
+    curves: dict[str, list[evaluation.Replay]] = {}
+    evaluators = {}
+    for name, kinds in found.items():
+        model = robot.load_model(kinds[0].actuators)
         motions = [reconstruction.reconstruct(recording.read_recording(p), model) for p in paths]
-        return evaluation.OpenLoopEvaluator(model, motions, kind.model)
-
-    evaluator = simulator(policies[0].actuators, policies[0])
-    replays = [evaluator.replay(policy.params) for policy in policies]
-    identified = evaluator.replay(policies[0].params, scale=0.0)
-    vanilla = simulator(None, policies[0]).replay(policies[0].params, scale=0.0)
-    aerodynamic = simulator(blown.actuators, blown).replay(blown.params)
+        evaluators[name] = evaluation.OpenLoopEvaluator(model, motions, kinds[0].model)
+        curves[kinds[0].model.name] = [evaluators[name].replay(kind.params) for kind in kinds]
+    identified, first = evaluators["identified"], found["identified"][0]
+    still = identified.replay(first.params, scale=0.0)
+    vanilla = robot.load_model()
+    motions = [reconstruction.reconstruct(recording.read_recording(p), vanilla) for p in paths]
+    nominal = evaluation.OpenLoopEvaluator(vanilla, motions, first.model).replay(first.params, scale=0.0)
+    every = {"vanilla": [nominal], "vanilla+sysid": [still], **curves}
     panels = []
-    for motion, run in zip(evaluator.motions, evaluator.first_runs, strict=True):
-        position, yaw = evaluator.recorded(run)
+    for motion, run in zip(identified.motions, identified.first_runs, strict=True):
+        position, yaw = identified.recorded(run)
         states = len(yaw)
 
         def curve(replay: evaluation.Replay, run: int = run, states: int = states) -> np.ndarray:
@@ -291,12 +352,7 @@ def figure(folders: list[Path], air: Path, paths: list[Path], path: Path) -> Non
                 title=motion.name,
                 time=np.arange(states) * robot.CONTROL_TIMESTEP,
                 recording=np.column_stack([position[:, :2], yaw]),
-                simulations={
-                    "vanilla": curve(vanilla),
-                    "vanilla+sysid": curve(identified),
-                    "envmimic": np.stack([curve(replay) for replay in replays]),
-                    "aerodynamic": curve(aerodynamic),
-                },
+                simulations={name: np.stack([curve(replay) for replay in replays]) for name, replays in every.items()},
             )
         )
     plots.tracking(path, panels)
@@ -321,7 +377,7 @@ class Options:
 
 def parse() -> Options:
     parser = argparse.ArgumentParser(description="Fidelity of simulators: the README's tables and figure.")
-    always = ("nominal", "identified", AIR)  # the figure and the long tables are of these
+    always = ("identified", AIR)  # the long tables are of these
     parser.add_argument(
         "--methods",
         nargs="*",
@@ -367,26 +423,35 @@ def main() -> None:
     options = parse()
     recorded = record(options.robot, options.output)
     folders = learn(options, recorded)
-    results = {name: [load(folder) for folder in members] for name, members in folders.items()}
-    times = {name: [seconds(folder) for folder in members] for name, members in folders.items()}
+    effort = {
+        METHODS[name].label: " | ".join(
+            f"{np.mean([of(folder) for folder in members]) / unit:,.0f}"
+            for of, unit in ((seconds, 1), (simulated, 1e3))
+        )
+        for name, members in folders.items()
+    }
     each = 1 if options.quick else 6
-    paths = bundled_recordings.fresh(options.fresh, options.output, each, options.robot)
-    larger = {name: evaluate(members, paths) for name, members in folders.items()}
+    fresh = bundled_recordings.fresh(options.fresh, options.output, each, options.robot)
+    policy = replayed_policy(options)
+    sets = {
+        "Bundled test recordings": recorded.test,
+        "Fresh test recordings": fresh,
+        "A vanilla policy's actions": [policy],
+    }
     parts = []
-    for title, found in (("Bundled test recordings", results), ("Fresh test recordings", larger)):
-        parts += [f"### {title}", *(comparison(found, times, horizon) for horizon in evaluation.SCORE_HORIZONS)]
-        nominal = found["nominal"]
-        legs = [evaluation.Evaluation(nominal[0].vanilla, found["identified"][0].vanilla)]
-        parts += ["vanilla+sysid. " + worst_case(legs, "vanilla")]
-        for name in options.methods:
-            evaluations = found[name] if METHODS[name].nominal else against(nominal, found[name])
-            parts += [f"{METHODS[name].label}. " + worst_case(evaluations, "vanilla")]
-        for name in ("identified", AIR, "nominal"):
-            parts += [table(found[name], "vanilla" if METHODS[name].nominal else "vanilla+sysid", METHODS[name].label)]
+    for title, paths in sets.items():
+        found = {
+            name: [load(folder) for folder in members] if paths is recorded.test else evaluate(members, paths)
+            for name, members in folders.items()
+        }
+        rows = rows_of(vanilla_errors(folders["identified"][0], paths), found)
+        parts += [f"### {title}", *(comparison(rows, effort, horizon) for horizon in evaluation.SCORE_HORIZONS)]
+        parts += [final_yaw(rows), worst_cases(rows)]
+        parts += [table(found[name], "vanilla+sysid", METHODS[name].label) for name in ("identified", AIR)]
     parts += ["### Progress", race(folders)]
     text = "\n\n".join(parts)
     (options.output / "table.md").write_text(text + "\n")
-    figure(folders["identified"], folders[AIR][0], recorded.test, options.output / "tracking.png")
+    figure(folders, [*recorded.test, policy], options.output / "tracking.png")
     print(text)
     print(f"\nWritten to {options.output}.")
 

@@ -233,6 +233,21 @@ def test_evaluator_finds_no_error_in_its_own_physics_and_some_in_pushed_ones(eva
     assert result.excess()[0] > 0 and "near-own" in result.excess()[1]
 
 
+def test_a_group_s_errors_are_not_those_of_its_luckiest_recording():
+    """Two recordings that trade their errors: either alone makes one bound look broken, their mean does not."""
+
+    def errors(name: str, size: float) -> evaluation.Errors:
+        return evaluation.Errors(name, "near", {5.0: (size, 0.1)}, {5.0: (10 * size, 1.0)}, size, 10 * size, 0.0)
+
+    vanilla, mimic = (errors("near-1", 1.0), errors("near-2", 3.0)), (errors("near-1", 3.0), errors("near-2", 1.0))
+    result = evaluation.Evaluation(vanilla, mimic)
+    worst, place = result.excess()
+    assert worst == pytest.approx(3.0 / (1.2 * 1.0 + 0.02) - 1) and "near-1" in place
+    worst, place = result.grouped().excess()
+    assert worst == pytest.approx(2.0 / (1.2 * 2.0 + 0.02) - 1) and "near at 5 s" in place
+    assert result.grouped().ratio("near", "yaw", 5.0) == result.ratio("near", "yaw", 5.0) == 1.0
+
+
 def test_one_program_serves_all_recordings_and_actuators(still: Motion, pushed: Motion):
     other = robot.load_model()
     nominal = robot.ActuatorParameters.nominal(other)
