@@ -119,21 +119,27 @@ def simulated(folder: Path) -> float:
 
 def race(folders: Mapping[str, list[Path]]) -> str:
     """Markdown: how soon methods whose progress is measured open loop are as good on the validation recordings as
-    EnvMimic ever is; means over seeds."""
+    EnvMimic ever is, and how good after a fifth of the time that EnvMimic takes; means over seeds."""
 
     def curve(folder: Path) -> tuple[Float[np.ndarray, " steps"], Float[np.ndarray, " steps"]]:
         steps, error = runs.column(folder, "validation_error")
         return np.interp(steps, *runs.column(folder, "seconds")), error
 
     goal = float(np.mean([curve(folder)[1].min() for folder in folders["identified"]]))
-    lines = ["| method | lowest validation error (score) | seconds to EnvMimic's lowest |", "| --- | ---: | ---: |"]
+    fifth = float(np.mean([seconds(folder) for folder in folders["identified"]])) / 5
+    lines = [
+        f"| method | lowest validation error (score) | within {fifth:.0f} s | seconds to EnvMimic's lowest |",
+        "| --- | ---: | ---: | ---: |",
+    ]
     for name, members in folders.items():
         if METHODS[name].nominal or name in ("regression", "supervised", AIR, "air-lift"):
             continue
         curves = [curve(folder) for folder in members]
-        first = [float(seconds[np.argmax(error <= goal)]) for seconds, error in curves if np.any(error <= goal)]
+        first = [float(time[np.argmax(error <= goal)]) for time, error in curves if np.any(error <= goal)]
+        soon = spread([float(error[time <= fifth].min(initial=1.0)) for time, error in curves])
         when = f"{np.mean(first):.0f} ({len(first)} of {len(curves)} seeds)" if first else "never"
-        lines.append(f"| {METHODS[name].label} | {spread([float(e.min()) for _, e in curves])} | {when} |")
+        lowest = spread([float(error.min()) for _, error in curves])
+        lines.append(f"| {METHODS[name].label} | {lowest} | {soon} | {when} |")
     return "\n".join(lines)
 
 
