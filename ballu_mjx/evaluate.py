@@ -35,6 +35,9 @@ class Options(runtime.CommandOptions):
     """Recordings to replay, files or folders. Without this option: the run's own for the test."""
     last: bool = False
     """Take the last checkpoint instead of the best by validation error."""
+    noise_floor: bool = False
+    """Also tell which errors the noise of motion capture (0.5 mm, 0.3 deg) makes by the starting states alone: no
+    simulator can be expected to do much better."""
     output: Path | None = None
     """Folder for evaluation.txt, evaluation.json, tracking.png and replay.npz, the run's own, say. Without this option:
     the table is only printed."""
@@ -54,6 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _evaluate(options: Options) -> None:
     from ballu_mjx import evaluation, residual, runs
     from ballu_mjx.general_reconstruction import reconstruct
+    from ballu_mjx.reconstruction import noisier
     from ballu_mjx.recording import read_recording
     from ballu_mjx.recording import recordings as expand
 
@@ -78,6 +82,28 @@ def _evaluate(options: Options) -> None:
     evaluator = evaluation.OpenLoopEvaluator(model, motions, loaded.model, base, robot)
     result = evaluator(loaded.params) if options.output is None else report(evaluator, loaded.params, options.output)
     print(result.table())
+    if options.noise_floor:
+        shaken = [noisier(recording, seed=number) for number, recording in enumerate(recordings)]
+        floor = evaluator.of_starts([reconstruct(each, model, robot) for each in shaken], loaded.params)
+        print(f"\n{noise_floor(dataclasses.replace(result, vanilla=floor))}")
+
+
+def noise_floor(beside: Evaluation) -> str:
+    """For the terminal: by group and horizon, what noise makes of the errors (in the place of vanilla's), and what the
+    simulator's are."""
+    from ballu_mjx.evaluation import HORIZONS
+
+    lines = [
+        "Of these errors, those that the noise of motion capture (0.5 mm, 0.3 deg) in the starting states makes:",
+    ]
+    for floor, ours in zip(beside.grouped().vanilla, beside.grouped().residual, strict=True):
+        for horizon in (horizon for horizon in HORIZONS if horizon in floor.position):
+            position, yaw = floor.position[horizon][0], floor.yaw[horizon][0]
+            lines.append(
+                f"{floor.group:7}{horizon:>8g} |{position:>14.3f} m of {ours.position[horizon][0]:.3f} m | "
+                f"{yaw:>6.1f} deg of {ours.yaw[horizon][0]:.1f} deg"
+            )
+    return "\n".join(lines)
 
 
 def check_recording(path: Path, recording: Recording, *, long_enough: bool) -> None:

@@ -405,8 +405,14 @@ class OpenLoopEvaluator:
 
         return jax.lax.scan(step, carry, start + jnp.arange(_CHUNK))
 
-    def errors(self, replay: Replay) -> tuple[Errors, ...]:
-        """Errors of a replay, by recording."""
+    def of_starts(self, motions: Sequence[Motion], params: Any) -> tuple[Errors, ...]:
+        """What the simulator with the residual is off from itself when it starts from the states of `motions`: the same
+        recordings reconstructed otherwise, from `reconstruction.noisier` ones, say. No simulator can be expected to be
+        much nearer to what was recorded."""
+        return self.errors(self.on(motions).replay(params), self.replay(params))
+
+    def errors(self, replay: Replay, against: Replay | None = None) -> tuple[Errors, ...]:
+        """Errors of a replay, by recording: beside what was recorded, or beside another replay."""
         results = []
         for index, motion in enumerate(self.motions):
             runs = [run for run, (recording, _) in enumerate(self.starts) if recording == index]
@@ -416,6 +422,8 @@ class OpenLoopEvaluator:
             for run in runs:
                 recorded_position, recorded_yaw = self.recorded(run)
                 states = len(recorded_yaw)
+                if against is not None:
+                    recorded_position, recorded_yaw = against.position[run, :states], against.yaw[run, :states]
                 distance = np.linalg.norm(replay.position[run, :states] - recorded_position, axis=-1)
                 turn = replay.yaw[run, :states] - recorded_yaw
                 turn = np.rad2deg(np.arctan2(np.sin(turn), np.cos(turn)))
@@ -428,6 +436,7 @@ class OpenLoopEvaluator:
                 if run == runs[0]:
                     start = self.starts[run][1]
                     recorded_com = self._recorded_com[index, start : start + states]
+                    recorded_com = recorded_com if against is None else against.com[run, :states]
                     com_error = float(np.linalg.norm(replay.com[run, :states] - recorded_com, axis=-1).mean())
                     final_yaw = float(turn[-1])
             results.append(

@@ -157,6 +157,34 @@ def reconstruct(
     )
 
 
+def noisier(recording: Recording, parameters: ReconstructionParameters | None = None, seed: int = 0) -> Recording:
+    """`recording` with as much white noise again as `parameters` say that its measurements have.
+
+    Reconstructed, it is off from the original by as much as the original is from the truth, as far as noise goes.
+    """
+    parameters = parameters or ReconstructionParameters()
+    rng = np.random.default_rng(seed)
+    spreads = dict.fromkeys(("balloon_position", "base_position", "foot_position"), parameters.position_noise)
+    spreads |= dict.fromkeys(("motor", "knee"), parameters.joint_noise)
+
+    def shaken(values: np.ndarray, spread: float) -> np.ndarray:
+        return values + spread * rng.normal(size=values.shape)
+
+    changed: dict[str, Any] = {
+        "points": {name: shaken(place, parameters.position_noise) for name, place in recording.points.items()},
+        "angles": {name: shaken(angle, parameters.joint_noise) for name, angle in recording.angles.items()},
+    }
+    for name, spread in spreads.items():
+        if (values := getattr(recording, name)) is not None:
+            changed[name] = shaken(values, spread)
+    for name in ("balloon_quaternion", "base_quaternion"):
+        if (values := getattr(recording, name)) is not None:
+            turn = Rotation.from_rotvec(shaken(np.zeros((len(values), 3)), parameters.rotation_noise))
+            turned = (turn * Rotation.from_quat(values, scalar_first=True)).as_quat(scalar_first=True)
+            changed[name] = sign_continuous(turned)
+    return dataclasses.replace(recording, **changed)
+
+
 # 1. Measurements on a uniform grid
 
 

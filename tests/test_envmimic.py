@@ -233,6 +233,15 @@ def test_evaluator_finds_no_error_in_its_own_physics_and_some_in_pushed_ones(eva
     assert result.excess()[0] > 0 and "near-own" in result.excess()[1]
 
 
+def test_errors_of_starts_are_how_far_the_starts_lie_apart(evaluator: evaluation.OpenLoopEvaluator):
+    """A robot that starts 2 cm beside itself walks 2 cm beside itself."""
+    assert all(e.position[2.0][0] == 0.0 for e in evaluator.of_starts(evaluator.motions, jnp.array(FORCE)))
+    beside = [dataclasses.replace(m, qpos=m.qpos + 0.02 * np.eye(m.qpos.shape[1])[1]) for m in evaluator.motions]
+    for errors in evaluator.of_starts(beside, jnp.array(FORCE)):
+        assert errors.position[2.0][0] == pytest.approx(0.02, rel=0.02)
+        assert errors.yaw[2.0][0] < 0.1 and errors.mean_com_error == pytest.approx(0.02, rel=0.02)
+
+
 def test_a_group_s_errors_are_not_those_of_its_luckiest_recording():
     """Two recordings that trade their errors: either alone makes one bound look broken, their mean does not."""
 

@@ -100,6 +100,20 @@ def seen_without_base(truth: Truth) -> Motion:
     return reconstruct(capture(truth, base=False), MODEL)
 
 
+def test_as_much_noise_again_errs_as_much_again(truth: Truth):
+    """What `noisier` recordings are reconstructed to is off from the original's states by as much as these from the
+    truth: a simulator's error by its starting states can be had without the truth."""
+    seen = capture(truth)
+    once = reconstruct(seen, MODEL).qpos
+    again = [reconstruct(reconstruction.noisier(seen, seed=seed), MODEL).qpos for seed in (1, 2)]
+    own = once[2:-2] - truth.qpos[::5][: len(once)][2:-2]
+    for twin in again:
+        places = [*range(3), *HIPS]  # what no stop clips
+        ratio = np.std((twin - once)[2:-2], axis=0)[places] / np.std(own, axis=0)[places]
+        assert np.all(ratio > 0.5) and np.all(ratio < 1.4), ratio
+    assert np.abs(again[0] - again[1]).max() > 1e-4
+
+
 def at_control_rate(values: np.ndarray, motion: Motion, shift: int = 0) -> np.ndarray:
     """Truth at the motion's times, `shift` samples later; both ends left out, so that shifts compare alike."""
     return values[5 * np.arange(2, len(motion.time) - 2) + shift]
