@@ -20,7 +20,7 @@ from ballu_mjx.errors import InputError
 from ballu_mjx.replay import Take
 
 if TYPE_CHECKING:
-    from ballu_mjx.evaluation import Evaluation, OpenLoopEvaluator, Replay
+    from ballu_mjx.evaluation import Errors, Evaluation, OpenLoopEvaluator, Replay
     from ballu_mjx.ppo import Params
     from ballu_mjx.recording import Recording
 
@@ -85,23 +85,21 @@ def _evaluate(options: Options) -> None:
     if options.noise_floor:
         shaken = [noisier(recording, seed=number) for number, recording in enumerate(recordings)]
         floor = evaluator.of_starts([reconstruct(each, model, robot) for each in shaken], loaded.params)
-        print(f"\n{noise_floor(dataclasses.replace(result, vanilla=floor))}")
+        print(f"\n{noise_floor(floor, result.residual)}")
 
 
-def noise_floor(beside: Evaluation) -> str:
-    """For the terminal: by group and horizon, what noise makes of the errors (in the place of vanilla's), and what the
-    simulator's are."""
-    from ballu_mjx.evaluation import HORIZONS
+def noise_floor(floor: Sequence[Errors], errors: Sequence[Errors]) -> str:
+    """For the terminal: by group and horizon, what noise alone makes of a simulator's errors, and what these are."""
+    from ballu_mjx.evaluation import grouped
 
     lines = [
         "Of these errors, those that the noise of motion capture (0.5 mm, 0.3 deg) in the starting states makes:",
     ]
-    for floor, ours in zip(beside.grouped().vanilla, beside.grouped().residual, strict=True):
-        for horizon in (horizon for horizon in HORIZONS if horizon in floor.position):
-            position, yaw = floor.position[horizon][0], floor.yaw[horizon][0]
+    for noise, ours in zip(grouped(floor), grouped(errors), strict=True):
+        for horizon, (position, _) in noise.position.items():
             lines.append(
-                f"{floor.group:7}{horizon:>8g} |{position:>14.3f} m of {ours.position[horizon][0]:.3f} m | "
-                f"{yaw:>6.1f} deg of {ours.yaw[horizon][0]:.1f} deg"
+                f"{noise.group:7}{horizon:>8g} |{position:>14.3f} m of {ours.position[horizon][0]:.3f} m | "
+                f"{noise.yaw[horizon][0]:>6.1f} deg of {ours.yaw[horizon][0]:.1f} deg"
             )
     return "\n".join(lines)
 

@@ -132,14 +132,6 @@ class Evaluation:
                 ratios += [self.ratio(group, quantity, horizon) for quantity in ("position", "yaw")]
         return float(np.mean(ratios))
 
-    def grouped(self) -> Evaluation:
-        """The means of each group's recordings, as one recording named after it."""
-
-        def means(found: Sequence[Errors]) -> tuple[Errors, ...]:
-            return tuple(_mean([e for e in found if e.group == group]) for group in self.groups)
-
-        return dataclasses.replace(self, vanilla=means(self.vanilla), residual=means(self.residual))
-
     def excess(self) -> tuple[float, str]:
         """Worst case over recordings and horizons of the residual's error beyond 1.2 vanilla + (2 cm or 3 deg).
 
@@ -451,6 +443,12 @@ class OpenLoopEvaluator:
                 )
             )
         return tuple(results)
+
+
+def grouped(errors: Sequence[Errors]) -> tuple[Errors, ...]:
+    """The means of each group's recordings, as one recording named after it."""
+    groups = dict.fromkeys(e.group for e in errors)
+    return tuple(_mean([e for e in errors if e.group == group]) for group in groups)
 
 
 def _mean(errors: Sequence[Errors]) -> Errors:

@@ -280,9 +280,11 @@ def worst_cases(rows: Rows) -> str:
         "| largest excess over 1.2 times vanilla + 2 cm, 3 deg | of a group's mean | of a single recording |",
         "| --- | --- | --- |",
     ]
+    vanilla = rows["vanilla"][0]
     for row, found in list(rows.items())[1:]:
-        beside = [evaluation.Evaluation(rows["vanilla"][0], errors) for errors in found]
-        worst = [max(each.excess() for each in some) for some in ([e.grouped() for e in beside], beside)]
+        single = [evaluation.Evaluation(vanilla, errors) for errors in found]
+        means = [evaluation.Evaluation(evaluation.grouped(vanilla), evaluation.grouped(errors)) for errors in found]
+        worst = [max(each.excess() for each in some) for some in (means, single)]
         lines.append(f"| {row} | " + " | ".join(f"{relative:+.0%}: {place}" for relative, place in worst) + " |")
     return "\n".join(lines)
 
