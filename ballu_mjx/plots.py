@@ -121,7 +121,8 @@ def tracking(path: Path, panels: Sequence[TrackingPanel]) -> None:
             axis.grid(alpha=0.3)
     for axis, label in zip(axes[:, 0], _QUANTITIES, strict=True):
         axis.set_ylabel(label)
-    axes[0, 0].legend()
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 3 * len(panels)))
     _save(figure, path)
 
 
