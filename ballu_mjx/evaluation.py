@@ -412,12 +412,17 @@ class OpenLoopEvaluator:
             yaw: dict[float, list[float]] = {h: [] for h in HORIZONS}
             com_error, final_yaw, forces = float("nan"), float("nan"), []
             for run in runs:
-                recorded_position, recorded_yaw = self.recorded(run)
-                states = len(recorded_yaw)
-                if against is not None:
-                    recorded_position, recorded_yaw = against.position[run, :states], against.yaw[run, :states]
-                distance = np.linalg.norm(replay.position[run, :states] - recorded_position, axis=-1)
-                turn = replay.yaw[run, :states] - recorded_yaw
+                start = self.starts[run][1]
+                states = len(motion.qpos) - start
+                if against is None:
+                    other_position, other_yaw = self.recorded(run)
+                    other_com = self._recorded_com[index, start : start + states]
+                else:
+                    other_position, other_yaw, other_com = (
+                        x[run, :states] for x in (against.position, against.yaw, against.com)
+                    )
+                distance = np.linalg.norm(replay.position[run, :states] - other_position, axis=-1)
+                turn = replay.yaw[run, :states] - other_yaw
                 turn = np.rad2deg(np.arctan2(np.sin(turn), np.cos(turn)))
                 forces.append(np.linalg.norm(replay.force[run, : states - 1], axis=-1).mean())
                 for horizon in HORIZONS:
@@ -426,10 +431,7 @@ class OpenLoopEvaluator:
                         position[horizon].append(_rms(distance[1 : steps + 1]))
                         yaw[horizon].append(_rms(turn[1 : steps + 1]))
                 if run == runs[0]:
-                    start = self.starts[run][1]
-                    recorded_com = self._recorded_com[index, start : start + states]
-                    recorded_com = recorded_com if against is None else against.com[run, :states]
-                    com_error = float(np.linalg.norm(replay.com[run, :states] - recorded_com, axis=-1).mean())
+                    com_error = float(np.linalg.norm(replay.com[run, :states] - other_com, axis=-1).mean())
                     final_yaw = float(turn[-1])
             results.append(
                 Errors(

@@ -71,6 +71,12 @@ class VirtualRobot:
     latency: float
     """Seconds from a command to the servo's target."""
 
+    @property
+    def actuators(self) -> ballu.ActuatorParameters:
+        """What identification of its actuators can hope to find."""
+        names = [field.name for field in dataclasses.fields(ballu.ActuatorParameters)]
+        return ballu.ActuatorParameters(**{name: jnp.array(getattr(self, name)) for name in names})
+
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
@@ -84,6 +90,11 @@ class Trial:
     """Offset of the start: x, y (m) and yaw (rad)."""
     capture_seed: int
     """Seed of the motion capture's noise and drop-outs."""
+
+
+def still(trial: Trial) -> Trial:
+    """The same without a draught."""
+    return dataclasses.replace(trial, draught=(0.0, 0.0, 0.0), draught_swing=(0.0, trial.draught_swing[1]))
 
 
 def draw_robot(seed: int) -> VirtualRobot:
@@ -159,14 +170,7 @@ def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
     model = spec.compile()
 
     nominal = ballu.load_model()
-    parameters = ballu.ActuatorParameters(
-        knee_spring_stiffness=jnp.array(virtual.knee_spring_stiffness),
-        motor_gain=jnp.array(virtual.motor_gain),
-        default_motor_angle=jnp.array(virtual.default_motor_angle),
-        default_knee_angle=jnp.array(virtual.default_knee_angle),
-        torque_limit=jnp.array(virtual.torque_limit),
-        cable_slack=jnp.full(2, ballu.CABLE_SLACK),
-    )
+    parameters = dataclasses.replace(virtual.actuators, cable_slack=jnp.full(2, ballu.CABLE_SLACK))
     ballu.set_fields(model, ballu.actuator_fields(model, parameters))
     model.actuator_forcerange[:] = np.outer(virtual.torque_limit, [-1.0, 1.0])  # in full precision
     model.tendon_lengthspring[:, 1] += np.array(virtual.cable_slack) - ballu.CABLE_SLACK

@@ -12,14 +12,12 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import multiprocessing
 
 from ballu_mjx import runtime
 
 runtime.prepare()
 
-import jax.numpy as jnp  # noqa: E402
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 from jaxtyping import Float  # noqa: E402
@@ -79,19 +77,6 @@ def standing(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     return data.qpos.copy(), data.qvel.copy()
 
 
-def identified(virtual: virtual_robot.VirtualRobot) -> mujoco.MjModel:
-    """The training simulator with the robot's own actuator parameters: what identification can hope for."""
-    model = robot.load_model()
-    parameters = robot.ActuatorParameters(
-        **{
-            field.name: jnp.array(getattr(virtual, field.name))
-            for field in dataclasses.fields(robot.ActuatorParameters)
-        }
-    )
-    robot.set_fields(model, robot.actuator_fields(model, parameters))
-    return model
-
-
 def horizon_errors(model: mujoco.MjModel, motion: reconstruction.Motion) -> tuple[float, float]:
     """Mean over starts a second apart of the base's position RMSE (m) and yaw RMSE (deg) over the horizon."""
     steps, interval = round(HORIZON / robot.CONTROL_TIMESTEP), round(1.0 / robot.CONTROL_TIMESTEP)
@@ -133,7 +118,7 @@ def main() -> None:
 
     if arguments.robot != 0:
         return
-    known = identified(virtual_robot.draw_robot(arguments.robot))
+    known = robot.load_model(virtual_robot.draw_robot(arguments.robot).actuators)
     print(f"RMSE over {HORIZON:g} s from recorded states, mean over starts: position (m) and yaw (deg)")
     print(f"{'recording':>26}{'vanilla':>18}{'true actuators':>20}")
     wide = []

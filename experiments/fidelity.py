@@ -181,20 +181,24 @@ def replayed_policy(options: Options) -> Path:
     return path
 
 
+def simulator(kind: residual.Residual, paths: list[Path], *, nominal: bool = False) -> evaluation.OpenLoopEvaluator:
+    """Recordings, for the residuals of a kind on its own actuators, or on nominal ones."""
+    model = robot.load_model(None if nominal else kind.actuators)
+    motions = [reconstruction.reconstruct(recording.read_recording(path), model) for path in paths]
+    return evaluation.OpenLoopEvaluator(model, motions, kind.model)
+
+
 def evaluate(folders: list[Path], paths: list[Path]) -> list[evaluation.Evaluation]:
     """Runs of the same configuration and actuators, on other recordings than their own."""
     policies = [residual.Residual.load(folder) for folder in folders]
-    model = robot.load_model(policies[0].actuators)
-    motions = [reconstruction.reconstruct(recording.read_recording(path), model) for path in paths]
-    evaluator = evaluation.OpenLoopEvaluator(model, motions, policies[0].model)
+    evaluator = simulator(policies[0], paths)
     return [evaluator(policy.params) for policy in policies]
 
 
 def vanilla_errors(folder: Path, paths: list[Path]) -> tuple[evaluation.Errors, ...]:
     """Of the nominal robot without residual. `folder` is any residual's run: none of it acts."""
-    kind, model = residual.Residual.load(folder), robot.load_model()
-    motions = [reconstruction.reconstruct(recording.read_recording(path), model) for path in paths]
-    evaluator = evaluation.OpenLoopEvaluator(model, motions, kind.model)
+    kind = residual.Residual.load(folder)
+    evaluator = simulator(kind, paths, nominal=True)
     return evaluator.errors(evaluator.replay(kind.params, scale=0.0))
 
 
@@ -334,19 +338,14 @@ DRAWN = ("regression", "identified", "analytic", AIR)
 def figure(folders: Mapping[str, list[Path]], paths: list[Path], path: Path) -> None:
     """Replay recordings in every simulator, with every seed's forces."""
     found = {name: [residual.Residual.load(folder) for folder in folders[name]] for name in DRAWN if name in folders}
-    curves: dict[str, list[evaluation.Replay]] = {}
-    evaluators = {}
-    for name, kinds in found.items():
-        model = robot.load_model(kinds[0].actuators)
-        motions = [reconstruction.reconstruct(recording.read_recording(p), model) for p in paths]
-        evaluators[name] = evaluation.OpenLoopEvaluator(model, motions, kinds[0].model)
-        curves[kinds[0].model.name] = [evaluators[name].replay(kind.params) for kind in kinds]
+    evaluators = {name: simulator(kinds[0], paths) for name, kinds in found.items()}
+    curves = {
+        kinds[0].model.name: [evaluators[name].replay(kind.params) for kind in kinds] for name, kinds in found.items()
+    }
     identified, first = evaluators["identified"], found["identified"][0]
     still = identified.replay(first.params, scale=0.0)
-    vanilla = robot.load_model()
-    motions = [reconstruction.reconstruct(recording.read_recording(p), vanilla) for p in paths]
-    nominal = evaluation.OpenLoopEvaluator(vanilla, motions, first.model).replay(first.params, scale=0.0)
-    every = {"vanilla": [nominal], "vanilla+sysid": [still], **curves}
+    vanilla = simulator(first, paths, nominal=True).replay(first.params, scale=0.0)
+    every = {"vanilla": [vanilla], "vanilla+sysid": [still], **curves}
     panels = []
     for motion, run in zip(identified.motions, identified.first_runs, strict=True):
         position, yaw = identified.recorded(run)

@@ -36,15 +36,15 @@ from ballu_mjx import runtime
 runtime.prepare()
 
 import bundled_recordings  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
+import deflation  # noqa: E402
 import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 from bundled_recordings import Job  # noqa: E402
 from jaxtyping import Float  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
-from ballu_mjx import evaluation, reconstruction, recording, robot, virtual_robot  # noqa: E402
-from ballu_mjx.virtual_robot import Trial, VirtualRobot  # noqa: E402
+from ballu_mjx import evaluation, reconstruction, robot, virtual_robot  # noqa: E402
+from ballu_mjx.virtual_robot import VirtualRobot  # noqa: E402
 
 HORIZON = 5.0
 """Seconds from each start."""
@@ -102,12 +102,6 @@ def simulator(virtual: VirtualRobot, variant: Variant) -> mujoco.MjModel:
     return model
 
 
-def known(virtual: VirtualRobot) -> mujoco.MjModel:
-    """The training simulator with the robot's own actuators, which identification comes near."""
-    names = [field.name for field in dataclasses.fields(robot.ActuatorParameters)]
-    return robot.load_model(robot.ActuatorParameters(**{name: jnp.array(getattr(virtual, name)) for name in names}))
-
-
 # %% [markdown]
 # ## Errors from every second of a recording on
 
@@ -127,12 +121,9 @@ def seen(model: mujoco.MjModel, qpos: Float[np.ndarray, "states nq"]) -> tuple[n
 def errors(virtual: VirtualRobot, job: Job) -> tuple[str, Float[np.ndarray, "variants 2"]]:
     """Group of a recording; RMSE of position (m) and yaw (deg) over the horizon, mean over starts, by variant."""
     trial = virtual_robot.draw_trial(job.trial)
-    seconds = len(job.commands) * robot.CONTROL_TIMESTEP
-    recorded = virtual_robot.record(virtual, trial, virtual_robot.open_loop(job.commands), seconds, job.name)
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{job.name}.csv.gz"
-        recording.write_recording(recorded, path)
-        motion = reconstruction.reconstruct(recording.read_recording(path), known(virtual))
+        recorded = deflation.recorded(job, virtual, job.trial, Path(folder))
+    motion = reconstruction.reconstruct(recorded, robot.load_model(virtual.actuators))
     steps, interval = (round(s / robot.CONTROL_TIMESTEP) for s in (HORIZON, evaluation.START_INTERVAL))
     starts = range(2, len(job.commands) - steps + 1, interval)
     nominal = robot.load_model()
@@ -140,7 +131,7 @@ def errors(virtual: VirtualRobot, job: Job) -> tuple[str, Float[np.ndarray, "var
     rows = []
     for variant in VARIANTS:
         legs = dataclasses.replace(virtual, **dict.fromkeys(variant.robot, (0.0, 0.0)))
-        air = _still(trial) if variant.still else trial
+        air = virtual_robot.still(trial) if variant.still else trial
         model, found = simulator(legs, variant), []
         for start in starts:
             state = motion.qpos[start], motion.qvel[start]
@@ -153,10 +144,6 @@ def errors(virtual: VirtualRobot, job: Job) -> tuple[str, Float[np.ndarray, "var
     return evaluation.group_of(job.name), np.array(rows)
 
 
-def _still(trial: Trial) -> Trial:
-    return dataclasses.replace(trial, draught=(0.0, 0.0, 0.0), draught_swing=(0.0, trial.draught_swing[1]))
-
-
 # %% [markdown]
 # ## Table
 
@@ -165,14 +152,12 @@ def _still(trial: Trial) -> Trial:
 def main() -> None:
     parser = argparse.ArgumentParser(description="What no simulator could do better, and what each shortcut costs.")
     parser.add_argument("--robot", type=int, default=bundled_recordings.ROBOT_SEED, help="seed of the virtual robot")
-    parser.add_argument("--lift", type=float, default=1.0, help="share of the robot's lift that it has left")
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the test set, that of fidelity.py")
     parser.add_argument("--output", type=Path, default=Path("runs/fidelity-limits"), help="folder of the table")
     parser.add_argument("--quick", action="store_true", help="two recordings; the numbers mean little")
     options = parser.parse_args()
 
-    whole = virtual_robot.draw_robot(options.robot)
-    virtual = dataclasses.replace(whole, buoyancy=whole.buoyancy * options.lift)
+    virtual = virtual_robot.draw_robot(options.robot)
     jobs = bundled_recordings.fresh_jobs(options.fresh, 1 if options.quick else 6)
     with multiprocessing.get_context("spawn").Pool() as pool:
         found = pool.starmap(errors, [(virtual, job) for job in jobs], chunksize=1)

@@ -26,7 +26,7 @@ import numpy as np  # noqa: E402
 from ballu_mjx import pipeline, robot, trials, virtual_robot  # noqa: E402
 from ballu_mjx.policy import Policy  # noqa: E402
 from ballu_mjx.transfer import Transfer  # noqa: E402
-from ballu_mjx.virtual_robot import Trial, VirtualRobot  # noqa: E402
+from ballu_mjx.virtual_robot import VirtualRobot  # noqa: E402
 
 # %% [markdown]
 # ## The effects, each as what takes it away
@@ -94,15 +94,10 @@ def variants(full: VirtualRobot) -> dict[str, VirtualRobot]:
 
 
 # %%
-def still(trial: Trial) -> Trial:
-    """The same trial without a draught: it would blur what the effects do."""
-    return dataclasses.replace(trial, draught=(0.0, 0.0, 0.0), draught_swing=(0.0, trial.draught_swing[1]))
-
-
 def measure(policy: Policy, robots: dict[str, VirtualRobot], count: int, folder: Path) -> dict[str, list[Transfer]]:
     """Trials of a policy on every variant."""
     loop = policy.closed_loop()
-    draws = [still(virtual_robot.draw_trial(5_000_000 + number)) for number in range(count)]
+    draws = [virtual_robot.still(virtual_robot.draw_trial(5_000_000 + number)) for number in range(count)]
     results = {}
     for name, variant in robots.items():
         place = folder / name.replace(" ", "-")
