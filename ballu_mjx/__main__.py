@@ -7,8 +7,9 @@ import importlib
 import sys
 from collections.abc import Sequence
 
-from ballu_mjx import completion, runtime
-from ballu_mjx.errors import InputError
+from ballu_mjx.cli import completion
+from ballu_mjx.common import runtime
+from ballu_mjx.common.errors import InputError
 
 COMMANDS = (
     ("recording", "record import FILE", "make a recording from a Vicon CSV, a C3D or any table"),
@@ -25,7 +26,7 @@ COMMANDS = (
     ("", "compare RUN RUN ...", "runs side by side, mean and interval over seeds"),
     ("the robot", "export RUN", "a policy as a controller that needs NumPy alone"),
 )
-"""Stage, what follows `python -m ballu_mjx.`, what it is for."""
+"""Stage, what follows `python -m ballu_mjx`, what it is for."""
 NAMES = tuple(dict.fromkeys(command.split()[0] for _, command, _ in COMMANDS))
 """Of the modules that are commands."""
 
@@ -34,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command that the first of the arguments names, or print them all; returns its exit status."""
     first, *others = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if first in NAMES:
-        return importlib.import_module(f"{__package__}.{first}").main(others)
+        return importlib.import_module(f"{__package__}.cli.{first}").main(others)
     return runtime.exit_status(lambda: _own(first, others), others)
 
 
@@ -44,13 +45,13 @@ def _own(first: str, others: Sequence[str]) -> None:
     elif first == "completion":
         if len(others) != 1 or others[0] not in completion.SHELLS:
             raise InputError(f"completion: give the shell, {' or '.join(completion.SHELLS)}.")
-        print(completion.script(others[0], NAMES))
+        print(completion.completion_script(others[0], NAMES))
     else:
         raise InputError(f"{first}: there is no such command; `python -m ballu_mjx` lists them.")
 
 
 def _print_commands() -> None:
-    print("Commands, each after `python -m ballu_mjx.`; --help explains one, `train ... --quick` shows it at work.\n")
+    print("Commands, each after `python -m ballu_mjx`; --help explains one, `train ... --quick` shows it at work.\n")
     for stage, command, purpose in COMMANDS:
         print(f"  {stage:15} {command:20} {purpose}")
     print("\n`ballu_mjx train` and so on does the same; `ballu_mjx completion bash` (or zsh) prints its completion.")

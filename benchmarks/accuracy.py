@@ -23,7 +23,7 @@ import time
 from collections.abc import Callable
 from typing import Annotated
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
@@ -36,8 +36,9 @@ import tyro
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float
 
-from ballu_mjx import robot, simulation
-from ballu_mjx.simulation import State
+from ballu_mjx.ballu.model import standing_qpos
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.sim.step import PhysicsState, balloon_id, control_step, count_substeps, make_data, put_model, state_at
 
 INTEGRATORS = {"implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST, "Euler": mujoco.mjtIntegrator.mjINT_EULER}
 SOLVERS = {"Newton": mujoco.mjtSolver.mjSOL_NEWTON, "CG": mujoco.mjtSolver.mjSOL_CG}
@@ -83,7 +84,7 @@ class Setting:
 
     def model(self) -> mujoco.MjModel:
         """The robot with this setting."""
-        model = robot.load_model()
+        model = load_model()
         model.opt.timestep = self.timestep
         model.opt.integrator = INTEGRATORS[self.integrator]
         model.opt.solver = SOLVERS[self.solver]
@@ -139,7 +140,7 @@ def settled(setting: Setting) -> Float[np.ndarray, " nq"]:
     """The robot standing still with both commands at 0: generalized position after 4 s of damped motion."""
     model = setting.tight(4)
     data = mujoco.MjData(model)
-    data.qpos[:] = robot.standing_qpos(model)
+    data.qpos[:] = standing_qpos(model)
     while data.time < 4.0:
         mujoco.mj_step(model, data)
         data.qvel *= 0.98
@@ -165,7 +166,7 @@ def c_rollout(
     threads: int,
 ) -> Float[np.ndarray, "count 3"]:
     """Balloon positions (m) at the end, by C MuJoCo on `threads` threads."""
-    control = commands.repeat(simulation.substeps(model), axis=1)
+    control = commands.repeat(count_substeps(model), axis=1)
     data = [mujoco.MjData(model) for _ in range(threads)]
     data[0].qpos[:] = qpos
     kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -188,16 +189,14 @@ def mjx_program(
     model: mujoco.MjModel, qpos: Float[np.ndarray, " nq"], devices: int
 ) -> Callable[[Float[Array, "batch steps 2"]], Float[Array, "batch nq"]]:
     """The same by MJX in float32: from commands to final generalized positions, the batch sharded over `devices`."""
-    step_count, balloon = simulation.substeps(model), simulation.balloon_id(model)
-    mjx_model, template = simulation.put_model(model), simulation.make_data(model)
-    start = simulation.at(jnp.asarray(qpos, jnp.float32), jnp.zeros(model.nv))
+    step_count, balloon = count_substeps(model), balloon_id(model)
+    mjx_model, template = put_model(model), make_data(model)
+    start = state_at(jnp.asarray(qpos, jnp.float32), jnp.zeros(model.nv))
 
     def one(command: Float[Array, "steps 2"]) -> Float[Array, " nq"]:
-        def step(state: State, command: Float[Array, " 2"]) -> tuple[State, None]:
+        def step(state: PhysicsState, command: Float[Array, " 2"]) -> tuple[PhysicsState, None]:
             no_force = jnp.zeros((1, 6))
-            state = simulation.control_step(
-                mjx_model, template, state, command, no_force, bodies=(balloon,), count=step_count
-            )
+            state = control_step(mjx_model, template, state, command, no_force, bodies=(balloon,), count=step_count)
             return state, None
 
         return jax.lax.scan(step, start, command)[0].qpos
@@ -224,7 +223,7 @@ def mjx_rollout(
         jax.block_until_ready(rollout(inputs))
         clock.append(time.perf_counter() - start_clock)
         processor.append(time.process_time() - start_processor)
-    simulated = batch * commands.shape[1] * robot.CONTROL_TIMESTEP
+    simulated = batch * commands.shape[1] * CONTROL_TIMESTEP
     return MjxResult(
         positions=balloon_positions(model, final[: len(commands)]),
         wall=simulated / min(clock),
@@ -258,9 +257,9 @@ def main(
     if quick:
         sequences, batch = 16, 32
     mujoco.set_mju_user_warning(lambda _: None)  # settings that diverge belong in the table
-    chosen = Setting.of(robot.load_model())
+    chosen = Setting.of(load_model())
     settings = [chosen] if quick else table(chosen)
-    steps = round(DURATION / robot.CONTROL_TIMESTEP)
+    steps = round(DURATION / CONTROL_TIMESTEP)
     commands, qpos = bang_bang(seed, sequences, steps), settled(chosen)
     threads, missed = jax.device_count(), False
 

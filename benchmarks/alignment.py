@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import argparse
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
 import numpy as np
 
-from ballu_mjx import gaits, virtual_robot
-from ballu_mjx.alignment import align
-from ballu_mjx.importers import response
-from ballu_mjx.record import LEAST_CONFIDENCE, Import
+from ballu_mjx.ballu import gaits
+from ballu_mjx.ballu.leg_response import measured_response, nominal_response
+from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.cli.record import LEAST_CONFIDENCE, Import
+from ballu_mjx.recordings.clock_alignment import align
 
 SECONDS = 14.0
 REST = np.zeros((40, 2))
@@ -43,9 +44,9 @@ def main() -> None:
                 commands = np.concatenate([REST, moves, REST])
                 play, day = virtual_robot.open_loop(commands), virtual_robot.draw_trial(100 * seed + trial)
                 seen = virtual_robot.record(virtual_robot.draw_robot(seed), day, play, len(commands) * 0.05, kind)
-                motion = response.measured(seen)
+                motion = measured_response(seen)
                 assert motion is not None
-                grid, legs = response.nominal(seen.time, seen.command, "free", knees=False)
+                grid, legs = nominal_response(seen.time, seen.command, "free", knees=False)
                 found, near = (align(seen.time, motion, grid, legs, within=w) for w in (None, (-0.35, 0.45)))
                 assert found is not None and near is not None
                 narrow.append(near.best.offset - Import.delay)

@@ -28,8 +28,9 @@ from jaxtyping import Float
 from pybullet_utils.bullet_client import BulletClient  # pyright: ignore[reportMissingImports]
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.deployment import euler_angles
-from ballu_mjx.robot import CONTROL_TIMESTEP, SIDES
+from ballu_mjx.ballu.model import SIDES
+from ballu_mjx.policies.deploy.estimator import euler_angles
+from ballu_mjx.robots.model import CONTROL_TIMESTEP
 
 TIMESTEPS = (1 / 240, 1e-3)
 """Bullet's own default, and a finer one (s); both divide the control step."""
@@ -183,7 +184,7 @@ class Robot:
         return info[8], info[9]
 
     def observe(self) -> tuple[Float[np.ndarray, " 27"], Float[np.ndarray, " 3"]]:
-        """The features of `envmimic.features`, and the centre of mass (m, world)."""
+        """The features of `observation.observe_features`, and the centre of mass (m, world)."""
         centre, quaternion = self._world.getBasePositionAndOrientation(self._body)
         velocity, spin = self._world.getBaseVelocity(self._body)
         states = self._world.getLinkStates(self._body, self._com_links, computeLinkVelocity=1)

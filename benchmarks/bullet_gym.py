@@ -9,16 +9,17 @@ import gymnasium  # pyright: ignore[reportMissingImports]
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx import robot
-from ballu_mjx.controller import observation
-from ballu_mjx.tasks import TASKS, Step
+from ballu_mjx.ballu.model import standing_qpos
+from ballu_mjx.policies.deploy.controller import observation
+from ballu_mjx.policies.tasks import TASKS, Step
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 
 OBSERVATIONS = 28
-"""As `locomotion.OBSERVATIONS`, which would bring MJX and Brax into every process."""
+"""As `locomotion_env.OBSERVATIONS`, which would bring MJX and Brax into every process."""
 
 
 class LocomotionEnv(gymnasium.Env):
-    """`locomotion.LocomotionEnv` in the nominal simulator, with PyBullet under it: the same observations, actions,
+    """`locomotion_env.LocomotionEnv` in the nominal simulator, with PyBullet under it: the same observations, actions,
     rewards, starting state and random lengths of episodes. `info["reward"]` is the reward as it was, whatever wrappers
     make of it."""
 
@@ -26,10 +27,10 @@ class LocomotionEnv(gymnasium.Env):
         """`timestep` (s) is Bullet's, `episode_seconds` the mean length of an episode."""
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBSERVATIONS,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
-        model = robot.load_model()
+        model = load_model()
         self._task, self.robot = TASKS[task], bullet.Robot(model, timestep)
-        self._start = robot.standing_qpos(model)
-        self._mean = round(episode_seconds / robot.CONTROL_TIMESTEP)
+        self._start = standing_qpos(model)
+        self._mean = round(episode_seconds / CONTROL_TIMESTEP)
         self._com, self._remaining = np.zeros(3), 0
 
     def reset(
@@ -50,7 +51,7 @@ class LocomotionEnv(gymnasium.Env):
         self.robot.step(command.tolist())
         features, com = self.robot.observe()
         finite = bool(np.isfinite(features).all())
-        velocity = (com - self._com) / robot.CONTROL_TIMESTEP
+        velocity = (com - self._com) / CONTROL_TIMESTEP
         reward = float(self._task.reward(Step(velocity, features, command))) if finite else 0.0  # pyright: ignore
         self._com = com
         self._remaining -= 1

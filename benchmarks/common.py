@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 CHILD = "--child"
 """First argument of a script that is to measure one thing; the second is JSON."""

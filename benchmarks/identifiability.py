@@ -15,17 +15,18 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import jax  # noqa: E402
-import numpy as np  # noqa: E402
+import jax
+import numpy as np
 
-from ballu_mjx import identification, virtual_robot  # noqa: E402
-from ballu_mjx.identification import NAMES, Drivetrain, Fit, IdentificationConfig  # noqa: E402
-from ballu_mjx.robot import SIDES  # noqa: E402
-from ballu_mjx.sweep import Sweep, read_sweep  # noqa: E402
+from ballu_mjx.ballu.identification import Fit, Identifier, leg_data
+from ballu_mjx.ballu.leg_parameters import LEG_PARAMETERS, Drivetrain, IdentificationConfig, drivetrain_coordinates
+from ballu_mjx.ballu.model import SIDES
+from ballu_mjx.ballu.sweep import Sweep, read_sweep
+from ballu_mjx.ballu.virtual import robot as virtual_robot
 
 NOISE = float(np.deg2rad(0.5))
 SAMPLES, TIMES, LEVELS = 30, 60, 20
@@ -41,12 +42,12 @@ def silent(stage: str, iteration: int, steps: int, value: float) -> None:
     """No report."""
 
 
-def simulate(identifier: identification.Identifier, vectors: np.ndarray) -> Sweep:
+def simulate(identifier: Identifier, vectors: np.ndarray) -> Sweep:
     """A sweep of the model itself, without noise."""
-    physics, data = identifier.physics, identification.leg_data(blank())
+    physics, data = identifier.physics, leg_data(blank())
     y = np.stack([identifier.space.coordinates(vector) for vector in vectors])
     qpos, _ = physics.settled(y, data.command)
-    train = np.tile(identification.drivetrain_coordinates(TRAIN), (len(SIDES), 1))
+    train = np.tile(drivetrain_coordinates(TRAIN), (len(SIDES), 1))
     motion, _ = physics.motion(np.concatenate([y, train], axis=1), data.commanded)
     return dataclasses.replace(
         blank(),
@@ -82,18 +83,18 @@ def with_noise(sweep: Sweep, seed: int) -> Sweep:
 
 def of_the_model_itself(seeds: int, draws: int) -> None:
     """Starts and noise."""
-    identifier = identification.Identifier(IdentificationConfig(), blank(), silent)
+    identifier = Identifier(IdentificationConfig(), blank(), silent)
     space = identifier.space
     changes = np.array(CHANGES)
     vectors = np.where(space.relative, space.nominal * changes, space.nominal + changes)
     clean = simulate(identifier, vectors)
-    worst = np.zeros(len(NAMES))
+    worst = np.zeros(len(LEG_PARAMETERS))
     for seed in range(seeds):
         identifier.config = IdentificationConfig(seed=seed)
         found = np.stack([fit.vector for fit in identifier.run(clean, silent).fits])
         worst = np.maximum(worst, np.abs(found - vectors).max(axis=0))
     print(f"Without noise, worst of {seeds} draws of starts:")
-    for name, error, value, relative in zip(NAMES, worst, vectors.min(axis=0), space.relative, strict=True):
+    for name, error, value, relative in zip(LEG_PARAMETERS, worst, vectors.min(axis=0), space.relative, strict=True):
         shown = f"{error / value:.1e} relative" if relative else f"{error:.1e} {'m' if 'slack' in name else 'rad'}"
         print(f"  {name:24}{shown}")
     within = []
@@ -119,14 +120,14 @@ def of_virtual_robots(robots: int) -> None:
         for number in range(robots):
             virtual = virtual_robot.draw_robot(number)
             sweep = read_sweep({Path("sweep"): virtual_robot.record_sweep(virtual, number, "sweep")})
-            identifier = identifier or identification.Identifier(config, sweep, silent)
+            identifier = identifier or Identifier(config, sweep, silent)
             fits = identifier.run(sweep, silent).fits
             print(f"{number:<6}{row(virtual, fits)}", flush=True)
 
 
 def row(virtual: virtual_robot.VirtualRobot, fits: tuple[Fit, Fit]) -> str:
     """One robot's line."""
-    found = {name: [fit.vector[index] for fit in fits] for index, name in enumerate(NAMES)}
+    found = {name: [fit.vector[index] for fit in fits] for index, name in enumerate(LEG_PARAMETERS)}
     ratios = [np.array(found[name]) / np.array(getattr(virtual, name)) for name in RATIOS]
     slack = 1e3 * (np.array(found["cable_slack"]) - np.array(virtual.cable_slack))
     scatter = np.rad2deg([fit.residual for fit in fits])

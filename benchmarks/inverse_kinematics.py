@@ -22,7 +22,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
@@ -32,9 +32,13 @@ import tyro
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx import robot, virtual_robot
-from ballu_mjx.reconstruction import Motion, ReconstructionParameters, reconstruct
-from ballu_mjx.recording import Recording, read_recording, write_recording
+from ballu_mjx.ballu.model import standing_qpos
+from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.recordings.csv_format import read_recording, write_recording
+from ballu_mjx.recordings.motion import Motion, ReconstructionParameters
+from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 
 CAPTURE_STEP = 0.01
 HORIZONS = (0.25, 1.0, 2.0)
@@ -65,7 +69,7 @@ def walk(model: mujoco.MjModel, gait: tuple[float, float, float], duration: floa
     turns = moment[:, None] / period + np.array([0.0, phase]) + 1e-9
     command = np.where(turns % 1.0 < duty, 1.0, 0.0)
     data = mujoco.MjData(model)
-    data.qpos[:] = robot.standing_qpos(model)
+    data.qpos[:] = standing_qpos(model)
     qpos, qvel = [], []
     for row in command:
         qpos.append(data.qpos.copy())
@@ -112,7 +116,7 @@ def capture(
 
 def errors(walked: Walk, motion: Motion) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Absolute errors of the positions, and errors of the velocities, by name."""
-    every = round(robot.CONTROL_TIMESTEP / CAPTURE_STEP)
+    every = round(CONTROL_TIMESTEP / CAPTURE_STEP)
     qpos, qvel = walked.qpos[::every][: len(motion.qpos)], walked.qvel[::every][: len(motion.qpos)]
     turn = Rotation.from_quat(qpos[:, 3:7], scalar_first=True).inv() * Rotation.from_quat(
         motion.qpos[:, 3:7], scalar_first=True
@@ -151,8 +155,8 @@ def replay(
     """Balloon's place and heading at each horizon, the commands held over their control steps."""
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = qpos, qvel
-    substeps = round(robot.CONTROL_TIMESTEP / model.opt.timestep)
-    ends = [round(horizon / robot.CONTROL_TIMESTEP) for horizon in HORIZONS]
+    substeps = round(CONTROL_TIMESTEP / model.opt.timestep)
+    ends = [round(horizon / CONTROL_TIMESTEP) for horizon in HORIZONS]
     place, heading = [], []
     for step, command in enumerate(commands[: ends[-1]], start=1):
         data.ctrl[:] = command
@@ -167,9 +171,9 @@ def replay(
 
 def divergence(model: mujoco.MjModel, walked: Walk, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     """Distance (mm) and heading (deg) between starts from `motion` and from the truth, [starts, horizons]."""
-    every = round(robot.CONTROL_TIMESTEP / CAPTURE_STEP)
+    every = round(CONTROL_TIMESTEP / CAPTURE_STEP)
     distance, turn = [], []
-    for k in range(0, len(motion.command) - round(HORIZONS[-1] / robot.CONTROL_TIMESTEP), 2):
+    for k in range(0, len(motion.command) - round(HORIZONS[-1] / CONTROL_TIMESTEP), 2):
         commands = motion.command[k:]
         place, heading = replay(model, motion.qpos[k], motion.qvel[k], commands)
         true_place, true_heading = replay(model, walked.qpos[every * k], walked.qvel[every * k], commands)
@@ -181,7 +185,7 @@ def divergence(model: mujoco.MjModel, walked: Walk, motion: Motion) -> tuple[np.
 def crude(model: mujoco.MjModel, motion: Motion, recording: Recording) -> Motion:
     """`motion` with velocities from neighbouring samples, at the recording's rate, of unfiltered positions."""
     unfiltered = ReconstructionParameters(position_window=0.05, rate_window=0.05, rotation_window=0.05)
-    return dataclasses.replace(motion, qvel=reconstruct(recording, model, unfiltered).qvel)
+    return dataclasses.replace(motion, qvel=reconstruct_ballu(recording, model, unfiltered).qvel)
 
 
 def spread(values: np.ndarray, digits: int = 2) -> str:
@@ -212,7 +216,7 @@ def main(quick: bool = False, duration: float = 20.0, seed: int = 0) -> None:
     """
     gaits = GAITS[:1] if quick else GAITS
     duration = 6.0 if quick else duration
-    model, noise = robot.load_model(), ReconstructionParameters()
+    model, noise = load_model(), ReconstructionParameters()
     walks = [walk(model, gait, duration) for gait in gaits]
     print(
         f"{len(gaits)} gaits of {duration} s, {noise.position_noise * 1e3} mm and "
@@ -228,10 +232,10 @@ def main(quick: bool = False, duration: float = 20.0, seed: int = 0) -> None:
     for case, level, base in (("recorded base", noise, True), ("no base", noise, False), ("exact", None, False)):
         recordings = [capture(model, walked, level, base, seed + i) for i, walked in enumerate(walks)]
         start = time.perf_counter()
-        motions = [reconstruct(recordings[0], model)]
+        motions = [reconstruct_ballu(recordings[0], model)]
         first = time.perf_counter() - start
         start = time.perf_counter()
-        motions = [reconstruct(recording, model) for recording in recordings]
+        motions = [reconstruct_ballu(recording, model) for recording in recordings]
         each = (time.perf_counter() - start) / len(recordings)
         print(f"{case}: {first:.1f} s for the first recording, {each:.1f} s for each after", flush=True)
         runs[case] = walks, motions
@@ -242,12 +246,12 @@ def main(quick: bool = False, duration: float = 20.0, seed: int = 0) -> None:
     stand_in = virtual_robot.draw_robot(seed)
     seen, true = [], []
     for walked, trial in zip(walks, trials, strict=True):
-        every = round(robot.CONTROL_TIMESTEP / CAPTURE_STEP)
+        every = round(CONTROL_TIMESTEP / CAPTURE_STEP)
         commands = walked.command[:-1:every]
         recording = virtual_robot.record(stand_in, trial, virtual_robot.open_loop(commands), duration, "stand-in")
         filled = fill(dataclasses.replace(recording, base_quaternion=None))
         qpos, qvel = virtual_robot.record_truth(stand_in, trial, virtual_robot.open_loop(commands), duration)
-        seen.append(reconstruct(filled, model))
+        seen.append(reconstruct_ballu(filled, model))
         true.append(Walk(walked.command, qpos, qvel))
     runs["stand-in"] = true, seen
 

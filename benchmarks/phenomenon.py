@@ -14,17 +14,23 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-from jaxtyping import Float  # noqa: E402
-from mujoco import rollout  # noqa: E402
-from scipy.spatial.transform import Rotation  # noqa: E402
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from mujoco import rollout
+from scipy.spatial.transform import Rotation
 
-from ballu_mjx import reconstruction, recording, robot, simulation, virtual_robot  # noqa: E402
+from ballu_mjx.ballu.model import standing_qpos
+from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.recordings.csv_format import list_bundled, read_recording
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.sim.step import count_substeps
 
 SECONDS = 20.0
 GAITS = ((0.7, 0.40, 1.0), (0.9, 0.35, 0.9), (1.1, 0.45, 0.8), (1.3, 0.40, 1.0), (1.6, 0.30, 0.8), (1.9, 0.40, 0.7))
@@ -35,7 +41,7 @@ HORIZON = 10.0
 def gait_commands(gait: tuple[float, float, float]) -> Float[np.ndarray, "steps 2"]:
     """Commands at the control rate."""
     period, duty, high = gait
-    phase = np.arange(round(SECONDS / robot.CONTROL_TIMESTEP))[:, None] * robot.CONTROL_TIMESTEP / period
+    phase = np.arange(round(SECONDS / CONTROL_TIMESTEP))[:, None] * CONTROL_TIMESTEP / period
     return np.where((phase + np.array([0.0, 0.5])) % 1.0 < duty - 1e-9, high, 0.0)
 
 
@@ -63,7 +69,7 @@ def replay(
     for row, (qpos, qvel) in enumerate(starts):
         data.qpos[:], data.qvel[:] = qpos, qvel
         mujoco.mj_getState(model, data, states[row], spec)
-    count = simulation.substeps(model)
+    count = count_substeps(model)
     workers = [mujoco.MjData(model) for _ in range(2)]
     simulated = np.asarray(rollout.rollout(model, workers, states, np.repeat(commands, count, axis=1))[0])
     return simulated[:, count - 1 :: count, 1 : 1 + model.nq]
@@ -72,14 +78,14 @@ def replay(
 def standing(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """The state after two seconds of standing still."""
     data = mujoco.MjData(model)
-    data.qpos[:] = robot.standing_qpos(model)
+    data.qpos[:] = standing_qpos(model)
     mujoco.mj_step(model, data, round(2.0 / model.opt.timestep))
     return data.qpos.copy(), data.qvel.copy()
 
 
-def horizon_errors(model: mujoco.MjModel, motion: reconstruction.Motion) -> tuple[float, float]:
+def horizon_errors(model: mujoco.MjModel, motion: Motion) -> tuple[float, float]:
     """Mean over starts a second apart of the base's position RMSE (m) and yaw RMSE (deg) over the horizon."""
-    steps, interval = round(HORIZON / robot.CONTROL_TIMESTEP), round(1.0 / robot.CONTROL_TIMESTEP)
+    steps, interval = round(HORIZON / CONTROL_TIMESTEP), round(1.0 / CONTROL_TIMESTEP)
     firsts = range(2, len(motion.command) - steps + 1, interval)
     commands = np.stack([motion.command[first : first + steps] for first in firsts])
     runs = replay(model, [(motion.qpos[first], motion.qvel[first]) for first in firsts], commands)
@@ -105,7 +111,7 @@ def main() -> None:
         jobs += [(arguments.robot, 1000 + 2 * trial, commands), (arguments.robot, 1001 + 2 * trial, commands[:, ::-1])]
     with multiprocessing.get_context("spawn").Pool() as pool:
         turned = np.reshape(pool.starmap(robot_yaw, jobs), (-1, 2)).mean(axis=1)
-    vanilla = robot.load_model()
+    vanilla = load_model()
     both = np.stack([job[2] for job in jobs])
     simulated = replay(vanilla, [standing(vanilla)] * len(both), both)
     vanilla_turned = np.reshape([yaw(run)[-1] for run in simulated], (-1, 2)).mean(axis=1)
@@ -118,14 +124,14 @@ def main() -> None:
 
     if arguments.robot != 0:
         return
-    known = robot.load_model(virtual_robot.draw_robot(arguments.robot).actuators)
+    known = load_model(virtual_robot.draw_robot(arguments.robot).actuators)
     print(f"RMSE over {HORIZON:g} s from recorded states, mean over starts: position (m) and yaw (deg)")
     print(f"{'recording':>26}{'vanilla':>18}{'true actuators':>20}")
     wide = []
     for split in ("validation", "test", "training"):
-        paths = recording.bundled(split)
+        paths = list_bundled(split)
         for path in paths[:1] if arguments.quick else paths:
-            motion = reconstruction.reconstruct(recording.read_recording(path), vanilla)
+            motion = reconstruct_ballu(read_recording(path), vanilla)
             (p, y), (q, z) = horizon_errors(vanilla, motion), horizon_errors(known, motion)
             wide.append((p >= 0.2, y >= 10.0, q / p, z / y))
             print(f"{split + ' ' + motion.name:>26}{p:>10.3f} m{y:>6.1f}{q:>12.3f} m{z:>6.1f}")

@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
@@ -36,7 +36,9 @@ import throughput
 import tyro
 from matplotlib.figure import Figure
 
-from ballu_mjx import robot, simulation
+from ballu_mjx.ballu.model import standing_qpos
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.sim.step import count_substeps
 
 MJX, MUJOCO, PYBULLET = "MJX", "C MuJoCo", "PyBullet"
 COLOURS = {MJX: "#0072b2", MUJOCO: "#d55e00", PYBULLET: "#009e73"}
@@ -74,7 +76,7 @@ def measure(engine: str, **request: Any) -> Any:
 
 def mjx_rates(batches: Sequence[int], repeats: int) -> list[list[float]]:
     """Control steps per second on all devices, by batch."""
-    setting = accuracy.Setting.of(robot.load_model())
+    setting = accuracy.Setting.of(load_model())
     model, qpos = setting.model(), accuracy.settled(setting)
     found = []
     for batch in batches:
@@ -92,7 +94,7 @@ def mjx_rates(batches: Sequence[int], repeats: int) -> list[list[float]]:
 
 def mujoco_rates(batches: Sequence[int], repeats: int) -> list[list[float]]:
     """Control steps per second with a thread per core, by batch."""
-    model, threads = robot.load_model(), len(common.cores())
+    model, threads = load_model(), len(common.cores())
     return [throughput.rollout_rates(model, threads, repeats, commands_for(batch)) for batch in batches]
 
 
@@ -120,10 +122,10 @@ def _pybullet_seconds(request: tuple[float, int, int]) -> list[float]:
     import bullet
 
     timestep, repeats, steps = request
-    model = robot.load_model()
+    model = load_model()
     world = bullet.Robot(model, timestep)
     commands = accuracy.bang_bang(0, 1, steps)[0].tolist()
-    start = robot.standing_qpos(model)
+    start = standing_qpos(model)
     found = []
     for _ in range(repeats + 1):
         world.reset(start)
@@ -140,8 +142,8 @@ def errors(sequences: int) -> dict[str, tuple[float, float]]:
     """Median and 95th percentile (mm) of each engine's error."""
     import bullet
 
-    setting = accuracy.Setting.of(robot.load_model())
-    steps = round(accuracy.DURATION / robot.CONTROL_TIMESTEP)
+    setting = accuracy.Setting.of(load_model())
+    steps = round(accuracy.DURATION / CONTROL_TIMESTEP)
     commands, qpos = accuracy.bang_bang(0, sequences, steps), accuracy.settled(setting)
     model, threads = setting.model(), len(common.cores())
     judge = accuracy.c_rollout(setting.tight(4), qpos, commands, threads)
@@ -176,7 +178,7 @@ def plot(path: Path, rows: list[dict[str, Any]], errors: dict[str, tuple[float, 
     for name in errors:
         for count in counts:
             mine = [row for row in rows if (row["engine"], row["cores"]) == (name, count)]
-            speed = [np.median(row["control_steps_per_second"]) * robot.CONTROL_TIMESTEP for row in mine]
+            speed = [np.median(row["control_steps_per_second"]) * CONTROL_TIMESTEP for row in mine]
             where = f"{count} core{'s' * (count > 1)}, {errors[name][0]:.1f} / {errors[name][1]:.1f} mm"
             look: dict[str, Any] = {"color": COLOURS[name.split(",")[0]], "linestyle": styles[count]}
             if mine[0]["batch"] is None:
@@ -196,8 +198,8 @@ def main(options: Options) -> None:
         options = dataclasses.replace(options, batches=(1, 64), repeats=3, sequences=8)
     import bullet
 
-    model = robot.load_model()
-    count = simulation.substeps(model)
+    model = load_model()
+    count = count_substeps(model)
     found = common.child(__file__, {"engine": "errors", "sequences": options.sequences})
     rows: list[dict[str, Any]] = []
     print(f"{'':28}{'cores':>6}{'batch':>7}{'control steps/s':>34}{'physics steps/s':>17}{'simulated s/s':>15}  error")
@@ -206,9 +208,9 @@ def main(options: Options) -> None:
         rows.append({"engine": name, "cores": threads, "batch": batch, "control_steps_per_second": rates})
         middle = float(np.median(rates))
         rows[-1] |= {"physics_steps_per_second": middle * substeps}
-        rows[-1] |= {"simulated_seconds_per_second": middle * robot.CONTROL_TIMESTEP}
+        rows[-1] |= {"simulated_seconds_per_second": middle * CONTROL_TIMESTEP}
         error = "{:.1f} / {:.1f} mm".format(*found[name])
-        speed = f"{middle * substeps:>17,.0f}{middle * robot.CONTROL_TIMESTEP:>15,.1f}"
+        speed = f"{middle * substeps:>17,.0f}{middle * CONTROL_TIMESTEP:>15,.1f}"
         print(f"{name:28}{threads:>6}{batch or '':>7}{common.spread(rates):>34}{speed}  {error}", flush=True)
 
     request = {"batches": options.batches, "repeats": options.repeats}
@@ -222,7 +224,7 @@ def main(options: Options) -> None:
             steps = 40 if options.quick else 200
             one = {"engine": PYBULLET, "timestep": timestep, "repeats": options.repeats, "steps": steps}
             rates = common.child(__file__, one, cores=used)
-            add(_bullet_name(timestep), threads, None, rates, round(robot.CONTROL_TIMESTEP / timestep))
+            add(_bullet_name(timestep), threads, None, rates, round(CONTROL_TIMESTEP / timestep))
     result = {"quick": options.quick, "time_step": model.opt.timestep, "errors_mm": found, "rows": rows}
     common.write(options.output, "physics", result)
     plot(options.output / "physics.png", rows, found, common.described(common.machine()))

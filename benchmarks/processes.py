@@ -27,7 +27,7 @@ import tyro
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 KINDS = {"one": "one process", "several": "a process a core"}
 COLOURS = {"one": "#0072b2", "several": "#d55e00"}
@@ -72,7 +72,7 @@ def train(kind: str, seed: int, options: Options) -> list[dict[str, Any]]:
 
     **Raises** `SystemExit` naming the log of a process that failed.
     """
-    from ballu_mjx import runs
+    from ballu_mjx.runs.metrics import read_metrics
 
     folder = options.output / f"{kind}-seed-{seed}"
     shutil.rmtree(folder, ignore_errors=True)
@@ -97,7 +97,7 @@ def train(kind: str, seed: int, options: Options) -> list[dict[str, Any]]:
         for process, log in processes:
             if process.wait():
                 raise SystemExit(f"The training failed with status {process.returncode}; {log} says why.")
-    return runs.read_metrics(folder)
+    return read_metrics(folder)
 
 
 def curve(rows: list[dict[str, Any]], name: str) -> tuple[Float[np.ndarray, " steps"], Float[np.ndarray, " steps"]]:

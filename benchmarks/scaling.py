@@ -30,7 +30,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 AXES = {
     "cores": "cores",
@@ -71,13 +71,16 @@ def measure(environments: int, episode_seconds: float | None, recordings: int | 
     runtime.prepare()
     import jax
 
-    from ballu_mjx import learner, ppo, reconstruction, recording, robot
-    from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv
+    from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+    from ballu_mjx.recordings.csv_format import list_bundled, read_recording
+    from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
+    from ballu_mjx.rl import learner, ppo
+    from ballu_mjx.robots.model import load_model
 
-    model = robot.load_model()
-    paths = recording.bundled("training")
+    model = load_model()
+    paths = list_bundled("training")
     paths = list(itertools.islice(itertools.cycle(paths), recordings or len(paths)))
-    known = {path: reconstruction.reconstruct(recording.read_recording(path), model) for path in set(paths)}
+    known = {path: reconstruct_ballu(read_recording(path), model) for path in set(paths)}
     config = EnvMimicConfig()
     if episode_seconds is not None:
         config = dataclasses.replace(config, episode_seconds=episode_seconds)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import sys
 import time
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
@@ -24,8 +24,9 @@ import tyro
 from jax import Array
 from jax.sharding import PartitionSpec
 
-from ballu_mjx import robot, simulation
-from ballu_mjx.simulation import State
+from ballu_mjx.ballu.model import JOINTS, standing_qpos
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.sim.step import PhysicsState, balloon_id, control_step, count_substeps, make_data, put_model, state_at
 
 MAX_JOINT_SPEED = 100.0
 """rad/s"""
@@ -46,24 +47,24 @@ def main(
     if quick:
         environments, duration = 100, 5.0
         print("--quick: these numbers mean little")
-    model = robot.load_model()
-    substeps, bodies, devices = simulation.substeps(model), (simulation.balloon_id(model),), jax.device_count()
-    steps = round(duration / robot.CONTROL_TIMESTEP)
-    mjx_model = simulation.put_model(model)
-    template = simulation.make_data(model)
-    start = simulation.at(jnp.asarray(robot.standing_qpos(model), jnp.float32), jnp.zeros(model.nv))
+    model = load_model()
+    substeps, bodies, devices = count_substeps(model), (balloon_id(model),), jax.device_count()
+    steps = round(duration / CONTROL_TIMESTEP)
+    mjx_model = put_model(model)
+    template = make_data(model)
+    start = state_at(jnp.asarray(standing_qpos(model), jnp.float32), jnp.zeros(model.nv))
 
     def worst(key: Array) -> tuple[Array, Array]:
         """Number of physics steps with a state that is not finite; each hinge's greatest speed (rad/s) before that."""
 
-        def control(state: State, key: Array) -> tuple[State, tuple[Array, Array]]:
+        def control(state: PhysicsState, key: Array) -> tuple[PhysicsState, tuple[Array, Array]]:
             command_key, force_key = jax.random.split(key)
             command = jax.random.uniform(command_key, (2,))
             push = jax.random.uniform(force_key, (3,), minval=-force, maxval=force)
             push = jnp.concatenate([push, jnp.zeros(3)])[None]
 
-            def physics(state: State, _: None) -> tuple[State, tuple[Array, Array]]:
-                state = simulation.control_step(mjx_model, template, state, command, push, bodies=bodies, count=1)
+            def physics(state: PhysicsState, _: None) -> tuple[PhysicsState, tuple[Array, Array]]:
+                state = control_step(mjx_model, template, state, command, push, bodies=bodies, count=1)
                 finite = jnp.isfinite(state.qpos).all() & jnp.isfinite(state.qvel).all()
                 return state, (finite, jnp.abs(state.qvel[6:]))
 
@@ -88,7 +89,7 @@ def main(
     print(f"{count} environments x {duration} s, forces to {force} N, {model.opt.timestep * 1e3:.2f} ms: {clock:.0f} s")
     print(f"diverged: {diverged}")
     print(f"greatest joint speed: {fastest.max():.1f} rad/s, in the median environment {np.median(fastest):.1f}")
-    for name, value in zip(robot.JOINTS, speed.max(axis=0), strict=True):
+    for name, value in zip(JOINTS, speed.max(axis=0), strict=True):
         print(f"    {name:12} {value:6.1f}")
     if diverged or not fastest.max() <= MAX_JOINT_SPEED:
         print(f"FAILED: wanted no divergence and no joint faster than {MAX_JOINT_SPEED:.0f} rad/s")

@@ -20,7 +20,7 @@ from typing import Any
 
 import common
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 FIRST, LAST, C = "batch first", "batch last", "C MuJoCo"
 
@@ -48,23 +48,34 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
     import numpy as np
     import throughput
 
-    from ballu_mjx import batch_last, robot, simulation
+    from ballu_mjx.ballu.model import standing_qpos
+    from ballu_mjx.robots.model import load_model
+    from ballu_mjx.sim.step import (
+        PhysicsState,
+        count_substeps,
+        load_state,
+        make_data,
+        physics_step,
+        put_model,
+        state_at,
+    )
+    from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 
-    model, rng = robot.load_model(), np.random.default_rng(0)
+    model, rng = load_model(), np.random.default_rng(0)
     if layout == C:
         commands = rng.integers(0, 2, (64, 40, 2)).astype(float)
         rates = throughput.rollout_rates(model, 1, 5, commands)
-        return {"whole": 1e6 / float(np.median(rates)) / simulation.substeps(model)}
+        return {"whole": 1e6 / float(np.median(rates)) / count_substeps(model)}
 
-    mjx_model, template = simulation.put_model(model), simulation.make_data(model)
+    mjx_model, template = put_model(model), make_data(model)
     commands = jnp.asarray(rng.uniform(size=(batch, 2)), jnp.float32)
-    qpos = np.tile(robot.standing_qpos(model), (batch, 1))
-    state = simulation.at(jnp.asarray(qpos), jnp.zeros((batch, model.nv)))
+    qpos = np.tile(standing_qpos(model), (batch, 1))
+    state = state_at(jnp.asarray(qpos), jnp.zeros((batch, model.nv)))
 
     def batched(function: Callable[..., Any]) -> Any:
-        return jax.jit(jax.vmap(batch_last.fast(function) if layout == LAST else function))
+        return jax.jit(jax.vmap(vmap_with_trailing_batch(function) if layout == LAST else function))
 
-    def seconds(function: Callable[..., Any], state: simulation.State) -> float:
+    def seconds(function: Callable[..., Any], state: PhysicsState) -> float:
         jax.block_until_ready(function(state, commands))
         took = []
         for _ in range(9):
@@ -73,8 +84,8 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
             took.append(time.perf_counter() - began)
         return float(np.median(took))
 
-    def step(state: simulation.State, command: Any) -> simulation.State:
-        return simulation.physics_step(mjx_model, template.replace(ctrl=command), state)  # pyright: ignore
+    def step(state: PhysicsState, command: Any) -> PhysicsState:
+        return physics_step(mjx_model, template.replace(ctrl=command), state)  # pyright: ignore
 
     whole = batched(step)
     for _ in range(50):  # walking about, feet on the floor
@@ -95,10 +106,8 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
         ):
             chain.append(part)
 
-            def so_far(
-                state: simulation.State, command: Any, chain: Sequence[Callable[..., Any]] = tuple(chain)
-            ) -> Any:
-                data: Any = simulation.load(template, state).replace(ctrl=command)  # pyright: ignore
+            def so_far(state: PhysicsState, command: Any, chain: Sequence[Callable[..., Any]] = tuple(chain)) -> Any:
+                data: Any = load_state(template, state).replace(ctrl=command)  # pyright: ignore
                 for function in chain:
                     data = function(mjx_model, data)
                 inner = data._impl

@@ -4,7 +4,7 @@ The objective is the sum over both legs of the directed Hausdorff distances from
 and knee, of settled angles. All three know the same bounds, for the paper's eight parameters and for twelve (with
 torque limits and slack):
 
-- ours: `ballu_mjx.identification` from settled angles alone, with either objective. The time is a second run's;
+- ours: `ballu_mjx.ballu.identification` from settled angles alone, with either objective. The time is a second run's;
   compiling, once for each size of sweep, stands apart.
 - the paper's way: scipy's L-BFGS-B from the nominal values, finite differences through C MuJoCo. Two favours: the
   parameters of both legs are perturbed at once, as neither leg feels the other, and the joints are damped so that they
@@ -36,7 +36,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
@@ -48,10 +48,15 @@ import scipy.optimize
 from jaxtyping import Float
 from mujoco import rollout
 
-from ballu_mjx import identification, recording, robot, sweep
-from ballu_mjx.identification import NAMES, IdentificationConfig, Space
-from ballu_mjx.robot import SIDES, ActuatorParameters
-from ballu_mjx.sweep import Sweep
+from ballu_mjx.ballu.identification import Identification, Identifier
+from ballu_mjx.ballu.leg_parameters import LEG_PARAMETERS, IdentificationConfig, ParameterTransform, nominal_leg
+from ballu_mjx.ballu.model import SIDES, ActuatorParameters, actuator_fields, load_suspended_leg, suspend
+from ballu_mjx.ballu.sweep import Sweep, read_sweep
+from ballu_mjx.ballu.sysid_report import mean_error
+from ballu_mjx.identification.curves import curve_distances
+from ballu_mjx.recordings.csv_format import list_bundled, read_recording
+from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.robots.model import assets, set_fields
 
 THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 LEFT_OUT_EVERY = 4
@@ -97,7 +102,7 @@ class Legs:
         self.steps = steps
         self.models, self.fields, self.places = [], [], []
         for side in SIDES:
-            model = robot.load_suspended_leg(side)
+            model = load_suspended_leg(side)
             for kind, damping in DAMPING.items():
                 model.dof_damping[model.joint(f"{kind}_{side}").dofadr[0]] = damping
             if exact:
@@ -116,10 +121,12 @@ class Legs:
         for pair in vectors:
             for leg, vector in enumerate(pair):
                 model = copy.copy(self.models[leg])
-                robot.set_fields(model, self.fields[leg](vector[:, None]))
+                set_fields(model, self.fields[leg](vector[:, None]))
                 data = self.data[0]
                 mujoco.mj_resetData(model, data)
-                data.qpos[self.places[leg]] = [vector[NAMES.index(f"default_{k}_angle")] for k in ("motor", "knee")]
+                data.qpos[self.places[leg]] = [
+                    vector[LEG_PARAMETERS.index(f"default_{k}_angle")] for k in ("motor", "knee")
+                ]
                 state = np.zeros(mujoco.mj_stateSize(model, kind))
                 mujoco.mj_getState(model, data, state, kind)
                 models += [model] * holds
@@ -132,8 +139,8 @@ class Legs:
 
 
 def _fields_of(model: mujoco.MjModel) -> Callable[[np.ndarray], dict[str, np.ndarray]]:
-    """`robot.actuator_fields` from rows of parameters, compiled: else the finite differences would wait for it."""
-    compiled = jax.jit(lambda rows: robot.actuator_fields(model, ActuatorParameters(*rows)))
+    """`model.actuator_fields` from rows of parameters, compiled: else the finite differences would wait for it."""
+    compiled = jax.jit(lambda rows: actuator_fields(model, ActuatorParameters(*rows)))
     return lambda rows: {name: np.asarray(value) for name, value in compiled(rows).items()}
 
 
@@ -143,9 +150,7 @@ def distances(data: Sweep) -> Callable[[Float[np.ndarray, "n holds 2 2"]], Float
     def both(angles: jax.Array) -> jax.Array:
         return sum(
             jnp.sum(
-                identification.curve_distances(
-                    data.command[:, leg], angles[:, :, leg], data.settled[:, :, leg], DEGREE
-                ),
+                curve_distances(data.command[:, leg], angles[:, :, leg], data.settled[:, :, leg], DEGREE),
                 axis=1,
             )
             for leg in range(len(SIDES))
@@ -165,7 +170,7 @@ def _lowest_so_far(trace: Trace) -> Trace:
 
 def ours(
     data: Sweep, config: IdentificationConfig, repeats: int
-) -> tuple[float, dict[str, tuple[Vectors, float, identification.Identification]]]:
+) -> tuple[float, dict[str, tuple[Vectors, float, Identification]]]:
     """Seconds of compiling; for each objective vectors, seconds of the last run, and the result."""
     marks: list[float] = []
 
@@ -174,7 +179,7 @@ def ours(
             marks.append(time.perf_counter())
 
     results = {}
-    identifier = identification.Identifier(config, data, report)
+    identifier = Identifier(config, data, report)
     for objective in OBJECTIVES:
         # Both share the programs that take long to compile.
         identifier.config = dataclasses.replace(config, objective=objective)
@@ -189,7 +194,7 @@ def ours(
 # ---- the paper's way ----
 
 
-def papers_way(data: Sweep, space: Space, iterations: int) -> tuple[Vectors, float, Trace]:
+def papers_way(data: Sweep, space: ParameterTransform, iterations: int) -> tuple[Vectors, float, Trace]:
     """L-BFGS-B over C MuJoCo: vectors, seconds, trace.
 
     Coordinates are shares of the span between the bounds, of the logarithm where ours is: units that differ by a factor
@@ -260,8 +265,8 @@ def missing_for_toolbox() -> list[str]:
 
 def _toolbox_spec() -> mujoco.MjSpec:
     """Both legs, hanging, with the sensors that the recording has; hips damped as for the others."""
-    spec = mujoco.MjSpec.from_file(str(robot.assets() / "ballu.xml"))
-    robot.suspend(spec)
+    spec = mujoco.MjSpec.from_file(str(assets() / "ballu.xml"))
+    suspend(spec)
     spec.delete(spec.body("balloon"))
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     for kind in ("motor", "knee"):
@@ -274,7 +279,7 @@ def _toolbox_spec() -> mujoco.MjSpec:
 
 
 def toolbox(
-    data: Sweep, kept: np.ndarray, source: recording.Recording, space: Space, iterations: int
+    data: Sweep, kept: np.ndarray, source: Recording, space: ParameterTransform, iterations: int
 ) -> tuple[Vectors, float, Trace]:
     """`mujoco.sysid.optimize`: vectors, seconds, trace. `data` is the whole sweep, of which `kept` is fitted."""
     from mujoco import sysid
@@ -292,7 +297,7 @@ def toolbox(
     def build(parameters: Any, spec: mujoco.MjSpec) -> mujoco.MjModel:
         built = copy.copy(model)
         built.dof_damping[hips] = DAMPING["hip"]
-        robot.set_fields(built, fields(as_vectors(parameters.as_vector()).T))
+        set_fields(built, fields(as_vectors(parameters.as_vector()).T))
         return built
 
     seconds = source.time - source.time[0]
@@ -323,7 +328,7 @@ def toolbox(
     parameters = sysid.ParameterDict()
     for index in free:
         low, high = (np.full(len(SIDES), bound[index]) for bound in (space.lower, space.upper))
-        parameters.add(sysid.Parameter(NAMES[index], np.full(len(SIDES), space.nominal[index]), low, high))
+        parameters.add(sysid.Parameter(LEG_PARAMETERS[index], np.full(len(SIDES), space.nominal[index]), low, high))
     fields(as_vectors(parameters.as_vector()).T)  # compiles
     began = time.perf_counter()
     # Parameters in their own units: the toolbox's advice for those is to scale by the Jacobian.
@@ -378,9 +383,9 @@ def main() -> None:
 
 
 def measure(quick: bool) -> list[Row]:
-    (path,) = recording.bundled("suspended")
-    source = recording.read_recording(path)
-    whole = sweep.read_sweep({path: source})
+    (path,) = list_bundled("suspended")
+    source = read_recording(path)
+    whole = read_sweep({path: source})
     everything = np.arange(len(whole.command))
     out = everything[LEFT_OUT_EVERY - 1 :: LEFT_OUT_EVERY]
     kept = np.setdiff1d(everything, out)
@@ -407,15 +412,15 @@ def measure(quick: bool) -> list[Row]:
         there, back = distance(angles)[0]
         unseen = None
         if held is not None:
-            unseen = identification.mean_error(judge.settled(held[None], left_out.command)[0], left_out)
-        error = identification.mean_error(angles[0], whole)
+            unseen = mean_error(judge.settled(held[None], left_out.command)[0], left_out)
+        error = mean_error(angles[0], whole)
         row = Row(way, free, seconds, compiling, float(there), float(back), error, unseen, vectors.tolist(), trace)
         rows.append(row)
         shown = "" if compiling is None else f"{compiling:.0f} s"
         numbers = f"{there:>11.4f}{back:>9.4f}{error:>7.2f} deg" + ("" if unseen is None else f"{unseen:>7.2f} deg")
         print(f"{way:27}{free or '':>10}{seconds:>7.1f} s{shown:>11}{numbers}", flush=True)
 
-    nominal = np.tile(identification.nominal_leg(), (len(SIDES), 1))
+    nominal = np.tile(nominal_leg(), (len(SIDES), 1))
     add("nominal", 0, nominal, 0.0, None, nominal, [])
     comparisons = []
     for beyond in (True,) if quick else (False, True):
@@ -423,7 +428,7 @@ def measure(quick: bool) -> list[Row]:
         config = IdentificationConfig(motion=False, torque_limit=beyond, cable_slack=beyond)
         if quick:
             config = dataclasses.replace(config, draws=15, steps=8)
-        space = Space(identification.nominal_leg(), config)
+        space = ParameterTransform(nominal_leg(), config)
         free = len(SIDES) * int(space.free.sum())
 
         compiling, fits = ours(whole, config, repeats=2)

@@ -13,19 +13,24 @@ from __future__ import annotations
 import argparse
 import time
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-from jaxtyping import Float  # noqa: E402
-from mujoco import rollout  # noqa: E402
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from mujoco import rollout
 
-from ballu_mjx import learner, ppo, reconstruction, recording, robot, simulation  # noqa: E402
-from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv  # noqa: E402
+from ballu_mjx.ballu.model import standing_qpos
+from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+from ballu_mjx.recordings.csv_format import list_bundled, read_recording
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
+from ballu_mjx.rl import learner, ppo
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.sim.step import count_substeps
 
 
 def training_rates(env: EnvMimicEnv, config: ppo.PPOConfig) -> list[float]:
@@ -61,9 +66,9 @@ def rollout_rates(
     model: mujoco.MjModel, threads: int, repeats: int, commands: Float[np.ndarray, "runs steps 2"]
 ) -> list[float]:
     """Control steps per second of C MuJoCo."""
-    count, (runs, steps, _) = simulation.substeps(model), commands.shape
+    count, (runs, steps, _) = count_substeps(model), commands.shape
     data = mujoco.MjData(model)
-    data.qpos[:] = robot.standing_qpos(model)
+    data.qpos[:] = standing_qpos(model)
     state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
     mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
     states, controls = np.tile(state, (runs, 1)), np.repeat(commands, count, axis=1)
@@ -84,8 +89,8 @@ def main() -> None:
     arguments = parser.parse_args()
     repeats = 3 if arguments.quick else 10
 
-    model = robot.load_model()
-    motions = [reconstruction.reconstruct(recording.read_recording(p), model) for p in recording.bundled("training")]
+    model = load_model()
+    motions = [reconstruct_ballu(read_recording(p), model) for p in list_bundled("training")]
     env = EnvMimicEnv(model, motions, EnvMimicConfig())
     config = ppo.PPOConfig(num_envs=arguments.num_envs)
     step_size = config.batch_size * config.num_minibatches * config.unroll_length
@@ -105,7 +110,7 @@ def main() -> None:
     for name, rates in rows.items():
         middle = float(np.median(rates))
         cell = f"{middle:,.0f} ({min(rates):,.0f} to {max(rates):,.0f})"
-        print(f"{name:36}{cell:>30}{middle * robot.CONTROL_TIMESTEP:>16,.0f}")
+        print(f"{name:36}{cell:>30}{middle * CONTROL_TIMESTEP:>16,.0f}")
 
 
 if __name__ == "__main__":

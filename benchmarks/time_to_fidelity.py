@@ -31,11 +31,11 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 STAGES = ("import", "prepare", "compile", "train", "evaluate", "rest")
 COLOURS = ("#999999", "#56b4e9", "#d55e00", "#009e73", "#e69f00", "#dddddd")
-IMPORTS = "from ballu_mjx import runtime; runtime.prepare(); import ballu_mjx.residual_training"
+IMPORTS = "from ballu_mjx.common import runtime; runtime.prepare(); import ballu_mjx.cli.train_envmimic"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,21 +115,25 @@ def timeline(rows: list[dict[str, Any]], marks: dict[str, float], imported: floa
 def vanilla_ratio(folder: str) -> float:
     """A run's best validation error as a share of vanilla's, over its error as a share of its base's."""
     runtime.prepare()
-    from ballu_mjx import evaluation, reconstruction, recording, residual, robot, runs
+    from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+    from ballu_mjx.evaluation.errors_table import Evaluation
+    from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
+    from ballu_mjx.recordings.csv_format import read_recording
+    from ballu_mjx.residuals.run_config import find_recordings
+    from ballu_mjx.residuals.trained import TrainedResidual
+    from ballu_mjx.robots.model import load_model
+    from ballu_mjx.runs.folder import read_config
 
     path = Path(folder)
-    trained = residual.Residual.load(path, "best")
-    recordings = [
-        recording.read_recording(each)
-        for each in runs.find_recordings(runs.read_config(path, "envmimic"), "validation", path)
-    ]
+    trained = TrainedResidual.load(path, "best")
+    recordings = [read_recording(each) for each in find_recordings(read_config(path, "envmimic"), "validation", path)]
 
-    def evaluate(model: Any) -> evaluation.Evaluation:
-        motions = [reconstruction.reconstruct(each, model) for each in recordings]
-        return evaluation.OpenLoopEvaluator(model, motions, trained.model)(trained.params)
+    def evaluate(model: Any) -> Evaluation:
+        motions = [reconstruct_ballu(each, model) for each in recordings]
+        return OpenLoopEvaluator(model, motions, trained.model)(trained.params)
 
-    best = evaluate(robot.load_model(trained.actuators))
-    vanilla = best.vanilla if trained.actuators is None else evaluate(robot.load_model()).vanilla
+    best = evaluate(load_model(trained.actuators))
+    vanilla = best.vanilla if trained.actuators is None else evaluate(load_model()).vanilla
     return dataclasses.replace(best, vanilla=vanilla).score / best.score
 
 
@@ -158,7 +162,7 @@ def plot(path: Path, entries: list[dict[str, Any]], target: float, machine: str)
 
 def main(options: Options) -> None:
     runtime.prepare()
-    from ballu_mjx import runs
+    from ballu_mjx.runs.metrics import read_metrics
 
     arguments = ("--validate-every", str(options.validate_every), *options.arguments)
     if options.quick:
@@ -170,7 +174,7 @@ def main(options: Options) -> None:
             folder = options.output / f"{stamp}-{state}"
             imported = import_seconds()
             marks = run(folder, arguments, cache)
-            line = timeline(runs.read_metrics(folder), marks, imported)
+            line = timeline(read_metrics(folder), marks, imported)
             entries.append({"cache": state, "whole_command_seconds": marks["end"], "timeline": line})
     # The two differ in nothing but their cache.
     factor = common.child(__file__, {"folder": str(options.output / f"{stamp}-warm")})

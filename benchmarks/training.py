@@ -34,7 +34,7 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 TASK = "walk"
 OURS, SAME, DEFAULTS, PLAYGROUND = "ours", "SB3 + PyBullet (same)", "SB3 + PyBullet (defaults)", "Playground"
@@ -83,9 +83,10 @@ class _ReachedError(Exception):
 def train_ours(launched: float, seed: int, steps: int, target: float, config: dict[str, Any]) -> Curve:
     """`python -m ballu_mjx.train walk` without its run folder; `config` is a `PPOConfig`."""
     runtime.prepare()
-    from ballu_mjx import learner, policy, ppo
-    from ballu_mjx.locomotion import LocomotionConfig
-    from ballu_mjx.tasks import TASKS
+    from ballu_mjx.policies.locomotion_env import LocomotionConfig
+    from ballu_mjx.policies.policy import make_environment
+    from ballu_mjx.policies.tasks import TASKS
+    from ballu_mjx.rl import learner, ppo
 
     curve: Curve = []
 
@@ -95,7 +96,7 @@ def train_ours(launched: float, seed: int, steps: int, target: float, config: di
             if seconds_to(curve, target) is not None:
                 raise _ReachedError
 
-    env = policy.environment(TASKS[TASK], LocomotionConfig(episode_seconds=EPISODE_SECONDS), None, None)
+    env = make_environment(TASKS[TASK], LocomotionConfig(episode_seconds=EPISODE_SECONDS), None, None)
     try:
         learner.train(env, dataclasses.replace(ppo.PPOConfig(**config), num_timesteps=steps, seed=seed), note)
     except _ReachedError:
@@ -286,9 +287,9 @@ def plot(path: Path, rows: list[dict[str, Any]], target: float, machine: str) ->
 
 def main(options: Options) -> None:
     runtime.prepare()
-    from ballu_mjx import policy_training
+    from ballu_mjx.cli import train_policy
 
-    config = dataclasses.asdict(policy_training.defaults())
+    config = dataclasses.asdict(train_policy.defaults())
     if options.quick:
         options = dataclasses.replace(options, seeds=(0,), steps=21_000)
     counts = [len(common.cores()) * each for each in ((2,) if options.quick else (1, 2, 4))]

@@ -19,19 +19,26 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import bundled_recordings  # noqa: E402
-import jax  # noqa: E402
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
+import bundled_recordings
+import jax
+import mujoco
+import numpy as np
 
-from ballu_mjx import actuators, evaluation, learner, ppo, recording, robot  # noqa: E402
-from ballu_mjx.envmimic import EnvMimicConfig, EnvMimicEnv, ForcePolicy  # noqa: E402
-from ballu_mjx.ppo import PPOConfig  # noqa: E402
-from ballu_mjx.reconstruction import Motion, reconstruct  # noqa: E402
+from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
+from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS
+from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
+from ballu_mjx.recordings.csv_format import list_bundled, read_recording
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
+from ballu_mjx.residuals.network import NetworkForces
+from ballu_mjx.rl import learner, ppo
+from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.robots.model import assets, load_model
 
 # %% [markdown]
 # ## The rows
@@ -87,8 +94,8 @@ def train(
     env_config = EnvMimicConfig(**row.env)
     ppo_config = PPOConfig(**{**sizes.ppo, "num_timesteps": sizes.steps, "seed": seed, **row.ppo})
     env = EnvMimicEnv(model, motions["training"], env_config)
-    forces = ForcePolicy(env_config, ppo.make_inference(env.observation_size, env.action_size, ppo_config))
-    evaluator = evaluation.OpenLoopEvaluator(model, motions["validation"], forces)
+    forces = NetworkForces(env_config, ppo.make_inference(env.observation_size, env.action_size, ppo_config))
+    evaluator = OpenLoopEvaluator(model, motions["validation"], forces)
     last = learner.total_timesteps(ppo_config)
     history: list[dict[str, Any]] = []
     due = sizes.validate_every
@@ -103,7 +110,7 @@ def train(
             f"{group} {quantity} {horizon:g}": result.ratio(group, quantity, horizon)
             for group in result.groups
             for quantity in ("position", "yaw")
-            for horizon in evaluation.SCORE_HORIZONS
+            for horizon in SCORE_HORIZONS
         }
         history.append({"step": step, "score": result.score, "reward": metrics["reward"], "ratios": ratios})
 
@@ -148,18 +155,16 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="two rows, trained for seconds; the numbers mean nothing")
     options = parser.parse_args()
 
-    training = recording.bundled("training")
+    training = list_bundled("training")
     rows, seeds, sizes = options.rows, options.seeds, Sizes(options.steps, 200_000, {})
     if options.quick:
         rows, seeds, training = rows[:2], seeds[:1], training[:2]
         sizes = Sizes(20_000, 20_000, {"num_envs": 256, "batch_size": 128})
     validation = bundled_recordings.fresh(options.fresh, options.output, 1 if options.quick else 6)
-    _, identified = actuators.read(robot.assets() / "recordings" / actuators.NAME)
-    model = robot.load_model(identified)
+    _, identified = read_actuators(assets() / "recordings" / ACTUATORS_FILE)
+    model = load_model(identified)
     read = {"training": training, "validation": validation}
-    motions = {
-        use: [reconstruct(recording.read_recording(path), model) for path in paths] for use, paths in read.items()
-    }
+    motions = {use: [reconstruct_ballu(read_recording(path), model) for path in paths] for use, paths in read.items()}
     options.output.mkdir(parents=True, exist_ok=True)
     results: dict[str, list[list[dict[str, Any]]]] = {}
     for seed in seeds:

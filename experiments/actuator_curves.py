@@ -34,13 +34,14 @@ import argparse
 import dataclasses
 import json
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-from ballu_mjx import actuator_fit, runs  # noqa: E402
-from ballu_mjx.errors import InputError  # noqa: E402
-from ballu_mjx.identification import IdentificationConfig  # noqa: E402
+from ballu_mjx.ballu.leg_parameters import IdentificationConfig
+from ballu_mjx.cli import train_sysid
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.runs.folder import read_config
 
 OUTPUT, QUICK_OUTPUT = Path("runs/actuator-curves"), Path("runs/actuator-curves-quick")
 FIGURE = "actuator_curves.png"
@@ -59,9 +60,9 @@ def identify(folder: Path, config: IdentificationConfig) -> None:
     **Raises** `InputError` where `folder` holds something else.
     """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-        actuator_fit.fit(actuator_fit.SweepData(output=folder), config)
+        train_sysid.fit(train_sysid.SweepData(output=folder), config)
         return
-    found = runs.read_config(folder, "sysid")["fit"]
+    found = read_config(folder, "sysid")["fit"]
     mend = "delete it, or give --output another folder"
     if found != json.loads(json.dumps(dataclasses.asdict(config))):
         raise InputError(f"{folder}: was made with other options (--quick, or not); {mend}.")
@@ -87,7 +88,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="settled angles alone, from fewer starts")
     options = parser.parse_args()
     folder = options.output or (QUICK_OUTPUT if options.quick else OUTPUT)
-    identify(folder, IdentificationConfig(**actuator_fit.QUICK if options.quick else {}))
+    identify(folder, IdentificationConfig(**train_sysid.QUICK if options.quick else {}))
     print(f"Figure: {folder / FIGURE}")
 
 

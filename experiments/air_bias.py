@@ -26,15 +26,20 @@ if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a co
 import argparse
 import dataclasses
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import bundled_recordings  # noqa: E402
-import deflation  # noqa: E402
+import bundled_recordings
+import deflation
 
-from ballu_mjx import actuators, air_fit, air_identification, reconstruction, robot, virtual_robot  # noqa: E402
-from ballu_mjx.air_identification import AirConfig  # noqa: E402
+from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
+from ballu_mjx.ballu.model import buoyancy_ratio
+from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.cli import train_aerodynamics
+from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
+from ballu_mjx.robots.model import assets, load_model
 
 NONE = (0.0, 0.0)
 FRICTION = {"knee_friction": NONE, "motor_friction": NONE}
@@ -54,22 +59,22 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="three gaits of two robots; the numbers mean little")
     options = parser.parse_args()
 
-    model = robot.load_model(actuators.read(robot.assets() / "recordings" / actuators.NAME)[1])
+    model = load_model(read_actuators(assets() / "recordings" / ACTUATORS_FILE)[1])
     full = virtual_robot.draw_robot(0)
-    lift = deflation.lift(full.buoyancy - robot.buoyancy_ratio(model))
+    lift = deflation.lift(full.buoyancy - buoyancy_ratio(model))
     lines = [
         "| robot | lift (mN) | added mass (kg) | added inertia (kg m^2) | delay (ms) | cost |",
         "| --- | ---: | ---: | ---: | ---: | ---: |",
         f"| truth | {lift * 1e3:.0f} | {full.added_mass:.3f} | {full.added_inertia:.4f} | {full.latency * 1e3:.0f} | |",
     ]
-    config = AirConfig(**air_fit.QUICK) if options.quick else AirConfig()
+    config = AirConfig(**train_aerodynamics.QUICK) if options.quick else AirConfig()
     training = [job for job in bundled_recordings.jobs() if job.split == "training"][: 3 if options.quick else None]
     for name, changes in list(ROBOTS.items())[: 2 if options.quick else None]:
         legs = dataclasses.replace(full, **changes)
         folder = options.output / name.replace(" ", "-")
         gaits = [deflation.recorded(job, legs, 2000 + number, folder) for number, job in enumerate(training)]
-        motions = [reconstruction.reconstruct(gait, model) for gait in gaits]
-        fit = air_identification.identify(model, motions, config)
+        motions = [reconstruct_ballu(gait, model) for gait in gaits]
+        fit = identify_air(model, motions, config)
         air, error = fit.parameters, fit.standard_errors
         lines.append(
             f"| {name} | {float(air.lift) * 1e3:.0f} ({float(error.lift) * 1e3:.0f}) | "

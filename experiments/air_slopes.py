@@ -28,20 +28,25 @@ if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a co
 import argparse
 import dataclasses
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import bundled_recordings  # noqa: E402
-import deflation  # noqa: E402
-import jax  # noqa: E402
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-from jax.flatten_util import ravel_pytree  # noqa: E402
-from jaxtyping import Array, Float  # noqa: E402
+import bundled_recordings
+import deflation
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
 
-from ballu_mjx import reconstruction, residual, robot, virtual_robot, windows  # noqa: E402
-from ballu_mjx.air_identification import AirConfig, AirWindows  # noqa: E402
+from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.recordings.segments import Segments, pseudo_huber
+from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirWindows
+from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.robots.model import load_model
+from ballu_mjx.sim.sharding import shard_over_devices
 
 STEPS = (0.1e-3, 1e-3, 3e-3, 10e-3, 30e-3, 100e-3)
 """Of the lift (N)."""
@@ -74,19 +79,19 @@ class Slopes:
 
 def slopes(simulated: AirWindows, known: Float[np.ndarray, " parameters"], lift: int, lost: float) -> Slopes:
     def cost(errors: np.ndarray) -> float:
-        return float(np.sum(windows.soften(np.sum(errors**2, axis=1)))) / 2
+        return float(np.sum(pseudo_huber(np.sum(errors**2, axis=1)))) / 2
 
     def at(less: float) -> np.ndarray:
         vector = known.copy()
         vector[lift] -= less
         return simulated.errors(vector)
 
-    def along(vector: Array, direction: Array, window: windows.Windows) -> Array:
+    def along(vector: Array, direction: Array, window: Segments) -> Array:
         return jax.jvp(lambda vector: simulated.simulate(vector, window), (vector,), (direction,))[1]
 
     direction = np.zeros_like(known, np.float32)
     direction[lift] = -1.0
-    derivative = windows.spread(along, shared=2)(np.float32(known), direction, simulated.windows)
+    derivative = shard_over_devices(along, shared=2)(np.float32(known), direction, simulated.windows)
     grid = np.linspace(-0.2 * lost, 1.6 * lost, 37)
     return Slopes(
         derivative=np.asarray(derivative, np.float64),
@@ -107,14 +112,14 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="windows of half a second alone")
     options = parser.parse_args()
 
-    known = residual.Residual.load(options.air)
-    model = robot.load_model(known.actuators)
+    known = TrainedResidual.load(options.air)
+    model = load_model(known.actuators)
     full = virtual_robot.draw_robot(0)
     deflated = dataclasses.replace(full, buoyancy=full.buoyancy * (1 - LOSS))
     lost = deflation.lift(LOSS * full.buoyancy)
     gait = next(job for job in bundled_recordings.jobs() if job.split == "training")
     recorded = deflation.recorded(gait, deflated, 2000, options.output / "recordings")
-    motions = [reconstruction.reconstruct(recorded, model)]
+    motions = [reconstruct_ballu(recorded, model)]
     # At a whole delay, where errors can be differentiated.
     timestep = float(model.opt.timestep)
     delay = np.round(float(known.params.delay) / timestep) * timestep

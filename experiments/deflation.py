@@ -31,45 +31,52 @@ import dataclasses
 import time
 from collections.abc import Sequence
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import bundled_recordings  # noqa: E402
-import fidelity  # noqa: E402
-import numpy as np  # noqa: E402
-from bundled_recordings import Job  # noqa: E402
+import bundled_recordings
+import fidelity
+import numpy as np
+from bundled_recordings import Job
 
-from ballu_mjx import air_fit, air_identification, evaluation, reconstruction, recording, residual, robot, virtual_robot  # noqa: E402
-from ballu_mjx.air_identification import AirConfig  # noqa: E402
-from ballu_mjx.evaluation import Evaluation, OpenLoopEvaluator  # noqa: E402
-from ballu_mjx.reconstruction import Motion  # noqa: E402
-from ballu_mjx.virtual_robot import VirtualRobot  # noqa: E402
+from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.ballu.virtual.robot import VirtualRobot
+from ballu_mjx.cli import train_aerodynamics
+from ballu_mjx.evaluation.errors_table import Evaluation, base_name
+from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
+from ballu_mjx.recordings.csv_format import read_recording, write_recording
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
+from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 
 # %% [markdown]
 # ## Recordings: the same commands, with all of the lift and with less
 
 
 # %%
-def recorded(job: Job, virtual: VirtualRobot, trial: int, folder: Path) -> recording.Recording:
+def recorded(job: Job, virtual: VirtualRobot, trial: int, folder: Path) -> Recording:
     """Some commands on a robot, in a draught of their own; recorded into `folder`."""
     taken = virtual_robot.record(
         virtual,
         virtual_robot.draw_trial(trial),
         virtual_robot.open_loop(job.commands),
-        len(job.commands) * robot.CONTROL_TIMESTEP,
+        len(job.commands) * CONTROL_TIMESTEP,
         job.name,
         job.notes,
     )
     path = folder / job.split / f"{job.name}.csv.gz"
     path.parent.mkdir(parents=True, exist_ok=True)
-    recording.write_recording(taken, path)
-    return recording.read_recording(path)  # which fills the gaps of hidden markers
+    write_recording(taken, path)
+    return read_recording(path)  # which fills the gaps of hidden markers
 
 
 def lift(buoyancy: float) -> float:
     """Force (N) of balloons that carry this share of BALLU's weight."""
-    model = robot.load_model()
+    model = load_model()
     return buoyancy * float(model.body_mass.sum() * np.linalg.norm(model.opt.gravity))
 
 
@@ -104,8 +111,8 @@ def main() -> None:
     if air is None:
         air = options.output / "aerodynamic"
         fidelity.train(air, "residual", "--method", "aerodynamic", *(["--quick"] if options.quick else []))
-    known = residual.Residual.load(air)
-    model = robot.load_model(known.actuators)
+    known = TrainedResidual.load(air)
+    model = load_model(known.actuators)
     full = virtual_robot.draw_robot(0)
     deflated = dataclasses.replace(full, buoyancy=full.buoyancy * (1 - options.loss))
     bundled = bundled_recordings.jobs()
@@ -114,7 +121,7 @@ def main() -> None:
     def motions(virtual: VirtualRobot, jobs: Sequence[Job], first: int, name: str) -> list[Motion]:
         folder = options.output / name
         recordings = [recorded(job, virtual, first + number, folder) for number, job in enumerate(jobs)]
-        return [reconstruction.reconstruct(each, model) for each in recordings]
+        return [reconstruct_ballu(each, model) for each in recordings]
 
     tests = tests[:1] if options.quick else tests
     before, after = motions(full, tests, 1000, "before"), motions(deflated, tests, 1000, "after")
@@ -124,18 +131,18 @@ def main() -> None:
     seconds = []
     for _ in range(2):  # the first compiles
         started = time.perf_counter()
-        fit = air_identification.identify(model, one, AirConfig(), known=known.params, free=("lift",))
+        fit = identify_air(model, one, AirConfig(), known=known.params, free=("lift",))
         seconds.append(time.perf_counter() - started)
 
-    sound = OpenLoopEvaluator(model, before, known.model, evaluation.base_name(True))(known.params)
-    evaluator = OpenLoopEvaluator(model, after, known.model, evaluation.base_name(True))
+    sound = OpenLoopEvaluator(model, before, known.model, base_name(True))(known.params)
+    evaluator = OpenLoopEvaluator(model, after, known.model, base_name(True))
     rows = [
         row("all of the lift", sound),
         row(f"{options.loss:.0%} less, lift as it was", evaluator(known.params)),
         row(f"{options.loss:.0%} less, lift from one recording", evaluator(fit.parameters)),
     ]
     if options.anew:
-        anew = air_identification.identify(model, every, AirConfig(**air_fit.QUICK if options.quick else {}))
+        anew = identify_air(model, every, AirConfig(**train_aerodynamics.QUICK if options.quick else {}))
         rows.append(
             row(f"{options.loss:.0%} less, all of the air, {len(every)} recordings", evaluator(anew.parameters))
         )

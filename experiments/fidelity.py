@@ -35,17 +35,33 @@ import argparse
 import dataclasses
 from collections.abc import Mapping, Sequence
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import bundled_recordings  # noqa: E402
-import numpy as np  # noqa: E402
-from bundled_recordings import Job  # noqa: E402
-from jaxtyping import Float  # noqa: E402
+import bundled_recordings
+import numpy as np
+from bundled_recordings import Job
+from jaxtyping import Float
 
-from ballu_mjx import aerodynamics, evaluation, plots, reconstruction, recording, residual, robot, runs  # noqa: E402
-from ballu_mjx.policy import Policy  # noqa: E402
+from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+from ballu_mjx.evaluation.errors_table import (
+    HORIZONS,
+    SCORE_HORIZONS,
+    Errors,
+    Evaluation,
+    mean_by_group,
+    read_evaluation,
+)
+from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
+from ballu_mjx.policies.policy import Policy
+from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS
+from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, assets, load_model
+from ballu_mjx.runs.checkpoints import list_checkpoints
+from ballu_mjx.runs.metrics import read_column
+from ballu_mjx.viz import plots
 
 # %% [markdown]
 # ## Train
@@ -79,7 +95,7 @@ METHODS = {
     AIR: Method("aerodynamic", ("residual", "--method", "aerodynamic"), seeded=False),
     "air-lift": Method(
         "aerodynamic, the model's lift",
-        ("residual", "--method", "aerodynamic", "--free", *(name for name in aerodynamics.NAMES if name != "lift")),
+        ("residual", "--method", "aerodynamic", "--free", *(name for name in AIR_PARAMETERS if name != "lift")),
         seeded=False,
     ),
     "air-analytic": Method("aerodynamic+analytic", ("residual", "--method", "analytic"), beside_air=True),
@@ -93,28 +109,28 @@ def train(folder: Path, *arguments: str, result: str = "evaluation.json") -> Non
     if (folder / result).exists():
         return
     options = [*arguments, "--output", str(folder)]
-    if arguments[0] == "envmimic" and runs.checkpoints(folder):
+    if arguments[0] == "envmimic" and list_checkpoints(folder):
         options = ["envmimic", "--resume", str(folder)]
     elif (folder / "config.json").exists():
         shutil.rmtree(folder)
     subprocess.run([sys.executable, "-m", "ballu_mjx.train", *options], check=True)
 
 
-def load(folder: Path) -> evaluation.Evaluation:
+def load(folder: Path) -> Evaluation:
     """The evaluation of one run."""
-    return evaluation.read(folder / "evaluation.json")
+    return read_evaluation(folder / "evaluation.json")
 
 
 def seconds(folder: Path) -> float:
     """Wall time that a run learned for, its validations included, reading and compiling for them not."""
-    return float(runs.column(folder, "seconds")[1][-1])
+    return float(read_column(folder, "seconds")[1][-1])
 
 
 def simulated(folder: Path) -> float:
     """Control steps that a run simulated to learn, validations left out; a derivative along one direction counts as one
     more."""
-    counted = runs.column(folder, "control_steps")[1]
-    return float(counted[-1] if len(counted) else runs.column(folder, "reward")[0][-1])
+    counted = read_column(folder, "control_steps")[1]
+    return float(counted[-1] if len(counted) else read_column(folder, "reward")[0][-1])
 
 
 def race(folders: Mapping[str, list[Path]]) -> str:
@@ -122,8 +138,8 @@ def race(folders: Mapping[str, list[Path]]) -> str:
     EnvMimic ever is, and how good after a fifth of the time that EnvMimic takes; means over seeds."""
 
     def curve(folder: Path) -> tuple[Float[np.ndarray, " steps"], Float[np.ndarray, " steps"]]:
-        steps, error = runs.column(folder, "validation_error")
-        return np.interp(steps, *runs.column(folder, "seconds")), error
+        steps, error = read_column(folder, "validation_error")
+        return np.interp(steps, *read_column(folder, "seconds")), error
 
     goal = float(np.mean([curve(folder)[1].min() for folder in folders["identified"]]))
     fifth = float(np.mean([seconds(folder) for folder in folders["identified"]])) / 5
@@ -155,7 +171,7 @@ class Recorded:
 
 def record(robot_seed: int, folder: Path) -> Recorded:
     """The bundled recordings for robot 0; for another one they are made, and its actuators identified, in `folder`."""
-    place = robot.assets() / "recordings"
+    place = assets() / "recordings"
     if robot_seed != bundled_recordings.ROBOT_SEED:
         place = folder / "recordings"
         if not (place / "suspended" / "sweep.csv.gz").exists():
@@ -163,7 +179,7 @@ def record(robot_seed: int, folder: Path) -> Recorded:
         if not (place / "actuators.json").exists():
             train(folder / "sysid", "sysid", "--recordings", str(place / "suspended"), result="actuators.json")
             shutil.copy(folder / "sysid" / "actuators.json", place)
-    training, validation, test = (recording.recordings([place / use]) for use in ("training", "validation", "test"))
+    training, validation, test = (list_recordings([place / use]) for use in ("training", "validation", "test"))
     return Recorded(training, validation, test, place / "actuators.json")
 
 
@@ -175,29 +191,29 @@ def replayed_policy(options: Options) -> Path:
     if not path.exists():
         policy = Policy.load(source)
         loop = policy.closed_loop()
-        actions = loop(policy.params, *loop.standing(), round(seconds / robot.CONTROL_TIMESTEP)).command[0]
+        actions = loop(policy.params, *loop.standing(), round(seconds / CONTROL_TIMESTEP)).command[0]
         job = Job(path.parent.name, "policy", np.round(actions, 3).astype(float), 300, "Actions of a vanilla policy.")
         bundled_recordings.make(job, options.robot, options.output)
     return path
 
 
-def simulator(kind: residual.Residual, paths: list[Path], *, nominal: bool = False) -> evaluation.OpenLoopEvaluator:
+def simulator(kind: TrainedResidual, paths: list[Path], *, nominal: bool = False) -> OpenLoopEvaluator:
     """Recordings, for the residuals of a kind on its own actuators, or on nominal ones."""
-    model = robot.load_model(None if nominal else kind.actuators)
-    motions = [reconstruction.reconstruct(recording.read_recording(path), model) for path in paths]
-    return evaluation.OpenLoopEvaluator(model, motions, kind.model)
+    model = load_model(None if nominal else kind.actuators)
+    motions = [reconstruct_ballu(read_recording(path), model) for path in paths]
+    return OpenLoopEvaluator(model, motions, kind.model)
 
 
-def evaluate(folders: list[Path], paths: list[Path]) -> list[evaluation.Evaluation]:
+def evaluate(folders: list[Path], paths: list[Path]) -> list[Evaluation]:
     """Runs of the same configuration and actuators, on other recordings than their own."""
-    policies = [residual.Residual.load(folder) for folder in folders]
+    policies = [TrainedResidual.load(folder) for folder in folders]
     evaluator = simulator(policies[0], paths)
     return [evaluator(policy.params) for policy in policies]
 
 
-def vanilla_errors(folder: Path, paths: list[Path]) -> tuple[evaluation.Errors, ...]:
+def vanilla_errors(folder: Path, paths: list[Path]) -> tuple[Errors, ...]:
     """Of the nominal robot without residual. `folder` is any residual's run: none of it acts."""
-    kind = residual.Residual.load(folder)
+    kind = TrainedResidual.load(folder)
     evaluator = simulator(kind, paths, nominal=True)
     return evaluator.errors(evaluator.replay(kind.params, scale=0.0))
 
@@ -219,11 +235,11 @@ def ratios(values: list[float]) -> str:
     return f"{np.mean(values):.2f}" + ("" if len(values) == 1 else f" [{min(values):.2f}, {max(values):.2f}]")
 
 
-Rows = Mapping[str, list[tuple[evaluation.Errors, ...]]]
+Rows = Mapping[str, list[tuple[Errors, ...]]]
 """Of each simulator, by its label, what it is off by on a set of recordings, those of all seeds; vanilla first."""
 
 
-def rows_of(vanilla: tuple[evaluation.Errors, ...], results: Mapping[str, list[evaluation.Evaluation]]) -> Rows:
+def rows_of(vanilla: tuple[Errors, ...], results: Mapping[str, list[Evaluation]]) -> Rows:
     """`results`: of each method of `METHODS`, those of all seeds."""
     rows = {"vanilla": [vanilla], "vanilla+sysid": [results["identified"][0].vanilla]}
     return rows | {METHODS[name].label: [run.residual for run in found] for name, found in results.items()}
@@ -239,7 +255,7 @@ def comparison(rows: Rows, effort: Mapping[str, str], horizon: float) -> str:
     what learning took. In vanilla's row stand its errors themselves; the least of a column is bold."""
     columns = [(group, quantity) for group in groups_of(rows) for quantity in ("position", "yaw")]
 
-    def mean(run: Sequence[evaluation.Errors], group: str, quantity: str) -> float:
+    def mean(run: Sequence[Errors], group: str, quantity: str) -> float:
         return float(np.mean([getattr(e, quantity)[horizon][0] for e in run if e.group == group]))
 
     head = [quantity if group == "all" else f"{group}: {quantity}" for group, quantity in columns]
@@ -286,14 +302,14 @@ def worst_cases(rows: Rows) -> str:
     ]
     vanilla = rows["vanilla"][0]
     for row, found in list(rows.items())[1:]:
-        single = [evaluation.Evaluation(vanilla, errors) for errors in found]
-        means = [evaluation.Evaluation(evaluation.grouped(vanilla), evaluation.grouped(errors)) for errors in found]
+        single = [Evaluation(vanilla, errors) for errors in found]
+        means = [Evaluation(mean_by_group(vanilla), mean_by_group(errors)) for errors in found]
         worst = [max(each.excess() for each in some) for some in (means, single)]
         lines.append(f"| {row} | " + " | ".join(f"{relative:+.0%}: {place}" for relative, place in worst) + " |")
     return "\n".join(lines)
 
 
-def table(runs: list[evaluation.Evaluation], base: str, name: str) -> str:
+def table(runs: list[Evaluation], base: str, name: str) -> str:
     """Markdown: RMSE of the simulator `base` and of `name`, and their ratio, by group and horizon."""
     lines = [
         f"| test recordings | horizon (s) | position, {base} (m) | {name} (m) | ratio | yaw, {base} (deg) | "
@@ -301,7 +317,7 @@ def table(runs: list[evaluation.Evaluation], base: str, name: str) -> str:
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for group in runs[0].groups:
-        for horizon in evaluation.HORIZONS:
+        for horizon in HORIZONS:
             cells = []
             for quantity, digits in (("position", 3), ("yaw", 1)):
                 mean = [
@@ -337,7 +353,7 @@ DRAWN = ("regression", "identified", "analytic", AIR)
 
 def figure(folders: Mapping[str, list[Path]], paths: list[Path], path: Path) -> None:
     """Replay recordings in every simulator, with every seed's forces."""
-    found = {name: [residual.Residual.load(folder) for folder in folders[name]] for name in DRAWN if name in folders}
+    found = {name: [TrainedResidual.load(folder) for folder in folders[name]] for name in DRAWN if name in folders}
     evaluators = {name: simulator(kinds[0], paths) for name, kinds in found.items()}
     curves = {
         kinds[0].model.name: [evaluators[name].replay(kind.params) for kind in kinds] for name, kinds in found.items()
@@ -351,13 +367,13 @@ def figure(folders: Mapping[str, list[Path]], paths: list[Path], path: Path) -> 
         position, yaw = identified.recorded(run)
         states = len(yaw)
 
-        def curve(replay: evaluation.Replay, run: int = run, states: int = states) -> np.ndarray:
+        def curve(replay: Replay, run: int = run, states: int = states) -> np.ndarray:
             return np.column_stack([replay.position[run, :states, :2], replay.yaw[run, :states]])
 
         panels.append(
             plots.TrackingPanel(
                 title=motion.name,
-                time=np.arange(states) * robot.CONTROL_TIMESTEP,
+                time=np.arange(states) * CONTROL_TIMESTEP,
                 recording=np.column_stack([position[:, :2], yaw]),
                 simulations={name: np.stack([curve(replay) for replay in replays]) for name, replays in every.items()},
             )
@@ -452,7 +468,7 @@ def main() -> None:
             for name, members in folders.items()
         }
         rows = rows_of(vanilla_errors(folders["identified"][0], paths), found)
-        parts += [f"### {title}", *(comparison(rows, effort, horizon) for horizon in evaluation.SCORE_HORIZONS)]
+        parts += [f"### {title}", *(comparison(rows, effort, horizon) for horizon in SCORE_HORIZONS)]
         parts += [final_yaw(rows), worst_cases(rows)]
         parts += [table(found[name], "vanilla+sysid", METHODS[name].label) for name in ("identified", AIR)]
     parts += ["### Progress", race(folders)]

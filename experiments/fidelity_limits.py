@@ -31,20 +31,24 @@ import dataclasses
 import multiprocessing
 import tempfile
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import bundled_recordings  # noqa: E402
-import deflation  # noqa: E402
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-from bundled_recordings import Job  # noqa: E402
-from jaxtyping import Float  # noqa: E402
-from scipy.spatial.transform import Rotation  # noqa: E402
+import bundled_recordings
+import deflation
+import mujoco
+import numpy as np
+from bundled_recordings import Job
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
-from ballu_mjx import evaluation, reconstruction, robot, virtual_robot  # noqa: E402
-from ballu_mjx.virtual_robot import VirtualRobot  # noqa: E402
+from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.ballu.virtual.robot import VirtualRobot
+from ballu_mjx.evaluation.open_loop import START_INTERVAL
+from ballu_mjx.recordings.groups import group_of
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 
 HORIZON = 5.0
 """Seconds from each start."""
@@ -93,7 +97,7 @@ def simulator(virtual: VirtualRobot, variant: Variant) -> mujoco.MjModel:
     """The model of a variant."""
     model = virtual_robot.build(virtual)
     if variant.timestep:
-        training = robot.load_model().opt
+        training = load_model().opt
         model.opt.timestep, model.opt.integrator = variant.timestep, training.integrator
         model.opt.iterations = variant.iterations or training.iterations
         model.opt.ls_iterations = variant.iterations or training.ls_iterations
@@ -123,10 +127,10 @@ def errors(virtual: VirtualRobot, job: Job) -> tuple[str, Float[np.ndarray, "var
     trial = virtual_robot.draw_trial(job.trial)
     with tempfile.TemporaryDirectory() as folder:
         recorded = deflation.recorded(job, virtual, job.trial, Path(folder))
-    motion = reconstruction.reconstruct(recorded, robot.load_model(virtual.actuators))
-    steps, interval = (round(s / robot.CONTROL_TIMESTEP) for s in (HORIZON, evaluation.START_INTERVAL))
+    motion = reconstruct_ballu(recorded, load_model(virtual.actuators))
+    steps, interval = (round(s / CONTROL_TIMESTEP) for s in (HORIZON, START_INTERVAL))
     starts = range(2, len(job.commands) - steps + 1, interval)
-    nominal = robot.load_model()
+    nominal = load_model()
     place, turn = seen(nominal, motion.qpos)
     rows = []
     for variant in VARIANTS:
@@ -141,7 +145,7 @@ def errors(virtual: VirtualRobot, job: Job) -> tuple[str, Float[np.ndarray, "var
             turned = np.angle(np.exp(1j * (ran[1] - turn[after])))
             found.append([np.sqrt(np.mean(away)), np.rad2deg(np.sqrt(np.mean(turned**2)))])
         rows.append(np.mean(found, axis=0))
-    return evaluation.group_of(job.name), np.array(rows)
+    return group_of(job.name), np.array(rows)
 
 
 # %% [markdown]

@@ -28,21 +28,29 @@ if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a co
 import argparse
 import dataclasses
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import bundled_recordings  # noqa: E402
-import jax  # noqa: E402
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-from jaxtyping import Float  # noqa: E402
+import bundled_recordings
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+from jaxtyping import Float
 
-from ballu_mjx import envmimic, reconstruction, recording, robot, robot_description, runs, virtual_robot  # noqa: E402
-from ballu_mjx.linearization import Linearizer  # noqa: E402
-from ballu_mjx.reconstruction import Motion  # noqa: E402
-from ballu_mjx.residual import Residual  # noqa: E402
-from ballu_mjx.supervised import Labeller, SupervisedConfig  # noqa: E402
+from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reference import stack_motions
+from ballu_mjx.residuals.supervised import ForceLabeller, SupervisedConfig
+from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.robots.description import ballu
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, assets, load_model
+from ballu_mjx.runs.folder import read_config, typed_config
+from ballu_mjx.sim.linearize import Linearizer
+from ballu_mjx.sim.observation import HISTORY, commands_seen
+from ballu_mjx.sim.simulator import Simulator
 
 # %% [markdown]
 # ## The same trials, with true states
@@ -59,10 +67,10 @@ def twin(job: bundled_recordings.Job) -> Motion:
         virtual_robot.draw_robot(bundled_recordings.ROBOT_SEED),
         virtual_robot.draw_trial(job.trial),
         virtual_robot.open_loop(job.commands),
-        steps * robot.CONTROL_TIMESTEP,
+        steps * CONTROL_TIMESTEP,
     )
-    every = round(robot.CONTROL_TIMESTEP / virtual_robot.CAPTURE_TIMESTEP)
-    time = np.arange(steps + 1) * robot.CONTROL_TIMESTEP
+    every = round(CONTROL_TIMESTEP / virtual_robot.CAPTURE_TIMESTEP)
+    time = np.arange(steps + 1) * CONTROL_TIMESTEP
     return Motion(job.name, time, job.commands, qpos[::every], qvel[::every], {})
 
 
@@ -71,15 +79,15 @@ def twin(job: bundled_recordings.Job) -> Motion:
 
 
 # %%
-def forces(simulator: envmimic.Simulator, residual: Residual, motion: Motion) -> Float[np.ndarray, "steps 3"]:
+def forces(simulator: Simulator, residual: TrainedResidual, motion: Motion) -> Float[np.ndarray, "steps 3"]:
     """What a network pushes with (N, world) along a motion, from the first state with a history on."""
-    reference, _ = envmimic.stack(simulator, [motion])
+    reference, _ = stack_motions(simulator, [motion])
 
     def at(time: jax.Array) -> jax.Array:
-        history = jax.lax.dynamic_slice_in_dim(reference.features[0], time - envmimic.HISTORY + 1, envmimic.HISTORY)
-        return residual.wrench(history, envmimic.commands_seen(reference.command[0], time))[0, :3]
+        history = jax.lax.dynamic_slice_in_dim(reference.features[0], time - HISTORY + 1, HISTORY)
+        return residual.wrench(history, commands_seen(reference.command[0], time))[0, :3]
 
-    return np.asarray(jax.jit(jax.vmap(at))(np.arange(envmimic.HISTORY - 1, len(motion.command))))
+    return np.asarray(jax.jit(jax.vmap(at))(np.arange(HISTORY - 1, len(motion.command))))
 
 
 def rms(values: np.ndarray) -> float:
@@ -103,11 +111,11 @@ def figure(shown: dict[str, np.ndarray], title: str, path: Path, seconds: float 
     """Forces along the three axes over time."""
     styles = {"true": ("black", 1.6), "label": ("#e69f00", 1.0), "network": ("#56b4e9", 1.6)}
     whole, axes = plt.subplots(3, 1, figsize=(8, 6.4), sharex=True, layout="constrained")
-    count = round(seconds / robot.CONTROL_TIMESTEP)
+    count = round(seconds / CONTROL_TIMESTEP)
     for axis, ax in enumerate(axes):
         for name, force in shown.items():
             color, width = styles[name]
-            time = (np.arange(len(force)) + envmimic.HISTORY - 1) * robot.CONTROL_TIMESTEP
+            time = (np.arange(len(force)) + HISTORY - 1) * CONTROL_TIMESTEP
             ax.plot(time[:count], 1e3 * force[:count, axis], color=color, linewidth=width, label=name)
         ax.set_ylabel(f"force along {'xyz'[axis]} (mN)")
         ax.grid(alpha=0.3)
@@ -123,22 +131,22 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="+", help="of train residual --method supervised")
     parser.add_argument("--output", type=Path, default=Path("runs/force_labels"), help="folder of table and figure")
     arguments = parser.parse_args()
-    networks = {folder.name: Residual.load(folder) for folder in arguments.runs}
+    networks = {folder.name: TrainedResidual.load(folder) for folder in arguments.runs}
     first = next(iter(networks.values()))
-    model, ballu = robot.load_model(first.actuators), robot_description.ballu()
-    config = runs.typed(SupervisedConfig, runs.read_config(arguments.runs[0], "supervised"), "fit", arguments.runs[0])
-    simulator, linearize = envmimic.Simulator(model), Linearizer(model, joints=ballu.joints)
-    label = Labeller(model, ballu, linearize, config)
-    label_well = Labeller(model, ballu, linearize, dataclasses.replace(config, **SEEN_WELL))
+    model, robot = load_model(first.actuators), ballu()
+    config = typed_config(SupervisedConfig, read_config(arguments.runs[0], "supervised"), "fit", arguments.runs[0])
+    simulator, linearize = Simulator(model), Linearizer(model, joints=robot.joints)
+    label = ForceLabeller(model, robot, linearize, config)
+    label_well = ForceLabeller(model, robot, linearize, dataclasses.replace(config, **SEEN_WELL))
 
-    recordings = {path.name: path for path in recording.recordings([robot.assets() / "recordings" / "validation"])}
+    recordings = {path.name: path for path in list_recordings([assets() / "recordings" / "validation"])}
     true, labels, twins = {}, {}, {}
     for job in bundled_recordings.jobs():
         if job.split == "validation":
             twins[job.name] = twin(job)
-            true[job.name] = label_well(twins[job.name])[envmimic.HISTORY - 1 :]
-            seen = recording.read_recording(recordings[f"{job.name}.csv.gz"])
-            labels[job.name] = label(reconstruction.reconstruct(seen, model))[envmimic.HISTORY - 1 :]
+            true[job.name] = label_well(twins[job.name])[HISTORY - 1 :]
+            seen = read_recording(recordings[f"{job.name}.csv.gz"])
+            labels[job.name] = label(reconstruct_ballu(seen, model))[HISTORY - 1 :]
             print(f"{job.name}: true forces {1e3 * rms(true[job.name]):.0f} mN (RMS along an axis)", flush=True)
     lines = ["| error over that of no force | near | x, y, z | far | x, y, z |", "| --- " * 5 + "|"]
     lines.append(row("labels from motion capture", labels, true))

@@ -27,17 +27,17 @@ if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a co
 # %%
 import argparse
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import bundled_recordings  # noqa: E402
-import fidelity  # noqa: E402
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-from jaxtyping import Float  # noqa: E402
+import bundled_recordings
+import fidelity
+import matplotlib.pyplot as plt
+import numpy as np
+from jaxtyping import Float
 
-from ballu_mjx import plots  # noqa: E402
+from ballu_mjx.viz.style import colour_of, label_of
 
 METHODS = {"identified": "envmimic", "regression": "supervised", "analytic": "analytic", "aerodynamic": "aerodynamic"}
 """Of `fidelity.METHODS`, and what they are called in figures."""
@@ -86,7 +86,7 @@ def table(found: dict[str, dict[int, list[Path]]]) -> str:
     for name, counts in found.items():
         for count, folders in counts.items():
             cells = [fidelity.ratios(list(left(folders, *column))) for column in columns]
-            lines.append(f"| {plots.label_of(METHODS[name])} | {count} | " + " | ".join(cells) + " |")
+            lines.append(f"| {label_of(METHODS[name])} | {count} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
@@ -98,11 +98,11 @@ def figure(found: dict[str, dict[int, list[Path]]], path: Path) -> None:
             for name, counts in found.items():
                 values = [left(folders, group, quantity) for folders in counts.values()]
                 simulator = METHODS[name]
-                colour = plots.colour_of(simulator)
+                colour = colour_of(simulator)
                 lowest, middle, highest = ([f(each) for each in values] for f in (np.min, np.mean, np.max))
-                ax.plot([*counts], middle, "o-", color=colour, label=plots.label_of(simulator))
+                ax.plot([*counts], middle, "o-", color=colour, label=label_of(simulator))
                 ax.fill_between([*counts], lowest, highest, color=colour, alpha=0.2)
-            ax.axhline(1.0, color=plots.colour_of("vanilla+sysid"), linestyle="--", label="vanilla+sysid")
+            ax.axhline(1.0, color=colour_of("vanilla+sysid"), linestyle="--", label="vanilla+sysid")
             ax.set_xscale("log", base=2)
             ax.set_yscale("log")
             ax.yaxis.set_major_formatter("{x:g}")

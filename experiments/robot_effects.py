@@ -17,22 +17,26 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import numpy as np  # noqa: E402
+import numpy as np
 
-from ballu_mjx import pipeline, robot, trials, virtual_robot  # noqa: E402
-from ballu_mjx.policy import Policy  # noqa: E402
-from ballu_mjx.transfer import Transfer  # noqa: E402
-from ballu_mjx.virtual_robot import VirtualRobot  # noqa: E402
+from ballu_mjx.ballu.model import CABLE_SLACK, ActuatorParameters
+from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.ballu.virtual.robot import VirtualRobot
+from ballu_mjx.ballu.virtual.trials import run_trials
+from ballu_mjx.cli import pipeline
+from ballu_mjx.evaluation.transfer import Transfer
+from ballu_mjx.policies.policy import Policy
+from ballu_mjx.robots.model import load_model
 
 # %% [markdown]
 # ## The effects, each as what takes it away
 
 # %%
-NOMINAL = robot.ActuatorParameters.nominal(robot.load_model())
+NOMINAL = ActuatorParameters.nominal(load_model())
 
 
 def pair(values: object) -> tuple[float, float]:
@@ -53,7 +57,7 @@ def without_actuators(full: VirtualRobot) -> VirtualRobot:
         knee_friction=(0.0, 0.0),
         motor_friction=(0.0, 0.0),
         backlash=(0.0, 0.0),
-        cable_slack=(robot.CABLE_SLACK, robot.CABLE_SLACK),
+        cable_slack=(CABLE_SLACK, CABLE_SLACK),
     )
 
 
@@ -102,7 +106,7 @@ def measure(policy: Policy, robots: dict[str, VirtualRobot], count: int, folder:
     for name, variant in robots.items():
         place = folder / name.replace(" ", "-")
         place.mkdir(parents=True, exist_ok=True)
-        results[name] = trials.run(policy, variant, draws, place, loop)
+        results[name] = run_trials(policy, variant, draws, place, loop)
     return results
 
 

@@ -32,21 +32,26 @@ import argparse
 import dataclasses
 from collections.abc import Sequence
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-from jaxtyping import Float  # noqa: E402
-from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
-from matplotlib.figure import Figure  # noqa: E402
-from mpl_toolkits.mplot3d import proj3d  # noqa: E402
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection  # noqa: E402
-from mpl_toolkits.mplot3d.axes3d import Axes3D  # noqa: E402
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import proj3d
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from mpl_toolkits.mplot3d.axes3d import Axes3D
 
-from ballu_mjx import pipeline, plots, reconstruction, recording, robot  # noqa: E402
-from ballu_mjx.errors import InputError  # noqa: E402
+from ballu_mjx.ballu.model import SIDES
+from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+from ballu_mjx.cli import pipeline
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.csv_format import read_recording
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.viz.style import LABELS
 
 TIMES = {"walk": (0.0, 5.0, 11.0, 16.0, 24.0), "turn": (0.0, 4.0, 10.0, 18.0, 22.0)}
 """When the paper's pictures were taken (s)."""
@@ -83,7 +88,7 @@ class Shown:
 
     def state(self, time: float) -> int:
         """The state nearest to `time` (s), which may be after the last by the samples that a recording's end loses."""
-        return min(round(time / robot.CONTROL_TIMESTEP), len(self.qpos) - 1)
+        return min(round(time / CONTROL_TIMESTEP), len(self.qpos) - 1)
 
 
 def read_trial(run: Path, task: str, setting: str, seed: int, trial: int, until: float) -> Shown:
@@ -97,8 +102,8 @@ def read_trial(run: Path, task: str, setting: str, seed: int, trial: int, until:
             f"{path}: there is no such trial; make it with `python -m ballu_mjx.train all --output {run} --tasks "
             f"{task} --seeds {seed}`, or name one that is there by --run, --tasks, --settings, --seed and --trial."
         )
-    model = robot.load_model()
-    motion = reconstruction.reconstruct(recording.read_recording(path), model)
+    model = load_model()
+    motion = reconstruct_ballu(read_recording(path), model)
     if motion.time[-1] < until - 0.5:
         raise InputError(f"{path}: ends at {motion.time[-1]:.1f} s, before {until:g} s; name earlier --times.")
     data = mujoco.MjData(model)
@@ -134,10 +139,10 @@ def draw_robot(axis: Axes3D, model: mujoco.MjModel, data: mujoco.MjData) -> None
         shadow = Poly3DCollection([np.column_stack([x, y, np.zeros(len(angle))])], facecolor="black", alpha=0.05)
         axis.add_collection3d(shadow)
         shadow.set_zorder(1)
-    hips = [data.body(f"femur_{side}").xpos for side in robot.SIDES]
+    hips = [data.body(f"femur_{side}").xpos for side in SIDES]
     stick(axis, hips, COLOURS["frame"], 3.0)
     stick(axis, [data.site("base").xpos, data.site("balloon").xpos], COLOURS["frame"], 0.9)
-    for side, hip in zip(robot.SIDES, hips, strict=True):
+    for side, hip in zip(SIDES, hips, strict=True):
         foot = data.site(f"foot_{side}").xpos
         stick(axis, [hip, data.body(f"tibia_{side}").xpos, foot], COLOURS[side], 2.2)
         axis.plot(*foot[:, None], "o", color=COLOURS[side], markersize=3.5, zorder=6)
@@ -162,7 +167,7 @@ def draw(trials: Sequence[Shown], times: Sequence[float], view: tuple[float, flo
 
     Titles: x, y and yaw since the start, as in the paper's tables.
     """
-    model = robot.load_model()
+    model = load_model()
     data = mujoco.MjData(model)
     low, high = limits(trials, times)
     corners = [(x, y, 0.0) for x in (low[0], high[0]) for y in (low[1], high[1])]
@@ -174,7 +179,7 @@ def draw(trials: Sequence[Shown], times: Sequence[float], view: tuple[float, flo
     figure = Figure(figsize=(size[0], size[1]))
     for row, trial in enumerate(trials):
         corner = np.array([0.4, size[1] - cell[1] * (row + 1)])
-        label, colour = plots.LABELS[trial.setting], plots.COLOURS[trial.setting]
+        label, colour = LABELS[trial.setting], COLOURS[trial.setting]
         middle = (corner[1] + (cell[1] - 0.5) / 2) / size[1]
         figure.text(
             0.2 / size[0], middle, label, rotation=90, ha="center", va="center", color=colour, size=13, weight="bold"

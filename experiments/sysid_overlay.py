@@ -26,17 +26,20 @@ if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a co
 # %%
 import argparse
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-from jaxtyping import Float  # noqa: E402
-from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402
-from matplotlib.figure import Figure  # noqa: E402
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
-from ballu_mjx import actuators, plots, robot  # noqa: E402
+from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
+from ballu_mjx.ballu.model import KNEES, MOTORS, SIDES, standing_qpos
+from ballu_mjx.robots.model import assets, load_model
+from ballu_mjx.viz.style import COLOURS, LABELS
 
 PERIODS = (0.8, 1.0, 1.2, 1.4, 1.6)
 """Seconds; the legs half a period apart, each at full command for 0.4 of it."""
@@ -52,7 +55,7 @@ def simulate(
 ) -> tuple[Float[np.ndarray, "steps 3"], Float[np.ndarray, "steps nq"]]:
     """Centre of mass (m, world) and generalized positions every physics step, after two seconds of standing."""
     data = mujoco.MjData(model)
-    data.qpos[:] = robot.standing_qpos(model)
+    data.qpos[:] = standing_qpos(model)
     mujoco.mj_step(model, data, round(2.0 / model.opt.timestep))
     com, qpos = [], []
     for step in range(round(SECONDS / model.opt.timestep)):
@@ -70,7 +73,7 @@ def compare(models: dict[str, mujoco.MjModel]) -> str:
     rows = []
     for period in PERIODS:
         (com, qpos), (other_com, other_qpos) = (simulate(model, period) for model in models.values())
-        joints = np.concatenate([np.arange(7, qpos.shape[1])[part] for part in (robot.KNEES, robot.MOTORS)])
+        joints = np.concatenate([np.arange(7, qpos.shape[1])[part] for part in (KNEES, MOTORS)])
         start, other_start = com[0], other_com[0]
         apart = np.linalg.norm((com[-1] - start) - (other_com[-1] - other_start))
         angles = np.rad2deg(np.abs(qpos[:, joints] - other_qpos[:, joints])).mean()
@@ -95,15 +98,15 @@ def draw(models: dict[str, mujoco.MjModel], period: float, path: Path) -> None:
         data = mujoco.MjData(model)
         data.qpos[:] = qpos[-1]
         mujoco.mj_kinematics(model, data)
-        colour = plots.COLOURS[name]
-        for leg, style in zip(robot.SIDES, ("-", "--"), strict=True):
+        colour = COLOURS[name]
+        for leg, style in zip(SIDES, ("-", "--"), strict=True):
             points = [data.body("base").xpos, data.body(f"tibia_{leg}").xpos, data.site(f"foot_{leg}").xpos]
-            label = f"{plots.LABELS[name]}, {leg} leg"
+            label = f"{LABELS[name]}, {leg} leg"
             side.plot(*np.array(points)[:, [0, 2]].T, style, color=colour, linewidth=2, marker="o", label=label)
         neck, balloon = data.body("base").xpos, data.site("balloon").xpos
         side.plot(*np.array([neck, balloon])[:, [0, 2]].T, ":", color=colour)
         side.plot(balloon[0], balloon[2], "o", markersize=22, color=colour, alpha=0.3)
-        above.plot(*(com - com[0])[:, :2].T, color=colour, label=plots.LABELS[name])
+        above.plot(*(com - com[0])[:, :2].T, color=colour, label=LABELS[name])
     side.axhline(0, color="grey", linewidth=0.8)
     for axis, title, second in ((side, f"after {SECONDS:g} s, from the side", "z (m)"), (above, "from above", "y (m)")):
         axis.set(title=title, xlabel="x (m)", ylabel=second)
@@ -121,12 +124,12 @@ def draw(models: dict[str, mujoco.MjModel], period: float, path: Path) -> None:
 # %%
 def main() -> None:
     parser = argparse.ArgumentParser(description="The same commands with nominal and with identified actuators.")
-    bundled = robot.assets() / "recordings" / actuators.NAME
+    bundled = assets() / "recordings" / ACTUATORS_FILE
     parser.add_argument("--actuators", type=Path, default=bundled, help="identified actuators (the bundled robot's)")
     parser.add_argument("--output", type=Path, default=Path("sysid_overlay.png"), help="picture to write")
     options = parser.parse_args()
-    _, identified = actuators.read(options.actuators)
-    models = {"vanilla": robot.load_model(), "vanilla+sysid": robot.load_model(identified)}
+    _, identified = read_actuators(options.actuators)
+    models = {"vanilla": load_model(), "vanilla+sysid": load_model(identified)}
     print(compare(models))
     draw(models, PERIODS[2], options.output)
     print(f"Written to {options.output}.")

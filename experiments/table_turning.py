@@ -34,20 +34,20 @@ if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a co
     sys.path[:0] = [".", "experiments"]
 
 # %%
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import transfer_figure  # noqa: E402
+import transfer_figure
 
-from ballu_mjx import pipeline  # noqa: E402
-from ballu_mjx.errors import InputError  # noqa: E402
+from ballu_mjx.cli import pipeline
+from ballu_mjx.common.errors import InputError
 
 # %% [markdown]
 # ## The table
 #
-# Training, trials and table are the package's: `ballu_mjx.pipeline` holds the stages, `ballu_mjx.transfer` the figures
-# of a trial.
+# Training, trials and table are the package's: `ballu_mjx.cli.pipeline` holds the stages,
+# `ballu_mjx.evaluation.transfer` the figures of a trial.
 
 
 # %%

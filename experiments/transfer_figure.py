@@ -12,8 +12,10 @@ from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ballu_mjx import pipeline, plots, recording
-from ballu_mjx.errors import InputError
+from ballu_mjx.cli import pipeline
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.csv_format import read_recording
+from ballu_mjx.viz.style import colour_of, label_of
 
 OUTPUT, QUICK_OUTPUT = Path("runs/all"), Path("runs/all-quick")
 """Folders of the stages. Two, so that trying `--quick` sets no training of hours aside."""
@@ -82,7 +84,7 @@ def _finished(trials: Path) -> bool:
 
 
 def _way(path: Path) -> Way:
-    base = recording.read_recording(path).base_position
+    base = read_recording(path).base_position
     if base is None:  # only in suspended recordings
         raise InputError(f"{path}: has no base position; it is no recording of a trial, take it out of the folder.")
     return base[:, :2] - base[0, :2]
@@ -108,10 +110,10 @@ def draw(ways: dict[str, list[list[Way]]], seeds: Sequence[int], path: Path) -> 
         axis.axvline(0.0, color="grey", linewidth=0.8)
         for style, trials in zip(styles, runs, strict=True):
             for way in trials:
-                axis.plot(*way.T, style, color=plots.colour_of(setting), linewidth=1.2, alpha=0.85)
-                axis.plot(*way[-1], "o", color=plots.colour_of(setting), markersize=4)
+                axis.plot(*way.T, style, color=colour_of(setting), linewidth=1.2, alpha=0.85)
+                axis.plot(*way[-1], "o", color=colour_of(setting), markersize=4)
         axis.plot(0.0, 0.0, "o", color="black", markersize=5)
-        axis.set(title=plots.label_of(setting), xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        axis.set(title=label_of(setting), xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axis.set_aspect("equal")
         axis.grid(alpha=0.3)
     for axis in axes.flat[len(ways) - columns : len(ways)]:  # the lowest of each column

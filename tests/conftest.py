@@ -6,7 +6,7 @@ from typing import TypeVar
 from beartype import beartype
 from jaxtyping import install_import_hook
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 Function = TypeVar("Function", bound=Callable)
 

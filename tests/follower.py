@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State
 
-from ballu_mjx.ppo import Params
+from ballu_mjx.rl.ppo import Params
 
 
 class Follower(Env):

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from ballu_mjx import robot
-from ballu_mjx.robot import CONTROL_TIMESTEP, JOINTS
+from ballu_mjx.ballu.model import JOINTS, standing_qpos
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, assets, load_model
 
 pytest.importorskip("pybullet", reason="needs the extra bench")
 import bullet  # noqa: E402  # pyright: ignore[reportMissingImports]
@@ -20,7 +20,7 @@ TIMESTEP = 1e-3
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    return robot.load_model()
+    return load_model()
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_it_sees_what_the_model_sees_of_a_bent_and_turned_pose(model: mujoco.MjM
 def test_it_stands_as_high(model: mujoco.MjModel, rival: bullet.Robot) -> None:
     """For half a second: then the balloon, whose swaying nothing steadies, has begun to sway its own way in each."""
     data = mujoco.MjData(model)
-    data.qpos[:] = robot.standing_qpos(model)
+    data.qpos[:] = standing_qpos(model)
     rival.reset(data.qpos)
     for _ in range(10):
         rival.step((0.0, 0.0))
@@ -72,7 +72,7 @@ def test_it_stands_as_high(model: mujoco.MjModel, rival: bullet.Robot) -> None:
 
 def test_its_neck_swings_at_the_same_frequency(model: mujoco.MjModel) -> None:
     """The base held still in the air, the balloon swings about the neck, its lift pulling it upright."""
-    spec = mujoco.MjSpec.from_file(str(robot.assets() / "ballu.xml"))
+    spec = mujoco.MjSpec.from_file(str(assets() / "ballu.xml"))
     spec.body("base").pos = [0, 0, 1.5]
     spec.delete(spec.joint("root"))
     hanging = spec.compile()
@@ -96,7 +96,7 @@ def test_its_neck_swings_at_the_same_frequency(model: mujoco.MjModel) -> None:
 def test_it_stays_whole_under_random_commands(model: mujoco.MjModel) -> None:
     for timestep in bullet.TIMESTEPS:
         with contextlib.closing(bullet.Robot(model, timestep)) as rival:
-            rival.reset(robot.standing_qpos(model))
+            rival.reset(standing_qpos(model))
             for command in np.random.default_rng(0).uniform(0.0, 1.0, (round(5.0 / CONTROL_TIMESTEP), 2)):
                 rival.step(command.tolist())
                 features, _ = rival.observe()

@@ -7,7 +7,7 @@ from pathlib import Path
 import ballu_mjx
 
 API = Path(__file__).parents[1] / "docs" / "api"
-PROGRAMS = {"ballu_mjx.__main__", "ballu_mjx.importers.ezc3d_process"}
+PROGRAMS = {"ballu_mjx.__main__", "ballu_mjx.train", "ballu_mjx.recordings.importers.c3d_process"}
 """Run as processes, imported by nobody."""
 
 

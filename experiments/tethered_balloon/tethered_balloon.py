@@ -28,19 +28,22 @@ if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a co
 import argparse
 import shutil
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-from matplotlib.figure import Figure  # noqa: E402
-from scipy.spatial.transform import Rotation  # noqa: E402
+import mujoco
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
-from ballu_mjx import evaluation, plots, recording, robot, robot_description, runs  # noqa: E402
-from ballu_mjx.evaluation import Evaluation  # noqa: E402
-from ballu_mjx.recording import Recording  # noqa: E402
-from ballu_mjx.robot_description import RobotDescription  # noqa: E402
+from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, read_evaluation
+from ballu_mjx.recordings.csv_format import write_recording
+from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.robots.description import RobotDescription, read_description
+from ballu_mjx.robots.model import CONTROL_TIMESTEP
+from ballu_mjx.runs.checkpoints import list_checkpoints
+from ballu_mjx.viz.style import COLOURS, LABELS
 
 FOLDER = Path("experiments/tethered_balloon") if "ipykernel" in sys.modules else Path(__file__).parent
 DESCRIPTION = FOLDER / "balloon.robot.json"
@@ -80,7 +83,7 @@ def record(description: RobotDescription, name: str, seconds: float, seed: int) 
     model = real(description)
     data = mujoco.MjData(model)
     before, steps = 30 * RATE, round(seconds * RATE)
-    control = round(robot.CONTROL_TIMESTEP * RATE)
+    control = round(CONTROL_TIMESTEP * RATE)
     sent = np.repeat(commands(rng, (before + steps) // control), control, axis=0)
     sites = [description.tracked, *description.points]
     gust, decay = 0.0, np.exp(-1 / (4 * RATE))
@@ -120,7 +123,7 @@ def record_all(description: RobotDescription, folder: Path, quick: bool) -> None
         (folder / use).mkdir(parents=True, exist_ok=True)
         for number in range(count):
             flight = record(description, f"flight-{use}-{number}", seconds, first + number)
-            recording.write_recording(flight, folder / use / f"{flight.name}.csv.gz", description)
+            write_recording(flight, folder / use / f"{flight.name}.csv.gz", description)
         first += 100
 
 
@@ -135,7 +138,7 @@ def learn(recordings: Path, run: Path, seed: int, quick: bool) -> Evaluation:
     """Train, unless the run is there already, or go on with it; its evaluation on the test recordings."""
     if not (run / "evaluation.json").exists():
         command = [sys.executable, "-m", "ballu_mjx.train", "envmimic"]
-        if runs.checkpoints(run):
+        if list_checkpoints(run):
             command += ["--resume", str(run)]
         else:
             shutil.rmtree(run, ignore_errors=True)
@@ -144,10 +147,10 @@ def learn(recordings: Path, run: Path, seed: int, quick: bool) -> Evaluation:
                 command += [f"--{option}", str(recordings / use)]
             command += QUICK if quick else []
         subprocess.run(command, check=True)
-    return evaluation.read(run / "evaluation.json")
+    return read_evaluation(run / "evaluation.json")
 
 
-def errors(found: tuple[evaluation.Errors, ...], quantity: str, horizon: float) -> float:
+def errors(found: tuple[Errors, ...], quantity: str, horizon: float) -> float:
     """Mean over recordings of the RMSE (m or deg) over a horizon (s)."""
     return float(np.mean([getattr(each, quantity)[horizon][0] for each in found if horizon in each.position]))
 
@@ -164,13 +167,13 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="one seed, for seconds; the numbers mean little")
     options = parser.parse_args()
 
-    description = robot_description.read(DESCRIPTION)
+    description = read_description(DESCRIPTION)
     recordings = options.output / "recordings"
     record_all(description, recordings, options.quick)
     seeds = options.seeds[:1] if options.quick else options.seeds
     found = [learn(recordings, options.output / f"envmimic-{seed}", seed, options.quick) for seed in seeds]
 
-    horizons = [h for h in evaluation.HORIZONS if any(h in each.position for each in found[0].vanilla)]
+    horizons = [h for h in HORIZONS if any(h in each.position for each in found[0].vanilla)]
     lines = [
         "| horizon (s) | vanilla: m, deg | EnvMimic: m, deg | left of vanilla's: position | yaw |",
         "| ---: | --- | --- | --- | --- |",
@@ -197,8 +200,8 @@ def main() -> None:
     axis = figure.subplots()
     for name, values in curves.items():
         mean, low, high = (reduce(np.array(values), axis=1) for reduce in (np.mean, np.min, np.max))
-        axis.plot(horizons, mean, color=plots.COLOURS[name], marker="o", label=plots.LABELS[name])
-        axis.fill_between(horizons, low, high, color=plots.COLOURS[name], alpha=0.2, linewidth=0)
+        axis.plot(horizons, mean, color=COLOURS[name], marker="o", label=LABELS[name])
+        axis.fill_between(horizons, low, high, color=COLOURS[name], alpha=0.2, linewidth=0)
     axis.set(xlabel="horizon (s)", ylabel="position RMSE (m)", xscale="log", ylim=(0, None))
     axis.set_xticks(horizons, [f"{horizon:g}" for horizon in horizons])
     axis.minorticks_off()

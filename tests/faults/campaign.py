@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 _HERE = Path(__file__).resolve().parent
 TASK = "walk"
@@ -47,9 +47,12 @@ def train(folder: Path) -> None:
     """Begin the training in `folder`, or go on with it, to its end."""
     from follower import Follower, weight
 
-    from ballu_mjx import learner, runs
-    from ballu_mjx.ppo import PPOConfig
-    from ballu_mjx.session import Session, Validation, start_from
+    from ballu_mjx.residuals.run_config import describe_run
+    from ballu_mjx.rl import learner
+    from ballu_mjx.rl.ppo import PPOConfig
+    from ballu_mjx.rl.training_loop import TrainingLoop, Validation, find_resume_point
+    from ballu_mjx.runs.folder import Run
+    from ballu_mjx.runs.progress import Progress
 
     config = PPOConfig(
         num_timesteps=STEPS * STEP,
@@ -63,11 +66,11 @@ def train(folder: Path) -> None:
         averaging=4,
     )
     begun = (folder / "config.json").exists()
-    start = start_from(TASK, folder if begun else None, config, output=None, quick=False)
-    content = runs.describe(TASK, {"ppo": config}, {}, [])
-    with runs.Run(folder, content, resumed_at=start.resumed_at) as run:
-        progress = runs.Progress(learner.total_timesteps(config), start.step, stream=io.StringIO())
-        Session(run, progress, EVERY * STEP, Validation(weight)).train(Follower(), config, start, content)
+    start = find_resume_point(TASK, folder if begun else None, config, output=None, quick=False)
+    content = describe_run(TASK, {"ppo": config}, {}, [])
+    with Run(folder, content, resumed_at=start.resumed_at) as run:
+        progress = Progress(learner.total_timesteps(config), start.step, stream=io.StringIO())
+        TrainingLoop(run, progress, EVERY * STEP, Validation(weight)).train(Follower(), config, start, content)
 
 
 def quietly(folder: Path, told: Path) -> None:
@@ -151,11 +154,11 @@ def trainer() -> Iterator[Trainer]:
 
 def outcome(folder: Path) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
     """Measurements but for the timings, and all of the last state. Raises on a torn line."""
-    from ballu_mjx import runs
+    from ballu_mjx.runs.checkpoints import last_checkpoint
 
     text = (folder / "metrics.jsonl").read_text()
     rows = [json.loads(line) for line in text.splitlines()]
-    last = runs.last_checkpoint(folder, training=True)
+    last = last_checkpoint(folder, training=True)
     assert text.endswith("\n") and last.training is not None
     return [{name: value for name, value in row.items() if name not in TIMINGS} for row in rows], last.training
 
@@ -183,9 +186,9 @@ def damage(path: Path, random: np.random.Generator) -> str:
 
 def checkpoint_files(folder: Path) -> list[Path]:
     """The files of a run's last checkpoint."""
-    from ballu_mjx import runs
+    from ballu_mjx.runs.checkpoints import list_checkpoints
 
-    last = folder / "checkpoints" / str(runs.checkpoints(folder)[-1])
+    last = folder / "checkpoints" / str(list_checkpoints(folder)[-1])
     return sorted(path for path in last.rglob("*") if path.is_file())
 
 
@@ -213,10 +216,10 @@ def damaged(at: Trainer, reference: Path, folder: Path, random: np.random.Genera
 def swapped(at: Trainer, reference: Path, folder: Path, random: np.random.Generator) -> tuple[str, bool]:
     """Copy a training that was killed to `folder`, exchange a file of its last two checkpoints, or all of them, let it
     end; returns what was done."""
-    from ballu_mjx import runs
+    from ballu_mjx.runs.checkpoints import list_checkpoints
 
     shutil.copytree(reference.parent / "killed", folder)
-    one, other = (folder / "checkpoints" / str(step) for step in runs.checkpoints(folder)[-2:])
+    one, other = (folder / "checkpoints" / str(step) for step in list_checkpoints(folder)[-2:])
     what = "swapped whole"
     if random.random() < 0.7:
         what = "file swapped"
@@ -264,7 +267,7 @@ def fill(place: Path, free: int) -> Path:
 def full_disk(at: Trainer, reference: Path, disk: Path, steps: int, free: int) -> bool:
     """Fill the disk of a training after so many steps; returns whether one sentence said so, a whole checkpoint was
     left, and with room again it ended as `reference` did. Raises `RuntimeError` where it did not stop."""
-    from ballu_mjx import runs
+    from ballu_mjx.runs.checkpoints import last_checkpoint
 
     folder = disk / "run"
     process = at.started(folder, steps)
@@ -276,7 +279,7 @@ def full_disk(at: Trainer, reference: Path, disk: Path, steps: int, free: int) -
         raise RuntimeError("The training neither goes on nor ends on a full disk.")
     said = at.told.read_text()[before:].strip()
     one_sentence = process.exitcode == 2 and "\n" not in said and f"{folder}: its disk is full; make room" in said
-    last = runs.last_checkpoint(folder, training=True)
+    last = last_checkpoint(folder, training=True)
     if not one_sentence or (f"step {last.step:,} is whole" not in said):
         raise RuntimeError(f"Exit status {process.exitcode}, checkpoint {last.step}: {said!r}")
     ballast.unlink()

@@ -30,8 +30,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from ballu_mjx import runtime
-from ballu_mjx.errors import InputError
+from ballu_mjx.common import runtime
+from ballu_mjx.common.errors import InputError
 
 OUTCOMES = ("refused", "accepted", "nonsense", "crashed", "hung")
 LONGEST = 10.0
@@ -382,11 +382,17 @@ def transfers_fault(found: Any) -> str | None:
 
 def formats(work: Path) -> list[Format]:
     """Every format that is read, with a valid example of it in a folder of its own below `work`."""
-    from ballu_mjx import actuators, aerodynamics, pipeline, residual, robot, robot_description, transfer
-    from ballu_mjx.importers import mapping
-    from ballu_mjx.recording import bundled, read_recording, write_recording
+    from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
+    from ballu_mjx.cli.cached_stages import read_mark, write_mark
+    from ballu_mjx.evaluation import transfer
+    from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_recording
+    from ballu_mjx.recordings.importers.mapping import EXAMPLE, ROLES, read_mapping
+    from ballu_mjx.residuals.aerodynamics import AERODYNAMICS_FILE, AERODYNAMICS_FORMAT, read_air_parameters
+    from ballu_mjx.residuals.trained import _read_observed
+    from ballu_mjx.robots.description import read_description
+    from ballu_mjx.robots.model import assets
 
-    whole = read_recording(bundled("test")[0])
+    whole = read_recording(list_bundled("test")[0])
     fields = {field.name: getattr(whole, field.name) for field in dataclasses.fields(whole)}
     cut = {name: value[:130] for name, value in fields.items() if isinstance(value, np.ndarray)}
     short = dataclasses.replace(whole, **cut)
@@ -409,7 +415,7 @@ def formats(work: Path) -> list[Format]:
         write_recording(short, path)
         add(name, folder / damaged, damages, lambda path=path: read_recording(path), recording_fault, share=share)
     folder = place()
-    sweep = read_recording(bundled("suspended")[0])
+    sweep = read_recording(list_bundled("suspended")[0])
     fields = {field.name: getattr(sweep, field.name) for field in dataclasses.fields(sweep)}
     cut = {name: value[:130] for name, value in fields.items() if isinstance(value, np.ndarray)}
     write_recording(dataclasses.replace(sweep, **cut), folder / "sweep.csv")
@@ -417,50 +423,50 @@ def formats(work: Path) -> list[Format]:
         recording_fault)  # fmt: skip
 
     folder = place()
-    path = folder / actuators.NAME
-    shutil.copy(robot.assets() / "recordings" / actuators.NAME, path)
-    add("actuators.json", path, JSON, lambda path=path: actuators.read(path), actuators_fault)
+    path = folder / ACTUATORS_FILE
+    shutil.copy(assets() / "recordings" / ACTUATORS_FILE, path)
+    add("actuators.json", path, JSON, lambda path=path: read_actuators(path), actuators_fault)
     folder = place()
     path = folder / "mine.robot.json"
-    path.write_bytes((robot.assets() / "ballu.robot.json").read_bytes())
-    shutil.copy(robot.assets() / "ballu.xml", folder)
-    add("robot description", path, JSON, lambda path=path: robot_description.read(path), description_fault)
+    path.write_bytes((assets() / "ballu.robot.json").read_bytes())
+    shutil.copy(assets() / "ballu.xml", folder)
+    add("robot description", path, JSON, lambda path=path: read_description(path), description_fault)
     folder = place()
-    path = folder / aerodynamics.FILE
+    path = folder / AERODYNAMICS_FILE
     values = dict.fromkeys(("centre", "linear_drag", "quadratic_drag", "turning_drag"), [0.01, 0.02, 0.03])
     values |= {"added_mass": 0.1, "added_inertia": 0.003, "lift": -0.004, "delay": 0.05}
-    path.write_text(json.dumps({"format": aerodynamics.FORMAT, "parameters": values, "windows": 3}))
-    add("air.json", path, JSON, lambda path=path: aerodynamics.read(path), air_fault)
+    path.write_text(json.dumps({"format": AERODYNAMICS_FORMAT, "parameters": values, "windows": 3}))
+    add("air.json", path, JSON, lambda path=path: read_air_parameters(path), air_fault)
     folder = place()
     path = folder / "observed.json"
     path.write_text(json.dumps({"low": [-0.5] * 87, "high": [0.5] * 87}))
-    add("observed.json", path, JSON, lambda path=path: residual._read_observed(path, 87), observed_fault, share=6)
+    add("observed.json", path, JSON, lambda path=path: _read_observed(path, 87), observed_fault, share=6)
 
     found += _run_formats(place, short.robot)
 
     folder = place()
     path = folder / "sweep.stage.json"
-    pipeline._write_mark(path, "0123456789abcdef", {"options": {"robot": 0}, "needs": []}, done=True)
-    add("stage.json", path, JSON, lambda path=path: pipeline._read_mark(path),
+    write_mark(path, "0123456789abcdef", {"options": {"robot": 0}, "needs": []}, done=True)
+    add("stage.json", path, JSON, lambda path=path: read_mark(path),
         lambda mark: None if type(mark["done"]) is bool and len(mark["key"]) == 16 else "key", share=5)  # fmt: skip
     folder = place()
     path = folder / "transfer.json"
-    transfer.write(path, [transfer.Transfer(*np.arange(11.0) / 7), transfer.Transfer(*np.arange(11.0))])
-    add("transfer.json", path, JSON, lambda path=path: transfer.read(path), transfers_fault, share=5)
+    transfer.write_transfer(path, [transfer.Transfer(*np.arange(11.0) / 7), transfer.Transfer(*np.arange(11.0))])
+    add("transfer.json", path, JSON, lambda path=path: transfer.read_transfer(path), transfers_fault, share=5)
 
     folder = place()
     path = folder / "room.toml"
-    path.write_text(mapping.EXAMPLE)
-    add("mapping, TOML", path, TEXT, lambda path=path: mapping.read_mapping(path), mapping_fault)
+    path.write_text(EXAMPLE)
+    add("mapping, TOML", path, TEXT, lambda path=path: read_mapping(path), mapping_fault)
     folder = place()
     path = folder / "room.json"
     offset = {"offset": [0.1, 0, 0], "turn": [0, 0, 90]}
     tables = {"balloon": {"markers": ["a", "b", "c"], "geometry": [[0.1, 0, 0], [0, 1, 0], [0, 0, 1]], **offset}}
-    tables |= {role: {"body": f"ballu:{role}"} for role in mapping.ROLES[1:]}
+    tables |= {role: {"body": f"ballu:{role}"} for role in ROLES[1:]}
     tables |= {"knee_left": {"column": "kl", "sign": -1, "zero": 3.5}, "commands": {"range_left": [0, 90]}}
     content = {"robot": ROBOT, "axes": {"forward": "x"}, "origin": {"floor": 0.1}, "units": {"length": "mm"}, **tables}
     path.write_text(json.dumps(content))
-    add("mapping, JSON", path, JSON, lambda path=path: mapping.read_mapping(path), mapping_fault)
+    add("mapping, JSON", path, JSON, lambda path=path: read_mapping(path), mapping_fault)
 
     found += _import_formats(place, short)
     folder = place()
@@ -470,14 +476,18 @@ def formats(work: Path) -> list[Format]:
 
 def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
     """The files of a run's folder."""
-    from ballu_mjx import compare, evaluation, replay, report, residual_training, runs
-    from ballu_mjx import envmimic as tasks
-    from ballu_mjx import ppo as learning
-    from ballu_mjx.envmimic import EnvMimicConfig
-    from ballu_mjx.evaluation import Errors, Evaluation
-    from ballu_mjx.ppo import PPOConfig
-    from ballu_mjx.recording import bundled
-    from ballu_mjx.replay import Take
+    from ballu_mjx.cli import compare, train_envmimic
+    from ballu_mjx.evaluation.errors_table import Errors, Evaluation, read_evaluation
+    from ballu_mjx.recordings.csv_format import list_bundled
+    from ballu_mjx.residuals.envmimic import EnvMimicConfig, check_envmimic_config
+    from ballu_mjx.residuals.run_config import describe_run, find_recordings, run_actuators, run_residual
+    from ballu_mjx.rl import ppo
+    from ballu_mjx.rl.ppo import PPOConfig
+    from ballu_mjx.runs.checkpoints import last_checkpoint
+    from ballu_mjx.runs.folder import Run, read_config, typed_config
+    from ballu_mjx.runs.metrics import read_metrics
+    from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, read_rollouts, write_rollouts
+    from ballu_mjx.viz import report
 
     def errors(scale: float) -> tuple[Errors, ...]:
         table = {horizon: (scale * horizon, 0.1) for horizon in (1.0, 5.0, 10.0)}
@@ -489,17 +499,17 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
         return values
 
     def write(folder: Path) -> Path:
-        sections = {"env": EnvMimicConfig(), "ppo": PPOConfig(), "data": residual_training.Data()}
-        files = {use: [bundled(use)[0]] for use in ("training", "validation", "test")}
-        content = runs.describe("envmimic", sections, files, ["cpu"]) | {"residual": None}
-        with runs.Run(folder, content) as run:
+        sections = {"env": EnvMimicConfig(), "ppo": PPOConfig(), "data": train_envmimic.Data()}
+        files = {use: [list_bundled(use)[0]] for use in ("training", "validation", "test")}
+        content = describe_run("envmimic", sections, files, ["cpu"]) | {"residual": None}
+        with Run(folder, content) as run:
             for step in range(0, 400, 100):
                 run.log(step, {"validation_error": 1.0 - step / 1000})
                 run.log(step, {"reward": 1.0 + step / 1000, "seconds": step / 7, "loss": math.nan})
                 run.save(step, {"w": np.arange(5.0)}, 1.0 - step / 1000, training={"step": np.array(step)})
         (folder / "evaluation.json").write_text(json.dumps(Evaluation(errors(1.0), errors(0.5)).to_json()))
         takes = [
-            Take(
+            StoredRollout(
                 name=name,
                 robot=robot_name,
                 time=0.05 * np.arange(12),
@@ -509,7 +519,7 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
             )
             for name in ("near-1", "far-1")
         ]
-        replay.write(folder / replay.NAME, takes)
+        write_rollouts(folder / ROLLOUT_FILE, takes)
         return folder
 
     example = write(place() / "example")
@@ -519,34 +529,34 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
 
     def read_run(folder: Path) -> Any:
         """As the commands that show, compare, evaluate or go on with a run do, but for its checkpoints."""
-        config = runs.read_config(folder, "envmimic")
+        config = read_config(folder, "envmimic")
         found = [
-            runs.typed(EnvMimicConfig, config, "env", folder, tasks.check),
-            runs.typed(PPOConfig, config, "ppo", folder, learning.check_values),
+            typed_config(EnvMimicConfig, config, "env", folder, check_envmimic_config),
+            typed_config(PPOConfig, config, "ppo", folder, ppo.check_values),
         ]
-        runs.actuators(config, folder)
-        runs.residual(config, folder)
-        runs.find_recordings(config, "training", folder)
+        run_actuators(config, folder)
+        run_residual(config, folder)
+        find_recordings(config, "training", folder)
         report.collect(folder)
         compare.rows([folder])
         compare.figures(folder)
         return found
 
-    def read_metrics(folder: Path) -> Any:
-        rows = runs.read_metrics(folder)
+    def metrics_of(folder: Path) -> Any:
+        rows = read_metrics(folder)
         report.collect(folder)
         return rows
 
-    def read_evaluation(folder: Path) -> Any:
+    def evaluation_of(folder: Path) -> Any:
         report.collect(folder)
-        return evaluation.read(folder / "evaluation.json")
+        return read_evaluation(folder / "evaluation.json")
 
     found = []
     for name, file, damages, read, fault, share in (
         ("config.json of a run", "config.json", JSON, read_run, options_fault, 16),
-        ("metrics.jsonl", "metrics.jsonl", (*TEXT, *[_json_lines] * 5), read_metrics, metrics_fault, 10),
-        ("evaluation.json", "evaluation.json", JSON, read_evaluation, evaluation_fault, 10),
-        ("replay.npz", replay.NAME, ARCHIVE, lambda folder: replay.read(folder / replay.NAME), replay_fault, 10),
+        ("metrics.jsonl", "metrics.jsonl", (*TEXT, *[_json_lines] * 5), metrics_of, metrics_fault, 10),
+        ("evaluation.json", "evaluation.json", JSON, evaluation_of, evaluation_fault, 10),
+        ("replay.npz", ROLLOUT_FILE, ARCHIVE, lambda folder: read_rollouts(folder / ROLLOUT_FILE), replay_fault, 10),
     ):
         folder = copied()
         found.append(Format(name, folder / file, damages, lambda f=folder, r=read: r(f), fault, share))
@@ -554,7 +564,7 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
     def read_checkpoint(folder: Path) -> Any:
         said = io.StringIO()
         with contextlib.redirect_stderr(said):
-            checkpoint = runs.last_checkpoint(folder, training=True)
+            checkpoint = last_checkpoint(folder, training=True)
         if checkpoint.step < 300:
             raise InputError(said.getvalue().rstrip("\n"))
         return checkpoint
@@ -578,9 +588,9 @@ def _import_formats(place: Callable[[], Path], short: Any) -> list[Format]:
     """What `record import` reads."""
     from scipy.spatial.transform import Rotation
 
-    from ballu_mjx import record
-    from ballu_mjx.importers.mapping import ROLES
-    from ballu_mjx.recording import description_path, read_recording
+    from ballu_mjx.cli import record
+    from ballu_mjx.recordings.csv_format import read_recording, sidecar_path
+    from ballu_mjx.recordings.importers.mapping import ROLES
 
     feet, count = short.foot_position, len(short.time)
     positions = dict(zip(ROLES, (short.balloon_position, short.base_position, feet[:, 0], feet[:, 1]), strict=True))
@@ -640,12 +650,12 @@ def _import_formats(place: Callable[[], Path], short: Any) -> list[Format]:
         )
 
         def read() -> Any:
-            for path in (output, description_path(output)):
+            for path in (output, sidecar_path(output)):
                 path.unlink(missing_ok=True)
             record._import(options)
             return read_recording(output)
 
-        written = (output, description_path(output))
+        written = (output, sidecar_path(output))
         found.append(Format(name, folder / damaged, damages, read, recording_fault, share, written))
 
     metres = top + '[units]\nlength = "m"\n' + columns
@@ -693,7 +703,7 @@ class _Controlled:
         self.folder = folder
 
     def __call__(self) -> Any:
-        from ballu_mjx.controller import Controller
+        from ballu_mjx.policies.deploy.controller import Controller
 
         try:
             return Controller(self.folder)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 
 def differences(first: Path, second: Path) -> list[str]:

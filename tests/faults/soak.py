@@ -22,7 +22,7 @@ from typing import Any
 
 from scipy import stats
 
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 
 MOST = 2.0
 """Percent."""
@@ -102,21 +102,21 @@ def main() -> int:
     if options.minutes * 60 < 3 * INTERVAL:
         parser.error(f"--minutes: give {3 * INTERVAL / 60:g} or more")
     runtime.prepare()
-    from ballu_mjx import residual_training
-    from ballu_mjx.envmimic import EnvMimicConfig
-    from ballu_mjx.ppo import PPOConfig
+    from ballu_mjx.cli import train_envmimic
+    from ballu_mjx.residuals.envmimic import EnvMimicConfig
+    from ballu_mjx.rl.ppo import PPOConfig
 
-    sizes = dict(residual_training.QUICK) if options.quick else {}
+    sizes = dict(train_envmimic.QUICK) if options.quick else {}
     steps = round(60 * options.minutes * options.rate)
     config = PPOConfig(**{**sizes, "num_timesteps": steps})
     with tempfile.TemporaryDirectory() as work:
         output = Path(work) / "run"
         sampler = Sampler(output / "metrics.jsonl", options.warm_up, 60 * options.minutes)
         sampler.start()
-        data = residual_training.Data(output=output, quick=options.quick)
+        data = train_envmimic.Data(output=output, quick=options.quick)
         # Shells start what runs in the background with this signal ignored.
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        status = residual_training.train(data, EnvMimicConfig(), config)
+        status = train_envmimic.train(data, EnvMimicConfig(), config)
     if len(sampler.samples) < 3:
         print(f"The training ended before there was anything to see, with {status}.", file=sys.stderr)
         return 1

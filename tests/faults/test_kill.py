@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 from campaign import Trainer
 
-from ballu_mjx import runs
-from ballu_mjx.errors import InputError
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.runs.checkpoints import _read, last_checkpoint, list_checkpoints, restore_checkpoint
+from ballu_mjx.runs.folder import Run
+from ballu_mjx.runs.layout import RUN_FORMAT
+from ballu_mjx.runs.metrics import read_metrics
 
 
 @pytest.fixture(scope="module")
@@ -51,30 +54,28 @@ def test_the_same_training_again_gives_the_same_numbers_to_the_bit(at: Trainer, 
 def test_a_second_process_is_refused_until_the_first_is_killed(at: Trainer):
     folder = at.work / "twice"
     process = at.start(folder)
-    while process.is_alive() and not runs.read_metrics(folder):
+    while process.is_alive() and not read_metrics(folder):
         process.join(0.01)
     before = (folder / "config.json").read_bytes()
-    content = {"format": runs.FORMAT, "task": campaign.TASK, "starts": []}
+    content = {"format": RUN_FORMAT, "task": campaign.TASK, "starts": []}
     with pytest.raises(InputError, match="another process is writing"):
-        runs.Run(folder, content, resumed_at=0)
+        Run(folder, content, resumed_at=0)
     assert process.is_alive() and (folder / "config.json").read_bytes() == before
     process.kill()
     process.join()
-    with runs.Run(folder, content, resumed_at=0):
+    with Run(folder, content, resumed_at=0):
         pass
 
 
 def test_no_damage_to_the_last_checkpoint_passes_for_its_content(undisturbed: Path, tmp_path: Path, capsys):
     """Every file of it, cut off or with a bit turned: what is read is what was written, or the checkpoint before."""
-    last, before = (
-        runs._read(undisturbed, step, training=True) for step in reversed(runs.checkpoints(undisturbed)[-2:])
-    )
+    last, before = (_read(undisturbed, step, training=True) for step in reversed(list_checkpoints(undisturbed)[-2:]))
     random, fallen = np.random.default_rng(), 0
     for file in campaign.checkpoint_files(undisturbed):
         folder = tmp_path / "copy"
         shutil.copytree(undisturbed / "checkpoints", folder / "checkpoints")
         what = campaign.damage(folder / file.relative_to(undisturbed), random)
-        found = runs.last_checkpoint(folder, training=True)
+        found = last_checkpoint(folder, training=True)
         expected = last if found.step == last.step else before
         message = f"{file.name} {what}"
         for name, value in dataclasses.asdict(expected).items():
@@ -91,7 +92,7 @@ def test_no_damage_to_the_last_checkpoint_passes_for_its_content(undisturbed: Pa
 def test_training_goes_on_from_the_checkpoint_before_a_damaged_one(at: Trainer, undisturbed: Path):
     folder = at.work / "damaged"
     shutil.copytree(undisturbed, folder)
-    last = runs.checkpoints(folder)[-1]
+    last = list_checkpoints(folder)[-1]
     (score,) = (
         path for path in (folder / "checkpoints" / str(last) / "metrics").iterdir() if "score" in path.read_text()
     )
@@ -106,11 +107,11 @@ def test_training_goes_on_from_the_checkpoint_before_a_damaged_one(at: Trainer, 
 def test_checkpoints_that_were_exchanged_are_not_taken(undisturbed: Path, tmp_path: Path, capsys):
     """Whole ones: every file of them is as it was written."""
     shutil.copytree(undisturbed / "checkpoints", tmp_path / "checkpoints")
-    steps = runs.checkpoints(tmp_path)
+    steps = list_checkpoints(tmp_path)
     one, other, aside = (tmp_path / "checkpoints" / name for name in (str(steps[-1]), str(steps[-2]), "aside"))
     for old, new in ((one, aside), (other, one), (aside, other)):
         old.rename(new)
-    assert runs.last_checkpoint(tmp_path).step == steps[-3]
+    assert last_checkpoint(tmp_path).step == steps[-3]
     said = capsys.readouterr().err
     assert f"the checkpoint is that of step {steps[-2]}" in said and said.count("\n") == 2
 
@@ -128,8 +129,8 @@ def test_measurements_that_cannot_be_written_end_a_run_in_a_sentence(tmp_path: P
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "metrics.jsonl").symlink_to("/dev/full")
-    content = {"format": runs.FORMAT, "task": campaign.TASK, "starts": []}
-    with pytest.raises(InputError) as error, runs.Run(folder, content) as run:
+    content = {"format": RUN_FORMAT, "task": campaign.TASK, "starts": []}
+    with pytest.raises(InputError) as error, Run(folder, content) as run:
         if saved:
             run.save(80, {"w": np.zeros(3)}, None)
         run.log(160, {"reward": 1.0})
@@ -142,6 +143,6 @@ def test_when_every_checkpoint_is_damaged_one_sentence_says_so(undisturbed: Path
     for record in (tmp_path / "checkpoints").glob("*/record.json"):
         record.write_text("{")
     with pytest.raises(InputError, match="all checkpoints of the run are damaged"):
-        runs.last_checkpoint(tmp_path)
+        last_checkpoint(tmp_path)
     with pytest.raises(InputError, match="the checkpoint is damaged"):
-        runs.restore(tmp_path, "best")
+        restore_checkpoint(tmp_path, "best")

@@ -15,9 +15,13 @@ import mutations
 import numpy as np
 import pytest
 
-from ballu_mjx import compare, record, report, runs
-from ballu_mjx.errors import InputError
-from ballu_mjx.recording import bundled, read_recording
+from ballu_mjx.cli import compare, record
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.csv_format import list_bundled, read_recording
+from ballu_mjx.runs.checkpoints import file_checksums, last_checkpoint, record_checksum, restore_checkpoint
+from ballu_mjx.runs.folder import Run
+from ballu_mjx.runs.layout import RUN_FORMAT
+from ballu_mjx.viz import report
 
 
 def test_damaged_files_are_refused_by_name_or_keep_their_format_s_promises():
@@ -80,15 +84,15 @@ def run(tmp_path: Path) -> Path:
 
 
 def go_on(folder: Path) -> None:
-    with runs.Run(folder, {"format": runs.FORMAT, "task": "envmimic", "starts": []}, resumed_at=300):
+    with Run(folder, {"format": RUN_FORMAT, "task": "envmimic", "starts": []}, resumed_at=300):
         pass
 
 
 def read_all(folder: Path) -> None:
     """Everything that commands read of a run's folder, one after the other whatever is refused."""
     for read in (
-        lambda: runs.last_checkpoint(folder, training=True),
-        lambda: runs.restore(folder, "best"),
+        lambda: last_checkpoint(folder, training=True),
+        lambda: restore_checkpoint(folder, "best"),
         lambda: report.collect(folder),
         lambda: compare.figures(folder),
         lambda: go_on(folder),
@@ -136,8 +140,8 @@ def test_no_checkpoint_with_the_right_checksums_runs_code(run: Path, tmp_path: P
         kept = record_path.read_bytes()
         stored = json.loads(kept)
         stored.pop("sha256")
-        stored["files"] = runs._checksums(place)
-        record_path.write_text(json.dumps({**stored, "sha256": runs._checksum(stored)}))
+        stored["files"] = file_checksums(place)
+        record_path.write_text(json.dumps({**stored, "sha256": record_checksum(stored)}))
         read_all(run)
         file.write_bytes(content)
         record_path.write_bytes(kept)
@@ -148,7 +152,7 @@ def test_no_recording_runs_code(tmp_path: Path, found_classes: list[str]):
     mark = tmp_path / "exploded"
     for name in ("walk.csv", "walk.csv.gz", "walk.json"):
         for ending in (".csv.gz", ".json"):
-            shutil.copy(str(bundled("test")[0]).removesuffix(".csv.gz") + ending, tmp_path / f"walk{ending}")
+            shutil.copy(str(list_bundled("test")[0]).removesuffix(".csv.gz") + ending, tmp_path / f"walk{ending}")
         (tmp_path / name).write_bytes(pickle.dumps(Bomb(mark)))
         path = tmp_path / ("walk.csv" if name == "walk.csv" else "walk.csv.gz")
         with pytest.raises(InputError):

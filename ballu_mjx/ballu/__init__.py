@@ -1,0 +1,1 @@
+"""BALLU: what only this robot has."""

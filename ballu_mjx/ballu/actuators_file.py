@@ -1,0 +1,97 @@
+"""Files of identified actuators, format `ballu-actuators/1`: what `train sysid` writes and `--actuators` reads.
+
+JSON with the keys `format`; `robot`, the name that its recordings carry; `parameters`, each field of
+`model.ActuatorParameters` as [left, right] in SI units and radians (`cable_slack` may be missing: nominal); and
+optionally `standard_errors` alike, `drivetrain` (delay, friction and backlash, which no simulator takes from here; null
+where unknown), `source` (the recordings) and whatever else the user wants to keep there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import reprlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ballu_mjx.ballu.model import CABLE_SLACK, ActuatorParameters
+from ballu_mjx.common import files
+from ballu_mjx.common.errors import InputError, is_number
+
+ACTUATORS_FORMAT = "ballu-actuators/1"
+ACTUATORS_FILE = "actuators.json"
+"""The name under which a robot's file is found beside its recordings."""
+_FIELDS = tuple(field.name for field in dataclasses.fields(ActuatorParameters))
+_POSITIVE = ("knee_spring_stiffness", "motor_gain", "torque_limit")
+_LARGEST_ANGLE = math.pi
+_LARGEST_SLACK = 0.05
+"""m: more than a motor arm of 16 mm can take up."""
+_SMALLEST, _LARGEST = 1e-9, 1e3
+"""Springs, gains and torques beyond this are no robot's of 0.3 kg."""
+
+
+def write_actuators(path: Path, robot: str, parameters: ActuatorParameters, more: Mapping[str, Any]) -> None:
+    """Write `parameters` of the robot named `robot`, with `more` keys beside them."""
+    content = {"format": ACTUATORS_FORMAT, "robot": robot, "parameters": actuators_to_json(parameters), **more}
+    files.write(path, json.dumps(content, indent=2) + "\n")
+
+
+def read_actuators(path: Path) -> tuple[str, ActuatorParameters]:
+    """The robot's name and its parameters.
+
+    **Raises** `InputError` naming file, key and mend.
+    """
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file; `python -m ballu_mjx.train sysid` writes one.")
+    content = files.read_json(path, "restore it or identify again")
+    if content.get("format") != ACTUATORS_FORMAT:
+        raise InputError(f'{path}: "format" is not "{ACTUATORS_FORMAT}"; give a file that `train sysid` wrote.')
+    if not isinstance(content.get("robot"), str) or not content["robot"].strip():
+        raise InputError(f'{path}: "robot" must be the name that the robot\'s recordings carry.')
+    if not isinstance(content.get("parameters"), dict):
+        raise InputError(f'{path}: "parameters" is missing; give a file that `train sysid` wrote.')
+    return content["robot"], actuators_from_json(content["parameters"], path)
+
+
+def find_actuators(recordings: Iterable[Path], robot: str) -> Path | None:
+    """The robot's file beside its recordings: in their folder or the one above."""
+    folders = dict.fromkeys(folder for path in recordings for folder in (path.parent, path.parent.parent))
+    for folder in folders:
+        path = folder / ACTUATORS_FILE
+        if path.is_file() and read_actuators(path)[0] == robot:
+            return path
+    return None
+
+
+def actuators_to_json(parameters: ActuatorParameters) -> dict[str, list[float]]:
+    """Pairs [left, right] by name."""
+    return {name: [float(f"{x:.6g}") for x in np.asarray(getattr(parameters, name))] for name in _FIELDS}
+
+
+def actuators_from_json(values: Mapping[str, Any], path: Path) -> ActuatorParameters:
+    """The inverse of `as_json`.
+
+    **Raises** `InputError` naming `path`, the parameter and the mend.
+    """
+    pairs = []
+    for name in _FIELDS:
+        pair = values.get(name, [CABLE_SLACK] * 2 if name == "cable_slack" else None)
+        if not (isinstance(pair, list) and len(pair) == 2 and all(is_number(x) for x in pair)):
+            raise InputError(f"{path}: {name} must be two numbers, [left, right]; it is {reprlib.repr(pair)}.")
+        if name in _POSITIVE and not _SMALLEST <= min(pair) <= max(pair) <= _LARGEST:
+            raise InputError(f"{path}: {name} is {pair}; it must be greater than 0, and in SI units.")
+        if name == "cable_slack" and not 0 <= min(pair) <= max(pair) <= _LARGEST_SLACK:
+            raise InputError(f"{path}: {name} is {pair}; it must be 0 or more, in metres.")
+        if name not in _POSITIVE and max(map(abs, pair)) > _LARGEST_ANGLE:
+            raise InputError(f"{path}: {name} is {pair}: give it in radians, not degrees.")
+        pairs.append(jnp.array(pair, jnp.float32))
+    unknown = set(values) - set(_FIELDS)
+    if unknown:
+        name = reprlib.repr(sorted(unknown)[0])
+        raise InputError(f"{path}: there is no parameter {name}; there are {', '.join(_FIELDS)}.")
+    return ActuatorParameters(*pairs)

@@ -1,0 +1,168 @@
+"""The parameters of a leg and its drivetrain: units, ranges, and the unbounded coordinates that are searched."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ballu_mjx.ballu.model import SIDES, ActuatorParameters, load_suspended_leg
+from ballu_mjx.common.errors import InputError
+
+LEG_PARAMETERS = tuple(field.name for field in dataclasses.fields(ActuatorParameters))
+"""A leg's parameters, in the order of a vector."""
+DEGREE = float(np.pi / 180)
+
+
+@dataclasses.dataclass(frozen=True)
+class IdentificationConfig:
+    """How actuators are identified. The defaults were chosen by measurement (docs/actuators.md)."""
+
+    torque_limit: bool = True
+    """Identify the servos' torque limits too. The paper's eight parameters alone can tell a weak servo only by a spring
+    stiffer than the robot's."""
+    cable_slack: bool = True
+    """Identify the cables' slack too. Without it, springs and servos come out up to three times too strong."""
+    motion: bool = True
+    """Learn from the whole motion, not from settled angles alone; delay, backlash and dry friction are then further
+    unknowns."""
+    objective: Literal["pointwise", "hausdorff"] = "pointwise"
+    """`pointwise`: least squares over all angles (Levenberg-Marquardt). `hausdorff`: the paper's distance between
+    curves (L-BFGS), started from the pointwise solution; motion has no part in it."""
+    degree: int = 7
+    """Degree of the polynomials fitted to the curves of angle over command."""
+    draws: int = 128
+    """Parameters drawn at random for each leg, beside the nominal ones, to find good starts."""
+    starts: int = 8
+    """Searches for each leg, from the best draws."""
+    steps: int = 25
+    """Most iterations of a search."""
+    seed: int = 0
+    """Seeds the draws."""
+
+
+class ParameterRange(NamedTuple):
+    """What is known of a parameter beforehand."""
+
+    factor: float | None
+    """Bounds are the nominal value divided and multiplied by this; or else:"""
+    reach: tuple[float, float]
+    """Bounds are the nominal value less and plus these (rad, or m)."""
+    prior: float
+    """How much robots differ (standard deviation): relative to the nominal value, or rad, or m."""
+
+
+RANGES: dict[str, ParameterRange] = {
+    "knee_spring_stiffness": ParameterRange(4.0, (0.0, 0.0), 0.3),
+    "motor_gain": ParameterRange(4.0, (0.0, 0.0), 0.3),
+    "default_motor_angle": ParameterRange(None, (20 * DEGREE, 20 * DEGREE), 5 * DEGREE),
+    "default_knee_angle": ParameterRange(None, (15 * DEGREE, 15 * DEGREE), 3 * DEGREE),
+    "torque_limit": ParameterRange(4.0, (0.0, 0.0), 0.3),
+    "cable_slack": ParameterRange(None, (9e-5, 5e-3), 5e-4),
+}
+
+
+class Drivetrain(NamedTuple):
+    """What a command meets on its way to the joints, and what the simulators leave out: identified with the parameters,
+    so that it does not pass for them, and reported."""
+
+    delay: Any
+    """Seconds from a command to the servo's target."""
+    motor_friction: Any
+    """Dry friction (N m)."""
+    knee_friction: Any
+    """Dry friction (N m)."""
+    backlash: Any
+    """Width (rad) of the play between command and motor arm."""
+
+
+FIRST_DRIVETRAIN = Drivetrain(0.03, 2e-3, 5e-4, 1 * DEGREE)
+"""Where the search begins."""
+
+
+def drivetrain_coordinates(values: Drivetrain) -> Float[np.ndarray, " 4"]:
+    """Unbounded coordinates: of the delay linear, of the others logarithms; 0 where the search begins."""
+    others = np.log(np.array(values[1:]) / np.array(FIRST_DRIVETRAIN[1:]))
+    return np.array([(values.delay - FIRST_DRIVETRAIN.delay) / DELAY_UNIT, *others])
+
+
+def drivetrain(coordinates: Float[Array, " 4"]) -> Drivetrain:
+    """The inverse of `drivetrain_coordinates`."""
+    delay, *others = coordinates
+    return Drivetrain(
+        FIRST_DRIVETRAIN.delay + DELAY_UNIT * delay,
+        *(f * jnp.exp(x) for f, x in zip(FIRST_DRIVETRAIN[1:], others, strict=True)),
+    )
+
+
+DELAY_UNIT = 0.01
+"""Seconds of delay that a coordinate of 1 stands for."""
+
+
+class ParameterTransform:
+    """Between a leg's parameters in their units and the unbounded coordinates that are searched.
+
+    A coordinate runs through a logistic function from the lower to the upper bound: of the logarithm for stiffness,
+    gain and torque limit, of the value itself for angles and slack. Parameters that are not free keep their nominal
+    value.
+    """
+
+    def __init__(self, nominal: Float[np.ndarray, " parameters"], config: IdentificationConfig) -> None:
+        ranges = [RANGES[name] for name in LEG_PARAMETERS]
+        factors = np.array([r.factor or 1.0 for r in ranges])
+        below, above = np.array([r.reach for r in ranges]).T
+        self.nominal = nominal
+        self.relative = np.array([r.factor is not None for r in ranges])
+        self.lower, self.upper = nominal / factors - below, nominal * factors + above
+        self.prior = np.array([r.prior for r in ranges]) * np.where(self.relative, nominal, 1.0)
+        """Standard deviation of each parameter among robots, in its units."""
+        self.free = np.isin(LEG_PARAMETERS, free_parameters(config))
+
+    def vector(self, coordinates: Float[Array, " free"]) -> Float[Array, " parameters"]:
+        """A leg's parameters, in their units."""
+        free, relative = self.free, self.relative[self.free]
+        lower, upper = self.lower[free], self.upper[free]
+        ratio = np.where(relative, upper / np.where(relative, lower, 1.0), 1.0)
+        share = jax.nn.sigmoid(coordinates)
+        values = jnp.where(relative, lower * ratio**share, lower + share * (upper - lower))
+        return jnp.asarray(self.nominal).at[np.flatnonzero(free)].set(values)
+
+    def coordinates(self, vector: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " free"]:
+        """The inverse of `vector`, for values within the bounds."""
+        share = (vector - self.lower) / (self.upper - self.lower)
+        logs = [np.log(np.where(self.relative, x, 1.0)) for x in (vector, self.lower, self.upper)]
+        span = np.where(self.relative, logs[2] - logs[1], 1.0)
+        share = np.where(self.relative, (logs[0] - logs[1]) / span, share)[self.free]
+        return np.log(share / (1 - share))
+
+    def draw(self, seed: int, count: int) -> Float[np.ndarray, "draws free"]:
+        """Coordinates: of the nominal values, then of uniform draws from the middle half of the bounds' span."""
+        shares = np.random.default_rng(seed).uniform(0.25, 0.75, (count, int(self.free.sum())))
+        return np.concatenate([self.coordinates(self.nominal)[None], np.log(shares / (1 - shares))])
+
+
+def nominal_leg() -> Float[np.ndarray, " parameters"]:
+    """A leg's nominal parameters."""
+    nominal = ActuatorParameters.nominal(load_suspended_leg(SIDES[0]))
+    return np.concatenate([np.asarray(getattr(nominal, name), float) for name in LEG_PARAMETERS])
+
+
+def check_identification_config(config: IdentificationConfig) -> None:
+    """Refuse sizes that make no sense.
+
+    **Raises** `InputError` naming the option.
+    """
+    for name in ("draws", "starts", "steps", "degree"):
+        if getattr(config, name) < 1:
+            raise InputError(f"--{name} is {getattr(config, name)}: it must be 1 or more; 1 is the nearest.")
+    if config.seed < 0:
+        raise InputError(f"--seed is {config.seed}: it must be 0 or more; 0 is the nearest.")
+
+
+def free_parameters(config: IdentificationConfig) -> tuple[str, ...]:
+    """All but those that have an option of their name which is off."""
+    return tuple(name for name in LEG_PARAMETERS if getattr(config, name, True))

@@ -1,0 +1,171 @@
+"""Figures of BALLU: gaits, actuator curves, recordings, ways from above."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
+
+from ballu_mjx.ballu.identification import Identification
+from ballu_mjx.ballu.model import SIDES
+from ballu_mjx.ballu.sweep import Sweep
+from ballu_mjx.evaluation.gait import planted_feet
+from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.viz.style import COLOURS, LABELS, SIDE_COLOURS, save_figure
+
+
+def gait(
+    path: Path, qpos: Float[np.ndarray, "states nq"], command: Float[np.ndarray, "steps 2"], *, start: float = 6.0
+) -> None:
+    """What a gait looks like: a strip of stick figures from the side, one every quarter of a second; the feet's heights
+    and the commands over time, stance marked (a foot near the floor and at rest; a swinging foot may graze the floor);
+    the way from above.
+
+    Strip and time plots show eight seconds from `start` (s) on; all are at the control rate.
+    """
+    period = CONTROL_TIMESTEP
+    sticks, feet, com = _sticks(qpos)
+    first = min(round(start / period), max(len(qpos) - 2, 0))
+    shown = slice(first, min(first + round(8.0 / period), len(command)))
+    time = np.arange(len(qpos)) * period
+    planted = planted_feet(feet)
+    figure = Figure(figsize=(12.0, 10.0), layout="constrained")
+    strip, heights, commands, above = figure.subplots(4, 1, height_ratios=(1.6, 1.0, 1.0, 1.4))
+    for state in range(shown.start, shown.stop, round(0.25 / period)):
+        for part, colour in (("body", "grey"), (SIDES[0], SIDE_COLOURS[0]), (SIDES[1], SIDE_COLOURS[1])):
+            strip.plot(sticks[part][state, :, 0], sticks[part][state, :, 2], color=colour, linewidth=1.0)
+        strip.plot(*sticks["body"][state, -1, [0, 2]], "o", color="lightgrey", markersize=9)
+    strip.axhline(0.0, color="black", linewidth=0.8)
+    strip.set_aspect("equal", adjustable="datalim")
+    strip.set_xlabel("x (m)")
+    strip.set_ylabel("z (m)")
+    for leg, side in enumerate(SIDES):
+        height = feet[shown, leg, 2]
+        heights.plot(time[shown], height, color=SIDE_COLOURS[leg], label=side)
+        stance = np.where(planted[shown, leg], -0.01 - 0.01 * leg, np.nan)
+        heights.plot(time[shown], stance, color=SIDE_COLOURS[leg], linewidth=3)
+        commands.plot(time[shown], command[shown, leg], color=SIDE_COLOURS[leg])
+    heights.set_ylabel("height of foot (m)")
+    heights.legend(loc="upper right")
+    commands.set_ylabel("command")
+    commands.set_xlabel("time (s)")
+    above.plot(com[:, 0], com[:, 1], color="black", label="centre of mass")
+    for leg, side in enumerate(SIDES):
+        down = feet[planted[:, leg], leg]
+        above.plot(down[:, 0], down[:, 1], ".", color=SIDE_COLOURS[leg], markersize=3, label=f"{side} foot, stance")
+    above.set_aspect("equal", adjustable="datalim")
+    above.set_xlabel("x (m)")
+    above.set_ylabel("y (m)")
+    above.legend(loc="upper right")
+    for axis in (heights, commands, above):
+        axis.grid(alpha=0.3)
+    save_figure(figure, path)
+
+
+def draw_trajectories(
+    path: Path,
+    hardware: Sequence[Float[np.ndarray, "states 3"]],
+    simulated: Sequence[Float[np.ndarray, "states 3"]],
+    simulator: str,
+) -> None:
+    """The centre of mass from above in each trial (m): on the robot, and in the policy's own simulator."""
+    figure = Figure(figsize=(7.0, 6.0), layout="constrained")
+    axis = figure.subplots()
+    for name, runs in ((simulator, simulated), ("recording", hardware)):
+        for index, com in enumerate(runs):
+            label = {"recording": "robot"}.get(name, f"{LABELS[name]} (simulated)") if not index else None
+            axis.plot(com[:, 0], com[:, 1], color=COLOURS[name], label=label, linewidth=1.2)
+            axis.plot(com[-1, 0], com[-1, 1], "o", color=COLOURS[name], markersize=4)
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.set_xlabel("x (m)")
+    axis.set_ylabel("y (m)")
+    axis.grid(alpha=0.3)
+    axis.legend()
+    save_figure(figure, path)
+
+
+def _sticks(qpos: Float[np.ndarray, "states nq"]) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+    """Polylines (m, world) of body and legs, positions of the feet, and the centre of mass, for each state."""
+    model = load_model()
+    data = mujoco.MjData(model)
+    lines: dict[str, list[np.ndarray]] = {"body": [], **{side: [] for side in SIDES}}
+    com = []
+    for state in qpos:
+        data.qpos[:] = state
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        lines["body"].append(np.stack([data.site("base").xpos, data.site("balloon").xpos]))
+        for side in SIDES:
+            leg = [data.body(f"femur_{side}").xpos, data.body(f"tibia_{side}").xpos, data.site(f"foot_{side}").xpos]
+            lines[side].append(np.stack(leg))
+        com.append(data.subtree_com[1].copy())
+    sticks = {part: np.stack(line) for part, line in lines.items()}
+    return sticks, np.stack([sticks[side][:, -1] for side in SIDES], axis=1), np.stack(com)
+
+
+def actuator_curves(path: Path, sweep: Sweep, result: Identification) -> None:
+    """Settled angles over commands, a panel for each joint: measured, nominal and identified (the paper's figure of the
+    actuators); dotted, identified with the drivetrain that belongs to it."""
+    figure = Figure(figsize=(9.0, 6.5), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True, sharey="row")
+    simulations = {"vanilla": result.nominal_settled, "vanilla+sysid": result.settled}
+    for row, joint in enumerate(("motor", "knee")):
+        for column, side in enumerate(SIDES):
+            axis, order = axes[row, column], np.argsort(sweep.command[:, column])
+            command = sweep.command[order, column]
+            for name, angles in simulations.items():
+                curve = np.rad2deg(angles[order, row, column])
+                axis.plot(command, curve, color=COLOURS[name], label=LABELS[name], linewidth=1.5)
+            if result.with_drivetrain is not None:
+                curve = np.rad2deg(result.with_drivetrain[order, row, column])
+                label = f"{LABELS['vanilla+sysid']}, with friction and backlash"
+                axis.plot(command, curve, ":", color=COLOURS["vanilla+sysid"], label=label, linewidth=1.5)
+            measured = np.rad2deg(sweep.settled[order, row, column])
+            axis.plot(command, measured, "o", color=COLOURS["recording"], label="measured", markersize=3.5)
+            axis.set_title(f"{joint}, {side}")
+            axis.grid(alpha=0.3)
+        axes[row, 0].set_ylabel("angle (deg)")
+    for axis in axes[-1]:
+        axis.set_xlabel("command")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    save_figure(figure, path)
+
+
+def recording(path: Path, seen: Recording, gaps: Mapping[str, Sequence[tuple[float, float]]]) -> None:
+    """A recording over time: where the robot goes, heights, how the legs bend, commands. Drop-outs (first and last time
+    by column) are shaded."""
+    panels: list[tuple[str, list[tuple[str, np.ndarray, str]], str]] = []
+    if seen.base_position is not None:
+        panels.append(("base (m)", [(axis, seen.base_position[:, i], f"C{i}") for i, axis in enumerate("xyz")], "base"))
+    if seen.balloon_position is not None and seen.balloon_quaternion is not None:
+        angles = np.rad2deg(Rotation.from_quat(seen.balloon_quaternion, scalar_first=True).as_euler("ZYX"))
+        angles = np.unwrap(angles, axis=0, period=360.0)
+        lines = [(name, angles[:, i], f"C{i}") for i, name in enumerate(("yaw", "pitch", "roll"))]
+        panels.append(("balloon (deg)", lines, "balloon"))
+    if seen.foot_position is not None:
+        lines = [(s, seen.foot_position[:, i, 2], SIDE_COLOURS[i]) for i, s in enumerate(SIDES)]
+        panels.append(("feet, height (m)", lines, "foot"))
+    for name, value in (("motor", seen.motor), ("knee", seen.knee)):
+        if value is not None:
+            lines = [(s, np.rad2deg(value[:, i]), SIDE_COLOURS[i]) for i, s in enumerate(SIDES)]
+            panels.append((f"{name}s (deg)", lines, name))
+    lines = [(s, seen.command[:, i], SIDE_COLOURS[i]) for i, s in enumerate(SIDES)]
+    panels.append(("command", lines, "command"))
+    figure = Figure(figsize=(9.0, 1.0 + 1.7 * len(panels)), layout="constrained")
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, (title, lines, prefix) in zip(axes, panels, strict=True):
+        for label, value, colour in lines:
+            axis.plot(seen.time, value, color=colour, label=label, linewidth=0.9)
+        for first, last in {span for name, spans in gaps.items() if name.startswith(prefix) for span in spans}:
+            axis.axvspan(first, last, color="0.85", linewidth=0)
+        axis.set_ylabel(title)
+        axis.legend(loc="upper right", fontsize="small", ncols=3)
+    axes[-1].set_xlabel("time (s)")
+    axes[0].set_title(f"{seen.name} ({seen.kind}, {seen.robot})")
+    save_figure(figure, path)

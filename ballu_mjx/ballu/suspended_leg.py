@@ -1,0 +1,186 @@
+"""One leg of the nominal robot in MJX, hanging from a base held still."""
+
+from __future__ import annotations
+
+import copy
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from mujoco import mjx
+
+from ballu_mjx.ballu.leg_parameters import FIRST_DRIVETRAIN, LEG_PARAMETERS, Drivetrain
+from ballu_mjx.ballu.model import SERVO_RANGE, SIDES, ActuatorParameters, actuator_fields, load_suspended_leg
+from ballu_mjx.ballu.sweep import SAMPLE_TIMESTEP
+from ballu_mjx.identification.batched_solver import along_directions
+from ballu_mjx.robots.model import with_fields
+from ballu_mjx.sim.step import PhysicsState, make_data, physics_step, put_model, state_at
+from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
+
+
+def leg_actuators(vector: Float[Array, " parameters"]) -> ActuatorParameters:
+    """Of a model with one leg."""
+    return ActuatorParameters(*vector[:, None])
+
+
+class SuspendedLeg:
+    """The nominal robot's leg in MJX, hanging from a base held still, for any actuator parameters.
+
+    The left leg, which serves for both: the right one is its mirror image, and moves alike. Legs come in one batch:
+    one for each command, parameters and direction of a derivative.
+    """
+
+    def __init__(self) -> None:
+        self.model = load_suspended_leg(SIDES[0])
+        joints = [self.model.joint(f"{kind}_{SIDES[0]}") for kind in ("motor", "knee")]
+        self.angles = np.array([joint.qposadr[0] for joint in joints])
+        self._dofs = np.array([joint.dofadr[0] for joint in joints])
+        self._mjx = put_model(self.model)
+        self._data = make_data(self.model)
+        rubbing = copy.copy(self.model)
+        rubbing.dof_frictionloss[self._dofs] = (
+            FIRST_DRIVETRAIN.motor_friction,
+            FIRST_DRIVETRAIN.knee_friction,
+        )  # MJX leaves out those of 0
+        self._rubbing = put_model(rubbing)
+        self._rubbing_data = make_data(rubbing)
+        self._relaxation_damping = np.zeros(self.model.nv)
+        for kind, damping in _RELAXATION_DAMPING.items():
+            self._relaxation_damping[self.model.joint(f"{kind}_{SIDES[0]}").dofadr[0]] = damping
+        self.residual_torque = vmap_with_trailing_batch(self._residual_torque)
+
+    def settled(
+        self, vectors: Float[Array, "legs parameters"], commands: Float[Array, " legs"]
+    ) -> tuple[Float[Array, "legs nq"], Float[Array, "legs nq parameters"]]:
+        """Generalized positions at rest under each leg's command; `[:, self.angles]` are motor and knee (rad). And
+        their derivatives, those of an implicit function."""
+        close = jax.vmap(vmap_with_trailing_batch(self._relaxed_qpos))(vectors, commands)
+        qpos, jacobians = self._rest(close, vectors, commands)
+        nq = self.model.nq
+        return qpos, -jnp.linalg.solve(jacobians[..., :nq], jacobians[..., nq:])
+
+    def motion(
+        self,
+        vector: Float[Array, " parameters"],
+        drivetrain: Drivetrain,
+        command: Float[Array, " times"],
+        begins: Bool[np.ndarray, " times"],
+    ) -> Float[Array, "times 2"]:
+        """One leg's motor and knee angle (rad) every `SAMPLE_TIMESTEP`, each as it was the delay before.
+
+        **Arguments**
+
+        - `command`: held from each time to the next.
+        - `begins`: where the leg is set to rest at the default angles, and the play to its middle.
+
+        Differentiable forwards.
+        """
+        inner = round(SAMPLE_TIMESTEP / float(self.model.opt.timestep))
+
+        def path(vector: Array, drivetrain: Drivetrain, command: Array) -> Array:
+            friction = jnp.zeros(self.model.nv)
+            friction = friction.at[self._dofs].set(jnp.stack([drivetrain.motor_friction, drivetrain.knee_friction]))
+            fields = actuator_fields(self.model, leg_actuators(vector)) | {"dof_frictionloss": friction}
+            model = with_fields(self._rubbing, fields)
+            start = state_at(self._default_qpos(vector), jnp.zeros(self.model.nv))
+            half = drivetrain.backlash / 2 / SERVO_RANGE
+
+            def step(
+                carry: tuple[PhysicsState, Array], now: tuple[Array, Array]
+            ) -> tuple[tuple[PhysicsState, Array], Array]:
+                (state, play), (command, begins) = carry, now
+                state = jax.tree.map(partial(jnp.where, begins), start, state)
+                play = jnp.where(begins, command, jnp.clip(play, command - half, command + half))
+                held = self._rubbing_data.replace(ctrl=play[None])  # pyright: ignore
+                for _ in range(inner):
+                    state = physics_step(model, held, state)
+                return (state, play), state.qpos[self.angles]
+
+            after = jax.lax.scan(step, (start, command[0]), (command, jnp.asarray(begins)))[1]
+            return jnp.concatenate([start.qpos[self.angles][None], after[:-1]])
+
+        moved = vmap_with_trailing_batch(path)(vector, drivetrain, command)
+        times = SAMPLE_TIMESTEP * jnp.arange(len(begins))
+        return jax.vmap(lambda column: jnp.interp(times - drivetrain.delay, times, column), 1, 1)(moved)
+
+    def _residual_torque(
+        self, qpos: Float[Array, " nq"], vector: Float[Array, " parameters"], command: Float[Array, ""]
+    ) -> Float[Array, " nv"]:
+        """Generalized force (N m) that nothing balances, at rest in `qpos`: zero where the leg hangs still."""
+        model = self._with(vector)
+        rest = jnp.zeros(self.model.nv)
+        data = self._data.replace(qpos=qpos, qvel=rest, qacc=rest, ctrl=command[None])  # pyright: ignore
+        data = mjx.fwd_actuation(model, mjx.inverse(model, data))
+        return data.qfrc_actuator - data.qfrc_inverse
+
+    def _with(self, vector: Float[Array, " parameters"]) -> mjx.Model:
+        return with_fields(self._mjx, actuator_fields(self.model, leg_actuators(vector)))
+
+    def _default_qpos(self, vector: Float[Array, " parameters"]) -> Float[Array, " nq"]:
+        rest = [vector[LEG_PARAMETERS.index(name)] for name in ("default_motor_angle", "default_knee_angle")]
+        return jnp.zeros(self.model.nq).at[self.angles].set(jnp.stack(rest))
+
+    def _relaxed_qpos(self, vector: Float[Array, " parameters"], command: Float[Array, ""]) -> Float[Array, " nq"]:
+        """Close to rest, by simulating the way there from command 0, heavily damped and in long steps: whether the
+        cable is taut, the stop holds and the servo saturates is then settled."""
+        model = self._with(vector)
+        # One iteration will do here: what is not exact is Newton's to mend.
+        option = model.opt.replace(timestep=jnp.asarray(_RELAXATION_TIMESTEP), iterations=1, ls_iterations=4)
+        model = model.replace(dof_damping=jnp.asarray(self._relaxation_damping), opt=option)  # pyright: ignore
+        start = state_at(self._default_qpos(vector), jnp.zeros(self.model.nv))
+        held = self._data.replace(ctrl=command[None])  # pyright: ignore
+        step = lambda _, state: physics_step(model, held, state)  # noqa: E731
+        return jax.lax.fori_loop(0, _RELAXATION_STEPS, step, start).qpos
+
+    def _rest(
+        self,
+        close: Float[Array, "legs nq"],
+        vectors: Float[Array, "legs parameters"],
+        commands: Float[Array, " legs"],
+    ) -> tuple[Float[Array, "legs nq"], Float[Array, "legs nv nq+parameters"]]:
+        """Where nothing is left unbalanced, and the derivatives there of what is, by positions and parameters.
+
+        By Newton's method with Levenberg's damping, from close by. Optimistix has such solvers; each holds MJX's
+        program several times over, this one once.
+        """
+        nq = self.model.nq
+        every = jnp.eye(nq + vectors.shape[1])
+        directions = tuple(jnp.tile(x, (len(close), 1, 1)) for x in (every[:, :nq], every[:, nq:]))
+
+        def evaluate(qpos: Array) -> tuple[Array, Array]:
+            return along_directions(self.residual_torque, (qpos, vectors), directions, (commands,))
+
+        def body(state: tuple[Array, ...]) -> tuple[Array, ...]:
+            x, value, jacobian, damping, trial, count = state
+            new_value, new_jacobian = evaluate(trial)
+            better = jnp.sum(new_value**2, axis=1) < jnp.sum(value**2, axis=1)
+            x, value = (jnp.where(better[:, None], *pair) for pair in ((trial, x), (new_value, value)))
+            jacobian = jnp.where(better[:, None, None], new_jacobian, jacobian)
+            damping = jnp.where(better, damping / 100, damping * 10)
+            slope = jacobian[..., :nq]
+            normal = jnp.swapaxes(slope, 1, 2) @ slope
+            damped = normal * (1 + damping[:, None, None] * jnp.eye(nq))
+            step = jnp.linalg.solve(damped, jnp.swapaxes(slope, 1, 2) @ value[..., None])[..., 0]
+            return x, value, jacobian, damping, x - step, count + 1
+
+        def unfinished(state: tuple[Array, ...]) -> Array:
+            x, _, _, _, trial, count = state
+            return (count < _ROOT_STEPS) & ((count == 0) | (jnp.max(jnp.abs(trial - x)) > _ROOT_TOLERANCE))
+
+        legs, nv = len(close), self.model.nv
+        start = (close, jnp.full((legs, nv), jnp.inf), jnp.zeros((legs, nv, len(every))), jnp.full(legs, 1e-4), close)
+        x, _, jacobian, *_ = jax.lax.while_loop(unfinished, body, (*start, jnp.zeros((), int)))
+        return x, jacobian
+
+
+_RELAXATION_TIMESTEP = 0.05
+_RELAXATION_STEPS = 150
+_RELAXATION_DAMPING = {"hip": 0.1, "knee": 0.03, "motor": 0.05}
+"""N m s/rad: more than half the time step times the stiffness of each joint, which keeps such long steps stable."""
+
+
+_ROOT_STEPS = 40
+_ROOT_TOLERANCE = 1e-9
+"""rad: the next step would be lost in rounding."""

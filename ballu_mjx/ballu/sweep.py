@@ -1,0 +1,154 @@
+"""Actuator sweeps: what a suspended recording says about the way from commands to joint angles.
+
+A sweep holds one pair of commands after the other, each until the joints have settled. Identification reads from it
+the settled angles (the paper's data, section "System Identification") and the whole motion.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ballu_mjx.ballu.model import SIDES
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.recording import Recording
+
+LEVELS = 20
+"""Command levels of a sweep (paper)."""
+SAMPLE_TIMESTEP = 0.01
+"""Seconds between two samples of the motion."""
+SHORTEST_HOLD = 0.6
+"""Seconds for which each command must be held at least."""
+_SETTLED_SECONDS = 0.5
+_SETTLED_WITHIN = float(np.deg2rad(0.5))
+"""Drift (rad) within the settled window above which the joints were still moving."""
+_SAME_LEVEL = 0.005
+_REACHES = (0.1, 0.9)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sweep:
+    """Angles (rad) of one or more suspended recordings of a robot, by hold; the last two axes are (motor, knee) and
+    (left, right)."""
+
+    robot: str
+    command: Float[np.ndarray, "holds 2"]
+    """Commands held (left, right)."""
+    settled: Float[np.ndarray, "holds 2 2"]
+    """Means over the last stretch of each hold."""
+    drift: Float[np.ndarray, "holds 2 2"]
+    """How far the second half of that stretch lies from its first."""
+    samples: Int[np.ndarray, " holds"]
+    """Samples in each of those means."""
+    motion: Float[np.ndarray, "times 2 2"]
+    """All angles, every `SAMPLE_TIMESTEP`, one recording after the other."""
+    hold: Int[np.ndarray, " times"]
+    """The hold at each of these times."""
+    begins: Bool[np.ndarray, " times"]
+    """Where a recording begins: what was before has no part in what follows."""
+
+    def means(self, motion: Float[np.ndarray, "times 2 2"]) -> Float[np.ndarray, "holds 2 2"]:
+        """Of a motion like this one: what it comes to at the end of each hold."""
+        count = min(round(_SETTLED_SECONDS / SAMPLE_TIMESTEP), int(np.bincount(self.hold).min()) // 3)
+        return np.array([motion[self.hold == hold][-count:].mean(axis=0) for hold in range(len(self.command))])
+
+    def settled_without(self, left_out: Sequence[int]) -> Sweep:
+        """The settled angles of all other holds, and no motion."""
+        kept = np.setdiff1d(np.arange(len(self.command)), left_out)
+        settled = {name: getattr(self, name)[kept] for name in ("command", "settled", "drift", "samples")}
+        motion = {name: getattr(self, name)[:0] for name in ("motion", "hold", "begins")}
+        return dataclasses.replace(self, **settled, **motion)
+
+
+def read_sweep(recordings: Mapping[Path, Recording], *, levels: int = LEVELS) -> Sweep:
+    """The sweep in one or more suspended recordings of one robot.
+
+    Legs may have been swept together or one after the other.
+
+    **Arguments**
+
+    - `recordings`: by the file that messages name.
+    - `levels`: fewest command levels a leg.
+
+    **Raises** `InputError` for recordings that are sound but no such sweep: of another kind or of several robots, with
+    a leg whose command never moves, with too few levels or levels that do not span [0, 1], with holds too short or
+    joints still moving at their end.
+    """
+    names = ", ".join(str(path) for path in recordings)
+    robots = sorted({recording.robot for recording in recordings.values()})
+    if len(robots) > 1:
+        raise InputError(f"{names}: recordings of several robots ({', '.join(robots)}); identify one at a time.")
+    parts: list[tuple[np.ndarray, ...]] = []
+    for path, recording in recordings.items():
+        if recording.kind != "suspended":
+            raise InputError(
+                f"{path}: is a {recording.kind} recording; actuators are identified from suspended ones (feet off the "
+                'ground, "kind": "suspended").'
+            )
+        parts.append(_holds(path, recording))
+    firsts = np.cumsum([0] + [len(part[0]) for part in parts])
+    command, settled, drift, samples, motion = (np.concatenate([part[i] for part in parts]) for i in range(5))
+    hold = np.concatenate([part[5] + first for part, first in zip(parts, firsts, strict=False)])
+    begins = np.concatenate([np.arange(len(part[5])) == 0 for part in parts])
+    for index, side in enumerate(SIDES):
+        _check_levels(names, side, command[:, index], levels)
+    return Sweep(robots[0], command, settled, drift, samples, motion, hold, begins)
+
+
+def _check_levels(names: str, side: str, command: Float[np.ndarray, " holds"], levels: int) -> None:
+    ordered = np.sort(command)
+    count = 1 + int(np.sum(np.diff(ordered) > _SAME_LEVEL))
+    if count == 1:
+        raise InputError(
+            f"{names}: command_{side} stays at {ordered[0]:g}: the {side} leg was not swept; add a recording in which "
+            "it was."
+        )
+    if count < levels:
+        raise InputError(
+            f"{names}: holds {count} levels of command_{side}; {levels} spread over [0, 1] are needed (--levels "
+            f"{count} accepts these, at the price of larger standard errors)."
+        )
+    if ordered[0] > _REACHES[0] or ordered[-1] < _REACHES[1]:
+        raise InputError(
+            f"{names}: command_{side} goes from {ordered[0]:.2f} to {ordered[-1]:.2f}; spread the levels over [0, 1]."
+        )
+
+
+def _holds(path: Path, recording: Recording) -> tuple[np.ndarray, ...]:
+    """Command, settled angles, drift and samples of each hold of one recording; its motion, and the hold at each
+    time."""
+    assert recording.motor is not None and recording.knee is not None  # mandatory in suspended recordings
+    time, angles = recording.time, np.stack([recording.motor, recording.knee], axis=1)
+    changes = 1 + np.flatnonzero(np.any(np.abs(np.diff(recording.command, axis=0)) > 1e-9, axis=1))
+    starts, ends = np.concatenate([[0], changes]), np.concatenate([changes, [len(time)]])
+    durations = time[ends - 1] - time[starts]
+    if durations.min() < SHORTEST_HOLD:
+        place = int(np.argmin(durations))
+        raise InputError(
+            f"{path}: the command at {time[starts[place]]:.2f} s is held for {durations[place]:.2f} s only; hold each "
+            f"until the joints settle, {SHORTEST_HOLD:g} s or more (2 s is good)."
+        )
+    settled_seconds = min(_SETTLED_SECONDS, durations.min() / 3)
+    settled, drifts, samples = [], [], []
+    for start, end in zip(starts, ends, strict=True):
+        window = angles[start:end][time[start:end] > time[end - 1] - settled_seconds]
+        half = len(window) // 2
+        drift = window[half:].mean(axis=0) - window[:half].mean(axis=0)
+        if np.abs(drift).max() > _SETTLED_WITHIN:
+            raise InputError(
+                f"{path}: a joint still moves by {np.rad2deg(np.abs(drift).max()):.1f} deg at the end of the hold from "
+                f"{time[start]:.2f} s; hold each command for longer."
+            )
+        settled.append(window.mean(axis=0))
+        drifts.append(drift)
+        samples.append(len(window))
+    grid = np.arange(time[0], time[-1] + 1e-9, SAMPLE_TIMESTEP)
+    flat = angles.reshape(len(time), 4)
+    motion = np.stack([np.interp(grid, time, column) for column in flat.T], axis=1).reshape(-1, 2, 2)
+    hold = np.searchsorted(time[starts], grid + 1e-9, side="right") - 1
+    command = recording.command[starts]
+    return command, np.array(settled), np.array(drifts), np.array(samples), motion, hold

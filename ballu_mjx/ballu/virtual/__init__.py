@@ -1,0 +1,1 @@
+"""A virtual BALLU that stands in for the hardware."""

@@ -1,0 +1,426 @@
+"""A stand-in for the hardware: a family of virtual robots in C MuJoCo that the training simulator does not contain.
+
+What differs from `assets/ballu.xml`: a time step of 0.5 ms and explicit (semi-implicit Euler) integration in double
+precision; air, by MuJoCo's ellipsoid model on the balloon cluster (drag, lift, Magnus force) with the added mass that
+model leaves out, and a slow draught that is another one in every trial; servos and cables that differ left to right
+(gain, zero, torque limit, friction, backlash, slack); knee springs and stops likewise; a balloon cluster a little off
+centre; command latency. The robot is seen through motion capture alone: 100 Hz, 0.5 mm, 0.3 deg, hidden markers.
+
+Nothing that trains may import this module's robots: they are known by their recordings only.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from ballu_mjx.ballu.model import (
+    CABLE_SLACK,
+    SERVO_RANGE,
+    SIDES,
+    ActuatorParameters,
+    actuator_fields,
+    standing_qpos,
+    suspend,
+)
+from ballu_mjx.policies.deploy.estimator import Capture, Controller
+from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, assets, load_model, set_fields
+
+PHYSICS_TIMESTEP = 5e-4
+CAPTURE_TIMESTEP = 0.01
+_TICK = 1e-3
+"""Seconds between two looks at the command queue; latency is resolved to it."""
+AIR_DENSITY = 1.2
+AIR_VISCOSITY = 1.8e-5
+POSITION_NOISE = 5e-4
+ORIENTATION_NOISE = float(np.deg2rad(0.3))
+
+
+@dataclasses.dataclass(frozen=True)
+class VirtualRobot:
+    """One robot of the family. Pairs are (left, right); SI units, radians."""
+
+    name: str
+    knee_spring_stiffness: tuple[float, float]
+    """N m/rad."""
+    default_knee_angle: tuple[float, float]
+    """Knee stops (rad)."""
+    knee_friction: tuple[float, float]
+    """Dry friction (N m)."""
+    motor_gain: tuple[float, float]
+    """N m/rad."""
+    default_motor_angle: tuple[float, float]
+    """Motor angle (rad) at command 0."""
+    torque_limit: tuple[float, float]
+    """N m."""
+    motor_friction: tuple[float, float]
+    """Dry friction (N m)."""
+    backlash: tuple[float, float]
+    """Width of the play between command and arm (rad)."""
+    cable_slack: tuple[float, float]
+    """Slack (m) with the motor at 0 and the knee at its stop."""
+    foot_friction: tuple[float, float]
+    """Coefficient of sliding friction between foot and floor."""
+    balloon_offset: tuple[float, float, float]
+    """Centre of lift and mass of the balloon cluster, off the nominal one (m, balloon frame)."""
+    balloon_semi_axes: tuple[float, float, float]
+    """The ellipsoid of air that the cluster displaces (m)."""
+    added_mass: float
+    """Mass of air that the cluster drags along (kg); its weight is carried by lift."""
+    added_inertia: float
+    """Rotational counterpart of `added_mass` (kg m^2)."""
+    buoyancy: float
+    """Lift over the nominal robot's weight."""
+    latency: float
+    """Seconds from a command to the servo's target."""
+
+    @property
+    def actuators(self) -> ActuatorParameters:
+        """What identification of its actuators can hope to find."""
+        names = [field.name for field in dataclasses.fields(ActuatorParameters)]
+        return ActuatorParameters(**{name: jnp.array(getattr(self, name)) for name in names})
+
+
+@dataclasses.dataclass(frozen=True)
+class TrialConditions:
+    """What differs from one trial of the same robot to the next."""
+
+    draught: tuple[float, float, float]
+    """Mean air velocity (m/s, world)."""
+    draught_swing: tuple[float, float]
+    """Amplitude (m/s) and period (s) of the slow change of the draught."""
+    start: tuple[float, float, float]
+    """Offset of the start: x, y (m) and yaw (rad)."""
+    capture_seed: int
+    """Seed of the motion capture's noise and drop-outs."""
+
+
+def still(trial: TrialConditions) -> TrialConditions:
+    """The same without a draught."""
+    return dataclasses.replace(trial, draught=(0.0, 0.0, 0.0), draught_swing=(0.0, trial.draught_swing[1]))
+
+
+def draw_robot(seed: int) -> VirtualRobot:
+    """Draw one robot of the family."""
+    rng = np.random.default_rng([seed, 1])
+
+    def pair(low: float, high: float) -> tuple[float, float]:
+        left, right = rng.uniform(low, high, 2)
+        return float(left), float(right)
+
+    degree = np.pi / 180
+    side = rng.choice([-1.0, 1.0])
+    return VirtualRobot(
+        name=f"virtual-ballu-{seed}",
+        knee_spring_stiffness=pair(0.0125, 0.0210),
+        default_knee_angle=pair(26 * degree, 33 * degree),
+        knee_friction=pair(2e-4, 1.2e-3),
+        motor_gain=pair(0.28, 0.55),
+        default_motor_angle=pair(-6 * degree, 6 * degree),
+        torque_limit=pair(0.055, 0.085),
+        motor_friction=pair(1e-3, 4e-3),
+        backlash=pair(1 * degree, 4 * degree),
+        cable_slack=pair(2e-4, 1.5e-3),
+        foot_friction=pair(0.7, 1.0),
+        balloon_offset=(float(rng.uniform(-0.01, 0.01)), float(side * rng.uniform(0.010, 0.020)), 0.0),
+        balloon_semi_axes=(0.34, 0.36, 0.38),
+        added_mass=float(rng.uniform(0.10, 0.14)),
+        added_inertia=float(rng.uniform(1e-3, 3e-3)),
+        buoyancy=float(rng.uniform(0.83, 0.85)),
+        latency=float(rng.uniform(0.03, 0.07)),
+    )
+
+
+def draw_trial(seed: int) -> TrialConditions:
+    """Draw the circumstances of one trial."""
+    rng = np.random.default_rng([seed, 2])
+    direction, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, 0.06)
+    return TrialConditions(
+        draught=(float(speed * np.cos(direction)), float(speed * np.sin(direction)), 0.0),
+        draught_swing=(float(rng.uniform(0.0, 0.03)), float(rng.uniform(8.0, 25.0))),
+        start=(float(rng.normal(0, 0.01)), float(rng.normal(0, 0.01)), float(rng.normal(0, np.deg2rad(2.0)))),
+        capture_seed=int(rng.integers(2**31)),
+    )
+
+
+def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
+    """The robot's C model. `suspended` welds the base to the world a metre up, for actuator sweeps."""
+    spec = mujoco.MjSpec.from_file(str(assets() / "ballu.xml"))
+    spec.option.timestep = PHYSICS_TIMESTEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    spec.option.iterations, spec.option.ls_iterations, spec.option.tolerance = 50, 50, 1e-9
+    spec.option.density, spec.option.viscosity = AIR_DENSITY, AIR_VISCOSITY
+
+    balloon = spec.body("balloon")
+    centre = np.asarray(balloon.ipos) + virtual.balloon_offset
+    balloon.add_geom(
+        name="air",
+        type=mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+        size=virtual.balloon_semi_axes,
+        pos=centre,
+        contype=0,
+        conaffinity=0,
+        group=4,
+        fluid_ellipsoid=1,
+    )
+    for index, side in enumerate(SIDES):
+        spec.joint(f"knee_{side}").frictionloss = virtual.knee_friction[index]
+        spec.joint(f"motor_{side}").frictionloss = virtual.motor_friction[index]
+        spec.geom(f"foot_{side}").friction[0] = virtual.foot_friction[index]
+    if suspended:
+        suspend(spec)
+    model = spec.compile()
+
+    nominal = load_model()
+    parameters = dataclasses.replace(virtual.actuators, cable_slack=jnp.full(2, CABLE_SLACK))
+    set_fields(model, actuator_fields(model, parameters))
+    model.actuator_forcerange[:] = np.outer(virtual.torque_limit, [-1.0, 1.0])  # in full precision
+    model.tendon_lengthspring[:, 1] += np.array(virtual.cable_slack) - CABLE_SLACK
+
+    index = model.body("balloon").id
+    gravity = np.linalg.norm(model.opt.gravity)
+    lift = virtual.buoyancy * nominal.body_mass.sum() * gravity
+    model.body_ipos[index] = centre
+    model.body_mass[index] += virtual.added_mass
+    model.body_inertia[index] += virtual.added_inertia
+    model.body_gravcomp[index] = (lift + virtual.added_mass * gravity) / (model.body_mass[index] * gravity)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+@dataclasses.dataclass
+class _Servos:
+    """Latency and backlash between the commands as sent and the servos' targets."""
+
+    latency: float
+    backlash: Float[np.ndarray, " 2"]
+    queue: list[tuple[float, np.ndarray]]
+    target: Float[np.ndarray, " 2"]
+
+    def send(self, time: float, command: np.ndarray) -> None:
+        self.queue.append((time + self.latency, command))
+
+    def at(self, time: float) -> np.ndarray:
+        """Targets in command units: the play operator lets a target follow only when pushed by half its width."""
+        while self.queue and self.queue[0][0] <= time + 1e-9:
+            _, command = self.queue.pop(0)
+            half = self.backlash / SERVO_RANGE / 2
+            self.target = np.clip(self.target, command - half, command + half)
+        return np.clip(self.target, 0.0, 1.0)
+
+
+def open_loop(commands: Float[np.ndarray, "steps 2"]) -> Controller:
+    """A controller that plays `commands`, one a control step, and looks at nothing."""
+    frames = round(CONTROL_TIMESTEP / CAPTURE_TIMESTEP)
+    return lambda capture: commands[(len(capture.time) - 1) // frames]
+
+
+def record(
+    virtual: VirtualRobot, trial: TrialConditions, controller: Controller, duration: float, name: str, notes: str = ""
+) -> Recording:
+    """Run one trial of `duration` seconds and return what motion capture saw.
+
+    The robot stands still for two seconds before time 0. Commands change at the control rate (20 Hz); the last
+    command is repeated in the last frame.
+    """
+    return _finish(_simulate(virtual, trial, controller, duration)[0], virtual, name, notes)
+
+
+def record_truth(
+    virtual: VirtualRobot, trial: TrialConditions, controller: Controller, duration: float
+) -> tuple[Float[np.ndarray, "frames nq"], Float[np.ndarray, "frames nv"]]:
+    """The same trial's true generalized positions and velocities, for checking what is made from the recording."""
+    _, qpos, qvel = _simulate(virtual, trial, controller, duration)
+    return qpos, qvel
+
+
+def _simulate(
+    virtual: VirtualRobot, trial: TrialConditions, controller: Controller, duration: float
+) -> tuple[Capture, np.ndarray, np.ndarray]:
+    model = build(virtual)
+    data = mujoco.MjData(model)
+    data.qpos[:] = standing_qpos(model)
+    servos = _Servos(virtual.latency, np.array(virtual.backlash), [], np.zeros(2))
+    mujoco.mj_step(model, data, round(2.0 / PHYSICS_TIMESTEP))
+    _place(model, data, trial)
+
+    rng = np.random.default_rng(trial.capture_seed)
+    capture = Capture([], [], [], [], [], [], [])
+    hidden = _hidden(rng, round(duration / CAPTURE_TIMESTEP) + 1)
+    frames_per_control = round(CONTROL_TIMESTEP / CAPTURE_TIMESTEP)
+    command = np.zeros(2)
+    truth = []
+    for frame in range(len(hidden)):
+        time = frame * CAPTURE_TIMESTEP
+        mujoco.mj_forward(model, data)
+        truth.append((data.qpos.copy(), data.qvel.copy()))
+        _capture_frame(data, rng, hidden[frame], time, capture)
+        if frame % frames_per_control == 0 and frame < len(hidden) - 1:
+            command = np.clip(np.asarray(controller(capture), float), 0.0, 1.0)
+            servos.send(time, command)
+        capture.command.append(command)
+        if frame == len(hidden) - 1:
+            break
+        _advance(model, data, servos, trial, time)
+    qpos, qvel = (np.array(x) for x in zip(*truth, strict=True))
+    return capture, qpos, qvel
+
+
+def _advance(model: mujoco.MjModel, data: mujoco.MjData, servos: _Servos, trial: TrialConditions, time: float) -> None:
+    """On from one frame of the capture, at `time` (s), to the next. Commands arrive with a tick, or with the nearest
+    physics step where these are longer."""
+    model.opt.wind[:] = _wind(trial, time)
+    tick = max(_TICK, model.opt.timestep)
+    for start in time + tick * np.arange(round(CAPTURE_TIMESTEP / tick)):
+        data.ctrl[:] = servos.at(start + (tick - _TICK) / 2)
+        mujoco.mj_step(model, data, round(tick / model.opt.timestep))
+
+
+def carry_on(
+    virtual: VirtualRobot,
+    trial: TrialConditions,
+    commands: Float[np.ndarray, "steps 2"],
+    first: int,
+    state: tuple[Float[np.ndarray, " nq"], Float[np.ndarray, " nv"]],
+    count: int,
+    model: mujoco.MjModel | None = None,
+) -> Float[np.ndarray, "count nq"]:
+    """Take a trial up at its control step `first`, in a given state (qpos, qvel) and with the servos as the commands
+    before have left them: generalized positions after each of `count` control steps.
+
+    `model`: another than the robot's own, of a time step up to the capture's.
+    """
+    model = build(virtual) if model is None else model
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = state
+    servos = _Servos(virtual.latency, np.array(virtual.backlash), [], np.zeros(2))
+    frames = round(CONTROL_TIMESTEP / CAPTURE_TIMESTEP)
+    qpos = []
+    for step, command in enumerate(commands[: first + count]):
+        time = step * CONTROL_TIMESTEP
+        servos.send(time, command)
+        if step < first:
+            servos.at(time)
+            continue
+        for frame in range(frames):
+            _advance(model, data, servos, trial, time + frame * CAPTURE_TIMESTEP)
+        qpos.append(data.qpos.copy())
+    return np.array(qpos)
+
+
+def record_sweep(virtual: VirtualRobot, seed: int, name: str, *, commands: int = 20, hold: float = 2.0) -> Recording:
+    """A suspended actuator sweep: `commands` levels spread uniformly over [0, 1], each held for `hold` seconds."""
+    model = build(virtual, suspended=True)
+    data = mujoco.MjData(model)
+    knees = [model.joint(f"knee_{side}").qposadr[0] for side in SIDES]
+    motors = [model.joint(f"motor_{side}").qposadr[0] for side in SIDES]
+    data.qpos[knees] = virtual.default_knee_angle
+    mujoco.mj_step(model, data, round(2.0 / PHYSICS_TIMESTEP))
+    rng = np.random.default_rng([seed, 3])
+    servos = _Servos(virtual.latency, np.array(virtual.backlash), [], np.zeros(2))
+    frames_per_level = round(hold / CAPTURE_TIMESTEP)
+    ticks_per_frame = round(CAPTURE_TIMESTEP / _TICK)
+    rows = []
+    for level in np.linspace(0.0, 1.0, commands):
+        for frame in range(frames_per_level):
+            time = len(rows) * CAPTURE_TIMESTEP
+            if frame == 0:
+                servos.send(time, np.full(2, level))
+            angles = np.concatenate([data.qpos[motors], data.qpos[knees]])
+            rows.append([time, level, *(angles + rng.normal(0, ORIENTATION_NOISE, 4))])
+            for tick in range(ticks_per_frame):
+                data.ctrl[:] = servos.at(time + tick * _TICK)
+                mujoco.mj_step(model, data, round(_TICK / PHYSICS_TIMESTEP))
+    table = np.array(rows)
+    return Recording(
+        name=name,
+        kind="suspended",
+        robot=virtual.name,
+        notes="Actuator sweep, feet off the ground.",
+        time=table[:, 0],
+        command=np.repeat(table[:, 1:2], 2, axis=1),
+        balloon_position=None,
+        balloon_quaternion=None,
+        base_position=None,
+        base_quaternion=None,
+        foot_position=None,
+        motor=table[:, 2:4],
+        knee=table[:, 4:6],
+        interpolated={},
+    )
+
+
+def _place(model: mujoco.MjModel, data: mujoco.MjData, trial: TrialConditions) -> None:
+    """Turn and shift the standing robot about its base, so that a trial starts near the origin, facing x."""
+    start = Rotation.from_quat(data.qpos[3:7], scalar_first=True)
+    heading = start.as_euler("ZYX")[0]
+    turn = Rotation.from_euler("z", trial.start[2] - heading)
+    data.qpos[:2] = trial.start[:2]
+    data.qpos[3:7] = (turn * start).as_quat(scalar_first=True)
+    data.qvel[:3] = turn.apply(data.qvel[:3])
+
+
+def _wind(trial: TrialConditions, time: float) -> np.ndarray:
+    amplitude, period = trial.draught_swing
+    phase = 2 * np.pi * time / period
+    return np.array(trial.draught) + amplitude * np.array([np.sin(phase), np.cos(phase), 0.0])
+
+
+_MARKERS = 4
+"""Balloon, base and two feet are hidden independently of each other."""
+
+
+def _hidden(rng: np.random.Generator, frames: int) -> np.ndarray:
+    """Which of the marker groups is hidden in which frame: about once in 10 s, for up to 0.15 s."""
+    hidden = np.zeros((frames, _MARKERS), bool)
+    for marker in range(_MARKERS):
+        for _ in range(rng.poisson(frames * CAPTURE_TIMESTEP / 10.0)):
+            start, length = rng.integers(5, max(frames - 20, 6)), rng.integers(2, 16)
+            hidden[start : start + length, marker] = True
+    return hidden
+
+
+def _capture_frame(
+    data: mujoco.MjData, rng: np.random.Generator, hidden: np.ndarray, time: float, capture: Capture
+) -> None:
+    def position(site: str, is_hidden: np.bool) -> np.ndarray:
+        noisy = data.site(site).xpos + rng.normal(0, POSITION_NOISE, 3)
+        return np.full(3, np.nan) if is_hidden else noisy
+
+    def quaternion(body: str, is_hidden: np.bool) -> np.ndarray:
+        noise = Rotation.from_rotvec(rng.normal(0, ORIENTATION_NOISE, 3))
+        noisy = noise * Rotation.from_quat(data.body(body).xquat, scalar_first=True)
+        return np.full(4, np.nan) if is_hidden else noisy.as_quat(scalar_first=True, canonical=True)
+
+    capture.time.append(time)
+    capture.balloon_position.append(position("balloon", hidden[0]))
+    capture.balloon_quaternion.append(quaternion("balloon", hidden[0]))
+    capture.base_position.append(position("base", hidden[1]))
+    capture.base_quaternion.append(quaternion("base", hidden[1]))
+    capture.foot_position.append(np.stack([position(f"foot_{side}", hidden[2 + i]) for i, side in enumerate(SIDES)]))
+
+
+def _finish(capture: Capture, virtual: VirtualRobot, name: str, notes: str) -> Recording:
+    return Recording(
+        name=name,
+        kind="free",
+        robot=virtual.name,
+        notes=notes,
+        time=np.array(capture.time),
+        command=np.array(capture.command),
+        balloon_position=np.array(capture.balloon_position),
+        balloon_quaternion=np.array(capture.balloon_quaternion),
+        base_position=np.array(capture.base_position),
+        base_quaternion=np.array(capture.base_quaternion),
+        foot_position=np.array(capture.foot_position),
+        motor=None,
+        knee=None,
+        interpolated={},
+    )

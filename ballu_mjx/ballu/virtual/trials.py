@@ -1,0 +1,66 @@
+"""Trials of a policy on the virtual robot, beside the same policy in its own simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ballu_mjx.ballu import plots as ballu_plots
+from ballu_mjx.ballu.features import foot_positions
+from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.ballu.virtual.robot import TrialConditions, VirtualRobot
+from ballu_mjx.evaluation.transfer import Trajectory, Transfer, compare_trajectories
+from ballu_mjx.policies.closed_loop import ClosedLoop
+from ballu_mjx.policies.deploy.estimator import PolicyController
+from ballu_mjx.policies.policy import Policy
+from ballu_mjx.recordings.csv_format import read_recording, write_recording
+from ballu_mjx.recordings.reference import stack_motions
+from ballu_mjx.robots.model import load_model
+from ballu_mjx.sim.simulator import Simulator
+
+
+def run_trials(
+    policy: Policy,
+    hardware: VirtualRobot,
+    draws: Sequence[TrialConditions],
+    folder: Path,
+    loop: ClosedLoop | None = None,
+) -> list[Transfer]:
+    """Run each trial in closed loop from motion capture alone, and compare it with the policy's own simulator (`loop`,
+    where that is at hand already) from the same state.
+
+    Leaves in `folder` a recording a trial, and `trials.png`: the ways from above, on the robot and in simulation.
+    """
+    act, seconds = policy.act(), policy.task.trial_seconds
+    recordings = []
+    for number, draw in enumerate(draws):
+        name = f"trial-{number + 1}"
+        notes = f"{policy.task.name}, trained in {policy.setting}, closed loop."
+        recording = virtual_robot.record(hardware, draw, PolicyController(act), seconds, name, notes)
+        path = folder / f"{name}.csv.gz"
+        write_recording(recording, path, decimals=4)
+        recordings.append(read_recording(path))  # reading fills the gaps
+        print(f"{policy.task.name}, {policy.setting}: {name} of {len(draws)} done", flush=True)
+
+    model = load_model(policy.actuators)
+    motions = [reconstruct_ballu(recording, model) for recording in recordings]
+    reference, com = stack_motions(Simulator(model), motions)
+    starts = [np.stack([getattr(motion, name)[0] for motion in motions]) for name in ("qpos", "qvel")]
+    rollout = (loop or policy.closed_loop())(policy.params, starts[0], starts[1], len(motions[0].command))
+    recorded = np.asarray(com), np.asarray(reference.features)
+    hardware_ways = [_way(*(x[i, : len(motion.qpos)] for x in recorded)) for i, motion in enumerate(motions)]
+    simulated = [_way(*states) for states in zip(rollout.com, rollout.features, strict=True)]
+    ballu_plots.draw_trajectories(
+        folder / "trials.png", [way.com for way in hardware_ways], [way.com for way in simulated], policy.setting
+    )
+    ballu_plots.gait(folder / "gait.png", motions[0].qpos, motions[0].command)
+    return [compare_trajectories(sim, real) for sim, real in zip(simulated, hardware_ways, strict=True)]
+
+
+def _way(com: Float[np.ndarray, "T 3"], features: Float[np.ndarray, "T 27"]) -> Trajectory:
+    """Of states as `observation.observe_features` sees them."""
+    return Trajectory(com, features[:, 8], foot_positions(features))

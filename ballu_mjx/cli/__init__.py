@@ -1,0 +1,1 @@
+"""Commands: they parse, print and return exit statuses."""

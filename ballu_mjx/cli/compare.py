@@ -1,0 +1,205 @@
+"""Runs side by side: `python -m ballu_mjx compare RUN RUN...`.
+
+Runs that differ in nothing but their seed are one row: mean, with the 95 % confidence interval (Student's t).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from scipy import stats
+
+from ballu_mjx.common import runtime
+from ballu_mjx.common.errors import InputError
+
+LEVEL = 0.95
+"""Of the confidence intervals."""
+_LAST = 0.1
+"""Part of a training, at its end, over which its reward is averaged."""
+_POINTS = 200
+"""Of a drawn learning curve."""
+_UNTOLD = ("seed", "num_timesteps")
+"""Options in which the runs of a row may differ: of the second, only the part that a run has done counts."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(runtime.CommandOptions):
+    """Compare runs of one task: a table and a plot, mean with 95 % interval over runs that differ in the seed alone."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of runs."""
+    output: Path | None = None
+    """Folder for compare.md and compare.png. Without this option: the table is only printed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """Runs that differ in their seed alone."""
+
+    label: str
+    """The options in which they differ from other rows."""
+    folders: tuple[Path, ...]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit status (`runtime.exit_status`)."""
+
+    def run() -> None:
+        runtime.prepare()
+        _compare(tyro.cli(Options, args=arguments, prog="python -m ballu_mjx compare"))
+
+    return runtime.exit_status(run, arguments)
+
+
+def interval(values: Sequence[float]) -> tuple[float, float]:
+    """Mean, and half the width of its confidence interval: not a number for a single value."""
+    mean = float(np.mean(values))
+    if len(values) < 2:
+        return mean, float("nan")
+    return mean, float(stats.t.ppf((1 + LEVEL) / 2, len(values) - 1) * stats.sem(values))
+
+
+def rows(folders: Sequence[Path]) -> list[Row]:
+    """Runs by what they have in common.
+
+    **Raises** `InputError` where one is no run, or the tasks differ.
+    """
+    from ballu_mjx.policies.tasks import TASKS
+    from ballu_mjx.residuals.trained import RESIDUAL_TASKS
+    from ballu_mjx.runs.folder import read_config
+
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise InputError("A run is given twice; give each once.")
+    configs = [read_config(folder, *RESIDUAL_TASKS, *TASKS) for folder in folders]
+    for folder, config in zip(folders, configs, strict=True):
+        if _kind(config) != _kind(configs[0]):
+            raise InputError(
+                f"{folder}: is a run of {config['task']!r}, {folders[0]} one of {configs[0]['task']!r}; compare runs "
+                "of one task."
+            )
+    options = [_options(config) for config in configs]
+    names = [name for name in options[0] if all(name in each for each in options)]
+    differing = [name for name in names if len({each.get(name) for each in options}) > 1]
+    found: dict[str, list[Path]] = {}
+    for folder, each in zip(folders, options, strict=True):
+        label = ", ".join(f"{name} {each[name]}" for name in differing) or configs[0]["task"]
+        found.setdefault(label, []).append(folder)
+    return [Row(label, tuple(members)) for label, members in found.items()]
+
+
+def figures(folder: Path) -> dict[str, float]:
+    """What a run came to, by name: reward at the end, and ratios to the simulator without forces where it has an
+    evaluation.
+
+    **Raises** `InputError` where the run has not trained yet, or its evaluation is damaged.
+    """
+    from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS, read_evaluation
+    from ballu_mjx.policies.tasks import TASKS
+    from ballu_mjx.residuals.trained import RESIDUAL_TASKS
+    from ballu_mjx.runs.folder import read_config
+    from ballu_mjx.runs.metrics import read_column
+
+    steps, reward = read_column(folder, "reward")
+    path = folder / "evaluation.json"
+    identified = read_config(folder, *RESIDUAL_TASKS, *TASKS)["task"] == "aerodynamic"
+    if not len(steps) and not identified:
+        raise InputError(f"{folder}: has not trained yet (metrics.jsonl holds no reward); leave it out.")
+    found = {"reward at the end": float(reward[steps > (1 - _LAST) * steps[-1]].mean())} if len(steps) else {}
+    if path.exists():
+        evaluation = read_evaluation(path)
+        for group in evaluation.groups:
+            for quantity in ("position", "yaw"):
+                for horizon in SCORE_HORIZONS:
+                    if any(horizon in errors.position for errors in evaluation.vanilla if errors.group == group):
+                        name = f"{group} {quantity}, {horizon:g} s (ratio)"
+                        found[name] = evaluation.ratio(group, quantity, horizon)
+    return found
+
+
+def table(found: Mapping[str, Sequence[Mapping[str, float]]]) -> str:
+    """Markdown: rows by label, a column for each figure that all of their runs have."""
+    everything = [figures for members in found.values() for figures in members]
+    names = [name for name in everything[0] if all(name in figures for figures in everything)]
+    lines = ["| | runs | " + " | ".join(names) + " |", "| --- | ---: |" + " ---: |" * len(names)]
+    for label, members in found.items():
+        cells = []
+        for name in names:
+            mean, half = interval([figures[name] for figures in members])
+            cells.append(f"{mean:.3f}" if np.isnan(half) else f"{mean:.3f} ± {half:.3f}")
+        lines.append(f"| {label} | {len(members)} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def curve(folders: Sequence[Path], name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Control steps, mean and half-width of the interval of what was measured under `name`, as far as all of the runs
+    got; None where one of them has not measured it twice."""
+    from ballu_mjx.runs.metrics import read_column
+
+    columns = [read_column(folder, name) for folder in folders]
+    if min(len(steps) for steps, _ in columns) < 2:
+        return None
+    low, high = max(steps[0] for steps, _ in columns), min(steps[-1] for steps, _ in columns)
+    if low >= high:
+        return None
+    at = np.linspace(low, high, _POINTS)
+    values = np.array([np.interp(at, steps, measured) for steps, measured in columns])
+    mean, half = np.array([interval(column) for column in values.T.tolist()]).T
+    return at, mean, half
+
+
+def _compare(options: Options) -> None:
+    from ballu_mjx.viz import plots
+
+    if not options.runs:
+        raise InputError("No run is given; name the folders of one or more.")
+    found = rows(options.runs)
+    text = table({row.label: [figures(folder) for folder in row.folders] for row in found})
+    print(text)
+    if options.output is None:
+        return
+    options.output.mkdir(parents=True, exist_ok=True)
+    (options.output / "compare.md").write_text(text + "\n", encoding="utf-8")
+    measured = {
+        "reward per control step": "reward",
+        "validation error (ratio to vanilla)": "validation_error",
+        "reward per control step, without exploration (m/s)": "validation_reward",
+    }
+    curves = {
+        title: {row.label: line for row in found if (line := curve(row.folders, name)) is not None}
+        for title, name in measured.items()
+    }
+    plots.compared(options.output / "compare.png", {title: lines for title, lines in curves.items() if lines})
+    print(f"\nWritten to {options.output}.")
+
+
+def _options(config: Mapping[str, Any]) -> dict[str, str]:
+    """What tells a run from others: options of environment and learning, actuators, residual and recordings."""
+    found = {"task": config["task"]} | {
+        name: json.dumps(value)
+        for section in ("env", "ppo", "fit")
+        for name, value in config.get(section, {}).items()
+        if name not in _UNTOLD
+    }
+    found["actuators"] = "nominal" if config.get("actuators") is None else _digest(config["actuators"])
+    for use, files in config.get("recordings", {}).items():
+        found[f"{use} recordings"] = _digest([file["sha256"] for file in files])
+    found["residual"] = config.get("residual") or "none"
+    return found
+
+
+def _kind(config: Mapping[str, Any]) -> str:
+    """What runs may be compared: residuals of whatever kind, and policies of one task."""
+    from ballu_mjx.residuals.trained import RESIDUAL_TASKS
+
+    return "residual" if config["task"] in RESIDUAL_TASKS else config["task"]
+
+
+def _digest(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:6]

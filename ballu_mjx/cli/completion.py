@@ -1,0 +1,50 @@
+"""Completion of the script `ballu_mjx` by the shell: `ballu_mjx completion bash`.
+
+Made by tyro from the options of all commands. JAX, and all that needs it, is imported inside functions:
+`runtime.prepare` has to come first.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, Union
+
+import tyro
+
+from ballu_mjx.common import runtime
+
+PROGRAM = "ballu_mjx"
+SHELLS = ("bash", "zsh")
+
+
+def completion_script(shell: str, commands: Sequence[str]) -> str:
+    """What the shell, one of `SHELLS`, reads to complete subcommands, options, their choices, and in bash paths.
+
+    `commands`: the modules of this package that are commands.
+    """
+    runtime.prepare()
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+        tyro.extras.subcommand_cli_from_dict(
+            {name: _parser(name) for name in commands},
+            prog=PROGRAM,
+            args=["--tyro-print-completion", shell],
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
+        )
+    if shell == "bash":  # tyro completes the paths of options alone
+        text.write(f"complete -o default -F _tyro_{PROGRAM} {PROGRAM}\n")
+    return text.getvalue()
+
+
+def _parser(command: str) -> Any:
+    """What tyro makes a command's parser from."""
+    module = importlib.import_module(f"{__package__}.{command}")
+    return _either(module.subcommands()) if hasattr(module, "subcommands") else module.Options
+
+
+def _either(subcommands: Mapping[str, Callable[..., Any]]) -> Any:
+    each = (Annotated[Any, tyro.conf.subcommand(name, constructor=made)] for name, made in subcommands.items())
+    return Union[tuple(each)]  # noqa: UP007, the members are not known before

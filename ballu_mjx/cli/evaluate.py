@@ -1,0 +1,116 @@
+"""Evaluation from the command line: `python -m ballu_mjx evaluate RUN`.
+
+JAX, and all that needs it, is imported inside functions: `runtime.prepare` has to come first.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+from ballu_mjx.common import files, runtime
+
+if TYPE_CHECKING:
+    from ballu_mjx.evaluation.errors_table import Errors
+    from ballu_mjx.rl.ppo import Params
+from ballu_mjx.residuals.dataset import check_recording
+from ballu_mjx.viz.artifacts import write_evaluation
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(runtime.CommandOptions):
+    """Replay recordings open loop, without and with a run's residual forces, and print the errors of both."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    recordings: tuple[Path, ...] = ()
+    """Recordings to replay, files or folders. Without this option: the run's own for the test."""
+    last: bool = False
+    """Take the last checkpoint instead of the best by validation error."""
+    noise_floor: bool = False
+    """Also tell which errors the noise of motion capture (0.5 mm, 0.3 deg) makes by the starting states alone: no
+    simulator can be expected to do much better."""
+    output: Path | None = None
+    """Folder for evaluation.txt, evaluation.json, tracking.png and replay.npz, the run's own, say. Without this option:
+    the table is only printed."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit status (`runtime.exit_status`)."""
+
+    def run() -> None:
+        runtime.prepare()
+        options = tyro.cli(Options, args=arguments, prog="python -m ballu_mjx evaluate")
+        _evaluate(options)
+
+    return runtime.exit_status(run, arguments)
+
+
+def _evaluate(options: Options) -> None:
+    from ballu_mjx.evaluation.errors_table import base_name
+    from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
+    from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+    from ballu_mjx.recordings.motion import add_capture_noise
+    from ballu_mjx.recordings.reconstruct import reconstruct
+    from ballu_mjx.residuals.run_config import find_recordings, run_robot
+    from ballu_mjx.residuals.trained import RESIDUAL_TASKS, TrainedResidual
+    from ballu_mjx.runs.folder import read_config
+
+    config = read_config(options.run, *RESIDUAL_TASKS)
+    which = "last" if options.last else "best"
+    robot = run_robot(config, options.run)
+    loaded = TrainedResidual.load(options.run, which, description=robot)
+    paths = list_recordings(options.recordings) or find_recordings(config, "test", options.run)
+    recordings = [read_recording(path, robot) for path in paths]
+    for path, recording in zip(paths, recordings, strict=True):
+        check_recording(path, recording, long_enough=True)
+    if options.output is not None:
+        files.check_folder(options.output)
+        options.output.mkdir(parents=True, exist_ok=True)
+
+    if loaded.step:
+        print(f"The {which} checkpoint of {options.run}: step {loaded.step:,}.", flush=True)
+    print("Compiling: half a minute the first time ...", flush=True)
+    model = robot.load_model(loaded.actuators)
+    motions = [reconstruct(recording, model, robot) for recording in recordings]
+    base = base_name(loaded.actuators is not None)
+    evaluator = OpenLoopEvaluator(model, motions, loaded.model, base, robot)
+    result = (
+        evaluator(loaded.params)
+        if options.output is None
+        else write_evaluation(evaluator, loaded.params, options.output)
+    )
+    print(result.table())
+    if options.noise_floor:
+        shaken = [add_capture_noise(recording, seed=number) for number, recording in enumerate(recordings)]
+        floor = evaluator.of_starts([reconstruct(each, model, robot) for each in shaken], loaded.params)
+        print(f"\n{noise_floor(floor, result.residual)}")
+
+
+def noise_floor(floor: Sequence[Errors], errors: Sequence[Errors]) -> str:
+    """For the terminal: by group and horizon, what noise alone makes of a simulator's errors, and what these are."""
+    from ballu_mjx.evaluation.errors_table import mean_by_group
+
+    lines = [
+        "Of these errors, those that the noise of motion capture (0.5 mm, 0.3 deg) in the starting states makes:",
+    ]
+    for noise, ours in zip(mean_by_group(floor), mean_by_group(errors), strict=True):
+        for horizon, (position, _) in noise.position.items():
+            lines.append(
+                f"{noise.group:7}{horizon:>8g} |{position:>14.3f} m of {ours.position[horizon][0]:.3f} m | "
+                f"{noise.yaw[horizon][0]:>6.1f} deg of {ours.yaw[horizon][0]:.1f} deg"
+            )
+    return "\n".join(lines)
+
+
+def load_params(folder: Path, which: Literal["best", "last"]) -> tuple[int, Params]:
+    """Step and parameters of a run's checkpoint; `InputError` where there is none."""
+    from ballu_mjx.rl import ppo
+    from ballu_mjx.runs.checkpoints import restore_checkpoint
+
+    step, tree = restore_checkpoint(folder, which)
+    return step, ppo.from_tree(tree)

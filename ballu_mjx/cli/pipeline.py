@@ -1,0 +1,370 @@
+"""The whole story in one command, on a virtual robot: `python -m ballu_mjx.train all`.
+
+Stages, in the paper's order: an actuator sweep and its identification; vanilla policies; their actions replayed on the
+robot, several times each; one EnvMimic a task, and beyond the paper the air identified from the same recordings;
+policies in all simulators; trials on the robot; tables. With `--rounds`, EnvMimic learns again from the robot under its
+own policies, and they in the simulator that this makes; `--also` adds simulators. Every stage is a folder, and beside
+it stands the key of what it was made from (options, and the keys of the stages it needs): an interrupted run goes on
+where it was, and a changed option redoes what depends on it and nothing else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import itertools
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE
+from ballu_mjx.ballu.leg_parameters import IdentificationConfig
+from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.ballu.virtual.trials import run_trials
+from ballu_mjx.cli import train_aerodynamics, train_envmimic, train_forces, train_policy, train_sysid
+from ballu_mjx.cli.cached_stages import cached_stage
+from ballu_mjx.common import files
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.evaluation import transfer
+from ballu_mjx.evaluation.transfer import Transfer, turning_table, walking_table
+from ballu_mjx.policies.deploy.estimator import Controller, PolicyController
+from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_locomotion_config
+from ballu_mjx.policies.policy import Policy
+from ballu_mjx.policies.tasks import TASKS
+from ballu_mjx.recordings.csv_format import write_recording
+from ballu_mjx.residuals.aerodynamics_fit import AirConfig
+from ballu_mjx.residuals.analytic import AnalyticConfig
+from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.supervised import SupervisedConfig
+from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.robots.model import CONTROL_TIMESTEP
+from ballu_mjx.runs import loggers
+from ballu_mjx.runs.checkpoints import list_checkpoints
+from ballu_mjx.runs.layout import KEPT
+from ballu_mjx.sim.force_model import ForceSet
+from ballu_mjx.viz.style import round_of
+
+TABLES = {"walk": walking_table, "turn": turning_table}
+"""The paper's tables, by task."""
+SETTINGS = ("vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic", "aerodynamic")
+"""The paper's four simulators, and one with the identified air instead of EnvMimic's forces."""
+SHARED = "envmimic-shared"
+"""The setting of one EnvMimic for all tasks."""
+NEAR = "envmimic-near"
+"""The setting with EnvMimic's forces whose policies pay for leaving what these were learned from."""
+WRENCH = "envmimic-wrench"
+"""The setting of an EnvMimic that pushes with a torque too."""
+MORE_SETTINGS = (NEAR, SHARED, WRENCH, "supervised", "analytic")
+"""Settings that are run on request; the last two are networks that regression and gradients learn."""
+ROUNDS = "envmimic"
+"""The setting that `Options.rounds` repeats. Nothing of an earlier round is replaced: later ones have their number
+behind the name."""
+_DECIMALS = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(loggers.LoggingOptions):
+    """What to run, and how long to train."""
+
+    output: Path = Path("runs/all")
+    """Folder of all stages. What is there already and was made with the same options is kept."""
+    robot: int = 0
+    """Which virtual robot of the family stands in for the hardware."""
+    seeds: tuple[int, ...] = (0,)
+    """Seeds of the trainings: each trains every policy and residual anew."""
+    tasks: tuple[Literal["walk", "turn"], ...] = ("walk", "turn")
+    """The paper's two tasks."""
+    trials: int = 5
+    """Trials on the robot for each policy, each in a draught of its own."""
+    takes: int = 2
+    """Recordings of each sequence of actions, each in a draught of its own."""
+    policy_steps: int = 3_000_000
+    """Control steps to train each policy for."""
+    residual_steps: int = 3_000_000
+    """Control steps to train each EnvMimic for."""
+    rounds: int = 1
+    """How often EnvMimic learns. From the second time on, its recordings are joined by the robot's motion under the
+    policies trained the time before, in closed loop; then policies are trained anew: `envmimic-2`, and so on."""
+    also: tuple[Literal["envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised", "analytic"], ...] = ()
+    """Further simulators to train policies in: with EnvMimic's forces, and policies that pay for leaving what these
+    were learned from; with one EnvMimic that learns from the recordings of both tasks, instead of one a task; with one
+    that pushes with a torque too; with the forces that regression (all of them, the paper's baseline), and that
+    gradients through the simulation, learn from the task's."""
+    outside_cost: float = 0.5
+    """What they pay in `envmimic-near`; see `train walk --help`."""
+    quick: bool = False
+    """Every stage within five minutes in all, for one task and two simulators; the tables mean nothing."""
+
+
+def run(options: Options) -> int:
+    """Run what is missing, print the tables; returns the exit status."""
+    started = time.perf_counter()
+    _check(options)
+    settings = settings_of(options)
+    if options.quick:
+        options = dataclasses.replace(options, trials=min(options.trials, 2), takes=1, tasks=options.tasks[:1])
+    results: dict[str, dict[str, list[list[Transfer]]]] = {
+        task: {setting: [] for setting in settings} for task in options.tasks
+    }
+    for seed in options.seeds:
+        story = Story(options, seed)
+        for task in options.tasks:
+            for setting in settings:
+                results[task][setting].append(story.transfers(task, setting))
+    for task in options.tasks:
+        text = TABLES[task](results[task])
+        table_file(options.output, task).write_text(text + "\n", encoding="utf-8")
+        print(f"\n### {task}\n\n{text}\n")
+    if options.quick:
+        print("These numbers mean nothing: --quick trains for seconds.")
+    print(f"Written to {options.output}. {time.perf_counter() - started:.0f} s in all.")
+    return 0
+
+
+def settings_of(options: Options) -> tuple[str, ...]:
+    """The simulators that policies are trained in, in the tables' order."""
+    first = ("vanilla+dr", ROUNDS) if options.quick else SETTINGS
+    return (*first, *(_again(number) for number in range(2, options.rounds + 1)), *options.also)
+
+
+def settings_beyond(folder: Path, task: str) -> tuple[str, ...]:
+    """The settings beyond `SETTINGS` that a seed's folder has policies of: of later rounds, and on request."""
+
+    def there(name: str) -> bool:
+        return (folder / f"{task}-{name}").is_dir()
+
+    return (*itertools.takewhile(there, map(_again, itertools.count(2))), *filter(there, MORE_SETTINGS))
+
+
+def _again(number: int) -> str:
+    """What EnvMimic's setting is called in a round."""
+    return f"{ROUNDS}-{number}" if number > 1 else ROUNDS
+
+
+def residual_folder(seed: Path, task: str, setting: str) -> Path:
+    """Where, in a seed's folder, the residual of a setting is learned."""
+    if setting == SHARED:
+        return seed / SHARED
+    method, number = round_of(ROUNDS if setting == NEAR else setting)
+    return seed / (f"{method}-{task}" if number == 1 else f"{method}-{task}-{number}")
+
+
+def table_file(output: Path, task: str) -> Path:
+    """Where the table of a task is written."""
+    return output / f"table-{task}.md"
+
+
+class Story:
+    """The stages of one seed. Each method makes its stage, and the ones before, unless they are there."""
+
+    def __init__(self, options: Options, seed: int) -> None:
+        self.options, self.seed = options, seed
+        self._robot = virtual_robot.draw_robot(options.robot)
+        self._shared, self._own = options.output, options.output / f"seed-{seed}"
+
+    def sweep(self) -> Path:
+        """An actuator sweep of the robot."""
+
+        def make(folder: Path) -> None:
+            sweep = virtual_robot.record_sweep(self._robot, seed=self.options.robot, name="sweep")
+            write_recording(sweep, folder / "sweep.csv.gz", decimals=_DECIMALS)
+
+        return cached_stage(self._shared / "sweep", {"robot": self.options.robot}, [], make)
+
+    def identified(self) -> Path:
+        """The run of the identification."""
+        sweep = self.sweep()
+        config = IdentificationConfig(**train_sysid.QUICK if self.options.quick else {})
+
+        def make(folder: Path) -> None:
+            recordings = (sweep / "sweep.csv.gz",)
+            data = train_sysid.SweepData(recordings=recordings, output=folder, wandb=self.options.wandb)
+            train_sysid.fit(data, config)
+
+        return cached_stage(self._shared / "sysid", config, [sweep], make)
+
+    def policy(self, task: str, setting: str) -> Path:
+        """The run of a policy's training."""
+        method, _ = round_of(setting)
+        learned = method in ("envmimic", "aerodynamic", *MORE_SETTINGS)
+        config = LocomotionConfig(
+            domain_randomization=learned or setting.endswith("+dr"),
+            outside_cost=self.options.outside_cost if setting == NEAR else 0.0,
+        )
+        quick = train_policy.QUICK if self.options.quick else {"num_timesteps": self.options.policy_steps}
+        ppo = train_policy.defaults(seed=self.seed, **quick)
+        needs = []
+        # Six checkpoints in all, or one a training step: the last three are what is replayed on the robot.
+        data = train_policy.Data(keep_every=max(ppo.num_timesteps // 6, 1), wandb=self.options.wandb)
+        if learned:
+            needs = [self.residual(task, setting)]
+            data = dataclasses.replace(data, residual=needs[0])
+        elif "+sysid" in setting:
+            needs = [self.identified()]
+            data = dataclasses.replace(data, actuators=needs[0] / ACTUATORS_FILE)
+
+        def make(folder: Path) -> None:
+            started = list_checkpoints(folder)
+            where = train_policy.Data(resume=folder, keep_every=data.keep_every, wandb=data.wandb)
+            where = where if started else dataclasses.replace(data, output=folder)
+            _stop_unless_done(train_policy.train(TASKS[task], where, config, ppo))
+
+        return cached_stage(self._own / f"{task}-{setting}", (config, ppo), needs, make)
+
+    def recordings(self, task: str) -> Path:
+        """The robot's motion under the actions of vanilla policies, replayed open loop (paper: several of them, several
+        times each): those of the last checkpoints of two trainings, without and with domain randomization."""
+        settings = ("vanilla+dr",) if self.options.quick else ("vanilla", "vanilla+dr")
+        sources = [self.policy(task, setting) for setting in settings]
+        takes, seconds = self.options.takes, 6.0 if self.options.quick else 20.0
+
+        def make(folder: Path) -> None:
+            sequences = [commands for source in sources for commands in self._actions(source, seconds + 5.0)]
+            jobs = []
+            for index, commands in enumerate(sequences):
+                # The last of the randomized training's sequences validates, a little longer than the others.
+                use = "validation" if index == len(sequences) - 1 else "training"
+                played = commands if use == "validation" else commands[: round(seconds / CONTROL_TIMESTEP)]
+                for take in range(takes):
+                    jobs.append((use, f"actions-{index}-take-{take + 1}", played))
+            for number, (use, name, commands) in enumerate(jobs):
+                controller, length = virtual_robot.open_loop(commands), len(commands) * CONTROL_TIMESTEP
+                draw, notes = _draw(self.seed, task, "recordings", number), f"Actions of a vanilla policy for {task}."
+                self._record(folder / use, name, controller, length, draw, notes)
+                print(f"Recorded {name} ({use}), {number + 1} of {len(jobs)}", flush=True)
+
+        options = {"robot": self.options.robot, "seed": self.seed, "takes": takes, "seconds": seconds}
+        return cached_stage(self._own / f"recordings-{task}", options, sources, make)
+
+    def trained_last(self, task: str, number: int) -> Path:
+        """The robot's motion under the policies of the round before, in closed loop: those of the last checkpoints,
+        each several times; and the last one's once more, a little longer, which validates."""
+        source = self.policy(task, _again(number - 1))
+        takes, seconds = self.options.takes, 6.0 if self.options.quick else 20.0
+
+        def make(folder: Path) -> None:
+            act = {step: Policy.load(source, step).act() for step in _last_steps(source)}
+            jobs = [("training", step, take, seconds) for step in act for take in range(takes)]
+            jobs.append(("validation", max(act), takes, seconds + 5.0))
+            for job, (use, step, take, length) in enumerate(jobs):
+                name = f"round-{number}-policy-{step}-take-{take + 1}"
+                controller = PolicyController(act[step])
+                draw, notes = _draw(self.seed, task, f"round {number}", job), f"A policy for {task}, closed loop."
+                self._record(folder / use, name, controller, length, draw, notes)
+                print(f"Recorded {name} ({use}), {job + 1} of {len(jobs)}", flush=True)
+
+        options = {"robot": self.options.robot, "seed": self.seed, "takes": takes, "seconds": seconds}
+        return cached_stage(self._own / f"recordings-{task}-{number}", options, [source], make)
+
+    def _record(self, folder: Path, name: str, controller: Controller, seconds: float, draw: int, notes: str) -> None:
+        recording = virtual_robot.record(self._robot, virtual_robot.draw_trial(draw), controller, seconds, name, notes)
+        folder.mkdir(exist_ok=True)
+        write_recording(recording, folder / f"{name}.csv.gz", decimals=_DECIMALS)
+
+    def residual(self, task: str, setting: str) -> Path:
+        """The run of a setting's residual, learned from the recordings of the task, those of all rounds up to its
+        own."""
+        method, number = round_of(setting)
+        if method == SHARED:
+            recordings = [self.recordings(each) for each in TABLES]
+        else:
+            recordings = [self.recordings(task), *(self.trained_last(task, n) for n in range(2, number + 1))]
+        identified = self.identified()
+        fits = {"aerodynamic": self._air, "supervised": self._supervised, "analytic": self._analytic}
+        envmimic = functools.partial(self._envmimic, "wrench" if method == WRENCH else "force")
+        options = fits.get(method, envmimic)()
+
+        def make(folder: Path) -> None:
+            sources: dict[str, Any] = {
+                "recordings": tuple(each / "training" for each in recordings),
+                "validation": tuple(each / "validation" for each in recordings),
+                "actuators": identified / ACTUATORS_FILE,
+                "output": folder,
+                "wandb": self.options.wandb,
+            }
+            if isinstance(options, AirConfig):
+                train_aerodynamics.fit(train_aerodynamics.AirData(**sources), options)
+            elif isinstance(options, SupervisedConfig):
+                train_forces.fit_supervised(train_forces.ForcesData(**sources), options)
+            elif isinstance(options, AnalyticConfig):
+                train_forces.fit_analytic(train_forces.ForcesData(**sources), options)
+            else:
+                data = train_envmimic.Data(**sources)
+                if list_checkpoints(folder):
+                    data = train_envmimic.Data(resume=folder, wandb=data.wandb)
+                _stop_unless_done(train_envmimic.train(data, *options))
+
+        needs = [*recordings, identified]
+        return cached_stage(residual_folder(self._own, task, setting), options, needs, make, goes_on=method not in fits)
+
+    def _supervised(self) -> SupervisedConfig:
+        # All of its forces: the paper's baseline, not what is left of it where they do not help.
+        return SupervisedConfig(
+            shares=(1.0,), seed=self.seed, **train_forces.QUICK["supervised"] if self.options.quick else {}
+        )
+
+    def _analytic(self) -> AnalyticConfig:
+        return AnalyticConfig(seed=self.seed, **train_forces.QUICK["analytic"] if self.options.quick else {})
+
+    def _air(self) -> AirConfig:
+        return AirConfig(**train_aerodynamics.QUICK if self.options.quick else {})
+
+    def _envmimic(self, forces: ForceSet) -> tuple[EnvMimicConfig, PPOConfig]:
+        quick = train_envmimic.QUICK if self.options.quick else {"num_timesteps": self.options.residual_steps}
+        return EnvMimicConfig(forces=forces), PPOConfig(seed=self.seed, **quick)
+
+    def transfers(self, task: str, setting: str) -> list[Transfer]:
+        """How the policy's trials on the robot compare with its own simulator."""
+        source = self.policy(task, setting)
+        count = self.options.trials
+
+        def make(folder: Path) -> None:
+            policy = Policy.load(source)
+            draws = [virtual_robot.draw_trial(_draw(self.seed, task, "trials", number)) for number in range(count)]
+            found = run_trials(policy, self._robot, draws, folder)
+            transfer.write_transfer(folder / "transfer.json", found)
+
+        options = {"robot": self.options.robot, "seed": self.seed, "trials": count}
+        folder = cached_stage(self._own / f"trials-{task}-{setting}", options, [source], make)
+        return transfer.read_transfer(folder / "transfer.json")
+
+    def _actions(self, run: Path, seconds: float) -> list[np.ndarray]:
+        """Commands of each of a policy's kept checkpoints over `seconds`, in its own simulator from standing."""
+        policies = [Policy.load(run, step) for step in _last_steps(run)]
+        loop = policies[0].closed_loop()
+        start, count = loop.standing(), round(seconds / CONTROL_TIMESTEP)
+        return [np.round(loop(p.params, *start, count).command[0], 3).astype(float) for p in policies]
+
+
+def _last_steps(run: Path) -> list[int]:
+    """Of a run's last checkpoints; the best may be an earlier one, and the first is of no training at all."""
+    return [step for step in list_checkpoints(run)[-KEPT:] if step > 0]
+
+
+def _draw(seed: int, task: str, use: str, number: int) -> int:
+    """The seed of a trial's circumstances. The same for all settings, which so meet the same draughts."""
+    digest = hashlib.sha256(f"{seed} {task} {use} {number}".encode()).digest()
+    return int.from_bytes(digest[:4], "big")
+
+
+def _stop_unless_done(status: int) -> None:
+    """What a training's exit status means for the story."""
+    if status:
+        raise KeyboardInterrupt
+
+
+def _check(options: Options) -> None:
+    for name in ("trials", "takes", "policy_steps", "residual_steps", "rounds"):
+        if getattr(options, name) < 1:
+            raise InputError(f"--{name.replace('_', '-')} is {getattr(options, name)}: it must be 1 or more.")
+    if not options.seeds or min(options.seeds) < 0 or options.robot < 0:
+        raise InputError("--seeds and --robot take numbers of 0 or more; give at least one seed.")
+    if not options.tasks:
+        raise InputError("--tasks is empty; name walk, turn, or both.")
+    check_locomotion_config(LocomotionConfig(outside_cost=options.outside_cost))
+    if options.output.exists() and not options.output.is_dir():
+        raise InputError(f"{options.output}: is a file; give --output a folder.")
+    files.check_folder(options.output)

@@ -1,0 +1,432 @@
+"""Recordings from the command line: `python -m ballu_mjx record import`, `... check`, `... simulate`.
+
+JAX, and all that needs it, is imported inside functions: `runtime.prepare` has to come first. The stand-in for the
+hardware is imported by `simulate` alone, and what it records leaves as a file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import tyro
+
+from ballu_mjx.common import files, runtime
+from ballu_mjx.common.errors import InputError
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    from ballu_mjx.recordings.importers.mapping import RoomMapping
+    from ballu_mjx.recordings.importers.table import Table
+    from ballu_mjx.recordings.importers.trajectories import Trajectories
+    from ballu_mjx.recordings.recording import Recording
+
+
+LEAST_CONFIDENCE = 0.4
+"""Of an `Alignment`: below it, another offset may as well be meant."""
+LEAST_CORRELATION = 0.35
+"""Below it, the log does not belong to the motion."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Import(runtime.CommandOptions):
+    """Turn a motion-capture file into a recording, with the commands of a log beside it."""
+
+    file: tyro.conf.Positional[Path]
+    """Vicon CSV (Nexus or Tracker), C3D, or a table: a CSV with names in its first row."""
+    mapping: Path
+    """What in it is which part of the robot: a TOML or JSON file, see `example-mapping`."""
+    output: Path
+    """The recording to write, NAME.csv or NAME.csv.gz; NAME.json comes beside it."""
+    commands: Path | None = None
+    """Log of the commands: a CSV. Without this option they must be columns of the table itself."""
+    offset: float | None = None
+    """Seconds to add to the log's times for those of the capture (whose first sample is at 0, or at its own time in a
+    table); 0 for one clock. Without this option the offset is looked for in how the legs move."""
+    offset_range: tuple[float, float] | None = None
+    """Look for the offset between these two only: what tells the periods of a gait apart."""
+    delay: float = 0.05
+    """Seconds from a command as logged to the servo's start, beyond what the nominal robot takes: what an offset that
+    was looked for does not count as the clock's."""
+    format: Literal["auto", "vicon", "c3d", "table"] = "auto"
+    """Of the file. auto: by its ending and first line."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Check(runtime.CommandOptions):
+    """Tell what recordings hold: rate, gaps, ranges and commands. Broken ones are refused, with the place and mend."""
+
+    recordings: tyro.conf.Positional[tuple[Path, ...]]
+    """Recordings, or folders of them."""
+    output: Path | None = None
+    """Folder for a figure of each, NAME.png. Without this option there are none."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulate(runtime.CommandOptions):
+    """Record on the virtual robot: try out a method, or what to send, before the hardware does."""
+
+    output: Path
+    """The recording to write, NAME.csv or NAME.csv.gz; NAME.json comes beside it."""
+    commands: Path | None = None
+    """CSV with the columns time (s), command_left and command_right in [0, 1], played at 20 Hz."""
+    gait: Literal["walking", "turning", "hopping", "one-legged", "telegraph", "waves"] | None = None
+    """A command sequence by name, in place of --commands."""
+    seconds: float = 20.0
+    """Length of the gait."""
+    robot_seed: int = 0
+    """Which robot of the family; 0 is the one of the bundled recordings."""
+    trial_seed: int = 0
+    """Which day: draught, start, noise and drop-outs of motion capture."""
+    suspended: bool = False
+    """An actuator sweep with the feet off the ground, in place of a gait."""
+    levels: int = 20
+    """Commands of the sweep, spread over [0, 1]."""
+    hold: float = 2.0
+    """Seconds for which the sweep holds each."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit status (`runtime.exit_status`)."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+
+    def run() -> int:
+        runtime.prepare()
+        options = tyro.extras.subcommand_cli_from_dict(
+            subcommands(),
+            args=arguments,
+            prog="python -m ballu_mjx record",
+            description="Make and check recordings of the robot. Each subcommand explains its options with --help.",
+            config=(tyro.conf.OmitArgPrefixes,),
+        )
+        return _run(options)
+
+    return runtime.exit_status(run, arguments)
+
+
+def subcommands() -> dict[str, type]:
+    """Options of the subcommands by name."""
+    return {"import": Import, "check": Check, "simulate": Simulate, "example-mapping": _Example}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Example(runtime.CommandOptions):
+    """Print a mapping file with every key and its default: to be saved, and cut down to what your room needs."""
+
+
+def _run(options: Import | Check | Simulate | _Example) -> int:
+    if isinstance(options, Import):
+        _import(options)
+    elif isinstance(options, Check):
+        return _check(options)
+    elif isinstance(options, Simulate):
+        _simulate(options)
+    else:
+        from ballu_mjx.recordings.importers.mapping import EXAMPLE
+
+        print(EXAMPLE, end="")
+    return 0
+
+
+# ---- import ----
+
+
+def _import(options: Import) -> None:
+    from ballu_mjx.recordings.csv_format import recording_name
+    from ballu_mjx.recordings.importers.mapping import read_mapping
+    from ballu_mjx.recordings.importers.placement import place, with_commands
+    from ballu_mjx.recordings.importers.table import Table, commands_in, read_commands
+    from ballu_mjx.recordings.validation import SHORTEST
+
+    _check_output(options.output)
+    if options.offset is not None and options.offset_range is not None:
+        raise InputError("--offset and --offset-range: the one gives what the other looks for; give one of them.")
+    if options.commands is None and (options.offset is not None or options.offset_range is not None):
+        raise InputError("--offset: it is a command log's, and there is none; add --commands.")
+    mapping = read_mapping(options.mapping)
+    trajectories, table = _read(options, mapping)
+    recording = place(trajectories, mapping, recording_name(options.output))
+    if recording.time[-1] - recording.time[0] < SHORTEST:
+        raise InputError(f"{options.file}: lasts less than {SHORTEST:g} s; capture for longer.")
+    print(f"{options.file}: {len(recording.time)} samples, {recording.time[-1] - recording.time[0]:.2f} s")
+    if options.commands is None:
+        if table is None or mapping.commands.left not in table.header:
+            raise InputError(
+                f"{options.file}: holds no commands; give their log by --commands, or name their columns under "
+                f"[commands] in {options.mapping}."
+            )
+        time, command = trajectories.time, commands_in(table, mapping.commands)
+    else:
+        time, command = read_commands(Table(options.commands, options.mapping), mapping.commands)
+        time = time + (_offset(options, recording, time, command) if options.offset is None else options.offset)
+    recording, cut = with_commands(options.commands or options.file, recording, time, command)
+    if max(cut) > 0:
+        print(f"cut off, for there are no commands: {cut[0]:.2f} s at the start, {cut[1]:.2f} s at the end")
+    _write(options, recording)
+
+
+def _read(options: Import, mapping: RoomMapping) -> tuple[Trajectories, Table | None]:
+    from ballu_mjx.recordings.importers.c3d import read_c3d
+    from ballu_mjx.recordings.importers.table import Table, read_table
+    from ballu_mjx.recordings.importers.vicon import is_vicon, read_vicon
+
+    kind = options.format
+    if kind == "auto":
+        if options.file.suffix.lower() == ".c3d":
+            kind = "c3d"
+        else:
+            kind = "vicon" if is_vicon(options.file) else "table"
+    if kind == "c3d":
+        return read_c3d(options.file, mapping), None
+    if kind == "vicon":
+        return read_vicon(options.file, mapping), None
+    table = Table(options.file, options.mapping)
+    return read_table(table, mapping), table
+
+
+def _offset(
+    options: Import, recording: Recording, time: Float[np.ndarray, " N"], command: Float[np.ndarray, "N 2"]
+) -> float:
+    """The log's offset by how the legs move; prints it, and raises `InputError` where it is not clear."""
+    from ballu_mjx.ballu.leg_response import measured_response, nominal_response
+    from ballu_mjx.recordings.clock_alignment import align
+
+    log, by_hand = options.commands, "give the offset by --offset"
+    motion = measured_response(recording)
+    if motion is None:
+        raise InputError(f"{log}: neither knees nor base and feet were captured to find its offset by; {by_hand}.")
+    for path, clock in ((log, time), (options.file, recording.time)):
+        if not 1.0 <= clock[-1] - clock[0] <= _LONGEST_SEARCH:
+            raise InputError(
+                f"{path}: lasts {clock[-1] - clock[0]:.4g} s; offsets are found for 1 to {_LONGEST_SEARCH:g} s, cut it "
+                f"or {by_hand}."
+            )
+    grid, legs = nominal_response(time, command, recording.kind, knees=recording.knee is not None)
+    within = options.offset_range
+    if within is not None:
+        within = min(within) + options.delay, max(within) + options.delay
+    found = align(recording.time, motion, grid, legs, within=within)
+    if found is None:
+        raise InputError(
+            f"{log}: nothing moves in it or in the capture, or too little of the two overlaps; {by_hand}, or mend "
+            "--offset-range."
+        )
+    best, offset = found.best, found.best.offset - options.delay
+    told = f"offset {offset:+.3f} s: correlation {best.correlation:.2f} over {found.overlap:.1f} s"
+    if abs(best.correlation) < LEAST_CORRELATION:
+        raise InputError(
+            f"{log}: fits the motion nowhere, best at {told}; give this trial's log, mend left, right and their ranges "
+            f"in {options.mapping}, or {by_hand}."
+        )
+    if best.correlation < 0:
+        raise InputError(
+            f"{log}: the legs move against the commands, at {told}; turn range_left and range_right round in "
+            f"{options.mapping}, or {by_hand}."
+        )
+    other = found.second
+    if other is not None and found.confidence < LEAST_CONFIDENCE:
+        raise InputError(
+            f"{log}: the commands repeat themselves, and do not tell {told} from {other.offset - options.delay:+.3f} s "
+            f"({other.correlation:.2f}), a confidence of {found.confidence:.2f}; give the right one by --offset, or "
+            "where to look by --offset-range."
+        )
+    print(f"{log}: {told}; good to about {_ALIGNMENT_ERROR:g} s")
+    if other is not None:
+        apart = f"{other.offset - options.delay:+.3f} s, correlation {other.correlation:.2f}"
+        print(f"  next best {apart}: confidence {found.confidence:.2f} of 1")
+    return offset
+
+
+_LONGEST_SEARCH = 7200.0
+"""s."""
+_ALIGNMENT_ERROR = 0.05
+"""s; nine of ten trials of virtual robots (benchmarks/alignment.py)."""
+
+
+def _write(options: Import, recording: Recording) -> None:
+    """Write, and read back what was written: the format's own reader judges it."""
+    from ballu_mjx.recordings.csv_format import read_recording, sidecar_path, write_recording
+
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    write_recording(recording, options.output)
+    try:
+        read = read_recording(options.output)
+    except InputError as error:
+        for path in (options.output, sidecar_path(options.output)):
+            path.unlink()
+        raise InputError(
+            f"{options.file}: gives no recording by {options.mapping}, nothing written: {error}"
+        ) from error
+    duration = read.time[-1] - read.time[0]
+    filled = sum(read.interpolated.values())
+    print(f"{options.output}: {duration:.2f} s, {filled} cells filled in when read; `record check` tells more")
+
+
+def _check_output(output: Path) -> None:
+    """Refuse a name that is none of a recording's, or taken, and a folder that cannot be written to."""
+    from ballu_mjx.recordings.csv_format import sidecar_path
+
+    for path in (output, sidecar_path(output)):
+        if path.exists():
+            raise InputError(f"{path}: stands there already; delete it, or give another --output.")
+    files.check_folder(output.parent)
+
+
+# ---- check ----
+
+
+def _check(options: Check) -> int:
+    from ballu_mjx.ballu import plots as ballu_plots
+    from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+
+    paths = list_recordings(options.recordings)
+    if not paths:
+        raise InputError("There is nothing to check; name a recording, or a folder of them.")
+    if options.output is not None:
+        options.output.mkdir(parents=True, exist_ok=True)
+    broken = 0
+    for path in paths:
+        try:
+            recording = read_recording(path)
+        except InputError as error:
+            print(error, file=sys.stderr)
+            broken += 1
+            continue
+        gaps = missing(path)
+        print(report(path, recording, gaps))
+        if options.output is not None:
+            figure = options.output / f"{recording.name}.png"
+            ballu_plots.recording(figure, recording, gaps)
+            print(f"  drawn in {figure}")
+    return 2 if broken else 0
+
+
+def missing(path: Path) -> dict[str, list[tuple[float, float]]]:
+    """Drop-outs by column of the recording's CSV: first and last time (s) without a sample."""
+    from ballu_mjx.recordings.importers.table import Table
+
+    table = Table(path)
+    time = table.column("time")
+    found: dict[str, list[tuple[float, float]]] = {}
+    for name in table.header:
+        edges = np.diff(np.concatenate([[0], np.isnan(table.column(name)), [0]]))
+        starts, ends = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0) - 1
+        if len(starts):
+            found[name] = [(float(time[a]), float(time[b])) for a, b in zip(starts, ends, strict=True)]
+    return found
+
+
+def report(path: Path, recording: Recording, gaps: dict[str, list[tuple[float, float]]]) -> str:
+    """What a recording holds, in lines."""
+    time = recording.time
+    steps = np.diff(time)
+    step = float(np.median(steps))
+    jitter = 1e3 * float(np.sqrt(np.mean((steps - step) ** 2)))
+    lines = [
+        f"{path}: {recording.kind}, {recording.robot}",
+        f"  {time[-1] - time[0]:.2f} s, {len(time)} samples, {1 / step:.4g} Hz, jitter {jitter:.2f} ms, "
+        f"longest step {1e3 * steps.max():.3g} ms",
+    ]
+    if any(recording.trimmed):
+        lines.append(f"  rows left out, for something is not seen there: {recording.trimmed[0]} at the start, "
+                     f"{recording.trimmed[1]} at the end")  # fmt: skip
+    groups: dict[tuple[tuple[float, float], ...], list[str]] = {}
+    for name, spans in gaps.items():
+        groups.setdefault(tuple(spans), []).append(name)
+    for spans, names in groups.items():
+        lengths = [b - a + step for a, b in spans]
+        shown = names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
+        told = f"{len(spans)} drop-outs, {sum(lengths):.2f} s in all, the longest {max(lengths):.2f} s"
+        lines.append(f"  {shown}: " + (told if len(spans) > 1 else f"1 drop-out of {lengths[0]:.2f} s"))
+    if not gaps:
+        lines.append("  no drop-outs")
+    for label, value in _ranges(recording):
+        low, high = value.min(axis=0), value.max(axis=0)
+        lines.append(f"  {label}: " + ", ".join(f"{a:.3f} to {b:.3f}" for a, b in zip(low, high, strict=True)))
+    for leg, side in enumerate(("left", "right")):
+        command = recording.command[:, leg]
+        changes = int((np.diff(command) != 0).sum())
+        held = (time[-1] - time[0]) / (changes + 1)
+        lines.append(
+            f"  command_{side}: {command.min():.2f} to {command.max():.2f}, mean {command.mean():.2f}, "
+            f"{changes} changes, held for {held:.2f} s on average"
+        )
+    return "\n".join(lines)
+
+
+def _ranges(recording: Recording) -> list[tuple[str, np.ndarray]]:
+    """Columns by what they are called in a report."""
+    feet = recording.foot_position
+    values = [
+        ("balloon x, y, z (m)", recording.balloon_position),
+        ("base x, y, z (m)", recording.base_position),
+        ("left foot x, y, z (m)", None if feet is None else feet[:, 0]),
+        ("right foot x, y, z (m)", None if feet is None else feet[:, 1]),
+        ("motors, left and right (rad)", recording.motor),
+        ("knees, left and right (rad)", recording.knee),
+    ]
+    return [(label, value) for label, value in values if value is not None]
+
+
+# ---- simulate ----
+
+
+def _simulate(options: Simulate) -> None:
+    from ballu_mjx.ballu.virtual import robot as virtual_robot
+    from ballu_mjx.recordings.csv_format import read_recording, recording_name, write_recording
+    from ballu_mjx.robots.model import CONTROL_TIMESTEP
+
+    _check_output(options.output)
+    for name in ("robot_seed", "trial_seed"):
+        if getattr(options, name) < 0:
+            raise InputError(f"--{name.replace('_', '-')} {getattr(options, name)}: seeds are 0 or more.")
+    robot, name = virtual_robot.draw_robot(options.robot_seed), recording_name(options.output)
+    if options.suspended:
+        if options.commands is not None or options.gait is not None:
+            raise InputError("--suspended: a sweep has its own commands; leave --commands and --gait out.")
+        if not (2 <= options.levels <= 1000 and 0.1 <= options.hold <= 60.0):
+            raise InputError("--levels, --hold: give 2 levels or more, and 0.1 to 60 s.")
+        result = virtual_robot.record_sweep(
+            robot, options.trial_seed, name, commands=options.levels, hold=options.hold
+        )  # fmt: skip
+    else:
+        commands, notes = _commands(options)
+        result = virtual_robot.record(
+            robot,
+            virtual_robot.draw_trial(options.trial_seed),
+            virtual_robot.open_loop(commands),
+            len(commands) * CONTROL_TIMESTEP,
+            name,
+            notes,
+        )
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    write_recording(result, options.output, decimals=4)
+    print(report(options.output, read_recording(options.output), missing(options.output)))
+
+
+def _commands(options: Simulate) -> tuple[Float[np.ndarray, "steps 2"], str]:
+    """Commands at the control rate, and what to say of them."""
+    from ballu_mjx.ballu.gaits import GAITS
+    from ballu_mjx.recordings.importers.mapping import Commands
+    from ballu_mjx.recordings.importers.table import Table, read_commands
+    from ballu_mjx.robots.model import CONTROL_TIMESTEP
+
+    if (options.commands is None) == (options.gait is None):
+        raise InputError("--commands, --gait: give one of them, or --suspended for a sweep.")
+    if options.commands is None:
+        if not 1.0 <= options.seconds <= 3600.0:
+            raise InputError(f"--seconds {options.seconds:g}: give 1 to 3600 s.")
+        assert options.gait is not None
+        gaits: dict[str, Callable[[float], Float[np.ndarray, "steps 2"]]] = dict(GAITS)
+        return gaits[options.gait](options.seconds), f"{options.gait}, open loop."
+    time, command = read_commands(Table(options.commands), Commands())
+    steps = int(round((time[-1] - time[0]) / CONTROL_TIMESTEP, 6)) + 1
+    if not 1.0 <= steps * CONTROL_TIMESTEP <= 3600.0:
+        raise InputError(f"{options.commands}: lasts {steps * CONTROL_TIMESTEP:g} s; give 1 to 3600 s.")
+    held = np.searchsorted(time, time[0] + CONTROL_TIMESTEP * np.arange(steps) + 1e-6, side="right") - 1
+    return command[held], f"{options.commands.name}, open loop."

@@ -1,0 +1,75 @@
+"""`python -m ballu_mjx report RUN`: a run as one page for the browser."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import webbrowser
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from ballu_mjx.common import files, runtime
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.viz import video
+
+if TYPE_CHECKING:
+    pass
+from ballu_mjx.viz.report import REPORT_FILE, collect, render
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(runtime.CommandOptions):
+    """Write a run, or a folder of `train all`, as one page for the browser, which needs no network."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of the run, or of `train all`."""
+    output: Path | None = None
+    """File to write. Without this option: report.html in the run's folder."""
+    open: bool = False
+    """Show it in the browser."""
+    video: bool = False
+    """Write the replay as MP4 too, beside the page."""
+    show: str | None = None
+    """Recording (or task) that the video shows. Without this option: the first."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit status (`runtime.exit_status`)."""
+
+    def run() -> None:
+        options = tyro.cli(Options, args=arguments, prog="python -m ballu_mjx report")
+        if options.video:
+            video.choose_renderer()
+        runtime.prepare()
+        _report(options)
+
+    return runtime.exit_status(run, arguments)
+
+
+def _report(options: Options) -> None:
+    path = options.output or options.run / REPORT_FILE
+    if path.is_dir():
+        raise InputError(f"--output {path}: is a folder; give a file.")
+    content = collect(options.run)
+    if options.show is not None and options.show not in (names := [take.name for take in content.takes]):
+        raise InputError(f"--show {options.show}: there is no such replay; one of {', '.join(names) or 'none'}.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files.write(path, render(content))
+    print(f"Written to {path}, {path.stat().st_size / 1e6:.1f} MB.")
+    if not content.takes:
+        print(
+            "It has no replay in 3D: identifications have none, nor have robots but BALLU; an EnvMimic's is written "
+            "by `python -m ballu_mjx evaluate RUN --output RUN`."
+        )
+    elif options.video:
+        shown = next(take for take in content.takes if options.show in (None, take.name))
+        try:
+            video.write(path.with_suffix(".mp4"), shown)
+            print(f"Written to {path.with_suffix('.mp4')}: {shown.name}.")
+        except InputError as error:
+            print(error, file=sys.stderr)
+    if options.open:
+        webbrowser.open(path.resolve().as_uri())

@@ -1,0 +1,276 @@
+"""A run or a recording, live in 3D: `python -m ballu_mjx view RUN`.
+
+JAX, MuJoCo, and all that needs them, are imported inside functions: `runtime.prepare` has to come first.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+import warnings
+import webbrowser
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import tyro
+
+from ballu_mjx.common import runtime
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, read_rollouts
+
+if TYPE_CHECKING:
+    from ballu_mjx.viz.viser_scene import LocalServer
+
+
+_SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
+_FRAME = 1.0 / 40.0
+"""Seconds between two looks at the clock."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(runtime.CommandOptions):
+    """Show the replay of a run, or a recording as it is reconstructed, in 3D: in the browser, on this machine alone."""
+
+    source: tyro.conf.Positional[Path]
+    """Folder of a run or of `train all`, or a recording (.csv or .csv.gz)."""
+    port: int = 8080
+    """Port to serve at on 127.0.0.1; where it is taken, the next that is free."""
+    open: bool = False
+    """Show it in the browser at once."""
+    mujoco: bool = False
+    """Open MuJoCo's own viewer instead, which needs a screen."""
+    show: str | None = None
+    """Recording (or task) to begin with. Without this option: the first."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command until it is interrupted; returns the exit status (`runtime.exit_status`)."""
+
+    def run() -> None:
+        try:
+            options = tyro.cli(Options, args=arguments, prog="python -m ballu_mjx view")
+            if not 0 <= options.port <= 65535:
+                raise InputError(f"--port is {options.port}: it must be between 0 and 65535.")
+            if options.mujoco:
+                check_screen()
+            runtime.prepare()
+            takes = load(options.source)
+            first = choose(takes, options.show)
+            if options.mujoco:
+                _mujoco(takes[first])
+            else:
+                _serve(takes, first, options)
+        except KeyboardInterrupt:  # the way to close it
+            print("Closed.", file=sys.stderr)
+
+    return runtime.exit_status(run, arguments)
+
+
+def load(source: Path) -> list[StoredRollout]:
+    """What there is to show of a run's folder or a recording.
+
+    **Raises** `InputError` where it is neither, or holds no replay.
+    """
+    if source.is_dir():
+        from ballu_mjx.viz.report import collect
+
+        takes = collect(source).takes
+        return takes or read_rollouts(source / ROLLOUT_FILE)
+    from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+    from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+    from ballu_mjx.robots.model import load_model
+
+    recording = read_recording(list_recordings([source])[0])
+    if recording.kind != "free":
+        raise InputError(f"{source}: is a {recording.kind} recording; only free ones have a way to show.")
+    print("Reconstructing the recorded states ...", flush=True)
+    motion = reconstruct_ballu(recording, load_model())
+    return [
+        StoredRollout(
+            name=motion.name,
+            robot=motion.robot,
+            time=motion.time,
+            qpos={"recording": motion.qpos},
+            command=motion.command,
+        )
+    ]
+
+
+def choose(takes: Sequence[StoredRollout], name: str | None) -> int:
+    """Place of the take of that name; the first for None.
+
+    **Raises** `InputError` where there is none.
+    """
+    names = [take.name for take in takes]
+    if name is None:
+        return 0
+    if name not in names:
+        raise InputError(f"--show {name}: there is no such replay; give one of {', '.join(names)}.")
+    return names.index(name)
+
+
+def check_screen() -> None:
+    """**Raises** `InputError` where there is no screen for MuJoCo's viewer."""
+    import glfw
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        there = glfw.init()
+    if not there:
+        raise InputError("--mujoco: there is no screen for MuJoCo's viewer; leave the option out to use a browser.")
+
+
+class Player:
+    """Takes on a server, with controls; `advance` lets time pass."""
+
+    def __init__(self, server: LocalServer, takes: Sequence[StoredRollout], first: int = 0) -> None:
+        self._server, self._takes = server, takes
+        names = _distinct([take.name for take in takes])
+        gui = server.gui
+        self.take = gui.add_dropdown("show", names, initial_value=names[first])
+        self._robot = gui.add_text("robot", "", disabled=True)
+        self.play = gui.add_checkbox("play", True)
+        self.clock = gui.add_slider("time (s)", 0.0, 1.0, 0.01, 0.0)
+        self.speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1")
+        self.follow = gui.add_checkbox("follow", True)
+        self._force = gui.add_text("residual force (N)", "", disabled=True)
+        self._names = names
+        self._scrubbed = False
+        self._folder: Any = None
+        self._boxes: list[Any] = []
+        self._shown: tuple[str, int] | None = None
+        self._load()
+
+        @self.clock.on_update
+        def _(event: Any) -> None:
+            self._scrubbed = self._scrubbed or event.client is not None
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass while it plays, from the start again after the end, and show what is the case then."""
+        if self._shown is None or self._shown[0] != self.take.value:
+            self._load()
+        take, end = self._stage.take, self.clock.max
+        now = float(self.clock.value)
+        if self.play.value and not self._scrubbed:
+            now = now + seconds * float(self.speed.value) if now < end else 0.0
+            self.clock.value = min(now, end)
+        self._scrubbed = False
+        # The states are evenly spaced but for the last digits.
+        state = int(np.argmin(np.abs(take.time - take.time[0] - now)))
+        for name, box in zip(self._stage.robots, self._boxes, strict=True):
+            self._stage.robots[name].visible = box.value
+        centre = self._stage.centre(state) if self.follow.value else np.zeros(3)
+        self._stage.world.position = (-centre[0], -centre[1], 0.0)
+        if (self.take.value, state) != self._shown:
+            self._show(state)
+
+    @property
+    def state(self) -> int:
+        """The state that is shown."""
+        return 0 if self._shown is None else self._shown[1]
+
+    def _load(self) -> None:
+        from ballu_mjx.viz.style import label_of
+        from ballu_mjx.viz.viser_scene import RobotScene
+
+        take = self._takes[self._names.index(self.take.value)]
+        self._server.scene.reset()
+        self._server.scene.set_up_direction("+z")
+        self._stage = RobotScene(self._server, take)
+        for client in self._server.get_clients().values():
+            client.camera.position, client.camera.look_at = self._close()
+        self._server.initial_camera.position, self._server.initial_camera.look_at = self._close()
+        self._robot.value = take.robot
+        self.clock.value = 0.0
+        self.clock.max = float(take.time[-1] - take.time[0])
+        if self._folder is not None:
+            self._folder.remove()
+        self._folder = self._server.gui.add_folder("robots")
+        with self._folder:
+            self._boxes = [self._server.gui.add_checkbox(label_of(name), True) for name in take.qpos]
+        self._show(0)
+
+    def _close(self) -> tuple[np.ndarray, np.ndarray]:
+        """A camera beside robots that are followed."""
+        target = np.array([0.0, 0.0, 0.65])
+        return target + np.array([-0.9, -2.6, 0.5]), target
+
+    def _show(self, state: int) -> None:
+        from ballu_mjx.viz import robot_meshes
+
+        self._stage.show(state)
+        force = robot_meshes.force_at(self._stage.take, state)
+        self._force.value = "" if force is None else "  ".join(f"{component:+.3f}" for component in force)
+        self._shown = (self.take.value, state)
+
+
+def _serve(takes: Sequence[StoredRollout], first: int, options: Options) -> None:
+    try:
+        from ballu_mjx.viz import viser_scene
+    except ImportError as error:
+        raise InputError(
+            f"The viewer needs {error.name}, which comes with the extra report: pip install -c constraints.txt -e "
+            '".[report]".'
+        ) from None
+    server = viser_scene.serve(options.port)
+    try:
+        player = Player(server, takes, first)
+        address = f"http://{viser_scene.HOST}:{server.get_port()}"
+        print(f"{address}, on this machine alone; Ctrl-C closes it.", flush=True)
+        if options.open:
+            webbrowser.open(address)
+        before = time.perf_counter()
+        while True:
+            time.sleep(_FRAME)
+            now = time.perf_counter()
+            player.advance(now - before)
+            before = now
+    finally:
+        server.stop()
+
+
+def _mujoco(take: StoredRollout) -> None:
+    """Show a take in MuJoCo's viewer, over and over, until its window is closed; the space bar pauses."""
+    import mujoco
+    import mujoco.viewer
+
+    from ballu_mjx.robots.model import load_model
+    from ballu_mjx.viz import robot_meshes
+
+    model = load_model()
+    data = mujoco.MjData(model)
+    drawn = mujoco.MjData(model)
+    playing = True
+
+    def key(code: int) -> None:
+        nonlocal playing
+        playing = playing != (code == ord(" "))
+
+    try:
+        window = mujoco.viewer.launch_passive(model, data, key_callback=key, show_left_ui=False, show_right_ui=False)
+    except RuntimeError as error:
+        raise InputError(f"--mujoco: {str(error).strip()}") from None
+    with window:
+        robot_meshes.hide_robot(window.opt)
+        now, before = 0.0, time.perf_counter()
+        while window.is_running():
+            time.sleep(_FRAME)
+            elapsed, before = time.perf_counter() - before, time.perf_counter()
+            now = (now + elapsed * playing) % float(take.time[-1] - take.time[0])
+            state = int(np.argmin(np.abs(take.time - take.time[0] - now)))
+            robots = {name: qpos[state] for name, qpos in take.qpos.items()}
+            force = robot_meshes.force_at(take, state) if robot_meshes.pushed(take) else None
+            with window.lock():
+                scene = window.user_scn
+                if scene is not None:
+                    scene.ngeom = 0
+                    robot_meshes.draw(scene, model, drawn, robots, force)
+            window.sync()
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """Names that no two have, for a list to choose from."""
+    return [name if names.count(name) == 1 else f"{name} ({index + 1})" for index, name in enumerate(names)]

@@ -1,0 +1,1 @@
+"""The ground under everything: errors, files, start-up. Knows no robot."""

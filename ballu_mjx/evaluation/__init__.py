@@ -1,0 +1,1 @@
+"""Stage 5: how well a simulator predicts, and how well a policy transfers."""

@@ -1,0 +1,87 @@
+"""Several Optimistix searches side by side in one compiled program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+
+def along_directions(
+    function: Callable[..., Array],
+    points: tuple[Float[Array, "n _"] | Float[Array, " n"], ...],
+    directions: tuple[Float[Array, "n k _"] | Float[Array, "n k"], ...],
+    held: tuple[Float[Array, "n ..."], ...],
+) -> tuple[Float[Array, "n ..."], Float[Array, "n ... k"]]:
+    """Values of `function(*point, *held)` at n points, and how they change along k directions at each.
+
+    In one batch of n k: batches within batches are traced once more each, and run in shorter loops.
+    """
+    n, k = directions[0].shape[:2]
+    points, held = (tuple(jnp.repeat(x, k, axis=0) for x in group) for group in (points, held))
+    directions = tuple(x.reshape(n * k, *x.shape[2:]) for x in directions)
+
+    def one(point: tuple[Array, ...], direction: tuple[Array, ...], held: tuple[Array, ...]) -> tuple[Array, Array]:
+        return jax.jvp(lambda *point: function(*point, *held), point, direction)
+
+    values, changes = jax.vmap(one)(points, directions, held)
+    return values[::k], jnp.moveaxis(changes.reshape(n, k, *changes.shape[1:]), 1, -1)
+
+
+Evaluate = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Coordinates (batch, size) to values (batch, n) and Jacobians (batch, n, size)."""
+
+
+class BatchedSolver:
+    """An Optimistix solver, for several starts side by side, one iteration at a time.
+
+    The solver's program holds no physics: values and Jacobians at the points that it tries next are computed outside
+    and handed in. MJX, which takes by far the longest to compile, then stands in one program for all solvers and
+    stages.
+    """
+
+    def __init__(self, solver: Any) -> None:
+        least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
+
+        @jax.custom_jvp
+        def known(y: Array, value: Array, jacobian: Array) -> Array:
+            return value
+
+        @known.defjvp
+        def _(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
+            return primals[1], primals[2] @ tangents[0]
+
+        def function(y: Array, evaluated: tuple[Array, Array]) -> tuple[Array, Array]:
+            value = known(y, *evaluated)
+            return (value, jnp.sum(value**2)) if least_squares else (value[0], value[0])
+
+        def init(y: Array, evaluated: tuple[Array, Array]) -> Any:
+            return solver.init(function, y, evaluated, {}, *jax.eval_shape(function, y, evaluated), frozenset())
+
+        def step(y: Array, evaluated: tuple[Array, Array], state: Any) -> tuple[Array, Any, Array, Array]:
+            y, state, loss = solver.step(function, y, evaluated, {}, state, frozenset())
+            done, _ = solver.terminate(function, y, evaluated, {}, state, frozenset())
+            return y, state, loss, done
+
+        self._init = eqx.filter_jit(eqx.filter_vmap(init))
+        self._step = eqx.filter_jit(eqx.filter_vmap(step))
+
+    def __call__(
+        self, evaluate: Evaluate, start: np.ndarray, steps: int, report: Callable[[int, int, float], None]
+    ) -> tuple[Float[np.ndarray, "batch size"], Float[np.ndarray, " batch"]]:
+        """Coordinates and losses at the end of each search: sums of squares, or the minimized function itself."""
+        evaluated = tuple(map(jnp.asarray, evaluate(start)))
+        y, state, loss = jnp.asarray(start), self._init(jnp.asarray(start), evaluated), np.zeros(len(start))
+        for iteration in range(steps):
+            y, state, loss, done = self._step(y, evaluated, state)
+            report(iteration + 1, steps, float(jnp.min(loss)))
+            if bool(jnp.all(done)):
+                break
+            evaluated = tuple(map(jnp.asarray, evaluate(np.asarray(state.y_eval))))
+        return np.asarray(y), np.asarray(loss)

@@ -1,0 +1,1 @@
+"""Stage 4, policies: tasks, environments, trained policies, deployment."""

@@ -1,0 +1,112 @@
+"""Policies in their own simulator, in closed loop."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import State
+from jaxtyping import Array, Float
+
+from ballu_mjx.policies.locomotion_env import (
+    Contents,
+    LocomotionEnv,
+    command_of,
+)
+from ballu_mjx.rl.ppo import Inference, Params
+
+
+class Rollout(NamedTuple):
+    """Closed-loop simulations at the control rate, the starting state first."""
+
+    qpos: Float[np.ndarray, "runs states nq"]
+    features: Float[np.ndarray, "runs states 27"]
+    """`observation.observe_features`."""
+    com: Float[np.ndarray, "runs states 3"]
+    """Centre of mass (m, world)."""
+    command: Float[np.ndarray, "runs steps 2"]
+    """Servo commands."""
+    outside: Float[np.ndarray, "runs steps"]
+    """1 where the residual's observation lay outside of what its training had seen."""
+    reward: Float[np.ndarray, "runs steps"]
+    """The task's."""
+
+    @property
+    def yaw(self) -> Float[np.ndarray, "runs states"]:
+        """Of the balloon (rad), not unwrapped."""
+        return self.features[..., 8]
+
+
+_CHUNK = 100
+"""Control steps that the compiled program does at a time."""
+_BATCH = 8
+"""Runs that it does side by side; fewer are filled up, more are done one batch after another."""
+
+
+class ClosedLoop:
+    """Runs policies in closed loop; one compiled program for any number of runs and steps, any parameters, and all
+    simulators that differ in their contents alone (`LocomotionEnv.contents`)."""
+
+    def __init__(self, env: LocomotionEnv, infer: Inference) -> None:
+        self._contents = env.contents
+
+        def look(state: State) -> tuple[Array, ...]:
+            s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
+            return s["physics"].qpos, s["history"][-1], s["com"]
+
+        def run(params: Params, contents: Contents, state: State) -> Any:
+            here = env.with_contents(contents)
+
+            def advance(state: State, _: None) -> tuple[State, Any]:
+                action = infer(params, state.obs)  # pyright: ignore[reportArgumentType]
+                after = here.step(state, action)
+                return after, (*look(after), command_of(action), after.metrics["outside"], after.reward)
+
+            return jax.lax.scan(advance, state, None, _CHUNK)
+
+        def at(contents: Contents, qpos: Array, qvel: Array, key: Array) -> State:
+            return env.with_contents(contents).at(qpos, qvel, key)
+
+        def reset(contents: Contents, key: Array) -> State:
+            return env.with_contents(contents).reset(key)
+
+        self._run = jax.jit(jax.vmap(run, in_axes=(None, None, 0)))
+        self._at = jax.jit(jax.vmap(at, in_axes=(None, 0, 0, 0)))
+        self._look = jax.vmap(look)
+        self._reset = jax.jit(jax.vmap(reset, in_axes=(None, 0)))
+
+    def __call__(
+        self,
+        params: Params,
+        qpos: Float[np.ndarray, "runs nq"],
+        qvel: Float[np.ndarray, "runs nv"],
+        steps: int,
+    ) -> Rollout:
+        """Simulate `steps` control steps from each of the given states."""
+        batches = [slice(first, first + _BATCH) for first in range(0, len(qpos), _BATCH)]
+        rollouts = [self._batch(params, qpos[batch], qvel[batch], steps) for batch in batches]
+        return Rollout(*(np.concatenate(parts) for parts in zip(*rollouts, strict=True)))
+
+    def _batch(self, params: Params, qpos: np.ndarray, qvel: np.ndarray, steps: int) -> Rollout:
+        runs = len(qpos)
+        filled = np.arange(_BATCH) % runs
+        keys = jax.random.split(jax.random.key(0), _BATCH)
+        start = (jnp.asarray(x[filled], jnp.float32) for x in (qpos, qvel))
+        state = self._at(self._contents, *start, keys)
+        pieces = [tuple(np.asarray(x)[:, None] for x in self._look(state))]
+        outcomes = []
+        for _ in range(-(-steps // _CHUNK)):
+            state, seen = self._run(params, self._contents, state)
+            state_parts, step_parts = seen[: len(pieces[0])], seen[len(pieces[0]) :]
+            pieces.append(tuple(np.asarray(x) for x in state_parts))
+            outcomes.append(tuple(np.asarray(x) for x in step_parts))
+        states = (np.concatenate(parts, axis=1)[:runs, : steps + 1] for parts in zip(*pieces, strict=True))
+        per_step = (np.concatenate(parts, axis=1)[:runs, :steps] for parts in zip(*outcomes, strict=True))
+        return Rollout(*states, *per_step)
+
+    def standing(self, count: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """`count` starting states, (qpos, qvel), as training draws them."""
+        state: Any = self._reset(self._contents, jax.random.split(jax.random.key(seed), count)).pipeline_state
+        return np.asarray(state["physics"].qpos), np.asarray(state["physics"].qvel)

@@ -1,0 +1,1 @@
+"""A policy on the robot's own computer."""

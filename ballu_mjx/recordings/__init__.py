@@ -1,0 +1,1 @@
+"""Stage 1, data: recordings, and their reconstruction as simulator states."""

@@ -1,0 +1,358 @@
+"""TODO."""
+
+from __future__ import annotations
+
+import array
+import csv
+import difflib
+import gzip
+import io
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation, Slerp
+
+from ballu_mjx.common import files
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.recording import (
+    ANGLE,
+    COLUMNS,
+    POINT,
+    QUATERNIONS,
+    Column,
+    ColumnLayout,
+    Kind,
+    Recording,
+    Split,
+    column_layout,
+)
+from ballu_mjx.recordings.validation import (
+    check_cells,
+    check_frame,
+    check_gaps,
+    check_time,
+    has_sample,
+    present_groups,
+    refuse_recording,
+)
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.model import assets
+
+RECORDING_FORMAT = "ballu-recording/1"
+
+_ENDINGS = (".csv", ".csv.gz")
+_COMMAND_DECIMALS = 4
+
+
+def read_recording(path: Path | str, robot: RobotDescription | None = None) -> Recording:
+    """Read, validate and fill in the recording at `path`, a `.csv` or `.csv.gz` with its `.json` beside it.
+
+    `robot` is whose it is; None: BALLU's.
+
+    Gaps of up to 0.5 s are interpolated, linearly or, for orientations, along the shortest rotation.
+
+    **Raises** `InputError` at the first fault found, with file, column, row (as a spreadsheet counts them, the header
+    being row 1) and mend.
+    """
+    path = Path(path)
+    description = sidecar_path(path)
+    layout = column_layout(robot)
+    columns = _read_columns(path, layout)
+    kind, made_by, notes = _read_description(description)
+    if robot is not None and not robot.is_ballu and kind != "free":
+        refuse_recording(
+            description, f'"kind" is "{kind}"', f'it must be "free" for {robot.name}: only BALLU is suspended'
+        )
+    groups = present_groups(path, columns, layout, kind)
+    check_time(path, columns["time"])
+    check_cells(path, columns, layout, kind)
+    first, last = check_gaps(path, columns, groups, layout, kind)
+    fields, interpolated = _fill(columns, layout, groups, slice(first, last + 1))
+    rows = len(columns["time"])
+    recording = Recording(
+        name=recording_name(path),
+        kind=kind,
+        robot=made_by,
+        notes=notes,
+        time=fields["time"][:, 0],
+        command=fields["command"],
+        balloon_position=fields.get("balloon_position"),
+        balloon_quaternion=fields.get("balloon_quaternion"),
+        base_position=fields.get("base_position"),
+        base_quaternion=fields.get("base_quaternion"),
+        foot_position=fields["foot_position"].reshape(-1, 2, 3) if "foot_position" in fields else None,
+        motor=fields.get("motor"),
+        knee=fields.get("knee"),
+        points={name: fields[POINT + name] for name in layout.points},
+        angles={name: fields[ANGLE + name][:, 0] for name in layout.joints if ANGLE + name in fields},
+        interpolated=interpolated,
+        trimmed=(first, rows - 1 - last),
+    )
+    if kind == "free" and layout.columns is COLUMNS:
+        check_frame(path, recording)
+    return recording
+
+
+def write_recording(
+    recording: Recording, path: Path | str, robot: RobotDescription | None = None, *, decimals: int = 5
+) -> None:
+    """Write `recording` to `path` (`.csv`, or `.csv.gz`: compressed) and its description to the `.json` beside it.
+
+    Positions and angles get `decimals`, quaternions one fewer, commands 4, time 3 to 6, as it needs; NaN becomes an
+    empty cell. The same recording always gives the same bytes (compressed ones: with the same zlib).
+    `robot` is whose it is; None: BALLU's.
+
+    **Raises** `ValueError` for infinite values or shapes that do not fit; `InputError` for another ending of `path`.
+    """
+    path = Path(path)
+    description = sidecar_path(path)
+    length = len(recording.time)
+    header: list[str] = []
+    cells: list[list[str]] = []
+    for field, names in column_layout(robot).columns.items():
+        value = _value(recording, field)
+        if value is None:
+            continue
+        value = np.asarray(value, float).reshape(length, len(names))
+        if np.isinf(value).any():
+            raise ValueError(f"{field} is infinite somewhere")
+        if field == "time":
+            places = _time_decimals(value)
+        elif field == "command":
+            places = _COMMAND_DECIMALS
+        else:
+            places = decimals - (field in QUATERNIONS)
+        header += names
+        cells += [[_text(x, places) for x in column] for column in value.T.tolist()]
+    lines = [",".join(header), *(",".join(row) for row in zip(*cells, strict=True))]
+    content = ("\n".join(lines) + "\n").encode()
+    if path.name.endswith(".gz"):
+        buffer = io.BytesIO()
+        with gzip.GzipFile(filename="", mode="wb", compresslevel=9, fileobj=buffer, mtime=0) as stream:
+            stream.write(content)
+        content = buffer.getvalue()
+    files.write(path, content)
+    keys = {"format": RECORDING_FORMAT, "kind": recording.kind, "robot": recording.robot, "notes": recording.notes}
+    files.write(description, json.dumps(keys, indent=2, ensure_ascii=False) + "\n")
+
+
+def list_recordings(paths: Iterable[Path | str]) -> list[Path]:
+    """The recordings that `paths` name, each a CSV or a folder of them (sorted by name), every one once.
+
+    **Raises** `InputError` for a path that is missing, is no recording, or is a folder without any.
+    """
+    found: dict[Path, Path] = {}
+    for path in map(Path, paths):
+        if path.is_dir():
+            inside = sorted(p for p in path.iterdir() if p.name.endswith(_ENDINGS) and not p.name.startswith("."))
+            if not inside:
+                raise InputError(f"{path}: the folder holds no recording (.csv or .csv.gz); name one that does.")
+            twice = [b for a, b in zip(inside, inside[1:], strict=False) if recording_name(a) == recording_name(b)]
+            if twice:
+                raise InputError(f"{twice[0]}: stands there a second time, without .gz; delete one of the two.")
+        elif path.exists():
+            sidecar_path(path)
+            inside = [path]
+        else:
+            raise InputError(f"{path}: there is no such file or folder; check the path.")
+        for p in inside:
+            found.setdefault(p.resolve(), p)
+    return list(found.values())
+
+
+def list_bundled(split: Split) -> list[Path]:
+    """The recordings that come with the package, sorted by name."""
+    return list_recordings([assets() / "recordings" / split])
+
+
+def _value(recording: Recording, field: str) -> np.ndarray | None:
+    if field.startswith(POINT):
+        return recording.points[field.removeprefix(POINT)]
+    if field.startswith(ANGLE):
+        return recording.angles.get(field.removeprefix(ANGLE))
+    return getattr(recording, field)
+
+
+def recording_name(path: Path) -> str:
+    """The name of the recording in a file: the file's, without its ending."""
+    return path.name.removesuffix(".gz").removesuffix(".csv")
+
+
+def sidecar_path(path: Path) -> Path:
+    """Where the description of the recording in `path` stands.
+
+    **Raises** `InputError` where that is not a recording's name.
+    """
+    if not path.name.endswith(_ENDINGS) or not recording_name(path):
+        raise InputError(f"{path}: not a recording's name; it must end in .csv or .csv.gz.")
+    return path.with_name(recording_name(path) + ".json")
+
+
+def _read_description(path: Path) -> tuple[Kind, str, str]:
+    """Kind, robot and notes."""
+    example = f'{{"format": "{RECORDING_FORMAT}", "kind": "free", "robot": "...", "notes": "..."}}'
+    if not path.is_file():
+        refuse_recording(path, "there is no description beside the recording", f"write one such as {example}")
+    keys = files.read_json(path, f"write it such as {example}")
+    if keys.get("format") != RECORDING_FORMAT:
+        refuse_recording(
+            path,
+            f'"format" is {_quote(keys, "format")}',
+            f'it must be "{RECORDING_FORMAT}", the format this version reads',
+        )
+    kind, made_by, notes = keys.get("kind"), keys.get("robot"), keys.get("notes", "")
+    if kind not in ("free", "suspended"):
+        refuse_recording(
+            path, f'"kind" is {_quote(keys, "kind")}', 'write "free", or "suspended" if the feet are off the ground'
+        )
+    if not isinstance(made_by, str) or not made_by.strip():
+        refuse_recording(path, f'"robot" is {_quote(keys, "robot")}', "write which robot was recorded, as text")
+    if not isinstance(notes, str):
+        refuse_recording(path, f'"notes" is {_quote(keys, "notes")}', "write text there")
+    return kind, made_by, notes
+
+
+def _quote(keys: dict, key: str) -> str:
+    if key not in keys:
+        return "missing"
+    text = json.dumps(keys[key])
+    return text if len(text) <= 40 else text[:40] + "..."
+
+
+def _read_columns(path: Path, layout: ColumnLayout) -> dict[str, Column]:
+    """The CSV's columns by name, missing samples as NaN."""
+    text = files.read_text(path)
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    values = array.array("d")
+    header: list[str] | None = None
+    rows = blank = 0
+    try:
+        for cells in reader:
+            if header is None:
+                header = _check_header(path, layout, [name.strip() for name in cells])
+                continue
+            if not any(map(str.strip, cells)):
+                blank += 1  # Blank lines at the end are no fault; one further up lacks its time.
+                continue
+            if blank:
+                refuse_recording(path, "the row is blank", "delete it or fill it in", column="time", row=rows)
+            values.extend(_parse_row(path, header, cells, rows))
+            rows += 1
+    except csv.Error as error:
+        row = None if header is None else rows + blank
+        refuse_recording(path, f"not readable as a table ({error})", "save it as plain CSV", row=row)
+    if header is None:
+        refuse_recording(path, "the file is empty", "record again or leave it out")
+    if not rows:
+        refuse_recording(path, "there is no sample below the header", "record again or leave it out", row=0)
+    table = np.frombuffer(values, float).reshape(rows, len(header))
+    return {name: table[:, i] for i, name in enumerate(header)}
+
+
+def _check_header(path: Path, layout: ColumnLayout, header: list[str]) -> list[str]:
+    known = [name for names in layout.columns.values() for name in names]
+    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
+        refuse_recording(
+            path, "the header has no commas", "save it with commas between cells and points in numbers", row=-1
+        )
+    for i, name in enumerate(header):
+        if name not in known:
+            close = difflib.get_close_matches(name[:40].lower(), known, 1)
+            mend = (
+                f"rename it to {close[0]} or delete it" if close else f"{RECORDING_FORMAT} does not have it, delete it"
+            )
+            refuse_recording(
+                path, "unknown column", mend, column=_shorten(name) if name else f"{i + 1} (no name)", row=-1
+            )
+        if name in header[:i]:
+            refuse_recording(path, "the column stands there twice", "delete one", column=name, row=-1)
+    return header
+
+
+def _parse_row(path: Path, header: list[str], cells: list[str], row: int) -> list[float]:
+    if len(cells) < len(header):
+        name = header[len(cells)]
+        refuse_recording(path, "the row ends before it", "complete the row or delete it", column=name, row=row)
+    if any(cell.strip() for cell in cells[len(header) :]):
+        name = f"{len(header) + 1} (no name)"
+        refuse_recording(
+            path, "the row has more cells than the header", "write points in numbers, not commas", column=name, row=row
+        )
+    numbers = []
+    for name, cell in zip(header, cells, strict=False):
+        try:
+            number = float(cell) if cell else math.nan
+            plain = not cell or (math.isfinite(number) and "_" not in cell)
+        except ValueError:
+            plain, number = not cell.strip(), math.nan
+        if not plain:
+            mend = "write a finite number, or leave the cell empty if the sample is missing"
+            refuse_recording(path, f"{_shorten(cell)!r} is not a finite number", mend, column=name, row=row)
+        numbers.append(number)
+    return numbers
+
+
+def _shorten(text: str) -> str:
+    return text if len(text) <= 40 else text[:40] + "..."
+
+
+def _text(value: float, decimals: int) -> str:
+    if math.isnan(value):
+        return ""
+    text = f"{value:.{decimals}f}".rstrip("0").rstrip(".")
+    return "0" if text == "-0" else text
+
+
+def _time_decimals(time: np.ndarray) -> int:
+    exact = (d for d in range(3, 6) if np.abs(np.round(time, d) - time).max(initial=0.0) < 1e-9)
+    return next(exact, 6)
+
+
+# ---- gaps ----
+
+
+def _fill(
+    columns: dict[str, Column], layout: ColumnLayout, groups: list[str], rows: slice
+) -> tuple[dict[str, Float[np.ndarray, "_ _"]], dict[str, int]]:
+    """Fields without gaps over `rows`, and the number of samples filled in by column."""
+    time = columns["time"]
+    fields: dict[str, np.ndarray] = {}
+    interpolated: dict[str, int] = {}
+    for field in groups:
+        names = layout.columns[field]
+        value = np.stack([columns[name] for name in names], axis=1)
+        if field in QUATERNIONS:
+            seen = has_sample(columns, names)
+            filled = dict.fromkeys(names, int((~seen[rows]).sum()))
+            value = _fill_quaternions(time, value, seen)[rows]
+        else:
+            filled = {name: int(np.isnan(columns[name][rows]).sum()) for name in names}
+            for column in value.T:
+                gap = np.isnan(column)
+                column[gap] = np.interp(time[gap], time[~gap], column[~gap])
+            value = value[rows]
+        fields[field] = value
+        interpolated |= {name: count for name, count in filled.items() if count}
+    return fields, interpolated
+
+
+def _fill_quaternions(
+    time: Column, quaternion: Float[np.ndarray, "T 4"], seen: Bool[np.ndarray, " T"]
+) -> Float[np.ndarray, "T 4"]:
+    """Unit quaternions (w, x, y, z) without gaps between the first and last seen, continuous in sign, first w >= 0."""
+    known = np.flatnonzero(seen)
+    inside = ~seen & (np.arange(len(time)) >= known[0]) & (np.arange(len(time)) <= known[-1])
+    quaternion = quaternion.copy()
+    quaternion[seen] /= np.linalg.norm(quaternion[seen], axis=1, keepdims=True)
+    if inside.any():
+        slerp = Slerp(time[seen], Rotation.from_quat(quaternion[seen], scalar_first=True))
+        quaternion[inside] = slerp(time[inside]).as_quat(scalar_first=True)
+    kept = quaternion[known[0] : known[-1] + 1]
+    turned = np.einsum("ti,ti->t", kept[1:], kept[:-1]) < 0
+    start = -1.0 if kept[0, 0] < 0 else 1.0
+    kept *= start * np.cumprod(np.concatenate([[1.0], np.where(turned, -1.0, 1.0)]))[:, None]
+    return quaternion

@@ -1,0 +1,171 @@
+"""From trajectories in a capture's frame to a recording: sites, axes, origin, commands on the capture's clock."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from ballu_mjx.ballu.model import SIDES
+from ballu_mjx.recordings.importers.mapping import JOINTS, RoomMapping
+from ballu_mjx.recordings.importers.trajectories import Body, Trajectories, refuse
+from ballu_mjx.recordings.recording import Recording
+
+FOOT_RADIUS = 0.004
+"""m, of the model's foot spheres: what their centres come down to."""
+_START_SAMPLES = 20
+"""Samples at the start over which `turn = "start"` takes the mean."""
+_FEET_PERCENTILE = 1.0
+"""Of the heights of both feet: the lowest without outliers."""
+
+
+def place(trajectories: Trajectories, mapping: RoomMapping, name: str) -> Recording:
+    """The recording that `trajectories` hold, without commands yet (NaN): sites of the model, x forward, y left, z up.
+
+    A body's orientation is renamed with the axes: one that stands like the capture's axes stands like the new ones.
+
+    **Raises** `InputError` where an orientation is needed and not there, or nothing was seen at all.
+    """
+    mapped = {role: _site(trajectories, mapping, role, body) for role, body in trajectories.bodies.items()}
+    for role, source in mapping.sources.items():
+        if source.turn == "start":
+            mapped[role] = _standing(mapped[role])
+    if mapping.kind == "free":
+        _to_floor(mapping, mapped)
+        if mapping.start:
+            _to_start(mapped)
+    time = trajectories.time
+    balloon, base = mapped.get("balloon"), mapped.get("base")
+    feet = [mapped[f"foot_{side}"].position for side in SIDES if f"foot_{side}" in mapped]
+    joints = [trajectories.columns.get(name) for name in JOINTS]
+    motor, knee = (_pair(pair) for pair in (joints[:2], joints[2:]))
+    return Recording(
+        name=name,
+        kind=mapping.kind,
+        robot=mapping.robot,
+        notes=mapping.notes,
+        time=time,
+        command=np.full((len(time), 2), np.nan),
+        balloon_position=None if balloon is None else balloon.position,
+        balloon_quaternion=None if balloon is None else balloon.quaternion,
+        base_position=None if base is None else base.position,
+        base_quaternion=None if base is None else base.quaternion,
+        foot_position=np.stack(feet, axis=1) if len(feet) == 2 else None,
+        motor=motor,
+        knee=knee,
+    )
+
+
+def _pair(columns: list[Float[np.ndarray, " T"] | None]) -> Float[np.ndarray, "T 2"] | None:
+    left, right = columns
+    return None if left is None or right is None else np.stack([left, right], axis=1)
+
+
+def _site(trajectories: Trajectories, mapping: RoomMapping, role: str, body: Body) -> Body:
+    """The model's site on a tracked body, with the axes renamed."""
+    source = mapping.sources[role]
+    axes = mapping.axes
+    if np.isnan(body.position).all():
+        refuse(trajectories.path, "", f"[{role}] was never seen", "mend the mapping or the labels")
+    if body.quaternion is None:
+        if role == "balloon":
+            mend = "name an object or a segment, or three markers or more, or columns, for it"
+            refuse(mapping.path, f"[{role}]", "what it names has no orientation", mend)
+        if source.turn == "start" or any(source.turn) or any(source.offset):
+            mend = "leave turn and offset out, or name what has one"
+            refuse(mapping.path, f"[{role}]", "what it names has no orientation to turn or shift along", mend)
+        return Body(body.position @ axes.T)
+    seen = ~np.isnan(body.quaternion).any(axis=1)
+    if not seen.any():
+        refuse(trajectories.path, "", f"the orientation of [{role}] was never seen", "mend the mapping or the labels")
+    turned = Rotation.from_quat(body.quaternion[seen], scalar_first=True)
+    position = body.position.copy()
+    if any(source.offset):
+        position[~seen] = np.nan
+        position[seen] += turned.apply(source.offset)
+    fixed = Rotation.identity() if source.turn == "start" else Rotation.from_rotvec(source.turn)
+    rename = Rotation.from_matrix(axes)
+    quaternion = np.full_like(body.quaternion, np.nan)
+    quaternion[seen] = (rename * turned * fixed * rename.inv()).as_quat(scalar_first=True)
+    return Body(position @ axes.T, quaternion)
+
+
+def _standing(body: Body) -> Body:
+    """The body turned in its own frame so that at the start it stands like the format's axes."""
+    assert body.quaternion is not None
+    seen = np.flatnonzero(~np.isnan(body.quaternion).any(axis=1))
+    turned = Rotation.from_quat(body.quaternion[seen], scalar_first=True)
+    quaternion = body.quaternion.copy()
+    quaternion[seen] = (turned * turned[:_START_SAMPLES].mean().inv()).as_quat(scalar_first=True)
+    return Body(body.position, quaternion)
+
+
+def _to_floor(mapping: RoomMapping, mapped: dict[str, Body]) -> None:
+    """Shift everything up or down, in place, until the floor is at 0."""
+    if mapping.floor == "feet":
+        heights = np.concatenate([mapped[f"foot_{side}"].position[:, 2] for side in SIDES])
+        floor = float(np.nanpercentile(heights, _FEET_PERCENTILE)) - FOOT_RADIUS
+    else:
+        floor = mapping.floor
+    for role, body in mapped.items():
+        mapped[role] = Body(body.position - [0.0, 0.0, floor], body.quaternion)
+
+
+def _to_start(mapped: dict[str, Body]) -> None:
+    """Turn about the vertical and shift along the floor, in place: the base starts at the origin, the balloon looks
+    along x. Both are taken from the first sample that shows them."""
+    balloon, base = mapped["balloon"], mapped["base"]
+    assert balloon.quaternion is not None
+    seen = ~np.isnan(balloon.quaternion).any(axis=1)
+    forward = Rotation.from_quat(balloon.quaternion[int(seen.argmax())], scalar_first=True).as_matrix()[:, 0]
+    turn = Rotation.from_euler("z", -np.arctan2(forward[1], forward[0]))
+    origin = base.position[int((~np.isnan(base.position).any(axis=1)).argmax())] * [1.0, 1.0, 0.0]
+    for role, body in mapped.items():
+        position = turn.apply(body.position - origin)  # NaN stays NaN
+        quaternion = body.quaternion
+        if quaternion is not None:
+            known = ~np.isnan(quaternion).any(axis=1)
+            quaternion = quaternion.copy()
+            quaternion[known] = (turn * Rotation.from_quat(quaternion[known], scalar_first=True)).as_quat(
+                scalar_first=True
+            )
+        mapped[role] = Body(position, quaternion)
+
+
+def with_commands(
+    path: Path,
+    recording: Recording,
+    time: Float[np.ndarray, " N"],
+    command: Float[np.ndarray, "N 2"],
+) -> tuple[Recording, tuple[float, float]]:
+    """`recording` with `command` sent at `time` (s, the recording's clock), each held until the next.
+
+    The last one is held as long as the longest before it. What lies outside is cut off.
+
+    **Arguments**
+
+    - `path`: the log that messages name.
+
+    **Returns**
+
+    The recording, from time 0 on, and the seconds cut off its start and end.
+
+    **Raises** `InputError` where less than a second is left.
+    """
+    clock = recording.time
+    last = time[-1] + (np.diff(time).max() if len(time) > 1 else 0.0)
+    kept = np.flatnonzero((clock >= time[0] - 1e-9) & (clock <= last + 1e-9))
+    if len(kept) < 2 or clock[kept[-1]] - clock[kept[0]] < 1.0:
+        problem = f"its commands, from {time[0]:.2f} to {last:.2f} s of the capture's clock, do not overlap it"
+        mend = f"the capture is from {clock[0]:.2f} to {clock[-1]:.2f} s; mend --offset, or give this trial's log"
+        refuse(path, "", problem, mend)
+    rows = slice(int(kept[0]), int(kept[-1]) + 1)
+    lost = float(clock[rows.start] - clock[0]), float(clock[-1] - clock[rows.stop - 1])
+    held = np.searchsorted(time, clock[rows] + 1e-9, side="right") - 1
+    fields = {field.name: getattr(recording, field.name) for field in dataclasses.fields(recording)}
+    cut = {name: value[rows] for name, value in fields.items() if isinstance(value, np.ndarray)}
+    fresh = {"time": cut["time"] - cut["time"][0], "command": command[held]}
+    return dataclasses.replace(recording, **(cut | fresh)), lost

@@ -1,0 +1,333 @@
+"""Vicon's CSV exports, of Nexus and Tracker.
+
+A file holds one or more sections, each after blank lines or none:
+
+    Segments                                    title: Objects, Segments, Trajectories, Joints, Model Outputs, ...
+    100                                         rate (Hz)
+    ,,ballu:base,,,,,,ballu:balloon,,,,,        names, each above its first column; Tracker: "Global Angle ballu"
+    Frame,Sub Frame,RX,RY,RZ,TX,TY,TZ,RX,...    components; RX, RY, RZ, RW is a quaternion; markers have X, Y, Z
+    ,,deg,deg,deg,mm,mm,mm,deg,...              units
+    1,0,0.1,...                                 an empty cell is a sample not seen
+
+Commas, semicolons or tabs between the cells. Frames count from any number; a body at exactly 0 in every component was
+not seen. The file does not say what three rotation components are: Nexus's segments are rotation vectors (helical
+angles), Tracker's objects as its settings say.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ballu_mjx.common.files import read_text
+from ballu_mjx.recordings.importers.mapping import MARKER_TOLERANCE, RoomMapping, Source
+from ballu_mjx.recordings.importers.trajectories import (
+    ANGLES,
+    LENGTHS,
+    Body,
+    Trajectories,
+    find,
+    refuse,
+    rigid_body,
+    shorten,
+    suggest,
+    to_quaternion,
+)
+
+_PREFIX = "Global Angle "
+_TRANSLATIONS = (("TX", "TY", "TZ"), ("X", "Y", "Z"))
+_ROTATION = ("RX", "RY", "RZ")
+_HELICAL = ("Segments",)
+"""Sections whose three rotation components are a rotation vector unless the mapping says otherwise."""
+_USED = ("Objects", "Segments", "Trajectories")
+"""Sections that must be whole; others that are laid out alike are read, and those that are not (Events) left alone."""
+_HEADER_ROWS = 5
+_SPELLINGS: Mapping[str, str] = {"degrees": "deg", "degree": "deg", "°": "deg", "radians": "rad", "radian": "rad"}
+_LARGEST = 1e6
+"""No unit makes sense of a larger number."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Group:
+    """The columns under one name of one section."""
+
+    section: _Section
+    columns: Mapping[str, int]
+    """By component."""
+    units: Mapping[str, str]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Section:
+    """A section's header, and the lines of its samples; lines count from 0."""
+
+    title: str
+    rate: float
+    first: int
+    last: int
+    width: int
+    names: Sequence[str]
+    """The name over each column, without Tracker's prefix."""
+    components: Sequence[str]
+    units: Sequence[str]
+
+
+_Values = Callable[[_Group, Sequence[str]], Float[np.ndarray, "T n"]]
+"""The columns of a group by component, over all frames."""
+
+
+def is_vicon(path: Path) -> bool:
+    """Whether the first line with text in it has one cell of it alone, as a section's title does."""
+    for line in read_text(path).splitlines():
+        cells = [cell for cell in line.replace(";", ",").replace("\t", ",").split(",") if cell.strip(' "')]
+        if cells:
+            return len(cells) == 1
+    return False
+
+
+def read_vicon(path: Path, mapping: RoomMapping) -> Trajectories:
+    """The bodies and markers that `mapping` names, from the Vicon CSV at `path`.
+
+    **Raises** `InputError` naming file, line and mend: for what is missing, cut off, counted backwards or no number,
+    and for units or rotations that are not clear.
+    """
+    lines = read_text(path).splitlines()
+    delimiter = _delimiter(path, lines)
+    groups = _groups(path, _sections(path, lines, delimiter), mapping)
+    wanted = {role: _wanted(path, mapping.path, source, groups) for role, source in mapping.sources.items()}
+    if not wanted:
+        refuse(mapping.path, "", "it asks for no body of a Vicon file", "say what the balloon is, or give a table")
+    used = list({id(g.section): g.section for gs in wanted.values() for g in gs}.values())
+    rates = {section.rate for section in used}
+    if len(rates) > 1:
+        refuse(path, "", f"sections run at {' and '.join(f'{r:g}' for r in sorted(rates))} Hz", "export one rate")
+    tables = {id(section): _read(path, lines, delimiter, section, wanted) for section in used}
+    frames = np.unique(np.concatenate([frame for frame, _ in tables.values()]))
+
+    def values(group: _Group, names: Sequence[str]) -> Float[np.ndarray, "T n"]:
+        frame, columns = tables[id(group.section)]
+        spread = np.full((len(frames), len(names)), np.nan)
+        spread[np.searchsorted(frames, frame)] = np.stack([columns[group.columns[name]] for name in names], axis=1)
+        return spread
+
+    bodies = {}
+    for role, source in mapping.sources.items():
+        markers = [_position(path, mapping, group, values) for group in wanted[role]]
+        if source.markers:
+            geometry = None if source.geometry is None else np.array(source.geometry)
+            bodies[role] = rigid_body(path, role, np.stack(markers), geometry, MARKER_TOLERANCE)
+        else:
+            bodies[role] = _body(path, mapping, source, wanted[role][0], markers[0], values)
+    rate = mapping.rate or rates.pop()
+    return Trajectories(path, (frames - frames[0]) / rate, bodies)
+
+
+def _delimiter(path: Path, lines: Sequence[str]) -> str:
+    for line in lines:
+        for delimiter in ",;\t":
+            cells = [cell.strip(' "') for cell in line.split(delimiter)]
+            if cells[0] == "Frame" and len(cells) > 1:
+                return delimiter
+    refuse(path, "", "no line begins with Frame, Sub Frame", "export as CSV from Nexus or Tracker, with its header")
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    return [cell.strip(' "') for cell in line.split(delimiter)]
+
+
+def _sections(path: Path, lines: Sequence[str], delimiter: str) -> list[_Section]:
+    blank = [not line.strip(f' "{delimiter}') for line in lines]
+    sections = []
+    line = 0
+    while line < len(lines):
+        if blank[line]:
+            line += 1
+            continue
+        end = next((i for i in range(line, len(lines)) if blank[i]), len(lines))
+        section = _section(path, lines, delimiter, line, end)
+        if section is not None:
+            sections.append(section)
+        line = end
+    return sections
+
+
+def _section(path: Path, lines: Sequence[str], delimiter: str, start: int, end: int) -> _Section | None:
+    title = _cells(lines[start], delimiter)
+    components = _cells(lines[start + 3], delimiter) if end - start >= _HEADER_ROWS else []
+    laid_out = components[:1] == ["Frame"] and components[1:2] in (["Sub Frame"], ["SubFrame"])
+    if not laid_out and not any(title[1:]) and _number(title[0]) is None and title[0] not in _USED:
+        return None
+    place = f"line {start + 1}"
+    if any(title[1:]) or _number(title[0]) is not None:
+        mend = "export again; sections begin with a title such as Segments in a line of its own, after a blank line"
+        refuse(path, place, "here a section's title is missing", mend)
+    if end - start < _HEADER_ROWS:
+        problem = f"the section {shorten(title[0])!r} ends within its header"
+        refuse(path, place, problem, "export again: title, rate, names, components and units stand above the samples")
+    rate_row, names, units = (_cells(lines[start + i], delimiter) for i in (1, 2, 4))
+    rate = _number(rate_row[0])
+    if rate is None or not 1 <= rate <= 1e5 or any(rate_row[1:]):
+        problem = f"{shorten(delimiter.join(rate_row))!r} is not a rate in Hz"
+        refuse(path, f"line {start + 2}", problem, "export again; the rate stands alone below the title")
+    if not laid_out:
+        problem = f"the row of components begins with {shorten(delimiter.join(components[:2]))!r}"
+        refuse(path, f"line {start + 4}", problem, "export again; it begins with Frame, Sub Frame")
+    while components and not components[-1]:
+        components.pop()
+    width = len(components)
+    spread, current = [], ""
+    for cell in [*names, *[""] * width][:width]:
+        current = cell.removeprefix(_PREFIX).strip() or current
+        spread.append(current)
+    if any(names[width:]):
+        refuse(path, f"line {start + 3}", "there are names without components below", "export again")
+    units = [*units, *[""] * width][:width]
+    return _Section(title[0], rate, start + _HEADER_ROWS, end, width, spread, components, units)
+
+
+def _groups(path: Path, sections: Sequence[_Section], mapping: RoomMapping) -> dict[str, list[_Group]]:
+    """All positions in the file by name."""
+    groups: dict[str, list[_Group]] = {}
+    for section in sections:
+        for name in dict.fromkeys(section.names[2:]):
+            places = [i for i in range(2, section.width) if section.names[i] == name]
+            components = [section.components[i] for i in places]
+            if not any(set(axes) <= set(components) for axes in _TRANSLATIONS):
+                continue
+            for component in components:
+                if components.count(component) > 1 and component:
+                    problem = f"{shorten(name)!r} has {component} twice"
+                    refuse(path, f"line {section.first - 1}", problem, "give bodies different names and export again")
+            columns = dict(zip(components, places, strict=True))
+            units = {component: section.units[i] for component, i in columns.items()}
+            groups.setdefault(name, []).append(_Group(section, columns, units))
+    return groups
+
+
+def _wanted(path: Path, mapping: Path, source: Source, groups: Mapping[str, list[_Group]]) -> list[_Group]:
+    if source.position:
+        mend = 'a Vicon file has bodies and markers by name, write body = "..." there'
+        refuse(path, "", f"{mapping} gives [{source.role}] by columns", mend)
+    found = []
+    for name in source.markers or (source.body or "",):
+        full = find(path, name, groups, "body or marker", mapping)
+        candidates = [g for g in groups[full] if source.section in (None, g.section.title)]
+        if not candidates:
+            titles = [g.section.title for g in groups[full]]
+            problem = f"{shorten(full)!r} does not stand in a section {shorten(str(source.section))!r}"
+            refuse(path, "", problem, f"mend {mapping}, {suggest(str(source.section), titles).rstrip('?')}")
+        if len(candidates) > 1:
+            titles = ", ".join(dict.fromkeys(g.section.title for g in candidates))
+            mend = f'add section = "..." to [{source.role}] in {mapping}'
+            refuse(path, "", f"{shorten(full)!r} stands in several sections ({titles})", mend)
+        found.append(candidates[0])
+    return found
+
+
+def _read(
+    path: Path, lines: Sequence[str], delimiter: str, section: _Section, wanted: Mapping[str, Sequence[_Group]]
+) -> tuple[np.ndarray, dict[int, np.ndarray]]:
+    """Frame numbers, and the columns wanted by their place."""
+    columns = sorted(
+        {i for groups in wanted.values() for g in groups if g.section is section for i in g.columns.values()}
+    )
+    if section.first == section.last:
+        refuse(path, f"line {section.last}", "there is no sample below the header", "export again with samples")
+    frames, table = [], []
+    for number in range(section.first, section.last):
+        cells = lines[number].split(delimiter)
+        place = f"line {number + 1}"
+        frame, sub = (_number(cells[i].strip(' "')) if i < len(cells) else None for i in (0, 1))
+        if frame is None or sub is None or frame != round(frame) or not 0 <= frame < 2**40:
+            problem = f"{shorten(delimiter.join(cells[:2]))!r} is not a frame and a sub-frame"
+            refuse(path, place, problem, "export again, or delete the line if it is no sample")
+        if sub != 0:
+            mend = "export at the cameras' rate"
+            refuse(path, place, f"section {section.title} has sub-frames, samples between the cameras' frames", mend)
+        if frames and frame <= frames[-1]:
+            problem = f"frame numbers run back, from {frames[-1]:g} to {frame:g}"
+            refuse(path, place, problem, "export again, one trial a file")
+        frames.append(frame)
+        if any(cell.strip(' "') for cell in cells[section.width :]):
+            refuse(path, place, "the row has more cells than the header", "export with points in numbers, not commas")
+        if len(cells) < section.width and any(cell.strip(' "') for cell in cells[2:]):
+            name = shorten(section.names[len(cells)] or section.components[len(cells)])
+            refuse(path, place, f"the row ends before {name!r}", "the file was cut off; copy or export it again")
+        row = []
+        for i in columns:
+            cell = cells[i].strip(' "') if i < len(cells) else ""
+            value = _number(cell) if cell and cell.lower() != "nan" else math.nan
+            if value is None or abs(value) > _LARGEST:
+                name = f"{shorten(section.names[i])} {section.components[i]}"
+                mend = "leave the cell empty if the sample is missing, and write points in numbers"
+                refuse(path, f"{place}, {name}", f"{shorten(cell)!r} is not a number that can be meant", mend)
+            row.append(value)
+        table.append(row)
+    values = np.array(table, float).reshape(len(table), len(columns))
+    return np.array(frames), {place: values[:, i] for i, place in enumerate(columns)}
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) and "_" not in text else None
+
+
+def _unit(
+    path: Path, group: _Group, components: Sequence[str], known: Mapping[str, float], override: str | None, kind: str
+) -> float:
+    if override is not None:
+        return known[override]
+    units = {group.units[c].lower() for c in components}
+    unit = _SPELLINGS.get(next(iter(units)), next(iter(units))) if len(units) == 1 else ""
+    if unit not in known:
+        shown = ", ".join(sorted(repr(shorten(u)) for u in units))
+        names = f"{shorten(group.section.names[group.columns[components[0]]])} {components[0]} to {components[-1]}"
+        mend = f'export in {", ".join(known)}, or write {kind} = "..." under [units] in the mapping'
+        refuse(path, f"line {group.section.first}, {names}", f"the unit {shown} is no {kind} that is known", mend)
+    return known[unit]
+
+
+def _position(path: Path, mapping: RoomMapping, group: _Group, values: _Values) -> Float[np.ndarray, "T 3"]:
+    axes = next(axes for axes in _TRANSLATIONS if set(axes) <= set(group.columns))
+    position = values(group, axes) * _unit(path, group, axes, LENGTHS, mapping.length, "length")
+    everything = values(group, list(group.columns))
+    position[(everything == 0).all(axis=1)] = np.nan
+    return position
+
+
+def _body(
+    path: Path,
+    mapping: RoomMapping,
+    source: Source,
+    group: _Group,
+    position: Float[np.ndarray, "T 3"],
+    values: _Values,
+) -> Body:
+    if not set(_ROTATION) <= set(group.columns):
+        return Body(position)
+    name = shorten(group.section.names[next(iter(group.columns.values()))])
+    place = f"section {group.section.title}, {name}"
+    rotation, unit = source.rotation, 1.0
+    if "RW" in group.columns:
+        if rotation not in (None, "quaternion"):
+            refuse(path, place, f"has RW, so it is no {rotation} rotation", 'write rotation = "quaternion"')
+        rotation = "quaternion"
+        columns = values(group, ("RW", *_ROTATION))
+    else:
+        if rotation is None and group.section.title in _HELICAL:
+            rotation = "helical"
+        if rotation in (None, "quaternion"):
+            mend = f'write rotation = "helical" or "XYZ" in [{source.role}] of the mapping, as it was exported'
+            refuse(path, place, "RX, RY, RZ may be a rotation vector or Euler angles", mend)
+        columns = values(group, _ROTATION)
+        unit = _unit(path, group, _ROTATION, ANGLES, mapping.angle, "angle")
+    columns[np.isnan(position).any(axis=1)] = np.nan
+    return Body(position, to_quaternion(path, place, columns, rotation, unit))

@@ -1,0 +1,99 @@
+"""Short windows of recorded motion, and how far a simulated one is off: what residuals are fitted to by derivatives.
+
+A window starts in a recorded state and runs under the recorded commands. It is short enough for errors not to compound,
+and long enough for a force of hundredths of a newton to move the balloon by more than the starting state's uncertainty.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reference import stack_motions
+from ballu_mjx.robots.model import CONTROL_TIMESTEP
+from ballu_mjx.sim.observation import HISTORY, wrap_angle
+from ballu_mjx.sim.simulator import Simulator
+
+POSITION = (0.002, 0.01)
+"""Expected error of the balloon's position (m) at a window's start, and what each second adds."""
+ANGLE = (np.deg2rad(0.3), np.deg2rad(0.6))
+"""Likewise of its orientation (rad)."""
+OUTLYING = 3.0
+"""Expected errors beyond which a window counts less: a foot slipped there, say."""
+
+
+class Segments(NamedTuple):
+    """Windows of recorded motions; `windowsteps` control steps each."""
+
+    qpos: Float[Array | np.ndarray, "windows nq"]
+    """First states."""
+    qvel: Float[Array | np.ndarray, "windows nv"]
+    history: Float[Array | np.ndarray, "windows 3 27"]
+    """`observation.observe_features` of the first state and the two before."""
+    commands: Float[Array | np.ndarray, "windows commands 2"]
+    """From two control steps before the first on."""
+    features: Float[Array | np.ndarray, "windows windowsteps 27"]
+    """Recorded, after each control step."""
+
+
+def check_segments(window_seconds: float, interval_seconds: float) -> None:
+    """**Raises** `InputError` for lengths out of range, naming the option."""
+    for name, value in (("--window-seconds", window_seconds), ("--interval-seconds", interval_seconds)):
+        if not 2 * CONTROL_TIMESTEP <= value < math.inf:
+            raise InputError(f"{name} is {value:g}: it must be 0.1 or more; 0.1 is the nearest.")
+
+
+def cut_segments(
+    simulator: Simulator, motions: Sequence[Motion], window_seconds: float, interval_seconds: float
+) -> Segments:
+    """Windows of the given length, one every `interval_seconds`.
+
+    **Raises** `InputError` where no recording is as long as a window.
+    """
+    steps, every = (round(s / CONTROL_TIMESTEP) for s in (window_seconds, interval_seconds))
+    history = HISTORY
+    places = [
+        (number, start)
+        for number, motion in enumerate(motions)
+        for start in range(history - 1, len(motion.command) - steps + 1, every)
+    ]
+    if not places:
+        raise InputError(f"No recording lasts {window_seconds:g} s; give longer ones, or --window-seconds.")
+    reference, _ = stack_motions(simulator, motions)
+    qpos, qvel, features, command = (np.asarray(x) for x in reference[:4])
+
+    def of(array: np.ndarray, first: int, count: int) -> np.ndarray:
+        return np.stack([array[r, s + first : s + first + count] for r, s in places])
+
+    return Segments(
+        of(qpos, 0, 1)[:, 0],
+        of(qvel, 0, 1)[:, 0],
+        of(features, 1 - history, history),
+        of(command, 1 - history, steps + history - 1),
+        of(features, 1, steps),
+    )
+
+
+def segment_errors(
+    features: Float[Array | np.ndarray, "windowsteps 27"], recorded: Float[Array | np.ndarray, "windowsteps 27"]
+) -> Float[Array, "windowsteps 6"]:
+    """Of the balloon's position and orientation, in expected errors. Neighbours in time say the same: all of a window's
+    squares add up to one for each of the six where errors are as expected."""
+    steps = len(recorded)
+    time = np.arange(1, steps + 1)[:, None] * CONTROL_TIMESTEP
+    start, each_second = np.array([POSITION] * 3 + [ANGLE] * 3).T
+    difference = jnp.asarray(features) - recorded
+    position, angles = difference[:, :3], wrap_angle(difference[:, 6:9])
+    return jnp.concatenate([position, angles], axis=1) / ((start + each_second * time) * np.sqrt(steps))
+
+
+def pseudo_huber(squared: Any) -> Any:
+    """Pseudo-Huber loss of windows, by their errors' squared length: that itself below `OUTLYING`, linear above."""
+    return 2 * OUTLYING**2 * ((1 + squared / OUTLYING**2) ** 0.5 - 1)

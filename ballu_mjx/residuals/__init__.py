@@ -1,0 +1,1 @@
+"""Stage 3, residual forces: what the simulator lacks, learned or identified."""

@@ -1,0 +1,229 @@
+"""Residual forces by the gradient of the tracking error through the simulation.
+
+Windows of the recordings are simulated with the network's forces, and every control step of them is linearized
+(`linearization`). Backpropagation through these derivatives, in time order, is backpropagation through the accurate
+simulator, contacts included; and for small changes of the forces the linearized windows go on standing in for it, so
+that one simulation serves some gradient steps. Then other windows are simulated and linearized.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import optax
+from jaxtyping import Array, Float, Int
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.segments import Segments, check_segments, pseudo_huber, segment_errors
+from ballu_mjx.residuals.envmimic import start_spread
+from ballu_mjx.residuals.network import NetworkForces, square_newtons
+from ballu_mjx.robots.description import ballu
+from ballu_mjx.sim.force_model import BoundForces, add_wrenches, to_wrenches
+from ballu_mjx.sim.linearize import ControlSteps, Linearized, Linearizer
+from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.sharding import shard_over_devices
+from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.step import state_at
+
+
+@dataclasses.dataclass(frozen=True)
+class AnalyticConfig:
+    """How to learn by gradients through the simulation."""
+
+    window_seconds: float = 8.0
+    """Length of a window, s."""
+    interval_seconds: float = 8.0
+    """Time between the starts of two windows, s."""
+    rounds: int = 8
+    """Simulations of windows, each linearized and then learned on."""
+    windows: int = 16
+    """Windows in a round, drawn anew for each."""
+    updates: int = 20
+    """Gradient steps in a round, each on all its windows."""
+    validate_every: int = 20
+    """Gradient steps between two validations, each of which leaves a checkpoint."""
+    learning_rate: float = 1e-3
+    """Adam's."""
+    max_grad_norm: float = 1.0
+    """Gradients longer than this are shortened to it: contacts make some windows' derivatives a thousand times longer
+    than others'."""
+    averaging: int = 50
+    """Gradient steps over which the network that is handed out is averaged (exponentially)."""
+    force_cost: float = 0.0
+    """Loss for each N^2 of force."""
+    observation_noise: float = 1.0
+    """Noise on what the network sees in training, in multiples of each entry's spread over the recordings."""
+    start_noise: float = 0.0
+    """Perturbation of a window's first state, in multiples of what reconstruction leaves uncertain."""
+    seed: int = 0
+    """Seeds network, batches and noise."""
+
+
+def check_analytic_config(config: AnalyticConfig) -> None:
+    """**Raises** `InputError` for options out of range, naming the option."""
+    check_segments(config.window_seconds, config.interval_seconds)
+    for name in ("rounds", "windows", "updates", "validate_every", "learning_rate", "max_grad_norm", "averaging"):
+        if not getattr(config, name) > 0:
+            raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name)}: it must be greater than 0.")
+
+
+def simulator(
+    model: mujoco.MjModel, forces: NetworkForces, beside: BoundForces | None = None
+) -> Callable[[Any, Segments], tuple[ControlSteps, Float[np.ndarray, "windows windowsteps 27"]]]:
+    """A compiled simulation of windows under the forces of `forces` (and of `beside`): (its parameters, windows) to all
+    control steps, window after window, and the features after each."""
+    robot = Simulator(model)
+    if beside is not None:
+        robot = robot.altered(beside.model.fields(beside.params))
+
+    def run(params: Any, window: Segments) -> tuple[ControlSteps, Array]:
+        def step(carry: tuple, time: Int[Array, ""]) -> tuple[tuple, tuple]:
+            state, history = carry
+            commands = jax.lax.dynamic_slice_in_dim(window.commands, time, HISTORY)
+            loads = forces.loads(params, forces.inputs(history, commands), history[-1, 8])
+            command, wrench = commands[-1], to_wrenches(loads, forces.config.forces)
+            if beside is not None:
+                command = beside.model.command(beside.params, commands)
+                wrench = add_wrenches(wrench, beside.model.wrench(beside.params, history, commands))
+            after = robot.step(state, command, wrench)
+            features, _ = robot.observe(after)
+            done = ControlSteps(state, history, commands, loads), features
+            return (after, jnp.concatenate([history[1:], features[None]])), done
+
+        first = state_at(jnp.asarray(window.qpos), jnp.asarray(window.qvel)), window.history
+        return jax.lax.scan(step, first, jnp.arange(len(window.features)))[1]
+
+    spread = shard_over_devices(run, shared=1)
+
+    def whole(params: Any, recorded: Segments) -> tuple[ControlSteps, np.ndarray]:
+        steps, features = spread(params, recorded)
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps), features
+
+    return whole
+
+
+Report = Callable[[int, Any, dict[str, float]], None]
+"""(gradient steps so far, the averaged parameters, measurements)."""
+
+
+def train(
+    model: mujoco.MjModel,
+    forces: NetworkForces,
+    wrap: Callable[[Any], Any],
+    start: Any,
+    recorded: Segments,
+    spread: Float[np.ndarray, " inputs"],
+    config: AnalyticConfig,
+    report: Report,
+    linearize: Linearizer,
+) -> None:
+    """Learn the parameters of `forces`.
+
+    **Arguments**
+
+    - `wrap`: what is learned to what `forces` takes.
+    - `start`: what is learned, to begin with.
+    - `recorded`: windows of the training recordings.
+    - `spread`: of each of the network's inputs over the recordings.
+    - `report`: told every `validate_every` gradient steps.
+    - `linearize`: that of the same model and force set, with the residual that the simulator has already; joints'
+      torques are left alone.
+    """
+    simulate = simulator(model, forces, linearize.beside)
+    optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
+    starts = start_spread(model, ballu())
+    update = _updates(forces, wrap, optimizer, spread, starts, config)
+    carry = (start, optimizer.init(start), start)
+    key = jax.random.key(config.seed)
+    done = simulated = 0
+    for _ in range(config.rounds):
+        key, own = jax.random.split(key)
+        drawn = np.asarray(jax.random.permutation(own, len(recorded.qpos)))[: config.windows]
+        taken = jax.tree.map(lambda x, drawn=drawn: np.asarray(x)[drawn], recorded)
+        steps, features = simulate(wrap(jax.device_get(carry[0])), taken)
+        data = _in_windows(linearize(steps), steps.loads, taken)
+        simulated += len(steps.loads) * (2 + linearize.directions)
+        loss = float(np.mean(jax.vmap(_loss)(features, taken.features)))
+        for first in range(0, config.updates, config.validate_every):
+            key, own = jax.random.split(key)
+            count = min(config.validate_every, config.updates - first)
+            carry, (linear, gradient) = update(carry, jax.random.split(own, count), data)
+            done += count
+            found = {"loss": loss, "linear_loss": float(jnp.mean(linear)), "gradient": float(jnp.median(gradient))}
+            report(done, jax.device_get(carry[2]), {**found, "control_steps": simulated})
+
+
+def _in_windows(
+    linearized: Linearized, loads: Float[Array | np.ndarray, "steps loads"], recorded: Segments
+) -> tuple[Linearized, Float[Array, "windows windowsteps loads"], Segments]:
+    shape, inputs = recorded.features.shape[:2], linearized.state.shape[1] + loads.shape[1]
+    linearized = linearized._replace(state=linearized.state[..., :inputs], seen=linearized.seen[..., :inputs])
+    parts = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32).reshape(*shape, *x.shape[1:]), (linearized, loads))
+    return *parts, jax.tree.map(jnp.asarray, recorded)
+
+
+def _loss(
+    features: Float[Array | np.ndarray, "windowsteps 27"], recorded: Float[Array | np.ndarray, "windowsteps 27"]
+) -> Float[Array, ""]:
+    """Of a whole window's error."""
+    return pseudo_huber(jnp.sum(segment_errors(features, recorded) ** 2))
+
+
+def _updates(
+    forces: NetworkForces,
+    wrap: Callable[[Any], Any],
+    optimizer: optax.GradientTransformation,
+    spread: Float[np.ndarray, " inputs"],
+    start_spread: Float[np.ndarray, " directions"],
+    config: AnalyticConfig,
+) -> Callable[..., Any]:
+    """Gradient steps on linearized windows, compiled."""
+
+    def window_loss(
+        params: Any, key: Array, linear: Linearized, about: Float[Array, "windowsteps loads"], window: Segments
+    ) -> tuple[Array, Array]:
+        key_start, key_noise = jax.random.split(key)
+        first = config.start_noise * start_spread * jax.random.normal(key_start, start_spread.shape)
+
+        def step(carry: tuple, inputs: tuple) -> tuple[tuple, tuple]:
+            moved, history = carry
+            linear, about, time, key = inputs
+            commands = jax.lax.dynamic_slice_in_dim(window.commands, time, HISTORY)
+            noise = config.observation_noise * spread * jax.random.normal(key, spread.shape)
+            loads = forces.loads(wrap(params), forces.inputs(history, commands) + noise, history[-1, 8])
+            both = jnp.concatenate([moved, loads - about])
+            features = linear.features + linear.seen @ both
+            return (linear.state @ both, jnp.concatenate([history[1:], features[None]])), (features, loads)
+
+        steps = len(window.features)
+        through = linear, about, jnp.arange(steps), jax.random.split(key_noise, steps)
+        _, (features, loads) = jax.lax.scan(step, (first, window.history), through)
+        tracking = _loss(features, window.features)
+        return tracking + config.force_cost * jnp.mean(square_newtons(loads, forces.config)), tracking
+
+    @jax.jit
+    def some(carry: tuple, keys: Array, data: tuple) -> tuple[tuple, tuple]:
+        count = len(data[1])
+
+        def update(carry: tuple, key: Array) -> tuple[tuple, tuple]:
+            params, state, average = carry
+
+            def loss(params: Any) -> tuple[Array, Array]:
+                both = jax.vmap(lambda key, *own: window_loss(params, key, *own))(jax.random.split(key, count), *data)
+                return jnp.mean(both[0]), jnp.mean(both[1])
+
+            (_, tracking), slope = jax.value_and_grad(loss, has_aux=True)(params)
+            change, state = optimizer.update(slope, state, params)
+            params = optax.apply_updates(params, change)
+            average = jax.tree.map(lambda a, p: a + (p - a) / config.averaging, average, params)
+            return (params, state, average), (tracking, optax.tree.norm(slope))
+
+        return jax.lax.scan(update, carry, keys)
+
+    return some

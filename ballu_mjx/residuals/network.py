@@ -1,0 +1,150 @@
+"""Residual forces by a neural network: what it sees, and what its output means."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ballu_mjx.recordings.reference import ReferenceMotions
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.sim.force_model import Fields, ForceSet, num_vectors, to_wrenches
+from ballu_mjx.sim.observation import HISTORY, commands_seen, heading_observation, world_rotation
+
+
+@dataclasses.dataclass(frozen=True)
+class ForceNetworkConfig:
+    """What a force network sees, and what its output means."""
+
+    forces: ForceSet = "force"
+    """What the policy pushes with: a force on the balloon (the paper's), a force and a torque there (wrench), or forces
+    at balloon, base and feet (multi)."""
+    force_limit: float = 1.0
+    """Largest force along each axis, N (paper: 1)."""
+    force_scale: float = 0.05
+    """Force, N, that one unit of the policy's output stands for. The forces that close the gap are hundredths of a
+    newton: with 1 N a unit, PPO's first steps throw the robot over, with a constant learning rate for good."""
+    torque_scale: float = 0.005
+    """Torque, N m, that one unit of the policy's output stands for, where it pushes with one. Limit and cost are, unit
+    for unit, those of a force."""
+    observe_command: bool = True
+    """Let the policy see the commands (now and the last two), which the paper's state leaves out."""
+
+
+def network_input(
+    history: Float[Array, "3 features"],
+    commands: Float[Array, "3 commands"],
+    config: ForceNetworkConfig,
+    anchored: bool = False,
+) -> Float[Array, " inputs"]:
+    """`observation`, with the commands (the coming one last) where the configuration asks for them."""
+    seen = heading_observation(history, anchored)
+    return jnp.concatenate([seen, commands.ravel()]) if config.observe_command else seen
+
+
+def num_inputs(config: ForceNetworkConfig, robot: RobotDescription) -> int:
+    """Numbers in `policy_input`."""
+    return HISTORY * (robot.features + len(robot.commands) * config.observe_command)
+
+
+def num_loads(config: ForceNetworkConfig, robot: RobotDescription) -> int:
+    """Numbers in an action."""
+    return 3 * num_vectors(config.forces, len(robot.points))
+
+
+def load_units(config: ForceNetworkConfig, size: int) -> Float[np.ndarray, " loads"]:
+    """What one unit of each number of an action stands for, N or N m."""
+    scale = np.full(size, config.force_scale)
+    if config.forces == "wrench":
+        scale[3:] = config.torque_scale
+    return scale
+
+
+def square_newtons(loads: Float[Array, "*batch loads"], config: ForceNetworkConfig) -> Float[Array, "*batch"]:
+    """What loads cost force for (N^2): their squares, a torque counted as the force that takes as many units."""
+    in_newtons = loads / load_units(config, loads.shape[-1]) * config.force_scale
+    return jnp.sum(in_newtons**2, axis=-1)
+
+
+def world_loads(
+    action: Float[Array, " loads"], yaw: Float[Array, ""], config: ForceNetworkConfig, anchored: bool = False
+) -> Float[Array, " loads"]:
+    """Return the loads (N, N m; world; see `to_wrenches`) that an action stands for, within the limit along each axis.
+
+    Actions are in the balloon's heading frame, like the observation: the same situation met in another direction
+    calls for the same force, turned. Those on an anchored robot are in the world's.
+    """
+    most = config.force_limit / config.force_scale
+    loads = jnp.asarray(load_units(config, len(action))) * jnp.clip(action, -most, most)
+    return (loads.reshape(-1, 3) @ world_rotation(yaw, anchored).T).ravel()
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkForces:
+    """EnvMimic's kind of residual (see `force_model.ForceModel`): a policy's action is what pushes the robot.
+
+    **Fields**
+
+    - `config`: what the policy sees, and what its actions mean.
+    - `infer`: (parameters, observation) to the most likely action.
+    - `sample`: (parameters, observation, key) to a drawn one; None: there is none to be had.
+    - `anchored`: whether the robot is (`description.RobotDescription`).
+    """
+
+    config: ForceNetworkConfig
+    infer: Callable[[Any, Float[Array, " inputs"]], Float[Array, " loads"]]
+    sample: Callable[[Any, Float[Array, " inputs"], Array], Float[Array, " loads"]] | None = None
+    name: str = "envmimic"
+    anchored: bool = False
+
+    def inputs(
+        self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]
+    ) -> Float[Array, " inputs"]:
+        """What the policy sees."""
+        return network_input(history, commands, self.config, self.anchored)
+
+    def fields(self, params: Any) -> Fields:
+        """None: forces are all there is."""
+        return {}
+
+    def command(self, params: Any, commands: Float[Array, "steps commands"]) -> Float[Array, "1 commands"]:
+        """The command as it is."""
+        return commands[-1:]
+
+    def wrench(
+        self,
+        params: Any,
+        history: Float[Array, "steps features"],
+        commands: Float[Array, "steps commands"],
+        key: Array | None = None,
+    ) -> Float[Array, "loaded 6"]:
+        """The policy's loads, where they act."""
+        seen, yaw = self.inputs(history, commands), history[-1, 8]
+        if key is None or self.sample is None:
+            loads = self.loads(params, seen, yaw)
+        else:
+            loads = world_loads(self.sample(params, seen, key), yaw, self.config, self.anchored)
+        return to_wrenches(loads, self.config.forces)
+
+    def loads(self, params: Any, seen: Float[Array, " inputs"], yaw: Float[Array, ""]) -> Float[Array, " loads"]:
+        """The most likely loads (N, N m; world) for what the policy sees, at a heading."""
+        return world_loads(self.infer(params, seen), yaw, self.config, self.anchored)
+
+
+def recorded_inputs(
+    reference: ReferenceMotions, config: ForceNetworkConfig, anchored: bool = False
+) -> Float[Array, "states inputs"]:
+    """What the policy would see of every recorded state."""
+
+    def inputs(recording: Array, time: Array) -> Array:
+        history = jax.lax.dynamic_slice_in_dim(reference.features[recording], time - HISTORY + 1, HISTORY)
+        return network_input(history, commands_seen(reference.command[recording], time), config, anchored)
+
+    steps = np.asarray(reference.steps)
+    pairs = np.array([(r, k) for r, count in enumerate(steps) for k in range(HISTORY - 1, count)])
+    return jax.jit(jax.vmap(inputs))(*jnp.array(pairs).T)

@@ -1,0 +1,243 @@
+"""Residual forces by regression, the paper's baseline: which force explains each recorded control step, and a network
+for it.
+
+One control step alone says little: half a millimetre of motion capture's noise over 0.05 s looks like a tenth of a
+newton. And not all that a recorded step differs in from the simulated one is a matter of the force: servos are late,
+legs slip, air turns the balloon. A label is therefore the most likely force given the whole recording, where capture,
+joints' torques and the motion itself err as well: a smoothing problem, linear along the recorded motion.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import optax
+import scipy.linalg
+from jaxtyping import Array, Float
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reference import stack_motions
+from ballu_mjx.residuals.network import ForceNetworkConfig, load_units, recorded_inputs
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.sim.linearize import ControlSteps, Linearizer
+from ballu_mjx.sim.observation import HISTORY, heading_rotation
+from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.step import state_at
+
+
+@dataclasses.dataclass(frozen=True)
+class SupervisedConfig:
+    """Labels and regression."""
+
+    force_spread: float = 0.3
+    """Standard deviation of the prior on the force along each axis, N. That on a torque is, in units of the network's
+    output, as wide."""
+    force_change: float = 0.1
+    """Standard deviation of the prior on how it changes from one control step to the next, N. Air that the balloon
+    drags along pushes back at every footfall: a prior that smooths more takes most of that away."""
+    torque_spread: float = 0.05
+    """Standard deviation of what motors and knees pull beyond the model, N m."""
+    position_noise: float = 0.0005
+    """Standard deviation of the recorded place, m."""
+    angle_noise: float = 0.3
+    """Likewise of recorded angles, deg."""
+    held_angle_noise: float = 10.0
+    """Likewise of the joints that motion capture does not show (BALLU's motors), deg."""
+    velocity_noise: float = 0.01
+    """Standard deviation of what a control step changes the base's velocity by beyond all this, m/s."""
+    rotation_noise: float = 3.0
+    """Likewise of the base's angular velocity and the balloon's against it, deg/s."""
+    joint_noise: float = 20.0
+    """Likewise of the legs' joints, deg/s."""
+    observation_noise: float = 1.0
+    """Noise on what the network sees in training, in multiples of each entry's spread over the recordings."""
+    updates: int = 4000
+    """Gradient steps."""
+    validate_every: int = 200
+    """Gradient steps between two looks at the validation recordings' labels, whose smallest error ends the search."""
+    batch_size: int = 256
+    """Labels in a gradient step."""
+    learning_rate: float = 1e-3
+    """Adam's."""
+    shares: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
+    """Of the forces, of which the one that acts is chosen: whose simulation follows the validation recordings best. A
+    force that is right in recorded states may lead astray in simulated ones. `--shares 1`: all of them, as in the
+    paper."""
+    seed: int = 0
+    """Seeds network and batches."""
+
+
+def check_supervised_config(config: SupervisedConfig) -> None:
+    """**Raises** `InputError` for options out of range, naming the option."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if field.name not in ("observation_noise", "shares", "seed") and not value > 0:
+            raise InputError(f"--{field.name.replace('_', '-')} is {value}: it must be greater than 0.")
+    if not config.shares or not all(0.0 <= share <= 1.0 for share in config.shares):
+        raise InputError(f"--shares is {' '.join(map(str, config.shares))}: give one or more from 0 to 1.")
+
+
+class ForceLabeller:
+    """Labels recorded motions."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        robot: RobotDescription,
+        linearize: Linearizer,
+        config: SupervisedConfig,
+        env: ForceNetworkConfig | None = None,
+    ) -> None:
+        """`linearize` is that of the same model and force set, with the torques of the robot's joints; where it has a
+        residual beside, labels are what that leaves. `env`: of the network to be (None: its defaults)."""
+        env = env or ForceNetworkConfig()
+        self._model, self._config, self._linearize = model, config, linearize
+        self._in_newtons = load_units(env, linearize.loads) / env.force_scale
+        self._simulator = Simulator(model, robot)
+        self._measured, self._process = _noise(model, robot, config)
+
+    def __call__(self, motion: Motion) -> Float[np.ndarray, "steps loads"]:
+        """The loads (N, N m; world) over each control step that explain the recorded motion."""
+        count, past = len(motion.command), HISTORY - 1
+        reference, _ = stack_motions(self._simulator, [motion])
+        states = state_at(reference.qpos[0, :-1], reference.qvel[0, :-1])
+        history, commands = (
+            np.lib.stride_tricks.sliding_window_view(
+                np.pad(x, [(past, 0), (0, 0)], mode="edge"), HISTORY, axis=0
+            ).swapaxes(1, 2)
+            for x in (np.asarray(reference.features[0, :-1]), motion.command)
+        )
+        linear = self._linearize(ControlSteps(states, history, commands, np.zeros((count, self._linearize.loads))))
+        defect = np.zeros((count, 2 * self._model.nv))
+        for step in range(count):
+            recorded, after = motion.qpos[step + 1], np.asarray(linear.qpos[step], np.float64)
+            mujoco.mj_differentiatePos(self._model, defect[step, : self._model.nv], 1.0, recorded, after)
+        defect[:, self._model.nv :] = linear.qvel - motion.qvel[1:]
+        return self._explain(np.asarray(linear.state, np.float64), defect)
+
+    def _explain(
+        self, state: Float[np.ndarray, "steps states directions"], defect: Float[np.ndarray, "steps states"]
+    ) -> Float[np.ndarray, "steps loads"]:
+        """The most likely loads of control steps that end `defect` off the recorded state after, to first order.
+
+        Unknown at each time are the state's deviation from the recorded one and the step's inputs; each time is tied to
+        the next alone, so that one banded factorization solves for a whole recording.
+        """
+        config, (count, after, every), loads = self._config, state.shape, self._linearize.loads
+        force = np.arange(after, after + loads)
+        known = np.any(state, axis=(1, 2), keepdims=True)[:, 0]  # zeros where there are no derivatives
+        weight = known / self._process**2
+        spread = np.r_[
+            self._measured,
+            np.full(self._model.nv, _ANY_VELOCITY),
+            config.force_spread * self._in_newtons,
+            np.full(every - after - loads, config.torque_spread),
+        ]
+        here = np.tile(np.diag(spread**-2.0), (count + 1, 1, 1))
+        here[:-1] += state.transpose(0, 2, 1) @ (weight[:, :, None] * state)
+        here[1:, range(after), range(after)] += weight
+        towards = np.zeros_like(here)  # rows of the time after, columns of this one
+        towards[:-1, :after] -= weight[:, :, None] * state
+        change = (config.force_change * self._in_newtons) ** -2.0
+        here[:-1, force, force] += change
+        here[1:, force, force] += change
+        towards[:-1, force, force] -= change
+        right = np.zeros((count + 1, every))
+        right[:-1] -= np.einsum("tsd,ts->td", state, weight * defect)
+        right[1:, :after] += weight * defect
+
+        columns = np.concatenate([here, towards], axis=1)
+        lower = np.zeros((2 * every, count + 1, every))
+        for place in range(every):
+            lower[: 2 * every - place, :, place] = columns[:, place:, place].T
+        found = scipy.linalg.solveh_banded(lower.reshape(2 * every, -1), right.ravel(), lower=True)
+        return found.reshape(count + 1, every)[:-1, force]
+
+
+_ANY_VELOCITY = 10.0
+"""m/s and rad/s: recorded velocities are differences of recorded places, and say nothing of their own."""
+
+
+def _noise(
+    model: mujoco.MjModel, robot: RobotDescription, config: SupervisedConfig
+) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, " 2*nv"]]:
+    """Standard deviations of recorded positions, and of what a control step is off by beyond its inputs; both along the
+    directions of `mjx.Data.qvel`, of the second also the velocities'."""
+    degree = np.pi / 180
+    trunk, body = [], int(model.site_bodyid[model.site(robot.tracked).id])
+    while body:  # from the tracked body down to the root
+        trunk.append(body)
+        body = int(model.body_parentid[body])
+    velocity = np.where(np.isin(model.dof_bodyid, trunk), config.rotation_noise, config.joint_noise) * degree
+    measured = np.full(model.nv, config.angle_noise * degree)
+    velocity[:3], measured[:3] = config.velocity_noise, config.position_noise
+    measured[[model.joint(name).dofadr[0] for name in robot.held]] = config.held_angle_noise * degree
+    return measured, np.concatenate([velocity * model.opt.timestep, velocity])
+
+
+def examples(
+    simulator: Simulator,
+    motions: Sequence[Motion],
+    loads: Sequence[Float[np.ndarray, "steps loads"]],
+    config: ForceNetworkConfig,
+) -> tuple[Float[np.ndarray, "examples inputs"], Float[np.ndarray, "examples loads"]]:
+    """What the network sees of each recorded state that has a history, and the action (see `network.world_loads`) that
+    is its label."""
+    reference, _ = stack_motions(simulator, motions)
+    first = HISTORY - 1
+    yaw = [np.asarray(seen[first:count, 8]) for seen, count in zip(reference.features, reference.steps, strict=True)]
+    labels = np.concatenate([each[first:] for each in loads])
+    to_world = np.asarray(jax.vmap(heading_rotation)(jnp.asarray(np.concatenate(yaw))))
+    turned = np.einsum("nji,nvj->nvi", to_world, labels.reshape(len(labels), -1, 3)).reshape(labels.shape)
+    actions = turned / load_units(config, labels.shape[1])
+    return np.asarray(recorded_inputs(reference, config)), np.asarray(actions, np.float32)
+
+
+Validate = Callable[[int, Any, float], None]
+"""(gradient steps so far, the policy network's parameters, mean squared error of training since the last)."""
+
+
+def regress(
+    infer: Callable[[Any, Float[Array, "batch inputs"]], Float[Array, "batch loads"]],
+    start: Any,
+    learned: tuple[Float[np.ndarray, "examples inputs"], Float[np.ndarray, "examples loads"]],
+    config: SupervisedConfig,
+    validate: Validate,
+) -> None:
+    """Fit the parameters of `infer`, from `start`, to `examples` by squared error; every `validate_every` steps
+    `validate` is told."""
+    inputs, actions = learned
+    optimizer = optax.adam(config.learning_rate)
+    spread = np.std(inputs, axis=0)
+
+    @jax.jit
+    def some(carry: tuple, keys: Array) -> tuple[tuple, Array]:
+        def update(carry: tuple, key: Array) -> tuple[tuple, Array]:
+            params, state = carry
+            key_choice, key_noise = jax.random.split(key)
+            chosen = jax.random.randint(key_choice, (config.batch_size,), 0, len(inputs))
+            noise = config.observation_noise * spread * jax.random.normal(key_noise, (config.batch_size, len(spread)))
+            seen = jnp.asarray(inputs)[chosen] + noise
+
+            def error(params: Any) -> Array:
+                return jnp.mean((infer(params, seen) - jnp.asarray(actions)[chosen]) ** 2)
+
+            value, slope = jax.value_and_grad(error)(params)
+            change, state = optimizer.update(slope, state, params)
+            return (optax.apply_updates(params, change), state), value
+
+        return jax.lax.scan(update, carry, keys)
+
+    carry, key = (start, optimizer.init(start)), jax.random.key(config.seed)
+    for done in range(0, config.updates, config.validate_every):
+        key, own = jax.random.split(key)
+        count = min(config.validate_every, config.updates - done)
+        carry, values = some(carry, jax.random.split(own, count))
+        validate(done + count, carry[0], float(jnp.mean(values)))

@@ -1,0 +1,1 @@
+"""PPO: networks, the learning loop, several processes."""

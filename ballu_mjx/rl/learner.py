@@ -1,0 +1,516 @@
+"""The loop that learns: PPO out of Brax's parts, in one program that is compiled once, and all its state in one tree.
+
+`brax.training.agents.ppo.train` does the same sums on the same random numbers (a test holds the two side by side), but
+keeps the optimizer and the environments to itself. Here they are in a `TrainingState`, which can be written to disk at
+any training step and gone on from as if nothing had happened.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import optax
+from brax.envs.base import Env, State, Wrapper
+from brax.training import acting
+from brax.training.acme import running_statistics
+from brax.training.acme.running_statistics import RunningStatisticsState
+from brax.training.agents.ppo import networks as brax_networks
+from brax.training.agents.ppo.losses import PPONetworkParams, compute_ppo_loss
+from brax.training.agents.ppo.optimizer import adaptive_kl_learning_rate
+from brax.training.types import Transition, UInt64
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Int, UInt32
+
+from ballu_mjx.rl import distributed, ppo
+from ballu_mjx.rl.ppo import STATE, Normalizer, Params, PPOConfig
+
+
+class TrainingState(NamedTuple):
+    """All that a training step hands to the next, on the devices: environments spread over them, the rest on each.
+
+    - `networks`: policy and value function as they learn.
+    - `averaged`: the policy that is handed out (see `PPOConfig.averaging`), in the shape of `networks.policy`.
+    - `averaged_steps`: training steps in that average, the starting point not counted.
+    - `optimizer`: optax's; Adam's moments, and the learning rate where it has got to.
+    - `normalizer`: running statistics of the observations, by name.
+    - `environments`: every environment's state, leaves of shape (num_envs, ...), with the keys of its resets.
+    - `key`: all randomness of the training steps to come.
+    - `steps`: control steps done, all environments together.
+    """
+
+    networks: PPONetworkParams
+    averaged: Any
+    averaged_steps: Int[Array, ""]
+    optimizer: optax.OptState
+    normalizer: RunningStatisticsState
+    environments: State
+    key: UInt32[Array, 2]
+    steps: UInt64
+
+
+Callback = Callable[[int, TrainingState, dict[str, float]], None]
+"""(control steps done, the state, means since the last call: empty before the first training step).
+
+The next training step reuses the state's memory: take `params` or `stored` of it before returning."""
+
+Stored = Mapping[str, np.ndarray]
+"""A `TrainingState` on the host: its arrays by their place in it."""
+
+_AXIS = "devices"
+_MEASURED = "measured"
+_MAX_CALLS = 400
+
+
+def wrap_for_training(env: Env) -> Wrapper:
+    """`env` vectorized, with every finished environment reset to a newly drawn state.
+
+    Brax's own auto-reset goes back to a cached first state for ever. Here all environments are reset in every step,
+    and the finished ones take the result: for environments whose reset costs nothing beside their step.
+
+    An `env` may have `contents`, a tree of arrays, and a method `with_contents(contents)` that gives the same with
+    others: a `Learner` hands them to its program, which so serves all environments that differ in nothing else.
+
+    An `env` with a method `renew(state, key)` is reset by it: what tells one variant of an environment from another can
+    then be handed on from state to state, instead of being a constant of the compiled program.
+
+    `env` ends its episodes itself, by time also: it sets `done` and, where only time ran out,
+    `info["truncation"]`, in both `reset` and `step`. What Brax's `compute_gae` makes of a truncated transition
+    `t`: its advantage is 0 and its value's target the value itself, so that it teaches nothing; the transition before
+    bootstraps from `V(s_t)`, as if the episode went on; the fresh state behind it never enters. So values are unbiased
+    at the price of one transition in an episode. A `done` without truncation is a termination, with 0 to come.
+
+    A step whose observation, reward or metrics are not all finite ends its episode with a reward of 0, and the numbers
+    that are none become 0: one robot that explodes must not spoil what all learn. The metric `diverged` is 1 there, and
+    otherwise the environment's own, if it has one.
+
+    The observation becomes a dictionary: `state` for the policy, `critic` for the value function where `env` gives both
+    by these names (else `state` serves both). `info["measured"]` has the step's reward and metrics, before any reset.
+    """
+    return _Training(env)
+
+
+class _Training(Wrapper):
+    """See `wrap_for_training`."""
+
+    def reset(self, rng: Array) -> State:
+        keys = jax.vmap(jax.random.split)(rng)
+        state = jax.vmap(self.env.reset)(keys[:, 0])
+        state = dataclasses.replace(state, metrics={_DIVERGED: jnp.zeros_like(state.reward)} | state.metrics)
+        return self._with_extras(state, state, keys[:, 1])
+
+    def step(self, state: State, action: Array) -> State:
+        keys = jax.vmap(jax.random.split)(state.info["reset_key"])
+        before = dataclasses.replace(state, done=jnp.zeros_like(state.done))
+        after = _only_finite(jax.vmap(self.env.step)(before, action))
+        renew = getattr(self.env, "renew", lambda state, key: self.env.reset(key))
+        fresh = jax.vmap(renew)(before, keys[:, 0])
+        done = after.done.astype(bool)
+
+        truncation = after.info["truncation"]
+        info = _where(done, fresh.info, {key: after.info[key] for key in fresh.info})
+        shown = dataclasses.replace(
+            after,
+            pipeline_state=_where(done, fresh.pipeline_state, after.pipeline_state),
+            obs=_where(done, fresh.obs, after.obs),
+            info=info | {"truncation": truncation},
+        )
+        return self._with_extras(shown, after, keys[:, 1])
+
+    def _with_extras(self, shown: State, outcome: State, keys: Array) -> State:
+        """Name the observations, and add the keys of the resets and the outcome's reward and metrics."""
+        measured = {"reward": outcome.reward} | outcome.metrics
+        info = shown.info | {"reset_key": keys, _MEASURED: jax.tree.map(jnp.float32, measured)}
+        named = dict(shown.obs) if isinstance(shown.obs, Mapping) else {STATE: shown.obs}
+        return dataclasses.replace(shown, obs=named, info=info)
+
+
+class Learner:
+    """PPO for one environment and configuration, on all devices, those of other processes included (see
+    `ballu_mjx.rl.distributed`).
+
+    Each device has its share of the environments, and collects and learns from their experience; gradients and
+    statistics are means over all of them.
+    """
+
+    def __init__(self, env: Env, config: PPOConfig) -> None:
+        """**Raises** `InputError` from `ppo.check`."""
+        self._devices = jax.device_count()
+        ppo.check(config, self._devices)
+        self._config, self._env = config, env
+        mesh = Mesh(np.array(jax.devices()), (_AXIS,))
+        each: Any = PartitionSpec()
+        everywhere = NamedSharding(mesh, each)
+        # From the host: an array of one device is not for all processes.
+        self._contents = jax.device_put(jax.device_get(getattr(env, "contents", ())), everywhere)
+        # A program of its own, for its shapes are asked for before it is part of another: traced once.
+        self._reset = jax.jit(lambda keys, contents: self._with_contents(contents).reset(keys))
+        keys = jax.ShapeDtypeStruct((config.num_envs, 2), jnp.uint32)
+        shapes = jax.eval_shape(self._reset, keys, self._contents).obs
+        self._observation = {name: jax.ShapeDtypeStruct(x.shape[1:], jnp.float32) for name, x in shapes.items()}
+        sizes = {name: x.shape for name, x in self._observation.items()}
+        self._networks = ppo.make_networks(sizes, env.action_size, config)
+        # The learning rate is part of the state also where it stays: one program for all of them.
+        self._optimizer = optax.chain(
+            optax.clip_by_global_norm(config.max_grad_norm),
+            optax.inject_hyperparams(optax.adam)(learning_rate=config.learning_rate),
+        )
+        loss = functools.partial(
+            compute_ppo_loss,
+            ppo_network=self._networks,
+            entropy_cost=config.entropy_cost,
+            discounting=config.discounting,
+            reward_scaling=config.reward_scaling,
+            gae_lambda=config.gae_lambda,
+            clipping_epsilon=config.clipping_epsilon,
+        )
+        self._gradient = jax.grad(loss, has_aux=True)
+
+        specs = TrainingState(*[each] * len(TrainingState._fields))._replace(environments=PartitionSpec(_AXIS))
+        self._shardings: Any = TrainingState(*(NamedSharding(mesh, spec) for spec in specs))  # pyright: ignore
+        self._first = jax.jit(self._make_first, out_shardings=self._shardings)
+        step = jax.shard_map(
+            self._make_step, mesh=mesh, in_specs=(specs, each), out_specs=(specs, each), check_vma=False
+        )
+        # Placed as they go in; on one device they would come back with another description, and compile a second time.
+        self._step = jax.jit(step, donate_argnums=0, out_shardings=(self._shardings, everywhere))
+
+    @property
+    def steps_each(self) -> int:
+        """Control steps of a training step."""
+        return _step_size(self._config)
+
+    def begin(self, seed: int) -> TrainingState:
+        """A fresh state; Brax's with this seed."""
+        arguments = np.array(jax.random.PRNGKey(seed)), self._contents
+        first = self._first.lower(*arguments)
+        state = jax.tree.map(
+            lambda x, sharding: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding),
+            first.out_info,
+            jax.tree.broadcast(self._shardings, first.out_info),
+        )
+        # XLA compiles this program while Python traces the next.
+        with ThreadPoolExecutor(1) as pool:
+            compiled = pool.submit(first.compile)
+            self._step.lower(state, self._contents)
+            compiled.result()
+        return self._first(*arguments)
+
+    def step(self, state: TrainingState) -> tuple[TrainingState, dict[str, Array]]:
+        """A training step: the state to the next one and its means, reward, metrics and losses. The memory of the state
+        that goes in is used again."""
+        return self._step(state, self._contents)
+
+    def go_on(self, stored: Stored, *, environments: bool = True) -> tuple[TrainingState, bool]:
+        """The state that `stored` was made of, and whether all of it could be used.
+
+        With `environments` False, or where theirs do not fit (another number of them, say), environments and random
+        numbers are fresh ones, drawn from the configuration's seed and the steps done.
+
+        **Raises** `ValueError` naming what is missing or has another shape in the rest of it.
+        """
+        shapes = jax.eval_shape(self._first, jax.random.PRNGKey(0), self._contents)
+        fits, drawn = {}, set()
+        for path, leaf in jax.tree.leaves_with_path(shapes):
+            name = _name(path)
+            found = stored.get(name)
+            fits[name] = found is not None and (found.shape, found.dtype) == (leaf.shape, leaf.dtype)
+            if name.split(".")[0] in ("environments", "key"):
+                drawn.add(name)
+        for name in fits.keys() - drawn:
+            if not fits[name]:
+                raise ValueError(f"{name} is missing or has another shape")
+        whole = environments and all(fits.values())
+        steps = int(UInt64(hi=stored["steps.hi"], lo=stored["steps.lo"]))  # pyright: ignore[reportCallIssue]
+
+        def choose(path: Any, leaf: Any) -> Any:
+            name = _name(path)
+            return leaf if name in drawn and not whole else np.array(stored[name])
+
+        template = shapes if whole else self.begin(_seed(self._config, steps))
+        return self._placed(jax.tree.map_with_path(choose, template)), whole
+
+    def begin_from(self, params: Params, steps: int) -> TrainingState:
+        """A state with what was learned in `steps` control steps, the optimizer and all else fresh."""
+        state = self.begin(_seed(self._config, steps))
+        known = params.normalizer
+        normalizer = dataclasses.replace(
+            state.normalizer,
+            count=_uint64(int(known.count)),
+            mean=known.mean,
+            std=known.std,
+            summed_variance=known.summed_variance,
+        )
+        networks = PPONetworkParams(policy=params.policy, value=params.value)  # pyright: ignore[reportCallIssue]
+        filled = state._replace(networks=networks, averaged=params.policy, normalizer=normalizer, steps=_uint64(steps))
+
+        def placeable(x: Any, like: Array) -> Any:
+            return x if isinstance(x, jax.Array) else np.array(x, like.dtype)
+
+        return self._placed(jax.tree.map(placeable, filled, state))
+
+    def _placed(self, state: TrainingState) -> TrainingState:
+        """From the host to where `step` wants it."""
+        return jax.device_put(state, self._shardings)
+
+    def _with_contents(self, contents: Any) -> Wrapper:
+        env: Any = self._env
+        return wrap_for_training(env.with_contents(contents) if hasattr(env, "with_contents") else env)
+
+    def _make_first(self, key: UInt32[Array, 2], contents: Any) -> TrainingState:
+        key_networks, key = jax.random.split(key)
+        key, key_environments, _ = jax.random.split(jax.random.fold_in(key, 0), 3)
+        key_policy, key_value = jax.random.split(key_networks)
+        networks = PPONetworkParams(
+            policy=self._networks.policy_network.init(key_policy),  # pyright: ignore[reportCallIssue]
+            value=self._networks.value_network.init(key_value),  # pyright: ignore[reportCallIssue]
+        )
+        return _settled(
+            TrainingState(
+                networks=networks,
+                averaged=networks.policy,
+                averaged_steps=jnp.zeros((), jnp.int32),
+                optimizer=self._optimizer.init(networks),  # pyright: ignore[reportArgumentType]
+                normalizer=running_statistics.init_state(self._observation),
+                environments=self._reset(jax.random.split(key_environments, self._config.num_envs), contents),
+                key=key,
+                steps=_uint64(0),
+            )
+        )
+
+    def _make_step(self, state: TrainingState, contents: Any) -> tuple[TrainingState, dict[str, Array]]:
+        """On one device, with its share of the environments; random numbers are split as Brax splits them."""
+        config = self._config
+        key_step, key = jax.random.split(state.key)
+        key_device = jax.random.split(key_step, self._devices)[jax.lax.axis_index(_AXIS)]
+        key_learn, key_act, _ = jax.random.split(key_device, 3)
+
+        environments, data, measured = self._act(self._with_contents(contents), state, key_act)
+
+        # Where the learning rate adapts, the old policy must still be what acted when the change is measured.
+        adaptive = config.desired_kl > 0
+        observe = functools.partial(running_statistics.update, batch=data.observation, pmap_axis_name=_AXIS)
+        normalizer = state.normalizer if adaptive else observe(state.normalizer)
+        (optimizer, networks, _), losses = jax.lax.scan(
+            functools.partial(self._pass, data=data, normalizer=normalizer),
+            (state.optimizer, state.networks, key_learn),
+            length=config.num_updates_per_batch,
+        )
+        if adaptive:
+            normalizer = observe(state.normalizer)
+
+        averaged_steps = state.averaged_steps + 1
+        share = 1.0 / jnp.minimum(averaged_steps, config.averaging)
+        averaged = jax.tree.map(lambda old, new: old + share * (new - old), state.averaged, networks.policy)
+        after = TrainingState(
+            networks=networks,
+            averaged=averaged,
+            averaged_steps=averaged_steps,
+            optimizer=optimizer,
+            normalizer=normalizer,
+            environments=environments,
+            key=key,
+            steps=state.steps + self.steps_each,
+        )
+        return _settled(after), jax.lax.pmean(jax.tree.map(jnp.mean, measured | losses), _AXIS)
+
+    def _act(self, env: Wrapper, state: TrainingState, key: Array) -> tuple[State, Transition, dict[str, Array]]:
+        """Environments one unroll or several on, the pieces of experience, leaves (pieces, unroll_length, ...), and
+        rewards and metrics."""
+        config = self._config
+        make_policy = brax_networks.make_inference_fn(self._networks)
+        policy = make_policy((state.normalizer, state.networks.policy, state.networks.value))
+
+        def unroll(carry: tuple[State, Array], _: None) -> tuple[tuple[State, Array], Transition]:
+            environments, key = carry
+            key, key_next = jax.random.split(key)
+            environments, data = acting.generate_unroll(
+                env, environments, policy, key, config.unroll_length, extra_fields=("truncation", _MEASURED)
+            )
+            return (environments, key_next), data
+
+        count = config.batch_size * config.num_minibatches // config.num_envs
+        (environments, _), data = jax.lax.scan(unroll, (state.environments, key), length=count)
+        data = jax.tree.map(lambda x: jnp.swapaxes(x, 1, 2).reshape(-1, x.shape[1], *x.shape[3:]), data)
+        extras = dict(data.extras["state_extras"])
+        measured = extras.pop(_MEASURED)
+        return environments, data._replace(extras={**data.extras, "state_extras": extras}), measured
+
+    def _pass(
+        self, carry: tuple[Any, Any, Array], nothing: None, *, data: Transition, normalizer: RunningStatisticsState
+    ) -> tuple[tuple[Any, Any, Array], dict[str, Array]]:
+        """Learn once from all that was collected, in minibatches drawn anew."""
+        optimizer, networks, key = carry
+        key, key_shuffle, key_loss = jax.random.split(key, 3)
+        # Once for all arrays: each shuffle is a sort and a dozen kernels to compile.
+        order = jax.random.permutation(key_shuffle, len(data.reward))
+
+        def minibatches(x: Array) -> Array:
+            return x[order].reshape(self._config.num_minibatches, -1, *x.shape[1:])
+
+        (optimizer, networks, _), losses = jax.lax.scan(
+            functools.partial(self._update, normalizer=normalizer),
+            (optimizer, networks, key_loss),
+            jax.tree.map(minibatches, data),
+        )
+        return (optimizer, networks, key), losses
+
+    def _update(
+        self, carry: tuple[Any, Any, Array], data: Transition, *, normalizer: RunningStatisticsState
+    ) -> tuple[tuple[Any, Any, Array], dict[str, Array]]:
+        """Learn from one minibatch."""
+        optimizer, networks, key = carry
+        key, key_loss = jax.random.split(key)
+        # All that devices must tell each other, in one exchange: each has its price, small or large.
+        own, losses = self._gradient(networks, normalizer, data, key_loss)
+        flat, apart = jax.flatten_util.ravel_pytree((own, losses["kl_mean"]))
+        gradient, change = apart(jax.lax.pmean(flat, _AXIS))
+        rate = optimizer[-1].hyperparams["learning_rate"]
+        if self._config.desired_kl > 0:
+            optimizer, rate = adaptive_kl_learning_rate(optimizer, change, self._config.desired_kl)
+        update, optimizer = self._optimizer.update(gradient, optimizer)
+        return (optimizer, optax.apply_updates(networks, update), key), {**losses, "learning_rate": rate}
+
+
+def train(
+    env: Env,
+    config: PPOConfig,
+    callback: Callback | None = None,
+    *,
+    start: Callable[[Learner], TrainingState] | None = None,
+) -> tuple[TrainingState, dict[str, float]]:
+    """Learn a policy for `env`, on all devices, until `config.num_timesteps` control steps are done.
+
+    **Arguments**
+
+    - `env`: unbatched; see `wrap_for_training` for what it must do.
+    - `callback`: called before the first training step and then after every one, or every few of many. It may raise to
+      stop.
+    - `start`: makes the state to go on from (see `Learner.go_on` and `Learner.begin_from`); without it a fresh one. A
+      training that goes on from a stored state, on the same machine with the same number of devices, ends in the same
+      numbers to the last bit as one that was never interrupted.
+
+    **Returns** the last state, and the last call's means: `reward` and the environment's metrics per control step,
+    `steps_per_second`, and Brax's losses.
+
+    **Raises** `InputError` from `ppo.check`.
+    """
+    learner = Learner(env, config)
+    state = start(learner) if start is not None else learner.begin(config.seed)
+    call = callback or (lambda step, state, metrics: None)
+    step = int(state.steps)
+    per_call, calls = _schedule(config, step)
+    metrics: dict[str, float] = {}
+    call(step, state, metrics)
+    for _ in range(calls):
+        began = time.perf_counter()
+        means = []
+        for _ in range(per_call):
+            state, mean = learner.step(state)
+            means.append(mean)
+        means = jax.device_get(means)  # waits for them
+        rate = per_call * learner.steps_each / (time.perf_counter() - began)
+        step += per_call * learner.steps_each
+        metrics = {name: float(np.mean([mean[name] for mean in means])) for name in means[0]}
+        metrics["steps_per_second"] = rate
+        call(step, state, metrics)
+    return state, metrics
+
+
+def total_timesteps(config: PPOConfig, first_step: int = 0) -> int:
+    """Control steps done when `train` ends, gone on from `first_step`: `num_timesteps` rounded up."""
+    per_call, calls = _schedule(config, first_step)
+    return first_step + calls * per_call * _step_size(config)
+
+
+def params(state: TrainingState) -> Params:
+    """What `state` has learned so far, with the averaged policy, copied to the host."""
+    statistics = state.normalizer
+    count = np.array(int(statistics.count), np.float32)  # pyright: ignore[reportArgumentType]
+    moments = _copied((statistics.mean, statistics.std, statistics.summed_variance))
+    return Params(Normalizer(count, *moments), *_copied((state.averaged, state.networks.value)))
+
+
+def stored(state: TrainingState) -> dict[str, np.ndarray]:
+    """All of `state`, copied to the host, for `Learner.go_on`; all processes must ask for it."""
+    return {_name(path): distributed.on_host(leaf) for path, leaf in jax.tree.leaves_with_path(state)}
+
+
+def with_learning_rate(stored: Stored, rate: float) -> dict[str, np.ndarray]:
+    """`stored` with another learning rate to go on with."""
+    name = next(name for name in stored if name.endswith("hyperparams.learning_rate"))
+    return {**stored, name: np.full_like(stored[name], rate)}
+
+
+_DIVERGED = "diverged"
+
+
+def _only_finite(state: State) -> State:
+    """What `wrap_for_training` says of numbers that are none; `state` is a batch."""
+    parts = jax.tree.leaves((state.obs, state.reward, state.metrics))
+    good = functools.reduce(jnp.logical_and, (jnp.isfinite(x).reshape(len(x), -1).all(axis=1) for x in parts))
+    metrics = {name: jnp.where(jnp.isfinite(x), x, 0.0) for name, x in state.metrics.items()}
+    return dataclasses.replace(
+        state,
+        reward=jnp.where(good, state.reward, 0.0),
+        done=jnp.where(good, state.done, 1.0),
+        metrics=metrics | {_DIVERGED: jnp.where(good, metrics.get(_DIVERGED, 0.0), 1.0)},
+        info=state.info | {"truncation": jnp.where(good, state.info["truncation"], 0.0)},
+    )
+
+
+def _where(done: Array, new: Any, old: Any) -> Any:
+    """`new` for the environments that are done, `old` for the others."""
+
+    def select(new: Array, old: Array) -> Array:
+        return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
+
+    return jax.tree.map(select, new, old)
+
+
+def _settled(state: TrainingState) -> TrainingState:
+    """`state` as the compiled step takes it: no two arrays the same one (memory given away twice), and no type that
+    only Python's numbers have (a second program)."""
+    return jax.tree.map(lambda x: jnp.array(x, jnp.asarray(x).dtype, copy=True), state)
+
+
+def _copied(tree: Any) -> Any:
+    """On the host, in memory of its own."""
+    return jax.tree.map(np.array, tree)
+
+
+def _name(path: Any) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=".")
+
+
+def _uint64(count: int) -> UInt64:
+    high, low = divmod(count, 2**32)
+    return UInt64(hi=high, lo=low)  # pyright: ignore[reportCallIssue]
+
+
+def _seed(config: PPOConfig, steps: int) -> int:
+    """The configuration's own at the start; a continued run must not draw the same numbers again."""
+    if not steps:
+        return config.seed
+    return int(np.random.SeedSequence([config.seed, steps]).generate_state(1)[0] >> 1)
+
+
+def _step_size(config: PPOConfig) -> int:
+    """Control steps of a training step."""
+    return config.batch_size * config.unroll_length * config.num_minibatches
+
+
+def _schedule(config: PPOConfig, first_step: int) -> tuple[int, int]:
+    """Training steps between two calls of the callback, and the number of calls from `first_step` on."""
+    size = _step_size(config)
+    per_call = math.ceil(math.ceil(config.num_timesteps / size) / _MAX_CALLS)
+    return per_call, max(math.ceil((config.num_timesteps - first_step) / (per_call * size)), 0)

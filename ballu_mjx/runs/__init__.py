@@ -1,0 +1,1 @@
+"""A run: its folder, checkpoints, metrics and what it shows on the terminal."""

@@ -1,0 +1,1 @@
+"""MJX: states in, states and observations out."""

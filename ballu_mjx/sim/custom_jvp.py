@@ -1,0 +1,64 @@
+"""Derivatives by rule, of functions of trees of arrays of which few change."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, PyTree
+
+
+def nonzero_tangents(changes: Sequence[Any]) -> list[int]:
+    """Which tangents, of those that a `custom_jvp` with `symbolic_zeros=True` is given, are not known to be zero."""
+    return [place for place, change in enumerate(changes) if not isinstance(change, SymbolicZero)]
+
+
+def directional_derivative(
+    function: Callable[[Sequence[Array]], PyTree],
+    leaves: Sequence[Array],
+    places: Sequence[int],
+    changes: Sequence[Array],
+) -> tuple[PyTree, PyTree]:
+    """Value of `function(leaves)`, and how it changes where the leaves at `places` change so, and no other."""
+
+    def of(*moved: Array) -> PyTree:
+        new = dict(zip(places, moved, strict=True))
+        return function([new.get(place, leaf) for place, leaf in enumerate(leaves)])
+
+    return jax.jvp(of, [leaves[place] for place in places], list(changes))
+
+
+DirectionalDerivative = Callable[[Callable[..., PyTree]], tuple[PyTree, PyTree]]
+"""Of a function: its value at the arguments at hand, and how it changes where they change as they do."""
+
+
+def with_custom_jvp(
+    function: Callable[..., PyTree], rule: Callable[[DirectionalDerivative, PyTree], PyTree]
+) -> Callable[..., PyTree]:
+    """`function` with another derivative: `rule(along, result)`, `result` being what `function` returns."""
+
+    def whole(*arguments: PyTree) -> PyTree:
+        leaves, tree = jax.tree.flatten(arguments)
+
+        @jax.custom_jvp
+        def apply(*leaves: Array) -> PyTree:
+            return function(*jax.tree.unflatten(tree, leaves))
+
+        @functools.partial(apply.defjvp, symbolic_zeros=True)
+        def _(leaves: Sequence[Array], changes: Sequence[Any]) -> tuple[PyTree, PyTree]:
+            result, places = apply(*leaves), nonzero_tangents(changes)
+
+            def along_changes(another: Callable[..., PyTree]) -> tuple[PyTree, PyTree]:
+                def flat(leaves: Sequence[Array]) -> PyTree:
+                    return another(*jax.tree.unflatten(tree, leaves))
+
+                return directional_derivative(flat, leaves, places, [changes[place] for place in places])
+
+            return result, rule(along_changes, result)
+
+        return apply(*leaves)
+
+    return whole

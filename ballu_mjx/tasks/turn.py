@@ -1,5 +1,0 @@
-"""Turning left (paper, section "Improved Sim-to-real Transfer"): velocity along y, trials of 22 s."""
-
-from ballu_mjx.tasks.base import Task
-
-TASK = Task("turn", "Turn left and walk along y.", lambda step: step.velocity[1], 22.0)

@@ -1,5 +1,0 @@
-"""Turning right: velocity along -y."""
-
-from ballu_mjx.tasks.base import Task
-
-TASK = Task("turn-right", "Turn right and walk along -y.", lambda step: -step.velocity[1], 22.0)

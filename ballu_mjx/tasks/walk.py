@@ -1,5 +1,0 @@
-"""Forward walking (paper, section "Improved Sim-to-real Transfer"): velocity along x, trials of 24 s."""
-
-from ballu_mjx.tasks.base import Task
-
-TASK = Task("walk", "Walk forward, along x.", lambda step: step.velocity[0], 24.0)

@@ -1,5 +1,0 @@
-"""Walking backward: velocity along -x."""
-
-from ballu_mjx.tasks.base import Task
-
-TASK = Task("walk-backward", "Walk backward, along -x.", lambda step: -step.velocity[0], 24.0)

@@ -1,0 +1,1 @@
+"""Figures, pages, videos and live views of runs."""

@@ -1,0 +1,93 @@
+"""The files that an evaluation leaves in a run's folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ballu_mjx.common import files
+from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, write_rollouts
+
+if TYPE_CHECKING:
+    from ballu_mjx.evaluation.errors_table import Evaluation
+    from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
+
+
+def write_evaluation(evaluator: OpenLoopEvaluator, params: Any, folder: Path) -> Evaluation:
+    """Evaluate, and write `evaluation.txt`, `evaluation.json`, `tracking.png` and, of BALLU, which alone can be drawn,
+    `replay.npz` into `folder`."""
+    from ballu_mjx.evaluation.errors_table import Evaluation
+
+    names = evaluator.base, evaluator.name
+    replays = dict(zip(names, (evaluator.replay(params, scale=0.0), evaluator.replay(params)), strict=True))
+    result = Evaluation(*(evaluator.errors(each) for each in replays.values()), *names)  # pyright: ignore[reportCallIssue]
+    files.write(folder / "evaluation.txt", result.table() + "\n")
+    files.write(folder / "evaluation.json", json.dumps(result.to_json(), indent=2) + "\n")
+    draw_tracking(evaluator, replays, folder / "tracking.png")
+    if evaluator.robot.is_ballu:
+        write_rollouts(folder / ROLLOUT_FILE, stored_rollouts(evaluator, replays))
+    return result
+
+
+def draw_tracking(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay], path: Path) -> None:
+    """Draw whole-recording replays, by simulator: of the first recording of each group."""
+    from ballu_mjx.recordings.groups import group_of
+    from ballu_mjx.robots.model import CONTROL_TIMESTEP
+    from ballu_mjx.viz import plots
+
+    shown: dict[str, plots.TrackingPanel] = {}
+    for motion, run in zip(evaluator.motions, evaluator.first_runs, strict=True):
+        if group_of(motion.name) in shown:
+            continue
+        position, yaw = evaluator.recorded(run)
+        states = len(yaw)
+        simulations = {
+            simulator: np.column_stack([replay.position[run, :states, :2], replay.yaw[run, :states]])
+            for simulator, replay in replays.items()
+        }
+        shown[group_of(motion.name)] = plots.TrackingPanel(
+            title=motion.name,
+            time=np.arange(states) * CONTROL_TIMESTEP,
+            recording=np.column_stack([position[:, :2], yaw]),
+            simulations=simulations,
+        )
+    plots.tracking(path, list(shown.values()))
+
+
+def stored_rollouts(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay]) -> list[StoredRollout]:
+    """Whole-recording replays of every recording, by simulator, to be looked at; the force is the last simulator's."""
+    found = []
+    for index, motion in enumerate(evaluator.motions):
+        run = evaluator.first_runs[index]
+        first = evaluator.starts[run][1]
+        states = len(motion.qpos) - first
+        *_, last = replays.values()
+        simulated = {simulator: replay.qpos[index, :states] for simulator, replay in replays.items()}
+        found.append(
+            StoredRollout(
+                name=motion.name,
+                robot=motion.robot,
+                time=motion.time[first:],
+                qpos={"recording": motion.qpos[first:], **simulated},
+                command=motion.command[first:],
+                force=last.force[run, : states - 1],
+            )
+        )
+    return found
+
+
+def draw_learning_curve(folder: Path, best_step: int) -> None:
+    """Draw `learning_curve.png` from the run's `metrics.jsonl`."""
+    from ballu_mjx.runs.metrics import read_column
+    from ballu_mjx.viz import plots
+
+    plots.learning_curve(
+        folder / "learning_curve.png",
+        *read_column(folder, "reward"),
+        *read_column(folder, "validation_error"),
+        best_step=best_step,
+    )

@@ -1,0 +1,149 @@
+"""Figures of a training run, drawn from arrays into PNG files; no display and no global state."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from ballu_mjx.viz.style import COLOURS, LABELS, save_figure, unwrapped
+
+_QUANTITIES = ("x (m)", "y (m)", "yaw (deg)")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackingPanel:
+    """One recording, with what simulators make of its commands from its first state on.
+
+    **Fields**
+
+    - `title`: the recording's name, say.
+    - `time`: s.
+    - `recording`: the balloon's x (m), y (m) and yaw (rad).
+    - `simulations`: the same by simulator (keys of `COLOURS`), one run, or several of which mean and range are drawn.
+    """
+
+    title: str
+    time: Float[np.ndarray, " T"]
+    recording: Float[np.ndarray, "T 3"]
+    simulations: Mapping[str, Float[np.ndarray, "T 3"] | Float[np.ndarray, "runs T 3"]]
+
+
+def tracking(path: Path, panels: Sequence[TrackingPanel]) -> None:
+    """x, y and yaw over time, a column for each panel."""
+    figure = Figure(figsize=(1.0 + 5.0 * len(panels), 7.0), layout="constrained")
+    axes = figure.subplots(len(_QUANTITIES), len(panels), sharex="col", squeeze=False)
+    for column, panel in zip(axes.T, panels, strict=True):
+        column[0].set_title(panel.title)
+        column[-1].set_xlabel("time (s)")
+        curves = {**panel.simulations, "recording": panel.recording}  # the recording last, on top
+        for name, values in curves.items():
+            runs = unwrapped(values if values.ndim == 3 else values[None], float(panel.recording[0, 2]))
+            for index, axis in enumerate(column):
+                mean = runs[..., index].mean(axis=0)
+                axis.plot(panel.time, mean, color=COLOURS[name], label=LABELS[name], linewidth=1.5)
+                if len(runs) > 1:
+                    low, high = runs[..., index].min(axis=0), runs[..., index].max(axis=0)
+                    axis.fill_between(panel.time, low, high, color=COLOURS[name], alpha=0.2, linewidth=0)
+        for axis in column:
+            axis.grid(alpha=0.3)
+    for axis, label in zip(axes[:, 0], _QUANTITIES, strict=True):
+        axis.set_ylabel(label)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 3 * len(panels)))
+    save_figure(figure, path)
+
+
+def learning_curve(
+    path: Path,
+    steps: Float[np.ndarray, " n"],
+    reward: Float[np.ndarray, " n"],
+    validation_steps: Float[np.ndarray, " m"],
+    validation_error: Float[np.ndarray, " m"],
+    best_step: int | None = None,
+) -> None:
+    """Mean reward per control step, and the validation error as a ratio to vanilla's, against control steps."""
+    figure = Figure(figsize=(7.0, 6.0), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    upper.plot(steps / 1e6, reward, color=COLOURS["envmimic"])
+    upper.set_ylabel("reward per control step")
+    lower.plot(validation_steps / 1e6, validation_error, color=COLOURS["envmimic"], marker="o", markersize=4)
+    lower.axhline(1.0, color=COLOURS["vanilla"], linestyle="--", label="vanilla")
+    if best_step is not None:
+        lower.axvline(best_step / 1e6, color="grey", linestyle=":", label="best checkpoint")
+    lower.set_ylabel("validation error (ratio to vanilla)")
+    lower.set_xlabel("control steps (millions)")
+    lower.legend()
+    for axis in (upper, lower):
+        axis.grid(alpha=0.3)
+    save_figure(figure, path)
+
+
+def fit_curve(
+    path: Path,
+    losses: Mapping[str, tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]],
+    validation: tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]],
+    label: str,
+    simulator: str,
+    best_step: int,
+) -> None:
+    """Losses by name and the validation error, called `label`, against gradient steps, in the simulator's colour."""
+    figure = Figure(figsize=(7.0, 6.0), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    for (name, curve), style in zip(losses.items(), ("-", "--"), strict=False):
+        upper.plot(*curve, color=COLOURS[simulator], linestyle=style, label=name)
+    lower.plot(*validation, color=COLOURS[simulator], marker="o", markersize=4)
+    lower.axhline(1.0, color=COLOURS["vanilla"], linestyle="--", label="no force")
+    lower.axvline(best_step, color="grey", linestyle=":", label="best checkpoint")
+    upper.set_ylabel("loss")
+    lower.set_ylabel(label)
+    lower.set_xlabel("gradient steps")
+    for axis in (upper, lower):
+        axis.legend()
+        axis.grid(alpha=0.3)
+    save_figure(figure, path)
+
+
+def compared(path: Path, panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]]]) -> None:
+    """Learning curves side by side: by axis label, by row, control steps, mean, and half the interval's width (not a
+    number: none is drawn)."""
+    figure = Figure(figsize=(8.0, 3.5 * len(panels)), layout="constrained")
+    rows = list(dict.fromkeys(label for lines in panels.values() for label in lines))
+    for axis, (title, lines) in zip(
+        np.ravel(figure.subplots(len(panels), 1, sharex=True)), panels.items(), strict=True
+    ):
+        for label, (steps, mean, half) in lines.items():
+            colour = f"C{rows.index(label)}"
+            axis.plot(steps / 1e6, mean, color=colour, label=label)
+            axis.fill_between(steps / 1e6, mean - half, mean + half, color=colour, alpha=0.2, linewidth=0)
+        axis.set_ylabel(title)
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize="small", title="mean, 95 % interval")
+        axis.set_xlabel("control steps (millions)")
+    save_figure(figure, path)
+
+
+def reward_curve(
+    path: Path,
+    steps: Float[np.ndarray, " n"],
+    reward: Float[np.ndarray, " n"],
+    validation_steps: Float[np.ndarray, " m"],
+    validation_reward: Float[np.ndarray, " m"],
+    simulator: str,
+) -> None:
+    """Mean reward per control step (m/s) against control steps, in the simulator's colour: of training, and of the
+    policy without exploration."""
+    figure = Figure(figsize=(7.0, 3.5), layout="constrained")
+    axis = figure.subplots()
+    axis.plot(steps / 1e6, reward, color=COLOURS[simulator], label=f"{LABELS[simulator]}, training")
+    validated = "without exploration, whole trials"
+    axis.plot(validation_steps / 1e6, validation_reward, "o--", color=COLOURS[simulator], markersize=4, label=validated)
+    axis.set_xlabel("control steps (millions)")
+    axis.set_ylabel("reward per control step (m/s)")
+    axis.grid(alpha=0.3)
+    axis.legend()
+    save_figure(figure, path)

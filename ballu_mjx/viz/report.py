@@ -1,0 +1,370 @@
+"""A run as one page for the browser: `python -m ballu_mjx report RUN`.
+
+The page holds all it shows and loads nothing: options, learning curves, errors, plots over time, and the replay in 3D.
+JAX, MuJoCo, and all that needs them, are imported inside functions: `runtime.prepare` has to come first.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import importlib.resources
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ballu_mjx.common import files
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, read_rollouts
+
+if TYPE_CHECKING:
+    from ballu_mjx.evaluation.errors_table import Errors
+
+
+REPORT_FILE = "report.html"
+_TEMPLATE = "report.html"
+_IMAGES = ("gait.png", "actuator_curves.png")
+"""Figures of a run's folder that have no interactive twin."""
+_CURVES = {
+    "reward": "reward per control step",
+    "validation_error": "validation error (ratio to vanilla)",
+    "validation_reward": "reward per control step, without exploration (m/s)",
+}
+_QUANTITIES = (("position", "position RMSE (m)", 3), ("yaw", "yaw RMSE (deg)", 1))
+_WHOLE = (("mean_com_error", "mean CoM error (m)", 3), ("final_yaw_error", "final yaw error (deg)", 1))
+_FORCE_COLOURS = ("#cc0000", "#7b3294", "#998ec3")
+_ROW_HEIGHT = 170
+
+
+# ---- what a page holds ----
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """A number as it is shown, and as it was stored."""
+
+    text: str
+    exact: str | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """A titled table."""
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Curve:
+    """What was measured in training: `values` by name of a run, each (control steps, values)."""
+
+    title: str
+    values: Mapping[str, tuple[np.ndarray, np.ndarray]]
+
+
+@dataclasses.dataclass
+class Content:
+    """All that a page shows."""
+
+    title: str
+    facts: list[tuple[str, str]] = dataclasses.field(default_factory=list)
+    tables: list[Table] = dataclasses.field(default_factory=list)
+    markdown: list[tuple[str, str]] = dataclasses.field(default_factory=list)
+    """Titled tables in Markdown."""
+    texts: list[tuple[str, str]] = dataclasses.field(default_factory=list)
+    """Titled plain text."""
+    curves: list[Curve] = dataclasses.field(default_factory=list)
+    images: list[tuple[str, bytes]] = dataclasses.field(default_factory=list)
+    """Titled PNGs."""
+    takes: list[StoredRollout] = dataclasses.field(default_factory=list)
+    options: list[tuple[str, list[tuple[str, str]]]] = dataclasses.field(default_factory=list)
+    """Options by section."""
+
+
+def collect(folder: Path) -> Content:
+    """What there is to show of a run, or of a folder of `train all`.
+
+    **Raises** `InputError` where `folder` is neither, or a file in it is damaged.
+    """
+    from ballu_mjx.cli import pipeline
+
+    tables = [(task, pipeline.table_file(folder, task)) for task in pipeline.TABLES]
+    if not (folder / "config.json").is_file() and any(path.is_file() for _, path in tables):
+        return _story(folder, {task: files.read_text(path) for task, path in tables if path.is_file()})
+    return _run(folder)
+
+
+def _run(folder: Path) -> Content:
+    from ballu_mjx.policies.tasks import TASKS
+    from ballu_mjx.residuals.trained import RESIDUAL_TASKS
+    from ballu_mjx.runs.folder import read_config
+
+    config = read_config(folder, *RESIDUAL_TASKS, "sysid", *TASKS)
+    content = Content(f"{config['task']}: {folder.resolve().name}")
+    start = (config.get("starts") or [{}])[-1]
+    content.facts = [("folder", str(folder.resolve())), ("begun", str(start.get("time", "")))]
+    content.facts += [("command", " ".join(map(str, start.get("command", []))))]
+    for use, used in config.get("recordings", {}).items():
+        content.facts.append((f"{use} recordings", ", ".join(str(file["path"]) for file in used)))
+    _add_evaluation(content, folder)
+    if (folder / "identification.txt").is_file():
+        content.texts.append(("Identification", files.read_text(folder / "identification.txt")))
+    content.curves = _curves({config["task"]: folder})
+    content.images = [(n, (folder / n).read_bytes()) for n in _IMAGES if (folder / n).is_file()]
+    if (folder / ROLLOUT_FILE).is_file():
+        content.takes = read_rollouts(folder / ROLLOUT_FILE)
+    robots = dict.fromkeys(take.robot for take in content.takes if take.robot)
+    if robots:
+        content.facts.append(("robot", ", ".join(robots)))
+    content.options = _options(config)
+    return content
+
+
+def _story(folder: Path, tables: Mapping[str, str]) -> Content:
+    """A folder of `train all`: its tables, and of each seed and task the policies over each other."""
+    from ballu_mjx.cli import pipeline
+    from ballu_mjx.viz.style import label_of
+
+    content = Content(f"train all: {folder.resolve().name}", facts=[("folder", str(folder.resolve()))])
+    content.markdown = [(f"Transfer, {task}", text) for task, text in tables.items()]
+    for seed in sorted(path for path in folder.glob("seed-*") if path.is_dir()):
+        for task in tables:
+            where = f"{task}, {seed.name}"
+            settings = ("vanilla", *pipeline.SETTINGS, *pipeline.settings_beyond(seed, task))
+            policies = {setting: seed / f"{task}-{setting}" for setting in settings}
+            policies = {setting: path for setting, path in policies.items() if (path / "config.json").is_file()}
+            content.curves += [dataclasses.replace(c, title=f"{c.title} ({where})") for c in _curves(policies)]
+            own = {s: read_rollouts(p / ROLLOUT_FILE)[0] for s, p in policies.items() if (p / ROLLOUT_FILE).is_file()}
+            if own:
+                content.takes.append(_over_each_other(f"policies: {where}", own))
+            for setting in policies:
+                image = seed / f"trials-{task}-{setting}" / "trials.png"
+                if image.is_file():
+                    content.images.append((f"Trials on the robot: {where}, {setting}", image.read_bytes()))
+            residuals: dict[Path, str] = {}  # two settings may have one
+            for setting in (pipeline.ROUNDS, *pipeline.settings_beyond(seed, task)):
+                residuals.setdefault(pipeline.residual_folder(seed, task, setting), setting)
+            for learned, setting in residuals.items():
+                name = f"{label_of(setting)}: {where}"
+                if (learned / "config.json").is_file():
+                    _add_evaluation(content, learned, f"{name}: ")
+                    if (learned / ROLLOUT_FILE).is_file():
+                        content.takes += [
+                            dataclasses.replace(take, name=f"{name}: {take.name}")
+                            for take in read_rollouts(learned / ROLLOUT_FILE)
+                        ]
+    return content
+
+
+def _over_each_other(name: str, own: Mapping[str, StoredRollout]) -> StoredRollout:
+    """Policies' episodes as one take, each in its own simulator, as long as the shortest."""
+    states = min(len(take.time) for take in own.values())
+    first = next(iter(own.values()))
+    qpos = {setting: next(iter(take.qpos.values()))[:states] for setting, take in own.items()}
+    return StoredRollout(name=name, time=first.time[:states], qpos=qpos)
+
+
+def _add_evaluation(content: Content, folder: Path, prefix: str = "") -> None:
+    """Tables from `evaluation.json`, and `evaluation.txt` as it is."""
+    path = folder / "evaluation.json"
+    if not path.is_file():
+        return
+    from ballu_mjx.evaluation.errors_table import read_evaluation
+    from ballu_mjx.viz.style import label_of
+
+    found = read_evaluation(path)
+    base, name = found.base, label_of(found.name)
+    pairs = list(zip(found.vanilla, found.residual, strict=True))
+    content.facts.append((f"{prefix}score", f"{found.score:.3f} (mean ratio to {base})"))
+    content.tables += [
+        _horizons(f"{prefix}{without.recording}", (base, name), without, mimic) for without, mimic in pairs
+    ]
+    header = ["", *(f"{title}, {each}" for _, title, _ in _WHOLE for each in (base, name)), "mean force (N)"]
+    rows = []
+    for without, mimic in pairs:
+        cells = [_cell(getattr(errors, key), digits) for key, _, digits in _WHOLE for errors in (without, mimic)]
+        rows.append([Cell(without.recording), *cells, _cell(mimic.mean_force, 4)])
+    content.tables.append(Table(f"{prefix}whole recordings", header, rows))
+    if (folder / "evaluation.txt").is_file():
+        content.texts.append((f"{prefix}by group", files.read_text(folder / "evaluation.txt")))
+
+
+def _horizons(title: str, names: tuple[str, str], without: Errors, mimic: Errors) -> Table:
+    """One recording's errors by horizon: mean over the starts, without and with the residual, and their ratio."""
+    from ballu_mjx.evaluation.errors_table import quotient
+
+    header = ["horizon (s)"]
+    for key, quantity, _ in _QUANTITIES:
+        header += [*(f"{quantity}, {name}" for name in names), f"{key}, ratio"]
+    rows = []
+    for horizon in without.position:
+        row = [Cell(f"{horizon:g}")]
+        for key, _, digits in _QUANTITIES:
+            one, other = getattr(without, key)[horizon][0], getattr(mimic, key)[horizon][0]
+            row += [_cell(one, digits), _cell(other, digits), _cell(quotient(other, one), 2)]
+        rows.append(row)
+    return Table(title, header, rows)
+
+
+def _cell(value: float, digits: int) -> Cell:
+    return Cell(f"{value:.{digits}f}", repr(float(value)))
+
+
+def _curves(folders: Mapping[str, Path]) -> list[Curve]:
+    from ballu_mjx.runs.metrics import read_column
+
+    found = []
+    for name, title in _CURVES.items():
+        values = {run: read_column(folder, name) for run, folder in folders.items()}
+        values = {run: pair for run, pair in values.items() if len(pair[0])}
+        if values:
+            found.append(Curve(title, values))
+    return found
+
+
+def _options(config: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """The sections of a `config.json`, each as names and values."""
+    sections, loose = [], []
+    for name, value in config.items():
+        if isinstance(value, dict):
+            sections.append((name, [(key, json.dumps(entry)) for key, entry in value.items()]))
+        elif isinstance(value, list):
+            sections.append((name, [(str(index), json.dumps(entry)) for index, entry in enumerate(value)]))
+        else:
+            loose.append((name, json.dumps(value)))
+    return [("run", loose), *sections]
+
+
+# ---- how it is shown ----
+
+
+def render(content: Content) -> str:
+    """The page. Strings of the run are escaped wherever they stand; nothing in them is markup.
+
+    **Raises** `InputError` where the packages of the extra `report` are missing.
+    """
+    try:
+        import jinja2
+        import markdown_it
+        import markupsafe
+        from plotly.offline import get_plotlyjs
+
+        from ballu_mjx.viz import robot_meshes, viser_scene
+        from ballu_mjx.viz.style import label_of
+    except ImportError as error:
+        raise InputError(
+            f"The report needs {error.name}, which comes with the extra report: pip install -c constraints.txt -e "
+            '".[report]".'
+        ) from None
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    template = environment.from_string(
+        importlib.resources.files("ballu_mjx.viz").joinpath(_TEMPLATE).read_text(encoding="utf-8")
+    )
+    markdown = markdown_it.MarkdownIt("commonmark", {"html": False}).enable("table")
+    takes = [dataclasses.replace(take, time=take.time - take.time[0]) for take in content.takes]
+    head, own, tail = viser_scene.shared([viser_scene.page(take) for take in takes]) if takes else ("", [], "")
+    shown = {
+        "curves": [_plot(_curve_rows([curve]), "control steps (millions)") for curve in content.curves],
+        "takes": [_plot(_take_rows(take), "time (s)") for take in takes],
+        "stage": {"head": head, "own": own, "tail": tail},
+    }
+    return template.render(
+        content=content,
+        markdown=[(title, markupsafe.Markup(markdown.render(text))) for title, text in content.markdown],
+        images=[(title, base64.b64encode(png).decode()) for title, png in content.images],
+        legends=[[(label_of(name), _hex(name)) for name in take.qpos] for take in takes],
+        arrow=robot_meshes.ARROW_LENGTH / 10,
+        with_force=any(robot_meshes.pushed(take) for take in takes),
+        shown=shown,
+        plotly=markupsafe.Markup(get_plotlyjs()),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Line:
+    name: str
+    colour: str
+    x: np.ndarray
+    y: np.ndarray
+    dash: str = "solid"
+
+
+_Rows = Sequence[tuple[str, Sequence[_Line]]]
+
+
+def _hex(name: str) -> str:
+    from matplotlib.colors import to_hex
+
+    from ballu_mjx.viz.style import colour_of
+
+    return to_hex(colour_of(name))
+
+
+def _curve_rows(curves: Sequence[Curve]) -> _Rows:
+    from ballu_mjx.viz.style import label_of
+
+    return [
+        (c.title, [_Line(label_of(name), _hex(name), x / 1e6, y) for name, (x, y) in c.values.items()]) for c in curves
+    ]
+
+
+def _take_rows(take: StoredRollout) -> _Rows:
+    """x, y and yaw of each robot's balloon, the residual force, the commands."""
+    from ballu_mjx.ballu.model import SIDES
+    from ballu_mjx.robots.model import load_model
+    from ballu_mjx.viz import robot_meshes
+    from ballu_mjx.viz.style import SIDE_COLOURS, label_of, unwrapped
+
+    model = load_model()
+    poses = {name: robot_meshes.poses(model, qpos) for name, qpos in take.qpos.items()}
+    start = next(iter(poses.values())).yaw[0]
+    ways = {name: unwrapped(np.column_stack([p.balloon[:, :2], p.yaw])[None], start)[0] for name, p in poses.items()}
+    rows: list[tuple[str, Sequence[_Line]]] = [
+        (title, [_Line(label_of(name), _hex(name), take.time, way[:, i]) for name, way in ways.items()])
+        for i, title in enumerate(("x (m)", "y (m)", "yaw (deg)"))
+    ]
+    steps = take.time[:-1]
+    if take.force is not None:
+        forces = zip("xyz", _FORCE_COLOURS, take.force.T, strict=True)
+        rows.append(("residual force (N)", [_Line(f"force {axis}", c, steps, value) for axis, c, value in forces]))
+    if take.command is not None:
+        sides = zip(SIDES, SIDE_COLOURS, ("solid", "dot"), take.command.T, strict=True)
+        rows.append(("command", [_Line(f"command, {side}", c, steps, value, dash) for side, c, dash, value in sides]))
+    return rows
+
+
+def _plot(rows: _Rows, x_title: str) -> dict[str, Any]:
+    """A plotly figure as plain data, a panel for each row, over one x."""
+    from plotly.subplots import make_subplots
+
+    figure = make_subplots(rows=len(rows), cols=1, shared_xaxes=True, vertical_spacing=0.03)
+    named: set[str] = set()
+    for index, (title, lines) in enumerate(rows, start=1):
+        for line in lines:
+            figure.add_scatter(
+                x=np.asarray(line.x, np.float32),
+                y=np.asarray(line.y, np.float32),
+                name=line.name,
+                legendgroup=line.name,
+                showlegend=line.name not in named,
+                mode="lines" if len(line.x) > 1 else "markers",
+                line={"color": line.colour, "width": 1.5, "dash": line.dash},
+                row=index,
+                col=1,
+            )
+            named.add(line.name)
+        figure.update_yaxes(title_text=title, row=index, col=1)
+    figure.update_xaxes(title_text=x_title, row=len(rows), col=1)
+    figure.update_layout(
+        height=_ROW_HEIGHT * len(rows) + 110,
+        margin={"l": 70, "r": 20, "t": 20, "b": 50},
+        template="plotly_white",
+        hovermode="x unified",
+        legend={"orientation": "h", "y": 1.0, "yanchor": "bottom"},
+    )
+    return json.loads(str(figure.to_json()))

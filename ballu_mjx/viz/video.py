@@ -1,0 +1,82 @@
+"""A take as MP4, drawn by MuJoCo's renderer. Needs OpenGL, and the extra `video` for the encoder."""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.runs.rollout_file import StoredRollout
+
+WIDTH, HEIGHT = 960, 544
+_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
+_NO_OPENGL = (
+    "No video: there is no OpenGL to draw with ({}). `apt-get install libegl1 libgl1-mesa-dri` with MUJOCO_GL=egl, or "
+    "`apt-get install libosmesa6` with MUJOCO_GL=osmesa, brings one."
+)
+
+
+def choose_renderer() -> None:
+    """Settle by which library MuJoCo draws, where there is no screen and the user has not said; before its import."""
+    if sys.platform != "linux" or "MUJOCO_GL" in os.environ:
+        return
+    if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        return
+    found = [name for name, library in _LIBRARIES.items() if ctypes.util.find_library(library)]
+    os.environ["MUJOCO_GL"] = found[0] if found else "disable"
+
+
+def write(path: Path, take: StoredRollout) -> None:
+    """Draw a take at the control rate, the camera beside the robots.
+
+    **Raises** `InputError` where there is no OpenGL or no encoder.
+    """
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise InputError(
+            'No video: the encoder comes with the extra video: pip install -c constraints.txt -e ".[video]".'
+        ) from None
+    import mujoco
+
+    from ballu_mjx.robots.model import load_model
+    from ballu_mjx.viz import robot_meshes
+
+    model = load_model()
+    model.vis.global_.offwidth, model.vis.global_.offheight = WIDTH, HEIGHT
+    try:
+        renderer = mujoco.Renderer(model, HEIGHT, WIDTH, max_geom=200 * (1 + len(take.qpos)))
+    except Exception as error:  # each OpenGL library has errors of its own
+        raise InputError(_NO_OPENGL.format(str(error).strip().split("\n")[0] or type(error).__name__)) from None
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    option, camera = mujoco.MjvOption(), mujoco.MjvCamera()
+    robot_meshes.hide_robot(option)
+    camera.azimuth, camera.elevation = 75.0, -12.0
+    ways = np.stack([robot_meshes.poses(model, qpos).balloon for qpos in take.qpos.values()])
+    middle = ways.mean(axis=0)
+    apart = np.linalg.norm(ways - middle, axis=-1).max(axis=0)
+    rate = round(1.0 / float(np.median(np.diff(take.time))))
+    frames = imageio_ffmpeg.write_frames(
+        str(path), (WIDTH, HEIGHT), fps=rate, codec="libx264", quality=7, macro_block_size=16
+    )
+    try:
+        frames.send(None)
+        for state in range(len(take.time)):
+            camera.lookat[:] = (*middle[state, :2], 0.7)
+            camera.distance = 2.4 + 1.2 * apart[state]
+            renderer.update_scene(data, camera, option)
+            robots = {name: qpos[state] for name, qpos in take.qpos.items()}
+            force = robot_meshes.force_at(take, state) if robot_meshes.pushed(take) else None
+            robot_meshes.draw(renderer.scene, model, data, robots, force)
+            # Where there is no GPU, shadows and mirrors would take two thirds of the time.
+            renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
+            renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
+            frames.send(renderer.render())
+    finally:
+        frames.close()
+        renderer.close()

@@ -1,0 +1,403 @@
+"""From recordings to states: are they where the robot was, as fast as it was, and fit to start a simulator from?"""
+
+import dataclasses
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from ballu_mjx.ballu.model import SIDES, standing_qpos
+from ballu_mjx.ballu.reconstruct import (
+    _differentiate,
+    _fit_chunk,
+    _forward_kinematics,
+    _servo_chunk,
+    _Skeleton,
+    reconstruct_ballu,
+)
+from ballu_mjx.recordings.csv_format import read_recording, write_recording
+from ballu_mjx.recordings.motion import Motion, ReconstructionParameters, add_capture_noise
+from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+
+DURATION = 10.0
+STEP = 0.01
+POSITION_NOISE, ROTATION_NOISE = 5e-4, np.deg2rad(0.3)
+MODEL = load_model()
+KNEES, HIPS, MOTORS = [9, 12], [8, 11], [10, 13]
+
+
+@dataclasses.dataclass(frozen=True)
+class Truth:
+    """The nominal robot on a bang-bang gait, every 10 ms."""
+
+    time: np.ndarray
+    command: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    sites: np.ndarray  # balloon, base, foot_left, foot_right
+    balloon_quaternion: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def truth() -> Truth:
+    assert STEP == MODEL.opt.timestep
+    data = mujoco.MjData(MODEL)
+    data.qpos[:] = standing_qpos(MODEL)
+    time = np.arange(round(DURATION / STEP) + 1) * STEP
+    phase = time[:, None] / 1.2 + np.array([0.0, 0.5]) + 1e-9
+    command = np.where(phase % 1.0 < 0.4, 1.0, 0.0)
+    sites = [MODEL.site(name).id for name in ("balloon", "base", "foot_left", "foot_right")]
+    qpos, qvel, places, quaternion = [], [], [], []
+    for row in command:
+        mujoco.mj_kinematics(MODEL, data)
+        qpos.append(data.qpos.copy())
+        qvel.append(data.qvel.copy())
+        places.append(data.site_xpos[sites].copy())
+        quaternion.append(data.body("balloon").xquat.copy())
+        data.ctrl[:] = row
+        mujoco.mj_step(MODEL, data)
+    return Truth(time, command, *(np.array(x) for x in (qpos, qvel, places, quaternion)))
+
+
+def capture(
+    truth: Truth, *, base: bool = True, noise: float = 1.0, time: np.ndarray | None = None, seed: int = 0
+) -> Recording:
+    """What motion capture sees at `time`, with `noise` times 0.5 mm and 0.3 deg."""
+    rng = np.random.default_rng(seed)
+    time = truth.time if time is None else time
+    sites = CubicSpline(truth.time, truth.sites)(time)
+    sites += noise * POSITION_NOISE * rng.normal(size=sites.shape)
+
+    def orientation(values: np.ndarray) -> np.ndarray:
+        exact = Rotation.from_quat(CubicSpline(truth.time, values)(time), scalar_first=True)
+        error = Rotation.from_rotvec(noise * ROTATION_NOISE * rng.normal(size=(len(time), 3)))
+        seen = (exact * error).as_quat(scalar_first=True)
+        flips = np.sum(seen[1:] * seen[:-1], axis=1) < 0
+        return seen * np.concatenate([[1.0], np.cumprod(np.where(flips, -1.0, 1.0))])[:, None]
+
+    held = np.clip(np.searchsorted(truth.time, time + 1e-9, side="right") - 1, 0, len(truth.time) - 1)
+    return Recording(
+        name="made",
+        kind="free",
+        robot="nominal",
+        time=time,
+        command=truth.command[held],
+        balloon_position=sites[:, 0],
+        balloon_quaternion=orientation(truth.balloon_quaternion),
+        base_position=sites[:, 1],
+        base_quaternion=orientation(truth.qpos[:, 3:7]) if base else None,
+        foot_position=sites[:, 2:],
+    )
+
+
+def head(recording: Recording, count: int) -> Recording:
+    """The first `count` samples."""
+    arrays = {name: value[:count] for name, value in vars(recording).items() if isinstance(value, np.ndarray)}
+    return dataclasses.replace(recording, **arrays)
+
+
+@pytest.fixture(scope="module")
+def seen_with_base(truth: Truth) -> Motion:
+    return reconstruct_ballu(capture(truth), MODEL)
+
+
+@pytest.fixture(scope="module")
+def seen_without_base(truth: Truth) -> Motion:
+    return reconstruct_ballu(capture(truth, base=False), MODEL)
+
+
+def test_as_much_noise_again_errs_as_much_again(truth: Truth):
+    """What `noisier` recordings are reconstructed to is off from the original's states by as much as these from the
+    truth: a simulator's error by its starting states can be had without the truth."""
+    seen = capture(truth)
+    once = reconstruct_ballu(seen, MODEL).qpos
+    again = [reconstruct_ballu(add_capture_noise(seen, seed=seed), MODEL).qpos for seed in (1, 2)]
+    own = once[2:-2] - truth.qpos[::5][: len(once)][2:-2]
+    for twin in again:
+        places = [*range(3), *HIPS]  # what no stop clips
+        ratio = np.std((twin - once)[2:-2], axis=0)[places] / np.std(own, axis=0)[places]
+        assert np.all(ratio > 0.5) and np.all(ratio < 1.4), ratio
+    assert np.abs(again[0] - again[1]).max() > 1e-4
+
+
+def at_control_rate(values: np.ndarray, motion: Motion, shift: int = 0) -> np.ndarray:
+    """Truth at the motion's times, `shift` samples later; both ends left out, so that shifts compare alike."""
+    return values[5 * np.arange(2, len(motion.time) - 2) + shift]
+
+
+def position_errors(truth: Truth, motion: Motion) -> dict[str, np.ndarray]:
+    """Absolute errors: degrees, and millimetres for `base`."""
+    qpos = at_control_rate(truth.qpos, motion)
+    found = motion.qpos[2:-2]
+    turn = Rotation.from_quat(qpos[:, 3:7], scalar_first=True).inv() * Rotation.from_quat(
+        found[:, 3:7], scalar_first=True
+    )
+    pitch = np.rad2deg(turn.as_rotvec()[:, 1])
+    degrees = np.abs(np.rad2deg(found - qpos))
+    return {
+        "base": 1e3 * np.linalg.norm(found[:, :3] - qpos[:, :3], axis=1),
+        "pitch": np.abs(pitch),
+        "hips": degrees[:, HIPS],
+        "knees": degrees[:, KNEES],
+        "motors": degrees[:, MOTORS],
+        "legs": leg_angles(qpos, found),
+    }
+
+
+def leg_angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angles (deg) between the world directions of femurs and tibias in two sets of positions."""
+
+    def directions(qpos: np.ndarray) -> np.ndarray:
+        data = mujoco.MjData(MODEL)
+        found = []
+        for row in qpos:
+            data.qpos[:] = row
+            mujoco.mj_kinematics(MODEL, data)
+            found.append(
+                [data.body(f"{part}_{side}").xmat.reshape(3, 3)[:, 2] for part in ("femur", "tibia") for side in SIDES]
+            )
+        return np.array(found)
+
+    cosine = np.sum(directions(a) * directions(b), axis=-1)
+    return np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def test_kinematics_are_mujocos():
+    data = mujoco.MjData(MODEL)
+    rng = np.random.default_rng(0)
+    qpos = rng.normal(size=(10, MODEL.nq))
+    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+    skeleton = _Skeleton.of(MODEL)
+    with jax.enable_x64(True):
+        found = [np.asarray(x) for x in jax.vmap(lambda q: _forward_kinematics(skeleton, q))(qpos)]
+    for i, row in enumerate(qpos):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(MODEL, data)
+        np.testing.assert_allclose(found[0][i], data.site("balloon").xpos, atol=1e-12)
+        np.testing.assert_allclose(found[1][i], data.body("balloon").xquat, atol=1e-12)
+        np.testing.assert_allclose(found[2][i], [data.site(f"foot_{s}").xpos for s in SIDES], atol=1e-12)
+
+
+@pytest.mark.parametrize("motion_name", ["seen_with_base", "seen_without_base"])
+def test_positions(truth, motion_name, request):
+    motion = request.getfixturevalue(motion_name)
+    errors = position_errors(truth, motion)
+    assert np.median(errors["knees"]) < 0.3  # the issue's limit is 1 deg, for legs too, and 2 mm
+    assert np.median(errors["legs"]) < 0.3
+    assert np.median(errors["base"]) < 0.6
+    assert np.percentile(errors["knees"], 95) < 1.5
+    assert np.percentile(errors["base"], 95) < 2.0
+    assert np.median(errors["motors"]) < 0.5
+    assert np.isfinite(motion.qpos).all() and np.isfinite(motion.qvel).all()
+    np.testing.assert_allclose(np.linalg.norm(motion.qpos[:, 3:7], axis=1), 1.0, atol=1e-9)
+
+
+def test_hips_and_pitch(truth, seen_with_base, seen_without_base):
+    errors = position_errors(truth, seen_with_base)
+    assert np.median(errors["hips"]) < 0.3
+    assert np.rad2deg(seen_with_base.pitch_deviation) < 0.3
+    # A sample's markers alone leave 7 deg; the torque balance, here exact, brings it down to the tenths.
+    errors = position_errors(truth, seen_without_base)
+    assert np.median(errors["hips"]) < 1.0
+    assert np.median(errors["pitch"]) < 1.0
+    assert 0.5 < np.rad2deg(seen_without_base.pitch_deviation) < 2.0
+    assert np.sqrt(np.mean(errors["pitch"] ** 2)) < 2 * np.rad2deg(seen_without_base.pitch_deviation)
+
+
+def test_pitch_follows_the_measured_base_against_the_torque_balance(truth):
+    """What is measured is believed: a base held 10 deg off its equilibrium is found there."""
+    recording = capture(truth, noise=0.0)
+    assert recording.base_quaternion is not None
+    tilt = Rotation.from_rotvec([0.0, np.deg2rad(10.0), 0.0])
+    base = Rotation.from_quat(recording.base_quaternion, scalar_first=True) * tilt
+    neck = Rotation.from_quat(truth.qpos[:, 3:7], scalar_first=True).apply(MODEL.body("balloon").pos)
+    moved = neck - base.apply(MODEL.body("balloon").pos)
+    recording = dataclasses.replace(
+        recording,
+        base_quaternion=base.as_quat(scalar_first=True),
+        base_position=recording.base_position + moved,
+        foot_position=recording.foot_position + moved[:, None],
+    )
+    motion = reconstruct_ballu(recording, MODEL)
+    change = np.rad2deg(motion.qpos - truth.qpos[::5])
+    assert np.median(np.abs(change[:, HIPS] + 10.0)) < 0.2
+    assert np.median(np.abs(change[:, 7] + 10.0)) < 0.2
+    assert np.median(np.abs(change[:, KNEES])) < 0.2
+
+
+def test_velocities_have_no_lag(truth, seen_with_base, seen_without_base):
+    """The error is least against the truth of the same instant, not of one 10 ms before or after."""
+    for motion in (seen_with_base, seen_without_base):
+        for columns, limit in (([0, 1, 2], 0.02), ([3, 5], 0.04), ([4], 0.35), ([7, 10], 0.4), ([8, 11], 1.1)):
+            error = {
+                shift: np.sqrt(
+                    np.mean((motion.qvel[2:-2] - at_control_rate(truth.qvel, motion, shift))[:, columns] ** 2)
+                )
+                for shift in range(-3, 4)
+            }
+            assert error[0] < limit, columns
+            if columns != [3, 5]:  # slower than the shifts can tell
+                assert min(error, key=lambda shift: error[shift]) == 0, (columns, error)
+
+
+def test_velocities_are_mujocos(truth):
+    """In a world turned by 130 deg, only the linear velocity turns; integrating qvel leads to the next qpos."""
+    plain = capture(truth, noise=0.0)
+    assert plain.balloon_quaternion is not None and plain.base_quaternion is not None
+    assert plain.foot_position is not None
+    turn = Rotation.from_euler("z", 130.0, degrees=True)
+
+    def turned(quaternion: np.ndarray) -> np.ndarray:
+        return (turn * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
+
+    recording = dataclasses.replace(
+        plain,
+        balloon_position=turn.apply(plain.balloon_position),
+        base_position=turn.apply(plain.base_position),
+        foot_position=turn.apply(plain.foot_position.reshape(-1, 3)).reshape(-1, 2, 3),
+        balloon_quaternion=turned(plain.balloon_quaternion),
+        base_quaternion=turned(plain.base_quaternion),
+    )
+    motion, reference = reconstruct_ballu(recording, MODEL), reconstruct_ballu(plain, MODEL)
+    np.testing.assert_allclose(motion.qvel[:, :3], turn.apply(reference.qvel[:, :3]), atol=1e-6)
+    np.testing.assert_allclose(motion.qvel[:, 3:], reference.qvel[:, 3:], atol=1e-5)
+
+    error, rate = [], np.zeros(MODEL.nv)
+    for k in range(5, len(motion.time) - 5):
+        # The mean over the physics step that led to the state.
+        mujoco.mj_differentiatePos(MODEL, rate, STEP, truth.qpos[5 * k - 1], truth.qpos[5 * k])
+        error.append(reference.qvel[k] - rate)
+    typical = np.median(np.abs(error), axis=0)
+    assert typical[:6].max() < 0.05
+    assert typical[6:].max() < 0.15
+
+
+def test_turning_quickly(truth):
+    """A body that turns at 3 rad/s about its own tilted axis, and through the sign change of its quaternion."""
+    time = np.arange(0.0, 4.0, STEP)
+    rate = np.array([0.3, 0.0, 3.0])
+    tilt = Rotation.from_euler("y", 20.0, degrees=True)
+    spin = (tilt * Rotation.from_rotvec(np.outer(time, rate))).as_quat(scalar_first=True)
+    qpos = np.tile(standing_qpos(MODEL), (len(time), 1))
+    qpos[:, 3:7] = spin
+    found, velocity = _differentiate(qpos, STEP, ReconstructionParameters())
+    np.testing.assert_allclose(velocity[:, 3:6], np.tile(rate, (len(time), 1)), atol=0.05)
+    np.testing.assert_allclose(np.abs(np.sum(found[:, 3:7] * spin, axis=1)), 1.0, atol=1e-5)
+    assert np.all(np.sum(found[1:, 3:7] * found[:-1, 3:7], axis=1) > 0.9)
+
+
+def test_residuals_are_the_noise(seen_with_base, seen_without_base):
+    for motion in (seen_with_base, seen_without_base):
+        assert set(motion.residual_mm) == {"balloon", "base", "feet"}
+        # Three axes of 0.5 mm are 0.87 mm; eleven unknowns take part of it.
+        assert all(0.1 < value < 0.87 for value in motion.residual_mm.values())
+
+
+def test_residuals_show_a_wrong_skeleton(truth):
+    longer = load_model()
+    longer.body_pos[longer.body("balloon").id, 2] += 0.02
+    motion = reconstruct_ballu(capture(truth, noise=0.0), longer)
+    assert motion.residual_mm["balloon"] > 3.0
+
+
+def test_states_start_a_simulator(truth, seen_with_base, seen_without_base):
+    """Started from the states found, the robot stays near the truth: the figures are in the benchmark's table."""
+    for motion in (seen_with_base, seen_without_base):
+        distance, heading = [], []
+        for k in range(4, len(motion.time) - 24, 6):
+            data = mujoco.MjData(MODEL)
+            data.qpos[:], data.qvel[:] = motion.qpos[k], motion.qvel[k]
+            for command in motion.command[k : k + 20]:
+                data.ctrl[:] = command
+                mujoco.mj_step(MODEL, data, 5)
+            mujoco.mj_kinematics(MODEL, data)
+            end = 5 * (k + 20)
+            distance.append(np.linalg.norm(data.site("balloon").xpos - truth.sites[end, 0]))
+            turn = Rotation.from_quat(truth.balloon_quaternion[end], scalar_first=True).inv() * Rotation.from_quat(
+                data.body("balloon").xquat, scalar_first=True
+            )
+            heading.append(abs(turn.as_rotvec(degrees=True)[2]))
+        assert np.median(distance) < 0.02
+        assert np.median(heading) < 1.5
+
+
+def test_knees_keep_their_stops(seen_with_base):
+    stop = MODEL.joint("knee_left").range[0]
+    assert seen_with_base.qpos[:, KNEES].min() > stop - np.deg2rad(0.51)
+    assert seen_with_base.qpos[:, KNEES].min() < stop
+
+
+@pytest.mark.parametrize("rate", [60.0, 100.0, 130.0])
+def test_jitter_and_rates(truth, rate):
+    rng = np.random.default_rng(1)
+    time = np.arange(0.0, DURATION - 0.02, 1.0 / rate)
+    time = 7.0 + time + np.concatenate([[0.0], rng.uniform(-0.3, 0.3, len(time) - 1) / rate])
+    recording = dataclasses.replace(capture(truth, time=time - 7.0), time=time)
+    motion = reconstruct_ballu(recording, MODEL)
+    np.testing.assert_allclose(motion.time, np.arange(len(motion.time)) * CONTROL_TIMESTEP)
+    errors = position_errors(truth, motion)
+    assert np.median(errors["knees"]) < 0.5
+    assert np.median(errors["legs"]) < 0.5
+    assert np.median(errors["base"]) < 1.0
+    velocity = motion.qvel[2:-2] - at_control_rate(truth.qvel, motion)
+    assert np.sqrt(np.mean(velocity[:, :3] ** 2)) < 0.03
+    assert np.sqrt(np.mean(velocity[:, 5] ** 2)) < 0.04
+
+
+def test_hidden_markers(truth, tmp_path):
+    recording = capture(truth, base=False)
+    assert recording.balloon_position is not None and recording.foot_position is not None
+    balloon, feet = recording.balloon_position.copy(), recording.foot_position.copy()
+    balloon[200:205], feet[400:403, 1], feet[700:705, 0] = np.nan, np.nan, np.nan
+    recording = dataclasses.replace(recording, balloon_position=balloon, foot_position=feet)
+    write_recording(recording, tmp_path / "walk.csv")
+    motion = reconstruct_ballu(read_recording(tmp_path / "walk.csv"), MODEL)
+    assert motion.interpolated["balloon_x"] == 5 and motion.interpolated["foot_left_z"] == 5
+    errors = position_errors(truth, motion)
+    assert np.median(errors["knees"]) < 0.3
+    assert max(errors["base"].max(), errors["knees"].max()) < 10.0
+
+
+def test_measured_joints_are_taken(truth):
+    recording = capture(truth)
+    recording = dataclasses.replace(recording, motor=truth.qpos[:, MOTORS] + 0.1, knee=truth.qpos[:, KNEES])
+    precise = ReconstructionParameters(joint_noise=1e-4)
+    motion = reconstruct_ballu(recording, MODEL, precise)
+    change = np.median(np.abs(motion.qpos[:, MOTORS] - truth.qpos[::5, MOTORS]))
+    assert abs(change - 0.1) < 0.01
+    assert np.median(position_errors(truth, motion)["knees"]) < 0.03
+
+
+def test_commands_are_means_over_control_steps(truth):
+    recording = capture(truth, noise=0.0)
+    command = np.zeros_like(recording.command)
+    command[12:27, 0] = 1.0  # from 0.12 s to 0.27 s
+    motion = reconstruct_ballu(dataclasses.replace(recording, command=command), MODEL)
+    np.testing.assert_allclose(motion.command[:7, 0], [0.0, 0.0, 0.6, 1.0, 1.0, 0.4, 0.0], atol=1e-9)
+    np.testing.assert_array_equal(motion.command[:, 1], 0.0)
+    assert len(motion.command) == len(motion.qpos) - 1 == len(motion.time) - 1
+
+
+def test_lengths_share_a_program(truth, seen_without_base):
+    def programs() -> list[int]:
+        compiled = (_fit_chunk, _servo_chunk)
+        return [function._cache_size() for function in compiled]  # pyright: ignore[reportAttributeAccessIssue]
+
+    before = programs()
+    recording = capture(truth, base=False)
+    motion = reconstruct_ballu(head(recording, 333), MODEL)
+    assert len(motion.qpos) == 67
+    assert programs() == before
+    np.testing.assert_allclose(motion.qpos[5:50, 7:], seen_without_base.qpos[5:50, 7:], atol=np.deg2rad(1.0))
+
+
+def test_suspended_and_short_recordings_are_refused(truth):
+    recording = capture(truth)
+    with pytest.raises(ValueError, match="suspended"):
+        reconstruct_ballu(dataclasses.replace(recording, kind="suspended"), MODEL)
+    with pytest.raises(ValueError, match="too short"):
+        reconstruct_ballu(head(recording, 8), MODEL)

@@ -1,0 +1,121 @@
+"""Reading actuator sweeps: what is in one, and what is refused with which sentence."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ballu_mjx.ballu.sweep import read_sweep
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.csv_format import list_bundled, read_recording
+from ballu_mjx.recordings.recording import Recording
+
+PATH = Path("sweep.csv")
+
+
+def made(
+    levels: np.ndarray, hold: float = 1.0, rate: float = 100.0, settle: float = 0.05, robot: str = "robot"
+) -> Recording:
+    """A sweep whose angles approach 1 + command exponentially, motors and knees, left and right, 0.1 rad apart."""
+    count = round(hold * rate)
+    time = np.arange(len(levels) * count) / rate
+    command = np.repeat(levels, count, axis=0)
+    since = np.tile(np.arange(count) / rate, len(levels))[:, None]
+    before = np.repeat(np.concatenate([levels[:1], levels[:-1]]), count, axis=0)
+    angle = 0.5 + command + (before - command) * np.exp(-since / settle)
+    return Recording(
+        name="sweep", kind="suspended", robot=robot, time=time, command=command, balloon_position=None,
+        balloon_quaternion=None, base_position=None, foot_position=None, motor=angle, knee=angle + 0.1,
+    )  # fmt: skip
+
+
+def both(count: int = 20) -> np.ndarray:
+    return np.repeat(np.linspace(0, 1, count)[:, None], 2, axis=1)
+
+
+def test_finds_holds_settled_angles_and_motion() -> None:
+    sweep = read_sweep({PATH: made(both())})
+    assert sweep.command == pytest.approx(both())
+    assert sweep.settled[:, 0] == pytest.approx(0.5 + both(), abs=1e-4)
+    assert sweep.settled[:, 1] == pytest.approx(0.6 + both(), abs=1e-4)
+    assert sweep.drift == pytest.approx(0, abs=1e-4)
+    assert sweep.means(sweep.motion) == pytest.approx(sweep.settled, abs=1e-4)
+    # From the angle of the hold before to its own.
+    first = np.flatnonzero(np.diff(sweep.hold, prepend=-1))
+    assert sweep.motion[first[1:]] == pytest.approx(sweep.settled[:-1], abs=1e-4)
+    assert sweep.motion[first[1:] - 1] == pytest.approx(sweep.settled[:-1], abs=1e-4)
+    assert sweep.motion[first[1:] + 20, 0] == pytest.approx(0.5 + both()[1:] - np.exp(-4) / 19, abs=1e-3)
+
+
+def test_a_jittered_clock_from_any_origin_changes_nothing() -> None:
+    steady = made(both(), rate=200.0)
+    rng = np.random.default_rng(0)
+    kept = np.sort(rng.choice(len(steady.time), round(0.7 * len(steady.time)), replace=False))
+    values = {name: getattr(steady, name)[kept] for name in ("time", "command", "motor", "knee")}
+    jittered = dataclasses.replace(steady, **{**values, "time": values["time"] + 1234.5})
+    expected, sweep = read_sweep({PATH: steady}), read_sweep({PATH: jittered})
+    assert sweep.settled == pytest.approx(expected.settled, abs=1e-3)
+    length = min(len(sweep.motion), len(expected.motion))
+    # Samples dropped at a change of command move that change, by 5 ms each: a step of 0.053 rad decays in 50 ms.
+    assert sweep.motion[:length] == pytest.approx(expected.motion[:length], abs=0.02)
+
+
+def test_legs_swept_one_after_the_other_make_one_sweep() -> None:
+    up, zero = np.linspace(0, 1, 20), np.zeros(20)
+    left, right = made(np.stack([up, zero], 1)), made(np.stack([zero, up], 1))
+    sweep = read_sweep({Path("left.csv"): left, Path("right.csv"): right})
+    assert len(sweep.command) == 40
+    assert sweep.hold[np.flatnonzero(sweep.begins)].tolist() == [0, 20], "a motion each, and none from one to the other"
+    assert sweep.settled[19, 0] == pytest.approx([1.5, 0.5], abs=1e-4)
+
+
+def test_a_joint_that_creeps_on_is_told_by_its_drift() -> None:
+    sweep = read_sweep({PATH: made(both(), hold=1.5, settle=0.4)})
+    # Means of exp(-t / 0.4 s) over the halves of the last half of a second, of a step of 1/19 rad.
+    expected = (1 / 19) * 0.4 * (np.exp(-2.5) - 2 * np.exp(-3.125) + np.exp(-3.75)) / 0.25
+    assert sweep.drift[1:] == pytest.approx(expected, rel=0.05)
+    assert sweep.drift[0] == pytest.approx(0, abs=1e-9)
+
+
+def test_leaving_out_a_hold_leaves_the_settled_angles_of_the_others() -> None:
+    sweep = read_sweep({PATH: made(both())})
+    shorter = sweep.settled_without([3])
+    assert len(shorter.command) == 19
+    assert shorter.command == pytest.approx(np.delete(both(), 3, axis=0))
+    assert shorter.settled == pytest.approx(np.delete(sweep.settled, 3, axis=0))
+    assert len(shorter.motion) == 0
+
+
+@pytest.mark.parametrize(
+    ("recording", "says"),
+    [
+        (made(both(12)), "12 levels of command_left; 20"),
+        (made(np.stack([np.linspace(0, 1, 20), np.zeros(20)], 1)), "the right leg was not swept"),
+        (made(0.6 * both()), "spread the levels over"),
+        (made(both(), hold=0.3), "held for 0.29 s only"),
+        (made(np.random.default_rng(0).permutation(both()), settle=1.0), "still moves by"),
+        (dataclasses.replace(made(both()), kind="free"), "is a free recording"),
+    ],
+)  # fmt: skip
+def test_is_refused(recording: Recording, says: str) -> None:
+    with pytest.raises(InputError, match="sweep.csv") as refusal:
+        read_sweep({PATH: recording})
+    assert says in str(refusal.value)
+
+
+def test_fewer_levels_are_taken_where_that_is_asked_for() -> None:
+    assert len(read_sweep({PATH: made(both(12))}, levels=12).command) == 12
+
+
+def test_recordings_of_two_robots_are_refused() -> None:
+    with pytest.raises(InputError, match="several robots"):
+        read_sweep({PATH: made(both()), Path("other.csv"): made(both(), robot="other")})
+
+
+def test_the_bundled_sweep_holds_twenty_commands_for_both_legs() -> None:
+    sweep = read_sweep({path: read_recording(path) for path in list_bundled("suspended")})
+    assert sweep.command == pytest.approx(both(), abs=1e-4)
+    assert np.all(np.diff(sweep.settled[:, 0], axis=0) > 0), "motors follow the command"

@@ -1,0 +1,169 @@
+"""The commands as a whole: `python -m ballu_mjx` lists them, and all tell of errors in the same way."""
+
+import importlib.util
+import pkgutil
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ballu_mjx import __main__ as package
+from ballu_mjx import cli
+from ballu_mjx.__main__ import COMMANDS, NAMES
+from ballu_mjx.cli import completion
+from ballu_mjx.common import runtime
+
+SUBCOMMANDS = [
+    "compare",
+    "evaluate",
+    "export",
+    "report",
+    "view",
+    *(f"record {name}" for name in ("import", "check", "simulate", "example-mapping")),
+    *(f"train {name}" for name in ("sysid", "envmimic", "walk", "turn", "turn-right", "walk-backward", "all")),
+]
+
+
+def main(line: str) -> int:
+    """Run a command line in this process."""
+    command, *arguments = line.split()
+    return importlib.import_module(f"ballu_mjx.cli.{command}").main(arguments)
+
+
+def test_every_command_is_listed_and_every_listed_one_is_there():
+    listed = {command.split()[0] for _, command, _ in COMMANDS}
+    found = set()
+    for module in pkgutil.iter_modules(cli.__path__):
+        spec = importlib.util.find_spec(f"ballu_mjx.cli.{module.name}")
+        assert spec is not None and spec.origin is not None
+        if "\ndef main(" in Path(spec.origin).read_text():
+            found.add(module.name)
+    assert found == listed
+
+
+def test_the_package_alone_lists_them():
+    done = subprocess.run([sys.executable, "-m", "ballu_mjx"], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    assert all(command in done.stdout for _, command, _ in COMMANDS)
+
+
+@pytest.mark.parametrize("line", SUBCOMMANDS)
+def test_every_help_tells_of_debug(line: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as left:
+        main(f"{line} --help")
+    assert left.value.code == 0
+    assert "--debug" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "compare nowhere",
+        "evaluate nowhere",
+        "export nowhere",
+        "report nowhere",
+        "view nowhere",
+        "record check nowhere",
+        "train sysid --recordings nowhere",
+        "train envmimic --resume nowhere",  # refused before the options are parsed
+    ],
+)
+def test_the_traceback_of_bad_input_is_shown_on_demand(line: str, capsys: pytest.CaptureFixture[str]):
+    assert main(line) == 2
+    sentence = capsys.readouterr().err
+    assert sentence.startswith("nowhere: ") and sentence.count("\n") == 1
+    assert main(f"{line} --debug") == 2
+    shown = capsys.readouterr().err
+    assert shown.startswith("Traceback") and shown.endswith(f"InputError: {sentence}")
+
+
+def test_an_unexpected_error_is_called_a_fault_of_the_package(capsys: pytest.CaptureFixture[str]):
+    def fail() -> None:
+        raise ValueError("shapes (3,)\nand (4,) do not match " + "x" * 5000)
+
+    assert runtime.exit_status(fail, []) == 1
+    told = capsys.readouterr().err
+    assert "fault of ballu_mjx" in told and "ValueError: shapes (3,) and (4,)" in told and "--debug" in told
+    assert told.count("\n") == 1 and len(told) < 600
+    assert runtime.exit_status(fail, ["--debug"]) == 1
+    assert "Traceback" in (shown := capsys.readouterr().err) and "in fail" in shown
+
+
+def test_what_the_system_refuses_is_no_fault_of_the_package(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    def open_nothing() -> None:
+        (tmp_path / "nothing").open()
+
+    assert runtime.exit_status(open_nothing, []) == 1
+    told = capsys.readouterr().err
+    assert f"{tmp_path}/nothing" in told and "fault" not in told and told.count("\n") == 1
+
+
+def test_a_folder_that_is_none_is_refused_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "file").touch()
+    assert main(f"record simulate --gait walking --seconds 1 --output {tmp_path}/file/walk.csv") == 2
+    assert f"{tmp_path}/file: cannot be written to" in capsys.readouterr().err
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    line = [sys.executable, "-m", "ballu_mjx", "record", "example-mapping"]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 141
+
+
+def test_the_script_runs_commands_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert package.main(["record", "example-mapping"]) == 0
+    assert "[commands]" in capsys.readouterr().out
+    assert package.main(["record", "check", str(tmp_path / "nowhere")]) == 2
+    assert capsys.readouterr().err.startswith(f"{tmp_path}/nowhere: ")
+    assert package.main(["import", "walk.csv"]) == 2
+    assert "import: there is no such command" in capsys.readouterr().err
+    assert package.main(["completion"]) == 2
+    assert "bash or zsh" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def bash_script(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("completion") / "ballu_mjx"
+    path.write_text(completion.completion_script("bash", NAMES))
+    return path
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ("", {"record", "train", "evaluate", "report", "view", "compare", "export"}),
+        ("tr", {"train"}),
+        ("record ", {"import", "check", "simulate", "example-mapping"}),
+        ("train ", {"sysid", "envmimic", "residual", "walk", "turn", "turn-right", "walk-backward", "all"}),
+        ("train envmimic --num-t", {"--num-timesteps"}),
+        ("record import --format ", {"auto", "vicon", "c3d", "table"}),
+        ("view --po", {"--port"}),
+        ("report rec", {"recordings"}),  # a path
+    ],
+)
+def test_bash_completes(bash_script: Path, typed: str, offered: set[str], tmp_path: Path):
+    (tmp_path / "recordings").mkdir()
+    words = ["ballu_mjx", *typed.split(" ")]
+    # What readline does: the function first; where it offers nothing, files, if the script asks for these by default.
+    ask = """source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); set -- $(complete -p ballu_mjx)
+        [[ " $* " =~ " -F "([^ ]+)" " ]]; "${BASH_REMATCH[1]}"
+        if [[ -z "${COMPREPLY[*]}" && " $* " == *" -o default "* ]]; then
+            COMPREPLY=($(compgen -f -- "${COMP_WORDS[COMP_CWORD]}"))
+        fi
+        printf '%s\\n' "${COMPREPLY[@]}" """
+    line = ["bash", "-c", ask, "bash", str(bash_script), *words]
+    done = subprocess.run(line, capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert done.stderr == ""
+    assert set(done.stdout.split()) - {"-h", "--help"} == offered
+
+
+def test_the_script_for_zsh_names_the_subcommands():
+    text = completion.completion_script("zsh", NAMES)
+    assert text.startswith("#compdef ballu_mjx")
+    assert all(line.split()[-1] in text for line in SUBCOMMANDS)

@@ -1,0 +1,99 @@
+"""Runs side by side: what counts as the same, and how sure a mean is."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from ballu_mjx.cli import compare
+from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, quotient
+from ballu_mjx.runs.folder import Run
+from ballu_mjx.runs.layout import RUN_FORMAT
+
+REWARD = {"a0": 1.0, "a1": 1.2, "a2": 1.1, "b0": 0.5, "b1": 0.7}
+
+
+def write(folder: Path, seed: int, scale: float, reward: float, task: str = "envmimic") -> Path:
+    config = {
+        "format": RUN_FORMAT,
+        "task": task,
+        "env": {"force_scale": scale},
+        "ppo": {"seed": seed, "num_timesteps": 100 + seed},
+        "actuators": None,
+        "recordings": {"training": [{"path": "x", "sha256": "1"}]},
+        "starts": [],
+    }
+    with Run(folder, config) as run:
+        run.log(0, {"validation_error": 1.0})
+        for step in range(0, 101, 5):
+            run.log(step, {"reward": reward if step > 90 else 0.0})
+        run.log(100, {"validation_error": reward / 2})
+    errors = [
+        Errors(name, name[:4].strip("-"), {h: (x * h, 0.1) for h in HORIZONS}, {h: (x, 0.1) for h in HORIZONS}, 0, 0, 0)
+        for name, x in (("near-1", 1.0), ("far-1", 2.0))
+    ]
+    half = [
+        Errors(e.recording, e.group, {h: (v / 2, s) for h, (v, s) in e.position.items()}, e.yaw, 0, 0, 0)
+        for e in errors
+    ]
+    content = Evaluation(tuple(errors), tuple(half)).to_json()
+    (folder / "evaluation.json").write_text(json.dumps(content))
+    return folder
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> list[Path]:
+    return [
+        write(tmp_path / name, int(name[1]), 0.05 if name[0] == "a" else 1.0, reward) for name, reward in REWARD.items()
+    ]
+
+
+def test_seeds_are_one_row_and_its_interval_is_students(folders: list[Path]):
+    found = compare.rows(folders)
+    assert [(row.label, len(row.folders)) for row in found] == [("force_scale 0.05", 3), ("force_scale 1.0", 2)]
+    figures = [compare.figures(folder) for folder in found[0].folders]
+    values = [each["reward at the end"] for each in figures]
+    assert values == pytest.approx([1.0, 1.2, 1.1])
+    mean, half = compare.interval(values)
+    expected = stats.t.interval(0.95, 2, loc=np.mean(values), scale=stats.sem(values))
+    assert (mean - half, mean + half) == pytest.approx(expected)
+    assert figures[0]["near position, 5 s (ratio)"] == pytest.approx(0.5)
+    assert figures[0]["far yaw, 10 s (ratio)"] == pytest.approx(1.0)
+
+
+def test_the_command_writes_table_and_plot(folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert compare.main([*map(str, folders), "--output", str(tmp_path / "out")]) == 0
+    text = (tmp_path / "out" / "compare.md").read_text()
+    assert text.strip() in capsys.readouterr().out
+    assert "| force_scale 0.05 | 3 | 1.100 ± 0.248 |" in text
+    assert (tmp_path / "out" / "compare.png").stat().st_size > 10_000
+
+
+def test_a_single_run_has_no_interval(folders: list[Path], capsys: pytest.CaptureFixture[str]):
+    assert compare.main([str(folders[0])]) == 0
+    out = capsys.readouterr().out
+    assert "| envmimic | 1 | 1.000 |" in out and "±" not in out and "nan" not in out
+
+
+def test_what_cannot_be_compared_is_refused(folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    walk = write(tmp_path / "walk", 0, 0.05, 1.0, task="walk")
+    (folders[1] / "evaluation.json").write_text('{"vanilla": [{"recording": 3}]}')
+    (folders[2] / "metrics.jsonl").write_text("")
+    for given, sentence in (
+        ([folders[0], walk], "compare runs of one task"),
+        ([folders[0], folders[0]], "given twice"),
+        ([tmp_path / "nothing"], "there is no run"),
+        ([folders[1]], "evaluation.json: is no evaluation"),
+        ([folders[2]], "has not trained yet"),
+    ):
+        assert compare.main([str(folder) for folder in given]) == 2
+        error = capsys.readouterr().err
+        assert sentence in error and error.count("\n") == 1
+
+
+def test_a_ratio_of_errors_is_a_number_where_there_is_no_error() -> None:
+    assert quotient(0.0, 0.0) == 1.0
+    assert quotient(0.2, 0.1) == pytest.approx(2.0)
+    assert 1.0 < quotient(0.1, 0.0) < np.inf

@@ -1,0 +1,125 @@
+"""Stages of the whole story: kept, found again, redone where something changed."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ballu_mjx.cli import pipeline
+from ballu_mjx.cli.cached_stages import cached_stage
+from ballu_mjx.cli.pipeline import Options
+from ballu_mjx.common.errors import InputError
+
+
+class Interrupted(Exception):
+    pass
+
+
+def story(root: Path, options: dict[str, int], stop_at: str | None = None) -> list[str]:
+    """Three stages in a row, each needing the one before; returns which of them were made."""
+    made: list[str] = []
+
+    def make(name: str) -> Path:
+        def write(folder: Path) -> None:
+            (folder / "begun").touch()
+            if name == stop_at:
+                raise Interrupted
+            made.append(name)
+            (folder / "result").write_text(str(options[name]))
+
+        needs = [] if name == "a" else [make(chr(ord(name) - 1))]
+        return cached_stage(root / name, {"value": options[name]}, needs, write)
+
+    make("c")
+    return made
+
+
+def test_finished_stages_are_found_again(tmp_path):
+    assert story(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["a", "b", "c"]
+    assert story(tmp_path, {"a": 1, "b": 2, "c": 3}) == []
+
+
+def test_an_interrupted_story_goes_on_where_it_was(tmp_path):
+    with pytest.raises(Interrupted):
+        story(tmp_path, {"a": 1, "b": 2, "c": 3}, stop_at="b")
+    assert (tmp_path / "b" / "begun").exists()
+    assert story(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["b", "c"]
+
+
+def test_a_changed_option_redoes_what_depends_on_it_and_loses_nothing(tmp_path):
+    story(tmp_path, {"a": 1, "b": 2, "c": 3})
+    assert story(tmp_path, {"a": 1, "b": 20, "c": 3}) == ["b", "c"]
+    assert (tmp_path / "b" / "result").read_text() == "20"
+    aside = [path for path in tmp_path.glob("b.*") if path.is_dir()]
+    assert [(path / "result").read_text() for path in aside] == ["2"]
+
+
+def test_stages_without_a_key_are_never_taken_for_finished(tmp_path):
+    story(tmp_path, {"a": 1, "b": 2, "c": 3})
+    mark = tmp_path / "b.stage.json"
+    content = json.loads(mark.read_text())
+    mark.write_text(json.dumps(content | {"done": False}))
+    assert story(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["b"]
+
+
+def test_trials_of_all_settings_meet_the_same_draughts_and_no_two_are_alike():
+    draws = [
+        pipeline._draw(seed, task, use, number)
+        for seed in (0, 1)
+        for task in ("walk", "turn")
+        for use in ("recordings", "trials", "round 2")
+        for number in range(10)
+    ]
+    assert len(set(draws)) == len(draws)
+    assert pipeline._draw(0, "walk", "trials", 3) == pipeline._draw(0, "walk", "trials", 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"trials": 0}, "--trials is 0"),
+        ({"policy_steps": -5}, "--policy-steps is -5"),
+        ({"seeds": ()}, "at least one seed"),
+        ({"tasks": ()}, "--tasks is empty"),
+        ({"outside_cost": -1.0}, "--outside-cost is -1"),
+    ],
+)
+def test_options_out_of_range_are_refused_before_anything_is_written(options, words, tmp_path):
+    with pytest.raises(InputError, match=words):
+        pipeline.run(Options(output=tmp_path / "out", **options))
+    assert not (tmp_path / "out").exists()
+
+
+def test_each_round_learns_from_all_recordings_so_far_and_keeps_what_came_before(tmp_path, monkeypatch):
+    """Which stage needs which, without making any: a stage is a folder whose needs stand beside it."""
+    needs: dict[str, list[str]] = {}
+    costs: dict[str, float] = {}
+    forces: dict[str, str] = {}
+
+    def stage(folder, options, sources, make, goes_on=True):
+        needs[folder.name] = [source.name for source in sources]
+        if folder.name.startswith("walk-"):
+            costs[folder.name] = options[0].outside_cost
+        if folder.name.startswith("envmimic-"):
+            forces[folder.name] = options[0].forces
+        return folder
+
+    monkeypatch.setattr(pipeline, "_stage", stage)
+    also = "envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised"
+    options = Options(output=tmp_path, rounds=3, also=also, outside_cost=2.0)
+    told = pipeline.Story(options, seed=0)
+    for setting in pipeline.settings_of(options):
+        told.policy("walk", setting)
+    assert pipeline.settings_of(options) == (*pipeline.SETTINGS, "envmimic-2", "envmimic-3", *options.also)
+    recorded = ["recordings-walk", "recordings-walk-2", "recordings-walk-3"]
+    for number, name in enumerate(("envmimic-walk", "envmimic-walk-2", "envmimic-walk-3"), 1):
+        assert needs[name] == [*recorded[:number], "sysid"]
+    assert needs["recordings-walk-3"] == ["walk-envmimic-2"]
+    assert needs["walk-envmimic-3"] == ["envmimic-walk-3"]
+    assert needs["walk-envmimic"] == needs["walk-envmimic-near"] == ["envmimic-walk"]
+    assert {name: cost for name, cost in costs.items() if cost} == {"walk-envmimic-near": 2.0}
+    assert needs["aerodynamic-walk"] == needs["supervised-walk"] == ["recordings-walk", "sysid"]
+    assert {name for name, kind in forces.items() if kind != "force"} == {"envmimic-wrench-walk"}
+    assert forces["envmimic-wrench-walk"] == "wrench"
+    assert needs["envmimic-shared"] == ["recordings-walk", "recordings-turn", "sysid"]
+    assert needs["walk-envmimic-shared"] == ["envmimic-shared"]

@@ -1,0 +1,252 @@
+"""`python -m ballu_mjx record`, from the outside."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+import typing
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ballu_mjx.ballu.gaits import GAITS
+from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.cli import record
+from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_recording
+from ballu_mjx.recordings.importers.mapping import EXAMPLE
+from ballu_mjx.recordings.recording import Recording
+
+ROLES = ("balloon", "base", "foot_left", "foot_right")
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Recording:
+    """Random jumps, told from each other everywhere."""
+    (path,) = [path for path in list_bundled("test") if path.name.startswith("far-1")]
+    return first(read_recording(path), 15.0)
+
+
+def first(recording: Recording, seconds: float) -> Recording:
+    fields = {field.name: getattr(recording, field.name) for field in dataclasses.fields(recording)}
+    rows = recording.time <= seconds
+    return dataclasses.replace(recording, **{n: v[rows] for n, v in fields.items() if isinstance(v, np.ndarray)})
+
+
+def vicon_file(recording: Recording, path: Path) -> None:
+    """A Tracker file of objects, quaternions, in another corner of a room."""
+    there = Rotation.from_euler("z", -70, degrees=True)
+    assert recording.balloon_position is not None and recording.balloon_quaternion is not None
+    assert recording.base_position is not None and recording.foot_position is not None
+    balloon = Rotation.from_quat(recording.balloon_quaternion, scalar_first=True)
+    feet = recording.foot_position
+    columns = []
+    for position in (recording.balloon_position, recording.base_position, feet[:, 0], feet[:, 1]):
+        columns += [(there * balloon).as_quat(), 1e3 * (there.apply(position) + [2.0, 1.0, 0.0])]
+    names = [f"Global Angle ballu:{role}" + "," * 6 for role in ROLES]
+    rows = [
+        "Objects",
+        "100",
+        ",," + ",".join(names),
+        "Frame,Sub Frame" + ",RX,RY,RZ,RW,TX,TY,TZ" * 4,
+        "," + ",,,,,mm,mm,mm" * 4,
+        *(f"{i + 1},0," + ",".join(f"{x:.6g}" for x in row) for i, row in enumerate(np.hstack(columns))),
+    ]
+    path.write_text("\n".join(rows) + "\n")
+
+
+def log_file(recording: Recording, path: Path, clock: float) -> None:
+    """Commands as a servo's degrees at 20 Hz."""
+    rows = zip(recording.time[::5] + clock, *(90 * recording.command[::5].T), strict=True)
+    path.write_text("t,l,r\n" + "".join(f"{t:.4f},{a:.3f},{b:.3f}\n" for t, a, b in rows))
+
+
+ROOM = 'robot = "mine"\n[commands]\ntime = "t"\nleft = "l"\nright = "r"\nrange_left = [0, 90]\nrange_right = [0, 90]\n'
+ROOM += "".join(f'[{role}]\nbody = "{role}"\n' for role in ROLES)
+
+
+@pytest.fixture
+def room(tmp_path: Path, recorded: Recording, monkeypatch: pytest.MonkeyPatch) -> Path:
+    vicon_file(recorded, tmp_path / "walk.csv")
+    log_file(recorded, tmp_path / "log.csv", 512.25)
+    (tmp_path / "room.toml").write_text(ROOM)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+LINE = "import walk.csv --mapping room.toml --commands log.csv --output out/walk.csv.gz".split()
+
+
+def test_import_by_hand_gives_the_recording_back(room: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]):
+    assert record.main([*LINE, "--offset", "-512.25"]) == 0
+    read = read_recording(room / "out" / "walk.csv.gz")
+    assert (read.robot, read.kind, len(read.time)) == ("mine", "free", len(recorded.time))
+    np.testing.assert_allclose(read.command, recorded.command, atol=1e-4)
+    # Turned and shifted to the start, it is the same walk: distances and heights are.
+    assert read.base_position is not None and recorded.base_position is not None
+    steps, expected = (np.linalg.norm(p - p[0], axis=1) for p in (read.base_position, recorded.base_position))
+    np.testing.assert_allclose(steps, expected, atol=3e-5)
+    assert "15.00 s" in capsys.readouterr().out
+
+
+def test_import_finds_the_offset_and_says_how_sure_it_is(room: Path, capsys: pytest.CaptureFixture[str]):
+    assert record.main(LINE) == 0
+    said = capsys.readouterr().out
+    offset = float(said.split("offset ")[1].split(" s:")[0])
+    assert offset == pytest.approx(-512.25, abs=0.08)
+    assert "confidence 0." in said and "good to about 0.05 s" in said
+
+
+def test_a_periodic_log_is_told(room: Path, capsys: pytest.CaptureFixture[str]):
+    (path,) = [path for path in list_bundled("test") if path.name.startswith("near-1")]
+    walk = first(read_recording(path), 15.0)
+    vicon_file(walk, room / "walk.csv")
+    log_file(walk, room / "log.csv", 0.0)
+    assert record.main(LINE) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("log.csv: the commands repeat themselves") and "--offset" in said
+    assert "Traceback" not in said and said.count("\n") == 1
+    assert not (room / "out").exists()
+    assert record.main([*LINE, "--offset-range", "-0.4", "0.4"]) == 0
+
+
+@pytest.mark.parametrize(
+    "change, line, said",
+    [
+        (lambda text: text.replace("[0, 90]", "[90, 0]"), [], "legs move against the commands"),
+        (lambda text: text, ["--offset", "3"], "log.csv: its commands, from 515.25"),
+        (lambda text: text, ["--offset", "1", "--offset-range", "0", "1"], "give one of them"),
+        (lambda text: text.replace('"foot_left"', '"foot_middle"'), [], "no body or marker 'foot_middle'"),
+        (
+            lambda text: text.replace("t_left]", "t_]").replace("t_right]", "t_left]").replace("t_]", "t_right]"),
+            ["--offset", "-512.25"],
+            "swap the feet",
+        ),
+        (lambda text: "[units]\nlength = 'm'\n" + text.replace('robot = "mine"\n', ""), [], "key robot"),
+        (lambda text: text + '[units]\nlength = "m"\n', ["--offset", "-512.25"], "nothing written"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_imported_is_refused_and_nothing_written(
+    room: Path, change: Callable[[str], str], line: list[str], said: str, capsys: pytest.CaptureFixture[str]
+):
+    (room / "room.toml").write_text(change(ROOM))
+    assert record.main([*LINE, *line]) == 2
+    error = capsys.readouterr().err
+    assert said in error and "Traceback" not in error and error.count("\n") == 1
+    assert not list(room.glob("out/*"))
+
+
+def test_import_overwrites_nothing(room: Path, capsys: pytest.CaptureFixture[str]):
+    (room / "out").mkdir()
+    (room / "out" / "walk.json").write_text("mine")
+    assert record.main([*LINE, "--offset", "-512.25"]) == 2
+    assert "walk.json: stands there already" in capsys.readouterr().err
+    assert (room / "out" / "walk.json").read_text() == "mine"
+
+
+def test_a_sweep_comes_from_a_table_with_its_commands(tmp_path: Path):
+    """Degrees, a knee that counts the other way round, and milliseconds of an absolute clock."""
+    (path,) = list_bundled("suspended")
+    sweep = read_recording(path)
+    assert sweep.motor is not None and sweep.knee is not None
+    columns = [1e3 * sweep.time + 1e9, *sweep.command.T, *np.rad2deg(sweep.motor).T, 90 - np.rad2deg(sweep.knee).T[0]]
+    columns.append(np.rad2deg(sweep.knee).T[1])
+    rows = [",".join(f"{x:.11g}" for x in row) for row in zip(*columns, strict=True)]
+    (tmp_path / "bench.csv").write_text("\n".join(["ms,cl,cr,ml,mr,kl,kr", *rows]) + "\n")
+    joints = {"motor_left": "ml", "motor_right": "mr", "knee_left": "kl", "knee_right": "kr"}
+    room = 'robot = "r"\nkind = "suspended"\n[units]\nangle = "deg"\ntime = "ms"\n'
+    room += '[commands]\ntime = "ms"\nleft = "cl"\nright = "cr"\n'
+    room += "".join(f'[{name}]\ncolumn = "{column}"\n' for name, column in joints.items())
+    room = room.replace('column = "kl"', 'column = "kl"\nsign = -1\nzero = 90')
+    (tmp_path / "room.toml").write_text(room)
+    line = ["import", tmp_path / "bench.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "sweep.csv"]
+    assert record.main(list(map(str, line))) == 0
+    read = read_recording(tmp_path / "sweep.csv")
+    np.testing.assert_allclose(np.asarray(read.knee), sweep.knee, atol=2e-5)
+    np.testing.assert_allclose(np.asarray(read.motor), sweep.motor, atol=2e-5)
+    np.testing.assert_allclose(read.command, sweep.command, atol=1e-4)
+    assert read.kind == "suspended" and read.time[0] == 0
+
+
+# ---- check ----
+
+
+def test_check_counts_what_is_missing(tmp_path: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]):
+    base = np.array(recorded.base_position)
+    base[100:112] = base[500:503] = np.nan
+    write_recording(dataclasses.replace(recorded, base_position=base), tmp_path / "walk.csv")
+    gaps = record.missing(tmp_path / "walk.csv")
+    assert gaps == {f"base_{axis}": [(1.0, 1.11), (5.0, 5.02)] for axis in "xyz"}
+    assert record.main(["check", str(tmp_path), "--output", str(tmp_path / "figures")]) == 0
+    said = capsys.readouterr().out
+    assert "15.00 s, 1501 samples, 100 Hz, jitter 0.00 ms" in said
+    assert "base_x ... base_z: 2 drop-outs, 0.15 s in all, the longest 0.12 s" in said
+    changes = int((np.diff(recorded.command[:, 0]) != 0).sum())
+    assert f"{changes} changes" in said
+    assert (tmp_path / "figures" / "walk.png").stat().st_size > 2e4
+
+
+def test_check_goes_on_after_a_broken_one(tmp_path: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]):
+    for name in ("a", "b"):
+        write_recording(recorded, tmp_path / f"{name}.csv")
+    text = (tmp_path / "a.csv").read_text().split("\n")
+    (tmp_path / "a.csv").write_text("\n".join([*text[:10], "x" + text[10], *text[11:]]))
+    assert record.main(["check", str(tmp_path)]) == 2
+    told = capsys.readouterr()
+    assert "a.csv, column time, row 11" in told.err and "b.csv: free" in told.out
+
+
+# ---- simulate ----
+
+
+def test_simulate_plays_a_log_of_commands(tmp_path: Path):
+    log = tmp_path / "log.csv"
+    log.write_text("time,command_left,command_right\n7,0,0.5\n7.5,1,0.5\n9,0,0\n")
+    path = tmp_path / "walk.csv"
+    line = ["simulate", "--commands", log, "--output", path, "--robot-seed", 3, "--trial-seed", 4]
+    assert record.main(list(map(str, line))) == 0
+    read = read_recording(path)
+    assert read.robot == virtual_robot.draw_robot(3).name
+    assert read.time[-1] == pytest.approx(2.05)
+    at = [read.command[round(100 * t)].tolist() for t in (0.0, 0.48, 0.5, 1.98, 2.0)]
+    assert at == [[0, 0.5], [0, 0.5], [1, 0.5], [1, 0.5], [0, 0]]
+
+
+def test_simulate_repeats_itself_by_its_seeds(tmp_path: Path):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        line = ["simulate", "--gait", "waves", "--seconds", 1.5, "--output", tmp_path / name / "walk.csv"]
+        assert record.main([*map(str, line), "--trial-seed", str(seed)]) == 0
+    first, again, other = ((tmp_path / name / "walk.csv").read_bytes() for name in "abc")
+    assert first == again != other
+
+
+def test_simulate_sweeps(tmp_path: Path):
+    line = ["simulate", "--suspended", "--levels", 5, "--hold", 0.5, "--output", tmp_path / "sweep.csv"]
+    assert record.main(list(map(str, line))) == 0
+    read = read_recording(tmp_path / "sweep.csv")
+    assert read.kind == "suspended" and np.unique(read.command[:, 0]).tolist() == [0.0, 0.25, 0.5, 0.75, 1.0]
+
+
+@pytest.mark.parametrize("line", [[], ["--gait", "waves", "--commands", "x"], ["--gait", "waves", "--seconds", "0.1"]])
+def test_simulate_needs_one_source_of_commands(tmp_path: Path, line: list[str], capsys: pytest.CaptureFixture[str]):
+    assert record.main(["simulate", "--output", str(tmp_path / "x.csv"), *line]) == 2
+    assert "--" in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_every_named_gait_can_be_asked_for():
+    named, _ = typing.get_args(typing.get_type_hints(record.Simulate)["gait"])
+    assert typing.get_args(named) == tuple(GAITS)
+
+
+# ---- the command ----
+
+
+def test_the_example_mapping_is_printed_and_documented(tmp_path: Path):
+    line = [sys.executable, "-m", "ballu_mjx", "record", "example-mapping"]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=120, cwd=tmp_path)
+    assert done.returncode == 0 and done.stdout == EXAMPLE
+    page = (Path(__file__).parents[2] / "docs" / "data.md").read_text()
+    assert EXAMPLE in page

@@ -1,0 +1,149 @@
+"""Start-up: each question about the environment is put to a fresh process."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ballu_mjx.common import runtime
+from ballu_mjx.common.errors import InputError
+
+SETTLED_BY_PREPARE = (
+    "XLA_FLAGS",
+    "TF_CPP_MIN_LOG_LEVEL",
+    "JAX_COMPILATION_CACHE_DIR",
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",
+    "MALLOC_ARENA_MAX",
+)
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+THREADS = 2 * CORES + 5
+PREPARE = "from ballu_mjx import runtime; runtime.prepare(); import jax\n"
+COMPILE = "import jax.numpy as jnp; jax.jit(lambda x: jnp.linalg.cholesky(x @ x.T + jnp.eye(3)))(jnp.ones((3, 3)))"
+
+
+def python(code: str, cache: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run `code` in a process that the user's settings, other than `environment`, do not reach."""
+    inherited = {name: value for name, value in os.environ.items() if name not in SETTLED_BY_PREPARE}
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env={**inherited, "JAX_PLATFORMS": "cpu", "XDG_CACHE_HOME": str(cache), **environment},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        ("", CORES),
+        ("--xla_force_host_platform_device_count=3 --xla_cpu_enable_fast_math=false", 3),
+    ],
+)
+def test_one_host_device_per_core_unless_the_user_says_otherwise(flags: str, expected: int, tmp_path: Path) -> None:
+    out = python(PREPARE + "print(jax.device_count())", tmp_path, XLA_FLAGS=flags).stdout
+    assert out == f"{expected}\n"
+
+
+def test_other_xla_flags_of_the_user_stay(tmp_path: Path) -> None:
+    flag = "--xla_cpu_enable_fast_math=false"
+    out = python(PREPARE + "import os; print(os.environ['XLA_FLAGS'])", tmp_path, XLA_FLAGS=flag).stdout
+    assert out.startswith(f"{flag} --xla_force_host_platform_device_count=")
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries have one heap")
+@pytest.mark.parametrize(("environment", "most"), [({}, CORES), ({"MALLOC_ARENA_MAX": "5"}, 5)])
+def test_threads_share_heaps(environment: dict[str, str], most: int, tmp_path: Path) -> None:
+    report = tmp_path / "heaps.xml"
+    code = PREPARE + (
+        "import ctypes, threading\n"
+        "libc = ctypes.CDLL(None)\n"
+        "libc.fopen.restype = libc.malloc.restype = ctypes.c_void_p\n"
+        f"together = threading.Barrier({THREADS})\n"
+        "def allocate():\n"
+        "    libc.malloc(5000)\n"
+        "    together.wait()\n"
+        f"threads = [threading.Thread(target=allocate) for _ in range({THREADS})]\n"
+        "for thread in threads: thread.start()\n"
+        "for thread in threads: thread.join()\n"
+        f"file = ctypes.c_void_p(libc.fopen({str(report)!r}.encode(), b'w'))\n"
+        "libc.malloc_info(0, file)\n"
+        "libc.fclose(file)\n"
+    )
+    python(code, tmp_path, **environment)
+    assert report.read_text().count("<heap ") == most
+
+
+def test_nothing_appears_on_the_screen_with_a_cold_or_a_warm_cache(tmp_path: Path) -> None:
+    code = PREPARE + "from ballu_mjx import simulation\n" + COMPILE
+    for _ in range(2):
+        done = python(code, tmp_path, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="0")
+        assert (done.stdout, done.stderr) == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("flags", "cpu", "width"),
+    [("", "fma avx2 avx512f", "512"), ("", "fma avx2", None), ("--xla_cpu_prefer_vector_width=128", "avx512f", "128")],
+)
+def test_wide_vectors_are_used_where_there_are_some(flags: str, cpu: str, width: str | None) -> None:
+    found = re.findall(r"--xla_cpu_prefer_vector_width=(\d+)", runtime._with_flags(flags, 2, cpu))
+    assert found == ([] if width is None else [width])
+
+
+def test_programs_are_kept_where_the_cache_is(tmp_path: Path) -> None:
+    at_once = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    code = PREPARE + COMPILE + "; print(runtime.cache_dir())"
+    folder = Path(python(code, tmp_path, **at_once).stdout.strip())
+    assert folder.is_relative_to(tmp_path)
+    assert any(path.stat().st_size > 0 for path in folder.iterdir())
+
+    own = tmp_path / "own"
+    python(code, tmp_path / "unused", JAX_COMPILATION_CACHE_DIR=str(own), **at_once)
+    assert any(own.iterdir())
+    assert not (tmp_path / "unused").exists()
+
+
+def test_a_cache_that_cannot_be_written_stops_nobody(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("no folder")
+    done = python(PREPARE + COMPILE + "; print('done')", blocked)
+    assert (done.stdout, done.stderr) == ("done\n", "")
+
+
+def test_importing_the_module_settles_nothing(tmp_path: Path) -> None:
+    code = "import os, sys; from ballu_mjx import runtime; print('jax' in sys.modules, os.environ.get('XLA_FLAGS'))"
+    assert python(code, tmp_path).stdout == "False None\n"
+
+
+@pytest.mark.parametrize(("jax", "cpu"), [("0.9.3", "A"), ("0.9.2", "B")])
+def test_programs_of_another_jaxlib_or_cpu_are_not_loaded(jax: str, cpu: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime.importlib.metadata, "version", lambda _: "0.9.2")
+    monkeypatch.setattr(runtime, "_cpu_description", lambda: "A")
+    before = runtime.cache_dir()
+    monkeypatch.setattr(runtime.importlib.metadata, "version", lambda _: jax)
+    monkeypatch.setattr(runtime, "_cpu_description", lambda: cpu)
+    assert runtime.cache_dir() != before
+
+
+@pytest.mark.parametrize("version", ["0.10.0", "0.10.1", "0.10.2"])
+def test_a_jax_that_deadlocks_is_refused_on_the_cpu_only(version: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime.importlib.metadata, "version", lambda _: version)
+    monkeypatch.setattr("jax.default_backend", lambda: "cpu")
+    with pytest.raises(InputError, match="deadlocks.*pip install") as refused:
+        runtime.check_jax()
+    assert version in str(refused.value) and "\n" not in str(refused.value)
+    monkeypatch.setattr("jax.default_backend", lambda: "gpu")
+    runtime.check_jax()
+
+
+@pytest.mark.parametrize("version", ["0.9.2", "0.11.0", "1.0.0"])
+def test_other_versions_of_jax_start(version: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime.importlib.metadata, "version", lambda _: version)
+    monkeypatch.setattr("jax.default_backend", lambda: "cpu")
+    runtime.check_jax()

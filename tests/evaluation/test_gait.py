@@ -1,0 +1,37 @@
+"""Steps: of a gait, and of what is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+
+from ballu_mjx.evaluation.gait import count_steps
+from ballu_mjx.robots.model import CONTROL_TIMESTEP
+
+TIME = np.arange(200) * CONTROL_TIMESTEP
+
+
+def walk(height: float) -> Float[np.ndarray, "T 2 3"]:
+    """One foot swings for half a second, then the other."""
+    stride = np.stack([TIME, TIME - 0.5], axis=1)
+    swing = np.clip(2 * (stride % 1.0), 0.0, 1.0)
+    sideways = np.tile([0.05, -0.05], (len(TIME), 1))
+    return np.stack([0.2 * (np.floor(stride) + swing), sideways, height * np.sin(np.pi * swing)], axis=-1)
+
+
+@pytest.mark.parametrize("height", [0.05, 0.001])
+def test_a_second_of_walking_is_two_steps(height: float) -> None:
+    """Also of feet that graze the floor."""
+    assert count_steps(walk(height)) == pytest.approx(2 * TIME[-1], abs=1)
+
+
+def test_what_is_no_gait_takes_no_step() -> None:
+    rest = np.tile(walk(0.0)[:1], (len(TIME), 1, 1))
+    slide = np.stack([0.3 * TIME, 0 * TIME, 0 * TIME], axis=-1)[:, None]
+    hop = np.stack([0 * TIME, 0 * TIME, 0.1 * np.abs(np.sin(3 * TIME))], axis=-1)[:, None]
+    limp = walk(0.05)
+    limp[:, 1] = rest[:, 1]
+    fly = np.array([0.0, 0.0, 0.1])
+    for name, feet in {"rest": rest, "slide": rest + slide, "hop": rest + hop, "limp": limp, "fly": rest + fly}.items():
+        assert count_steps(feet) == 0, name

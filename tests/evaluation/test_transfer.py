@@ -1,0 +1,199 @@
+"""Transfer: the paper's figures on paths known by hand, the bootstrap's coverage, and the tables."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+
+from ballu_mjx.evaluation.transfer import (
+    PAPER_TURNING,
+    PAPER_WALKING,
+    Interval,
+    Trajectory,
+    Transfer,
+    bootstrap,
+    compare_trajectories,
+    path_length,
+    separated,
+    turning_table,
+    walking_table,
+)
+from ballu_mjx.robots.model import CONTROL_TIMESTEP
+
+SETTINGS = ("vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic")
+
+
+def clock(seconds: float) -> Float[np.ndarray, " T"]:
+    return np.arange(round(seconds / CONTROL_TIMESTEP) + 1) * CONTROL_TIMESTEP
+
+
+def resting(com: Float[np.ndarray, "T 3"], yaw: Float[np.ndarray, " T"]) -> Trajectory:
+    """Feet stay where they are."""
+    return Trajectory(com, yaw, np.zeros((len(com), 2, 3)))
+
+
+def straight(seconds: float, speed: float, yaw: float = 0.0) -> Trajectory:
+    """Along x from the origin, 1 m high."""
+    time = clock(seconds)
+    return resting(np.stack([speed * time, 0 * time, 0 * time + 1.0], axis=1), np.full(len(time), yaw))
+
+
+def circle(seconds: float, turns: float, radius: float = 1.0) -> Trajectory:
+    """Leftwards from the origin, heading along x; yaw as a sensor gives it, within half a turn."""
+    angle = 2 * np.pi * turns * clock(seconds) / seconds
+    com = radius * np.stack([np.sin(angle), 1 - np.cos(angle), 0 * angle], axis=1)
+    return resting(com, np.arctan2(np.sin(angle), np.cos(angle)))
+
+
+def trial(value: float) -> Transfer:
+    return Transfer(**{field.name: value for field in dataclasses.fields(Transfer)})
+
+
+def test_straight_walk() -> None:
+    found = compare_trajectories(straight(10, 0.2), straight(10, 0.1))
+    assert found.com_error == pytest.approx(0.5)  # 0 m at the start to 1 m at the end
+    assert (found.x_distance, found.total_distance, found.sim_x_distance) == pytest.approx((1.0, 1.0, 2.0))
+    assert (found.y_distance, found.sim_y_distance, found.yaw_error, found.yaw_change) == pytest.approx((0, 0, 0, 0))
+
+
+def test_constant_offset_is_the_com_error_in_three_dimensions() -> None:
+    robot = straight(5, 0.1)
+    found = compare_trajectories(resting(robot.com + np.array([0.2, -0.3, 0.6]), robot.yaw), robot)
+    assert found.com_error == pytest.approx(0.7)
+    assert found.sim_x_distance == pytest.approx(found.x_distance)
+
+
+@pytest.mark.parametrize(("simulated", "real"), [(1.25, 1.5), (-0.5, 1.5), (2.0, -1.25)])
+def test_full_turns_count(simulated: float, real: float) -> None:
+    found = compare_trajectories(circle(20, simulated), circle(20, real))
+    assert found.yaw_change == pytest.approx(360 * real)
+    assert found.sim_yaw_change == pytest.approx(360 * simulated)
+    assert found.yaw_error == pytest.approx(360 * (simulated - real))
+    assert found.y_distance == pytest.approx(1 - np.cos(2 * np.pi * real), abs=1e-12)
+
+
+def test_starts_on_either_side_of_the_half_turn_are_near() -> None:
+    found = compare_trajectories(straight(2, 0.1, np.deg2rad(179)), straight(2, 0.1, np.deg2rad(-179)))
+    assert found.yaw_error == pytest.approx(-2)
+    assert found.yaw_change == 0
+
+
+def test_looks_at_the_shorter_path_whichever_it_is() -> None:
+    short, long = straight(4, 0.1), circle(20, 1.0)
+    cut = resting(long.com[: len(short.com)], long.yaw[: len(short.yaw)])
+    assert compare_trajectories(short, long) == compare_trajectories(short, cut)
+    assert compare_trajectories(long, short) == compare_trajectories(cut, short)
+
+
+def test_path_length_ignores_sway_and_keeps_the_last_second() -> None:
+    way = straight(24.35, 0.05)
+    time = clock(24.35)
+    noise = np.random.default_rng(0).normal(scale=0.002, size=way.com.shape)
+    swaying = way.com + 0.03 * np.sin(2 * np.pi * 2.1 * time)[:, None] * np.array([0.0, 1.0, 0.3]) + noise
+    everywhere = np.linalg.norm(np.diff(swaying[:, :2], axis=0), axis=1).sum()
+    assert path_length(way.com) == pytest.approx(24.35 * 0.05)
+    assert everywhere > 4 * 24.35 * 0.05
+    assert path_length(swaying) == pytest.approx(24.35 * 0.05, rel=0.1)
+    assert path_length(way.com[:2]) == pytest.approx(0.05 * CONTROL_TIMESTEP)
+
+
+def test_path_length_of_a_circle() -> None:
+    """A chord a second: 2 r sin(angle / 2) each."""
+    assert path_length(circle(20, 1.0).com) == pytest.approx(20 * 2 * np.sin(np.pi / 20))
+
+
+def test_single_precision_serves() -> None:
+    way = straight(10, 0.1)
+    single = resting(way.com.astype(np.float32), way.yaw.astype(np.float32))
+    assert compare_trajectories(single, single).x_distance == pytest.approx(1.0, rel=1e-5)
+
+
+def test_refuses_paths_that_are_none() -> None:
+    way = straight(1, 0.1)
+    point = resting(way.com[:1], way.yaw[:1])
+    for pair, name in (((point, way), "simulation"), ((way, point), "robot")):
+        with pytest.raises(ValueError, match=f"The {name} has 1 states"):
+            compare_trajectories(*pair)
+    with pytest.raises(ValueError, match="21 centres of mass, but 20 yaws"):
+        compare_trajectories(way, Trajectory(way.com, way.yaw[:-1], way.feet))
+
+
+def test_json_round_trip() -> None:
+    found = compare_trajectories(circle(10, 0.3), circle(10, 0.2))
+    assert Transfer.from_json(json.loads(json.dumps(found.to_json()))) == found
+
+
+def test_bootstrap_covers_the_mean() -> None:
+    """Seeds and trials both normal about 3: the interval has the mean in about 95 % of datasets."""
+    rng, covered, count = np.random.default_rng(1), 0, 300
+    for number in range(count):
+        data = 3.0 + rng.normal(size=(20, 1)) + 0.7 * rng.normal(size=(20, 4))
+        found = bootstrap(data.tolist(), draws=400, seed=number)
+        assert found.mean == pytest.approx(data.mean())
+        covered += found.low <= 3.0 <= found.high
+    assert 0.90 < covered / count < 0.99
+
+
+def test_bootstrap_is_wider_where_seeds_differ() -> None:
+    rng = np.random.default_rng(2)
+    trials = rng.normal(size=(6, 5))
+    alike = bootstrap(trials.tolist())
+    differing = bootstrap((trials + 4 * rng.normal(size=(6, 1))).tolist())
+    assert differing.high - differing.low > 2 * (alike.high - alike.low)
+
+
+def test_bootstrap_with_one_seed_resamples_its_trials() -> None:
+    """Against the standard error of the mean, here of 0, 1, ..., 39."""
+    values = np.arange(40.0)
+    found = bootstrap([values.tolist()])
+    error = values.std() / np.sqrt(40)
+    assert (found.mean, found.low, found.high) == pytest.approx(
+        (19.5, 19.5 - 1.96 * error, 19.5 + 1.96 * error), rel=0.02
+    )
+    assert bootstrap([[2.0]]) == (2.0, 2.0, 2.0)
+
+
+def test_bootstrap_weighs_seeds_alike_whatever_their_trials() -> None:
+    assert bootstrap([[1.0], [3.0] * 9]) == (2.0, 1.0, 3.0)
+    for nothing in ([], [[1.0], []]):
+        with pytest.raises(ValueError, match="a trial or more"):
+            bootstrap(nothing)
+
+
+def test_separated() -> None:
+    low, middle, high = Interval(1, 0, 2), Interval(2, 1, 3), Interval(4, 2.5, 5)
+    assert separated(low, high) and separated(high, low)
+    assert not separated(low, middle) and not separated(middle, high)
+
+
+@pytest.mark.parametrize(("table", "paper"), [(walking_table, PAPER_WALKING), (turning_table, PAPER_TURNING)])
+def test_table_has_the_papers_rows_and_numbers(
+    table: Callable[..., str], paper: Mapping[str, tuple[float, float, float]]
+) -> None:
+    names = (*SETTINGS, "envmimic, other draughts")
+    results = {name: [[trial(0.1), trial(0.3)], [trial(0.2), trial(0.4)]] for name in names}
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table(results).splitlines()]
+    assert [len(row) for row in rows] == [8] * 7
+    assert [row[0] for row in rows[2:]] == list(names)
+    for row in rows[2:6]:
+        assert row[2:7:2] == [f"{value:.2f}" for value in paper[row[0]]]
+    assert rows[6][2:7:2] == ["-"] * 3
+    assert all(cell.startswith(("0.25 [0.", "0.2 [0.")) for row in rows[2:] for cell in row[1:6:2])
+    assert table(results).isascii()
+
+
+def test_tables_numbers() -> None:
+    """Absolute yaw errors, for those of +10 and -10 do not make a perfect policy; no interval about one trial."""
+    errors = [dataclasses.replace(trial(0.0), yaw_error=value, steps=20 + value) for value in (10.0, -10.0)]
+    assert turning_table({"envmimic": [errors]}).splitlines()[-1] == (
+        "| envmimic | 10.0 [10.0, 10.0] | 3.50 | 0.00 [0.00, 0.00] | 0.29 | 0.0 [0.0, 0.0] | 36.42 | 20 (10 to 30); 0 |"
+    )
+    walk = dataclasses.replace(trial(0.0), com_error=0.5, x_distance=1.234, total_distance=2.0)
+    assert walking_table({"vanilla+dr": [[walk]]}).splitlines()[-1] == (
+        "| vanilla+dr | 0.50 | 1.24 | 1.23 | 0.32 | 2.00 | 0.60 | 0; 0 |"
+    )

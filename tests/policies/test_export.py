@@ -1,0 +1,345 @@
+"""The exported controller: alone on NumPy it is the policy, and nothing it is given gets past its limits."""
+
+import ast
+import importlib.util
+import math
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from ballu_mjx.cli import export as export_command
+from ballu_mjx.cli import train_policy
+from ballu_mjx.cli.export import Options
+from ballu_mjx.policies.deploy import controller, estimator, export
+from ballu_mjx.policies.deploy.controller import CONTROL_PERIOD, FULL_TRAVEL, TIMEOUT, Controller
+from ballu_mjx.policies.deploy.estimator import Capture
+from ballu_mjx.policies.locomotion_env import OBSERVATIONS, LocomotionConfig, locomotion_observation
+from ballu_mjx.policies.policy import ACTIONS, Policy
+from ballu_mjx.residuals.run_config import describe_run
+from ballu_mjx.rl import ppo
+from ballu_mjx.rl.ppo import Normalizer, Params, PPOConfig
+from ballu_mjx.runs.folder import Run
+
+LIMIT = CONTROL_PERIOD / FULL_TRAVEL
+CLEAN = """
+import sys
+
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("jax", "jaxlib", "jaxtyping", "mujoco", "brax", "flax", "scipy", "ballu_mjx"):
+            raise ImportError(name + " is not on the robot")
+
+sys.meta_path.insert(0, Refuse())
+sys.path.insert(0, sys.argv[1])
+import numpy as np
+from controller import Controller
+
+controller = Controller(sys.argv[1])
+features = np.load(sys.argv[2])
+np.save(sys.argv[3], [controller.act(row) for row in features])
+"""
+"""Runs an exported policy where there is nothing but NumPy."""
+
+
+def write_run(folder: Path, task: str = "walk", **settings: Any) -> Path:
+    """A run whose policy is drawn at random, with commands all over [0, 1]."""
+    config = PPOConfig(policy_layers=(16, 12), value_layers=(4,), **settings)
+    networks = ppo.make_networks(OBSERVATIONS, ACTIONS, config)
+    tree: Any = jax.device_get(networks.policy_network.init(jax.random.key(1)))
+    tree["params"]["Dense_0"]["kernel"] = 100.0 * tree["params"]["Dense_0"]["kernel"]
+    rng = np.random.default_rng(2)
+    moments = ({"state": rng.uniform(0.1, 0.5, OBSERVATIONS).astype(np.float32)} for _ in range(3))
+    normalizer = Normalizer(np.float32(100.0), *moments)  # pyright: ignore[reportArgumentType]
+    value = jax.device_get(networks.value_network.init(jax.random.key(3)))
+    sections = {"env": LocomotionConfig(), "ppo": config, "data": train_policy.Data()}
+    content = describe_run(task, sections, {}, []) | {"residual": None}
+    with Run(folder, content) as run:
+        run.save(7, ppo.as_tree(Params(normalizer, tree, value)), -1.0)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("export") / "run")
+
+
+@pytest.fixture(scope="module")
+def exported(run: Path) -> Path:
+    return export.export_policy(Options(run, open_loop=False))
+
+
+def random_features(count: int) -> np.ndarray:
+    rng = np.random.default_rng(4)
+    features = rng.normal(0.0, 1.0, (count, 27))
+    features[:, 8] = rng.uniform(-math.pi, math.pi, count)
+    return features
+
+
+def frame_at(time: float) -> dict[str, np.ndarray]:
+    """A robot that sways."""
+    sway = 0.3 * np.sin(4.0 * time + np.arange(3))
+    return {
+        "balloon_position": np.array([0.1, 0.0, 1.1]) + 0.2 * sway,
+        "balloon_quaternion": np.array([np.cos(sway[0]), 0.0, 0.0, np.sin(sway[0])]),
+        "base_position": np.array([0.1, 0.0, 0.75]) + 0.1 * sway,
+        "foot_position": np.array([sway, -sway]),
+    }
+
+
+@pytest.mark.parametrize("settings", [{}, {"activation": "tanh"}, {"normalize_observations": False}])
+def test_exported_policy_is_the_policy_without_its_libraries(settings: dict, tmp_path: Path):
+    folder = export.export_policy(Options(write_run(tmp_path / "run", **settings), tmp_path / "robot", open_loop=False))
+    features = random_features(1000)
+    np.save(tmp_path / "features.npy", features)
+    line = [sys.executable, "-I", "-c", CLEAN, folder, tmp_path / "features.npy", tmp_path / "commands.npy"]
+    done = subprocess.run(list(map(str, line)), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    act = Policy.load(tmp_path / "run").act()
+    expected = np.array([act(row) for row in features])
+    assert np.mean((expected > 0.01) & (expected < 0.99)) > 0.2  # not all at the stops
+    np.testing.assert_allclose(np.load(tmp_path / "commands.npy"), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("settings", [{}, {"activation": "tanh"}, {"normalize_observations": False}])
+def test_onnx_is_the_policy(settings: dict, tmp_path: Path):
+    import onnxruntime
+
+    folder = export.export_policy(
+        Options(write_run(tmp_path / "run", **settings), tmp_path / "robot", open_loop=False, onnx=True)
+    )
+    features = random_features(1000)
+    observations = np.array([controller.observation(row) for row in features], np.float32)
+    session = onnxruntime.InferenceSession(folder / "policy.onnx", providers=["CPUExecutionProvider"])
+    commands = np.asarray(session.run(["command"], {"observation": observations})[0])
+    act = Policy.load(tmp_path / "run").act()
+    np.testing.assert_allclose(commands, np.array([act(row) for row in features]), atol=1e-5)
+
+
+def test_onnx_that_is_not_installed_is_told_before_anything_is_written(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert export_command.main([str(run), "--output", str(tmp_path / "robot"), "--onnx"]) == 2
+    error = capsys.readouterr().err
+    assert "ballu-mjx[onnx]" in error and error.count("\n") == 1
+    assert not (tmp_path / "robot").exists()
+
+
+def test_self_test_passes_and_notices_other_weights(exported: Path, tmp_path: Path):
+    done = subprocess.run([sys.executable, "controller.py"], cwd=exported, capture_output=True, text=True)
+    assert done.returncode == 0 and "Passed." in done.stdout and "ms" in done.stdout, done.stderr
+    with np.load(exported / "weights.npz") as file:
+        stored: dict[str, Any] = {name: file[name] for name in file.files}
+    np.savez(tmp_path / "weights.npz", **stored | {"bias_0": stored["bias_0"] + 1})
+    assert controller.self_test(tmp_path, frames=100) == 1
+
+
+def test_exported_source_suits_python_3_9(exported: Path):
+    for name in ("controller.py", "estimator.py"):
+        text = (exported / name).read_text()
+        ast.parse(text, feature_version=(3, 9))
+        assert not re.search(r"\bimport (jax|ballu_mjx)|from (jax|ballu_mjx)|strict=", text)
+        assert "from __future__ import annotations" in text  # types may be written as those of later versions
+
+
+def test_observation_is_named_and_that_of_training():
+    features = random_features(20)
+    for row in features:
+        np.testing.assert_allclose(
+            controller.observation(row), locomotion_observation(jax.numpy.asarray(row)), atol=1e-5
+        )
+    assert len(controller.OBSERVATION) == len(set(controller.OBSERVATION)) == OBSERVATIONS
+    row = np.zeros(27)
+    row[[2, 13, 7]] = 1.1, 0.3, 0.2
+    seen = dict(zip(controller.OBSERVATION, controller.observation(row), strict=True))
+    names = ("balloon position z, m", "base velocity y, m/s", "balloon pitch, rad", "cosine of balloon yaw")
+    assert [seen[name] for name in names] == [1.1, 0.3, 0.2, 1.0]
+
+
+def test_steps_are_those_of_the_policy_controller(exported: Path):
+    """Frame by frame at 100 Hz, some hidden: the policy on `estimator.estimate`'s features every 50 ms."""
+    robot = Controller(exported, full_travel=1e-3)  # in effect without the limit
+    capture = Capture([], [], [], [], [], [], [])
+    start, rng = 1.7e9, np.random.default_rng(5)
+    for number in range(300):
+        frame = frame_at(number * 0.01)
+        for values in frame.values():
+            if number > 3 and rng.uniform() < 0.2:
+                values[...] = np.nan
+        capture.time.append(number * 0.01)
+        for name, values in frame.items():
+            getattr(capture, name).append(values)
+        command = robot.step(start + number * 0.01, frame)
+        if number % 5 == 0:
+            assert robot.status == "running"
+            expected = robot.act(estimator.estimate(capture))
+        np.testing.assert_allclose(command, expected, atol=1e-4)  # such times have steps of 0.2 us
+    assert robot.steps == 60
+
+
+def test_calls_at_the_control_rate_are_control_steps(exported: Path):
+    robot = Controller(exported)
+    rng = np.random.default_rng(6)
+    for number in range(100):
+        robot.step(number * 0.05 + rng.uniform(0, 0.004), frame_at(number * 0.05))
+    assert robot.steps == 100 and robot.status == "running"
+
+
+def test_rate_limit_holds_where_the_policy_jumps(exported: Path, monkeypatch: pytest.MonkeyPatch):
+    robot = Controller(exported)
+    target = np.ones(2)
+    monkeypatch.setattr(robot, "act", lambda features: target)
+    seen = [robot.step(n * 0.01, frame_at(n * 0.01)) for n in range(40)]
+    np.testing.assert_allclose(np.array(seen)[::5, 0], [0.25, 0.5, 0.75, 1.0, 1.0, 1.0, 1.0, 1.0], atol=1e-12)
+    target[:] = 0.0
+    seen = [robot.step(n * 0.01, frame_at(n * 0.01)) for n in range(40, 60)]
+    np.testing.assert_allclose(np.array(seen)[::5, 1], [0.75, 0.5, 0.25, 0.0], atol=1e-12)
+
+
+def without(name: str, value: Any) -> Callable[[float], Any]:
+    return lambda time: {**frame_at(time), name: value}
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        lambda time: None,
+        lambda time: {},
+        lambda time: "no frame",
+        without("base_position", np.full(3, np.nan)),
+        without("base_position", [np.inf, 0, 0]),
+        without("base_position", [1e9, 0, 0]),
+        without("base_position", None),
+        without("foot_position", np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])),
+        without("foot_position", np.zeros(3)),
+        without("balloon_quaternion", np.zeros(4)),
+        without("balloon_quaternion", ["w", "x", "y", "z"]),
+    ],
+)
+def test_time_out_relaxes_and_ends(exported: Path, monkeypatch: pytest.MonkeyPatch, broken: Callable[[float], Any]):
+    robot = Controller(exported)
+    monkeypatch.setattr(robot, "act", lambda features: np.ones(2))
+    for number in range(101):
+        robot.step(number * 0.01, frame_at(number * 0.01))
+    assert robot.command.tolist() == [1.0, 1.0]
+    for number in range(101, 170):
+        now = number * 0.01
+        command = robot.step(now, broken(now))
+        if now < 1.0 + TIMEOUT - 0.001:
+            assert command == (1.0, 1.0)
+    assert command == (0.0, 0.0)
+    assert robot.status.startswith("relaxed: ") and "not seen" in robot.status
+    for number in range(170, 200):
+        command = robot.step(number * 0.01, frame_at(number * 0.01))
+    assert command == (1.0, 1.0) and robot.status == "running"
+
+
+@pytest.mark.parametrize("times", [lambda n: 1.0, lambda n: math.nan, lambda n: 1.0 - 0.01 * n, lambda n: "soon"])
+def test_a_clock_that_does_not_go_relaxes(exported: Path, monkeypatch: pytest.MonkeyPatch, times: Callable):
+    robot = Controller(exported)
+    monkeypatch.setattr(robot, "act", lambda features: np.ones(2))
+    for number in range(101):
+        robot.step(number * 0.01, frame_at(number * 0.01))
+    for number in range(60):
+        robot.step(times(number), frame_at(1.0))
+    assert robot.command.tolist() == [0.0, 0.0]
+    for number in range(40):
+        robot.step(2.0 + number * 0.01, frame_at(2.0 + number * 0.01))
+    assert robot.command.tolist() == [1.0, 1.0]
+
+
+def test_a_clock_set_back_is_followed(exported: Path):
+    robot = Controller(exported)
+    for origin in (100.0, 3.0, 1e9, -50.0):
+        for number in range(100):
+            robot.step(origin + number * 0.01, frame_at(number * 0.01))
+        assert robot.status == "running"
+    assert 75 <= robot.steps <= 85
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_gets_past_the_limits(exported: Path, seed: int):
+    """Frames with all sorts of faults at steady times, then at times that are at fault as well."""
+    rng = np.random.default_rng(seed)
+    wild: list[Any] = [math.nan, math.inf, -math.inf, 1e308, -1e308, 50.0, None, "x", [], 10**400, 0.0]
+    robot = Controller(exported)
+    before, changed = (0.0, 0.0), -math.inf
+    time: Any = 0.0
+    for number in range(4000):
+        faulty_clock = number >= 2000
+        frame: Any = frame_at(number * 0.01)
+        for name, values in list(frame.items()):
+            fault = rng.integers(0, 12)
+            if fault == 0:
+                frame[name] = wild[rng.integers(len(wild))]
+            elif fault == 1:
+                values[...] = np.nan
+            elif fault == 2:
+                values.flat[rng.integers(values.size)] = rng.choice([math.nan, math.inf, 1e308, 99.0, -3.0])
+            elif fault == 3:
+                del frame[name]
+        if rng.uniform() < 0.1:
+            frame = [None, (), 3.0, "", object()][rng.integers(5)]
+        time = number * 0.01 + rng.uniform(0, 0.009)
+        if faulty_clock and rng.uniform() < 0.3:
+            time = [*wild, time - 5.0, time - 0.02, time + 0.5, time + 1e6, -1e300][rng.integers(len(wild) + 5)]
+        command = robot.step(time, frame)
+        assert all(math.isfinite(value) and 0.0 <= value <= 1.0 for value in command)
+        change = max(abs(command[0] - before[0]), abs(command[1] - before[1]))
+        assert change <= LIMIT + 1e-12
+        if change > 0 and not faulty_clock:
+            assert change <= (time - changed) / FULL_TRAVEL + 1e-9
+            changed = time
+        before = command
+    assert robot.steps > 500
+
+
+def test_command_refuses_what_it_cannot_use(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").write_text("keep")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "config.json").write_text('{"format": "ballu-run/1", "task": "envmimic"}')
+    for arguments, words in (
+        ([tmp_path / "nothing"], "there is no run"),
+        ([tmp_path / "other"], "is of a run of 'envmimic'"),
+        ([run, "--output", tmp_path / "full", "--no-open-loop"], "not empty"),
+        ([run, "--seconds", "0"], "--seconds"),
+        ([run, "--pulse-low", "-1"], "--pulse-low"),
+        ([run, "--pulse-low", "1500", "--pulse-high", "1500"], "would not move"),
+    ):
+        assert export_command.main(list(map(str, arguments))) == 2
+        error = capsys.readouterr().err
+        assert words in error and error.count("\n") == 1
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["notes.txt"]
+
+
+def test_commands_are_written_as_pulses(tmp_path: Path):
+    commands = np.array([[0.0, 1.0], [0.5, 0.25]])
+    export._write_commands(tmp_path / "commands.csv", commands, Options(tmp_path, pulse_low=900, pulse_high=2100))
+    assert (tmp_path / "commands.csv").read_text().splitlines() == [
+        "time,command_left,command_right,pulse_left_us,pulse_right_us",
+        "0.00,0.0000,1.0000,900.0,2100.0",
+        "0.05,0.5000,0.2500,1500.0,1200.0",
+    ]
+
+
+def test_readme_tells_of_the_run(exported: Path):
+    text = (exported / "README.txt").read_text()
+    assert "task 'walk'" in text and "step 7" in text and "27: sine of balloon yaw" in text
+    assert max(map(len, text.splitlines())) <= 120
+
+
+def test_export_can_be_imported_from_anywhere(exported: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.syspath_prepend(str(exported))
+    spec = importlib.util.spec_from_file_location("controller", exported / "controller.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    assert module.Controller(exported).step(0.0, None) == (0.0, 0.0)

@@ -1,0 +1,229 @@
+"""Locomotion tasks: what they reward, what their simulators are made of, and the residual's place in them."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from ballu_mjx.ballu.features import foot_positions
+from ballu_mjx.ballu.model import KNEES, MOTORS, ActuatorParameters, standing_qpos
+from ballu_mjx.policies.closed_loop import ClosedLoop
+from ballu_mjx.policies.locomotion_env import LocomotionConfig, LocomotionEnv, locomotion_observation, setting_of
+from ballu_mjx.policies.tasks import TASKS, Step
+from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.network import NetworkForces
+from ballu_mjx.residuals.trained import MARGIN, TrainedResidual
+from ballu_mjx.rl import ppo
+from ballu_mjx.rl.learner import Learner
+from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.sim.observation import HISTORY, heading_rotation
+from ballu_mjx.sim.step import state_at
+
+MODEL = load_model()
+INPUTS = 87
+"""Of the residual: three steps of 27 features, and three commands."""
+
+
+def make_residual(action: np.ndarray, width: float = 1e6) -> TrainedResidual:
+    """A residual whose policy always answers `action`, and that has seen inputs within plus and minus `width`."""
+    bound = np.full(INPUTS, width, np.float32)
+    forces = NetworkForces(
+        EnvMimicConfig(),
+        infer=lambda params, seen: jnp.asarray(action, jnp.float32),
+        sample=lambda params, seen, key: jnp.asarray(action, jnp.float32) + jax.random.normal(key, (3,)),
+    )
+    return TrainedResidual(
+        forces,
+        params=None,
+        observed=(-bound, bound),
+        step=0,
+        actuators=None,
+    )
+
+
+def inner(state) -> Any:
+    return state.pipeline_state
+
+
+PLAIN = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig())
+RESET, STEP = jax.jit(lambda setting, key: PLAIN._start(setting, key)), jax.jit(PLAIN.step)
+"""Compiled once: what tells one simulator from another travels in the state."""
+
+
+def test_rewards_are_velocities_of_the_task_s_direction():
+    step = Step(jnp.array([0.3, -0.2, 0.1]), jnp.zeros(27), jnp.zeros(2))
+    rewards = {name: float(task.reward(step)) for name, task in TASKS.items()}
+    assert rewards == pytest.approx({"walk": 0.3, "turn": -0.2, "turn-right": 0.2, "walk-backward": -0.3})
+
+
+def test_reward_is_the_mean_velocity_of_the_robot_in_c_mujoco():
+    state = RESET(PLAIN.setting, jax.random.key(0))
+    data = mujoco.MjData(MODEL)
+    for number in range(20):
+        # From the same state every time: over a second a foot's contact may come a step earlier in one of the two.
+        physics = inner(state)["physics"]
+        data.qpos[:], data.qvel[:] = physics.qpos, physics.qvel
+        mujoco.mj_forward(MODEL, data)
+        before = data.subtree_com[1].copy()
+        action = np.array([1.0, -1.0]) if number % 10 < 5 else np.array([-1.0, 0.2])
+        state = STEP(state, jnp.asarray(action, jnp.float32))
+        data.ctrl[:] = (action + 1) / 2
+        mujoco.mj_step(MODEL, data, round(CONTROL_TIMESTEP / MODEL.opt.timestep))
+        mujoco.mj_forward(MODEL, data)
+        speed = (data.subtree_com[1] - before) / CONTROL_TIMESTEP
+        assert float(state.reward) == pytest.approx(speed[0], abs=0.01)
+    assert np.abs(speed[0]) > 0.02
+
+
+def test_policy_sees_neither_place_nor_direction_but_the_heading():
+    rng = np.random.default_rng(0)
+    seen = rng.normal(size=27).astype(np.float32)
+    yaw, shift = 0.7, np.array([3.0, -2.0, 0.0])
+    turn = np.array(heading_rotation(jnp.array(yaw)))
+    vectors = np.concatenate([seen[:6], seen[9:]]).reshape(-1, 3) @ turn.T
+    vectors[::2] += shift
+    moved = np.concatenate([vectors[:2].ravel(), seen[6:9] + [0, 0, yaw], vectors[2:].ravel()]).astype(np.float32)
+    one, other = (np.asarray(locomotion_observation(jnp.asarray(x))) for x in (seen, moved))
+    np.testing.assert_allclose(other[:-2], one[:-2], atol=1e-5)
+    np.testing.assert_allclose(other[-2:], [np.cos(seen[8] + yaw), np.sin(seen[8] + yaw)], atol=1e-6)
+
+
+def test_randomization_draws_friction_and_start_and_is_off_by_default():
+    keys = jax.random.split(jax.random.key(1), 200)
+    draw = jax.jit(jax.vmap(PLAIN._start, in_axes=(None, 0)))
+    plain = inner(draw(PLAIN.setting, keys))
+    assert np.unique(plain["friction"]).tolist() == pytest.approx([0.9])
+    assert np.ptp(plain["physics"].qpos, axis=0).max() == 0 and np.abs(plain["physics"].qvel).max() == 0
+
+    config = LocomotionConfig(domain_randomization=True)
+    drawn = inner(draw(setting_of(MODEL, config, None), keys))
+    low, high = config.friction
+    assert low <= drawn["friction"].min() < low + 0.05 and high - 0.05 < drawn["friction"].max() <= high
+    yaw = np.rad2deg(np.asarray(drawn["history"])[:, -1, 8])
+    assert config.start_yaw * 0.9 < yaw.max() <= config.start_yaw + 1 and yaw.min() < -config.start_yaw * 0.9
+    knees = np.asarray(drawn["physics"].qpos)[:, 7:][:, KNEES]
+    assert (knees >= standing_qpos(MODEL)[7:][KNEES] - 1e-6).all()
+
+
+def test_friction_drawn_is_friction_felt():
+    """A robot thrown along the floor slides further on a smoother one."""
+    state = RESET(PLAIN.setting, jax.random.key(0))
+    way = []
+    for friction in (0.2, 1.0):
+        thrown = inner(state)["physics"]
+        thrown = thrown._replace(qvel=thrown.qvel.at[0].set(1.0))
+        pushed = inner(state) | {"friction": jnp.float32(friction), "physics": thrown}
+        now = dataclasses.replace(state, pipeline_state=pushed)
+        for _ in range(10):
+            now = STEP(now, -jnp.ones(2))
+        way.append(float(inner(now)["history"][-1, 15]))
+    assert way[0] > way[1] + 0.02
+
+
+def test_identified_actuators_are_in_the_simulator_and_pass_from_episode_to_episode():
+    nominal = ActuatorParameters.nominal(MODEL)
+    weak = dataclasses.replace(nominal, torque_limit=nominal.torque_limit * jnp.array([0.1, 1.0]))
+    reached = []
+    for setting in (PLAIN.setting, setting_of(MODEL, LocomotionConfig(), weak)):
+        state = STEP(RESET(setting, jax.random.key(0)), jnp.ones(2))
+        state = RESET(inner(state)["setting"], jax.random.key(1))
+        for _ in range(20):
+            state = STEP(state, jnp.ones(2))
+        reached.append(np.asarray(inner(state)["physics"].qpos)[7:][MOTORS])
+    left, right = np.rad2deg(reached[0] - reached[1])
+    assert left > 15 and abs(right) < left / 3
+
+
+def test_residual_pushes_in_the_balloon_s_heading_and_only_so_hard():
+    action, yaw = np.array([0.5, 0.2, -0.1]), 2.0
+    env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(), residual=make_residual(action))
+    simulator, zeros = env.simulator, jnp.zeros(MODEL.nv)
+    qpos = standing_qpos(MODEL)
+    qpos[3:7] = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+    qpos = jnp.asarray(qpos, jnp.float32)
+    state = jax.jit(lambda qpos: env.step(env.at(qpos, zeros, jax.random.key(0)), -jnp.ones(2)))(qpos)
+
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    force = turn @ (EnvMimicConfig().force_scale * action)
+    pushed = jax.jit(lambda wrench: simulator.step(state_at(qpos, zeros), jnp.zeros(2), wrench))
+    expected = pushed(jnp.asarray([[*force, 0, 0, 0]], jnp.float32))
+    np.testing.assert_allclose(inner(state)["physics"].qvel, expected.qvel, atol=1e-5)
+    assert np.abs(np.asarray(expected.qvel - pushed(jnp.zeros((1, 6))).qvel)).max() > 1e-3
+    assert float(state.metrics["force"]) == pytest.approx(np.linalg.norm(force), rel=1e-5)
+
+
+def test_force_fades_outside_of_what_the_residual_has_seen():
+    history = jnp.zeros((HISTORY, 27)).at[-1, 2].set(2.0)  # the balloon's height, alone outside
+    history = history.at[:-1].set(history[-1])
+    commands = jnp.zeros((HISTORY, 2))
+    width = 1.0
+    residual = make_residual(np.array([1.0, 0.0, 0.0]), width)
+    expected = (2.0 - width) / (2 * width) - MARGIN
+    assert float(residual.excess(history, commands)) == pytest.approx(expected, rel=1e-5)
+    assert float(residual.excess(jnp.zeros((HISTORY, 27)), commands)) == 0.0
+
+    far, key = history, jax.random.key(0)
+    forces = []
+    for decay in (0.0, 3.0):
+        env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(residual_decay=decay), residual=residual)
+        wrench, excess = env._wrench(far, commands, key)
+        assert float(excess) == pytest.approx(expected, rel=1e-5)
+        forces.append(float(jnp.linalg.norm(wrench)))
+    assert forces[0] == pytest.approx(EnvMimicConfig().force_scale, rel=1e-5)
+    assert forces[1] == pytest.approx(forces[0] * np.exp(-3.0 * expected), rel=1e-5)
+
+
+GAIN = ppo.Params(ppo.Normalizer(np.zeros(()), {}, {}, {}), None, np.float32(0.8))
+"""Of policies that are no network."""
+
+
+def test_one_program_serves_all_residuals_of_a_kind():
+    action, network = 3, PPOConfig(policy_layers=(4,), value_layers=(4,))
+    infer = ppo.make_inference({ppo.STATE: (INPUTS,)}, action, network)
+    nominal = ActuatorParameters.nominal(MODEL)
+    weak = dataclasses.replace(nominal, torque_limit=0.5 * nominal.torque_limit)
+    sizes = dataclasses.replace(
+        network, num_envs=8, batch_size=8, num_minibatches=1, unroll_length=2, num_updates_per_batch=1
+    )
+    training, closed_loop = [], []
+    for seed, actuators in ((0, nominal), (1, weak)):
+        inputs = np.random.default_rng(seed).normal(size=(50, INPUTS)).astype(np.float32)
+        params = ppo.initial_policy(inputs, action, dataclasses.replace(network, seed=seed))
+        seen = inputs.min(axis=0), inputs.max(axis=0)
+        learned = TrainedResidual(NetworkForces(EnvMimicConfig(), infer), params, seen, 0, actuators)
+        env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(), actuators=actuators, residual=learned)
+        learner = Learner(env, sizes)
+        state = jax.eval_shape(learner._first, jax.random.PRNGKey(0), learner._contents)
+        training.append(learner._step.lower(state, learner._contents).as_text())
+        loop = ClosedLoop(env, lambda params, seen: params.value * seen[:2])
+        state = jax.eval_shape(loop._reset, env.contents, jax.random.split(jax.random.key(0), 8))
+        closed_loop.append(loop._run.lower(GAIN, env.contents, state).as_text())
+    assert training[0] == training[1]
+    assert closed_loop[0] == closed_loop[1]
+
+
+def test_closed_loop_is_the_environment_step_by_step():
+    infer = lambda params, seen: params.value * jnp.sin(10 * seen[:2])  # noqa: E731
+    env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(domain_randomization=True))
+    loop = ClosedLoop(env, infer)
+    still, start = (inner(RESET(x.setting, jax.random.key(k)))["physics"] for x, k in ((PLAIN, 0), (env, 3)))
+    qpos, qvel = (np.stack([x] * 8 + [y]) for x, y in ((still.qpos, start.qpos), (still.qvel, start.qvel)))
+    rollout = loop(GAIN, qpos, qvel, 5)  # the last one is of a batch of its own
+    state = jax.jit(env.at)(jnp.asarray(qpos[-1]), jnp.asarray(qvel[-1]), jax.random.key(0))
+    for number in range(5):
+        action = 0.8 * jnp.sin(10 * jnp.asarray(state.obs)[:2])
+        np.testing.assert_allclose(rollout.command[-1, number], (action + 1) / 2, atol=1e-5)
+        state = STEP(state, action)
+        np.testing.assert_allclose(rollout.com[-1, number + 1], inner(state)["com"], atol=1e-4)
+        assert rollout.reward[-1, number] == pytest.approx(float(state.reward), abs=1e-3)
+    assert rollout.qpos.shape == (9, 6, MODEL.nq) and rollout.reward.shape == (9, 5)
+    data = mujoco.MjData(MODEL)
+    data.qpos[:] = rollout.qpos[-1, -1]
+    mujoco.mj_kinematics(MODEL, data)
+    standing = [data.site(f"foot_{side}").xpos for side in ("left", "right")]
+    np.testing.assert_allclose(foot_positions(rollout.features)[-1, -1], standing, atol=1e-4)

@@ -1,0 +1,705 @@
+"""Importers: what each vendor's layout holds comes back, and damage is refused with place and mend."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import struct
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.csv_format import list_bundled, read_recording
+from ballu_mjx.recordings.importers.c3d import read_c3d
+from ballu_mjx.recordings.importers.mapping import EXAMPLE, Commands, RoomMapping, Source, read_mapping
+from ballu_mjx.recordings.importers.placement import FOOT_RADIUS, place, with_commands
+from ballu_mjx.recordings.importers.table import Table, commands_in, read_commands, read_table
+from ballu_mjx.recordings.importers.trajectories import rigid_body
+from ballu_mjx.recordings.importers.vicon import read_vicon
+from ballu_mjx.recordings.recording import Recording
+
+ROLES = ("balloon", "base", "foot_left", "foot_right")
+BODIES = "\n".join(f'[{role}]\nbody = "ballu:{role}"' for role in ROLES)
+KEPT = "[origin]\nstart = false\n"
+HIDDEN = slice(40, 55)
+"""Samples in which the files' left foot and balloon are missing."""
+Y_UP = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""From a capture with y up, z forward and x left."""
+
+
+@functools.cache
+def source() -> Recording:
+    """Three seconds of a bundled recording."""
+    recording = read_recording(list_bundled("test")[0])
+    fields = {field.name: getattr(recording, field.name) for field in dataclasses.fields(recording)}
+    return dataclasses.replace(
+        recording, **{name: value[:300] for name, value in fields.items() if isinstance(value, np.ndarray)}
+    )
+
+
+def poses(recording: Recording) -> dict[str, tuple[np.ndarray, Rotation]]:
+    """Positions (m) and rotations of all roles; the feet are given some turn of their own."""
+    assert recording.balloon_position is not None and recording.base_position is not None
+    assert recording.foot_position is not None
+    assert recording.balloon_quaternion is not None and recording.base_quaternion is not None
+    balloon = Rotation.from_quat(recording.balloon_quaternion, scalar_first=True)
+    base = Rotation.from_quat(recording.base_quaternion, scalar_first=True)
+    feet = recording.foot_position
+    return {
+        "balloon": (recording.balloon_position, balloon),
+        "base": (recording.base_position, base),
+        "foot_left": (feet[:, 0], balloon * Rotation.from_rotvec([0.1, 0.2, 0.3])),
+        "foot_right": (feet[:, 1], base * Rotation.from_rotvec([-0.3, 0.2, 0.1])),
+    }
+
+
+def captured(
+    axes: np.ndarray, offset: np.ndarray | None = None, turn: Rotation | None = None
+) -> dict[str, tuple[np.ndarray, Rotation]]:
+    """The same in a capture that `axes` turns into the format's frame; the balloon's tracked body sits apart from the
+    site, `offset` (m, its own frame) and `turn` lead from the one to the other."""
+    rename = Rotation.from_matrix(axes)
+    found = {
+        role: (position @ axes, rename.inv() * rotation * rename)
+        for role, (position, rotation) in poses(source()).items()
+    }
+    position, rotation = found["balloon"]
+    rotation = rotation if turn is None else rotation * turn.inv()
+    position = position if offset is None else position - rotation.apply(offset)
+    return found | {"balloon": (position, rotation)}
+
+
+ROTATIONS: Mapping[str, Callable[[Rotation], np.ndarray]] = {
+    "helical": lambda r: r.as_rotvec(),
+    "XYZ": lambda r: r.as_euler("XYZ"),
+    "quaternion": lambda r: r.as_quat(),
+}
+
+
+def section(
+    title: str,
+    bodies: Mapping[str, tuple[np.ndarray, Rotation]],
+    *,
+    prefix: str = "ballu:",
+    rotation: str | None = "helical",
+    angle: str = "deg",
+    length: str = "mm",
+    delimiter: str = ",",
+    first: int = 1,
+) -> str:
+    """One section in Vicon's layout, some samples hidden; markers where `rotation` is None."""
+    components = [*{None: (), "quaternion": ("RX", "RY", "RZ", "RW")}.get(rotation, ("RX", "RY", "RZ"))]
+    components += ["TX", "TY", "TZ"] if rotation else ["X", "Y", "Z"]
+    turns = ["" if rotation == "quaternion" else angle] * (len(components) - 3)
+    names, cells = ["", ""], []
+    for role, (position, turned) in bodies.items():
+        names += [f"{prefix}{role}", *[""] * (len(components) - 1)]
+        values = [position * {"mm": 1e3, "cm": 1e2, "m": 1.0}[length]]
+        if rotation:
+            scale = 180 / np.pi if angle == "deg" and rotation != "quaternion" else 1.0
+            values.insert(0, ROTATIONS[rotation](turned) * scale)
+        text = [[f"{x:.7g}" for x in row] for row in np.hstack(values)]
+        if role in ("balloon", "foot_left"):
+            text[HIDDEN] = [[""] * len(components)] * len(text[HIDDEN])
+        cells.append(text)
+    rows = [
+        [title],
+        ["100"],
+        names,
+        ["Frame", "Sub Frame", *components * len(bodies)],
+        ["", "", *[*turns, length, length, length] * len(bodies)],
+    ]
+    samples = zip(*cells, strict=True)
+    rows += [[str(first + i), "0", *(cell for body in row for cell in body)] for i, row in enumerate(samples)]
+    return "".join(delimiter.join(row) + "\n" for row in rows)
+
+
+EVENTS = "Events\n100\nSubject,Context,Name,Time (s),Description\nballu,Left,Foot Strike,1.2,The heel strikes\n"
+DEVICES = (
+    "Devices\n1000\n,,Force plate - Force,,\nFrame,Sub Frame,Fx,Fy,Fz\n,,N,N,N\n1,0,0.1,0.2,0.3\n1,1,0.1,0.2,0.3\n"
+)
+
+
+def read(folder: Path, text: str, rooms: str, name: str = "walk.csv") -> Recording:
+    (folder / name).write_text(text)
+    (folder / "room.toml").write_text(rooms)
+    room = read_mapping(folder / "room.toml")
+    return place(read_vicon(folder / name, room), room, "walk")
+
+
+def same(actual: Recording) -> None:
+    expected = poses(source())
+    assert actual.balloon_quaternion is not None and actual.foot_position is not None
+    assert actual.balloon_position is not None and actual.base_position is not None
+    np.testing.assert_allclose(actual.time, source().time, atol=1e-9)
+    shown = np.ones(len(actual.time), bool)
+    shown[HIDDEN] = False
+    for value, role in (
+        (actual.balloon_position, "balloon"),
+        (actual.base_position, "base"),
+        (actual.foot_position[:, 0], "foot_left"),
+        (actual.foot_position[:, 1], "foot_right"),
+    ):
+        hidden = ~shown & (role in ("balloon", "foot_left"))
+        assert np.isnan(value[hidden]).all()
+        np.testing.assert_allclose(value[~hidden], expected[role][0][~hidden], atol=2e-6)
+    turned = Rotation.from_quat(actual.balloon_quaternion[shown], scalar_first=True)
+    balloon = Rotation.from_quat(expected["balloon"][1].as_quat()[shown])
+    assert (balloon.inv() * turned).magnitude().max() < 2e-6
+    if actual.base_quaternion is not None:
+        base = Rotation.from_quat(actual.base_quaternion, scalar_first=True)
+        assert (expected["base"][1].inv() * base).magnitude().max() < 2e-6
+
+
+# ---- Vicon ----
+
+
+@pytest.mark.parametrize("angle", ["deg", "rad"])
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_nexus_segments_are_rotation_vectors(tmp_path: Path, angle: str, delimiter: str):
+    text = "\n\n" + section("Segments", captured(np.eye(3)), angle=angle, delimiter=delimiter, first=212)
+    same(read(tmp_path, text, 'robot = "r"\n' + KEPT + BODIES))
+
+
+@pytest.mark.parametrize("rotation", ROTATIONS)
+def test_tracker_objects_are_what_the_mapping_says(tmp_path: Path, rotation: str):
+    text = section("Objects", captured(np.eye(3)), prefix="Global Angle ballu:", rotation=rotation, angle="rad")
+    bodies = "\n".join(f'[{role}]\nbody = "{role}"\nrotation = "{rotation}"' for role in ROLES)
+    same(read(tmp_path, text, 'robot = "r"\n' + KEPT + bodies))
+
+
+def test_several_sections_and_subjects_in_one_file(tmp_path: Path):
+    """Segments of one subject, markers of another, a force plate at its own rate, and Windows' line ends."""
+    everything = captured(np.eye(3))
+    rigid = {role: everything[role] for role in ("balloon", "base")}
+    feet = {role: everything[role] for role in ("foot_left", "foot_right")}
+    chair = section("Segments", {"seat": everything["base"]}, prefix="chair:")
+    parts = [
+        EVENTS,
+        DEVICES,
+        section("Segments", rigid),
+        chair,
+        section("Trajectories", feet, prefix="shoes:", rotation=None),
+    ]
+    rooms = 'robot = "r"\n' + KEPT + BODIES.replace("ballu:foot", "shoes:foot")
+    same(read(tmp_path, "\n".join(parts).replace("\n", "\r\n"), rooms))
+
+
+@pytest.mark.parametrize("length", ["m", "cm", "mm"])
+def test_lengths_are_read_by_the_units_row_unless_the_mapping_knows_better(tmp_path: Path, length: str):
+    text = section("Segments", captured(np.eye(3)), length=length)
+    same(read(tmp_path, text, 'robot = "r"\n' + KEPT + BODIES))
+    wrong = text.replace(f",{length},{length},{length}", ",in,in,in")
+    same(read(tmp_path, wrong, f'robot = "r"\n{KEPT}[units]\nlength = "{length}"\n{BODIES}'))
+
+
+def test_axes_offset_and_turn_lead_to_the_models_site(tmp_path: Path):
+    offset, turn = np.array([0.03, -0.2, 0.11]), Rotation.from_rotvec(np.deg2rad([10.0, 90.0, -20.0]))
+    text = section("Segments", captured(Y_UP, offset, turn))
+    axes = '[axes]\nforward = "z"\nleft = "x"\nup = "y"\n'
+    site = "offset = [0.03, -0.2, 0.11]\nturn = [10, 90, -20]\n"
+    bodies = BODIES.replace('body = "ballu:balloon"\n', f'body = "ballu:balloon"\n{site}')
+    same(read(tmp_path, text, 'robot = "r"\n' + KEPT + axes + bodies))
+
+
+def test_start_brings_any_place_in_the_room_to_the_origin(tmp_path: Path):
+    """The same walk in another corner of the room, on a floor 0.2 m up, gives the same recording."""
+    there = Rotation.from_euler("z", 130, degrees=True)
+    moved = {
+        role: (there.apply(position) + [3.0, -2.0, 0.2], there * rotation)
+        for role, (position, rotation) in captured(np.eye(3)).items()
+    }
+    rooms = 'robot = "r"\n[origin]\nfloor = FLOOR\n' + BODIES
+    first = read(tmp_path, section("Segments", captured(np.eye(3))), rooms.replace("FLOOR", "0"))
+    second = read(tmp_path, section("Segments", moved), rooms.replace("FLOOR", "0.2"))
+    assert first.base_position is not None and first.foot_position is not None and second.foot_position is not None
+    np.testing.assert_allclose(first.base_position[0, :2], 0, atol=1e-9)
+    np.testing.assert_allclose(second.foot_position, first.foot_position, atol=5e-6)
+    forward = Rotation.from_quat(np.asarray(second.balloon_quaternion)[0], scalar_first=True).as_matrix()[:, 0]
+    assert forward[1] == pytest.approx(0, abs=1e-9) and forward[0] > 0.9
+
+
+def test_feet_find_the_floor(tmp_path: Path):
+    lifted = {role: (p + [0, 0, 0.7], r) for role, (p, r) in captured(np.eye(3)).items()}
+    actual = read(tmp_path, section("Segments", lifted), f'robot = "r"\n[origin]\nfloor = "feet"\n{BODIES}')
+    assert actual.foot_position is not None
+    assert abs(np.nanmin(actual.foot_position[:, :, 2]) - FOOT_RADIUS) < 3e-3
+
+
+def test_turn_start_makes_any_tracked_frame_upright(tmp_path: Path):
+    """However the object was drawn: from standing upright its frame is known all the same."""
+    skew = Rotation.from_rotvec([0.7, -1.2, 2.0])
+    text = section("Segments", captured(np.eye(3), turn=skew))
+    bodies = BODIES.replace('body = "ballu:balloon"', 'body = "ballu:balloon"\nturn = "start"')
+    actual = read(tmp_path, text, 'robot = "r"\n' + KEPT + bodies)
+    shown = np.r_[0 : HIDDEN.start, HIDDEN.stop : 300]
+    turned = Rotation.from_quat(np.asarray(actual.balloon_quaternion)[shown], scalar_first=True)
+    expected = poses(source())["balloon"][1][shown]
+    # What is left is how far it really stands from upright and forward at the start.
+    left = (expected.inv() * turned).magnitude()
+    np.testing.assert_allclose(left, expected[:20].mean().magnitude(), atol=1e-5)
+    assert np.rad2deg(left[0]) < 5 and np.rad2deg(skew.magnitude()) > 90
+
+
+def test_a_body_at_exactly_zero_was_not_seen(tmp_path: Path):
+    text = section("Segments", captured(np.eye(3)))
+    same(read(tmp_path, zeroed(text), 'robot = "r"\n' + KEPT + BODIES))
+
+
+def zeroed(text: str) -> str:
+    """Empty cells of samples as zeros."""
+    lines = text.split("\n")
+    return "\n".join(
+        [*lines[:5], *(",".join(cell or "0" for cell in line.split(",")) if line else "" for line in lines[5:])]
+    )
+
+
+def test_frames_that_are_missing_stay_missing_in_time(tmp_path: Path):
+    lines = section("Segments", captured(np.eye(3))).split("\n")
+    del lines[100:110]
+    actual = read(tmp_path, "\n".join(lines), 'robot = "r"\n' + KEPT + BODIES)
+    np.testing.assert_allclose(actual.time, np.delete(source().time, slice(95, 105)), atol=1e-9)
+
+
+def line(number: int, change: Callable[[list[str]], list[str]]) -> Callable[[str], str]:
+    """Change the cells of the line that messages call `number`."""
+
+    def damage(text: str) -> str:
+        lines = text.split("\n")
+        lines[number - 1] = ",".join(change(lines[number - 1].split(",")))
+        return "\n".join(lines)
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    "damage, said",
+    [
+        (line(80, lambda cells: cells[:9]), ["line 80", "ends before 'ballu:base'", "cut off"]),
+        (line(80, lambda cells: [*cells, "7"]), ["line 80", "more cells than the header", "points in numbers"]),
+        (line(80, lambda cells: [*cells[:8], "12.x", *cells[9:]]), ["line 80", "ballu:base RX", "'12.x'", "empty"]),
+        (line(80, lambda cells: [*cells[:8], "1e300", *cells[9:]]), ["line 80", "ballu:base RX", "number"]),
+        (line(80, lambda cells: ["12", *cells[1:]]), ["line 80", "run back, from 74 to 12", "one trial"]),
+        (line(80, lambda cells: ["74", *cells[1:]]), ["line 80", "run back"]),
+        (line(80, lambda cells: ["1.5", *cells[1:]]), ["line 80", "'1.5,0' is not a frame"]),
+        (line(80, lambda cells: [cells[0], "1", *cells[2:]]), ["line 80", "sub-frames", "cameras' rate"]),
+        (line(2, lambda cells: ["many"]), ["line 2", "'many' is not a rate in Hz"]),
+        (line(4, lambda cells: ["Time", *cells[1:]]), ["no line begins with Frame", "export as CSV"]),
+        (
+            line(5, lambda cells: [*cells[:5], "in", *cells[6:]]),
+            ["line 5", "ballu:balloon TX to TZ", "'in'", "[units]"],
+        ),
+        (line(5, lambda cells: [c.replace("deg", "rad") for c in cells]), ["turned by", "unit of angles"]),
+        (line(5, lambda cells: [c.replace("deg", "mm") for c in cells]), ["line 5", "RX to RZ", "no angle"]),
+        (line(3, lambda cells: [c.replace("ballu:base", "ballu:beam") for c in cells]), ["'ballu:base'", "ballu:"]),
+        (line(3, lambda cells: [c.replace("ballu:base", "ballu:balloon") for c in cells]), ["line 4", "RX twice"]),
+        (line(1, lambda cells: ["Segments", "two"]), ["line 1", "title is missing"]),
+        (lambda text: "\n".join(text.split("\n")[:3]), ["no line begins with Frame"]),
+        (lambda text: "\n".join(text.split("\n")[:4]), ["line 1", "ends within its header"]),
+        (lambda text: "\n".join(text.split("\n")[:5]), ["no sample below the header"]),
+        (lambda text: "", ["no line begins with Frame"]),
+        (lambda text: text + "\n" + text.replace("Segments", "Objects"), ["several sections (Segments, Objects)"]),
+        (lambda text: text.replace("Segments", "Objects"), ["rotation vector or Euler angles", 'rotation = "helical"']),
+    ],
+)
+def test_damage_is_refused_with_its_place_and_mend(tmp_path: Path, damage: Callable[[str], str], said: list[str]):
+    with pytest.raises(InputError) as refusal:
+        read(tmp_path, damage(vicon_text()), 'robot = "r"\n' + KEPT + BODIES)
+    message = str(refusal.value)
+    assert message.startswith(str(tmp_path / "walk.csv")) and message.endswith(".") and "\n" not in message
+    for part in said:
+        assert part in message
+
+
+@functools.cache
+def vicon_text() -> str:
+    return section("Segments", captured(np.eye(3)))
+
+
+def test_a_marker_cannot_be_the_balloon(tmp_path: Path):
+    text = section("Trajectories", captured(np.eye(3)), rotation=None)
+    with pytest.raises(InputError, match=r"room.toml, \[balloon\]: what it names has no orientation; name an object"):
+        read(tmp_path, text, 'robot = "r"\n' + BODIES)
+
+
+CELLS = st.one_of(
+    st.text(max_size=8),
+    st.floats().map(repr),
+    st.integers(-(10**30), 10**30).map(str),
+    st.sampled_from(
+        ["", " ", '"', ",", "\n", "\r", "\0", "nan", "inf", "-1e308", "1_0", "Frame", "mm", "deg", ";", "²"]
+    ),
+)
+
+
+@functools.cache
+def short_rows() -> list[list[str]]:
+    bodies = {role: (position[:120], rotation[:120]) for role, (position, rotation) in captured(np.eye(3)).items()}
+    return [row.split(",") for row in section("Segments", bodies).split("\n")]
+
+
+@settings(max_examples=250, deadline=None)
+@given(
+    edits=st.lists(st.tuples(st.integers(0, 124), st.integers(0, 25), CELLS), max_size=3),
+    cut=st.one_of(st.none(), st.integers(0, 30_000)),
+    swapped=st.one_of(st.none(), st.tuples(st.integers(0, 124), st.integers(0, 124))),
+)
+def test_mutated_files_are_refused_or_hold_what_they_held(
+    edits: list[tuple[int, int, str]], cut: int | None, swapped: tuple[int, int] | None
+):
+    """No other exception, no infinite number, time in order, and untouched samples as they were."""
+    rows = [list(row) for row in short_rows()]
+    for row, column, text in edits:
+        cells = rows[row]
+        cells[min(column, len(cells) - 1)] = text
+    if swapped is not None:
+        rows[swapped[0]], rows[swapped[1]] = rows[swapped[1]], rows[swapped[0]]
+    text = "\n".join(",".join(row) for row in rows)[:cut]
+    with tempfile.TemporaryDirectory() as folder:
+        path, room = Path(folder) / "walk.csv", Path(folder) / "room.toml"
+        path.write_bytes(text.encode("utf-8", "surrogatepass"))
+        room.write_text('robot = "r"\n' + KEPT + BODIES)
+        try:
+            checked = read_mapping(room)
+            recording = place(read_vicon(path, checked), checked, "walk")
+        except InputError as error:
+            assert folder in str(error) and len(str(error)) < 600
+            return
+    assert (np.diff(recording.time) > 0).all()
+    header = any(row < 5 for row, _, _ in edits) or (swapped is not None and min(swapped) < 5)
+    clean = poses(source())["base"][0]
+    assert recording.base_position is not None
+    for field in (recording.base_position, recording.balloon_position, recording.foot_position):
+        assert not np.isinf(np.asarray(field)).any()
+    if not header and len(recording.time) > 1:
+        frames = np.round(recording.time * 100).astype(int)
+        touched = {row - 5 for row, _, _ in edits}
+        kept = [i for i, frame in enumerate(frames) if frame not in touched and frame < len(clean)]
+        if 0 not in touched and not any("\n" in t or "\r" in t or "," in t for _, _, t in edits) and cut is None:
+            np.testing.assert_allclose(recording.base_position[kept], clean[frames[kept]], atol=2e-6)
+
+
+# ---- markers ----
+
+
+def cluster(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-0.2, 0.2, (5, 3))
+
+
+def test_markers_give_the_body_that_carries_them():
+    position, rotation = poses(source())["balloon"]
+    places = cluster()
+    markers = np.stack([position + rotation.apply(place) for place in places])
+    markers[0, 10:40] = markers[1, 30:60] = np.nan  # three of five are enough
+    markers[:3, 80:90] = np.nan  # two are not
+    body = rigid_body(Path("x"), "balloon", markers, places, 0.01)
+    lost = np.zeros(300, bool)
+    lost[80:90] = True
+    assert body.quaternion is not None and np.isnan(body.quaternion[lost]).all()
+    turned = Rotation.from_quat(body.quaternion[~lost], scalar_first=True)
+    expected = Rotation.from_quat(rotation.as_quat()[~lost])
+    assert (expected.inv() * turned).magnitude().max() < 1e-7
+    np.testing.assert_allclose(body.position[~lost], position[~lost], atol=1e-9)
+
+
+def test_markers_on_a_line_or_mixed_up_are_refused():
+    position, rotation = poses(source())["balloon"]
+    markers = np.stack([position + rotation.apply(place) for place in cluster()])
+    on_a_line = np.outer(np.arange(3), [0.1, 0.0, 0.02])
+    with pytest.raises(InputError, match="lie on a line"):
+        rigid_body(Path("x"), "balloon", markers[:3], on_a_line, 0.01)
+    markers[:2, 150] = markers[1::-1, 150]
+    with pytest.raises(InputError, match="in sample 151 the markers of balloon are off their places"):
+        rigid_body(Path("x"), "balloon", markers, cluster(), 0.01)
+
+
+# ---- C3D ----
+
+
+@pytest.fixture
+def c3d_file(tmp_path: Path) -> Path:
+    ezc3d = pytest.importorskip("ezc3d", reason="C3D files need the extra `import`")
+    found = poses(source())
+    position, rotation = found["balloon"]
+    markers = {f"ballu:B{i}": position + rotation.apply(place) for i, place in enumerate(cluster())}
+    markers |= {f"ballu:{role}": found[role][0] for role in ROLES[1:]}
+    points = np.stack([1e3 * value.T for value in markers.values()], axis=1)
+    residuals = np.zeros((1, *points.shape[1:]))
+    for hidden in [*range(5), list(markers).index("ballu:foot_left")]:
+        residuals[0, hidden, HIDDEN] = -1
+    content = ezc3d.c3d()
+    for key, value in (("RATE", [100.0]), ("LABELS", list(markers)), ("UNITS", ["mm"])):
+        content["parameters"]["POINT"][key]["value"] = value
+    content["data"]["points"] = np.concatenate([points, np.ones((1, *points.shape[1:]))])
+    content["data"]["meta_points"]["residuals"] = residuals
+    content.write(str(tmp_path / "walk.c3d"))
+    return tmp_path / "walk.c3d"
+
+
+def c3d_room(folder: Path, more: str = "") -> RoomMapping:
+    markers = ", ".join(f'"B{i}"' for i in range(5))
+    balloon = f"[balloon]\nmarkers = [{markers}]\ngeometry = {cluster().tolist()}\n"
+    (folder / "room.toml").write_text('robot = "r"\n' + KEPT + more + balloon + BODIES.split("\n", 2)[2])
+    return read_mapping(folder / "room.toml")
+
+
+def test_c3d_comes_back(c3d_file: Path):
+    """Single precision in the file: a tenth of a micrometre."""
+    room = c3d_room(c3d_file.parent)
+    same(place(read_c3d(c3d_file, room), room, "walk"))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.05, 0.3, 0.9, 0.98])
+def test_a_c3d_cut_anywhere_is_refused(c3d_file: Path, share: float):
+    content = c3d_file.read_bytes()
+    c3d_file.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(InputError, match=r"walk.c3d: (not a|too short)"):
+        read_c3d(c3d_file, c3d_room(c3d_file.parent))
+
+
+def test_c3d_without_what_is_asked_for_is_refused(c3d_file: Path):
+    room = c3d_room(c3d_file.parent)
+    (c3d_file.parent / "room.toml").write_text((c3d_file.parent / "room.toml").read_text().replace("B4", "B9"))
+    with pytest.raises(InputError, match=r"walk.c3d: there is no marker 'B9'; mend .*room\.toml"):
+        read_c3d(c3d_file, read_mapping(c3d_file.parent / "room.toml"))
+    content = bytearray(c3d_file.read_bytes())
+    units = content.index(b"UNITS")
+    content[content.index(b"mm", units) : content.index(b"mm", units) + 2] = b"xy"
+    c3d_file.write_bytes(content)
+    with pytest.raises(InputError, match=r"POINT:UNITS: the unit 'xy' is no length"):
+        read_c3d(c3d_file, room)
+    same(place(read_c3d(c3d_file, c3d_room(c3d_file.parent, '[units]\nlength = "mm"\n')), room, "walk"))
+
+
+@pytest.mark.parametrize("seed", [2, 6, 93, 184])
+def test_a_c3d_with_damaged_parameters_is_refused_whatever_its_library_does(c3d_file: Path, seed: int):
+    """Some damage takes a process with ezc3d in it down: ours is not that one."""
+    rng = np.random.default_rng(seed)
+    content = bytearray(c3d_file.read_bytes())
+    content[1024:1536] = rng.integers(0, 256, 512, np.uint8).tobytes()
+    content[512 + rng.integers(4, 512)] = rng.integers(0, 256)
+    c3d_file.write_bytes(content)
+    with pytest.raises(InputError, match=r"walk\.c3d"):
+        read_c3d(c3d_file, c3d_room(c3d_file.parent))
+
+
+def test_what_is_no_c3d_is_refused(tmp_path: Path):
+    (tmp_path / "walk.c3d").write_bytes(struct.pack("<256H", *range(256)))
+    with pytest.raises(InputError, match="walk.c3d: not a C3D file"):
+        read_c3d(tmp_path / "walk.c3d", c3d_room(tmp_path))
+
+
+# ---- tables ----
+
+COLUMNS = """
+robot = "r"
+[origin]
+start = false
+[units]
+length = "cm"
+angle = "deg"
+time = "ms"
+[balloon]
+position = ["bx", "by", "bz"]
+orientation = ["bw", "bi", "bj", "bk"]
+rotation = "quaternion"
+[base]
+position = ["px", "py", "pz"]
+[foot_left]
+position = ["lx", "ly", "lz"]
+[foot_right]
+position = ["rx", "ry", "rz"]
+[knee_left]
+column = "kl"
+sign = -1
+zero = 10
+[knee_right]
+column = "kr"
+[motor_left]
+column = "kl"
+[motor_right]
+column = "kr"
+[commands]
+time = "clock"
+left = "servo"
+right = "servo2"
+range_left = [0, 90]
+range_right = [180, 90]
+"""
+
+
+def table_text() -> str:
+    found = poses(source())
+    columns = [1e3 * source().time, *(100 * found["balloon"][0].T), *found["balloon"][1].as_quat(scalar_first=True).T]
+    for role in ROLES[1:]:
+        columns += list(100 * found[role][0].T)
+    wave = 30 * np.sin(source().time)
+    columns += [10 - wave, wave, 90 * source().command[:, 0], 180 - 90 * source().command[:, 1]]
+    names = "clock bx by bz bw bi bj bk px py pz lx ly lz rx ry rz kl kr servo servo2"
+    rows = [names.replace(" ", ","), *(",".join(f"{x:.9g}" for x in row) for row in zip(*columns, strict=True))]
+    lines = [row.split(",") for row in rows]
+    for row in lines[HIDDEN.start + 1 : HIDDEN.stop + 1]:
+        row[1:8], row[11:14] = [""] * 7, [""] * 3
+    return "\n".join(",".join(row) for row in lines) + "\n"
+
+
+def read_columns(folder: Path, text: str, rooms: str = COLUMNS) -> tuple[Recording, np.ndarray]:
+    (folder / "walk.csv").write_text(text)
+    (folder / "room.toml").write_text(rooms)
+    room = read_mapping(folder / "room.toml")
+    table = Table(folder / "walk.csv")
+    return place(read_table(table, room), room, "walk"), commands_in(table, room.commands)
+
+
+def test_tables_come_back(tmp_path: Path):
+    actual, command = read_columns(tmp_path, table_text())
+    same(actual)
+    np.testing.assert_allclose(command, source().command, atol=1e-7)
+    assert actual.knee is not None
+    np.testing.assert_allclose(actual.knee, np.deg2rad(30 * np.sin(source().time))[:, None] * [1, 1], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "damage, said",
+    [
+        (lambda t, m: (t.replace("lx", "mx"), m), ["walk.csv: there is no column 'lx'", "mend the mapping"]),
+        (lambda t, m: (t.replace("bx,by", "by,by"), m), ["walk.csv"]),
+        (lambda t, m: ("\n".join(t.split("\n")[:50]) + "\n1,2,3\n", m), ["line 51", "3 cells, the header 21"]),
+        (lambda t, m: (t.replace("\n10,", "\nten,"), m), ["line 3, column clock", "'ten' is not a number"]),
+        (lambda t, m: (t.replace("\n10,", "\n,"), m), ["line 3, column clock", "time is missing"]),
+        (lambda t, m: (t.replace("\n10,", "\n-5,"), m), ["line 3, column clock", "runs back"]),
+        (lambda t, m: ("clock,bx\n", m), ["no sample below a header"]),
+        (lambda t, m: (t, m.replace('length = "cm"\n', "")), ["room.toml, [units]", "length of a table's"]),
+        (lambda t, m: (t, m.replace("[0, 90]", "[0, 45]")), ["column servo", "outside of 0 to 45", "range_left"]),
+        (lambda t, m: (t, m.replace('"clock"', '"watch"')), ["no column 'watch' of times", "rate"]),
+        (lambda t, m: (t, m.replace('"bw", "bi", "bj", "bk"', '"bi", "bj", "bk", "px"')), ["quaternion", "length"]),
+    ],
+)  # fmt: skip
+def test_damaged_tables_are_refused(tmp_path: Path, damage: Callable[[str, str], tuple[str, str]], said: list[str]):
+    with pytest.raises(InputError) as refusal:
+        read_columns(tmp_path, *damage(table_text(), COLUMNS))
+    for part in said:
+        assert part in str(refusal.value)
+
+
+def test_logs_hold_commands_until_the_next(tmp_path: Path):
+    log = tmp_path / "log.csv"
+    log.write_text("time,command_left,command_right\n5,0.2,0\n5.5,,1\n6.25,0.7,\n")
+    time, command = read_commands(Table(log), Commands())
+    assert time.tolist() == [5.0, 5.5, 6.25]
+    assert command.tolist() == [[0.2, 0.0], [0.2, 1.0], [0.7, 1.0]]
+    with_log, cut = with_commands(log, source(), time - 5.0, command)
+    # From 0 s on, and the last is held for 0.75 s, as long as the longest before.
+    assert cut == pytest.approx((0.0, 0.99)) and with_log.time[-1] == pytest.approx(2.0)
+    assert with_log.command[[0, 49, 50, 124, 125, 200]].tolist() == [
+        [0.2, 0],
+        [0.2, 0],
+        *[[0.2, 1]] * 2,
+        *[[0.7, 1]] * 2,
+    ]
+    with pytest.raises(InputError, match=r"log.csv: its commands, from 10.00 to 12.00 s .* do not overlap it"):
+        with_commands(log, source(), time + 5.0, command)
+
+
+# ---- mappings ----
+
+
+def test_the_example_is_a_mapping_and_shows_the_defaults(tmp_path: Path):
+    (tmp_path / "example.toml").write_text(EXAMPLE)
+    bare = "\n".join(f'[{role}]\nbody = "ballu:{role}"' for role in ROLES)
+    (tmp_path / "bare.toml").write_text('robot = "ballu-room-3"\n' + bare)
+    example, bare = (read_mapping(tmp_path / f"{name}.toml") for name in ("example", "bare"))
+    for field in dataclasses.fields(RoomMapping):
+        if field.name not in ("path", "axes"):
+            assert getattr(example, field.name) == getattr(bare, field.name), field.name
+    np.testing.assert_array_equal(example.axes, np.eye(3))
+
+
+def test_json_is_read_alike(tmp_path: Path):
+    (tmp_path / "room.json").write_text(
+        '{"robot": "r", ' + ", ".join(f'"{role}": {{"body": "{role}"}}' for role in ROLES) + "}"
+    )
+    assert read_mapping(tmp_path / "room.json").sources["base"].body == "base"
+
+
+@pytest.mark.parametrize(
+    "old, new, said",
+    [
+        ('robot = "r"', "", ["key robot", "missing"]),
+        ('robot = "r"', 'robot = "r', ["not TOML", "example-mapping"]),
+        ("[base]", "[bass]", ["[base]", "missing"]),
+        ('body = "ballu:base"', 'bdy = "ballu:base"', ["[base]", "nothing says"]),
+        ('body = "ballu:base"', 'body = "b"\nofset = [0, 0, 0]', ["[base] ofset", "no such key", "offset"]),
+        ('body = "ballu:base"', 'body = "b"\noffset = [0, 0]', ["[base] offset", "3 numbers"]),
+        ('body = "ballu:base"', 'body = "b"\noffset = [0, 0, 30]', ["[base] offset", "metres"]),
+        ('body = "ballu:base"', 'body = "b"\nrotation = "XXZ"', ["[base] rotation", "helical"]),
+        ('body = "ballu:base"', 'markers = ["a", "b"]', ["[base] markers", "three"]),
+        ('body = "ballu:base"', 'body = "b"\nmarkers = ["a", "b", "c"]', ["body and markers"]),
+        ('robot = "r"', 'robot = "r"\n[axes]\nup = "w"', ["[axes] up", '"w"', '"-y"']),
+        ('robot = "r"', 'robot = "r"\n[axes]\nup = "-z"', ["[axes]", "left-handed"]),
+        ('robot = "r"', 'robot = "r"\n[axes]\nup = "y"', ["[axes]", "same way"]),
+        ('robot = "r"', 'robot = "r"\n[units]\nlength = "inch"', ["[units] length", "m, cm, mm"]),
+        ('robot = "r"', 'robot = "r"\nkind = "loose"', ["key kind", "free, suspended"]),
+        ('robot = "r"', 'robot = "r"\nrate = 0', ["key rate", "positive"]),
+        ('robot = "r"', 'robot = "r"\nbase = 3', ["not TOML"]),
+        (
+            'robot = "r"',
+            'robot = "r"\n[commands]\nrange_left = [1, 1]',
+            ["range_left", "at command 0 and at command 1"],
+        ),
+    ],
+)
+def test_broken_mappings_are_refused(tmp_path: Path, old: str, new: str, said: list[str]):
+    text = 'robot = "r"\n' + BODIES
+    assert old in text
+    (tmp_path / "room.toml").write_text(text.replace(old, new))
+    with pytest.raises(InputError) as refusal:
+        read_mapping(tmp_path / "room.toml")
+    assert str(refusal.value).startswith(str(tmp_path / "room.toml"))
+    for part in said:
+        assert part in str(refusal.value)
+
+
+VALUES = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.sampled_from(["x", "-z"])),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+KEYS = [("", field.name) for field in dataclasses.fields(RoomMapping)]
+KEYS += [("balloon", field.name) for field in dataclasses.fields(Source)]
+KEYS += [("commands", field.name) for field in dataclasses.fields(Commands)]
+KEYS += [("axes", "up"), ("origin", "start"), ("origin", "floor"), ("units", "angle"), ("knee_left", "column")]
+
+
+@settings(max_examples=150, deadline=None)
+@given(changes=st.lists(st.tuples(st.sampled_from(KEYS), VALUES), min_size=1, max_size=3))
+def test_whatever_stands_in_a_mapping_is_read_or_refused(changes: list[tuple[tuple[str, str], object]]):
+    content: dict = {"robot": "r", **{role: {"body": role} for role in ROLES}}
+    for (table, key), value in changes:
+        place = content.setdefault(table, {}) if table else content
+        if isinstance(place, dict):
+            place[key] = value
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "room.json"
+        path.write_text(json.dumps(content))
+        try:
+            checked = read_mapping(path)
+        except InputError as error:
+            assert str(error).startswith(str(path))
+        else:
+            assert np.linalg.det(checked.axes) == pytest.approx(1.0) and checked.robot.strip()
+
+
+def test_names_that_two_subjects_share_need_the_subject(tmp_path: Path):
+    found = captured(np.eye(3))
+    text = section("Segments", found) + "\n" + section("Segments", {"base": found["base"]}, prefix="twin:")
+    with pytest.raises(InputError, match=r"'base' belongs to several subjects; name one in .*: ballu:base, twin:base"):
+        read(tmp_path, text, 'robot = "r"\n' + BODIES.replace("ballu:", ""))

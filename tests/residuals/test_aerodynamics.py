@@ -1,0 +1,247 @@
+"""The air around the balloon: is it physics, in the right frame, and is it found again in recordings?"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from ballu_mjx.ballu.model import standing_qpos
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.residuals.aerodynamics import (
+    AERODYNAMICS_FILE,
+    AERODYNAMICS_FORMAT,
+    AIR_PARAMETERS,
+    Aerodynamics,
+    AirParameters,
+    air_parameters_to_json,
+    read_air_parameters,
+    rotation,
+)
+from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, Optimum, at_whole_delay, identify_air
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model, set_fields
+from ballu_mjx.sim.observation import HISTORY, heading_rotation
+
+MODEL = load_model()
+AIR = AirParameters(
+    added_mass=jnp.array(0.12),
+    added_inertia=jnp.array(3e-3),
+    lift=jnp.array(-0.12),
+    centre=jnp.array([0.004, 0.013, 0.0]),
+    linear_drag=jnp.array([0.04, 0.03, 0.05]),
+    quadratic_drag=jnp.array([0.25, 0.15, 0.2]),
+    turning_drag=jnp.array([2e-3, 3e-3, 4e-3]),
+    delay=jnp.array(0.05),
+)
+CONFIG = AirConfig(window_seconds=0.5, interval_seconds=0.5)
+"""Over windows as short as these contacts leave little to chance."""
+COMMANDS = jnp.zeros((HISTORY, 2))
+
+
+def windy_model() -> mujoco.MjModel:
+    """The robot in C MuJoCo with `AIR`'s mass, inertia, centre and lift, from the definitions."""
+    model = load_model()
+    body = model.body("balloon").id
+    lift = model.body_gravcomp[body] * model.body_mass[body] * 9.81 - 0.12 + 0.12 * 9.81
+    model.body_mass[body] += 0.12
+    model.body_inertia[body] += 3e-3
+    model.body_ipos[body] += [0.004, 0.013, 0.0]
+    model.body_gravcomp[body] = lift / (model.body_mass[body] * 9.81)
+    return model
+
+
+def blown(name: str, period: float, phase: float, steps: int = 160) -> Motion:
+    """The nominal robot in `AIR`, in C MuJoCo; drag from MuJoCo's own velocities, at every physics step."""
+    model = windy_model()
+    data = mujoco.MjData(model)
+    data.qpos[:] = standing_qpos(model)
+    body, site = model.body("balloon").id, model.site("balloon").id
+    mujoco.mj_step(model, data, 100)
+    time = np.arange(steps) * CONTROL_TIMESTEP
+    phases = time[:, None] / period + np.array([0.0, phase])
+    command = np.where(phases % 1.0 < 0.45, 0.9, 0.0)
+    states = [(data.qpos.copy(), data.qvel.copy())]
+    for row in np.concatenate([command[:1], command[:-1]]):  # one control step late
+        data.ctrl[:] = row
+        for _ in range(round(CONTROL_TIMESTEP / model.opt.timestep)):
+            mujoco.mj_forward(model, data)
+            velocity = np.zeros(6)
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, site, velocity, 1)
+            turning, linear = velocity[:3], velocity[3:]
+            frame = data.site_xmat[site].reshape(3, 3)
+            force = -(np.array([0.04, 0.03, 0.05]) + np.array([0.25, 0.15, 0.2]) * np.linalg.norm(linear)) * linear
+            data.xfrc_applied[body, :3] = frame @ force
+            data.xfrc_applied[body, 3:] = frame @ (-np.array([2e-3, 3e-3, 4e-3]) * turning)
+            mujoco.mj_step(model, data)
+        states.append((data.qpos.copy(), data.qvel.copy()))
+    qpos, qvel = (np.array(x) for x in zip(*states, strict=True))
+    times = np.arange(steps + 1) * CONTROL_TIMESTEP
+    return Motion(name=name, time=times, command=command, qpos=qpos, qvel=qvel, residual_mm={})
+
+
+def history(euler: np.ndarray, velocity: np.ndarray, turning: np.ndarray) -> jnp.ndarray:
+    """Features of a balloon that moves and turns; `turning` in its own frame."""
+    now = rotation(jnp.asarray(euler))
+    hat = np.array([[0, -turning[2], turning[1]], [turning[2], 0, -turning[0]], [-turning[1], turning[0], 0]])
+
+    def angles(age: int) -> jnp.ndarray:
+        matrix = now @ jax.scipy.linalg.expm(jnp.asarray(-age * CONTROL_TIMESTEP * hat))
+        roll, yaw = jnp.arctan2(matrix[2, 1], matrix[2, 2]), jnp.arctan2(matrix[1, 0], matrix[0, 0])
+        return jnp.array([roll, jnp.arcsin(-matrix[2, 0]), yaw])
+
+    seen = jnp.zeros((HISTORY, 27)).at[:, 3:6].set(jnp.asarray(velocity))
+    return seen.at[:, 6:9].set(jnp.stack([angles(age) for age in (2, 1, 0)]))
+
+
+def test_no_air_is_the_nominal_model():
+    air, none = Aerodynamics(MODEL), AirParameters.none()
+    for name, value in air.fields(none).items():
+        np.testing.assert_allclose(value, getattr(MODEL, name), rtol=1e-6, atol=1e-8)
+    seen = history(np.array([0.1, 0.2, 0.3]), np.array([0.3, -0.2, 0.1]), np.array([0.1, 0.2, 0.3]))
+    assert not np.any(air.wrench(none, seen, COMMANDS))
+
+
+def test_added_mass_weighs_nothing_and_lift_lifts():
+    model = load_model()
+    set_fields(model, Aerodynamics(MODEL).fields(AIR))
+    for name in ("body_mass", "body_inertia", "body_ipos", "body_gravcomp"):
+        np.testing.assert_allclose(getattr(model, name), getattr(windy_model(), name), rtol=1e-5, atol=1e-7)
+
+    def push_on_the_floor(model: mujoco.MjModel) -> float:
+        """Net vertical force at rest, by Newton's second law over the whole robot in free fall."""
+        data = mujoco.MjData(model)
+        data.qpos[2] += 5.0
+        mujoco.mj_forward(model, data)
+        return float(data.qfrc_passive[2] - data.qfrc_bias[2])
+
+    assert push_on_the_floor(model) - push_on_the_floor(MODEL) == pytest.approx(-0.12, rel=1e-3)
+
+
+def test_late_commands_arrive_physics_step_by_physics_step():
+    air, sent = Aerodynamics(MODEL), jnp.array([[0.0, 0.2], [1.0, 0.4], [0.0, 1.0]])
+    for delay, ages in ((0.0, [0] * 5), (0.05, [1] * 5), (0.02, [1, 1, 0, 0, 0]), (0.08, [2, 2, 2, 1, 1])):
+        late = dataclasses.replace(AIR, delay=jnp.array(delay))
+        np.testing.assert_array_equal(air.command(late, sent), sent[2 - np.array(ages)])
+
+
+def test_rounding_a_delay_moves_what_passes_for_it():
+    """On a quadratic cost, whose optimum is known."""
+    step, truth = 0.01, np.array([0.062, 0.12])
+    covariance = np.array([[4e-5, -9e-5], [-9e-5, 2.5e-4]])  # of (delay, mass)
+    precision = np.linalg.inv(covariance)
+
+    def fitted(vector: np.ndarray) -> Optimum:
+        mass = truth[1] - precision[0, 1] / precision[1, 1] * (vector[0] - truth[0])
+        off = np.array([vector[0], mass]) - truth
+        return Optimum(off + truth, np.zeros((2, 2)), float(off @ precision @ off) / 2)
+
+    found = at_whole_delay(Optimum(truth, covariance, 0.0), np.array([True, False]), step, fitted)
+    assert found.vector == pytest.approx(fitted(np.array([0.06, 0.0])).vector)
+    rounding = np.array([1.0, covariance[0, 1] / covariance[0, 0]]) ** 2 * step**2 / 12
+    np.testing.assert_allclose(np.diag(found.covariance), np.diag(covariance) + rounding, rtol=1e-6)
+
+
+def test_drag_opposes_the_motion_whatever_the_heading():
+    air = Aerodynamics(MODEL)
+    velocity, turning = np.array([0.4, -0.3, 0.2]), np.array([0.3, -0.5, 0.7])
+    level = np.asarray(air.wrench(AIR, history(np.zeros(3), velocity, turning), COMMANDS))[0]
+    speed = np.linalg.norm(velocity)
+    expected = -(np.array(AIR.linear_drag) + np.array(AIR.quadratic_drag) * speed) * velocity
+    np.testing.assert_allclose(level[:3], expected, rtol=1e-4)
+    np.testing.assert_allclose(level[3:], -np.array(AIR.turning_drag) * turning, rtol=2e-2)
+
+    yaw = 2.0
+    turned = np.asarray(heading_rotation(jnp.array(yaw)))
+    seen = history(np.array([0.0, 0.0, yaw]), turned @ velocity, turning)
+    wrench = np.asarray(air.wrench(AIR, seen, COMMANDS))[0]
+    np.testing.assert_allclose(wrench[:3], turned @ level[:3], rtol=1e-4)
+    np.testing.assert_allclose(wrench[3:], turned @ level[3:], rtol=2e-2, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def motions() -> list[Motion]:
+    return [blown("one", 1.2, 0.5), blown("two", 1.7, 0.35), blown("three", 0.9, 0.6)]
+
+
+@pytest.fixture(scope="module")
+def found(motions: list[Motion]) -> AirFit:
+    return identify_air(MODEL, motions, CONFIG)
+
+
+def test_known_air_is_found_again_in_another_simulator_s_motion(found: AirFit):
+    """Would catch a sign or a frame error in any of them."""
+    got, errors = found.parameters, found.standard_errors
+    assert float(got.delay) == pytest.approx(0.05, abs=1e-6)
+    assert float(got.added_mass) == pytest.approx(0.12, rel=0.05)
+    assert float(got.added_inertia) == pytest.approx(3e-3, rel=0.1)
+    assert float(got.lift) == pytest.approx(-0.12, abs=0.004)
+    np.testing.assert_allclose(got.centre[:2], [0.004, 0.013], atol=7e-4)
+    speed = 0.3  # linear and quadratic drag are hard to tell apart, their sum at walking speed is not
+    drag, true = (np.array(p.linear_drag + p.quadratic_drag * speed) for p in (got, AIR))
+    assert drag[0] == pytest.approx(true[0], rel=0.15)  # forwards; hardly any of the motion is along the other axes
+    assert found.cost[1] < 0.02 * found.cost[0]
+    assert 0 < float(errors.added_mass) < 0.3 * float(got.added_mass)
+
+
+def test_a_search_begun_elsewhere_ends_at_the_same_air(motions: list[Motion], found: AirFit):
+    """A delay and an added mass explain much the same motion: a search may walk from one to the other, or stop."""
+    began = dataclasses.replace(jax.tree.map(lambda x: x / 2, AIR), delay=jnp.array(0.1))
+    again = identify_air(MODEL, motions, CONFIG, known=began).parameters
+    assert float(again.delay) == pytest.approx(float(found.parameters.delay))
+    little = 0.25 * float(found.standard_errors.added_mass)
+    assert float(again.added_mass) == pytest.approx(float(found.parameters.added_mass), abs=little)
+
+
+def test_lost_lift_is_found_with_the_rest_kept(motions: list[Motion]):
+    """A balloon that loses gas: one number. With the old lift feet come down at other times, and the robot is elsewhere
+    within 2 s: no derivative there points to the right one."""
+    known = dataclasses.replace(AIR, lift=jnp.array(1e-4))
+    fit = identify_air(MODEL, motions, AirConfig(), known=known, free=("lift",))
+    assert float(fit.parameters.lift) == pytest.approx(-0.12, abs=0.002)
+    np.testing.assert_array_equal(fit.parameters.turning_drag, AIR.turning_drag)
+    assert float(fit.standard_errors.turning_drag[0]) == 0.0
+
+
+def test_what_is_not_free_stays_nominal(motions: list[Motion]):
+    """Lift that was weighed; what nothing is known of is no air."""
+    fit = identify_air(MODEL, motions, CONFIG, free=("added_mass",))
+    assert float(fit.parameters.added_mass) > 0
+    assert not any(np.any(getattr(fit.parameters, name)) for name in AIR_PARAMETERS if name != "added_mass")
+
+
+def test_recordings_shorter_than_a_window_are_refused(motions: list[Motion]):
+    with pytest.raises(InputError, match="--window-seconds"):
+        identify_air(MODEL, motions[:1], AirConfig(window_seconds=30.0))
+
+
+def test_file_says_what_was_found(tmp_path: Path):
+    path = tmp_path / AERODYNAMICS_FILE
+    path.write_text(json.dumps({"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(AIR)}))
+    read = read_air_parameters(path)
+    for name in AIR_PARAMETERS:
+        np.testing.assert_allclose(getattr(read, name), getattr(AIR, name), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"added_mass": -0.1}, "added_mass is -0.1; it must be 0 or more"),
+        ({"centre": [0.0, 0.1]}, "centre must be three numbers"),
+        ({"lift": "much"}, "lift must be a number"),
+        ({"lift": float("nan")}, "lift must be a number"),
+        ({"viscosity": 1.0}, "no parameter 'viscosity'"),
+    ],
+)
+def test_damaged_file_is_refused(tmp_path: Path, change: dict, says: str):
+    path = tmp_path / AERODYNAMICS_FILE
+    path.write_text(json.dumps({"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(AIR) | change}))
+    with pytest.raises(InputError, match=says) as caught:
+        read_air_parameters(path)
+    assert str(path) in str(caught.value)

@@ -1,0 +1,309 @@
+"""The residual-force task: its equations, its frames, its resets."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ballu_mjx.ballu.model import ActuatorParameters, standing_qpos
+from ballu_mjx.evaluation.errors_table import Errors, Evaluation, mean_by_group
+from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reference import stack_motions
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, reward_terms
+from ballu_mjx.residuals.network import NetworkForces, world_loads
+from ballu_mjx.rl.learner import Learner
+from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.sim.observation import HISTORY, euler_angles, heading_observation, heading_rotation
+from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.step import state_at
+from ballu_mjx.viz import artifacts, robot_meshes
+
+STEPS = 30
+
+
+def make_motion(force: np.ndarray, name: str = "made", steps: int = STEPS) -> Motion:
+    """Nominal robot in C MuJoCo at the training time step, stepping, with a constant force on the balloon."""
+    model = load_model()
+    data = mujoco.MjData(model)
+    data.qpos[:] = standing_qpos(model)
+    balloon = model.body("balloon").id
+    substeps = round(CONTROL_TIMESTEP / model.opt.timestep)
+    mujoco.mj_step(model, data, 100)
+    time = np.arange(steps) * CONTROL_TIMESTEP
+    command = np.stack([(time % 1.2 < 0.5), ((time + 0.6) % 1.2 < 0.5)], axis=1) * 0.9
+    qpos, qvel = [data.qpos.copy()], [data.qvel.copy()]
+    data.xfrc_applied[balloon, :3] = force
+    for step in range(steps):
+        data.ctrl[:] = command[step]
+        mujoco.mj_step(model, data, substeps)
+        qpos.append(data.qpos.copy())
+        qvel.append(data.qvel.copy())
+    return Motion(
+        name=name,
+        time=np.arange(steps + 1) * CONTROL_TIMESTEP,
+        command=command,
+        qpos=np.array(qpos),
+        qvel=np.array(qvel),
+        **{f.name: _EMPTY[f.name] for f in dataclasses.fields(Motion) if f.name in _EMPTY},
+    )
+
+
+_EMPTY = {"residual_mm": {}, "pitch_deviation": 0.0, "interpolated": {}}
+
+
+@pytest.fixture(scope="module")
+def still() -> Motion:
+    return make_motion(np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def pushed() -> Motion:
+    return make_motion(np.array([0.04, 0.0, 0.02]))
+
+
+def test_reward_is_the_papers():
+    config = EnvMimicConfig(fine_position_weight=0.0, fine_orientation_weight=0.0)
+    seen, target = np.zeros(27, np.float32), np.zeros(27, np.float32)
+    seen[:3] = [0.1, -0.2, 0.05]
+    seen[6:9] = [0.1, 0.2, np.pi - 0.05]
+    target[6:9] = [0.0, 0.0, -np.pi + 0.05]
+    terms = reward_terms(jnp.array(seen), jnp.array(target), config)
+    assert float(terms["position"]) == pytest.approx(np.exp(-10 * (0.1**2 + 0.2**2 + 0.05**2)), rel=1e-5)
+    # The yaw difference is 0.1 rad across the wrap, not 2 pi - 0.1.
+    weighted = 0.2 * 0.1**2 + 0.4 * 0.2**2 + 0.4 * 0.1**2
+    assert float(terms["orientation"]) == pytest.approx(np.exp(-2 * weighted), rel=1e-4)
+    assert float(terms["tracking"]) == pytest.approx(0.7 * float(terms["position"]) + 0.3 * float(terms["orientation"]))
+
+
+def test_euler_angles_are_intrinsic_zyx():
+    for seed in range(20):
+        rotation = Rotation.random(rng=np.random.default_rng(seed))
+        ours = euler_angles(jnp.array(rotation.as_quat(scalar_first=True), jnp.float32))
+        np.testing.assert_allclose(ours, rotation.as_euler("ZYX")[::-1], atol=2e-3)
+
+
+def test_features_agree_with_c_mujoco(still: Motion):
+    model = load_model()
+    data = mujoco.MjData(model)
+    simulator = Simulator(model)
+    rng = np.random.default_rng(0)
+    data.qpos[:] = still.qpos[17]
+    data.qvel[:] = rng.normal(0, 1.0, model.nv)
+    mujoco.mj_forward(model, data)
+    ours, com = simulator.observe(state_at(*(jnp.array(x, jnp.float32) for x in (data.qpos, data.qvel))))
+    frames = []
+    for site in ("balloon", "base", "foot_left", "foot_right"):
+        velocity = np.zeros(6)
+        index = model.site(site).id
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, index, velocity, 0)
+        frames += [data.site(site).xpos, velocity[3:]]
+    euler = Rotation.from_quat(data.body("balloon").xquat, scalar_first=True).as_euler("ZYX")[::-1]
+    np.testing.assert_allclose(ours, np.concatenate([*frames[:2], euler, *frames[2:]]), atol=1e-4)
+    np.testing.assert_allclose(com, data.subtree_com[1], atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_observation_and_force_turn_with_the_robot(still: Motion, seed: int):
+    """The same motion elsewhere in the room, in another direction: same observation, force turned along."""
+    rng = np.random.default_rng(seed)
+    simulator = Simulator(load_model())
+    reference, _ = stack_motions(simulator, [still])
+    turn = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi))
+    moved_qpos, moved_qvel = still.qpos.copy(), still.qvel.copy()
+    moved_qpos[:, :3] = turn.apply(still.qpos[:, :3]) + [rng.normal(), rng.normal(), 0]
+    start = Rotation.from_quat(still.qpos[:, 3:7], scalar_first=True)
+    moved_qpos[:, 3:7] = (turn * start).as_quat(scalar_first=True)
+    moved_qvel[:, :3] = turn.apply(still.qvel[:, :3])
+    moved, _ = stack_motions(simulator, [dataclasses.replace(still, qpos=moved_qpos, qvel=moved_qvel)])
+    here, there = reference.features[0, 10:13], moved.features[0, 10:13]
+    np.testing.assert_allclose(heading_observation(here), heading_observation(there), atol=2e-4)
+    config, action = EnvMimicConfig(), jnp.array([1.0, -0.5, 0.3])
+    np.testing.assert_allclose(
+        turn.apply(world_loads(action, here[-1, 8], config)),
+        world_loads(action, there[-1, 8], config),
+        atol=1e-5,
+    )
+
+
+def test_force_stays_within_its_limit():
+    config = EnvMimicConfig()
+    force = world_loads(jnp.array([1e6, -1e6, 0.0]), jnp.zeros(()), config)
+    np.testing.assert_allclose(force, [1.0, -1.0, 0.0])
+
+
+def test_reset_starts_at_recorded_states_with_their_history(still: Motion, pushed: Motion):
+    env = EnvMimicEnv(load_model(), [still, pushed], EnvMimicConfig(start_noise=0.0))
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 256))
+    s = states.pipeline_state
+    recording, time = np.asarray(s["recording"]), np.asarray(s["time"])
+    assert set(recording) == {0, 1}
+    assert set(time) == set(range(HISTORY - 1, STEPS))
+    motions = [still, pushed]
+    for run in range(0, 256, 16):
+        np.testing.assert_allclose(s["physics"].qpos[run], motions[recording[run]].qpos[time[run]], atol=1e-6)
+        expected = env.reference.features[recording[run], time[run] - 2 : time[run] + 1]
+        np.testing.assert_array_equal(s["history"][run], expected)
+
+
+def test_start_noise_stays_small_and_keeps_the_quaternion_a_unit(still: Motion):
+    env = EnvMimicEnv(load_model(), [still], EnvMimicConfig(start_noise=1.0))
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 256)).pipeline_state
+    recorded = np.asarray(env.reference.qpos)[0, np.asarray(states["time"])]
+    np.testing.assert_allclose(np.linalg.norm(states["physics"].qpos[:, 3:7], axis=1), 1.0, atol=1e-5)
+    angle = 2 * np.arccos(np.clip(np.abs(np.sum(states["physics"].qpos[:, 3:7] * recorded[:, 3:7], axis=1)), 0, 1))
+    assert 0.3 < np.rad2deg(angle).mean() < 1.5
+    hinges = np.rad2deg(np.asarray(states["physics"].qpos[:, 7:]) - recorded[:, 7:])
+    assert 0.4 < hinges[:, 0].std() < 0.6
+    assert np.abs(hinges[:, 3]).max() == 0.0  # motors stay
+
+
+def test_time_limits_truncate_and_divergence_terminates(still: Motion):
+    env = EnvMimicEnv(load_model(), [still], EnvMimicConfig(episode_seconds=0.4, start_noise=0.0))
+    step = jax.jit(env.step)
+    many = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 200))
+    lengths = many.pipeline_state["remaining"]  # pyright: ignore
+    assert (lengths.min(), lengths.max()) == (4, 12)
+    state = jax.jit(env.reset)(jax.random.key(3))
+    time, remaining = (int(state.pipeline_state[name]) for name in ("time", "remaining"))
+    for elapsed in range(1, min(remaining, STEPS - time) + 1):
+        state = step(state, jnp.zeros(3))
+        over = float(elapsed == remaining or time + elapsed == STEPS)
+        assert (float(state.done), float(state.info["truncation"])) == (over, over)
+
+    state = jax.jit(env.reset)(jax.random.key(3))
+    s = state.pipeline_state
+    physics = s["physics"]._replace(qvel=s["physics"].qvel.at[3].set(jnp.nan))
+    broken = state.replace(pipeline_state=s | {"physics": physics})
+    state = step(broken, jnp.zeros(3))
+    assert (float(state.done), float(state.info["truncation"])) == (1.0, 0.0)
+    assert float(state.metrics["diverged"]) == 1.0
+    assert all(np.isfinite(x).all() for x in state.obs.values()) and np.isfinite(float(state.reward))
+
+
+def test_the_missing_force_earns_more_than_none_and_its_opposite_less(pushed: Motion):
+    """A constant force on the reference robot: would catch a sign or frame error. Of forces at balloon, base and feet,
+    only the first is not zero."""
+    env = EnvMimicEnv(load_model(), [pushed], EnvMimicConfig(start_noise=0.0, force_cost=0.0, forces="multi"))
+    state = jax.jit(env.reset)(jax.random.key(5))
+    s = state.pipeline_state
+    start = 2
+    state = state.replace(
+        pipeline_state=s
+        | {
+            "physics": state_at(env.reference.qpos[0, start], env.reference.qvel[0, start]),
+            "history": env.reference.features[0, start - 2 : start + 1],
+            "time": jnp.asarray(start, s["time"].dtype),
+        }
+    )
+    step = jax.jit(env.step)
+
+    def total(force: np.ndarray) -> float:
+        run, reward = state, 0.0
+        for _ in range(20):
+            heading = np.asarray(heading_rotation(run.pipeline_state["history"][-1, 8]))
+            action = jnp.zeros(env.action_size).at[:3].set(heading.T @ force / env.config.force_scale)
+            run = step(run, action)
+            reward += float(run.reward)
+        return reward
+
+    force = np.array([0.04, 0.0, 0.02])
+    assert total(force) > total(np.zeros(3)) + 0.05 > total(-force) + 0.1
+    best = env.config.position_weight + env.config.orientation_weight
+    best += env.config.fine_position_weight + env.config.fine_orientation_weight
+    assert total(force) > 20 * 0.99 * best
+
+
+FORCE = np.array([0.04, 0.0, 0.02])
+
+
+@pytest.fixture(scope="module")
+def evaluator() -> OpenLoopEvaluator:
+    """Of a recording without and a shorter one with `FORCE`; the policy's parameters are the force it gives."""
+    config = EnvMimicConfig()
+    motions = [make_motion(np.zeros(3), "near-own", 60), make_motion(FORCE, "far-pushed", 50)]
+    constant = NetworkForces(config, lambda params, _: params / config.force_scale)
+    return OpenLoopEvaluator(load_model(), motions, constant)
+
+
+def test_evaluator_finds_no_error_in_its_own_physics_and_some_in_pushed_ones(evaluator: OpenLoopEvaluator):
+    result = evaluator(jnp.array(FORCE))
+    own, pushed = result.vanilla
+    assert own.group == "near" and pushed.group == "far"
+    assert own.position[1.0][0] < 1e-3 and own.yaw[1.0][0] < 0.1
+    assert pushed.position[2.0][0] > 0.03
+    # The force that made the recording explains it; on the other recording it does harm, and the bound says so.
+    assert result.ratio("far", "position", 2.0) < 0.1
+    assert result.excess()[0] > 0 and "near-own" in result.excess()[1]
+
+
+def test_errors_of_starts_are_how_far_the_starts_lie_apart(evaluator: OpenLoopEvaluator):
+    """A robot that starts 2 cm beside itself walks 2 cm beside itself."""
+    assert all(e.position[2.0][0] == 0.0 for e in evaluator.of_starts(evaluator.motions, jnp.array(FORCE)))
+    beside = [dataclasses.replace(m, qpos=m.qpos + 0.02 * np.eye(m.qpos.shape[1])[1]) for m in evaluator.motions]
+    for errors in evaluator.of_starts(beside, jnp.array(FORCE)):
+        assert errors.position[2.0][0] == pytest.approx(0.02, rel=0.02)
+        assert errors.yaw[2.0][0] < 0.1 and errors.mean_com_error == pytest.approx(0.02, rel=0.02)
+
+
+def test_a_group_s_errors_are_not_those_of_its_luckiest_recording():
+    """Two recordings that trade their errors: either alone makes one bound look broken, their mean does not."""
+
+    def errors(name: str, size: float) -> Errors:
+        return Errors(name, "near", {5.0: (size, 0.1)}, {5.0: (10 * size, 1.0)}, size, 10 * size, 0.0)
+
+    vanilla, mimic = (errors("near-1", 1.0), errors("near-2", 3.0)), (errors("near-1", 3.0), errors("near-2", 1.0))
+    result = Evaluation(vanilla, mimic)
+    worst, place = result.excess()
+    assert worst == pytest.approx(3.0 / (1.2 * 1.0 + 0.02) - 1) and "near-1" in place
+    means = Evaluation(mean_by_group(vanilla), mean_by_group(mimic))
+    worst, place = means.excess()
+    assert worst == pytest.approx(2.0 / (1.2 * 2.0 + 0.02) - 1) and "near at 5 s" in place
+    assert means.ratio("near", "yaw", 5.0) == result.ratio("near", "yaw", 5.0) == 1.0
+
+
+def test_one_program_serves_all_recordings_and_actuators(still: Motion, pushed: Motion):
+    other = load_model()
+    nominal = ActuatorParameters.nominal(other)
+    stiffer = dataclasses.replace(nominal, knee_spring_stiffness=1.2 * nominal.knee_spring_stiffness)
+    cases = [
+        (load_model(), [still]),
+        (load_model(stiffer), [make_motion(FORCE, steps=50), pushed, still]),
+    ]
+    sizes = PPOConfig(num_envs=8, batch_size=8, num_minibatches=1, unroll_length=2, num_updates_per_batch=1)
+    training, replaying = [], []
+    for model, motions in cases:
+        learner = Learner(EnvMimicEnv(model, motions, EnvMimicConfig()), sizes)
+        state = jax.eval_shape(learner._first, jax.random.PRNGKey(0), learner._contents)
+        training.append(learner._step.lower(state, learner._contents).as_text())
+        evaluator = OpenLoopEvaluator(model, motions, NetworkForces(EnvMimicConfig(), lambda params, _: params))
+        places = np.tile(np.array([0, 2], np.int32), (evaluator._size, 1))
+        carry = evaluator._begin(places)
+        replaying.append(evaluator._chunk.lower(np.zeros(3), 1.0, *evaluator._fixed, carry, places).as_text())
+    assert training[0] == training[1]
+    assert replaying[0] == replaying[1]
+
+
+def test_replays_kept_to_be_looked_at_are_those_evaluated(evaluator: OpenLoopEvaluator):
+    replays = {"vanilla": evaluator.replay(jnp.array(FORCE), scale=0.0), "envmimic": evaluator.replay(jnp.array(FORCE))}
+    takes = artifacts.stored_rollouts(evaluator, replays)
+    assert [take.name for take in takes] == ["near-own", "far-pushed"]
+    first = HISTORY - 1
+    for take, motion, run in zip(takes, evaluator.motions, evaluator.first_runs, strict=True):
+        np.testing.assert_array_equal(take.qpos["recording"], motion.qpos[first:])
+        assert take.time[0] == pytest.approx(first * CONTROL_TIMESTEP)
+        for name, replay in replays.items():
+            states = len(take.time)
+            seen = robot_meshes.poses(load_model(), take.qpos[name])
+            np.testing.assert_allclose(seen.balloon, replay.position[run, :states], atol=1e-4)
+            np.testing.assert_allclose(seen.yaw, replay.yaw[run, :states], atol=1e-3)
+        assert take.force is not None
+        np.testing.assert_allclose(take.force, np.tile(FORCE, (len(take.time) - 1, 1)), atol=0.02)
+    # Of each recording, the simulator that it was made in.
+    for take, name in zip(takes, ("vanilla", "envmimic"), strict=True):
+        np.testing.assert_allclose(take.qpos[name], take.qpos["recording"], atol=0.02)

@@ -1,0 +1,255 @@
+"""Forces by regression and by gradients: are the derivatives the simulation's, and is a known push found again?"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from ballu_mjx.ballu.model import ActuatorParameters, standing_qpos
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reference import stack_motions
+from ballu_mjx.recordings.segments import Segments, cut_segments
+from ballu_mjx.residuals import analytic, supervised
+from ballu_mjx.residuals.analytic import AnalyticConfig, check_analytic_config
+from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.network import NetworkForces, load_units, num_inputs, num_loads, recorded_inputs
+from ballu_mjx.residuals.supervised import SupervisedConfig, check_supervised_config
+from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.rl import ppo
+from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.robots.description import ballu
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.sim.linearize import ControlSteps, Linearizer
+from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.step import balloon_id, count_substeps
+
+MODEL = load_model()
+BALLU = ballu()
+PUSH = np.array([0.02, -0.03, 0.015])
+"""N, world."""
+TWIST = np.array([1e-3, -1.5e-3, 2e-3])
+"""N m, world."""
+CLOSE = 0.05 * float(np.linalg.norm(PUSH))
+CLOSE_TWIST = 0.05 * float(np.linalg.norm(TWIST))
+SECONDS = 0.5
+INPUTS = num_inputs(EnvMimicConfig(), ballu())
+NETWORK = PPOConfig(policy_layers=(16,), value_layers=(4,))
+WRENCH = EnvMimicConfig(forces="wrench")
+ACTIONS = num_loads(WRENCH, BALLU)
+FORCES = NetworkForces(WRENCH, ppo.make_inference({ppo.STATE: (INPUTS,)}, ACTIONS, NETWORK), name="analytic")
+
+
+def pushed(name: str, height: float, model: mujoco.MjModel = MODEL, twist: float = 0.0, steps: int = 60) -> Motion:
+    """The nominal robot in C MuJoCo, stepping or, above the floor, falling, with `PUSH` and `twist` times `TWIST` on
+    the balloon."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = standing_qpos(model)
+    mujoco.mj_step(model, data, 100)
+    data.qpos[2] += height
+    data.xfrc_applied[balloon_id(model)] = np.r_[PUSH, twist * TWIST]
+    time = np.arange(steps) * CONTROL_TIMESTEP
+    command = np.where((time[:, None] / 1.2 + np.array([0.0, 0.5])) % 1.0 < 0.4, 0.7, 0.0)
+    states = [(data.qpos.copy(), data.qvel.copy())]
+    for row in command:
+        data.ctrl[:] = row
+        mujoco.mj_step(model, data, count_substeps(model))
+        states.append((data.qpos.copy(), data.qvel.copy()))
+    qpos, qvel = (np.array(x) for x in zip(*states, strict=True))
+    times = np.arange(steps + 1) * CONTROL_TIMESTEP
+    return Motion(name=name, time=times, command=command, qpos=qpos, qvel=qvel, residual_mm={})
+
+
+@pytest.fixture(scope="module")
+def motions() -> list[Motion]:
+    return [pushed("stepping", 0.0), pushed("falling", 10.0)]
+
+
+@pytest.fixture(scope="module")
+def recorded(motions: list[Motion]) -> Segments:
+    return cut_segments(Simulator(MODEL), motions, SECONDS, SECONDS)
+
+
+@pytest.fixture(scope="module")
+def linearize() -> Linearizer:
+    return Linearizer(MODEL, joints=BALLU.joints, forces="wrench")
+
+
+@pytest.fixture(scope="module")
+def inputs(motions: list[Motion], recorded: Segments) -> np.ndarray:
+    """What networks see of the states in the windows."""
+    reference, _ = stack_motions(Simulator(MODEL), motions)
+    seen = np.asarray(recorded_inputs(reference, EnvMimicConfig())).reshape(len(motions), -1, INPUTS)
+    states = recorded.features.shape[0] * recorded.features.shape[1] // len(motions)
+    return seen[:, :states].reshape(-1, INPUTS)
+
+
+@pytest.fixture(scope="module")
+def start(inputs: np.ndarray) -> ppo.Params:
+    return ppo.initial_policy(inputs, ACTIONS, NETWORK)
+
+
+@pytest.fixture(scope="module")
+def unforced(recorded: Segments, start: ppo.Params) -> ControlSteps:
+    still = start._replace(policy=jax.tree.map(np.zeros_like, jax.device_get(start.policy)))
+    return analytic.simulator(MODEL, FORCES)(still, recorded)[0]
+
+
+def test_derivatives_are_those_of_c_mujoco(unforced: ControlSteps, linearize: Linearizer):
+    """Through contacts and taut cables; where a foot lands within the step, differences of any size are no derivative,
+    so most steps must agree, not all."""
+    few = jax.tree.map(lambda x: x[::4], unforced)
+    linear = linearize(few._replace(loads=np.zeros((len(few.loads), linearize.loads))))
+    data, body, nv = mujoco.MjData(MODEL), balloon_id(MODEL), MODEL.nv
+    joints = [MODEL.joint(name).dofadr[0] for name in BALLU.joints]
+    sizes = np.r_[np.full(nv, 1e-5), np.full(nv, 1e-4), np.full(3, 1e-3), np.full(3 + len(joints), 1e-5)]
+    rng = np.random.default_rng(0)
+
+    def after(place: int, change: np.ndarray) -> np.ndarray:
+        mujoco.mj_resetData(MODEL, data)
+        data.qpos[:], data.qvel[:] = few.physics.qpos[place], few.physics.qvel[place] + change[nv : 2 * nv]
+        data.qacc_warmstart[:] = few.physics.warmstart[place]
+        mujoco.mj_integratePos(MODEL, data.qpos, change[:nv], 1.0)
+        data.ctrl[:], data.xfrc_applied[body] = few.commands[place, -1], change[2 * nv :][:6]
+        data.qfrc_applied[joints] = change[2 * nv + 6 :]
+        mujoco.mj_step(MODEL, data, count_substeps(MODEL))
+        return np.concatenate([data.qpos, data.qvel])
+
+    wrong = []
+    for place in range(len(few.loads)):
+        direction = rng.normal(size=linearize.directions) * sizes
+        plus, minus = after(place, direction), after(place, -direction)
+        difference = np.zeros(nv)
+        mujoco.mj_differentiatePos(MODEL, difference, 1.0, minus[: MODEL.nq], plus[: MODEL.nq])
+        measured = np.concatenate([difference, plus[MODEL.nq :] - minus[MODEL.nq :]]) / 2
+        found = linear.state[place] @ direction
+        wrong.append(np.linalg.norm(found - measured) / np.linalg.norm(measured))
+    assert np.median(wrong) < 0.02
+    assert np.quantile(wrong, 0.75) < 0.1
+
+
+def test_labels_are_the_push(linearize: Linearizer):
+    """Of motions seen without noise, by a model that is right in all else. All of it in the air; on its legs the robot
+    does not show what lifts it."""
+    config = SupervisedConfig(
+        position_noise=1e-5,
+        angle_noise=1e-3,
+        held_angle_noise=1e-3,
+        velocity_noise=1e-4,
+        rotation_noise=0.05,
+        joint_noise=1.0,
+        torque_spread=1e-4,
+    )
+    label = supervised.ForceLabeller(MODEL, BALLU, linearize, config, WRENCH)
+    motions = [pushed("stepping", 0.0, twist=1.0), pushed("falling", 10.0, twist=1.0)]
+    stepping, falling = (label(motion).mean(axis=0) for motion in motions)
+    np.testing.assert_allclose(falling[:3], PUSH, atol=CLOSE)
+    np.testing.assert_allclose(falling[3:], TWIST, atol=CLOSE_TWIST)
+    np.testing.assert_allclose(stepping[:2], PUSH[:2], atol=CLOSE)
+
+
+def test_legs_that_differ_are_not_taken_for_forces(linearize: Linearizer):
+    """Knee springs by a fifth stiffer than the model's: their torques are unknowns of their own. In the median step:
+    where a foot lands within a step, derivatives are none, and a single label may be far off."""
+    nominal = ActuatorParameters.nominal(MODEL)
+    stiffer = dataclasses.replace(nominal, knee_spring_stiffness=1.2 * nominal.knee_spring_stiffness)
+    motion = pushed("stiff knees", 0.0, load_model(stiffer))
+
+    def wrong(config: SupervisedConfig) -> float:
+        labels = supervised.ForceLabeller(MODEL, BALLU, linearize, config, WRENCH)(motion)
+        return float(np.median(np.linalg.norm(labels[:, :3] - PUSH, axis=1)))
+
+    assert wrong(SupervisedConfig()) < 0.5 * wrong(SupervisedConfig(torque_spread=1e-5))
+
+
+def test_examples_are_in_the_balloon_s_heading(motions: list[Motion]):
+    """Seen by a robot that has turned, a force keeps its side."""
+    simulator = Simulator(MODEL)
+    loads = [np.tile(np.r_[PUSH, TWIST], (len(motion.command), 1)) for motion in motions]
+    seen, actions = supervised.examples(simulator, motions, loads, WRENCH)
+    features, _ = simulator.observe_all(jnp.asarray(motions[0].qpos[40:41]), jnp.asarray(motions[0].qvel[40:41]))
+    yaw = float(features[0, 8])
+    assert abs(yaw) > 1e-3
+    x = np.cos(yaw) * PUSH[0] + np.sin(yaw) * PUSH[1]
+    y = np.cos(yaw) * PUSH[1] - np.sin(yaw) * PUSH[0]
+    action = actions[40 - HISTORY + 1]
+    np.testing.assert_allclose(0.05 * action[:3], [x, y, PUSH[2]], rtol=1e-4)
+    np.testing.assert_allclose(0.005 * np.linalg.norm(action[3:]), np.linalg.norm(TWIST), rtol=1e-4)
+    assert len(seen) == len(actions)
+
+
+def test_gradients_find_the_push(recorded: Segments, inputs: np.ndarray, start: ppo.Params, linearize: Linearizer):
+    config = AnalyticConfig(
+        window_seconds=SECONDS, rounds=4, updates=150, validate_every=150, learning_rate=1e-3, observation_noise=0.0
+    )
+    found: list[tuple[object, dict[str, float]]] = []
+    analytic.train(
+        MODEL,
+        FORCES,
+        lambda policy: start._replace(policy=policy),
+        start.policy,
+        recorded,
+        np.ones(INPUTS, np.float32),
+        config,
+        lambda step, policy, metrics: found.append((policy, metrics)),
+        linearize,
+    )
+    policy, metrics = found[-1]
+    actions_found = np.asarray(FORCES.infer(start._replace(policy=policy), jnp.asarray(inputs)))
+    stepping, falling = (load_units(WRENCH, ACTIONS) * actions_found).reshape(2, -1, ACTIONS).mean(axis=1)
+    np.testing.assert_allclose(falling[:3], PUSH, atol=CLOSE)
+    np.testing.assert_allclose(falling[3:], 0.0, atol=CLOSE_TWIST)
+    # On legs other forces and torques, which change from step to step, move the balloon almost as this force does.
+    np.testing.assert_allclose(stepping[:2], PUSH[:2], atol=2 * CLOSE)
+    assert metrics["loss"] < 0.05 * found[0][1]["loss"]  # of the last simulation, beside the first
+
+
+@pytest.mark.parametrize(
+    ("config", "says"),
+    [
+        (AnalyticConfig(rounds=0), "--rounds is 0"),
+        (AnalyticConfig(window_seconds=0.01), "--window-seconds"),
+        (SupervisedConfig(force_change=-1.0), "--force-change is -1"),
+        (SupervisedConfig(shares=(0.5, 1.5)), "--shares is 0.5 1.5"),
+        (SupervisedConfig(shares=()), "--shares"),
+        (AnalyticConfig(interval_seconds=float("inf")), "--interval-seconds"),
+    ],
+)
+def test_options_out_of_range_are_refused(config: AnalyticConfig | SupervisedConfig, says: str):
+    with pytest.raises(InputError, match=says):
+        if isinstance(config, AnalyticConfig):
+            check_analytic_config(config)
+        else:
+            check_supervised_config(config)
+
+
+def test_a_share_of_a_policy_s_forces(start: ppo.Params, inputs: np.ndarray):
+    whole = np.asarray(FORCES.infer(start, jnp.asarray(inputs)))
+    half = np.asarray(FORCES.infer(start._replace(policy=ppo.with_share(start.policy, 0.5)), jnp.asarray(inputs)))
+    assert np.abs(whole).max() > 0
+    np.testing.assert_allclose(half, 0.5 * whole, rtol=1e-5)
+
+
+def test_a_run_is_read_as_its_kind(tmp_path: Path, start: ppo.Params):
+    """What `force_fit` leaves, `Residual.load` understands."""
+    from ballu_mjx.residuals.run_config import describe_run
+    from ballu_mjx.residuals.trained import write_observed
+    from ballu_mjx.runs.folder import Run
+
+    sections = {"env": WRENCH, "ppo": NETWORK, "fit": SupervisedConfig()}
+    with Run(tmp_path, describe_run("supervised", sections, {}, []) | {"residual": None}) as run:
+        write_observed(run, np.zeros((2, INPUTS)))
+        run.save(5, ppo.as_tree(start), 0.5)
+    loaded = TrainedResidual.load(tmp_path)
+    assert (loaded.model.name, loaded.step) == ("supervised", 5)
+    assert json.loads((tmp_path / "config.json").read_text())["task"] == "supervised"
+    wrench = loaded.wrench(jnp.zeros((HISTORY, 27)), jnp.zeros((HISTORY, 2)))
+    assert np.all(np.isfinite(wrench))

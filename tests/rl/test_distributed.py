@@ -1,0 +1,144 @@
+"""Does one training in two processes learn what it learns in one, and is it kept by the first alone?"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.rl import distributed
+from ballu_mjx.rl.distributed import DistributedOptions
+from ballu_mjx.runs.checkpoints import last_checkpoint
+from ballu_mjx.runs.metrics import read_metrics
+
+TRAINING = """
+import json, sys
+from ballu_mjx import runtime
+runtime.prepare()
+from pathlib import Path
+from ballu_mjx import distributed, ppo, runs
+from ballu_mjx.session import Session, Start, Validation
+from follower import Follower, weight
+
+options, folder = json.loads(sys.argv[1]), Path(sys.argv[2])
+distributed.join(distributed.DistributedOptions(**options))
+config = ppo.PPOConfig(num_envs=32, batch_size=16, num_minibatches=2, unroll_length=5, num_timesteps=160 * 6,
+                       policy_layers=(8,), value_layers=(8,))
+sections = {"env": Follower.limit, "ppo": config}
+content = {"task": "follow", "starts": [], "recordings": {}, "ppo": {"learning_rate": 1e-4, "seed": 0}}
+if distributed.is_first():
+    with runs.Run(folder, content) as run:
+        Session(run, None, 320, Validation(weight)).train(Follower(), config, Start(), content)
+else:
+    sys.exit(Session(None, None, 320, Validation(weight)).follow(Follower(), config, Start(), content))
+"""
+
+
+PHYSICS = """
+import json, sys
+from ballu_mjx import runtime
+runtime.prepare()
+from ballu_mjx import distributed, robot, simulation
+import jax
+
+distributed.join(distributed.DistributedOptions(**json.loads(sys.argv[1])))
+model = robot.load_model()
+for leaf in jax.tree.leaves((simulation.put_model(model), simulation.make_data(model))):
+    assert not isinstance(leaf, jax.Array) or leaf.is_fully_addressable, leaf.sharding
+distributed.meet()
+"""
+
+FAILURE = """
+import json, sys
+from ballu_mjx import distributed
+
+options = json.loads(sys.argv[1])
+distributed.join(distributed.DistributedOptions(**options))
+if options["process_id"] == 1:
+    distributed.leave(2)
+distributed.meet()
+"""
+
+
+def start(code: str, folder: Path, devices: int, **options: Any) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", code, json.dumps(options), str(folder)]
+    path = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
+    flags = f"--xla_force_host_platform_device_count={devices}"
+    environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": path}
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def finish(*processes: subprocess.Popen[str]) -> None:
+    try:
+        for process in processes:
+            _, said = process.communicate(timeout=300)
+            assert process.returncode == 0, said
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
+
+
+def together() -> dict[str, Any]:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    return {"coordinator": f"127.0.0.1:{port}", "num_processes": 2}
+
+
+def test_two_processes_learn_what_one_with_two_devices_does(tmp_path: Path) -> None:
+    options = together()
+    both = [start(TRAINING, tmp_path / f"process-{i}", 1, **options, process_id=i) for i in range(2)]
+    finish(*both, start(TRAINING, tmp_path / "alone", 2))
+
+    def curve(folder: str) -> list[list[float]]:
+        rows = read_metrics(tmp_path / folder)
+        return [[row["reward"], row["total_loss"], row["distance"]] for row in rows if "reward" in row]
+
+    assert len(curve("process-0")) == 6
+    np.testing.assert_allclose(curve("process-0"), curve("alone"), rtol=1e-6)
+    assert not (tmp_path / "process-1").exists()
+    kept, expected = (last_checkpoint(tmp_path / name, training=True) for name in ("process-0", "alone"))
+    assert kept.step == expected.step
+    assert kept.training is not None and expected.training is not None
+    for name, values in expected.training.items():  # the environments of both processes among them
+        np.testing.assert_allclose(kept.training[name], values, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+def test_every_process_reads_the_robot_it_simulates(tmp_path: Path) -> None:
+    options = together()
+    finish(*(start(PHYSICS, tmp_path, 1, **options, process_id=i) for i in range(2)))
+
+
+def test_a_process_that_fails_does_not_wait_for_those_that_wait_for_it(tmp_path: Path) -> None:
+    options = together()
+    waiting, failing = (start(FAILURE, tmp_path, 1, **options, process_id=i) for i in range(2))
+    try:
+        assert failing.wait(60) == 2
+        assert waiting.poll() is None
+    finally:
+        for process in (waiting, failing):
+            process.kill()
+            process.communicate()
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"process_id": 1}, "--process-id goes with --coordinator"),
+        ({"coordinator": "here:1"}, "needs --num-processes and --process-id"),
+        ({"coordinator": "here:1", "num_processes": 2, "process_id": 2}, "must be 0 to 1"),
+        ({"coordinator": "here", "num_processes": 2, "process_id": 1}, "give host:port"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(given: dict[str, Any], told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        distributed.join(DistributedOptions(**given))

@@ -1,0 +1,279 @@
+"""Between PPO and the run's folder: what interrupts, breaks or doubles a training."""
+
+import dataclasses
+import io
+import json
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+from brax.training.acme import running_statistics
+from brax.training.agents.ppo.losses import PPONetworkParams
+from brax.training.types import UInt64
+from follower import Follower, weight
+
+from ballu_mjx.common import files
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.rl import learner, ppo
+from ballu_mjx.rl.learner import Learner, TrainingState
+from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.rl.training_loop import ResumePoint, TrainingLoop, Validation, Watchdog, _made_with, find_resume_point
+from ballu_mjx.runs.checkpoints import last_checkpoint, list_checkpoints, restore_checkpoint
+from ballu_mjx.runs.folder import Run, new_folder
+from ballu_mjx.runs.layout import RUN_FORMAT
+from ballu_mjx.runs.metrics import read_metrics
+from ballu_mjx.runs.progress import Progress
+
+GOOD = {"reward": 0.1, "diverged": 0.0, "steps_per_second": 100.0, "total_loss": 0.5}
+
+
+CONFIG = PPOConfig(
+    num_timesteps=1000, num_envs=8, batch_size=8, num_minibatches=2, policy_layers=(4,), value_layers=(4,)
+)
+
+
+def state(value: float) -> TrainingState:
+    """One that nobody will go on from."""
+    weights = {"w": jnp.full(3, value)}
+    array: Any = jnp.full(2, value)
+    return TrainingState(
+        networks=PPONetworkParams(policy=weights, value=weights),  # pyright: ignore[reportCallIssue]
+        averaged=weights,
+        averaged_steps=jnp.zeros((), jnp.int32),
+        optimizer=array,
+        normalizer=running_statistics.init_state({"state": array}),
+        environments=array,
+        key=jnp.zeros(2, jnp.uint32),
+        steps=UInt64(hi=0, lo=0),  # pyright: ignore[reportCallIssue]
+    )
+
+
+def content(config: PPOConfig = CONFIG, **sections: Any) -> dict[str, Any]:
+    return {
+        "format": RUN_FORMAT,
+        "task": "walk",
+        "ppo": dataclasses.asdict(config),
+        "recordings": {},
+        "starts": [],
+    } | sections
+
+
+def open_run(folder: Path) -> Run:
+    return Run(folder, content())
+
+
+def session_in(run: Run, *, greatest: bool = False) -> TrainingLoop:
+    return TrainingLoop(run, Progress(1000, stream=io.StringIO()), 100, Validation(weight, "way", greatest))
+
+
+def test_a_run_is_written_by_one_process_at_a_time(tmp_path):
+    with open_run(tmp_path / "run"), pytest.raises(InputError, match="another process is writing"):
+        open_run(tmp_path / "run")
+    with open_run(tmp_path / "run"):
+        pass
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_training_after_the_step_and_is_told_to_the_shell(tmp_path, number):
+    before = signal.getsignal(number)
+    signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+    try:
+        with open_run(tmp_path / "run") as run:
+            session = session_in(run)
+            with session._interrupts_noted():
+                session._step_done(100, state(1.0), GOOD)
+                os.kill(os.getpid(), number)
+                with pytest.raises(KeyboardInterrupt):
+                    session._step_done(120, state(2.0), GOOD)
+        assert session.exit_status == 128 + number
+        stopped = last_checkpoint(tmp_path / "run", training=True)
+        assert (stopped.step, stopped.notes["due"]) == (120, 100) and stopped.training is not None
+        assert restore_checkpoint(tmp_path / "run", "best")[0] == 100, "nobody has measured the other"
+        assert signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL), "given back"
+    finally:
+        signal.signal(number, before)
+
+
+def test_a_loss_that_is_no_number_ends_training_with_the_last_good_checkpoint(tmp_path):
+    with open_run(tmp_path / "run") as run:
+        session = session_in(run)
+        session._step_done(100, state(1.0), GOOD)
+        with pytest.raises(
+            InputError, match="total_loss is not a number any more. The last good checkpoint is that of step 100"
+        ):
+            session._step_done(200, state(np.nan), GOOD | {"total_loss": float("nan")})
+    step, tree = restore_checkpoint(tmp_path / "run", "last")
+    assert step == 100 and np.all(tree["policy"]["w"] == 1.0)
+    assert {row["step"] for row in read_metrics(tmp_path / "run")} == {100}
+
+
+def test_diverging_physics_is_told_once_and_only_above_a_thousandth(tmp_path, capsys):
+    with open_run(tmp_path / "run") as run:
+        session = session_in(run)
+        for step, share in ((100, 0.0005), (200, 0.02), (300, 0.03)):
+            session._step_done(step, state(1.0), GOOD | {"diverged": share})
+    error = capsys.readouterr().err
+    assert error.count("Physics diverged") == 1 and "2.00%" in error
+
+
+@pytest.mark.parametrize(("greatest", "best"), [(False, 300), (True, 100)])
+def test_validation_tells_the_best_checkpoint_whatever_the_reward(tmp_path: Path, greatest: bool, best: int):
+    measured = {100: 3.0, 200: 2.0, 300: 1.0}
+    with open_run(tmp_path / "run") as run:
+        session = session_in(run, greatest=greatest)
+        session._step_done(0, state(2.5), {})
+        for step, reward in ((100, 0.1), (200, 0.3), (300, 0.2)):
+            session._step_done(step, state(measured[step]), GOOD | {"reward": reward})
+    assert restore_checkpoint(tmp_path / "run", "best")[0] == best
+    assert [row["way"] for row in read_metrics(tmp_path / "run") if "way" in row] == [2.5, *measured.values()]
+
+
+@pytest.fixture(scope="module")
+def small() -> Learner:
+    return Learner(Follower(), CONFIG)
+
+
+def saved(folder: Path, state: TrainingState, config: dict[str, Any], step: int = 160) -> Path:
+    with Run(folder, config) as run:
+        tree, training = ppo.as_tree(learner.params(state)), learner.stored(state)
+        run.save(step, tree, -1.0, training=training, notes=_made_with(config))
+    return folder
+
+
+def resumed(folder: Path, config: PPOConfig) -> ResumePoint:
+    return find_resume_point("walk", folder, config, output=None, quick=False)
+
+
+def test_a_run_goes_on_with_its_whole_state(tmp_path, small, capsys):
+    before = small.begin(5)
+    start = resumed(saved(tmp_path / "run", before, content(env={"friction": (1.0, 2.0)})), CONFIG)
+    again = start.state(small, CONFIG, _made_with(content(env={"friction": [1.0, 2.0]})))
+    for name, value in learner.stored(before).items():
+        np.testing.assert_array_equal(learner.stored(again)[name], value)
+    assert start.step == 160 and capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize(
+    ("ppo_change", "sections"),
+    [({"seed": 1}, {}), ({}, {"env": {"friction": 2}}), ({}, {"recordings": {"training": [{"sha256": "1"}]}})],
+)
+def test_changed_options_start_the_environments_anew(tmp_path, small, capsys, ppo_change, sections):
+    before = small.begin(5)
+    start = resumed(saved(tmp_path / "run", before, content()), CONFIG)
+    changed = dataclasses.replace(CONFIG, learning_rate=0.5, **ppo_change)
+    again = learner.stored(start.state(small, changed, _made_with(content(changed, **sections))))
+    said = capsys.readouterr().out
+    assert (
+        "the environments start anew, for the options changed; the optimizer goes on" in said and said.count("\n") == 1
+    )
+    stored = learner.stored(before)
+    assert np.array_equal(again["optimizer.1.count"], stored["optimizer.1.count"])
+    assert again["optimizer.1.hyperparams.learning_rate"] == 0.5
+    goal = "environments.pipeline_state.goal"
+    assert again[goal].shape == stored[goal].shape and not np.array_equal(again[goal], stored[goal])
+
+
+def test_a_run_of_an_older_version_goes_on_from_its_parameters(tmp_path, small, capsys):
+    before = small.begin(5)
+    folder = tmp_path / "run"
+    params = learner.params(before)
+    with Run(folder, content()):
+        pass
+    options = ocp.CheckpointManagerOptions(enable_async_checkpointing=False)
+    with ocp.CheckpointManager((folder / "checkpoints").resolve(), options=options) as manager:
+        manager.save(160, args=ocp.args.StandardSave(ppo.as_tree(params)))
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | {"format": "ballu-run/1"}))
+    start = resumed(folder, CONFIG)
+    again = learner.params(start.state(small, CONFIG, _made_with(content())))
+    assert "an older version kept parameters alone" in capsys.readouterr().out
+    assert start.step == 160
+    for name, value in learner.stored(before).items():
+        if name.startswith("networks"):
+            np.testing.assert_array_equal(
+                learner.stored(start.state(small, CONFIG, _made_with(content())))[name], value
+            )
+    np.testing.assert_array_equal(again.normalizer.mean["state"], params.normalizer.mean["state"])
+    with Run(folder, content(), resumed_at=160) as run:
+        run.save(240, ppo.as_tree(params), None)
+    assert list_checkpoints(folder) == [160, 240] and last_checkpoint(folder).step == 240
+
+
+def test_a_run_without_a_checkpoint_begins_again_in_its_folder(tmp_path, capsys):
+    folder = tmp_path / "run"
+    with open_run(folder) as run:
+        run.log(0, {"validation_error": 1.0})
+    start = resumed(folder, CONFIG)
+    assert "starting from the beginning" in capsys.readouterr().err
+    with Run(folder, content(), resumed_at=start.resumed_at):
+        assert read_metrics(folder) == [], "it will be measured again"
+
+
+def test_a_run_that_ended_without_its_results_may_go_on_to_them(tmp_path, small):
+    folder = saved(tmp_path / "run", small.begin(5), content(), step=1120)
+    assert resumed(folder, CONFIG).step == 1120
+    (folder / "replay.npz").write_bytes(b"")
+    with pytest.raises(InputError, match="already"):
+        resumed(folder, CONFIG)
+
+
+def until_told(stream: io.StringIO, lines: int) -> list[str]:
+    """What was told, when it is so many lines, or after two seconds."""
+    end = time.monotonic() + 2.0
+    while stream.getvalue().count("\n") < lines and time.monotonic() < end:
+        time.sleep(0.01)
+    return stream.getvalue().splitlines()
+
+
+def test_the_user_is_told_once_of_each_standstill_and_of_compiling_in_other_words():
+    stream = io.StringIO()
+    with Watchdog(Path("runs/walk"), limit=0.1, stream=stream) as watchdog:
+        (compiling,) = until_told(stream, 1)
+        assert "a first compilation takes" in compiling and "--num-envs" in compiling
+        time.sleep(0.3)
+        assert len(stream.getvalue().splitlines()) == 1, "said again"
+        for step in range(20, 120, 20):  # goes on for longer than the limit
+            watchdog.step_done(step)
+            time.sleep(0.05)
+        assert len(stream.getvalue().splitlines()) == 1
+        _, standing = until_told(stream, 2)
+        assert "since step 100" in standing and "--resume runs/walk" in standing
+    time.sleep(0.3)
+    assert stream.getvalue().count("\n") == 2, "the training is over"
+
+
+def test_a_training_that_ends_leaves_no_watchdog(tmp_path):
+    with open_run(tmp_path / "run") as run:
+        session = session_in(run)
+        assert session._watchdog._limit == 300.0
+        with session._watchdog:
+            assert any(thread.name == "watchdog" and thread.daemon for thread in threading.enumerate())
+        end = time.monotonic() + 2.0
+        while any(thread.name == "watchdog" for thread in threading.enumerate()) and time.monotonic() < end:
+            time.sleep(0.01)
+        assert not any(thread.name == "watchdog" for thread in threading.enumerate())
+
+
+def test_a_folder_that_takes_no_results_is_found_before_the_work(tmp_path):
+    (tmp_path / "file").write_text("")
+    places = [tmp_path / "file" / "run"]
+    if Path("/proc").is_dir():
+        places.append(Path("/proc/run"))  # read-only for root too
+    if os.geteuid():
+        (tmp_path / "locked").mkdir(mode=0o555)
+        places.append(tmp_path / "locked" / "run")
+    for place in places:
+        with pytest.raises(InputError, match="cannot be written to .*; mend its permissions, or give another folder"):
+            files.check_folder(place)
+        with pytest.raises(InputError, match="cannot be written to"):
+            new_folder(place, "walk")
+    files.check_folder(tmp_path / "new" / "run")
+    left = {path.name for path in tmp_path.iterdir()} - {"locked"}
+    assert left == {"file"}, "what was tried is left behind"

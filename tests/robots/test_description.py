@@ -1,0 +1,294 @@
+"""Robots other than BALLU: what is refused of a description, whether the second robot is simulated and recovered."""
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ballu_mjx.cli import train
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.csv_format import read_recording, write_recording
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.recordings.recording import COLUMNS, Recording
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
+from ballu_mjx.residuals.network import world_loads
+from ballu_mjx.robots.description import ballu, read_description
+from ballu_mjx.robots.model import CONTROL_TIMESTEP
+from ballu_mjx.sim.observation import HISTORY, heading_observation
+from ballu_mjx.sim.step import PhysicsState, count_substeps
+
+BALLOON = Path(__file__).parents[2] / "experiments" / "tethered_balloon"
+DESCRIPTION = read_description(BALLOON / "balloon.robot.json")
+PUSH = np.array([0.06, 0.03, 0.0])
+SECONDS = 6.0
+
+
+def fly(seconds: float = SECONDS) -> tuple[Recording, np.ndarray, np.ndarray]:
+    """A flight of the balloon's own model under a steady push, without noise; positions and velocities at 100 Hz."""
+    model = DESCRIPTION.load_model()
+    data = mujoco.MjData(model)
+    data.xfrc_applied[model.body("balloon").id, :3] = PUSH
+    sent = np.repeat(np.random.default_rng(0).uniform(0, 1, (round(seconds / 0.5), 2)), 50, axis=0)
+    places, turns, qpos, qvel = [], [], [], []
+    for command in sent:
+        data.ctrl[:] = command
+        mujoco.mj_kinematics(model, data)
+        places.append([data.site(site).xpos.copy() for site in ("balloon", "knot")])
+        turns.append(data.body("balloon").xquat.copy())
+        qpos.append(data.qpos.copy())
+        qvel.append(data.qvel.copy())
+        mujoco.mj_step(model, data)
+    seen = np.array(places)
+    flight = Recording(
+        name="flight", kind="free", robot="balloon-0", time=np.arange(len(sent)) / 100, command=sent,
+        balloon_position=seen[:, 0], balloon_quaternion=np.array(turns), base_position=None, foot_position=None,
+        points={"knot": seen[:, 1]},
+    )  # fmt: skip
+    return flight, np.array(qpos), np.array(qvel)
+
+
+@pytest.fixture(scope="module")
+def flight() -> tuple[Recording, np.ndarray, np.ndarray]:
+    return fly()
+
+
+@pytest.fixture(scope="module")
+def motion(flight: tuple[Recording, np.ndarray, np.ndarray]) -> Motion:
+    return reconstruct(flight[0], DESCRIPTION.load_model(), DESCRIPTION)
+
+
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    for name in ("balloon.xml", "balloon.robot.json"):
+        shutil.copy(BALLOON / name, tmp_path)
+    return tmp_path / "balloon.robot.json"
+
+
+def test_ballu_s_description_says_what_its_recordings_hold():
+    description = ballu()
+    optional = {*COLUMNS["base_quaternion"]}
+    assert set(description.columns) == {name for names in COLUMNS.values() for name in names} - optional
+    assert description.is_ballu and not description.anchored
+
+
+def in_json(**changes: Any) -> Callable[[Path], None]:
+    def damage(path: Path) -> None:
+        content = json.loads(path.read_text()) | changes
+        path.write_text(json.dumps({key: value for key, value in content.items() if value is not ...}))
+
+    return damage
+
+
+def in_model(old: str, new: str) -> Callable[[Path], None]:
+    def damage(path: Path) -> None:
+        text = path.with_name("balloon.xml").read_text()
+        assert old in text
+        path.with_name("balloon.xml").write_text(text.replace(old, new))
+
+    return damage
+
+
+SWIVEL = '<joint name="swivel" axis="0 0 1" stiffness="0.008"/>'
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda path: path.unlink(), "no such file"),
+        (lambda path: path.write_text("{"), "not JSON"),
+        (in_json(format="ballu-robot/2"), '"format" is'),
+        (in_json(points=...), '"points" is missing'),
+        (in_json(feet=["a"]), "no key 'feet'"),
+        (in_json(name=" "), '"name" is'),
+        (in_json(model="nothing.xml"), "there is no file"),
+        (in_json(model="balloon.robot.json"), "MuJoCo cannot read"),
+        (in_json(tracked="ballon"), "'ballon', no site of the model; there are knot, balloon"),
+        (in_json(points="knot"), "a list of names"),
+        (in_json(points=["knot", "knot"]), "one twice"),
+        (in_json(points=["balloon"]), "two columns balloon_x"),
+        (in_json(points=["kn,ot"]), "letters, digits"),
+        (in_json(commands={"left": "propeller_left"}), "all in its order: propeller_left, propeller_right"),
+        (in_json(commands={"left": "propeller_right", "right": "propeller_left"}), "in its order"),
+        (in_json(commands=[]), '"commands" is'),
+        (in_json(joints=["knee"]), "no joint of the model"),
+        (in_json(built_like="SpotMini"), '"built_like" is'),
+        (in_json(built_like="BALLU"), 'leave "built_like" out'),
+        (in_model(SWIVEL, '<joint name="swivel" type="ball"/>'), "a ball joint"),
+        (in_model('timestep="0.01"', 'timestep="0.015"'), "divide the control step"),
+        (in_model('ctrlrange="0 1"', 'ctrlrange="-1 1"'), "ctrlrange"),
+        (in_model('<body name="lower"', '<site name="tripod"/><body name="lower"'), ""),
+    ],
+)  # fmt: skip
+def test_a_damaged_description_is_refused_by_file_key_and_mend(
+    copy: Path, damage: Callable[[Path], None], said: str
+) -> None:
+    damage(copy)
+    if not said:  # harmless, until it is asked for
+        read_description(copy)
+        in_json(points=["tripod"])(copy)
+        said = "does not move"
+    with pytest.raises(InputError) as refused:
+        read_description(copy)
+    assert said in str(refused.value) and copy.name in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_commands_for_ballu_alone_refuse_another_robot(capsys: pytest.CaptureFixture[str]):
+    given = ["--robot-description", str(DESCRIPTION.file)]
+    for command in ("sysid", "walk", "residual"):
+        assert train.main([command, *given]) == 2
+        assert f"`train {command}` is for BALLU alone" in capsys.readouterr().err
+    assert train.main(["envmimic", *given]) == 2
+    assert "--recordings" in capsys.readouterr().err
+
+
+def test_recordings_go_through_files(flight: tuple[Recording, np.ndarray, np.ndarray], tmp_path: Path):
+    write_recording(flight[0], tmp_path / "flight.csv", DESCRIPTION)
+    found = read_recording(tmp_path / "flight.csv", DESCRIPTION)
+    np.testing.assert_allclose(found.points["knot"], flight[0].points["knot"], atol=6e-6)
+    assert found.balloon_position is not None and flight[0].balloon_position is not None
+    np.testing.assert_allclose(found.balloon_position, flight[0].balloon_position, atol=6e-6)
+    with pytest.raises(InputError, match="unknown column"):
+        read_recording(tmp_path / "flight.csv")
+    header, rest = (tmp_path / "flight.csv").read_text().split("\n", 1)
+    (tmp_path / "flight.csv").write_text(header.replace("knot_y", "knot_w") + "\n" + rest)
+    with pytest.raises(InputError, match="knot_w"):
+        read_recording(tmp_path / "flight.csv", DESCRIPTION)
+
+
+def test_states_are_recovered(flight: tuple[Recording, np.ndarray, np.ndarray], motion: Motion):
+    every = round(CONTROL_TIMESTEP * 100)
+    inner = slice(4, -4)  # a filter has less to go by at the ends
+    count = len(motion.qpos)
+    qpos, qvel = (values[::every][:count] for values in flight[1:])
+    assert np.abs(motion.qpos - qpos)[inner].max() < 0.01
+    error = np.abs(motion.qvel - qvel)[inner]
+    assert np.sqrt(np.mean(error**2)) < 0.1 * np.sqrt(np.mean(qvel**2))
+    assert max(motion.residual_mm.values()) < 0.1
+
+
+def test_a_free_robot_is_recovered_wherever_it_is(tmp_path: Path):
+    """The balloon, cut loose and turned over: its root is found from far away."""
+    text = (BALLOON / "balloon.xml").read_text()
+    joints = '<joint name="tilt_x" axis="1 0 0"/>\n      <joint name="tilt_y" axis="0 1 0"/>'
+    assert joints in text
+    (tmp_path / "balloon.xml").write_text(text.replace(joints, '<freejoint name="root"/>'))
+    shutil.copy(BALLOON / "balloon.robot.json", tmp_path)
+    open_ended = read_description(tmp_path / "balloon.robot.json")
+    in_json(joints=["bend_x", "bend_y", "swivel"])(tmp_path / "balloon.robot.json")
+    found = read_description(tmp_path / "balloon.robot.json")
+    assert not found.anchored
+    model = found.load_model()
+    data = mujoco.MjData(model)
+    time = np.arange(150) / 100
+    turn = Rotation.from_euler("ZY", np.column_stack([2.0 + time, 0.5 * np.sin(2 * time)])).as_quat(scalar_first=True)
+    places, turns = [], []
+    for t, quaternion in zip(time, turn, strict=True):
+        data.qpos[:] = [1 + 0.3 * t, -2, 0.5, *quaternion, 0.2 * np.sin(3 * t), 0.1, 0.3 * t]
+        mujoco.mj_kinematics(model, data)
+        places.append([data.site(site).xpos.copy() for site in ("balloon", "knot")])
+        turns.append(data.body("balloon").xquat.copy())
+    seen = np.array(places)
+    made = Recording(
+        name="loose", kind="free", robot="loose", time=time, command=np.zeros((len(time), 2)),
+        balloon_position=seen[:, 0], balloon_quaternion=np.array(turns), base_position=None, foot_position=None,
+        points={"knot": seen[:, 1]},
+        angles={"bend_x": 0.2 * np.sin(3 * time), "bend_y": np.full(len(time), 0.1), "swivel": 0.3 * time},
+    )  # fmt: skip
+    motion = reconstruct(made, model, found)
+    np.testing.assert_allclose(motion.qvel[10, :3], [0.3, 0, 0], atol=0.02)
+    np.testing.assert_allclose(motion.qvel[10, -1], 0.3, atol=0.02)
+    np.testing.assert_allclose(motion.qpos[10, :3], [1.15, -2, 0.5], atol=0.005)
+    with pytest.raises(InputError, match="nothing that is measured shows the joint"):
+        reconstruct(dataclasses.replace(made, angles={}), model, open_ended)
+
+
+def test_a_joint_that_nothing_shows_is_named(flight: tuple[Recording, np.ndarray, np.ndarray], copy: Path):
+    inertia = '<inertial pos="0 0 0" mass="0.001" diaginertia="1e-6 1e-6 1e-6"/>'
+    site = '<site name="propeller_left"'
+    in_model(site, f'<body><joint name="fan"/>{inertia}</body>{site}')(copy)
+    hidden = read_description(copy)
+    with pytest.raises(InputError, match="joint fan"):
+        reconstruct(flight[0], hidden.load_model(), hidden)
+
+
+def test_places_that_are_not_the_model_s_are_refused(flight: tuple[Recording, np.ndarray, np.ndarray]):
+    moved = {"knot": flight[0].points["knot"] + [0.0, 0.0, 0.4]}
+    with pytest.raises(InputError, match="from where the model can have it"):
+        reconstruct(dataclasses.replace(flight[0], points=moved), DESCRIPTION.load_model(), DESCRIPTION)
+
+
+@pytest.fixture(scope="module")
+def env(motion: Motion) -> EnvMimicEnv:
+    config = EnvMimicConfig(start_noise=0.0, observation_noise=0.0)
+    return EnvMimicEnv(DESCRIPTION.load_model(), [motion], config, robot=DESCRIPTION)
+
+
+def test_the_environment_steps_as_c_mujoco_does(env: EnvMimicEnv):
+    """The push that is in the recording, found again: with it as the action the simulation stays on it, and without it
+    drifts off."""
+    state = jax.jit(env.reset)(jax.random.key(3))
+    s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
+    model = DESCRIPTION.load_model()
+    data = mujoco.MjData(model)
+    physics: PhysicsState = s["physics"]
+    data.qpos[:], data.qvel[:] = np.asarray(physics.qpos), np.asarray(physics.qvel)
+    data.xfrc_applied[model.body("balloon").id, :3] = PUSH
+    step = jax.jit(env.step)
+    for number in range(10):
+        data.ctrl[:] = np.asarray(env.reference.command[0, int(s["time"]) + number])
+        mujoco.mj_step(model, data, count_substeps(model))
+        state = step(state, jnp.asarray(PUSH / env.config.force_scale, jnp.float32))
+    after: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
+    np.testing.assert_allclose(after["physics"].qpos, data.qpos, atol=2e-4)
+    mujoco.mj_forward(model, data)
+    velocity = np.zeros(6)
+    mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, model.site("knot").id, velocity, 0)
+    features = after["history"][-1]
+    assert features.shape == (DESCRIPTION.features,)
+    np.testing.assert_allclose(features[9:12], data.site("knot").xpos, atol=2e-4)
+    np.testing.assert_allclose(features[12:15], velocity[3:], atol=1e-3)
+    target = env.reference.features[0, int(after["time"])]
+    assert float(jnp.linalg.norm(features[:3] - target[:3])) < 0.01
+
+
+def test_an_anchored_robot_sees_the_world(motion: Motion, env: EnvMimicEnv):
+    """Wind does not turn with the robot: neither do what it sees and the force on it."""
+    history = env.reference.features[0, 10:13]
+    turned = history.at[:, 8].add(1.0)
+    seen, other = (heading_observation(each, anchored=True) for each in (history, turned))
+    changed = np.flatnonzero(np.abs(seen - other) > 1e-6)
+    assert len(changed) == HISTORY, "the yaw alone"
+    np.testing.assert_allclose(np.sort(np.asarray(seen)[:3]), np.sort(np.asarray(history[0, :3])), atol=1e-6)
+    force = world_loads(jnp.array([1.0, 2.0, 3.0]), turned[-1, 8], EnvMimicConfig(), anchored=True)
+    np.testing.assert_allclose(force, [0.05, 0.1, 0.15], atol=1e-6)
+
+
+def test_envmimic_runs_from_files_to_an_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """The command on a description and recordings, and the evaluation of what it leaves."""
+    from ballu_mjx.cli import evaluate
+
+    write_recording(fly(7.0)[0], tmp_path / "flight.csv", DESCRIPTION)
+    arguments = [
+        "envmimic", "--robot-description", str(DESCRIPTION.file), "--recordings", str(tmp_path / "flight.csv"),
+        "--output", str(tmp_path / "run"), "--num-timesteps", "160", "--num-envs", "8", "--batch-size", "8",
+        "--num-minibatches", "2", "--unroll-length", "5", "--num-updates-per-batch", "1", "--validate-every", "160",
+        "--policy-layers", "16", "--value-layers", "16",
+    ]  # fmt: skip
+    assert train.main(arguments) == 0
+    stored = json.loads((tmp_path / "run" / "evaluation.json").read_text())
+    assert stored["residual"][0]["mean_force"] > 0
+    capsys.readouterr()
+    assert evaluate.main([str(tmp_path / "run")]) == 0
+    assert f"{stored['residual'][0]['position']['5.0'][0]:.3f}" in capsys.readouterr().out
+    assert train.main(["walk", "--residual", str(tmp_path / "run")]) == 2
+    assert "is of the robot tethered balloon, not of BALLU" in capsys.readouterr().err

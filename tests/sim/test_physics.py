@@ -1,0 +1,393 @@
+"""The robot's physics: MJX against C MuJoCo, symmetry, cable, servo, weight, and what the parameters move."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+
+from ballu_mjx.ballu.model import (
+    CABLE_SLACK,
+    KNEES,
+    MOTORS,
+    SIDES,
+    ActuatorParameters,
+    actuator_fields,
+    buoyancy_fields,
+    buoyancy_ratio,
+    cable_length,
+    standing_qpos,
+)
+from ballu_mjx.robots.description import ballu
+from ballu_mjx.robots.model import load_model, set_fields, with_fields
+from ballu_mjx.sim.step import balloon_id, control_step, count_substeps, make_data, put_model, state_at
+
+CABLES = [f"cable_{side}" for side in SIDES]
+FIELDS = [field.name for field in dataclasses.fields(ActuatorParameters)]
+
+
+def tight_model() -> mujoco.MjModel:
+    """The robot with the contact solver run to convergence."""
+    model = load_model()
+    model.opt.iterations, model.opt.tolerance = 100, 1e-14
+    model.opt.ls_iterations, model.opt.ls_tolerance = 50, 1e-6
+    return model
+
+
+def advance(model: mujoco.MjModel, data: mujoco.MjData, command: np.ndarray, seconds: float) -> None:
+    data.ctrl[:] = command
+    for _ in range(round(seconds / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+
+
+def weightless() -> mujoco.MjModel:
+    """The robot afloat in still space, its base held by thick air: for the actuators alone."""
+    model = load_model()
+    model.opt.gravity[:] = 0
+    model.dof_damping[:6] = 5
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # nothing touches: less to compile
+    return model
+
+
+def afloat(model: mujoco.MjModel) -> mujoco.MjData:
+    data = mujoco.MjData(model)
+    data.qpos[:] = standing_qpos(model)
+    data.qpos[2] += 1
+    return data
+
+
+# ---- MJX against C MuJoCo ----
+
+
+@dataclasses.dataclass(frozen=True)
+class Samples:
+    """States along pushed walks with the commands and forces to come, and whether each is in the named regimes."""
+
+    qpos: np.ndarray
+    qvel: np.ndarray
+    command: np.ndarray
+    force: np.ndarray
+    contact: np.ndarray
+    taut: np.ndarray
+    saturated: np.ndarray
+
+
+@functools.cache
+def samples() -> Samples:
+    model = tight_model()
+    balloon, rng = balloon_id(model), np.random.default_rng(0)
+    rows = []
+    for _ in range(8):
+        data = mujoco.MjData(model)
+        data.qpos[:] = standing_qpos(model)
+        for _ in range(8):
+            advance(model, data, rng.integers(0, 2, 2), rng.uniform(0.05, 0.3))
+            data.xfrc_applied[balloon, :3] = rng.uniform(-0.5, 0.5, 3)
+            data.ctrl[:] = rng.integers(0, 2, 2)
+            mujoco.mj_forward(model, data)
+            length = data.ten_length - model.tendon_lengthspring[:, 1]
+            rows.append(
+                (
+                    data.qpos.copy(),
+                    data.qvel.copy(),
+                    data.ctrl.copy(),
+                    data.xfrc_applied[balloon, :3].copy(),
+                    data.ncon > 0,
+                    length > 0,
+                    np.abs(data.actuator_force) > 0.0849,
+                )
+            )
+    return Samples(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def test_samples_visit_every_regime() -> None:
+    s = samples()
+    for regime in (s.contact, s.taut, s.saturated):
+        assert 0.1 < regime.mean() < 0.95
+
+
+def test_mjx_follows_c_mujoco_over_a_control_step() -> None:
+    """The same step in float32 and in double precision, under a wrench on the balloon and forces at base and feet."""
+    s, model = samples(), load_model()
+    count, balloon = count_substeps(model), balloon_id(model)
+    points = tuple(model.site(name).id for name in ballu().points)
+    bodies = (balloon, *model.site_bodyid[list(points)].tolist())
+    mjx_model, template = put_model(model), make_data(model)
+
+    @jax.jit
+    @jax.vmap
+    def step(qpos: Array, qvel: Array, command: Array, wrench: Array) -> tuple[Array, Array]:
+        state = state_at(qpos, qvel)
+        state = control_step(mjx_model, template, state, command, wrench, bodies=bodies, points=points, count=count)
+        return state.qpos, state.qvel
+
+    wrench = np.zeros((len(s.force), len(bodies), 6))
+    wrench[:, 0] = np.concatenate([s.force, 0.1 * s.force[:, ::-1]], axis=1)
+    wrench[:, 1:, :3] = np.random.default_rng(1).uniform(-0.05, 0.05, (len(s.force), len(points), 3))
+    inputs = [jnp.asarray(x, jnp.float32) for x in (s.qpos, s.qvel, s.command, wrench)]
+    qpos, qvel = (np.asarray(x) for x in step(*inputs))
+    expected_qpos, expected_qvel = [], []
+    for i in range(len(s.qpos)):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = s.qpos[i], s.qvel[i]
+        data.ctrl[:], data.xfrc_applied[balloon] = s.command[i], wrench[i, 0]
+        for _ in range(count):
+            mujoco.mj_step1(model, data)
+            data.qfrc_applied[:] = 0
+            for point, body, push in zip(points, bodies[1:], wrench[i, 1:, :3], strict=True):
+                mujoco.mj_applyFT(model, data, push, np.zeros(3), data.site_xpos[point], body, data.qfrc_applied)
+            mujoco.mj_step2(model, data)
+        expected_qpos.append(data.qpos.copy())
+        expected_qvel.append(data.qvel.copy())
+    position = np.abs(qpos - expected_qpos).max(axis=1)
+    speed = np.abs(qvel - expected_qvel).max(axis=1)
+    assert position.max() < 5e-5
+    assert speed.max() < 5e-3
+
+
+# ---- symmetry ----
+
+
+def mirrored_qpos(qpos: np.ndarray) -> np.ndarray:
+    """Reflection in the plane y = 0: left and right change places."""
+    neck, left, right = np.split(qpos[7:], [1, 4])
+    return np.concatenate([qpos[:7] * [1, -1, 1, 1, -1, 1, -1], neck, right, left])
+
+
+def mirrored_qvel(qvel: np.ndarray) -> np.ndarray:
+    neck, left, right = np.split(qvel[6:], [1, 4])
+    return np.concatenate([qvel[:6] * [1, -1, 1, -1, 1, -1], neck, right, left])
+
+
+def test_the_mirrored_robot_moves_in_mirror_image() -> None:
+    s, model = samples(), tight_model()
+    worst = 0.0
+    for qpos, qvel, command in zip(s.qpos[::4], s.qvel[::4], s.command[::4], strict=True):
+        one, other = mujoco.MjData(model), mujoco.MjData(model)
+        one.qpos[:], one.qvel[:] = qpos, qvel
+        other.qpos[:], other.qvel[:] = mirrored_qpos(qpos), mirrored_qvel(qvel)
+        for data, pair in ((one, command), (other, command[::-1])):
+            advance(model, data, pair, 0.2)
+        assert np.abs(one.qpos - qpos).max() > 1e-3
+        worst = max(worst, np.abs(mirrored_qpos(one.qpos) - other.qpos).max())
+    assert worst < 1e-9
+
+
+# ---- cable and servo ----
+
+
+def test_the_cable_pulls_when_stretched_and_never_pushes() -> None:
+    model = load_model()
+    cut = load_model()
+    cut.tendon_stiffness[:] = 0
+    data, without = mujoco.MjData(model), mujoco.MjData(cut)
+    seen = set()
+    for knee in np.deg2rad(np.arange(28, 100, 8.0)):
+        for motor in np.deg2rad(np.arange(0, 91, 10.0)):
+            for m, d in ((model, data), (cut, without)):
+                d.qpos[7:][KNEES], d.qpos[7:][MOTORS] = knee, motor
+                mujoco.mj_forward(m, d)
+            cable = data.qfrc_passive - without.qfrc_passive
+            taut = data.ten_length > model.tendon_lengthspring[:, 1]
+            seen |= set(taut)
+            # A pull flexes the knee (positive) and turns the arm back towards 0 (negative).
+            assert np.all(np.where(taut, cable[6:][KNEES] > 0, cable[6:][KNEES] == 0))
+            assert np.all(cable[6:][MOTORS][~taut] == 0)
+            assert np.all(cable[6:][MOTORS][taut] <= 0)
+    assert seen == {True, False}
+
+
+def test_cable_length_is_the_models_own() -> None:
+    model = load_model()
+    data = mujoco.MjData(model)
+    knee, motor = np.array([0.6, 1.2]), np.array([0.3, 1.4])
+    data.qpos[7:][KNEES], data.qpos[7:][MOTORS] = knee, motor
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(cable_length(model, jnp.asarray(knee), jnp.asarray(motor)), data.ten_length, rtol=1e-6)
+
+
+def test_the_cables_rest_length_leaves_the_stated_slack() -> None:
+    model = load_model()
+    nominal = ActuatorParameters.nominal(model)
+    np.testing.assert_allclose(nominal.cable_slack, CABLE_SLACK, atol=1e-5)
+    rest = actuator_fields(model, nominal)["tendon_lengthspring"][:, 1]
+    np.testing.assert_allclose(model.tendon_lengthspring[:, 1], rest, atol=1e-7)
+    looser = dataclasses.replace(nominal, cable_slack=nominal.cable_slack + jnp.array([1e-3, 0.0]))
+    longer = actuator_fields(model, looser)["tendon_lengthspring"][:, 1] - rest
+    np.testing.assert_allclose(longer, [1e-3, 0.0], atol=1e-7)
+
+
+def test_the_servo_saturates_at_its_torque() -> None:
+    model = load_model()
+    data = mujoco.MjData(model)
+    data.ctrl[:] = [1.0, 0.05]
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.actuator_force, [0.085, 0.5 * 0.05 * np.pi / 2], rtol=1e-5)
+    data.qpos[7:][MOTORS] = 1.5
+    data.ctrl[:] = 0
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.actuator_force, -0.085, rtol=1e-6)
+
+
+def test_commands_map_monotonically_to_settled_knees() -> None:
+    """From the stop, at the command where the cable comes taut, to 72 deg; left and right alike."""
+    model = weightless()
+    knees = []
+    for command in np.linspace(0, 1, 9):
+        data = afloat(model)
+        advance(model, data, np.full(2, command), 4.0)
+        knees.append(np.rad2deg(data.qpos[7:][KNEES]))
+    knees = np.array(knees)
+    np.testing.assert_allclose(knees[:, 0], knees[:, 1], atol=1e-6)
+    np.testing.assert_allclose(knees[0], 27.35, atol=0.3)
+    np.testing.assert_allclose(knees[-1], 72, atol=1)
+    assert np.all(np.diff(knees[:, 0]) > 0)
+    assert knees[3, 0] > 30  # no dead zone up to 0.35
+
+
+# ---- weight ----
+
+
+def test_weight_and_lift() -> None:
+    model = load_model()
+    assert model.body_mass.sum() == pytest.approx(0.28679, abs=1e-9)
+    assert buoyancy_ratio(model) == pytest.approx(0.84, abs=1e-4)
+    for ratio in (0.84, 0.5):
+        set_fields(model, buoyancy_fields(model, ratio))
+        data = afloat(model)
+        mujoco.mj_forward(model, data)
+        acceleration = sum(model.body_mass) * 9.81 * (ratio - 1)
+        # Nothing touches it: what accelerates the robot as a whole is weight less lift.
+        momentum = np.zeros((3, model.nv))
+        mujoco.mj_jacSubtreeCom(model, data, momentum, 1)
+        force = model.body_subtreemass[1] * momentum @ data.qacc
+        np.testing.assert_allclose(force, [0, 0, acceleration], atol=1e-4)
+
+
+def test_it_stands_with_its_feet_on_the_floor() -> None:
+    model = load_model()
+    qpos = standing_qpos(model)
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    for side in SIDES:
+        assert data.geom(f"foot_{side}").xpos[2] == pytest.approx(0.004, abs=1e-6)
+    advance(model, data, np.zeros(2), 3.0)
+    upright = data.body("balloon").xmat[8]
+    assert 0.69 < data.body("base").xpos[2] < 0.74
+    assert upright > 0.99
+    assert data.ncon == 2
+
+
+# ---- parameters ----
+
+
+@functools.cache
+def settled_in_mjx() -> tuple[np.ndarray, np.ndarray]:
+    """Settled knees [case, knee] and what a change of each parameter changes [case, field, parameter's side, knee], per
+    unit of the parameter.
+
+    All rows of `CASES` side by side: vmapped, with a set of parameters each.
+    """
+    model = weightless()
+    mjx_model = put_model(model)
+    data = afloat(model)
+    template, start = make_data(model), state_at(jnp.asarray(data.qpos), jnp.zeros(model.nv))
+
+    def knees(parameters: ActuatorParameters, command: Float[Array, " 2"]) -> Array:
+        moved = with_fields(mjx_model, actuator_fields(model, parameters))
+        bodies, no_force = (balloon_id(model),), jnp.zeros((1, 6))
+        state = control_step(moved, template, start, command, no_force, bodies=bodies, count=SETTLING_STEPS)
+        return state.qpos[7:][KNEES]
+
+    cases = [(case_parameters(case), case[0]) for case in CASES]
+    rows = cases + [(p, c) for base, c in cases for f in FIELDS for i in range(2) for p in changed(base, f, i)]
+    parameters = jax.tree.map(lambda *x: jnp.stack(x), *(row[0] for row in rows))
+    found = np.asarray(jax.jit(jax.vmap(knees))(parameters, jnp.asarray([row[1] for row in rows])), float)
+    settled, pairs = found[: len(CASES)], found[len(CASES) :].reshape(len(CASES), len(FIELDS), 2, 2, 2)
+    sizes = np.array([[[change_of(p, name, side) for side in range(2)] for name in FIELDS] for p, _ in cases])
+    return settled, (pairs[:, :, :, 0] - pairs[:, :, :, 1]) / (2 * sizes[..., None])
+
+
+def change_of(parameters: ActuatorParameters, name: str, side: int) -> float:
+    """2 % of a parameter; 5 mrad where it is an angle of 0, 0.05 mm of slack."""
+    return 5e-5 if name == "cable_slack" else 0.02 * abs(float(getattr(parameters, name)[side])) or 5e-3
+
+
+def changed(parameters: ActuatorParameters, name: str, side: int) -> list[ActuatorParameters]:
+    """With a parameter of one side increased, and decreased."""
+    value, change = getattr(parameters, name), change_of(parameters, name, side)
+    return [dataclasses.replace(parameters, **{name: value.at[side].add(sign * change)}) for sign in (1, -1)]
+
+
+SETTLING_STEPS = 200
+CASES = (
+    ((0.0, 0.0), {}),  # both at their stops
+    ((0.8, 0.5), {}),  # cables taut
+    (
+        (0.7, 0.9),
+        {"knee_spring_stiffness": (0.012, 0.02), "motor_gain": (0.05, 0.3), "default_knee_angle": (0.5, 0.44)},
+    ),
+    ((1.0, 1.0), {"knee_spring_stiffness": (0.08, 0.09)}),  # servos saturated: the springs are too strong for them
+)
+"""Commands, and parameters other than nominal."""
+SATURATED = 3
+
+
+def case_parameters(case: tuple[tuple[float, float], dict[str, tuple[float, float]]]) -> ActuatorParameters:
+    nominal = ActuatorParameters.nominal(load_model())
+    return dataclasses.replace(nominal, **{name: jnp.asarray(pair) for name, pair in case[1].items()})
+
+
+def settled_in_c(parameters: ActuatorParameters, command: tuple[float, float]) -> mujoco.MjData:
+    model = weightless()
+    set_fields(model, actuator_fields(model, parameters))
+    data = afloat(model)
+    advance(model, data, np.array(command), SETTLING_STEPS * model.opt.timestep)
+    return data
+
+
+@pytest.mark.parametrize("case", range(len(CASES)))
+def test_settled_knees_and_what_moves_them_agree_with_c_mujoco(case: int) -> None:
+    values, slopes = settled_in_mjx()
+    command, parameters = CASES[case][0], case_parameters(CASES[case])
+    data = settled_in_c(parameters, command)
+    np.testing.assert_allclose(values[case], data.qpos[7:][KNEES], atol=2e-4)
+    limit = np.asarray(parameters.torque_limit, float)
+    assert np.all(np.abs(data.actuator_force) == limit) == (case == SATURATED)
+    for f, name in enumerate(FIELDS):
+        for side in range(2):
+            delta = change_of(parameters, name, side)
+            high, low = (settled_in_c(each, command).qpos for each in changed(parameters, name, side))
+            # Per 1 % of the parameter (of 1 rad, where it is an angle of 0; 0.025 mm of slack), in rad at the knee.
+            scale = delta / 0.02 * 0.01
+            np.testing.assert_allclose(
+                slopes[case, f, side] * scale,
+                (high - low)[7:][KNEES] / (2 * delta) * scale,
+                rtol=0.05,
+                atol=1e-5,
+                err_msg=name,
+            )
+
+
+def test_each_parameter_moves_its_own_side_as_described() -> None:
+    _, slopes = settled_in_mjx()
+    at_stop, taut, saturated = slopes[0], slopes[1], slopes[SATURATED]
+    own, other = np.eye(2, dtype=bool), ~np.eye(2, dtype=bool)
+    limit = FIELDS.index("torque_limit")
+    # A servo that does not saturate at rest did so on the way: the legs still swing a little from that.
+    assert np.all(saturated[limit][own] > 1e-2) and np.abs(taut[limit]).max() < 0.1 * saturated[limit][own].min()
+    for f, name in enumerate(FIELDS):
+        if f == limit:
+            continue
+        sign = -1 if name in ("knee_spring_stiffness", "cable_slack") else 1
+        assert np.all(sign * taut[f][own] > 1e-2), name
+        assert np.abs(taut[f][other]).max() < 0.1 * np.abs(taut[f][own]).min(), name
+    np.testing.assert_allclose(at_stop[FIELDS.index("default_knee_angle")][own], 1, atol=0.05)
+    np.testing.assert_allclose(at_stop[FIELDS.index("motor_gain")], 0, atol=1e-3)  # single precision leaves 4e-4
