@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from importlib import resources
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 import mujoco
@@ -16,6 +16,7 @@ from jaxtyping import Array
 from mujoco import mjx
 
 
+@runtime_checkable
 class ModelParameters(Protocol):
     """Parameters that change fields of a model, such as identified actuators."""
 
