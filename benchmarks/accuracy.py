@@ -36,8 +36,7 @@ import tyro
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float
 
-from ballu_mjx.ballu.model import standing_qpos
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.sim.step import PhysicsState, balloon_id, control_step, count_substeps, make_data, put_model, state_at
 
 INTEGRATORS = {"implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST, "Euler": mujoco.mjtIntegrator.mjINT_EULER}

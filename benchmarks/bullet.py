@@ -28,9 +28,8 @@ from jaxtyping import Float
 from pybullet_utils.bullet_client import BulletClient  # pyright: ignore[reportMissingImports]
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu.model import SIDES
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES
 from ballu_mjx.policies.deploy.estimator import euler_angles
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
 
 TIMESTEPS = (1 / 240, 1e-3)
 """Bullet's own default, and a finer one (s); both divide the control step."""

@@ -9,10 +9,9 @@ import gymnasium  # pyright: ignore[reportMissingImports]
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.ballu.model import standing_qpos
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.policies.deploy.controller import observation
 from ballu_mjx.policies.tasks import TASKS, Step
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 
 OBSERVATIONS = 28
 """As `locomotion_env.OBSERVATIONS`, which would bring MJX and Brax into every process."""

@@ -32,13 +32,12 @@ import tyro
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu.model import standing_qpos
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion, ReconstructionParameters
 from ballu_mjx.recordings.recording import Recording
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 
 CAPTURE_STEP = 0.01
 HORIZONS = (0.25, 1.0, 2.0)

@@ -24,12 +24,11 @@ from jaxtyping import Float
 from mujoco import rollout
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu.model import standing_qpos
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 from ballu_mjx.sim.step import count_substeps
 
 SECONDS = 20.0

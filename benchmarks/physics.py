@@ -36,8 +36,7 @@ import throughput
 import tyro
 from matplotlib.figure import Figure
 
-from ballu_mjx.ballu.model import standing_qpos
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.sim.step import count_substeps
 
 MJX, MUJOCO, PYBULLET = "MJX", "C MuJoCo", "PyBullet"

@@ -71,11 +71,11 @@ def measure(environments: int, episode_seconds: float | None, recordings: int | 
     runtime.prepare()
     import jax
 
+    from ballu_mjx.ballu.model import load_model
     from ballu_mjx.ballu.reconstruct import reconstruct_ballu
     from ballu_mjx.recordings.csv_format import list_bundled, read_recording
     from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
     from ballu_mjx.rl import learner, ppo
-    from ballu_mjx.robots.model import load_model
 
     model = load_model()
     paths = list_bundled("training")

@@ -24,8 +24,7 @@ import tyro
 from jax import Array
 from jax.sharding import PartitionSpec
 
-from ballu_mjx.ballu.model import JOINTS, standing_qpos
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, JOINTS, load_model, standing_qpos
 from ballu_mjx.sim.step import PhysicsState, balloon_id, control_step, count_substeps, make_data, put_model, state_at
 
 MAX_JOINT_SPEED = 100.0

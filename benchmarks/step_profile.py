@@ -48,8 +48,7 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
     import numpy as np
     import throughput
 
-    from ballu_mjx.ballu.model import standing_qpos
-    from ballu_mjx.robots.model import load_model
+    from ballu_mjx.ballu.model import load_model, standing_qpos
     from ballu_mjx.sim.step import (
         PhysicsState,
         count_substeps,

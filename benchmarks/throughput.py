@@ -24,12 +24,11 @@ import numpy as np
 from jaxtyping import Float
 from mujoco import rollout
 
-from ballu_mjx.ballu.model import standing_qpos
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.rl import learner, ppo
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 from ballu_mjx.sim.step import count_substeps
 
 

@@ -115,13 +115,13 @@ def timeline(rows: list[dict[str, Any]], marks: dict[str, float], imported: floa
 def vanilla_ratio(folder: str) -> float:
     """A run's best validation error as a share of vanilla's, over its error as a share of its base's."""
     runtime.prepare()
+    from ballu_mjx.ballu.model import load_model
     from ballu_mjx.ballu.reconstruct import reconstruct_ballu
     from ballu_mjx.evaluation.errors_table import Evaluation
     from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
     from ballu_mjx.recordings.csv_format import read_recording
     from ballu_mjx.residuals.run_config import find_recordings
     from ballu_mjx.residuals.trained import TrainedResidual
-    from ballu_mjx.robots.model import load_model
     from ballu_mjx.runs.folder import read_config
 
     path = Path(folder)

@@ -29,6 +29,7 @@ import mujoco
 import numpy as np
 
 from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
+from ballu_mjx.ballu.model import load_model
 from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
@@ -38,7 +39,7 @@ from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.residuals.network import NetworkForces
 from ballu_mjx.rl import learner, ppo
 from ballu_mjx.rl.ppo import PPOConfig
-from ballu_mjx.robots.model import assets, load_model
+from ballu_mjx.robots.model import assets
 
 # %% [markdown]
 # ## The rows

@@ -34,12 +34,12 @@ import bundled_recordings
 import deflation
 
 from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
-from ballu_mjx.ballu.model import buoyancy_ratio
+from ballu_mjx.ballu.model import buoyancy_ratio, load_model
 from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.cli import train_aerodynamics
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
-from ballu_mjx.robots.model import assets, load_model
+from ballu_mjx.robots.model import assets
 
 NONE = (0.0, 0.0)
 FRICTION = {"knee_friction": NONE, "motor_friction": NONE}

@@ -40,12 +40,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from ballu_mjx.ballu.model import load_model
 from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.recordings.segments import Segments, pseudo_huber
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirWindows
 from ballu_mjx.residuals.trained import TrainedResidual
-from ballu_mjx.robots.model import load_model
 from ballu_mjx.sim.sharding import shard_over_devices
 
 STEPS = (0.1e-3, 1e-3, 3e-3, 10e-3, 30e-3, 100e-3)

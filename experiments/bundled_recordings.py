@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.ballu.gaits import Gait, hopping, one_legged, telegraph, waves
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.recordings.csv_format import write_recording
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, assets
+from ballu_mjx.robots.model import assets
 
 ROBOT_SEED = 0
 DECIMALS = 4

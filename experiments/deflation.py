@@ -40,6 +40,7 @@ import fidelity
 import numpy as np
 from bundled_recordings import Job
 
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
 from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
@@ -51,7 +52,6 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.residuals.trained import TrainedResidual
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 
 # %% [markdown]
 # ## Recordings: the same commands, with all of the lift and with less

@@ -44,6 +44,7 @@ import numpy as np
 from bundled_recordings import Job
 from jaxtyping import Float
 
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
 from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.evaluation.errors_table import (
     HORIZONS,
@@ -58,7 +59,7 @@ from ballu_mjx.policies.policy import Policy
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS
 from ballu_mjx.residuals.trained import TrainedResidual
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, assets, load_model
+from ballu_mjx.robots.model import assets
 from ballu_mjx.runs.checkpoints import list_checkpoints
 from ballu_mjx.runs.metrics import read_column
 from ballu_mjx.viz import plots

@@ -43,12 +43,12 @@ from bundled_recordings import Job
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
 from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.evaluation.open_loop import START_INTERVAL
 from ballu_mjx.recordings.groups import group_of
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 
 HORIZON = 5.0
 """Seconds from each start."""

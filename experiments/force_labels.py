@@ -38,6 +38,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
 
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
 from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
@@ -45,8 +46,8 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.supervised import ForceLabeller, SupervisedConfig
 from ballu_mjx.residuals.trained import TrainedResidual
-from ballu_mjx.robots.description import ballu
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, assets, load_model
+from ballu_mjx.robots.model import assets
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.folder import read_config, typed_config
 from ballu_mjx.sim.linearize import Linearizer
 from ballu_mjx.sim.observation import HISTORY, commands_seen
@@ -133,7 +134,7 @@ def main() -> None:
     arguments = parser.parse_args()
     networks = {folder.name: TrainedResidual.load(folder) for folder in arguments.runs}
     first = next(iter(networks.values()))
-    model, robot = load_model(first.actuators), ballu()
+    model, robot = load_model(first.actuators), load_robot()
     config = typed_config(SupervisedConfig, read_config(arguments.runs[0], "supervised"), "fit", arguments.runs[0])
     simulator, linearize = Simulator(model), Linearizer(model, joints=robot.joints)
     label = ForceLabeller(model, robot, linearize, config)

@@ -23,14 +23,13 @@ runtime.prepare()
 
 import numpy as np
 
-from ballu_mjx.ballu.model import CABLE_SLACK, ActuatorParameters
+from ballu_mjx.ballu.model import CABLE_SLACK, ActuatorParameters, load_model
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.ballu.virtual.trials import run_trials
 from ballu_mjx.cli import pipeline
 from ballu_mjx.evaluation.transfer import Transfer
 from ballu_mjx.policies.policy import Policy
-from ballu_mjx.robots.model import load_model
 
 # %% [markdown]
 # ## The effects, each as what takes it away

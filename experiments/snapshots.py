@@ -45,12 +45,11 @@ from mpl_toolkits.mplot3d import proj3d
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
-from ballu_mjx.ballu.model import SIDES
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model
 from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.cli import pipeline
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import read_recording
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 from ballu_mjx.viz.style import LABELS
 
 TIMES = {"walk": (0.0, 5.0, 11.0, 16.0, 24.0), "turn": (0.0, 4.0, 10.0, 18.0, 22.0)}

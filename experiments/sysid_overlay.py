@@ -37,8 +37,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
-from ballu_mjx.ballu.model import KNEES, MOTORS, SIDES, standing_qpos
-from ballu_mjx.robots.model import assets, load_model
+from ballu_mjx.ballu.model import KNEES, MOTORS, SIDES, load_model, standing_qpos
+from ballu_mjx.robots.model import assets
 from ballu_mjx.viz.style import COLOURS, LABELS
 
 PERIODS = (0.8, 1.0, 1.2, 1.4, 1.6)

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from ballu_mjx.ballu.model import JOINTS, standing_qpos
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, assets, load_model
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, JOINTS, load_model, standing_qpos
+from ballu_mjx.robots.model import assets
 
 pytest.importorskip("pybullet", reason="needs the extra bench")
 import bullet  # noqa: E402  # pyright: ignore[reportMissingImports]

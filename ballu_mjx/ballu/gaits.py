@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.ballu.model import SIDES, standing_qpos, suspend
+from ballu_mjx.ballu.model import SIDES, load_model, standing_qpos, suspend
 from ballu_mjx.recordings.recording import Kind, Recording
-from ballu_mjx.robots.model import assets, load_model
+from ballu_mjx.robots.model import assets
 
 _SETTLING = 2.0
 """s of rest before the first command."""

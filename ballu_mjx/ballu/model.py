@@ -14,17 +14,25 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from ballu_mjx.robots.model import assets
+from ballu_mjx.robots.model import ModelParameters, assets
+from ballu_mjx.robots.model import load_model as load_model_file
 
 SIDES = ("left", "right")
 JOINTS = ("neck", "hip_left", "knee_left", "motor_left", "hip_right", "knee_right", "motor_right")
 """Hinges in the order of `qpos[7:]` and `qvel[6:]`; the first seven (six) entries are the base's free joint."""
 HIPS, KNEES, MOTORS = (slice(1, None, 3), slice(2, None, 3), slice(3, None, 3))
 """Places of the left and right hip, knee and motor within `JOINTS`."""
+CONTROL_TIMESTEP = 0.05
+"""Seconds between two commands (20 Hz)."""
 CABLE_SLACK = 1e-4
 """The nominal robot's slack of the cable (m) with the motor at 0 and the knee at its stop."""
 SERVO_RANGE = np.pi / 2
 """Motor angle (rad) that a command of 1 asks for."""
+
+
+def load_model(actuators: ModelParameters | None = None) -> mujoco.MjModel:
+    """Return BALLU for C MuJoCo: the nominal one ("vanilla"), or with identified actuators ("vanilla+sysid")."""
+    return load_model_file(assets() / "ballu.xml", actuators)
 
 
 def suspend(spec: mujoco.MjSpec) -> None:
@@ -91,16 +99,6 @@ class ActuatorParameters:
             torque_limit=jnp.asarray(model.actuator_forcerange[servos, 1], jnp.float32),
             cable_slack=jnp.asarray(model.tendon_lengthspring[_cable_ids(model), 1] - taut, jnp.float32),
         )
-
-
-def same_actuators(one: ActuatorParameters | None, other: ActuatorParameters | None) -> bool:
-    """Whether two simulators have equal actuators (None: nominal)."""
-    if one is None or other is None:
-        return one is other
-    return all(
-        np.array_equal(np.float32(getattr(one, f.name)), np.float32(getattr(other, f.name)))
-        for f in dataclasses.fields(one)
-    )
 
 
 def cable_length(

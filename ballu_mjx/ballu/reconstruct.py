@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 from scipy.signal import savgol_coeffs
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu.model import HIPS, KNEES, MOTORS, SIDES
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, HIPS, KNEES, MOTORS, SIDES
 from ballu_mjx.recordings.filters import (
     control_grid,
     interpolate,
@@ -40,7 +40,6 @@ from ballu_mjx.recordings.filters import (
 )
 from ballu_mjx.recordings.motion import Motion, ReconstructionParameters
 from ballu_mjx.recordings.recording import Recording
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
 
 _CHUNK = 512
 """Samples in a compiled call: recordings of any length share one program."""

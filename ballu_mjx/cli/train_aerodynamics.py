@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 import jax
 
-from ballu_mjx.ballu.model import same_actuators
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.reference import stack_motions
@@ -28,6 +27,7 @@ from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.network import recorded_inputs
 from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.residuals.trained import TrainedResidual, write_observed
+from ballu_mjx.robots.model import same_parameters
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import Run, new_folder
 from ballu_mjx.runs.progress import PhaseProgress
@@ -63,7 +63,7 @@ def fit(data: AirData, config: AirConfig) -> int:
     if known is not None and not isinstance(known.model, Aerodynamics):
         raise InputError(f"{data.known}: is no run of --method aerodynamic; give one.")
     prepared = ResidualDataset.read(data)
-    if known is not None and not same_actuators(known.actuators, prepared.identified):
+    if known is not None and not same_parameters(known.actuators, prepared.identified):
         raise InputError(f"{data.known}: belongs to other actuators than {prepared.where}; give --actuators the same.")
     folder = new_folder(data.output, "aerodynamic")
     prepared.announce(folder, data.quick)

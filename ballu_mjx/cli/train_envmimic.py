@@ -22,7 +22,8 @@ from ballu_mjx.residuals.trained import TrainedResidual, write_observed
 from ballu_mjx.rl import distributed, learner, ppo
 from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.rl.training_loop import TrainingLoop, Validation, find_resume_point
-from ballu_mjx.robots.description import RobotDescription, ballu, check_simulates, read_description
+from ballu_mjx.robots.description import RobotDescription, check_simulates, read_description
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import Run, new_folder, read_config
 from ballu_mjx.runs.progress import Progress
@@ -121,7 +122,7 @@ def _description(data: Data) -> RobotDescription:
             raise InputError("--robot-description does not go with --resume, which keeps the robot; leave one out.")
         return run_robot(read_config(data.resume, "envmimic"), data.resume)
     if data.robot_description is None:
-        return ballu()
+        return load_robot()
     found = read_description(data.robot_description)
     check_simulates(found)
     if not data.recordings:

@@ -17,7 +17,6 @@ from jaxtyping import Float
 from ballu_mjx.ballu import plots as ballu_plots
 from ballu_mjx.ballu.actuators_file import read_actuators
 from ballu_mjx.ballu.features import foot_positions
-from ballu_mjx.ballu.model import ActuatorParameters
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.gait import count_steps
 from ballu_mjx.policies.closed_loop import ClosedLoop, Rollout
@@ -29,7 +28,8 @@ from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl import distributed, learner, ppo
 from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.rl.training_loop import TrainingLoop, Validation, find_resume_point
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, ModelParameters
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import Run, new_folder, read_config
 from ballu_mjx.runs.metrics import read_column
@@ -157,14 +157,14 @@ def summary(task: Task, rollout: Rollout, with_residual: bool) -> str:
     return text
 
 
-def _simulator(task: Task, data: Data) -> tuple[ActuatorParameters | None, Path | None]:
+def _simulator(task: Task, data: Data) -> tuple[ModelParameters | None, Path | None]:
     """Actuators (None: nominal) and residual (None: none)."""
     if data.resume is not None:
         for option, given in (("--actuators", data.actuators), ("--residual", data.residual)):
             if given is not None:
                 raise InputError(f"{option} does not go with --resume, which keeps the simulator; leave one out.")
         stored = read_config(data.resume, task.name)
-        return run_actuators(stored, data.resume), run_residual(stored, data.resume)
+        return run_actuators(stored, data.resume, load_robot()), run_residual(stored, data.resume)
     if data.actuators == NOMINAL:
         return None, data.residual
     if data.actuators is not None:

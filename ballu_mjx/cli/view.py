@@ -79,9 +79,9 @@ def load(source: Path) -> list[StoredRollout]:
 
         takes = collect(source).takes
         return takes or read_rollouts(source / ROLLOUT_FILE)
+    from ballu_mjx.ballu.model import load_model
     from ballu_mjx.ballu.reconstruct import reconstruct_ballu
     from ballu_mjx.recordings.csv_format import list_recordings, read_recording
-    from ballu_mjx.robots.model import load_model
 
     recording = read_recording(list_recordings([source])[0])
     if recording.kind != "free":
@@ -237,7 +237,7 @@ def _mujoco(take: StoredRollout) -> None:
     import mujoco
     import mujoco.viewer
 
-    from ballu_mjx.robots.model import load_model
+    from ballu_mjx.ballu.model import load_model
     from ballu_mjx.viz import robot_meshes
 
     model = load_model()

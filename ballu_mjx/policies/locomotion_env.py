@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import functools
 import math
 from typing import Any
 
@@ -21,11 +20,12 @@ import numpy as np
 from brax.envs.base import Env, State
 from jaxtyping import Array, Float
 
-from ballu_mjx.ballu.model import KNEES, MOTORS, SIDES, ActuatorParameters, actuator_fields, standing_qpos
+from ballu_mjx.ballu.model import KNEES, MOTORS, SIDES, standing_qpos
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.tasks import Step, Task
 from ballu_mjx.residuals.trained import TrainedResidual
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.robots.model import CONTROL_TIMESTEP, ModelParameters
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, heading_observation
 from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.sim.step import PhysicsState, state_at
@@ -118,7 +118,7 @@ class LocomotionEnv(Env):
         task: Task,
         config: LocomotionConfig,
         *,
-        actuators: ActuatorParameters | None = None,
+        actuators: ModelParameters | None = None,
         residual: TrainedResidual | None = None,
     ) -> None:
         """`model` is the nominal robot; `actuators` (None: nominal ones) and `residual` (None: none) improve it."""
@@ -276,15 +276,16 @@ class LocomotionEnv(Env):
         return wrench * jnp.exp(-self.config.residual_decay * excess), excess
 
 
-def setting_of(model: mujoco.MjModel, config: LocomotionConfig, actuators: ActuatorParameters | None) -> Setting:
+def setting_of(model: mujoco.MjModel, config: LocomotionConfig, actuators: ModelParameters | None) -> Setting:
     """What tells a simulator from another, as arrays: model fields, starting pose, ranges of what is drawn."""
-    parameters = ActuatorParameters.nominal(model) if actuators is None else actuators
-    improved = load_model(actuators)
+    parameters = load_robot().adapter.nominal_actuators(model) if actuators is None else actuators
+    assert parameters is not None
+    improved = load_robot().load_model(actuators)
     nominal = float(model.geom_friction[model.geom("foot_left").id, 0])
     on = 1.0 if config.domain_randomization else 0.0
     degree = np.pi / 180
     # One program: thirty small ones take half a second of every start.
-    fields = jax.jit(functools.partial(actuator_fields, model))(parameters)
+    fields = jax.jit(lambda parameters: parameters.fields(model))(parameters)
     turn = np.array([config.start_tilt, config.start_tilt, config.start_yaw]) * degree
     return {
         "fields": jax.tree.map(jnp.float32, fields),

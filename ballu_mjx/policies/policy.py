@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ballu_mjx.ballu.model import ActuatorParameters, same_actuators
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.closed_loop import ClosedLoop
 from ballu_mjx.policies.locomotion_env import (
@@ -25,11 +24,12 @@ from ballu_mjx.policies.locomotion_env import (
     setting_name,
 )
 from ballu_mjx.policies.tasks import TASKS, Task
-from ballu_mjx.residuals.run_config import run_actuators, run_residual
+from ballu_mjx.residuals.run_config import run_actuators, run_residual, run_robot
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Inference, Params, PPOConfig
-from ballu_mjx.robots.model import load_model
+from ballu_mjx.robots.model import ModelParameters, same_parameters
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.checkpoints import Which, restore_checkpoint
 from ballu_mjx.runs.folder import read_config, typed_config
 
@@ -51,7 +51,7 @@ class Policy:
 
     task: Task
     config: LocomotionConfig
-    actuators: ActuatorParameters | None
+    actuators: ModelParameters | None
     residual: Path | None
     params: Params
     infer: Inference
@@ -77,7 +77,7 @@ class Policy:
         return Policy(
             task=TASKS[stored["task"]],
             config=config,
-            actuators=run_actuators(stored, folder),
+            actuators=run_actuators(stored, folder, run_robot(stored, folder)),
             residual=run_residual(stored, folder),
             params=params,
             infer=infer,
@@ -109,16 +109,16 @@ class Policy:
 
 
 def make_environment(
-    task: Task, config: LocomotionConfig, actuators: ActuatorParameters | None, residual: Path | None
+    task: Task, config: LocomotionConfig, actuators: ModelParameters | None, residual: Path | None
 ) -> LocomotionEnv:
     """A task's simulator.
 
     **Raises** `InputError` where `residual` holds no residual, or one that belongs to other actuators.
     """
     force = None if residual is None else TrainedResidual.load(residual)
-    if force is not None and not same_actuators(force.actuators, actuators):
+    if force is not None and not same_parameters(force.actuators, actuators):
         raise InputError(
             f"{residual}: its forces were learned beside other actuators; give --actuators the same file, or leave it "
             "out to take the residual's."
         )
-    return LocomotionEnv(load_model(), task, config, actuators=actuators, residual=force)
+    return LocomotionEnv(load_robot().load_model(), task, config, actuators=actuators, residual=force)

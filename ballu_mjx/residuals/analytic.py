@@ -23,7 +23,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.segments import Segments, check_segments, pseudo_huber, segment_errors
 from ballu_mjx.residuals.envmimic import start_spread
 from ballu_mjx.residuals.network import NetworkForces, square_newtons
-from ballu_mjx.robots.description import ballu
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.force_model import BoundForces, add_wrenches, to_wrenches
 from ballu_mjx.sim.linearize import ControlSteps, Linearized, Linearizer
 from ballu_mjx.sim.observation import HISTORY
@@ -137,7 +137,7 @@ def train(
     """
     simulate = simulator(model, forces, linearize.beside)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
-    starts = start_spread(model, ballu())
+    starts = start_spread(model, load_robot())
     update = _updates(forces, wrap, optimizer, spread, starts, config)
     carry = (start, optimizer.init(start), start)
     key = jax.random.key(config.seed)

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING
 
 import mujoco
 
-from ballu_mjx.ballu.actuators_file import find_actuators, read_actuators
-from ballu_mjx.ballu.model import ActuatorParameters, same_actuators
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.errors_table import base_name
 from ballu_mjx.recordings.csv_format import list_bundled, list_recordings, read_recording
@@ -19,7 +17,9 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.run_config import find_recordings, run_actuators
-from ballu_mjx.robots.description import RobotDescription, ballu
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.model import ModelParameters, same_parameters
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import read_config
 
@@ -65,7 +65,7 @@ class ResidualDataset:
 
     files: Mapping[str, list[Path]]
     recordings: Mapping[str, list[Recording]]
-    identified: ActuatorParameters | None
+    identified: ModelParameters | None
     where: str
     """Where the actuators come from, for the user to read."""
     robot: RobotDescription
@@ -79,18 +79,10 @@ class ResidualDataset:
 
         **Raises** `InputError` for recordings or actuators that cannot be used, naming them.
         """
-        description = description or ballu()
+        description = description or load_robot()
         files = _choose(data, earlier)
         recordings = _read(files, description)
-        if description.is_ballu:
-            found = _actuators(data, earlier, files["training"], recordings["training"])
-        elif data.actuators in (None, Path("nominal")):
-            found = None, f"those of {description.model.name}"
-        else:
-            raise InputError(
-                f"{data.actuators}: only actuators of BALLU's legs can be identified, and {description.file} has none; "
-                "leave --actuators out."
-            )
+        found = _actuators(data, earlier, files["training"], recordings["training"], description)
         return ResidualDataset(files, recordings, *found, description)
 
     @property
@@ -98,9 +90,9 @@ class ResidualDataset:
         """What the simulator without residual is called."""
         return base_name(self.identified is not None)
 
-    def check_beside(self, learned_with: ActuatorParameters | None, run: Path | None) -> None:
+    def check_beside(self, learned_with: ModelParameters | None, run: Path | None) -> None:
         """**Raises** `InputError` where the residual of `run` was learned beside other actuators than these."""
-        if not same_actuators(learned_with, self.identified):
+        if not same_parameters(learned_with, self.identified):
             raise InputError(f"{run}: was learned beside other actuators than {self.where}; give --actuators the same.")
 
     @property
@@ -150,21 +142,25 @@ def _choose(data: RecordingsData, earlier: Path | None) -> dict[str, list[Path]]
 
 
 def _actuators(
-    data: RecordingsData, earlier: Path | None, files: Sequence[Path], recordings: Sequence[Recording]
-) -> tuple[ActuatorParameters | None, str]:
+    data: RecordingsData,
+    earlier: Path | None,
+    files: Sequence[Path],
+    recordings: Sequence[Recording],
+    description: RobotDescription,
+) -> tuple[ModelParameters | None, str]:
     """The simulator's actuators (None: nominal), and where they come from, for the user to read."""
     if data.actuators is None and earlier is not None:
-        identified = run_actuators(read_config(earlier, "envmimic"), earlier)
+        identified = run_actuators(read_config(earlier, "envmimic"), earlier, description)
         return identified, f"{'nominal' if identified is None else 'identified'}, as before"
     if data.actuators == Path("nominal"):
         return None, "nominal"
     robots = {recording.robot for recording in recordings}
     path = data.actuators
     if path is None and len(robots) == 1:
-        path = find_actuators(files, next(iter(robots)))
+        path = description.adapter.find_actuators(files, next(iter(robots)))
     if path is None:
         return None, "nominal (the recordings' robot has no actuators.json; `train sysid` identifies one from a sweep)"
-    robot, identified = read_actuators(path)
+    robot, identified = description.adapter.read_actuators(description, path)
     if robots != {robot}:
         raise InputError(
             f"{path}: these are the actuators of {robot!r}, the recordings are of {', '.join(sorted(robots))}; give "

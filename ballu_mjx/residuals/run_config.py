@@ -12,17 +12,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-try:
-    import fcntl
-except ImportError:  # Windows, where runs are not locked
-    fcntl = None
-
-
-from ballu_mjx.ballu.actuators_file import actuators_from_json, actuators_to_json
-from ballu_mjx.ballu.model import ActuatorParameters
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.robots.description import RobotDescription, ballu, read_description
-from ballu_mjx.robots.model import assets
+from ballu_mjx.robots.description import RobotDescription, read_description
+from ballu_mjx.robots.model import ModelParameters, assets
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.folder import config_section
 from ballu_mjx.runs.layout import CONFIG_FILE, RUN_FORMAT
 
@@ -31,25 +24,25 @@ _LONGEST_PATH = 300
 _PACKAGES = ("ballu-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "optimistix", "numpy")
 
 
-def run_actuators(config: Mapping[str, Any], folder: Path) -> ActuatorParameters | None:
+def run_actuators(config: Mapping[str, Any], folder: Path, robot: RobotDescription) -> ModelParameters | None:
     """The actuators of a run's simulator; None for the nominal ones.
 
     **Raises** `InputError` where they are damaged.
     """
     stored = config_section(config, "actuators", folder)
-    return None if stored is None else actuators_from_json(stored, folder / CONFIG_FILE)
+    return None if stored is None else robot.adapter.actuators_from_json(robot, stored, folder / CONFIG_FILE)
 
 
 def run_robot(config: Mapping[str, Any], folder: Path) -> RobotDescription:
-    """The robot of a run; BALLU where it names none.
+    """The robot of a run; the default one where it names none.
 
     **Raises** `InputError` where its description is gone, has changed, or its model has.
     """
     stored = config.get("robot_description")
     if stored is None:
-        return ballu()
+        return load_robot()
     mend = f"restore it: {folder / CONFIG_FILE} names it"
-    there, path = False, Path(stored["path"])
+    there, path = False, _installed(stored["path"])
     with contextlib.suppress(OSError, ValueError):  # a name that no file can have
         there = path.is_file()
     if not there:
@@ -74,20 +67,20 @@ def describe_run(
     sections: Mapping[str, Any],
     recordings: Mapping[str, Sequence[Path]],
     devices: Sequence[str],
-    identified: ActuatorParameters | None = None,
+    identified: ModelParameters | None = None,
     description: RobotDescription | None = None,
 ) -> dict[str, Any]:
     """What `config.json` holds: `sections` are configurations (dataclasses) by name, `recordings` files by use,
-    `identified` the simulator's actuators where they are not the nominal ones, `description` the robot where it is not
-    BALLU."""
-    other = description is not None and description.sha256 != ballu().sha256
+    `identified` the simulator's actuators where they are not the nominal ones, `description` the robot (None: the
+    default one)."""
+    description = description or load_robot()
     return {
         "format": RUN_FORMAT,
         "task": task,
         **{name: dataclasses.asdict(section) for name, section in sections.items()},
-        "actuators": None if identified is None else actuators_to_json(identified),
+        "actuators": None if identified is None else description.adapter.actuators_to_json(identified),
         "recordings": {use: [describe_recording(path) for path in paths] for use, paths in recordings.items()},
-        **({"robot_description": _described(description)} if description is not None and other else {}),
+        "robot_description": _described(description),
         "starts": [
             {
                 "time": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
@@ -102,10 +95,7 @@ def describe_run(
 
 def describe_recording(path: Path) -> dict[str, str]:
     """Where a recording lies (bundled ones independently of the installation), and the SHA-256 of its content."""
-    bundled = (assets() / "recordings").resolve()
-    absolute = path.resolve()
-    inside = absolute.is_relative_to(bundled)
-    place = _BUNDLED + absolute.relative_to(bundled).as_posix() if inside else str(absolute)
+    place = _portable(path, assets() / "recordings")
     return {"path": place, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
@@ -140,7 +130,18 @@ def find_recordings(config: Mapping[str, Any], use: str, folder: Path) -> list[P
 
 
 def _described(description: RobotDescription) -> dict[str, str]:
-    return {"path": str(description.file.resolve()), "sha256": description.sha256}
+    return {"path": _portable(description.file, assets()), "sha256": description.sha256}
+
+
+def _portable(path: Path, bundled: Path) -> str:
+    """Return where a file lies; of a bundled one, independently of the installation."""
+    absolute, bundled = path.resolve(), bundled.resolve()
+    return _BUNDLED + absolute.relative_to(bundled).as_posix() if absolute.is_relative_to(bundled) else str(absolute)
+
+
+def _installed(stored: str) -> Path:
+    """Return the inverse of `_portable`, of what comes with the package."""
+    return assets() / stored.removeprefix(_BUNDLED) if stored.startswith(_BUNDLED) else Path(stored)
 
 
 def _cut(place: str) -> str:

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ballu_mjx.ballu.model import ActuatorParameters
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.residuals.aerodynamics import AERODYNAMICS_FILE, Aerodynamics, read_air_parameters
@@ -20,7 +19,9 @@ from ballu_mjx.residuals.network import NetworkForces, num_inputs, num_loads
 from ballu_mjx.residuals.run_config import run_actuators, run_residual, run_robot
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
-from ballu_mjx.robots.description import RobotDescription, ballu
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.model import ModelParameters
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.checkpoints import restore_checkpoint
 from ballu_mjx.runs.folder import Run, read_config, typed_config
 from ballu_mjx.sim.force_model import BoundForces, Fields, ForceModel, SumOfForces
@@ -53,7 +54,7 @@ class TrainedResidual:
     params: Any
     observed: tuple[Float[np.ndarray, " inputs"], Float[np.ndarray, " inputs"]]
     step: int
-    actuators: ActuatorParameters | None
+    actuators: ModelParameters | None
 
     @staticmethod
     def load(
@@ -68,7 +69,7 @@ class TrainedResidual:
 
         **Raises** `InputError` where `folder` is no such run, is of another robot or has no such checkpoint.
         """
-        description = description or ballu()
+        description = description or load_robot()
         folder = Path(folder)
         beside |= {folder.resolve()}
         stored = read_config(folder, *RESIDUAL_TASKS)
@@ -77,7 +78,7 @@ class TrainedResidual:
             raise InputError(
                 f"{folder}: is of the robot {own.name}, not of {description.name}; give one of the same robot."
             )
-        identified = run_actuators(stored, folder)
+        identified = run_actuators(stored, folder, own)
         if stored["task"] == "aerodynamic":
             step, model = 0, Aerodynamics(description.load_model(identified))
             params = read_air_parameters(folder / AERODYNAMICS_FILE)

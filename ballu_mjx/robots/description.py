@@ -7,11 +7,18 @@ JSON with the keys
 - `tracked`: the site whose place and orientation are followed; forces act on its body, at the centre of mass;
 - `points`: further sites whose places are measured and observed; may be empty;
 - `commands`: the model's actuators, all of them in its order, each under the name that follows `command_` in
-  recordings; `ctrlrange` is 0 to 1;
+  recordings: `"left": "servo_left"`, or, for an actuator without a `ctrlrange`,
+  `"left": {"actuator": "servo_left", "range": [-1, 1]}`. Commands are in the actuators' own units;
+- `control_timestep` (optional): seconds between two commands, a multiple of the model's time step; 0.05 without it;
 - `joints` (optional): hinges (rad) and slides (m) that recordings may hold, as columns of their names;
+- `oriented_points` (optional): points whose orientation recordings may hold too;
 - `held` (optional): joints that no noise on starting states moves;
-- `built_like` (optional): "BALLU", for a model with BALLU's legs and their names. What is tied to these (actuators and
-  their identification, the base's pitch, servos in the reconstruction) works with such models only.
+- `keyframe` (optional): the model's keyframe that simulations and inverse kinematics start from;
+- `limits` (optional): what no recording of this robot exceeds: `height` ([low, high], m), `distance` (m),
+  `speed` (m/s), `angle` (rad or m);
+- `mirror` (optional): for a robot that is its own mirror image about the xz plane, pairs of names (points, commands,
+  joints) that change places, as `{"foot_left": "foot_right"}`; {} where nothing does;
+- `adapter` (optional): `module:Class`, a `robots.adapter.RobotAdapter` with what only this robot has.
 
 Joints are one free joint at the root or none, then hinges and slides. A robot without a free joint is anchored: what it
 sees and how it is pushed are told in the world's frame, for where it stands and how it is turned then matter.
@@ -20,31 +27,56 @@ sees and how it is pushed are told in the world's frame, for where it stands and
 from __future__ import annotations
 
 import dataclasses
-import functools
 import hashlib
+import importlib
 import re
 import textwrap
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
 import mujoco
 from mujoco import mjx
 
-from ballu_mjx.ballu.model import JOINTS, SIDES, ActuatorParameters
 from ballu_mjx.common import files
-from ballu_mjx.common.errors import InputError
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, assets, load_model
+from ballu_mjx.common.errors import InputError, is_number
+from ballu_mjx.robots.adapter import RobotAdapter
+from ballu_mjx.robots.model import ModelParameters, load_model
 
 DESCRIPTION_FORMAT = "ballu-robot/1"
-BALLU = "BALLU"
-"""The value of `built_like`."""
+DEFAULT_CONTROL_TIMESTEP = 0.05
+"""Seconds between two commands (20 Hz) where a description does not say."""
 _MANDATORY = ("format", "name", "model", "tracked", "points", "commands")
-_OPTIONAL = ("joints", "held", "built_like")
+_OPTIONAL = (
+    "control_timestep",
+    "joints",
+    "oriented_points",
+    "held",
+    "keyframe",
+    "limits",
+    "mirror",
+    "adapter",
+)
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 _LONGEST = 60
+_LONGEST_STEP = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
+class Limits:
+    """What no recording of a robot exceeds; None: no limit."""
+
+    height: tuple[float, float] | None = None
+    """m, along z."""
+    distance: float | None = None
+    """m, along x and y."""
+    speed: float | None = None
+    """m/s, between two samples along an axis."""
+    angle: float | None = None
+    """rad of a hinge, m of a slide."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class RobotDescription:
     """What `read` found; keys of the format are explained at the module's head."""
 
@@ -58,12 +90,29 @@ class RobotDescription:
     """Their names in recordings, in the order of the model's actuators."""
     joints: tuple[str, ...]
     held: tuple[str, ...]
-    is_ballu: bool
-    """Whether it has BALLU's legs."""
     anchored: bool
     """Whether the model has no free joint."""
     sha256: str
     """Of description and MJCF file."""
+    command_ranges: tuple[tuple[float, float], ...]
+    """Smallest and largest value of each command, in its actuator's units."""
+    control_timestep: float = DEFAULT_CONTROL_TIMESTEP
+    """Seconds between two commands."""
+    oriented_points: tuple[str, ...] = ()
+    """Points whose orientation recordings may hold."""
+    keyframe: str | None = None
+    """The model's keyframe to start from."""
+    limits: Limits = Limits()
+    """What no recording exceeds."""
+    mirror: Mapping[str, str] | None = None
+    """Names that change places in the mirror image about the xz plane, both ways; None: the robot is not symmetric."""
+    adapter: RobotAdapter = dataclasses.field(default_factory=RobotAdapter)
+    """What only this robot has."""
+
+    @property
+    def is_ballu(self) -> bool:
+        """Whether it has BALLU's legs."""
+        return type(self.adapter) is not RobotAdapter
 
     @property
     def features(self) -> int:
@@ -74,19 +123,14 @@ class RobotDescription:
     @property
     def columns(self) -> tuple[str, ...]:
         """Columns that its recordings may have, in order."""
-        tracked, points = self.tracked, (f"{point}_{axis}" for point in self.points for axis in "xyz")
-        places = (*(f"{tracked}_{axis}" for axis in "xyz"), *(f"{tracked}_q{axis}" for axis in "wxyz"), *points)
+        points = (f"{point}_{axis}" for point in self.points for axis in "xyz")
+        turns = (f"{site}_q{axis}" for site in (self.tracked, *self.oriented_points) for axis in "wxyz")
+        places = (*(f"{self.tracked}_{axis}" for axis in "xyz"), *turns, *points)
         return ("time", *(f"command_{name}" for name in self.commands), *places, *self.joints)
 
-    def load_model(self, actuators: ActuatorParameters | None = None) -> mujoco.MjModel:
-        """The robot for C MuJoCo; `actuators` for one with BALLU's legs only."""
-        return load_model(actuators, self.model)
-
-
-@functools.cache
-def ballu() -> RobotDescription:
-    """The robot that comes with the package."""
-    return read_description(assets() / "ballu.robot.json")
+    def load_model(self, actuators: ModelParameters | None = None) -> mujoco.MjModel:
+        """Return the robot for C MuJoCo: the nominal one, or with identified actuators."""
+        return load_model(self.model, actuators)
 
 
 def read_description(path: Path | str) -> RobotDescription:
@@ -110,30 +154,52 @@ def read_description(path: Path | str) -> RobotDescription:
     commands = content["commands"]
     if not isinstance(commands, dict) or not commands:
         _refuse(path, f'"commands" is {_shown(commands)}', 'write {"name in recordings": "actuator", ...}')
-    driven = {_name(path, "commands", key): value for key, value in commands.items()}
-    like = content.get("built_like")
-    if like not in (None, BALLU):
-        _refuse(path, f'"built_like" is {_shown(like)}', f'write "{BALLU}" for a robot with its legs, or leave it out')
+    driven = {_name(path, "commands", key): _actuator(path, key, value) for key, value in commands.items()}
+    step = content.get("control_timestep", DEFAULT_CONTROL_TIMESTEP)
+    if not is_number(step) or not 0 < step <= _LONGEST_STEP:
+        _refuse(path, f'"control_timestep" is {_shown(step)}', f"write seconds, above 0 and at most {_LONGEST_STEP:g}")
     place = path.parent / file
     model = _load(path, place)
-    _check_joints(path, model)
+    _check_joints(path, model, step)
     _check_sites(path, model, tracked, points)
-    _check_actuators(path, model, driven)
+    ranges = _check_actuators(path, model, driven)
     for key, names in (("joints", joints), ("held", held)):
         for joint in names:
             index = _find(path, model, mujoco.mjtObj.mjOBJ_JOINT, key, joint)
             if model.jnt_type[index] == mujoco.mjtJoint.mjJNT_FREE:
                 _refuse(path, f'"{key}" names {_shown(joint)}, a free joint', "name hinges and slides only")
+    for point in (oriented := _names(path, "oriented_points", content.get("oriented_points", []))):
+        if point not in points:
+            _refuse(path, f'"oriented_points" names {_shown(point)}, none of "points"', "name some of these")
+    keyframe = content.get("keyframe")
+    if keyframe is not None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, _text(path, content, "keyframe")) < 0:
+        own = ", ".join(model.key(index).name for index in range(model.nkey)) or "none"
+        _refuse(path, f'"keyframe" is {_shown(keyframe)}, no keyframe of the model', f"there are {own}")
     digest = hashlib.sha256(path.read_bytes() + b"\0" + place.read_bytes()).hexdigest()
-    anchored = model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE
     found = RobotDescription(
-        path, name, place, tracked, points, tuple(driven), joints, held, like == BALLU, bool(anchored), digest
+        file=path,
+        name=name,
+        model=place,
+        tracked=tracked,
+        points=points,
+        commands=tuple(driven),
+        joints=joints,
+        held=held,
+        anchored=bool(model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE),
+        sha256=digest,
+        command_ranges=ranges,
+        control_timestep=float(step),
+        oriented_points=oriented,
+        keyframe=keyframe,
+        limits=_limits(path, content.get("limits", {})),
+        mirror=_mirror(path, content.get("mirror"), (*points, *driven, *joints)),
+        adapter=_adapter(path, content.get("adapter")),
     )
     twice = [column for number, column in enumerate(found.columns) if column in found.columns[:number]]
     if twice:
         _refuse(path, f"recordings would have two columns {twice[0]}", "name sites, commands and joints apart")
-    if found.is_ballu:
-        _check_legs(path, model, found)
+    if (problem := found.adapter.check(found, model)) is not None:
+        _refuse(path, f'"adapter" is {_shown(content["adapter"])}, but {problem}', "leave it out, or rename the parts")
     return found
 
 
@@ -162,7 +228,7 @@ def _load(path: Path, place: Path) -> mujoco.MjModel:
         _refuse(path, f'"model" is {_shown(place.name)}, which MuJoCo cannot read ({_said(error)})', mend)
 
 
-def _check_joints(path: Path, model: mujoco.MjModel) -> None:
+def _check_joints(path: Path, model: mujoco.MjModel, control_timestep: float) -> None:
     kinds = mujoco.mjtJoint
     if not model.njnt:
         _refuse(path, '"model" has no joints', "give a robot that moves")
@@ -171,10 +237,10 @@ def _check_joints(path: Path, model: mujoco.MjModel) -> None:
             called = {int(kinds.mjJNT_BALL): "a ball joint", int(kinds.mjJNT_FREE): "a second free joint"}[int(kind)]
             mend = "make it of hinges and slides; one free joint may come first"
             _refuse(path, f'"model" has {called}, {_shown(model.joint(index).name)}', mend)
-    count = CONTROL_TIMESTEP / model.opt.timestep
+    count = control_timestep / model.opt.timestep
     if abs(count - round(count)) > 1e-6 or count < 1:
         problem = f'"model" has a time step of {model.opt.timestep:g} s'
-        _refuse(path, problem, f"it must divide the control step of {CONTROL_TIMESTEP:g} s")
+        _refuse(path, problem, f"it must divide the control step of {control_timestep:g} s")
 
 
 def _check_sites(path: Path, model: mujoco.MjModel, tracked: str, points: tuple[str, ...]) -> None:
@@ -189,39 +255,87 @@ def _check_sites(path: Path, model: mujoco.MjModel, tracked: str, points: tuple[
             _refuse(path, problem, "give sites below one body of the world")
 
 
-def _check_actuators(path: Path, model: mujoco.MjModel, driven: dict[str, Any]) -> None:
+def _check_actuators(
+    path: Path, model: mujoco.MjModel, driven: Mapping[str, tuple[str, tuple[float, float] | None]]
+) -> tuple[tuple[float, float], ...]:
+    """Return the range of each command."""
     own = [model.actuator(index).name for index in range(model.nu)]
-    if list(driven.values()) != own:
-        problem = f'"commands" has the actuators {_shown(list(driven.values()))}'
+    named = [name for name, _ in driven.values()]
+    if named != own:
+        problem = f'"commands" has the actuators {_shown(named)}'
         _refuse(path, problem, f"name the model's, all in its order: {textwrap.shorten(', '.join(own), 200) or 'none'}")
     if model.na:
         _refuse(path, '"model" has actuators with states of their own', "give actuators without activation")
-    for index, name in enumerate(own):
-        if not model.actuator_ctrllimited[index] or tuple(model.actuator_ctrlrange[index]) != (0.0, 1.0):
-            _refuse(
-                path, f'the model\'s actuator {_shown(name)} has no ctrlrange "0 1"', "give it one, and a gain for it"
-            )
-
-
-def _check_legs(path: Path, model: mujoco.MjModel, found: RobotDescription) -> None:
-    mend = 'leave "built_like" out, or name joints, sites and actuators as BALLU\'s'
-    hinges = tuple(model.joint(index).name for index in range(1, model.njnt))
-    legs = [f"{kind}_{side}" for kind in ("femur", "tibia", "arm") for side in SIDES]
-    sites = [f"cable_{part}_{side}" for part in ("femur", "arm") for side in SIDES]
-    kinds = mujoco.mjtObj
-    needed = [(kinds.mjOBJ_BODY, name) for name in ("base", "balloon", *legs)]
-    needed += [(kinds.mjOBJ_SITE, name) for name in sites]
-    needed += [(kinds.mjOBJ_TENDON, f"cable_{side}") for side in SIDES]
-    needed += [(kinds.mjOBJ_ACTUATOR, f"servo_{side}") for side in SIDES]
-    missing = [name for kind, name in needed if mujoco.mj_name2id(model, kind, name) < 0]
-    own = (found.tracked, found.points, found.commands, found.joints)
-    feet = ("base", "foot_left", "foot_right")
-    angles = ("motor_left", "motor_right", "knee_left", "knee_right")
-    if found.anchored or hinges != JOINTS or missing or own != ("balloon", feet, SIDES, angles):
-        _refuse(path, f'"built_like" is "{BALLU}", but it has other {missing[0] if missing else "names"}', mend)
+    ranges = []
+    for index, (name, given) in enumerate(driven.values()):
+        if given is None and not model.actuator_ctrllimited[index]:
+            fix = f'give it one, or write {{"actuator": "{name}", "range": [low, high]}} in "commands"'
+            _refuse(path, f"the model's actuator {_shown(name)} has no ctrlrange", fix)
+        low, high = given or map(float, model.actuator_ctrlrange[index])
+        if not low < high:
+            _refuse(path, f"the range of {_shown(name)} is {low:g} to {high:g}", "give the smaller number first")
+        ranges.append((low, high))
+    return tuple(ranges)
 
 
 # ---- values ----
+
+
+def _actuator(path: Path, key: str, value: Any) -> tuple[str, tuple[float, float] | None]:
+    """Return the actuator of a command, and its range where the description gives one."""
+    if isinstance(value, str):
+        return value, None
+    if isinstance(value, dict) and set(value) == {"actuator", "range"} and isinstance(value["actuator"], str):
+        return value["actuator"], _pair(path, f"range of {key}", value["range"])
+    _refuse(path, f'"commands" has {_shown(value)} for {key}', 'write the actuator\'s name, or {"actuator", "range"}')
+
+
+def _pair(path: Path, key: str, value: Any) -> tuple[float, float]:
+    if isinstance(value, list) and len(value) == 2 and all(map(is_number, value)) and value[0] < value[1]:
+        return float(value[0]), float(value[1])
+    _refuse(path, f'"{key}" is {_shown(value)}', "write two numbers, the smaller first")
+
+
+def _limits(path: Path, value: Any) -> Limits:
+    names = [field.name for field in dataclasses.fields(Limits)]
+    if not isinstance(value, dict) or not set(value) <= set(names):
+        _refuse(path, f'"limits" is {_shown(value)}', f"write an object with some of {', '.join(names)}")
+    found: dict[str, Any] = {}
+    for key, limit in value.items():
+        if key == "height":
+            found[key] = _pair(path, "limits: height", limit)
+        elif not is_number(limit) or limit <= 0:
+            _refuse(path, f'"limits: {key}" is {_shown(limit)}', "write a number above 0")
+        else:
+            found[key] = float(limit)
+    return Limits(**found)
+
+
+def _mirror(path: Path, value: Any, known: tuple[str, ...]) -> Mapping[str, str] | None:
+    if value is None:
+        return None
+    if not isinstance(value, dict) or not all(isinstance(each, str) for each in value.values()):
+        _refuse(path, f'"mirror" is {_shown(value)}', 'write pairs such as {"foot_left": "foot_right"}')
+    pairs = value | {other: name for name, other in value.items()}
+    unknown = [name for name in pairs if name not in known]
+    if unknown:
+        _refuse(path, f'"mirror" names {_shown(unknown[0])}', "name points, commands and joints of the description")
+    if len(pairs) != 2 * len(value):
+        _refuse(path, '"mirror" names one twice', "name each once")
+    return pairs
+
+
+def _adapter(path: Path, value: Any) -> RobotAdapter:
+    if value is None:
+        return RobotAdapter()
+    module, _, name = value.partition(":") if isinstance(value, str) else ("", "", "")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        _refuse(path, f'"adapter" is {_shown(value)}, which cannot be imported ({_said(error)})', "write module:Class")
+    if not (isinstance(found, type) and issubclass(found, RobotAdapter)):
+        _refuse(path, f'"adapter" is {_shown(value)}, no RobotAdapter', "derive it from ballu_mjx.robots.adapter")
+    return found()
 
 
 def _find(path: Path, model: mujoco.MjModel, kind: mujoco.mjtObj, key: str, name: str) -> int:

@@ -9,6 +9,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -35,15 +36,22 @@ def assets() -> Path:
     return packaged if packaged.is_dir() else packaged.parents[1] / "assets"
 
 
-def load_model(actuators: ModelParameters | None = None, file: Path | None = None) -> mujoco.MjModel:
-    """The robot for C MuJoCo: the nominal one ("vanilla"), or with identified actuators ("vanilla+sysid").
-
-    `file` is the MJCF of another one.
-    """
-    model = mujoco.MjModel.from_xml_path(str(file or assets() / "ballu.xml"))
-    if actuators is not None:
-        set_fields(model, actuators.fields(model))
+def load_model(file: Path, parameters: ModelParameters | None = None) -> mujoco.MjModel:
+    """Return the model in an MJCF file, nominal or with identified parameters."""
+    model = mujoco.MjModel.from_xml_path(str(file))
+    if parameters is not None:
+        set_fields(model, parameters.fields(model))
     return model
+
+
+def same_parameters(one: ModelParameters | None, other: ModelParameters | None) -> bool:
+    """Return whether two simulators have equal parameters (None: nominal)."""
+    if one is None or other is None:
+        return one is other
+    leaves = [jax.tree.leaves(each) for each in (one, other)]
+    return type(one) is type(other) and all(
+        np.array_equal(np.float32(a), np.float32(b)) for a, b in zip(*leaves, strict=True)
+    )
 
 
 def with_fields(model: mjx.Model, fields: dict[str, Array]) -> mjx.Model:

@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from mujoco import mjx
 
-from ballu_mjx.robots.description import RobotDescription, ballu
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import with_fields
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import observe_features
 from ballu_mjx.sim.step import PhysicsState, control_step, count_substeps, load_state, make_data, put_model, state_at
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
@@ -26,7 +27,7 @@ class Simulator:
 
     def __init__(self, model: mujoco.MjModel, robot: RobotDescription | None = None) -> None:
         """`robot` says what is what in `model`; None: it is BALLU."""
-        robot = robot or ballu()
+        robot = robot or load_robot()
         self.robot = robot
         self.nv = model.nv
         self.model = put_model(model)

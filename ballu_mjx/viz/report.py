@@ -315,8 +315,7 @@ def _curve_rows(curves: Sequence[Curve]) -> _Rows:
 
 def _take_rows(take: StoredRollout) -> _Rows:
     """x, y and yaw of each robot's balloon, the residual force, the commands."""
-    from ballu_mjx.ballu.model import SIDES
-    from ballu_mjx.robots.model import load_model
+    from ballu_mjx.ballu.model import SIDES, load_model
     from ballu_mjx.viz import robot_meshes
     from ballu_mjx.viz.style import SIDE_COLOURS, label_of, unwrapped
 

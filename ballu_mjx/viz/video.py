@@ -43,7 +43,7 @@ def write(path: Path, take: StoredRollout) -> None:
         ) from None
     import mujoco
 
-    from ballu_mjx.robots.model import load_model
+    from ballu_mjx.ballu.model import load_model
     from ballu_mjx.viz import robot_meshes
 
     model = load_model()

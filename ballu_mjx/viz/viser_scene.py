@@ -14,8 +14,8 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
+from ballu_mjx.ballu.model import load_model
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.robots.model import load_model
 from ballu_mjx.runs.rollout_file import StoredRollout
 from ballu_mjx.viz import robot_meshes
 from ballu_mjx.viz.style import colour_of, label_of

@@ -37,11 +37,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, read_evaluation
 from ballu_mjx.recordings.csv_format import write_recording
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription, read_description
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
 from ballu_mjx.runs.checkpoints import list_checkpoints
 from ballu_mjx.viz.style import COLOURS, LABELS
 

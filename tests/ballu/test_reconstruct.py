@@ -9,7 +9,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu.model import SIDES, standing_qpos
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model, standing_qpos
 from ballu_mjx.ballu.reconstruct import (
     _differentiate,
     _fit_chunk,
@@ -21,7 +21,6 @@ from ballu_mjx.ballu.reconstruct import (
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion, ReconstructionParameters, add_capture_noise
 from ballu_mjx.recordings.recording import Recording
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 
 DURATION = 10.0
 STEP = 0.01

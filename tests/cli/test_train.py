@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
-from ballu_mjx.ballu.model import CABLE_SLACK
+from ballu_mjx.ballu.model import CABLE_SLACK, ActuatorParameters
 from ballu_mjx.ballu.sweep import read_sweep
 from ballu_mjx.cli import evaluate, train, train_envmimic
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_recording
@@ -28,8 +28,8 @@ from ballu_mjx.residuals.dataset import _choose, _read
 from ballu_mjx.residuals.run_config import describe_recording
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl.ppo import PPOConfig
-from ballu_mjx.robots.description import ballu
 from ballu_mjx.robots.model import assets
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.checkpoints import restore_checkpoint
 from ballu_mjx.runs.folder import Run
 from ballu_mjx.runs.layout import RUN_FORMAT
@@ -189,7 +189,9 @@ def test_envmimic_takes_identified_actuators_from_beside_the_recordings(trained:
     stored = json.loads((trained / "config.json").read_text())["actuators"]
     assert stored == json.loads((trained.parent / "data" / ACTUATORS_FILE).read_text())["parameters"]
     loaded = TrainedResidual.load(trained, "last").actuators
-    assert loaded is not None and np.asarray(loaded.motor_gain) == pytest.approx(stored["motor_gain"])
+    assert isinstance(loaded, ActuatorParameters) and np.asarray(loaded.motor_gain) == pytest.approx(
+        stored["motor_gain"]
+    )
     assert "vanilla+sysid" in (trained / "evaluation.txt").read_text()
 
 
@@ -229,7 +231,7 @@ def test_damaged_actuators_are_refused(tmp_path: Path, folder: Path, change: dic
 def test_quick_validates_on_own_recordings_where_there_are_no_others(folder: Path):
     files = _choose(train_envmimic.Data(recordings=(folder / "data",), quick=True), None)
     assert len(files["training"]) == 2 and files["validation"] == files["training"] == files["test"]
-    _read(files, ballu())
+    _read(files, load_robot())
 
 
 def test_help_explains_every_option(folder: Path):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.evaluation.gait import count_steps
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
 
 TIME = np.arange(200) * CONTROL_TIMESTEP
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from jaxtyping import Float
 
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.evaluation.transfer import (
     PAPER_TURNING,
     PAPER_WALKING,
@@ -23,7 +24,6 @@ from ballu_mjx.evaluation.transfer import (
     turning_table,
     walking_table,
 )
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
 
 SETTINGS = ("vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic")
 

@@ -483,6 +483,7 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
     from ballu_mjx.residuals.run_config import describe_run, find_recordings, run_actuators, run_residual
     from ballu_mjx.rl import ppo
     from ballu_mjx.rl.ppo import PPOConfig
+    from ballu_mjx.robots.registry import load_robot
     from ballu_mjx.runs.checkpoints import last_checkpoint
     from ballu_mjx.runs.folder import Run, read_config, typed_config
     from ballu_mjx.runs.metrics import read_metrics
@@ -534,7 +535,7 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
             typed_config(EnvMimicConfig, config, "env", folder, check_envmimic_config),
             typed_config(PPOConfig, config, "ppo", folder, ppo.check_values),
         ]
-        run_actuators(config, folder)
+        run_actuators(config, folder, load_robot())
         run_residual(config, folder)
         find_recordings(config, "training", folder)
         report.collect(folder)

@@ -4,5 +4,6 @@ from ballu_mjx.common import runtime
 
 runtime.prepare()
 
-import ballu_mjx.session  # noqa: E402, F401
 import follower  # noqa: E402, F401
+
+import ballu_mjx.rl.training_loop  # noqa: E402, F401

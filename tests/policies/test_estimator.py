@@ -13,11 +13,10 @@ import pytest
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu.model import SIDES, standing_qpos
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model, standing_qpos
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.policies.deploy import estimator
 from ballu_mjx.policies.deploy.estimator import Capture, PolicyController, estimate
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 from ballu_mjx.sim.observation import euler_angles
 from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.sim.step import state_at

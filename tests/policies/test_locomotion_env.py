@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ballu_mjx.ballu.features import foot_positions
-from ballu_mjx.ballu.model import KNEES, MOTORS, ActuatorParameters, standing_qpos
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, KNEES, MOTORS, ActuatorParameters, load_model, standing_qpos
 from ballu_mjx.policies.closed_loop import ClosedLoop
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, LocomotionEnv, locomotion_observation, setting_of
 from ballu_mjx.policies.tasks import TASKS, Step
@@ -20,7 +20,6 @@ from ballu_mjx.residuals.trained import MARGIN, TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.learner import Learner
 from ballu_mjx.rl.ppo import PPOConfig
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 from ballu_mjx.sim.observation import HISTORY, heading_rotation
 from ballu_mjx.sim.step import state_at
 

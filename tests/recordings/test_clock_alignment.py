@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 
 from ballu_mjx.ballu import gaits
 from ballu_mjx.ballu.leg_response import measured_response, nominal_response
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.cli.record import LEAST_CONFIDENCE
 from ballu_mjx.recordings.clock_alignment import align
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.recording import Recording
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
 
 
 def wave(time: np.ndarray) -> np.ndarray:

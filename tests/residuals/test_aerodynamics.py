@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from ballu_mjx.ballu.model import standing_qpos
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.aerodynamics import (
@@ -26,7 +26,7 @@ from ballu_mjx.residuals.aerodynamics import (
     rotation,
 )
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, Optimum, at_whole_delay, identify_air
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model, set_fields
+from ballu_mjx.robots.model import set_fields
 from ballu_mjx.sim.observation import HISTORY, heading_rotation
 
 MODEL = load_model()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu.model import ActuatorParameters, standing_qpos
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, ActuatorParameters, load_model, standing_qpos
 from ballu_mjx.evaluation.errors_table import Errors, Evaluation, mean_by_group
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.motion import Motion
@@ -18,7 +18,6 @@ from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, reward_ter
 from ballu_mjx.residuals.network import NetworkForces, world_loads
 from ballu_mjx.rl.learner import Learner
 from ballu_mjx.rl.ppo import PPOConfig
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 from ballu_mjx.sim.observation import HISTORY, euler_angles, heading_observation, heading_rotation
 from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.sim.step import state_at

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from ballu_mjx.ballu.model import ActuatorParameters, standing_qpos
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, ActuatorParameters, load_model, standing_qpos
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
@@ -25,15 +25,14 @@ from ballu_mjx.residuals.supervised import SupervisedConfig, check_supervised_co
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
-from ballu_mjx.robots.description import ballu
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.linearize import ControlSteps, Linearizer
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.sim.step import balloon_id, count_substeps
 
 MODEL = load_model()
-BALLU = ballu()
+BALLU = load_robot()
 PUSH = np.array([0.02, -0.03, 0.015])
 """N, world."""
 TWIST = np.array([1e-3, -1.5e-3, 2e-3])
@@ -41,7 +40,7 @@ TWIST = np.array([1e-3, -1.5e-3, 2e-3])
 CLOSE = 0.05 * float(np.linalg.norm(PUSH))
 CLOSE_TWIST = 0.05 * float(np.linalg.norm(TWIST))
 SECONDS = 0.5
-INPUTS = num_inputs(EnvMimicConfig(), ballu())
+INPUTS = num_inputs(EnvMimicConfig(), load_robot())
 NETWORK = PPOConfig(policy_layers=(16,), value_layers=(4,))
 WRENCH = EnvMimicConfig(forces="wrench")
 ACTIONS = num_loads(WRENCH, BALLU)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.cli import train
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
@@ -22,8 +23,8 @@ from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import COLUMNS, Recording
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.residuals.network import world_loads
-from ballu_mjx.robots.description import ballu, read_description
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
+from ballu_mjx.robots.description import read_description
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, heading_observation
 from ballu_mjx.sim.step import PhysicsState, count_substeps
 
@@ -75,9 +76,8 @@ def copy(tmp_path: Path) -> Path:
 
 
 def test_ballu_s_description_says_what_its_recordings_hold():
-    description = ballu()
-    optional = {*COLUMNS["base_quaternion"]}
-    assert set(description.columns) == {name for names in COLUMNS.values() for name in names} - optional
+    description = load_robot()
+    assert set(description.columns) == {name for names in COLUMNS.values() for name in names}
     assert description.is_ballu and not description.anchored
 
 
@@ -121,11 +121,22 @@ SWIVEL = '<joint name="swivel" axis="0 0 1" stiffness="0.008"/>'
         (in_json(commands={"left": "propeller_right", "right": "propeller_left"}), "in its order"),
         (in_json(commands=[]), '"commands" is'),
         (in_json(joints=["knee"]), "no joint of the model"),
-        (in_json(built_like="SpotMini"), '"built_like" is'),
-        (in_json(built_like="BALLU"), 'leave "built_like" out'),
+        (in_json(adapter="SpotMini"), 'which cannot be imported'),
+        (in_json(adapter="pathlib:Path"), "no RobotAdapter"),
+        (in_json(adapter="ballu_mjx.ballu.adapter:Ballu"), "other base than BALLU; leave it out"),
+        (in_json(control_timestep=0.0), '"control_timestep" is 0.0'),
+        (in_json(control_timestep=0.015), "divide the control step of 0.015 s"),
+        (in_json(keyframe="hover"), "no keyframe of the model; there are none"),
+        (in_json(oriented_points=["balloon"]), 'none of "points"'),
+        (in_json(limits={"height": [3, 1]}), '"limits: height" is'),
+        (in_json(limits={"speed": -1}), "above 0"),
+        (in_json(limits={"depth": 1}), "some of height, distance, speed, angle"),
+        (in_json(mirror={"left": "rihgt"}), '"mirror" names'),
+        (in_json(mirror={"left": "right", "right": "left"}), "one twice"),
+        (in_json(commands={"left": {"actuator": "propeller_left"}, "right": "propeller_right"}), "for left"),
         (in_model(SWIVEL, '<joint name="swivel" type="ball"/>'), "a ball joint"),
         (in_model('timestep="0.01"', 'timestep="0.015"'), "divide the control step"),
-        (in_model('ctrlrange="0 1"', 'ctrlrange="-1 1"'), "ctrlrange"),
+        (in_model('ctrlrange="0 1"', 'ctrllimited="false"'), "has no ctrlrange"),
         (in_model('<body name="lower"', '<site name="tripod"/><body name="lower"'), ""),
     ],
 )  # fmt: skip

@@ -22,10 +22,11 @@ from ballu_mjx.ballu.model import (
     buoyancy_fields,
     buoyancy_ratio,
     cable_length,
+    load_model,
     standing_qpos,
 )
-from ballu_mjx.robots.description import ballu
-from ballu_mjx.robots.model import load_model, set_fields, with_fields
+from ballu_mjx.robots.model import set_fields, with_fields
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.step import balloon_id, control_step, count_substeps, make_data, put_model, state_at
 
 CABLES = [f"cable_{side}" for side in SIDES]
@@ -116,7 +117,7 @@ def test_mjx_follows_c_mujoco_over_a_control_step() -> None:
     """The same step in float32 and in double precision, under a wrench on the balloon and forces at base and feet."""
     s, model = samples(), load_model()
     count, balloon = count_substeps(model), balloon_id(model)
-    points = tuple(model.site(name).id for name in ballu().points)
+    points = tuple(model.site(name).id for name in load_robot().points)
     bodies = (balloon, *model.site_bodyid[list(points)].tolist())
     mjx_model, template = put_model(model), make_data(model)
 

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from ballu_mjx.ballu.model import standing_qpos
-from ballu_mjx.robots.model import load_model
+from ballu_mjx.ballu.model import load_model, standing_qpos
 from ballu_mjx.sim import vmap_last
 from ballu_mjx.sim.step import PhysicsState, balloon_id, control_step, make_data, put_model, state_at
 from ballu_mjx.sim.vmap_last import nested_vmap, vmap, vmap_with_trailing_batch

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ballu_mjx.ballu.model import standing_qpos
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.cli import pipeline, train_envmimic, train_policy, view
 from ballu_mjx.cli.report import main
 from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation
@@ -33,7 +33,6 @@ from ballu_mjx.recordings.csv_format import list_bundled
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.rl.ppo import PPOConfig
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, load_model
 from ballu_mjx.runs.folder import Run
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, read_rollouts, write_rollouts
 from ballu_mjx.viz import report, robot_meshes, video, viser_scene

@@ -21,16 +21,18 @@ from scipy.spatial.transform import Rotation
 
 from ballu_mjx.ballu.model import (
     CABLE_SLACK,
+    CONTROL_TIMESTEP,
     SERVO_RANGE,
     SIDES,
     ActuatorParameters,
     actuator_fields,
+    load_model,
     standing_qpos,
     suspend,
 )
 from ballu_mjx.policies.deploy.estimator import Capture, Controller
 from ballu_mjx.recordings.recording import Recording
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, assets, load_model, set_fields
+from ballu_mjx.robots.model import assets, set_fields
 
 PHYSICS_TIMESTEP = 5e-4
 CAPTURE_TIMESTEP = 0.01

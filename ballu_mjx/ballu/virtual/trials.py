@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from ballu_mjx.ballu import plots as ballu_plots
 from ballu_mjx.ballu.features import foot_positions
+from ballu_mjx.ballu.model import load_model
 from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import TrialConditions, VirtualRobot
@@ -19,7 +20,6 @@ from ballu_mjx.policies.deploy.estimator import PolicyController
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.robots.model import load_model
 from ballu_mjx.sim.simulator import Simulator
 
 
