@@ -17,6 +17,7 @@ from mujoco import mjx
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import with_fields
 from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.derived_constants import ReferencePose, with_derived_constants
 from ballu_mjx.sim.observation import observe_features
 from ballu_mjx.sim.step import PhysicsState, control_step, count_substeps, load_state, make_data, put_model, state_at
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
@@ -32,6 +33,7 @@ class Simulator:
         self.nv = model.nv
         self.model = put_model(model)
         self._template = make_data(model)
+        self._pose = ReferencePose.of(model)
         self._count = count_substeps(model)
         sites = [model.site(name).id for name in (robot.tracked, *robot.points)]
         self._root = int(model.body_rootid[model.site_bodyid[sites[0]]])
@@ -39,9 +41,9 @@ class Simulator:
         self._masses = jnp.asarray(model.body_mass / model.body_mass.sum())
 
     def altered(self, fields: Mapping[str, Array]) -> Simulator:
-        """The same with other model fields, which may be traced. The centre of mass stays that of the model's own
-        masses: air that the robot drags along is no part of it."""
-        return self.of(with_fields(self.model, dict(fields)))
+        """The same with other model fields, which may be traced, and the constants that follow from them. The centre of
+        mass stays that of the model's own masses: air that the robot drags along is no part of it."""
+        return self.of(with_fields(self.model, with_derived_constants(self._pose, self.model, fields)))
 
     def of(self, model: mjx.Model) -> Simulator:
         """The same of another model of this structure, which may be traced."""
