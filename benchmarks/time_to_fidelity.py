@@ -116,20 +116,24 @@ def vanilla_ratio(folder: str) -> float:
     """A run's best validation error as a share of vanilla's, over its error as a share of its base's."""
     runtime.prepare()
     from ballu_mjx.ballu.model import load_model
-    from ballu_mjx.ballu.reconstruct import reconstruct_ballu
     from ballu_mjx.evaluation.errors_table import Evaluation
     from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
     from ballu_mjx.recordings.csv_format import read_recording
+    from ballu_mjx.recordings.reconstruct import reconstruct
     from ballu_mjx.residuals.run_config import find_recordings
     from ballu_mjx.residuals.trained import TrainedResidual
+    from ballu_mjx.robots.registry import load_robot
     from ballu_mjx.runs.folder import read_config
 
     path = Path(folder)
     trained = TrainedResidual.load(path, "best")
-    recordings = [read_recording(each) for each in find_recordings(read_config(path, "envmimic"), "validation", path)]
+    recordings = [
+        read_recording(each, load_robot())
+        for each in find_recordings(read_config(path, "envmimic"), "validation", path)
+    ]
 
     def evaluate(model: Any) -> Evaluation:
-        motions = [reconstruct_ballu(each, model) for each in recordings]
+        motions = [reconstruct(each, model, load_robot()) for each in recordings]
         return OpenLoopEvaluator(model, motions, trained.model)(trained.params)
 
     best = evaluate(load_model(trained.actuators))

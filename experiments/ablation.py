@@ -30,16 +30,17 @@ import numpy as np
 
 from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
 from ballu_mjx.ballu.model import load_model
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.residuals.network import NetworkForces
 from ballu_mjx.rl import learner, ppo
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.model import assets
+from ballu_mjx.robots.registry import load_robot
 
 # %% [markdown]
 # ## The rows
@@ -165,7 +166,10 @@ def main() -> None:
     _, identified = read_actuators(assets() / "recordings" / ACTUATORS_FILE)
     model = load_model(identified)
     read = {"training": training, "validation": validation}
-    motions = {use: [reconstruct_ballu(read_recording(path), model) for path in paths] for use, paths in read.items()}
+    motions = {
+        use: [reconstruct(read_recording(path, load_robot()), model, load_robot()) for path in paths]
+        for use, paths in read.items()
+    }
     options.output.mkdir(parents=True, exist_ok=True)
     results: dict[str, list[list[dict[str, Any]]]] = {}
     for seed in seeds:

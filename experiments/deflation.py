@@ -41,7 +41,6 @@ import numpy as np
 from bundled_recordings import Job
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.cli import train_aerodynamics
@@ -49,9 +48,11 @@ from ballu_mjx.evaluation.errors_table import Evaluation, base_name
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.robots.registry import load_robot
 
 # %% [markdown]
 # ## Recordings: the same commands, with all of the lift and with less
@@ -70,8 +71,8 @@ def recorded(job: Job, virtual: VirtualRobot, trial: int, folder: Path) -> Recor
     )
     path = folder / job.split / f"{job.name}.csv.gz"
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_recording(taken, path)
-    return read_recording(path)  # which fills the gaps of hidden markers
+    write_recording(taken, path, load_robot())
+    return read_recording(path, load_robot())  # which fills the gaps of hidden markers
 
 
 def lift(buoyancy: float) -> float:
@@ -121,7 +122,7 @@ def main() -> None:
     def motions(virtual: VirtualRobot, jobs: Sequence[Job], first: int, name: str) -> list[Motion]:
         folder = options.output / name
         recordings = [recorded(job, virtual, first + number, folder) for number, job in enumerate(jobs)]
-        return [reconstruct_ballu(each, model) for each in recordings]
+        return [reconstruct(each, model, load_robot()) for each in recordings]
 
     tests = tests[:1] if options.quick else tests
     before, after = motions(full, tests, 1000, "before"), motions(deflated, tests, 1000, "after")
