@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ballu_mjx.ballu.recordings import make_recording
 from ballu_mjx.ballu.sweep import read_sweep
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
@@ -27,9 +28,8 @@ def made(
     since = np.tile(np.arange(count) / rate, len(levels))[:, None]
     before = np.repeat(np.concatenate([levels[:1], levels[:-1]]), count, axis=0)
     angle = 0.5 + command + (before - command) * np.exp(-since / settle)
-    return Recording(
-        name="sweep", kind="suspended", robot=robot, time=time, command=command, balloon_position=None,
-        balloon_quaternion=None, base_position=None, foot_position=None, motor=angle, knee=angle + 0.1,
+    return make_recording(
+        name="sweep", kind="suspended", robot=robot, time=time, command=command, motor=angle, knee=angle + 0.1,
     )  # fmt: skip
 
 
