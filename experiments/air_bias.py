@@ -27,6 +27,8 @@ import argparse
 import dataclasses
 
 from ballu_mjx.common import runtime
+from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.simulator import Simulator
 
 runtime.prepare()
 
@@ -40,7 +42,6 @@ from ballu_mjx.cli import train_aerodynamics
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.robots.model import assets
-from ballu_mjx.robots.registry import load_robot
 
 NONE = (0.0, 0.0)
 FRICTION = {"knee_friction": NONE, "motor_friction": NONE}
@@ -75,7 +76,7 @@ def main() -> None:
         folder = options.output / name.replace(" ", "-")
         gaits = [deflation.recorded(job, legs, 2000 + number, folder) for number, job in enumerate(training)]
         motions = [reconstruct(gait, model, load_robot()) for gait in gaits]
-        fit = identify_air(model, motions, config)
+        fit = identify_air(Simulator(load_robot(), model=model), motions, config)
         air, error = fit.parameters, fit.standard_errors
         lines.append(
             f"| {name} | {float(air.lift) * 1e3:.0f} ({float(error.lift) * 1e3:.0f}) | "

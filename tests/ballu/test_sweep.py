@@ -55,8 +55,9 @@ def test_a_jittered_clock_from_any_origin_changes_nothing() -> None:
     steady = made(both(), rate=200.0)
     rng = np.random.default_rng(0)
     kept = np.sort(rng.choice(len(steady.time), round(0.7 * len(steady.time)), replace=False))
-    values = {name: getattr(steady, name)[kept] for name in ("time", "command", "motor", "knee")}
-    jittered = dataclasses.replace(steady, **{**values, "time": values["time"] + 1234.5})
+    angles = {joint: angle[kept] for joint, angle in steady.joint_angles.items()}
+    time, command = steady.time[kept] + 1234.5, steady.command[kept]
+    jittered = dataclasses.replace(steady, time=time, command=command, joint_angles=angles)
     expected, sweep = read_sweep({PATH: steady}), read_sweep({PATH: jittered})
     assert sweep.settled == pytest.approx(expected.settled, abs=1e-3)
     length = min(len(sweep.motion), len(expected.motion))

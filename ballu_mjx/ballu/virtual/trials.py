@@ -49,7 +49,7 @@ def run_trials(
 
     model = load_model(policy.actuators)
     motions = [reconstruct(recording, model, load_robot()) for recording in recordings]
-    reference, com = stack_motions(Simulator(model), motions)
+    reference, com = stack_motions(Simulator(load_robot(), model=model), motions)
     starts = [np.stack([getattr(motion, name)[0] for motion in motions]) for name in ("qpos", "qvel")]
     rollout = (loop or policy.closed_loop())(policy.params, starts[0], starts[1], len(motions[0].command))
     recorded = np.asarray(com), np.asarray(reference.features)
