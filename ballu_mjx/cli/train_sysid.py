@@ -16,6 +16,7 @@ from ballu_mjx.ballu.sweep import read_sweep
 from ballu_mjx.ballu.sysid_report import identification_details, identification_table
 from ballu_mjx.recordings.csv_format import list_bundled, list_recordings, read_recording
 from ballu_mjx.residuals.run_config import describe_recording, describe_run
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import Run, new_folder
 from ballu_mjx.runs.progress import PhaseProgress
@@ -45,7 +46,7 @@ def fit(data: SweepData, config: IdentificationConfig) -> int:
     check_identification_config(config)
     loggers.check(data.wandb)
     paths = list_recordings(data.recordings) if data.recordings else list_bundled("suspended")
-    sweep = read_sweep({path: read_recording(path) for path in paths}, levels=data.levels)
+    sweep = read_sweep({path: read_recording(path, load_robot()) for path in paths}, levels=data.levels)
     folder = new_folder(data.output, "sysid")
     print(f"Run folder: {folder}")
     print(f"  sweep of {sweep.robot}: {len(sweep.command)} holds, {', '.join(path.name for path in paths)}")
