@@ -24,6 +24,7 @@ from ballu_mjx.rl.learner import Learner, TrainingState
 from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.runs.checkpoints import Checkpoint, last_checkpoint, list_checkpoints
 from ballu_mjx.runs.folder import read_config, typed_config
+from ballu_mjx.runs.metrics import read_metrics
 from ballu_mjx.runs.progress import Progress
 from ballu_mjx.runs.record import TrainingRecord
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE
@@ -141,6 +142,14 @@ def _made_with(config: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _seconds_until(folder: Path, step: int) -> float:
+    """Return the wall time that a run trained for up to a control step, its validations included."""
+    found = 0.0
+    for row in read_metrics(folder, step):
+        found = row.get("seconds") or found + (row.get("validation_seconds") or 0.0)
+    return found
+
+
 class Watchdog:
     """Tells the user when no training step has finished for long: a context manager around the training.
 
@@ -229,6 +238,7 @@ class TrainingLoop:
         self._validated: float | None = None
         self._warned = False
         self._started = time.perf_counter()
+        self._seconds_before = 0.0
         folder = None if run is None else run.folder
         self._watchdog = Watchdog(folder or Path("RUN"))
 
@@ -242,6 +252,8 @@ class TrainingLoop:
         if start.checkpoint is not None:
             self._saved = start.checkpoint.step
             self._due = start.checkpoint.notes.get("due", self._saved)
+            if self._run is not None and self._run.folder is not None:
+                self._seconds_before = _seconds_until(self._run.folder, self._saved)
         try:
             watched = contextlib.nullcontext() if self._progress is None else self._watchdog
             with self._interrupts_noted(), watched:
@@ -280,7 +292,8 @@ class TrainingLoop:
                 file=sys.stderr,
             )
         if metrics:
-            self._log(step, metrics | {"seconds": time.perf_counter() - self._started})
+            seconds = self._seconds_before + time.perf_counter() - self._started
+            self._log(step, metrics | {"seconds": seconds})
         if self._due is None or step - self._due >= self._every:
             self._keep(step, state)
         if metrics and self._progress is not None:
