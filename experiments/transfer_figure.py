@@ -31,7 +31,7 @@ def options(description: str, task: str) -> tuple[pipeline.Options, bool]:
     """The command line of a table's script, and whether nothing but the figure is asked for."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="trainings of every policy (0 1 2)")
-    parser.add_argument("--robot", type=int, default=0, help="which virtual robot stands in for the hardware (0)")
+    parser.add_argument("--robot-seed", type=int, default=0, help="which virtual robot stands in for the hardware (0)")
     parser.add_argument(
         "--output", type=Path, help=f"folder of `train all`'s stages ({OUTPUT}, or {QUICK_OUTPUT} under --quick)"
     )
@@ -49,7 +49,7 @@ def options(description: str, task: str) -> tuple[pipeline.Options, bool]:
     output = given.output or (QUICK_OUTPUT if given.quick else OUTPUT)
     chosen = pipeline.Options(
         output=output,
-        robot=given.robot,
+        robot_seed=given.robot_seed,
         seeds=tuple(given.seeds),
         tasks=(task,),  # pyright: ignore[reportArgumentType]  # a literal at every call
         quick=given.quick,

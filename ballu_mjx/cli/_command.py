@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -11,8 +12,15 @@ from typing import Any
 
 import tyro
 
-from ballu_mjx.runs.folder import read_config, typed_config
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.residuals.run_config import run_robot
+from ballu_mjx.rl.training_loop import TrainingInterrupted
+from ballu_mjx.robots.description import RobotDescription, check_simulates
+from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
+from ballu_mjx.runs.folder import Run, read_config, typed_config
+from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
 
+PROGRAM = "python -m ballu_mjx.train"
 _KEPT = ("validate_every", "keep_every", "wandb")
 """Options of a command's data that a run keeps."""
 
@@ -84,9 +92,7 @@ def _parser(name: str, command: TrainCommand, sections: Mapping[str, Any] | None
     return made
 
 
-def run_command(
-    commands: Mapping[str, TrainCommand], arguments: Sequence[str] | None, program: str, description: str
-) -> int:
+def run_command(commands: Mapping[str, TrainCommand], arguments: Sequence[str] | None, description: str) -> int:
     """Parse the arguments (None: the process's own), and run the command that they name; returns its exit status.
 
     Defaults that depend on other options, --resume and --quick, are settled by a second parse.
@@ -98,7 +104,7 @@ def run_command(
         return tyro.extras.subcommand_cli_from_dict(
             parsers(commands, sections),
             args=arguments,
-            prog=program,
+            prog=PROGRAM,
             description=description,
             config=(tyro.conf.OmitArgPrefixes,),
         )
@@ -108,12 +114,60 @@ def run_command(
     implied = command.implied(name, getattr(given, "data", None))
     if implied is not None:
         given = parse({name: implied})
-    return command.run(**{section: getattr(given, section) for section in command.sections})
+    try:
+        return command.run(**{section: getattr(given, section) for section in command.sections})
+    except TrainingInterrupted as stopped:
+        return stopped.status
+
+
+def load_chosen_robot(robot: str | None, resume: Path | None = None, task: str | None = None) -> RobotDescription:
+    """Return the robot of the option --robot (None: the default one), or that of the run of a `task` that goes on.
+
+    **Raises** `InputError` where there is no such robot, or both are given.
+    """
+    if resume is not None and task is not None:
+        if robot is not None:
+            raise InputError("--robot does not go with --resume, which keeps the robot; leave one out.")
+        return run_robot(read_config(resume, task), resume)
+    found = load_robot(DEFAULT_ROBOT if robot is None else robot)
+    check_simulates(found)
+    return found
+
+
+@dataclasses.dataclass
+class Written:
+    """Where a command writes to."""
+
+    folder: Path | None = None
 
 
 @contextlib.contextmanager
-def written_to(folder: Path) -> Iterator[None]:
-    """Say at the end where everything lies, and how long it took."""
-    started = time.perf_counter()
-    yield
-    print(f"\nWritten to {folder}. {time.perf_counter() - started:.0f} s in all.")
+def written_to(*, first: bool = True) -> Iterator[Written]:
+    """Say at the end where everything lies, and how long it took; `first` is whether this process writes.
+
+    The command sets `folder` of what it gets.
+    """
+    started, written = time.perf_counter(), Written()
+    yield written
+    if first:
+        print(f"\nWritten to {written.folder}. {time.perf_counter() - started:.0f} s in all.")
+
+
+@contextlib.contextmanager
+def open_run(
+    folder: Path, content: Mapping[str, Any], resumed_at: int | None, wandb: str | None, *, first: bool = True
+) -> Iterator[TrainingRecord]:
+    """Open the run's folder for a training: in memory alone where another process writes; see `Run`.
+
+    A training that is interrupted is told how to go on.
+    """
+    if not first:
+        yield MemoryRecord(content)
+        return
+    with Run(folder, content, resumed_at=resumed_at, wandb=wandb) as run:
+        print("Compiling: about a minute the first time ...", flush=True)
+        try:
+            yield run
+        except TrainingInterrupted:
+            print(f"To go on: {PROGRAM} {content['task']} --resume {folder}", file=sys.stderr)
+            raise

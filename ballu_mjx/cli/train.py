@@ -14,7 +14,6 @@ from ballu_mjx.common import runtime
 if TYPE_CHECKING:
     from ballu_mjx.cli._command import TrainCommand
 
-_PROGRAM = "python -m ballu_mjx.train"
 _SIGNALS = 128
 """Statuses from here on are of processes that were interrupted, all of them together."""
 
@@ -27,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from ballu_mjx.cli._command import run_command
 
         description = "Learn from recordings of the robot. Each subcommand explains its options with --help."
-        return run_command(_commands(), arguments, _PROGRAM, description)
+        return run_command(_commands(), arguments, description)
 
     status = runtime.exit_status(run, arguments)
     if 0 < status < _SIGNALS and "jax" in sys.modules:

@@ -57,7 +57,8 @@ def train(data: SweepData, fit: IdentificationConfig) -> int:
     def report(stage: str, iteration: int, steps: int, loss: float) -> None:
         run.log(stages.update(stage, iteration, steps, loss), {stage: loss})
 
-    with written_to(folder), Run(folder, content, wandb=data.wandb) as run:
+    with written_to() as written, Run(folder, content, wandb=data.wandb) as run:
+        written.folder = folder
         print(f"Run folder: {folder}")
         print(f"  sweeps: {', '.join(path.name for path in paths)}")
         found = identify_actuators(recordings, robot, fit, levels=data.levels, progress=report)

@@ -46,8 +46,8 @@ def fit_supervised(
 
     **Arguments**
 
-    - `simulator`: what is to follow the motions. Where it has a residual already, the forces learn what that leaves, and
-      the result is both together.
+    - `simulator`: what is to follow the motions. Where it has a residual already, the forces learn what that leaves,
+      and the result is both together.
     - `motions`: recorded ones.
     - `config`: how to label and regress; None: the defaults.
     - `forces`: what the network pushes with.
@@ -201,7 +201,9 @@ class _Analytic(_Fit):
     def learn(self) -> None:
         """Gradients through the simulation; the validation is open loop."""
         setup, config = self.setup, self.config
-        cut = cut_segments(setup.simulator.simulator, setup.motions.training, config.window_seconds, config.interval_seconds)
+        cut = cut_segments(
+            setup.simulator.simulator, setup.motions.training, config.window_seconds, config.interval_seconds
+        )
         total = config.rounds * config.updates
 
         def report(step: int, policy: Any, metrics: dict[str, float]) -> None:

@@ -117,7 +117,9 @@ def test_a_cache_that_cannot_be_written_stops_nobody(tmp_path: Path) -> None:
 
 
 def test_importing_the_module_settles_nothing(tmp_path: Path) -> None:
-    code = "import os, sys; from ballu_mjx.common import runtime; print('jax' in sys.modules, os.environ.get('XLA_FLAGS'))"
+    code = (
+        "import os, sys; from ballu_mjx.common import runtime; print('jax' in sys.modules, os.environ.get('XLA_FLAGS'))"
+    )
     assert python(code, tmp_path).stdout == "False None\n"
 
 
