@@ -9,6 +9,7 @@ import subprocess
 import sys
 import typing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,12 +56,9 @@ def motions(robot: bm.RobotDescription) -> list[bm.Motion]:
 def shortened(recording: bm.Recording, seconds: float) -> bm.Recording:
     """Return the first seconds of a recording."""
     rows = recording.time - recording.time[0] <= seconds
-    return bm.Recording(
-        **{
-            field.name: value[rows] if isinstance(value := getattr(recording, field.name), np.ndarray) else value
-            for field in dataclasses.fields(recording)
-        }
-    )
+    values = {field.name: getattr(recording, field.name) for field in dataclasses.fields(recording)}
+    cut: dict[str, Any] = {name: value[rows] for name, value in values.items() if isinstance(value, np.ndarray)}
+    return dataclasses.replace(recording, **cut)
 
 
 @pytest.fixture(scope="module")

@@ -80,8 +80,7 @@ def train_policy(
     check_policy_options(config, ppo_config, keep_every)
     chosen = _task(task) if isinstance(task, str) else task
     augmented = simulator.with_residual(None)
-    actuators = augmented.simulator.actuators
-    residual = TrainedResidual.of(augmented)
+    actuators, residual = augmented.actuators, TrainedResidual.of(augmented)
     env = environment_of(augmented.robot, chosen, config, actuators, residual)
     infer = ppo.make_inference(env.observation_size, env.action_size, ppo_config)
     loop = ClosedLoop(env, infer)
@@ -94,7 +93,17 @@ def train_policy(
     tells_best = Validation(measure, VALIDATION_METRIC, greatest=True)
     TrainingLoop(record, progress, keep_every, tells_best).train(env, ppo_config, start, record.config)
     step, tree = record.best()
-    return Policy(chosen, config, augmented.robot, actuators, residual, ppo.from_tree(tree), infer, step, loop)
+    return Policy(
+        task=chosen,
+        config=config,
+        robot=augmented.robot,
+        actuators=actuators,
+        residual=residual,
+        params=ppo.from_tree(tree),
+        infer=infer,
+        step=step,
+        loop=loop,
+    )
 
 
 def check_policy_options(config: LocomotionConfig, ppo_config: PPOConfig, keep_every: int) -> None:

@@ -21,8 +21,7 @@ from ballu_mjx.residuals.aerodynamics import (
     air_parameters_to_json,
 )
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, check_air_config, identify_air
-from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.residuals.network import recorded_inputs
+from ballu_mjx.residuals.network import ForceNetworkConfig, recorded_inputs
 from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
 from ballu_mjx.robots.model import same_parameters
 from ballu_mjx.runs.progress import PhaseProgress
@@ -76,13 +75,13 @@ def fit_aerodynamics(
         record.log(done, {"cost": cost, "seconds": time.perf_counter() - began})
 
     values = None if known is None else known.params
-    found = identify_air(simulator, motions, config, report, known=values, free=free)
+    found = identify_air(simulator, motions, config, report, fixed_from=values, free=free)
     if progress is not None:
         progress.close()
     record.log(done, {"control_steps": found.control_steps})
     record.write(AERODYNAMICS_FILE, json.dumps(air_details(found), indent=2) + "\n")
     reference, _ = stack_motions(simulator, motions)
-    inputs = np.asarray(recorded_inputs(reference, EnvMimicConfig(), simulator.robot.anchored))
+    inputs = np.asarray(recorded_inputs(reference, ForceNetworkConfig(), simulator.robot))
     write_observed(record, inputs)
     return TrainedResidual(
         Aerodynamics(simulator.robot, simulator.mj_model),

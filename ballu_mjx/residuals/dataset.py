@@ -79,10 +79,10 @@ class ResidualDataset:
         found = _actuators(data, earlier, files["training"], recordings["training"], robot)
         return ResidualDataset(files, recordings, *found, robot)
 
-    def check_beside(self, learned_with: ModelParameters | None, run: Path | None) -> None:
-        """**Raises** `InputError` where the residual of `run` was learned beside other actuators than these."""
+    def check_base_residual(self, learned_with: ModelParameters | None, run: Path | None) -> None:
+        """**Raises** `InputError` where the base residual, of `run`, was learned with other actuators than these."""
         if not same_parameters(learned_with, self.identified):
-            raise InputError(f"{run}: was learned beside other actuators than {self.where}; give --actuators the same.")
+            raise InputError(f"{run}: was learned with other actuators than {self.where}; give --actuators the same.")
 
     def reconstruct(self, model: mujoco.MjModel) -> dict[str, list[Motion]]:
         """Return states at the control rate, by use; uses of the same files share a list."""

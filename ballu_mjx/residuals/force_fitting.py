@@ -245,9 +245,9 @@ def _fit(
     record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run
     env, network = network_sections(forces, config.seed)
     reference, _ = stack_motions(plain, motions.training)
-    inputs = np.asarray(recorded_inputs(reference, env, robot.anchored))
+    inputs = np.asarray(recorded_inputs(reference, env, robot))
     sizes = {ppo.STATE: (inputs.shape[1],)}, num_loads(env, robot), network
-    network_forces = NetworkForces(env, ppo.make_inference(*sizes), None, name, robot.anchored)
+    network_forces = NetworkForces(env, robot, ppo.make_inference(*sizes), None, name)
     start = ppo.initial_policy(inputs, sizes[1], network)
     model, all_params = add_to_base(augmented.residual, network_forces)
     measure = (evaluators or Evaluators(plain)).of(model, motions.validation)
