@@ -76,7 +76,7 @@ def _evaluate(options: Options) -> None:
     print("Compiling: half a minute the first time ...", flush=True)
     simulator = Simulator(robot, loaded.actuators)
     model = simulator.mj_model
-    motions = [reconstruct(recording, model, robot) for recording in recordings]
+    motions = [reconstruct(recording, robot, model) for recording in recordings]
     evaluator = Evaluators(simulator).of(loaded.model, motions)
     result = (
         evaluator(loaded.params)
@@ -86,7 +86,7 @@ def _evaluate(options: Options) -> None:
     print(result.table())
     if options.noise_floor:
         shaken = [add_capture_noise(recording, seed=number) for number, recording in enumerate(recordings)]
-        floor = evaluator.of_starts([reconstruct(each, model, robot) for each in shaken], loaded.params)
+        floor = evaluator.of_starts([reconstruct(each, robot, model) for each in shaken], loaded.params)
         print(f"\n{noise_floor(floor, result.residual)}")
 
 

@@ -67,11 +67,9 @@ class TrainedResidual:
         bound = simulator.residual
         if bound is None:
             return None
-        observed = (
-            (np.array(-_ANYTHING, np.float32), np.array(_ANYTHING, np.float32))
-            if bound.observed is None
-            else bound.observed
-        )
+        observed = bound.observed
+        if observed is None:
+            observed = np.array(-_ANYTHING, np.float32), np.array(_ANYTHING, np.float32)
         return TrainedResidual(bound.model, bound.params, observed, 0, simulator.actuators)
 
     @staticmethod

@@ -67,7 +67,7 @@ def flight() -> tuple[Recording, np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def motion(flight: tuple[Recording, np.ndarray, np.ndarray]) -> Motion:
-    return reconstruct(flight[0], DESCRIPTION.load_model(), DESCRIPTION)
+    return reconstruct(flight[0], DESCRIPTION)
 
 
 @pytest.fixture
@@ -282,12 +282,12 @@ def test_a_free_robot_is_recovered_wherever_it_is(tmp_path: Path):
         points={"knot": seen[:, 1]},
         angles={"bend_x": 0.2 * np.sin(3 * time), "bend_y": np.full(len(time), 0.1), "swivel": 0.3 * time},
     )  # fmt: skip
-    motion = reconstruct(made, model, found)
+    motion = reconstruct(made, found, model)
     np.testing.assert_allclose(motion.qvel[10, :3], [0.3, 0, 0], atol=0.02)
     np.testing.assert_allclose(motion.qvel[10, -1], 0.3, atol=0.02)
     np.testing.assert_allclose(motion.qpos[10, :3], [1.15, -2, 0.5], atol=0.005)
     with pytest.raises(InputError, match="nothing that is measured shows the joint"):
-        reconstruct(dataclasses.replace(made, angles={}), model, open_ended)
+        reconstruct(dataclasses.replace(made, angles={}), open_ended, model)
 
 
 def test_a_joint_that_nothing_shows_is_named(flight: tuple[Recording, np.ndarray, np.ndarray], copy: Path):
@@ -296,13 +296,13 @@ def test_a_joint_that_nothing_shows_is_named(flight: tuple[Recording, np.ndarray
     in_model(site, f'<body><joint name="fan"/>{inertia}</body>{site}')(copy)
     hidden = read_description(copy)
     with pytest.raises(InputError, match="joint fan"):
-        reconstruct(flight[0], hidden.load_model(), hidden)
+        reconstruct(flight[0], hidden)
 
 
 def test_places_that_are_not_the_model_s_are_refused(flight: tuple[Recording, np.ndarray, np.ndarray]):
     moved = {"knot": flight[0].points["knot"] + [0.0, 0.0, 0.4]}
     with pytest.raises(InputError, match="from where the model can have it"):
-        reconstruct(dataclasses.replace(flight[0], points=moved), DESCRIPTION.load_model(), DESCRIPTION)
+        reconstruct(dataclasses.replace(flight[0], points=moved), DESCRIPTION)
 
 
 @pytest.fixture(scope="module")
