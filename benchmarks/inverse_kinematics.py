@@ -187,7 +187,7 @@ def divergence(model: mujoco.MjModel, walked: Walk, motion: Motion) -> tuple[np.
 def crude(model: mujoco.MjModel, motion: Motion, recording: Recording) -> Motion:
     """`motion` with velocities from neighbouring samples, at the recording's rate, of unfiltered positions."""
     unfiltered = ReconstructionParameters(position_window=0.05, rate_window=0.05, rotation_window=0.05)
-    return dataclasses.replace(motion, qvel=reconstruct(recording, model, load_robot(), unfiltered).qvel)
+    return dataclasses.replace(motion, qvel=reconstruct(recording, load_robot(), model, unfiltered).qvel)
 
 
 def spread(values: np.ndarray, digits: int = 2) -> str:
@@ -234,10 +234,10 @@ def main(quick: bool = False, duration: float = 20.0, seed: int = 0) -> None:
     for case, level, base in (("recorded base", noise, True), ("no base", noise, False), ("exact", None, False)):
         recordings = [capture(model, walked, level, base, seed + i) for i, walked in enumerate(walks)]
         start = time.perf_counter()
-        motions = [reconstruct(recordings[0], model, load_robot())]
+        motions = [reconstruct(recordings[0], load_robot(), model)]
         first = time.perf_counter() - start
         start = time.perf_counter()
-        motions = [reconstruct(recording, model, load_robot()) for recording in recordings]
+        motions = [reconstruct(recording, load_robot(), model) for recording in recordings]
         each = (time.perf_counter() - start) / len(recordings)
         print(f"{case}: {first:.1f} s for the first recording, {each:.1f} s for each after", flush=True)
         runs[case] = walks, motions
@@ -253,7 +253,7 @@ def main(quick: bool = False, duration: float = 20.0, seed: int = 0) -> None:
         recording = virtual_robot.record(stand_in, trial, virtual_robot.open_loop(commands), duration, "stand-in")
         filled = fill(dataclasses.replace(recording, orientations={}))
         qpos, qvel = virtual_robot.record_truth(stand_in, trial, virtual_robot.open_loop(commands), duration)
-        seen.append(reconstruct(filled, model, load_robot()))
+        seen.append(reconstruct(filled, load_robot(), model))
         true.append(Walk(walked.command, qpos, qvel))
     runs["stand-in"] = true, seen
 

@@ -131,7 +131,7 @@ def main() -> None:
     for split in ("validation", "test", "training"):
         paths = list_bundled(split)
         for path in paths[:1] if arguments.quick else paths:
-            motion = reconstruct(read_recording(path, load_robot()), vanilla, load_robot())
+            motion = reconstruct(read_recording(path, load_robot()), load_robot(), vanilla)
             (p, y), (q, z) = horizon_errors(vanilla, motion), horizon_errors(known, motion)
             wide.append((p >= 0.2, y >= 10.0, q / p, z / y))
             print(f"{split + ' ' + motion.name:>26}{p:>10.3f} m{y:>6.1f}{q:>12.3f} m{z:>6.1f}")

@@ -82,7 +82,7 @@ def measure(environments: int, episode_seconds: float | None, recordings: int | 
     model = load_model()
     paths = list_bundled("training")
     paths = list(itertools.islice(itertools.cycle(paths), recordings or len(paths)))
-    known = {path: reconstruct(read_recording(path, load_robot()), model, load_robot()) for path in set(paths)}
+    known = {path: reconstruct(read_recording(path, load_robot()), load_robot(), model) for path in set(paths)}
     config = EnvMimicConfig()
     if episode_seconds is not None:
         config = dataclasses.replace(config, episode_seconds=episode_seconds)

@@ -91,7 +91,7 @@ def main() -> None:
     repeats = 3 if arguments.quick else 10
 
     model = load_model()
-    motions = [reconstruct(read_recording(p, load_robot()), model, load_robot()) for p in list_bundled("training")]
+    motions = [reconstruct(read_recording(p, load_robot()), load_robot(), model) for p in list_bundled("training")]
     env = EnvMimicEnv(Simulator(load_robot(), model=model), motions, EnvMimicConfig())
     config = ppo.PPOConfig(num_envs=arguments.num_envs)
     step_size = config.batch_size * config.num_minibatches * config.unroll_length

@@ -168,7 +168,7 @@ def main() -> None:
     simulator = Simulator(load_robot(), identified)
     read = {"training": training, "validation": validation}
     motions = {
-        use: [reconstruct(read_recording(path, load_robot()), simulator.mj_model, load_robot()) for path in paths]
+        use: [reconstruct(read_recording(path, load_robot()), load_robot(), simulator.mj_model) for path in paths]
         for use, paths in read.items()
     }
     options.output.mkdir(parents=True, exist_ok=True)

@@ -75,7 +75,7 @@ def main() -> None:
         legs = dataclasses.replace(full, **changes)
         folder = options.output / name.replace(" ", "-")
         gaits = [deflation.recorded(job, legs, 2000 + number, folder) for number, job in enumerate(training)]
-        motions = [reconstruct(gait, model, load_robot()) for gait in gaits]
+        motions = [reconstruct(gait, load_robot(), model) for gait in gaits]
         fit = identify_air(Simulator(load_robot(), model=model), motions, config)
         air, error = fit.parameters, fit.standard_errors
         lines.append(

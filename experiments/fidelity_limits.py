@@ -128,7 +128,7 @@ def errors(virtual: VirtualRobot, job: Job) -> tuple[str, Float[np.ndarray, "var
     trial = virtual_robot.draw_trial(job.trial)
     with tempfile.TemporaryDirectory() as folder:
         recorded = deflation.recorded(job, virtual, job.trial, Path(folder))
-    motion = reconstruct(recorded, load_model(virtual.actuators), load_robot())
+    motion = reconstruct(recorded, load_robot(), load_model(virtual.actuators))
     steps, interval = (round(s / CONTROL_TIMESTEP) for s in (HORIZON, START_INTERVAL))
     starts = range(2, len(job.commands) - steps + 1, interval)
     nominal = load_model()

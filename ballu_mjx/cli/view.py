@@ -88,7 +88,7 @@ def load(source: Path) -> list[StoredRollout]:
     if recording.kind != "free":
         raise InputError(f"{source}: is a {recording.kind} recording; only free ones have a way to show.")
     print("Reconstructing the recorded states ...", flush=True)
-    motion = reconstruct(recording, robot.load_model(), robot)
+    motion = reconstruct(recording, robot)
     return [
         StoredRollout(
             name=motion.name,

@@ -41,8 +41,8 @@ _TURN_TOLERANCE = 0.1
 
 def reconstruct(
     recording: Recording,
-    model: mujoco.MjModel,
     robot: RobotDescription,
+    model: mujoco.MjModel | None = None,
     parameters: ReconstructionParameters | None = None,
 ) -> Motion:
     """Return states and commands at the control rate from a free recording.
@@ -50,20 +50,21 @@ def reconstruct(
     **Arguments**
 
     - `recording`: as `csv_format.read_recording` gives it: no missing values.
-    - `model`: the robot to be simulated from these states.
+    - `model`: the robot to be simulated from these states, with its identified actuators, say; None: the nominal one.
     - `parameters`: noise and filters; the defaults suit motion capture of 0.5 mm and 0.3 deg.
 
     **Raises** `InputError` where measurements leave a joint open, or do not fit the model; `ValueError` for a suspended
     recording, and for one shorter than two control steps.
     """
     parameters, hooks = parameters or ReconstructionParameters(), hooks_of(robot)
-    grid = resample(recording, model, robot)
-    fit, distance = solve_inverse_kinematics(model, robot, grid, parameters, recording.name)
-    qpos, qvel = differentiate(fit.qpos, model, robot, grid.step, parameters)
+    simulated = robot.load_model() if model is None else model
+    grid = resample(recording, simulated, robot)
+    fit, distance = solve_inverse_kinematics(simulated, robot, grid, parameters, recording.name)
+    qpos, qvel = differentiate(fit.qpos, simulated, robot, grid.step, parameters)
     # A semi-implicit integrator's velocity is the mean over the time step that led to the position.
-    qvel -= np.gradient(qvel, grid.step, axis=0) * model.opt.timestep / 2
-    _keep_ranges(model, qpos)
-    qpos, qvel = hooks.complete_joints(model, grid, qpos, qvel)
+    qvel -= np.gradient(qvel, grid.step, axis=0) * simulated.opt.timestep / 2
+    _keep_ranges(simulated, qpos)
+    qpos, qvel = hooks.complete_joints(simulated, grid, qpos, qvel)
     states = slice(None, None, grid.samples_per_step)
     edges = np.arange(len(qpos[states])) * robot.control_timestep
     return Motion(

@@ -48,7 +48,7 @@ def run_trials(
         print(f"{policy.task.name}, {policy.setting}: {name} of {len(draws)} done", flush=True)
 
     model = load_model(policy.actuators)
-    motions = [reconstruct(recording, model, load_robot()) for recording in recordings]
+    motions = [reconstruct(recording, load_robot(), model) for recording in recordings]
     reference, com = stack_motions(Simulator(load_robot(), model=model), motions)
     starts = [np.stack([getattr(motion, name)[0] for motion in motions]) for name in ("qpos", "qvel")]
     rollout = (loop or policy.closed_loop())(policy.params, starts[0], starts[1], len(motions[0].command))
