@@ -91,7 +91,9 @@ METHODS = {
     "identified": Method("EnvMimic", ("envmimic",)),
     "wrench": Method("EnvMimic, wrench", ("envmimic", "--forces", "wrench")),
     "multi": Method("EnvMimic, forces at balloon, base and feet", ("envmimic", "--forces", "multi")),
-    "regression": Method("supervised, all of its forces", ("residual", "--method", "supervised", "--shares", "1")),
+    "regression": Method(
+        "supervised, all of its forces", ("residual", "--method", "supervised", "--force-scales", "1")
+    ),
     "supervised": Method("supervised", ("residual", "--method", "supervised")),
     "analytic": Method("analytic", ("residual", "--method", "analytic")),
     "analytic-wrench": Method("analytic, wrench", ("residual", "--method", "analytic", "--forces", "wrench")),

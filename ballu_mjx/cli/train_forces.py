@@ -40,7 +40,7 @@ from ballu_mjx.viz import artifacts, plots
 
 QUICK: Mapping[str, Mapping[str, Any]] = {
     "supervised": {"updates": 400},
-    "analytic": {"window_seconds": 0.5, "rounds": 1, "updates": 50},
+    "analytic": {"window_seconds": 0.5, "relinearizations": 1, "updates": 50},
 }
 """Defaults of the methods' configurations under `--quick`."""
 
@@ -150,7 +150,7 @@ class _Supervised(_Fit):
         supervised.regress(infer, setup.start.policy, found["training"], config, validate)
         self.stages.close()
         _, step, policy = best
-        parts = {share: ppo.with_share(policy, share) for share in config.shares}
+        parts = {share: ppo.with_share(policy, share) for share in config.force_scales}
         errors = {share: self.validate(setup.with_policy(part)) for share, part in parts.items()}
         told = ", ".join(f"{share:.0%}: {error:.2f}" for share, error in errors.items())
         print(f"Validation error by the share of the forces that acts (ratio): {told}.", flush=True)
@@ -169,7 +169,7 @@ class _Analytic(_Fit):
         setup, config = self.setup, self.config
         robots = setup.simulator.simulator
         cut = cut_segments(robots, setup.motions["training"], config.window_seconds, config.interval_seconds)
-        total = config.rounds * config.updates
+        total = config.relinearizations * config.updates
 
         def report(step: int, policy: Any, metrics: dict[str, float]) -> None:
             error = self.validate(setup.with_policy(policy))
