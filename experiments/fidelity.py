@@ -91,7 +91,7 @@ METHODS = {
     "identified": Method("EnvMimic", ("envmimic",)),
     "wrench": Method("EnvMimic, wrench", ("envmimic", "--forces", "wrench")),
     "multi": Method("EnvMimic, forces at balloon, base and feet", ("envmimic", "--forces", "multi")),
-    "regression": Method("supervised, all of its forces", ("supervised", "--shares", "1")),
+    "regression": Method("supervised, all of its forces", ("supervised", "--force-scales", "1")),
     "supervised": Method("supervised", ("supervised",)),
     "analytic": Method("analytic", ("analytic",)),
     "analytic-wrench": Method("analytic, wrench", ("analytic", "--forces", "wrench")),

@@ -65,7 +65,7 @@ class KinematicFit:
         self, site: str, quaternion: Float[np.ndarray, "T 4"], weight: Float[np.ndarray, " 3"], **uncertainty: float
     ) -> KinematicFit:
         """Return the fit with an orientation of a site's body held, with a weight (1/rad) about each of its axes."""
-        orientations = self.problem.orientations | {site: (quaternion, weight)}
+        orientations = {**self.problem.orientations, site: (quaternion, weight)}
         problem = dataclasses.replace(self.problem, orientations=orientations)
         solver = _Solver(problem)
         rows = np.arange(len(self.qpos))
