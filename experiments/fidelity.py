@@ -52,11 +52,13 @@ from ballu_mjx.evaluation.errors_table import (
     Errors,
     Evaluation,
     mean_by_group,
+    quotient,
     read_evaluation,
 )
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+from ballu_mjx.recordings.groups import OTHER
 from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.robots.model import assets
@@ -259,7 +261,7 @@ def comparison(rows: Rows, effort: Mapping[str, str], horizon: float) -> str:
     def mean(run: Sequence[Errors], group: str, quantity: str) -> float:
         return float(np.mean([getattr(e, quantity)[horizon][0] for e in run if e.group == group]))
 
-    head = [quantity if group == "all" else f"{group}: {quantity}" for group, quantity in columns]
+    head = [quantity if group == OTHER else f"{group}: {quantity}" for group, quantity in columns]
     lines = [
         f"| {horizon:g} s | " + " | ".join(head) + " | learning (s) | thousand control steps |",
         "| --- " + "| ---: " * (2 + len(head)) + "|",
@@ -268,7 +270,7 @@ def comparison(rows: Rows, effort: Mapping[str, str], horizon: float) -> str:
     errors = [f"{whole[c]:.3f} m" if c[1] == "position" else f"{whole[c]:.1f} deg" for c in columns]
     lines.append("| vanilla | " + " | ".join(errors) + " | | |")
     left = {
-        row: [[mean(run, *column) / whole[column] for run in runs] for column in columns]
+        row: [[quotient(mean(run, *column), whole[column]) for run in runs] for column in columns]
         for row, runs in rows.items()
         if row != "vanilla"
     }

@@ -131,7 +131,12 @@ def table(found: Mapping[str, Sequence[Mapping[str, float]]]) -> str:
     for label, members in found.items():
         cells = []
         for name in names:
-            mean, half = interval([figures[name] for figures in members])
+            values = [figures[name] for figures in members]
+            broken = sum(map(np.isinf, values))
+            if broken:
+                cells.append(f"diverged in {broken} of {len(values)}")
+                continue
+            mean, half = interval(values)
             cells.append(f"{mean:.3f}" if np.isnan(half) else f"{mean:.3f} ± {half:.3f}")
         lines.append(f"| {label} | {len(members)} | " + " | ".join(cells) + " |")
     return "\n".join(lines)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
-from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation
+from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, has_diverged, summarize_starts
 from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, pad_to_bucket, stack_motions
@@ -203,7 +203,7 @@ class OpenLoopEvaluator:
             runs = [run for run, (recording, _) in enumerate(self.starts) if recording == index]
             position: dict[float, list[float]] = {h: [] for h in HORIZONS}
             yaw: dict[float, list[float]] = {h: [] for h in HORIZONS}
-            com_error, final_yaw, forces = float("nan"), float("nan"), []
+            com_error, final_yaw, forces = np.inf, np.inf, []
             for run in runs:
                 start = self.starts[run][1]
                 states = len(motion.qpos) - start
@@ -217,24 +217,28 @@ class OpenLoopEvaluator:
                 distance = np.linalg.norm(replay.position[run, :states] - other_position, axis=-1)
                 turn = replay.yaw[run, :states] - other_yaw
                 turn = np.rad2deg(np.arctan2(np.sin(turn), np.cos(turn)))
-                forces.append(np.linalg.norm(replay.force[run, : states - 1], axis=-1).mean())
+                forces.append(float(np.linalg.norm(replay.force[run, : states - 1], axis=-1).mean()))
                 for horizon in HORIZONS:
                     steps = round(horizon / CONTROL_TIMESTEP)
                     if steps < states:
-                        position[horizon].append(_rms(distance[1 : steps + 1]))
-                        yaw[horizon].append(_rms(turn[1 : steps + 1]))
+                        # A start that diverged counts for neither: its angles may still be numbers.
+                        far, turned = _rms(distance[1 : steps + 1]), _rms(turn[1 : steps + 1])
+                        broken = has_diverged(far) or has_diverged(turned)
+                        position[horizon].append(np.inf if broken else far)
+                        yaw[horizon].append(np.inf if broken else turned)
                 if run == runs[0]:
-                    com_error = float(np.linalg.norm(replay.com[run, :states] - other_com, axis=-1).mean())
-                    final_yaw = float(turn[-1])
+                    com_error = _finite(float(np.linalg.norm(replay.com[run, :states] - other_com, axis=-1).mean()))
+                    final_yaw = _finite(float(turn[-1]))
             results.append(
                 Errors(
                     recording=motion.name,
                     group=group_of(motion.name),
-                    position={h: _mean_spread(v) for h, v in position.items() if v},
-                    yaw={h: _mean_spread(v) for h, v in yaw.items() if v},
+                    position={h: summarize_starts(v) for h, v in position.items() if v},
+                    yaw={h: summarize_starts(v) for h, v in yaw.items() if v},
                     mean_com_error=com_error,
                     final_yaw_error=final_yaw,
-                    mean_force=float(np.mean(forces)),
+                    mean_force=summarize_starts(forces)[0],
+                    diverged={h: (sum(map(has_diverged, v)), len(v)) for h, v in position.items() if v},
                 )
             )
         return tuple(results)
@@ -244,5 +248,5 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
 
 
-def _mean_spread(values: list[float]) -> tuple[float, float]:
-    return float(np.mean(values)), float(np.std(values))
+def _finite(error: float) -> float:
+    return np.inf if has_diverged(error) else error
