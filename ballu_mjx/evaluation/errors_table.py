@@ -263,6 +263,11 @@ class Evaluation:
                 raise ValueError(f"{reprlib.repr(found.recording)} is not of the group {reprlib.repr(found.group)}")
             if not found.position or found.position.keys() != found.yaw.keys():
                 raise ValueError(f"{reprlib.repr(found.recording)} has not the same horizons for both")
+            for horizon in found.position:
+                some, starts = found.diverged.get(horizon, (0, 0))
+                lost = some == starts > 0
+                if any(np.isinf(quantity[horizon][0]) != lost for quantity in (found.position, found.yaw)):
+                    raise ValueError(f"{reprlib.repr(found.recording)} has no error at {horizon:g} s, or one too many")
             return found
 
         nominal, without, mimic = (tuple(map(errors, content[which])) for which in ("nominal", "vanilla", "residual"))
