@@ -103,7 +103,7 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     artifacts.draw_learning_curve(folder, best_step)
     test = validation if prepared.one_set else validation.on(motions["test"])
     untrained = "" if best_step else ", before any training: no later one validated better"
-    print(f"Best checkpoint: step {best_step:,}{untrained}. Open-loop replay of the test recordings:\n")
+    print(f"Best checkpoint: step {best_step:,}{untrained}. {prepared.replayed}:\n")
     print(artifacts.write_evaluation(test, all_params(params), folder).table())
     if data.quick:
         print("\nThese numbers mean little: --quick trains for seconds.")

@@ -231,7 +231,7 @@ def _fit(task: str, data: ForcesData, config: Any, method: type[_Fit]) -> int:
     validated = read_column(folder, method.curve)
     plots.fit_curve(folder / "learning_curve.png", losses, validated, method.curve_label, task, best_step)
     test = validation if prepared.one_set else validation.on(motions["test"])
-    print(f"Best checkpoint: gradient step {best_step:,}. Open-loop replay of the test recordings:\n")
+    print(f"Best checkpoint: gradient step {best_step:,}. {prepared.replayed}:\n")
     print(artifacts.write_evaluation(test, all_params(params), folder).table())
     if data.quick:
         print("\nThese numbers mean little: --quick learns for seconds.")
