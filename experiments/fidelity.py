@@ -258,7 +258,8 @@ def groups_of(rows: Rows) -> list[str]:
 
 def comparison(rows: Rows, effort: Mapping[str, str], horizon: float) -> str:
     """Markdown: what simulators leave of vanilla's RMSE over `horizon` s, the range of that over seeds, and `effort`,
-    what learning took. In vanilla's row stand its errors themselves; the least of a column is bold."""
+    what learning took. In vanilla's row stand its errors themselves; the least of a column is bold, unless there is one
+    seed alone, which ranks nothing."""
     columns = [(group, quantity) for group in groups_of(rows) for quantity in ("position", "yaw")]
 
     def mean(run: Sequence[Errors], group: str, quantity: str) -> float:
@@ -278,8 +279,10 @@ def comparison(rows: Rows, effort: Mapping[str, str], horizon: float) -> str:
         if row != "vanilla"
     }
     least = [min(np.mean(cells[place]) for cells in left.values()) for place in range(len(columns))]
+    ranked = max(map(len, rows.values())) > 1
     for row, cells in left.items():
-        said = [f"**{ratios(c)}**" if np.mean(c) == low else ratios(c) for c, low in zip(cells, least, strict=True)]
+        best = [ranked and np.mean(c) == low for c, low in zip(cells, least, strict=True)]
+        said = [f"**{ratios(c)}**" if bold else ratios(c) for c, bold in zip(cells, best, strict=True)]
         lines.append(f"| {row} | " + " | ".join([*said, effort.get(row, " | ")]) + " |")
     return "\n".join(lines)
 
