@@ -104,10 +104,20 @@ class OpenLoopEvaluator:
         recordings = [recording for recording, _ in self.starts]
         # Of each recording, the place in `starts` of the run over (nearly) all of it.
         self.first_runs = [recordings.index(index) for index in range(len(self.motions))]
-        self._vanilla: tuple[Errors, ...] | None = None
+        self._without: tuple[tuple[Errors, ...], tuple[Errors, ...]] | None = None
 
-    def replay(self, params: Any, *, scale: float = 1.0) -> Replay:
-        """Simulate every start to its recording's end; `scale` is the residual's share (0: none, 1: all of it)."""
+    def replay(self, params: Any, *, scale: float = 1.0, nominal: bool = False) -> Replay:
+        """Simulate every start to its recording's end.
+
+        **Arguments**
+
+        - `scale`: the residual's share (0: none, 1: all of it).
+        - `nominal`: simulate with nominal actuators instead of identified ones.
+        """
+        fixed = self._fixed
+        if nominal:
+            model = jax.device_get(Simulator(self.robot).model)
+            fixed = jax.device_put((model, self._reference), self._everywhere)
         params = jax.device_get(params)  # they may live on one device; the batch is spread over all
         starts = np.array(self.starts, np.int32)
         steps = np.array([len(self.motions[recording].command) - start for recording, start in self.starts])
@@ -125,7 +135,7 @@ class OpenLoopEvaluator:
             carry = self._begin(places)
             for done in range(0, int(steps[batch].max()), _CHUNK):
                 now = places + np.array([0, done], np.int32)
-                carry, seen = self._chunk(params, np.float32(scale), *self._fixed, carry, now)
+                carry, seen = self._chunk(params, np.float32(scale), *fixed, carry, now)
                 part = slice(done, min(done + _CHUNK, longest))
                 after = slice(part.start + 1, part.stop + 1)
                 for array, where, values in zip(
@@ -153,10 +163,18 @@ class OpenLoopEvaluator:
         return states[:, :3], states[:, _BALLOON_YAW]
 
     def __call__(self, params: Any) -> Evaluation:
-        """Errors of the simulator with the residual, beside those of the one without."""
-        if self._vanilla is None:
-            self._vanilla = self.errors(self.replay(params, scale=0.0))
-        return Evaluation(self._vanilla, self.errors(self.replay(params)), self.base, self.name)
+        """Return errors of the simulator with the residual, beside those of the ones without."""
+        if self._without is None:
+            self._without = self.errors(self.replay(params, scale=0.0)), self.nominal_errors(params)
+        vanilla, nominal = self._without
+        return Evaluation(vanilla, self.errors(self.replay(params)), self.base, self.name, nominal)
+
+    def nominal_errors(self, params: Any) -> tuple[Errors, ...]:
+        """Return errors with nominal actuators and without the residual, of which `params` are any; empty where the
+        simulator's own actuators are nominal."""
+        if self._simulator.actuators is None:
+            return ()
+        return self.errors(self.replay(params, scale=0.0, nominal=True))
 
     def _advance(
         self,

@@ -254,6 +254,17 @@ def test_a_residual_that_breaks_the_simulation_down_is_counted_and_never_average
     assert "diverged" in result.table() and "nan" not in result.table() + json.dumps(result.to_json()).lower()
 
 
+def test_the_nominal_robot_stands_beside_the_one_with_identified_actuators(evaluator: OpenLoopEvaluator):
+    """The first recording is the nominal robot's own: only without the identified actuators is there no error."""
+    assert evaluator(jnp.array(FORCE)).nominal == ()
+    nominal = ActuatorParameters.nominal(load_model())
+    stiffer = dataclasses.replace(nominal, knee_spring_stiffness=1.5 * nominal.knee_spring_stiffness)
+    identified = Simulator(load_robot(), stiffer)
+    result = OpenLoopEvaluator(identified, evaluator.motions, evaluator._residual, "vanilla+sysid")(jnp.array(FORCE))
+    assert list(result.simulators) == ["vanilla", "vanilla+sysid", "envmimic"]
+    assert result.nominal[0].position[1.0][0] < 1e-3 < 5e-3 < result.vanilla[0].position[1.0][0]
+
+
 def test_errors_of_starts_are_how_far_the_starts_lie_apart(evaluator: OpenLoopEvaluator):
     """A robot that starts 2 cm beside itself walks 2 cm beside itself."""
     assert all(e.position[2.0][0] == 0.0 for e in evaluator.of_starts(evaluator.motions, jnp.array(FORCE)))
