@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -217,12 +218,16 @@ def fit_robot(
         solver = BatchedSolver(optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6))
         search = _Search(objective, config.starts)
         found, losses = solver(
-            search, parameters.draw(config.seed, config.starts), config.steps, lambda i, n, v: report("search", i, n, v)
+            search,
+            parameters.draw(config.seed, config.starts),
+            config.steps,
+            partial(report, "search"),
+            _PATIENCE,
         )
         best = int(np.argmin(losses))
         objective.rescale(search.residuals[best])
         again = _Search(objective, 1, search.start[best])
-        found, _ = solver(again, found[best][None], config.steps, lambda i, n, v: report("refinement", i, n, v))
+        found, _ = solver(again, found[best][None], config.steps, partial(report, "refinement"), _PATIENCE)
         objective.rescale(again.residuals[0])
         values = np.asarray(parameters.vector(found[0]), float)
         analysis = _analyse(objective, values, again.start[0])
@@ -244,6 +249,7 @@ def fit_robot(
 
 
 _EVERY = 4
+_PATIENCE = 6
 
 
 class _Reduced(NamedTuple):

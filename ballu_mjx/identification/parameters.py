@@ -164,7 +164,8 @@ class ParameterSet:
     ) -> dict[str, Array]:
         """Return the fields of `model` that carry the values, by name, for `mjx.Model.replace`.
 
-        Bodies are deformed from what they are in `model`; everything else is set.
+        Bodies are deformed from what they are in `model`; everything else is set. Dry friction stays above 0: MJX takes
+        a row of friction 0 for one that never slips.
         """
         found: dict[str, Array] = {}
         deformed: dict[int, dict[int, Array]] = {}
@@ -172,7 +173,10 @@ class ParameterSet:
             for target in parameter.targets:
                 if isinstance(target, FieldTarget):
                     field = found.get(target.field, jnp.asarray(getattr(model, target.field)))
-                    found[target.field] = field.at[target.index].set(value * target.factor)
+                    entry = value * target.factor
+                    if target.field in ("dof_frictionloss", "tendon_frictionloss"):
+                        entry = jnp.maximum(entry, LEAST_FRICTION)
+                    found[target.field] = field.at[target.index].set(entry)
                 elif isinstance(target, BodyTarget):
                     deformed.setdefault(target.body, {})[target.place] = value * target.factor
         for body, changes in deformed.items():
@@ -234,6 +238,8 @@ class ParameterSet:
         return np.where(self._logarithmic, logarithms, values)
 
 
+LEAST_FRICTION = 1e-9
+"""N m, or N: of no effect."""
 _INSIDE = 0.02
 """Share of the way from a bound at which a search begins at the nearest: on the bound itself nothing moves it."""
 _AT_BOUND = 0.01

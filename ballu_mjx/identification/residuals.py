@@ -24,7 +24,7 @@ from mujoco.mjx._src import math as mjx_math
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.batched_solver import along_directions
-from ballu_mjx.identification.parameters import ParameterSet
+from ballu_mjx.identification.parameters import LEAST_FRICTION, ParameterSet
 from ballu_mjx.recordings.filters import interpolate, mean_command, savitzky_golay
 from ballu_mjx.recordings.motion import Motion, ReconstructionParameters
 from ballu_mjx.recordings.recording import Recording
@@ -92,7 +92,8 @@ def measure(
     joints = [model.joint(number).name for number in range(model.njnt)]
     for joint in joints:
         if joint not in recording.angles:
-            raise InputError(f'{recording.name}: joint {joint} was not recorded; add its column, and name it in "joints".')
+            problem = f"{recording.name}: joint {joint} was not recorded"
+            raise InputError(f'{problem}; add its column, and name it in "joints" of the robot description.')
     timestep = float(model.opt.timestep)
     every = max(1, round(config.sample_timestep / timestep))
     sample = every * timestep
@@ -378,12 +379,12 @@ _LOST = 1e3
 def _with_friction_rows(model: mujoco.MjModel, parameters: ParameterSet) -> mujoco.MjModel:
     """Return a copy that has dry friction wherever it is a parameter: MJX leaves out what has none when it begins."""
     model = copy.copy(model)
-    for own, places in ((model.dof_frictionloss, parameters.rubbing_dofs), (model.tendon_frictionloss, parameters.rubbing_tendons)):
-        own[places] = np.maximum(own[places], _LITTLE_FRICTION)
+    for field, places in (
+        (model.dof_frictionloss, parameters.rubbing_dofs),
+        (model.tendon_frictionloss, parameters.rubbing_tendons),
+    ):
+        field[places] = np.maximum(field[places], LEAST_FRICTION)
     return model
-
-
-_LITTLE_FRICTION = 1e-9
 
 
 def _differing(models: Sequence[mjx.Model], names: Sequence[str]) -> tuple[tuple[str, ...], list[np.ndarray]]:
