@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.batched_solver import BatchedSolver
@@ -71,6 +71,8 @@ class Direction(NamedTuple):
 class HeldOut:
     """Errors on held-out windows, from measured starting states."""
 
+    motion: Int[np.ndarray, " windows"]
+    """Number of the motion that each is of."""
     errors: Float[np.ndarray, "windows samples channels"]
     """Simulated less recorded: positions, then velocities, along the velocities' directions (SI units)."""
     noise: Float[np.ndarray, " channels"]
@@ -207,10 +209,10 @@ def fit_robot(
             held = np.arange(len(windows.first)) % _EVERY == _EVERY - 1
             held_out = Windows(windows.motion[held], windows.first[held], windows.samples)
             windows = Windows(windows.motion[~held], windows.first[~held], windows.samples)
-            replay = WindowSimulator(parameters, training, held_out)
+            simulator = WindowSimulator(parameters, training, held_out)
         else:
             held_out = cut_windows(validation, config.window_seconds, config.interval_seconds)
-            replay = WindowSimulator(parameters, validation, held_out)
+            simulator = WindowSimulator(parameters, validation, held_out)
         objective = _Objective(WindowSimulator(parameters, training, windows), config)
         report("data check", 0, 1, float("nan"))
         unseen = _visibility(objective, config).unseen
@@ -231,7 +233,7 @@ def fit_robot(
         objective.rescale(again.residuals[0])
         values = np.asarray(parameters.vector(found[0]), float)
         analysis = _analyse(objective, values, again.start[0])
-        pair = [_held_out(replay, point) for point in (parameters.nominal, values)]
+        pair = [_held_out(simulator, point) for point in (parameters.nominal, values)]
     return RobotFit(
         parameters=parameters,
         values=values,
@@ -250,6 +252,23 @@ def fit_robot(
 
 _EVERY = 4
 _PATIENCE = 6
+
+
+def replay(
+    parameters: ParameterSet,
+    motions: Sequence[MeasuredMotion],
+    points: Sequence[Float[np.ndarray, " parameters"]],
+    seconds: float,
+    interval: float | None = None,
+) -> tuple[HeldOut, ...]:
+    """Replay motions with several values of the parameters, in windows of `seconds`, one every `interval` (s; None: end
+    to end), from measured starting states.
+
+    **Raises** `InputError` where no motion is as long.
+    """
+    with jax.enable_x64(True):
+        simulator = WindowSimulator(parameters, motions, cut_windows(motions, seconds, interval))
+        return tuple(_held_out(simulator, np.asarray(values, float)) for values in points)
 
 
 class _Reduced(NamedTuple):
@@ -357,7 +376,9 @@ class _Search:
         else:  # starting states may be what went too far
             self._refused[number] += 1
         slopes = np.concatenate([reduced.slopes.reshape(-1, len(values)), np.diag(1 / parameters.prior)])
-        table = np.concatenate([slopes @ by_coordinates, np.concatenate([reduced.values.ravel(), prior])[:, None]], axis=1)
+        table = np.concatenate(
+            [slopes @ by_coordinates, np.concatenate([reduced.values.ravel(), prior])[:, None]], axis=1
+        )
         triangle = np.linalg.qr(table, mode="r")
         return triangle[:, -1], triangle[:, :-1]
 
@@ -418,4 +439,4 @@ def _held_out(simulator: WindowSimulator, values: Float[np.ndarray, " parameters
     motions = simulator.motions
     noise = np.array([np.concatenate([m.position_noise, m.velocity_noise]) for m in motions])
     errors = simulator.differences(values) * noise[simulator.windows.motion][:, None]
-    return HeldOut(errors, noise.mean(axis=0))
+    return HeldOut(simulator.windows.motion, errors, noise.mean(axis=0))

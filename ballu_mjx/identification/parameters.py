@@ -546,7 +546,7 @@ class _Declaration:
         if not rest:
             return name, ()
         if not number.isdecimal() or len(shape) != 1 or int(number) >= shape[0]:
-            self.refuse(f'has the index {number} in {name}, of shape {shape}', "give one that is there")
+            self.refuse(f"has the index {number} in {name}, of shape {shape}", "give one that is there")
         return name, (int(number),)
 
     def _servo(self, index: int, element: str, field: str) -> tuple[float, tuple[Target, ...]]:

@@ -313,7 +313,9 @@ class WindowSimulator:
 
             def sample(state: PhysicsState, ctrl: Array) -> tuple[PhysicsState, tuple[Array, Array]]:
                 step = lambda number, state: physics_step(  # noqa: E731
-                    model, self._data.replace(ctrl=ctrl[number]), state  # pyright: ignore
+                    model,
+                    self._data.replace(ctrl=ctrl[number]),
+                    state,  # pyright: ignore
                 )
                 state = jax.lax.fori_loop(0, self.every, step, state)
                 return state, (state.qpos, state.qvel)

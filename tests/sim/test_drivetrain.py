@@ -65,9 +65,7 @@ def test_each_part_is_as_in_a_plain_reference(case: str):
     commands = wandering()
     with jax.enable_x64(True):
         each = [jnp.array([values[name], other[name]]) for name in DrivetrainParameters._fields]
-        found = filter_commands(
-            DrivetrainParameters(*each), jnp.asarray(commands), STEP, count_slots(0.1, STEP)
-        )
+        found = filter_commands(DrivetrainParameters(*each), jnp.asarray(commands), STEP, count_slots(0.1, STEP))
     np.testing.assert_allclose(found[:, 0], commands[:, 0], atol=1e-12)
     np.testing.assert_allclose(found[:, 1], reference(other, commands[:, 1]), atol=1e-12)
 
