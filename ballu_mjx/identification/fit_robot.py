@@ -379,7 +379,7 @@ class _Search:
         table = np.concatenate(
             [slopes @ by_coordinates, np.concatenate([reduced.values.ravel(), prior])[:, None]], axis=1
         )
-        triangle = np.linalg.qr(table, mode="r")
+        triangle = np.asarray(np.linalg.qr(table, mode="r"))
         return triangle[:, -1], triangle[:, :-1]
 
 

@@ -531,7 +531,7 @@ class _Declaration:
         if array[place].ndim or not np.issubdtype(array.dtype, np.floating):
             self.refuse(f"has the field {own} of shape {array.shape[1:]}", 'add the "index" of the number in it')
         targets = [FieldTarget(own, place, 1.0)]
-        if own == "tendon_lengthspring" and not rest[0] == 0 and array[index, 0] == array[index, 1]:
+        if field == "springlength" and array[index, 0] == array[index, 1]:
             targets.append(FieldTarget(own, (index, 0), 1.0))  # no dead band: both ends are one
         return float(array[place]), tuple(targets)
 

@@ -395,7 +395,7 @@ def _differing(models: Sequence[mjx.Model], names: Sequence[str]) -> tuple[tuple
     **Raises** `InputError` where they differ in structure.
     """
     fields, values = [], []
-    for field in dataclasses.fields(models[0]):
+    for field in dataclasses.fields(models[0]):  # pyright: ignore
         own = [getattr(model, field.name) for model in models]
         if isinstance(own[0], jax.Array):
             if any(x.shape != own[0].shape for x in own):

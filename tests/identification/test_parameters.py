@@ -176,7 +176,8 @@ def test_derivatives_by_inertia_hold_where_principal_moments_are_equal():
     mass, ipos, inertia, iquat = 0.4, np.zeros(3), np.array([2e-3, 2e-3, 5e-4]), np.array([1.0, 0, 0, 0])
 
     def whole(numbers: jax.Array) -> jax.Array:
-        _, _, quaternion, own = deform_body(*map(jnp.asarray, (mass, ipos, iquat, inertia)), numbers)
+        nominal = jnp.asarray(mass), jnp.asarray(ipos), jnp.asarray(iquat), jnp.asarray(inertia)
+        _, _, quaternion, own = deform_body(*nominal, numbers)
         w, v = quaternion[0], quaternion[1:]
         cross = jnp.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
         turned = jnp.eye(3) + 2 * w * cross + 2 * cross @ cross

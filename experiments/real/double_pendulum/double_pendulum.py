@@ -5,8 +5,8 @@
 # al., open-source dual-purpose acrobot and pendubot platform, IEEE RAM 2023. We use the ten recordings of design C.1 in
 # `data/experiment_records/design_C.1/sys_id/20230629`. `--data` is a folder with these as recordings of the project's
 # format (`docs/data.md`), named `sysid-20230629-HHMMSS.csv.gz`. Columns `shoulder`, `elbow` are `pos_meas1`,
-# `pos_meas2` (rad); `command_shoulder`, `command_elbow` are `tau_con / 20 + 0.5`. The places of `middle` and `tip` follow by
-# forward kinematics.
+# `pos_meas2` (rad); `command_shoulder`, `command_elbow` are `tau_con / 20 + 0.5`. Places of `middle` and `tip` follow
+# by forward kinematics.
 #
 # Masses, lengths and inertias of the model are the published ones. Six recordings train, two choose nothing but show
 # whether identification helps (validation), two are the test. The published friction is replayed beside.
