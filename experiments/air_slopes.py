@@ -108,7 +108,7 @@ def slopes(simulated: AirWindows, known: Float[np.ndarray, " parameters"], lift:
 # %%
 def main() -> None:
     parser = argparse.ArgumentParser(description="Derivatives and differences of windows of motion, by the lift.")
-    parser.add_argument("--air", type=Path, required=True, help="run of `train residual`, before the loss")
+    parser.add_argument("--air", type=Path, required=True, help="run of `train aerodynamic`, before the loss")
     parser.add_argument("--output", type=Path, default=Path("runs/air-slopes"), help="folder of the table and figure")
     parser.add_argument("--quick", action="store_true", help="windows of half a second alone")
     options = parser.parse_args()

@@ -101,7 +101,7 @@ def row(label: str, result: Evaluation) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Lost lift, found again from one recording.")
-    parser.add_argument("--air", type=Path, help="run of `train residual`; without it, one is made")
+    parser.add_argument("--air", type=Path, help="run of `train aerodynamic`; without it, one is made")
     parser.add_argument("--loss", type=float, default=0.05, help="share of the lift that is lost")
     parser.add_argument("--anew", action="store_true", help="also identify all of the air anew: ten minutes more")
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the larger test set")
@@ -112,7 +112,7 @@ def main() -> None:
     air = options.air
     if air is None:
         air = options.output / "aerodynamic"
-        fidelity.train(air, "residual", "--method", "aerodynamic", *(["--quick"] if options.quick else []))
+        fidelity.train(air, "aerodynamic", *(["--quick"] if options.quick else []))
     known = TrainedResidual.load(air, load_robot())
     simulator = Simulator(load_robot(), known.actuators)
     model = simulator.mj_model

@@ -6,7 +6,7 @@
 # the validation recordings, with true states instead of motion capture's. The force that explains *these* is what the
 # network should have said.
 #
-# `python experiments/force_labels.py RUN [RUN ...]`, of `train residual --method supervised` on the bundled recordings,
+# `python experiments/force_labels.py RUN [RUN ...]`, of `train supervised` on the bundled recordings,
 # takes two minutes. The table is in docs/fidelity.md, beside what the same networks do in open loop.
 
 # %%
@@ -129,7 +129,7 @@ def figure(shown: dict[str, np.ndarray], title: str, path: Path, seconds: float 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Are the forces that regression finds the right ones?")
-    parser.add_argument("runs", type=Path, nargs="+", help="of train residual --method supervised")
+    parser.add_argument("runs", type=Path, nargs="+", help="of train supervised")
     parser.add_argument("--output", type=Path, default=Path("runs/force_labels"), help="folder of table and figure")
     arguments = parser.parse_args()
     networks = {folder.name: TrainedResidual.load(folder, load_robot()) for folder in arguments.runs}

@@ -229,7 +229,7 @@ def test_damaged_actuators_are_refused(tmp_path: Path, folder: Path, change: dic
 
 
 def test_quick_validates_on_own_recordings_where_there_are_no_others(folder: Path):
-    files = _choose(train_envmimic.Data(recordings=(folder / "data",), quick=True), None)
+    files = _choose(train_envmimic.Data(recordings=(folder / "data",), quick=True), load_robot(), None)
     assert len(files["training"]) == 2 and files["validation"] == files["training"] == files["test"]
     _read(files, load_robot())
 
