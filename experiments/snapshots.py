@@ -47,8 +47,8 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model
 from ballu_mjx.ballu.reconstruct import reconstruct_ballu
-from ballu_mjx.cli import pipeline
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.evaluation import story_layout
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.viz.style import LABELS
 
@@ -260,7 +260,11 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--run", type=Path, default=Path("runs/all"), help="folder of `train all` (runs/all)")
     parser.add_argument("--tasks", nargs="+", choices=list(TIMES), default=list(TIMES), help="a figure each (both)")
     parser.add_argument(
-        "--settings", nargs="+", choices=pipeline.SETTINGS, default=list(SETTINGS), help="a row each (the paper's two)"
+        "--settings",
+        nargs="+",
+        choices=story_layout.SETTINGS,
+        default=list(SETTINGS),
+        help="a row each (the paper's two)",
     )
     parser.add_argument("--seed", type=int, default=0, help="which training (0)")
     parser.add_argument("--trial", type=int, default=1, help="which trial of it (1, the first)")

@@ -12,7 +12,8 @@ from jaxtyping import Float
 
 from ballu_mjx.ballu import actuators_file
 from ballu_mjx.ballu.model import JOINTS, SIDES, ActuatorParameters, standing_qpos
-from ballu_mjx.robots.adapter import RobotAdapter
+from ballu_mjx.ballu.sweep import LEVELS, read_sweep
+from ballu_mjx.robots.adapter import IdentificationProgress, IdentifiedActuators, RobotAdapter
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 
@@ -47,6 +48,25 @@ class Ballu(RobotAdapter):
         """Return the parameters that stand in `model`."""
         return ActuatorParameters.nominal(model)
 
+    def identify_actuators(
+        self,
+        robot: RobotDescription,
+        recordings: Mapping[Path, Any],
+        config: Any = None,
+        levels: int | None = None,
+        progress: IdentificationProgress | None = None,
+    ) -> IdentifiedActuators:
+        """Return what `leg_identification.identify_from_sweep` returns."""
+        del robot
+        from ballu_mjx.ballu.leg_identification import identify_from_sweep  # Optimistix: slow to import
+
+        return identify_from_sweep(recordings, config, levels, progress)
+
+    def check_sweep(self, robot: RobotDescription, recordings: Mapping[Path, Any], levels: int | None = None) -> None:
+        """Check that the recordings are a sweep of both legs; see `sweep.read_sweep`."""
+        del robot
+        read_sweep(recordings, levels=LEVELS if levels is None else levels)
+
     def read_actuators(self, robot: RobotDescription, path: Path) -> tuple[str, ModelParameters]:
         """Return what `actuators_file.read_actuators` returns."""
         del robot
@@ -55,6 +75,11 @@ class Ballu(RobotAdapter):
     def find_actuators(self, recordings: Iterable[Path], name: str) -> Path | None:
         """Return what `actuators_file.find_actuators` returns."""
         return actuators_file.find_actuators(recordings, name)
+
+    def write_actuators(self, path: Path, found: IdentifiedActuators, more: Mapping[str, Any]) -> None:
+        """Write what `actuators_file.write_actuators` writes."""
+        assert isinstance(found.parameters, ActuatorParameters)
+        actuators_file.write_actuators(path, found.robot, found.parameters, {**found.details, **more})
 
     def actuators_to_json(self, parameters: ModelParameters) -> dict[str, Any]:
         """Return pairs [left, right] by name."""

@@ -27,8 +27,8 @@ from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.robots.model import CONTROL_TIMESTEP, ModelParameters
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, heading_observation
-from ballu_mjx.sim.simulator import Simulator
-from ballu_mjx.sim.step import PhysicsState, state_at
+from ballu_mjx.sim.simulator import RolloutState, Simulator
+from ballu_mjx.sim.step import state_at
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,9 +123,9 @@ class LocomotionEnv(Env):
     ) -> None:
         """`model` is the nominal robot; `actuators` (None: nominal ones) and `residual` (None: none) improve it."""
         self.task, self.config, self.residual = task, config, residual
-        self.simulator = Simulator(model)
-        if residual is not None:
-            self.simulator = self.simulator.altered(residual.fields)
+        self.control_timestep = load_robot().control_timestep
+        bound = None if residual is None else residual.bound
+        self.simulator = Simulator(load_robot(), model=model).with_residual(bound)
         self.setting = setting_of(model, config, actuators)
         self._feet = np.array([model.geom(f"foot_{side}").id for side in SIDES])
         self._friction = jnp.asarray(model.geom_friction)
@@ -137,14 +137,14 @@ class LocomotionEnv(Env):
         the same task, configuration and kind of residual, as arrays (beside the setting, which may differ from robot to
         robot). Programs that take it as an argument serve them all."""
         residual = None if self.residual is None else (self.residual.params, self.residual.observed)
-        return {"model": self.simulator.model, "setting": self.setting, "residual": residual}
+        return {"model": self.simulator.simulator.model, "setting": self.setting, "residual": residual}
 
     def with_contents(self, contents: Contents) -> LocomotionEnv:
         """The same with other contents, which may be traced."""
         other = copy.copy(self)
-        other.simulator, other.setting = self.simulator.of(contents["model"]), contents["setting"]
+        params, observed = (None, None) if self.residual is None else contents["residual"]
+        other.simulator, other.setting = self.simulator.with_model(contents["model"], params), contents["setting"]
         if self.residual is not None:
-            params, observed = contents["residual"]
             other.residual = dataclasses.replace(self.residual, params=params, observed=observed)
         return other
 
@@ -167,37 +167,32 @@ class LocomotionEnv(Env):
         """Advance one control step under the policy's commands and the residual's force."""
         s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
         command = command_of(action)
-        commands = jnp.concatenate([s["commands"][1:], command[None]])
         key, key_force = jax.random.split(s["key"])
-        wrench, excess = self._wrench(s["history"], commands, key_force)
+        earlier: RolloutState = s["rollout"]
+        excess = self._excess(earlier, command)
+        decay = jnp.exp(-self.config.residual_decay * excess)
 
         fields = s["setting"]["fields"] | {"geom_friction": self._friction.at[self._feet, 0].set(s["friction"])}
-        simulator = self.simulator.altered(fields)
-        earlier: PhysicsState = s["physics"]
-        arriving = command if self.residual is None else self.residual.command(commands)
-        after = simulator.step(earlier, arriving, wrench)
-        features, com = simulator.observe(after)
+        drawn = key_force if self.config.sampled_residual else None
+        after = self.simulator.with_fields(fields).step(earlier, command, wrench_scale=decay, key=drawn)
 
-        finite = jnp.all(jnp.isfinite(features)) & jnp.all(jnp.isfinite(after.qvel))
         before: Array = s["com"]
-        last: Array = s["history"][-1]
-        features, com = jnp.where(finite, features, last), jnp.where(finite, com, before)
-        velocity = (com - before) / CONTROL_TIMESTEP
+        rollout, finite = after.state.keep_finite(earlier, earlier.features)
+        features, com = rollout.features, jnp.where(finite, after.com, before)
+        velocity = (com - before) / self.control_timestep
         earned = self.task.reward(Step(velocity, features, command)) - self.config.outside_cost * excess
         reward = jnp.where(finite, earned, 0.0)
         remaining = s["remaining"] - 1
         s = s | {
-            "physics": jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, earlier),
+            "rollout": rollout,
             "com": com,
-            "history": jnp.concatenate([s["history"][1:], features[None]]),
-            "commands": commands,
             "remaining": remaining,
             "key": key,
         }
         metrics = {
             "velocity_x": velocity[0],
             "velocity_y": velocity[1],
-            "force": jnp.linalg.norm(wrench[0, :3]),
+            "force": jnp.linalg.norm(after.wrench[0, :3]),
             "outside": jnp.asarray(excess > 0.0, jnp.float32),
             "excess": excess,
             "diverged": jnp.asarray(~finite, jnp.float32),
@@ -235,22 +230,22 @@ class LocomotionEnv(Env):
         hinges = hinges.at[MOTORS].set(standing[7:][MOTORS])
         hinges = hinges.at[KNEES].set(jnp.maximum(hinges, standing[7:])[KNEES])
         qpos = jnp.concatenate([standing[:3], quaternion / jnp.linalg.norm(quaternion), hinges])
-        qvel = spread["velocity"] * jax.random.normal(key_velocity, (self.simulator.nv,))
-        qvel = qvel * jnp.where(jnp.arange(self.simulator.nv) < 3, 1.0, 5.0)
+        nv = self.simulator.simulator.nv
+        qvel = spread["velocity"] * jax.random.normal(key_velocity, (nv,))
+        qvel = qvel * jnp.where(jnp.arange(nv) < 3, 1.0, 5.0)
         return self._begin(setting, qpos, qvel, friction, rng)
 
     def _begin(self, setting: Setting, qpos: Array, qvel: Array, friction: Array, rng: Array) -> State:
         key, key_length = jax.random.split(rng)
-        mean = max(round(self.config.episode_seconds / CONTROL_TIMESTEP), 2)
+        mean = max(round(self.config.episode_seconds / self.control_timestep), 2)
         physics = state_at(qpos, qvel)
-        features, com = self.simulator.observe(physics)
+        features, com = self.simulator.simulator.observe(physics)
+        rollout = RolloutState(physics, jnp.tile(features, (HISTORY, 1)), jnp.zeros((HISTORY - 1, 2)))
         s = {
             "setting": setting,
             "friction": friction,
-            "physics": physics,
+            "rollout": rollout,
             "com": com,
-            "history": jnp.tile(features, (HISTORY, 1)),
-            "commands": jnp.zeros((HISTORY, 2)),
             "remaining": jax.random.randint(key_length, (), mean // 2, mean + mean // 2 + 1),
             "key": key,
         }
@@ -265,15 +260,11 @@ class LocomotionEnv(Env):
             info={"truncation": zero},
         )
 
-    def _wrench(
-        self, history: Float[Array, "3 27"], commands: Float[Array, "3 2"], key: Array
-    ) -> tuple[Float[Array, "loaded 6"], Float[Array, ""]]:
-        """The residual's wrenches (N, N m; world), and how far its observation lies outside of its data."""
+    def _excess(self, rollout: RolloutState, command: Float[Array, " 2"]) -> Float[Array, ""]:
+        """Return how far the residual's observation lies outside of its data."""
         if self.residual is None:
-            return jnp.zeros((1, 6)), jnp.zeros(())
-        excess = self.residual.excess(history, commands)
-        wrench = self.residual.wrench(history, commands, key if self.config.sampled_residual else None)
-        return wrench * jnp.exp(-self.config.residual_decay * excess), excess
+            return jnp.zeros(())
+        return self.residual.excess(rollout.history, rollout.with_command(command))
 
 
 def setting_of(model: mujoco.MjModel, config: LocomotionConfig, actuators: ModelParameters | None) -> Setting:

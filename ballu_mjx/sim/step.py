@@ -14,20 +14,19 @@ from jaxtyping import Array, Float
 from mujoco import mjx
 from mujoco.mjx._src.solver import Context
 
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
 from ballu_mjx.sim.custom_jvp import DirectionalDerivative, with_custom_jvp
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 
 
-def count_substeps(model: mujoco.MjModel) -> int:
-    """Physics steps in a control step.
+def count_substeps(model: mujoco.MjModel, control_timestep: float) -> int:
+    """Return the number of physics steps in a control step of `control_timestep` seconds.
 
-    Raises `ValueError` where the control step is no whole number of them.
+    **Raises** `ValueError` where the control step is no whole number of them.
     """
-    count = CONTROL_TIMESTEP / model.opt.timestep
-    if abs(count - round(count)) > 1e-6:
+    count = control_timestep / model.opt.timestep
+    if abs(count - round(count)) > 1e-6 or count < 1 - 1e-6:
         raise ValueError(
-            f"The model's timestep {model.opt.timestep} s does not divide the control step of {CONTROL_TIMESTEP} s."
+            f"The model's timestep {model.opt.timestep} s does not divide the control step of {control_timestep} s."
         )
     return round(count)
 
@@ -104,18 +103,21 @@ def _derivative(along: DirectionalDerivative, found: _Solution) -> _Solution:
     return jax.tree.map(lambda x, y: jnp.where(arrived, x, y), at_place, on_the_way)
 
 
-_ARRIVED = 0.05
-"""m/s^2 and rad/s^2: half a millimetre or milliradian a second over a physics step. Rounding leaves up to 0.02 at rest;
-one in twenty steps of a walking robot is farther off, by up to 40."""
+_ARRIVED = 0.025
+"""Length of a Newton step (m/s^2 and rad/s^2) that counts as none: a quarter of a mm/s or mrad/s over a physics step.
+
+Rounding leaves up to 0.01 at rest; one in twenty steps of a walking robot is farther off, by up to 20."""
 
 
 def _newton_step(found: _Solution, model: mjx.Model, data: mjx.Data) -> tuple[_Solution, Float[Array, " nv"]]:
-    """From where the solver ended; and the step. The cost's Hessian is held: what multiplies its derivative is zero."""
+    """Return where a Newton step leads from where the solver ended; and the step. The cost's Hessian is held: what
+    multiplies its derivative is zero."""
     data = data.replace(qacc=found.qacc)  # pyright: ignore
     here = Context.create(model, data, grad=False)
     slope = here.Ma - data.qfrc_smooth - here.qfrc_constraint
     held_model, held = jax.lax.stop_gradient((model, data))
-    step = Context.create(held_model, held.replace(qfrc_smooth=held.qfrc_smooth - slope)).search
+    moved = slope - jax.lax.stop_gradient(slope)  # zero, but for its derivative
+    step = Context.create(held_model, held.replace(qfrc_smooth=held.qfrc_smooth - moved)).search
     qacc = found.qacc + step
     # Where the cost is least, forces are in balance.
     return _Solution(qacc, mjx.mul_m(model, data, qacc) - data.qfrc_smooth), step
@@ -142,7 +144,7 @@ def control_step(
     **Arguments**
 
     - `template`: data of the model, from `make_data`; of no influence but for what no step changes.
-    - `command`: actuators' commands in [0, 1], held, or a row for each physics step.
+    - `command`: commands in the actuators' own units, held, or a row for each physics step.
     - `wrench`: force (N) and torque (N m), world frame, on the bodies of the ids `bodies`: at the first one's centre of
       mass, and on each of the others at the site of its id in `points`, wherever that moves.
     """

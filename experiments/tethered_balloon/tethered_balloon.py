@@ -142,7 +142,7 @@ def learn(recordings: Path, run: Path, seed: int, quick: bool) -> Evaluation:
             command += ["--resume", str(run)]
         else:
             shutil.rmtree(run, ignore_errors=True)
-            command += ["--robot-description", str(DESCRIPTION), "--seed", str(seed), "--output", str(run)]
+            command += ["--robot", str(DESCRIPTION), "--seed", str(seed), "--output", str(run)]
             for option, use in (("recordings", "training"), ("validation", "validation"), ("test", "test")):
                 command += [f"--{option}", str(recordings / use)]
             command += QUICK if quick else []
