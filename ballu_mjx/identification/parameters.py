@@ -318,15 +318,15 @@ class IdentifiedParameters:
     """Values of a `ParameterSet`, as simulators take them (`robots.model.ModelParameters`)."""
 
     values: Float[Array, " parameters"]
-    parameters: ParameterSet = dataclasses.field(metadata={"static": True})
+    declared: ParameterSet = dataclasses.field(metadata={"static": True})
 
     def fields(self, model: mujoco.MjModel) -> dict[str, Array]:
         """Return the fields of `model` that carry the values, by name."""
-        return self.parameters.fields(model, self.values)
+        return self.declared.fields(model, self.values)
 
     def drivetrain(self) -> DrivetrainParameters:
         """Return the drivetrain of all commands."""
-        return self.parameters.drivetrain(self.values)
+        return self.declared.drivetrain(self.values)
 
 
 # ---- declarations ----

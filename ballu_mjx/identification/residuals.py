@@ -29,6 +29,8 @@ from ballu_mjx.recordings.filters import interpolate, mean_command, savitzky_gol
 from ballu_mjx.recordings.motion import Motion, ReconstructionParameters
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.model import with_fields
+from ballu_mjx.sim.derived_constants import ReferencePose, with_derived_constants
 from ballu_mjx.sim.drivetrain import filter_commands
 from ballu_mjx.sim.step import PhysicsState, make_data, physics_step, put_model, state_at
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
@@ -215,6 +217,7 @@ class WindowSimulator:
                 raise InputError(f"{motion.name}: its time step differs from {motions[0].name}'s; make them equal.")
         own = [put_model(_with_friction_rows(motion.model, parameters)) for motion in motions]
         self._mjx = own[0]
+        self._pose = ReferencePose.of(model)
         self._data = make_data(_with_friction_rows(model, parameters))
         self._own_fields, own_values = _differing(own, [motion.name for motion in motions])
         self._slots = parameters.slots(self.timestep)
@@ -308,7 +311,8 @@ class WindowSimulator:
 
         def path(values: Array, shift: Array, ctrl: Array, qpos: Array, qvel: Array, *own: Array) -> tuple:
             model = self._mjx.replace(**dict(zip(self._own_fields, own, strict=True)))  # pyright: ignore
-            model = model.replace(**self.parameters.fields(model, values))
+            fields = self.parameters.fields(model, values)
+            model = with_fields(model, with_derived_constants(self._pose, model, fields))
             first = state_at(self._moved(qpos, shift[: self.nv]), qvel + shift[self.nv :])
 
             def sample(state: PhysicsState, ctrl: Array) -> tuple[PhysicsState, tuple[Array, Array]]:

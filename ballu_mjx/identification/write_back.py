@@ -1,4 +1,4 @@
-"""Identified values in files: JSON that simulators of this package read, and the user's MJCF with the values in place."""
+"""Identified values in files: JSON that this package reads, and the user's MJCF with the values in place."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def identified_to_json(
     values = np.asarray(identified.values, float)
     errors = np.full(len(values), np.nan) if standard_errors is None else standard_errors
     rows = {}
-    for parameter, value, error in zip(identified.parameters.parameters, values, errors, strict=True):
+    for parameter, value, error in zip(identified.declared.parameters, values, errors, strict=True):
         rows[parameter.name] = {"value": float(value), "unit": parameter.unit}
         if np.isfinite(error):
             rows[parameter.name]["standard_error"] = float(error)
@@ -78,10 +78,10 @@ def identified_xml(robot: RobotDescription, identified: IdentifiedParameters) ->
     """
     model = robot.load_model()
     with jax.enable_x64(True):
-        fields = {k: np.asarray(v) for k, v in identified.parameters.fields(model, identified.values).items()}
+        fields = {k: np.asarray(v) for k, v in identified.declared.fields(model, identified.values).items()}
     set_fields(model, fields)
     spec = mujoco.MjSpec.from_file(str(robot.model))
-    targets = [target for parameter in identified.parameters.parameters for target in parameter.targets]
+    targets = [target for parameter in identified.declared.parameters for target in parameter.targets]
     for target in targets:
         if isinstance(target, FieldTarget):
             _write(spec, model, target)

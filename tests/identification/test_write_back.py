@@ -51,13 +51,13 @@ def test_a_field_that_mjcf_has_not_is_refused(tmp_path: Path):
 def test_values_come_back_from_json_and_what_is_left_out_is_nominal(tmp_path: Path):
     robot, found = identified(tmp_path, *EVERYTHING)
     path = tmp_path / "identified.json"
-    path.write_text(identified_to_json(robot, found, np.ones(len(found.parameters))))
+    path.write_text(identified_to_json(robot, found, np.ones(len(found.declared))))
     np.testing.assert_allclose(read_identified(path, robot).values, found.values, rtol=1e-6)
     content = json.loads(path.read_text())
-    name = found.parameters.names[0]
+    name = found.declared.names[0]
     del content["parameters"][name]
     path.write_text(json.dumps(content))
-    np.testing.assert_allclose(read_identified(path, robot).values[0], found.parameters.nominal[0])
+    np.testing.assert_allclose(read_identified(path, robot).values[0], found.declared.nominal[0])
     content["parameters"]["knee"] = {"value": 1}
     path.write_text(json.dumps(content))
     with pytest.raises(InputError, match=r"identified\.json: arm\.robot\.json identifies no knee"):
