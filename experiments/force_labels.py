@@ -39,10 +39,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.supervised import ForceLabeller, SupervisedConfig
 from ballu_mjx.residuals.trained import TrainedResidual
@@ -147,8 +147,8 @@ def main() -> None:
         if job.split == "validation":
             twins[job.name] = twin(job)
             true[job.name] = label_well(twins[job.name])[HISTORY - 1 :]
-            seen = read_recording(recordings[f"{job.name}.csv.gz"])
-            labels[job.name] = label(reconstruct_ballu(seen, simulator.mj_model))[HISTORY - 1 :]
+            seen = read_recording(recordings[f"{job.name}.csv.gz"], load_robot())
+            labels[job.name] = label(reconstruct(seen, load_robot(), simulator.mj_model))[HISTORY - 1 :]
             print(f"{job.name}: true forces {1e3 * rms(true[job.name]):.0f} mN (RMS along an axis)", flush=True)
     lines = ["| error over that of no force | near | x, y, z | far | x, y, z |", "| --- " * 5 + "|"]
     lines.append(row("labels from motion capture", labels, true))

@@ -12,10 +12,12 @@ from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from ballu_mjx.ballu.recordings import base_position
 from ballu_mjx.cli import pipeline
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation import story_layout
 from ballu_mjx.recordings.csv_format import read_recording
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.viz.style import colour_of, label_of
 
 OUTPUT, QUICK_OUTPUT = Path("runs/all"), Path("runs/all-quick")
@@ -85,7 +87,7 @@ def _finished(trials: Path) -> bool:
 
 
 def _way(path: Path) -> Way:
-    base = read_recording(path).base_position
+    base = base_position(read_recording(path, load_robot()))
     if base is None:  # only in suspended recordings
         raise InputError(f"{path}: has no base position; it is no recording of a trial, take it out of the folder.")
     return base[:, :2] - base[0, :2]

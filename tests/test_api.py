@@ -127,8 +127,8 @@ def test_a_training_in_memory_is_that_in_a_folder(
 
 
 def test_regression_and_gradients_return_residuals(simulator: bm.Simulator, motions: list[bm.Motion]):
-    regressed = bm.fit_supervised(simulator, motions, bm.SupervisedConfig(updates=20, shares=(1.0,)))
-    config = bm.AnalyticConfig(window_seconds=0.5, rounds=1, updates=2, validate_every=2)
+    regressed = bm.fit_supervised(simulator, motions, bm.SupervisedConfig(updates=20, force_scales=(1.0,)))
+    config = bm.AnalyticConfig(window_seconds=0.5, relinearizations=1, updates=2, validate_every=2)
     for learned in (regressed, bm.fit_analytic(simulator, motions, config)):
         assert np.isfinite(bm.evaluate(simulator.with_residual(learned), motions).score)
     assert "Labels, training" in regressed.report

@@ -53,8 +53,9 @@ def _evaluate(options: Options) -> None:
     from ballu_mjx.recordings.motion import add_capture_noise
     from ballu_mjx.recordings.reconstruct import reconstruct
     from ballu_mjx.residuals.dataset import check_recording
+    from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
     from ballu_mjx.residuals.run_config import find_recordings, run_robot
-    from ballu_mjx.residuals.trained import RESIDUAL_TASKS, TrainedResidual
+    from ballu_mjx.residuals.trained import TrainedResidual
     from ballu_mjx.runs.folder import read_config
     from ballu_mjx.sim.simulator import Simulator
     from ballu_mjx.viz.artifacts import write_evaluation
@@ -76,7 +77,7 @@ def _evaluate(options: Options) -> None:
     print("Compiling: half a minute the first time ...", flush=True)
     simulator = Simulator(robot, loaded.actuators)
     model = simulator.mj_model
-    motions = [reconstruct(recording, model, robot) for recording in recordings]
+    motions = [reconstruct(recording, robot, model) for recording in recordings]
     evaluator = Evaluators(simulator).of(loaded.model, motions)
     result = (
         evaluator(loaded.params)
@@ -86,7 +87,7 @@ def _evaluate(options: Options) -> None:
     print(result.table())
     if options.noise_floor:
         shaken = [add_capture_noise(recording, seed=number) for number, recording in enumerate(recordings)]
-        floor = evaluator.of_starts([reconstruct(each, model, robot) for each in shaken], loaded.params)
+        floor = evaluator.of_starts([reconstruct(each, robot, model) for each in shaken], loaded.params)
         print(f"\n{noise_floor(floor, result.residual)}")
 
 

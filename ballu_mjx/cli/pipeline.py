@@ -52,6 +52,7 @@ from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.supervised import SupervisedConfig
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.model import CONTROL_TIMESTEP
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.checkpoints import list_checkpoints
 from ballu_mjx.runs.layout import KEPT
@@ -143,7 +144,7 @@ class Story:
 
         def make(folder: Path) -> None:
             sweep = virtual_robot.record_sweep(self._robot, seed=self.options.robot_seed, name="sweep")
-            write_recording(sweep, folder / "sweep.csv.gz", decimals=_DECIMALS)
+            write_recording(sweep, folder / "sweep.csv.gz", load_robot(), decimals=_DECIMALS)
 
         return cached_stage(self._shared / "sweep", {"robot": self.options.robot_seed}, [], make)
 
@@ -235,7 +236,7 @@ class Story:
     def _record(self, folder: Path, name: str, controller: Controller, seconds: float, draw: int, notes: str) -> None:
         recording = virtual_robot.record(self._robot, virtual_robot.draw_trial(draw), controller, seconds, name, notes)
         folder.mkdir(exist_ok=True)
-        write_recording(recording, folder / f"{name}.csv.gz", decimals=_DECIMALS)
+        write_recording(recording, folder / f"{name}.csv.gz", load_robot(), decimals=_DECIMALS)
 
     def residual(self, task: str, setting: str) -> Path:
         """The run of a setting's residual, learned from the recordings of the task, those of all rounds up to its
@@ -277,7 +278,7 @@ class Story:
     def _supervised(self) -> SupervisedConfig:
         # All of its forces: the paper's baseline, not what is left of it where they do not help.
         return SupervisedConfig(
-            shares=(1.0,), seed=self.seed, **train_forces.QUICK["supervised"] if self.options.quick else {}
+            force_scales=(1.0,), seed=self.seed, **train_forces.QUICK["supervised"] if self.options.quick else {}
         )
 
     def _analytic(self) -> AnalyticConfig:

@@ -22,7 +22,7 @@ from ballu_mjx.viz import plots
 
 QUICK: Mapping[str, Mapping[str, Any]] = {
     "supervised": {"updates": 400},
-    "analytic": {"window_seconds": 0.5, "rounds": 1, "updates": 50},
+    "analytic": {"window_seconds": 0.5, "relinearizations": 1, "updates": 50},
 }
 """Defaults of the methods' configurations under `--quick`."""
 _CURVES = {

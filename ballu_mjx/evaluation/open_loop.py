@@ -21,13 +21,12 @@ from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, pad_to_bucket, stack_motions
 from ballu_mjx.sim.force_model import BoundForces, ForceModel
-from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState
 
 START_INTERVAL = 1.0
 """Seconds between two starts in the same recording."""
-_BALLOON_YAW = 8
 _RUNS = {True: 64, False: 1024}
 """Runs side by side on each device; on a CPU, and elsewhere. Fewer are filled up, more go batch after batch."""
 _CHUNK = 100
@@ -39,9 +38,9 @@ class Replay(NamedTuple):
     nothing."""
 
     position: Float[np.ndarray, "runs states 3"]
-    """Balloon (m, world)."""
+    """Of the tracked body (m, world)."""
     yaw: Float[np.ndarray, "runs states"]
-    """Balloon (rad), not unwrapped."""
+    """Of the tracked body (rad), not unwrapped."""
     com: Float[np.ndarray, "runs states 3"]
     """Centre of mass (m, world)."""
     force: Float[np.ndarray, "runs steps 3"]
@@ -164,7 +163,13 @@ class OpenLoopEvaluator:
                     (features, com, force, qpos), (after, after, part, after), jax.device_get(seen), strict=True
                 ):
                     array[batch, where] = values[: len(batch), : part.stop - part.start]
-        return Replay(features[..., :3], features[..., _BALLOON_YAW], com, force, qpos[self.first_runs])
+        return Replay(
+            features[..., ObservationLayout.position],
+            features[..., ObservationLayout.yaw],
+            com,
+            force,
+            qpos[self.first_runs],
+        )
 
     def _begin(self, places: Int[np.ndarray, "runs 2"]) -> RolloutState:
         """Return the recorded states at their places (recording, control step)."""
@@ -179,10 +184,10 @@ class OpenLoopEvaluator:
         return jax.device_put(RolloutState(physics, features, command), self._split)  # pyright: ignore
 
     def recorded(self, run: int) -> tuple[Float[np.ndarray, "states 3"], Float[np.ndarray, " states"]]:
-        """Recorded balloon position (m) and yaw (rad) from the start of `run` to the recording's end."""
+        """Return the tracked body's recorded position (m) and yaw (rad), from the start of `run` to the end."""
         recording, start = self.starts[run]
         states = self._recorded[recording, start : len(self.motions[recording].qpos)]
-        return states[:, :3], states[:, _BALLOON_YAW]
+        return states[:, ObservationLayout.position], states[:, ObservationLayout.yaw]
 
     def __call__(self, params: Any) -> Evaluation:
         """Errors of the simulator with the residual, beside those of the one without."""

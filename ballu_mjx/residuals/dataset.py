@@ -92,7 +92,7 @@ class ResidualDataset:
             if same is not None:
                 motions[use] = motions[same]
             else:
-                motions[use] = [reconstruct(each, model, self.robot) for each in self.recordings[use]]
+                motions[use] = [reconstruct(each, self.robot, model) for each in self.recordings[use]]
         return motions
 
 
