@@ -365,7 +365,7 @@ class WindowSimulator:
     def _of_windows(self, ctrl: Float[np.ndarray, "motions steps ..."]) -> Float[np.ndarray, "windows ctrl ..."]:
         """Cut what is of all motions' physics steps into windows, steps and commands in one axis."""
         cut = ctrl[self.windows.motion[:, None], self._steps]
-        return cut.reshape(self.count, -1, *cut.shape[3:])
+        return cut.reshape(self.count, cut.shape[1] * cut.shape[2], *cut.shape[3:])
 
     def _chunks(self, size: int) -> list[tuple[Int[np.ndarray, " chunk"], int]]:
         """Rows of windows in equal parts, the last filled up; and how many of each count."""

@@ -28,7 +28,7 @@ import numpy as np
 
 from ballu_mjx.identification.fit_robot import FitConfig, HeldOut, RobotFit, fit_robot, replay
 from ballu_mjx.identification.parameters import declared_parameters
-from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, measure
+from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, cut_windows, measure
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.description import read_description
 
@@ -49,8 +49,16 @@ PUBLISHED = {
 
 def load(data: Path, names: tuple[str, ...]) -> list[MeasuredMotion]:
     """Read recordings by the time in their names."""
+    return read([data / f"sysid-20230629-{name}.csv.gz" for name in names])
+
+
+def load_swing_ups(data: Path) -> list[MeasuredMotion]:
+    """Read the swing-ups of the acrobot under the controller `ilqr_tvlqr_lqr`, if they are there."""
+    return read(sorted(data.glob("acrobot-ilqr_tvlqr_lqr-experiment*.csv.gz")))
+
+
+def read(paths: list[Path]) -> list[MeasuredMotion]:
     robot = read_description(FOLDER / "double_pendulum.robot.json")
-    paths = [data / f"sysid-20230629-{name}.csv.gz" for name in names]
     return [measure(read_recording(path, robot), robot, robot.load_model(), SAMPLING) for path in paths]
 
 
@@ -61,7 +69,7 @@ def identify(data: Path, *, quick: bool) -> RobotFit:
     training = load(data, TRAINING[:1] if quick else TRAINING)
     config = FitConfig(
         window_seconds=0.4 if quick else 1.0,
-        interval_seconds=2.0,
+        interval_seconds=2.0 if quick else 1.0,
         starts=1 if quick else 2,
         steps=2 if quick else 15,
     )
@@ -77,6 +85,21 @@ def row(name: str, found: HeldOut, motions: int) -> str:
     each = [np.median(np.abs(found.errors[found.motion == number, -1, :2]), axis=0) for number in range(motions)]
     cells = [np.rad2deg(found.final_median[:2]), *map(np.rad2deg, each)]
     return f"| {name} | " + " | ".join(f"{q1:.2f} / {q2:.2f}" for q1, q2 in cells) + " |"
+
+
+def tip_errors(found: HeldOut, motions: list[MeasuredMotion], seconds: float, interval: float) -> np.ndarray:
+    """Distances (m) between simulated and recorded tip at the windows' end; inf where a simulation diverged."""
+    windows = cut_windows(motions, seconds, interval)
+    ends = zip(windows.motion, windows.first + windows.samples - 1, strict=True)
+    recorded = np.array([motions[motion].qpos[sample] for motion, sample in ends])
+    distance = np.linalg.norm(tip(recorded + found.errors[:, -1, :2]) - tip(recorded), axis=1)
+    return np.where(np.isfinite(distance), distance, np.inf)
+
+
+def tip(angles: np.ndarray) -> np.ndarray:
+    """Place of the tip (m) in the plane of motion; angles (..., 2) in rad."""
+    upper, lower = angles[..., 0], angles.sum(axis=-1)
+    return np.stack([0.2 * np.sin(upper) + 0.3 * np.sin(lower), -0.2 * np.cos(upper) - 0.3 * np.cos(lower)], axis=-1)
 
 
 # %%
@@ -102,3 +125,9 @@ if __name__ == "__main__":
         found = replay(fit.parameters, motions, list(points.values()), seconds, 0.2)
         for name, errors in zip(points, found, strict=True):
             print(row(name, errors, len(motions)))
+    if swing_ups := [] if options.quick else load_swing_ups(options.data):
+        print("\nSwing-ups of the acrobot (other motions, another controller): tip after 0.4 s, m, median and 90 %\n")
+        found = replay(fit.parameters, swing_ups, list(points.values()), 0.4, 0.2)
+        for name, errors in zip(points, found, strict=True):
+            middle, most = np.percentile(tip_errors(errors, swing_ups, 0.4, 0.2), [50, 90])
+            print(f"| {name} | {middle:.4f} | {most:.4f} |")
