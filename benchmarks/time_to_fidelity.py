@@ -115,7 +115,7 @@ def timeline(rows: list[dict[str, Any]], marks: dict[str, float], imported: floa
 def vanilla_ratio(folder: str) -> float:
     """A run's best validation error as a share of vanilla's, over its error as a share of its base's."""
     runtime.prepare()
-        from ballu_mjx.evaluation.errors_table import Evaluation
+    from ballu_mjx.evaluation.errors_table import Evaluation
     from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
     from ballu_mjx.recordings.csv_format import read_recording
     from ballu_mjx.recordings.reconstruct import reconstruct
@@ -128,7 +128,8 @@ def vanilla_ratio(folder: str) -> float:
     path = Path(folder)
     robot = load_robot()
     trained = TrainedResidual.load(path, robot)
-    recordings = [read_recording(each, load_robot()) for each in find_recordings(read_config(path, "envmimic"), "validation", path)]
+    files = find_recordings(read_config(path, "envmimic"), "validation", path)
+    recordings = [read_recording(each, robot) for each in files]
 
     def evaluate(simulator: Simulator) -> Evaluation:
         motions = [reconstruct(each, simulator.mj_model, load_robot()) for each in recordings]

@@ -50,11 +50,8 @@ def make_motion(force: np.ndarray, name: str = "made", steps: int = STEPS) -> Mo
         command=command,
         qpos=np.array(qpos),
         qvel=np.array(qvel),
-        **{f.name: _EMPTY[f.name] for f in dataclasses.fields(Motion) if f.name in _EMPTY},
+        residual_mm={},
     )
-
-
-_EMPTY = {"residual_mm": {}, "uncertainty": {}, "interpolated": {}}
 
 
 @pytest.fixture(scope="module")
