@@ -55,8 +55,8 @@ _MOVED = 0.3
 _MOST_JUMPS = 8
 _OUTSTANDING = 3.0
 """Of what the quietest fifth of such samples moves at most: what a change of posture moves at least."""
-_AWAY = 1.0
-"""rad, m: the same from the starting pose, where two first postures are."""
+_AWAY = (1.0, 0.3)
+"""rad, m: the same from the starting pose, where two first postures are. From the reference pose; from a keyframe."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -162,6 +162,7 @@ class _Solver:
         give = np.where(self.tree.rotates[self._dofs], *_RANGE_GIVE)
         self._low, self._high = low, high
         self._lowest, self._highest = low - give, high + give
+        self._has_keyframe = problem.robot.keyframe is not None or model.nkey > 0
         self.bounded = True
         """Whether poses keep within the joints' ranges."""
         self._turns = self.tree.rotates[self._dofs] & ~(np.isfinite(self._low) & np.isfinite(self._high))
@@ -376,7 +377,7 @@ class _Solver:
         cost: Float[np.ndarray, "candidates A"],
     ) -> tuple[Float[np.ndarray, "A joints"], Float[np.ndarray, " A"]]:
         """One candidate of each sample, so that misfits and movements are least in all, and their misfits."""
-        total = cost[:, 0] + self._apart(joints[:, 0], own) / _AWAY**2
+        total = cost[:, 0] + self._apart(joints[:, 0], own) / _AWAY[self._has_keyframe] ** 2
         came = []
         for sample in range(1, joints.shape[1]):
             moved = self._apart(joints[:, sample, None], joints[None, :, sample - 1]) / _MOVED**2
@@ -393,8 +394,8 @@ class _Solver:
         reference pose, with joints whose ranges do not hold it in the middle of these."""
         problem, model = self.problem, self.problem.model
         start = problem.robot.adapter.initial_qpos(problem.robot, model)
-        if problem.robot.keyframe is not None or model.nkey:
-            return start if problem.robot.keyframe is not None else model.key_qpos[0].copy()
+        if self._has_keyframe:
+            return model.key_qpos[0].copy() if problem.robot.keyframe is None else start
         joints = start[self._addresses]
         outside = (joints < self._low) | (joints > self._high)
         start[self._addresses] = np.where(outside, self._middle(joints), joints)
