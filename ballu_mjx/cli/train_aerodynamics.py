@@ -54,7 +54,7 @@ class AirData(RecordingsData):
 def fit(data: AirData, config: AirConfig) -> int:
     """Read and check everything, identify, evaluate; returns the exit status."""
     started = time.perf_counter()
-    check_air_config(config)
+    check_air_config(config, load_robot().control_timestep)
     loggers.check(data.wandb)
     if not data.free:
         raise InputError(f"--free names no parameter; there are {', '.join(AIR_PARAMETERS)}.")

@@ -65,7 +65,7 @@ def fit_supervised(data: ForcesData, config: SupervisedConfig) -> int:
 
 def fit_analytic(data: ForcesData, config: AnalyticConfig) -> int:
     """Read and check everything, learn, evaluate; returns the exit status."""
-    analytic.check_analytic_config(config)
+    analytic.check_analytic_config(config, load_robot().control_timestep)
     return _fit("analytic", data, config, _Analytic)
 
 

@@ -62,9 +62,9 @@ class AnalyticConfig:
     """Seeds network, batches and noise."""
 
 
-def check_analytic_config(config: AnalyticConfig) -> None:
+def check_analytic_config(config: AnalyticConfig, control_timestep: float) -> None:
     """**Raises** `InputError` for options out of range, naming the option."""
-    check_segments(config.window_seconds, config.interval_seconds)
+    check_segments(config.window_seconds, config.interval_seconds, control_timestep)
     for name in ("rounds", "windows", "updates", "validate_every", "learning_rate", "max_grad_norm", "averaging"):
         if not getattr(config, name) > 0:
             raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name)}: it must be greater than 0.")
@@ -127,7 +127,7 @@ def train(
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
     plain = linearize.simulator.simulator
     starts = start_spread(plain.mj_model, plain.robot)
-    update = _updates(forces, wrap, optimizer, spread, starts, config)
+    update = _updates(forces, wrap, optimizer, spread, starts, config, plain.robot.control_timestep)
     carry = (start, optimizer.init(start), start)
     key = jax.random.key(config.seed)
     done = simulated = 0
@@ -158,10 +158,12 @@ def _in_windows(
 
 
 def _loss(
-    features: Float[Array | np.ndarray, "windowsteps 27"], recorded: Float[Array | np.ndarray, "windowsteps 27"]
+    features: Float[Array | np.ndarray, "windowsteps features"],
+    recorded: Float[Array | np.ndarray, "windowsteps features"],
+    control_timestep: float,
 ) -> Float[Array, ""]:
     """Of a whole window's error."""
-    return pseudo_huber(jnp.sum(segment_errors(features, recorded) ** 2))
+    return pseudo_huber(jnp.sum(segment_errors(features, recorded, control_timestep) ** 2))
 
 
 def _updates(
@@ -171,6 +173,7 @@ def _updates(
     spread: Float[np.ndarray, " inputs"],
     start_spread: Float[np.ndarray, " directions"],
     config: AnalyticConfig,
+    control_timestep: float,
 ) -> Callable[..., Any]:
     """Gradient steps on linearized windows, compiled."""
 
@@ -193,7 +196,7 @@ def _updates(
         steps = len(window.features)
         through = linear, about, jnp.arange(steps), jax.random.split(key_noise, steps)
         _, (features, loads) = jax.lax.scan(step, (first, window.history), through)
-        tracking = _loss(features, window.features)
+        tracking = _loss(features, window.features, control_timestep)
         return tracking + config.force_cost * jnp.mean(square_newtons(loads, forces.config)), tracking
 
     @jax.jit
