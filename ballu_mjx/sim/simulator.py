@@ -56,7 +56,7 @@ class Simulator:
         """Physics steps in a control step."""
         self.model = put_model(self.mj_model)
         self._template = make_data(self.mj_model)
-        self._pose = ReferencePose.of(self.mj_model)
+        self._reference_pose = ReferencePose.of(self.mj_model)
         sites = [self.mj_model.site(name).id for name in (robot.tracked, *robot.points)]
         bodies = self.mj_model.site_bodyid[sites]
         self._root = int(self.mj_model.body_rootid[bodies[0]])
@@ -68,7 +68,9 @@ class Simulator:
 
         The centre of mass stays that of the model's own masses: air that the robot drags along is no part of it.
         """
-        return self.with_model(with_fields(self.model, with_derived_constants(self._pose, self.model, fields)))
+        return self.with_model(
+            with_fields(self.model, with_derived_constants(self._reference_pose, self.model, fields))
+        )
 
     def with_model(self, model: mjx.Model) -> Simulator:
         """Return the same simulator of another MJX model of this structure, which may be traced."""
