@@ -3,8 +3,8 @@ for it.
 
 One control step alone says little: half a millimetre of motion capture's noise over 0.05 s looks like a tenth of a
 newton. And not all that a recorded step differs in from the simulated one is a matter of the force: actuators are late,
-feet slip, air turns the tracked body. A label is therefore the most likely force given the whole recording, where capture,
-joints' torques and the motion itself err as well: a smoothing problem, linear along the recorded motion.
+feet slip, air turns the tracked body. A label is therefore the most likely force given the whole recording, where
+capture, joints' torques and the motion itself err as well: a smoothing problem, linear along the recorded motion.
 """
 
 from __future__ import annotations
