@@ -264,7 +264,7 @@ class LocomotionEnv(Env):
         """Return how far the residual's observation lies outside of its data."""
         if self.residual is None:
             return jnp.zeros(())
-        return self.residual.excess(rollout.history, rollout.with_command(command))
+        return self.residual.out_of_range(rollout.history, rollout.with_command(command))
 
 
 def setting_of(model: mujoco.MjModel, config: LocomotionConfig, actuators: ModelParameters | None) -> Setting:

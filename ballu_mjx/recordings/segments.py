@@ -1,7 +1,8 @@
 """Short windows of recorded motion, and how far a simulated one is off: what residuals are fitted to by derivatives.
 
 A window starts in a recorded state and runs under the recorded commands. It is short enough for errors not to compound,
-and long enough for a force of hundredths of a newton to move the balloon by more than the starting state's uncertainty.
+and long enough for a force of hundredths of a newton to move the tracked body by more than the starting state's
+uncertainty.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ class Aerodynamics:
     ) -> Float[Array, "parts commands"]:
         """What has arrived by the start of each physics step, `delay` late.
 
-        Not a mean of old and new command: a servo that saturates would turn at once as fast as it can.
+        Not a mean of old and new command: an actuator that saturates would turn at once as fast as it can.
         """
         late = jnp.clip(params.delay, 0.0, self._longest_delay) - self._timestep * jnp.arange(self._substeps)
         age = jnp.ceil(late / self._control_timestep - _JUST)

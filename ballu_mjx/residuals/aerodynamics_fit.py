@@ -1,8 +1,8 @@
 """Identifying the air from recordings of free motion, by least squares through MJX.
 
 The recordings are cut into short windows. Each is simulated from its recorded first state under its recorded commands;
-what the simulated balloon's place and orientation differ by from the recorded ones is made small, by nonlinear least
-squares with a loss that a slipped foot does not rule.
+what the place and orientation of the simulated tracked body differ by from the recorded ones is made small, by
+nonlinear least squares with a loss that single bad windows, such as one where a foot slipped, do not rule.
 
 Slopes are taken over a parameter's order of magnitude, not at a point. Where feet come down at other times than in the
 recording, derivatives hold for less than a millinewton of lift and point nowhere beyond, while errors over thirty
@@ -80,7 +80,7 @@ SCALES: dict[str, Scale] = {
 }
 """By name; SI units."""
 _AGAIN = 4
-"""Most steps of the solver at each of the two whole delays beside the best."""
+"""Most steps of the solver at each of the two whole delays next to the best."""
 _INSIDE = 0.01
 """Of `typical`: so far from its bounds a search begins. On one, the solver takes its first steps for nothing."""
 _GAIN, _STEP = 1e-4, 1e-3
@@ -213,12 +213,12 @@ class Optimum(NamedTuple):
 def at_whole_delay(
     found: Optimum, delay: Bool[np.ndarray, " parameters"], step: float, fitted: Callable[[np.ndarray], Optimum]
 ) -> Optimum:
-    """The better one of the two whole delays beside the one `found`, with all else fitted again. To the covariance of
+    """The better one of the two whole delays next to the one `found`, with all else fitted again. To the covariance of
     `found` comes what rounding the delay does to it and to what passes for it."""
     place = int(np.flatnonzero(delay)[0])
     steps = found.vector[place] / step
-    beside = {int(np.floor(steps + _JUST)), int(np.ceil(steps - _JUST))}
-    best = min((fitted(np.where(delay, step * whole, found.vector)) for whole in beside), key=lambda fit: fit.cost)
+    neighbours = {int(np.floor(steps + _JUST)), int(np.ceil(steps - _JUST))}
+    best = min((fitted(np.where(delay, step * whole, found.vector)) for whole in neighbours), key=lambda fit: fit.cost)
     with_it = found.covariance[place] / max(found.covariance[place, place], np.finfo(float).tiny)
     return best._replace(covariance=found.covariance + np.outer(with_it, with_it) * step**2 / 12)
 
@@ -283,7 +283,7 @@ class AirWindows:
         Commands arrive with a physics step; for a delay between two, errors are a mean of what the one and the other
         give, and change by it as from the one to the other. Along other parameters: at the nearest whole delay.
         """
-        before, after, share = self._beside(vector)
+        before, after, share = self._neighbours(vector)
         nearest = before if share < 0.5 else after
         between, is_delay = share >= _JUST, places == self._delay
         first = self._whole(before)
@@ -299,8 +299,8 @@ class AirWindows:
                 slopes[..., number] = (self._whole(moved) - near) / step
         return (1 - share) * first + share * second if between else first, slopes
 
-    def _beside(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """With the two whole delays beside that of `vector`, and how far it is from the first to the second."""
+    def _neighbours(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """With the two whole delays next to that of `vector`, and how far it is from the first to the second."""
         most = round(self.longest_delay / self.timestep)
         steps = vector[self._delay] / self.timestep
         first = min(int(steps + _JUST), most - 1)

@@ -1,7 +1,8 @@
 """EnvMimic: the residual-force policy's Markov decision process (paper, section "Residual Dynamics Learning").
 
-The actuators replay a recording's commands; the policy pushes on the balloon; the reward is high while the simulated
-balloon follows the recorded one. What the policy learns is the part of the physics that the simulator lacks.
+The actuators replay a recording's commands; the policy pushes on the tracked body (BALLU's balloon); the reward is high
+while the simulated body follows the recorded one. What the policy learns is the part of the physics that the simulator
+lacks.
 """
 
 from __future__ import annotations

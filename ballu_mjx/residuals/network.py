@@ -22,8 +22,8 @@ class ForceNetworkConfig:
     """What a force network sees, and what its output means."""
 
     forces: ForceSet = "force"
-    """What the policy pushes with: a force on the balloon (the paper's), a force and a torque there (wrench), or forces
-    at balloon, base and feet (multi)."""
+    """What the policy pushes with: a force on the tracked body (the paper's), a force and a torque there (wrench), or
+    forces there and at all measured points (multi)."""
     force_limit: float = 1.0
     """Largest force along each axis, N (paper: 1)."""
     force_scale: float = 0.05
@@ -82,7 +82,7 @@ def world_loads(
 ) -> Float[Array, " loads"]:
     """Return the loads (N, N m; world; see `to_wrenches`) that an action stands for, within the limit along each axis.
 
-    Actions are in the balloon's heading frame, like the observation: the same situation met in another direction
+    Actions are in the tracked body's heading frame, like the observation: the same situation met in another direction
     calls for the same force, turned. Those on an anchored robot are in the world's.
     """
     most = config.force_limit / config.force_scale

@@ -2,9 +2,9 @@
 for it.
 
 One control step alone says little: half a millimetre of motion capture's noise over 0.05 s looks like a tenth of a
-newton. And not all that a recorded step differs in from the simulated one is a matter of the force: servos are late,
-legs slip, air turns the balloon. A label is therefore the most likely force given the whole recording, where capture,
-joints' torques and the motion itself err as well: a smoothing problem, linear along the recorded motion.
+newton. And not all that a recorded step differs in from the simulated one is a matter of the force: actuators are late,
+feet slip, air turns the tracked body. A label is therefore the most likely force given the whole recording, where
+capture, joints' torques and the motion itself err as well: a smoothing problem, linear along the recorded motion.
 """
 
 from __future__ import annotations
@@ -41,22 +41,22 @@ class SupervisedConfig:
     """Standard deviation of the prior on the force along each axis, N. That on a torque is, in units of the network's
     output, as wide."""
     force_change: float = 0.1
-    """Standard deviation of the prior on how it changes from one control step to the next, N. Air that the balloon
+    """Standard deviation of the prior on how it changes from one control step to the next, N. Air that a balloon
     drags along pushes back at every footfall: a prior that smooths more takes most of that away."""
     torque_spread: float = 0.05
-    """Standard deviation of what motors and knees pull beyond the model, N m."""
+    """Standard deviation of what the robot's joints pull beyond the model, N m."""
     position_noise: float = 0.0005
     """Standard deviation of the recorded place, m."""
     angle_noise: float = 0.3
     """Likewise of recorded angles, deg."""
     held_angle_noise: float = 10.0
-    """Likewise of the joints that motion capture does not show (BALLU's motors), deg."""
+    """Likewise of the robot's held joints, which motion capture hardly shows, deg."""
     velocity_noise: float = 0.01
-    """Standard deviation of what a control step changes the base's velocity by beyond all this, m/s."""
+    """Standard deviation of what a control step changes the root's velocity by beyond all this, m/s."""
     rotation_noise: float = 3.0
-    """Likewise of the base's angular velocity and the balloon's against it, deg/s."""
+    """Likewise of angular velocities from the root to the tracked body, deg/s."""
     joint_noise: float = 20.0
-    """Likewise of the legs' joints, deg/s."""
+    """Likewise of all other joints, deg/s."""
     observation_noise: float = 1.0
     """Noise on what the network sees in training, in multiples of each entry's spread over the recordings."""
     updates: int = 4000

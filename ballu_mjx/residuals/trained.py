@@ -19,7 +19,7 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 from ballu_mjx.runs.folder import read_config
 from ballu_mjx.runs.record import TrainingRecord
-from ballu_mjx.sim.force_model import BoundForces, Fields, ForceModel
+from ballu_mjx.sim.force_model import BoundForces, ForceModel
 from ballu_mjx.sim.simulator import AugmentedSimulator
 
 MARGIN = 0.1
@@ -95,17 +95,8 @@ class TrainedResidual:
 
     @property
     def bound(self) -> BoundForces:
-        """Model and parameters."""
+        """Return the model with its parameters."""
         return BoundForces(self.model, self.params, self.observed)
-
-    @property
-    def fields(self) -> Fields:
-        """Model fields to simulate with; see `force_model.ForceModel.fields`."""
-        return self.model.fields(self.params)
-
-    def command(self, commands: Float[Array, "steps commands"]) -> Float[Array, "parts commands"]:
-        """What the actuators get; see `force_model.ForceModel.command`."""
-        return self.model.command(self.params, commands)
 
     def wrench(
         self,
@@ -116,11 +107,13 @@ class TrainedResidual:
         """Forces and torques over the coming control step; see `force_model.ForceModel.wrench`."""
         return self.model.wrench(self.params, history, commands, key)
 
-    def excess(
+    def out_of_range(
         self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]
     ) -> Float[Array, ""]:
-        """How far an observation lies outside of what the recordings showed: by the worst of its entries, in widths of
-        that entry's range, `MARGIN` taken off; 0 inside."""
+        """Return how far an observation lies outside of what the recordings showed.
+
+        It is that of the worst entry, in widths of the entry's range, `MARGIN` taken off; 0 inside.
+        """
         seen = self.model.inputs(history, commands)
         low, high = (jnp.asarray(bound) for bound in self.observed)
         beyond = jnp.maximum(low - seen, seen - high) / jnp.maximum(high - low, _NARROW)

@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 Fields = dict[str, Array]
 """Fields of `mjx.Model` by name."""
 ForceSet = Literal["force", "wrench", "multi"]
-"""What a network pushes with: a force on the tracked body, the balloon (the paper's); a force and a torque on it; or
-forces on it and at every measured point (BALLU's base and feet)."""
+"""What a network pushes with: a force on the tracked body (the paper's), a force and a torque on it, or forces on it
+and at every measured point."""
 
 
 def num_vectors(forces: ForceSet, points: int) -> int:

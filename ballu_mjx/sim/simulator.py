@@ -7,7 +7,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -220,10 +220,10 @@ class AugmentedSimulator:
         """Return the same with other model fields; see `Simulator.with_fields`."""
         return dataclasses.replace(self, simulator=self.simulator.with_fields(fields))
 
-    def with_model(self, model: mjx.Model, params: object = None) -> AugmentedSimulator:
+    def with_model(self, model: mjx.Model, params: Any) -> AugmentedSimulator:
         """Return the same of another MJX model, and with other parameters of the residual; both may be traced.
 
-        `model` has the residual's fields already.
+        `model` has the residual's fields already. Without a residual, `params` are of no influence.
         """
         residual = None if self.residual is None else self.residual._replace(params=params)
         return dataclasses.replace(self, simulator=self.simulator.with_model(model), residual=residual)

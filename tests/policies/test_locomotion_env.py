@@ -166,8 +166,8 @@ def test_force_fades_outside_of_what_the_residual_has_seen():
     width = 1.0
     residual = make_residual(np.array([1.0, 0.0, 0.0]), width)
     expected = (2.0 - width) / (2 * width) - MARGIN
-    assert float(residual.excess(history, commands)) == pytest.approx(expected, rel=1e-5)
-    assert float(residual.excess(jnp.zeros((HISTORY, 27)), commands)) == 0.0
+    assert float(residual.out_of_range(history, commands)) == pytest.approx(expected, rel=1e-5)
+    assert float(residual.out_of_range(jnp.zeros((HISTORY, 27)), commands)) == 0.0
 
     forces = []
     for decay in (0.0, 3.0):

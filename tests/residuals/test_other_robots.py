@@ -106,9 +106,9 @@ def test_gradients_through_the_simulation_find_the_push(motions: list[Motion], l
     )
     policy, metrics = found[-1]
     actions = np.asarray(forces.infer(start._replace(policy=policy), jnp.asarray(inputs)))
-    np.testing.assert_allclose(
-        (load_units(CONFIG, 3) * actions).mean(axis=0), PUSH, atol=0.1 * float(np.linalg.norm(PUSH))
-    )
+    found_push = (load_units(CONFIG, 3) * actions).mean(axis=0)
+    # A force along the taut tether moves the balloon no more than another one: only the horizontal part shows.
+    np.testing.assert_allclose(found_push[:2], PUSH[:2], atol=0.05 * float(np.linalg.norm(PUSH)))
     assert metrics["loss"] < 0.1 * found[0][1]["loss"]
 
 
