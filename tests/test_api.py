@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pytest
 import ballu_mjx as bm
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
 from ballu_mjx.recordings.recording import cut
+from ballu_mjx.runs.layout import RUN_FORMAT
 from ballu_mjx.runs.record import MemoryRecord
 
 SIZES = bm.PPOConfig(
@@ -109,7 +111,7 @@ def test_forces_learned_beside_the_air_are_evaluated_with_it(
 def test_a_training_in_memory_is_that_in_a_folder(
     simulator: bm.Simulator, motions: list[bm.Motion], tmp_path: Path, robot: bm.RobotDescription
 ):
-    content = {"format": "ballu-run/2", "task": "envmimic", "starts": []}
+    content = {"format": RUN_FORMAT, "task": "envmimic", "starts": [], "ppo": dataclasses.asdict(SIZES)}
     memory = MemoryRecord(content)
     kept = bm.train_envmimic(simulator, motions, ppo_config=SIZES, run=memory, validate_every=160)
     with bm.Run(tmp_path / "run", content) as run:
@@ -120,12 +122,16 @@ def test_a_training_in_memory_is_that_in_a_folder(
     assert [row["step"] for row in memory.metrics if "validation_error" in row] == [0, 160, 320]
 
 
-def test_regression_and_gradients_return_residuals(simulator: bm.Simulator, motions: list[bm.Motion]):
-    regressed = bm.fit_supervised(simulator, motions, bm.SupervisedConfig(updates=20, shares=(1.0,)))
+def test_regression_returns_a_residual(simulator: bm.Simulator, motions: list[bm.Motion]):
+    learned = bm.fit_supervised(simulator, motions, bm.SupervisedConfig(updates=20, shares=(1.0,)))
+    assert np.isfinite(bm.evaluate(simulator.with_residual(learned), motions).score)
+    assert "Labels, training" in learned.report
+
+
+def test_gradients_return_a_residual(simulator: bm.Simulator, motions: list[bm.Motion]):
     config = bm.AnalyticConfig(window_seconds=0.5, rounds=1, updates=2, validate_every=2)
-    for learned in (regressed, bm.fit_analytic(simulator, motions, config)):
-        assert np.isfinite(bm.evaluate(simulator.with_residual(learned), motions).score)
-    assert "Labels, training" in regressed.report
+    learned = bm.fit_analytic(simulator, motions, config)
+    assert np.isfinite(bm.evaluate(simulator.with_residual(learned), motions).score)
 
 
 def test_recordings_of_another_robot_are_not_the_bundled_ones(robot: bm.RobotDescription, tmp_path: Path):
