@@ -123,13 +123,13 @@ def test_a_training_in_memory_is_that_in_a_folder(
 
 
 def test_regression_returns_a_residual(simulator: bm.Simulator, motions: list[bm.Motion]):
-    learned = bm.fit_supervised(simulator, motions, bm.SupervisedConfig(updates=20, shares=(1.0,)))
+    learned = bm.fit_supervised(simulator, motions, bm.SupervisedConfig(updates=20, force_scales=(1.0,)))
     assert np.isfinite(bm.evaluate(simulator.with_residual(learned), motions).score)
     assert "Labels, training" in learned.report
 
 
 def test_gradients_return_a_residual(simulator: bm.Simulator, motions: list[bm.Motion]):
-    config = bm.AnalyticConfig(window_seconds=0.5, rounds=1, updates=2, validate_every=2)
+    config = bm.AnalyticConfig(window_seconds=0.5, relinearizations=1, updates=2, validate_every=2)
     learned = bm.fit_analytic(simulator, motions, config)
     assert np.isfinite(bm.evaluate(simulator.with_residual(learned), motions).score)
 

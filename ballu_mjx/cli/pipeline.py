@@ -278,7 +278,7 @@ class Story:
     def _supervised(self) -> SupervisedConfig:
         # All of its forces: the paper's baseline, not what is left of it where they do not help.
         return SupervisedConfig(
-            shares=(1.0,), seed=self.seed, **train_forces.QUICK["supervised"] if self.options.quick else {}
+            force_scales=(1.0,), seed=self.seed, **train_forces.QUICK["supervised"] if self.options.quick else {}
         )
 
     def _analytic(self) -> AnalyticConfig:

@@ -1,7 +1,8 @@
-"""The white-box residual: what the air does to the balloon, in sixteen numbers.
+"""The white-box residual: what the air does to a buoyant body, in sixteen numbers.
 
-A balloon drags half its displaced air along, is slowed by it, and is lifted at a point that need not be where the model
-has it. Each of these is a textbook's formula with a constant or two to find; none needs a network.
+The body is the tracked one of the robot, and has `gravcomp` in its model: a balloon. It drags half its displaced air
+along, is slowed by it, and is lifted at a point that need not be where the model has it. Each of these is a textbook's
+formula with a constant or two to find; none needs a network.
 """
 
 from __future__ import annotations
@@ -23,23 +24,26 @@ from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.residuals.network import ForceNetworkConfig, network_input
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.force_model import Fields
-from ballu_mjx.sim.observation import HISTORY, heading_rotation
-from ballu_mjx.sim.step import balloon_id, count_substeps
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout, heading_rotation
+from ballu_mjx.sim.step import count_substeps
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class AirParameters:
-    """What the nominal model leaves out of the air's effect on the balloon; all 0: nothing. Axes are the balloon's."""
+    """What the nominal model leaves out of the air's effect on the tracked body; all 0: nothing.
+
+    Axes are the body's.
+    """
 
     added_mass: Float[Array, ""]
-    """Mass of air that the balloon drags along (kg); weightless."""
+    """Mass of air that the body drags along (kg); weightless."""
     added_inertia: Float[Array, ""]
     """Moment of inertia of that air (kg m^2)."""
     lift: Float[Array, ""]
     """Lift beyond the model's (N)."""
     centre: Float[Array, " 3"]
-    """Where mass, lift and drag act, off the model's centre of the balloon (m)."""
+    """Where mass, lift and drag act, off the model's centre of mass of the body (m)."""
     linear_drag: Float[Array, " 3"]
     """Force for each m/s along each axis (N s/m)."""
     quadratic_drag: Float[Array, " 3"]
@@ -47,7 +51,7 @@ class AirParameters:
     turning_drag: Float[Array, " 3"]
     """Torque for each rad/s about each axis (N m s)."""
     delay: Float[Array, ""]
-    """How late commands reach the servos (s, at most `longest_delay`). No air, but what moves late passes for heavy:
+    """How late commands reach the actuators (s, at most `longest_delay`). No air, but what moves late passes for heavy:
     left out, it is laid at the added mass's door."""
 
     @staticmethod
@@ -64,7 +68,7 @@ AIR_PARAMETERS = tuple(field.name for field in dataclasses.fields(AirParameters)
 SIGNED_AIR_PARAMETERS = ("lift", "centre")
 """All others are 0 or more."""
 _MOST = 100.0
-"""No parameter of a balloon comes near, in SI units."""
+"""No parameter comes near, in SI units."""
 
 
 def longest_delay(robot: RobotDescription) -> float:
@@ -78,20 +82,31 @@ class Aerodynamics:
     name = "aerodynamic"
 
     def __init__(self, robot: RobotDescription, model: mujoco.MjModel) -> None:
-        """Prepare for `robot`; `model` is its C model without the residual."""
-        self._robot, self._balloon = robot, balloon_id(model)
+        """Prepare for `robot`; `model` is its C model without the residual.
+
+        **Raises** `InputError` where the tracked body has no buoyancy.
+        """
+        self._robot, self._body = robot, int(model.site_bodyid[model.site(robot.tracked).id])
+        if not model.body_gravcomp[self._body] > 0:
+            name = model.body(self._body).name or "that the tracked site is on"
+            raise InputError(
+                f"{robot.model}: the body {name} has no buoyancy, which aerodynamics are identified for; give it "
+                'gravcomp="LIFT / WEIGHT".'
+            )
         self._control_timestep, self._longest_delay = robot.control_timestep, longest_delay(robot)
         self._mass, self._inertia = jnp.asarray(model.body_mass), jnp.asarray(model.body_inertia)
         self._centre, self._gravcomp = jnp.asarray(model.body_ipos), jnp.asarray(model.body_gravcomp)
         self._timestep, self._substeps = float(model.opt.timestep), count_substeps(model, robot.control_timestep)
         self._gravity = float(np.linalg.norm(model.opt.gravity))
 
-    def inputs(self, history: Float[Array, "steps 27"], commands: Float[Array, "steps 2"]) -> Float[Array, " inputs"]:
+    def inputs(
+        self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]
+    ) -> Float[Array, " inputs"]:
         return network_input(history, commands, ForceNetworkConfig(), self._robot)
 
     def fields(self, params: AirParameters) -> Fields:
-        """The balloon's mass, inertia, centre and lift. The lift carries the added mass."""
-        body = self._balloon
+        """Return the tracked body's mass, inertia, centre and lift. The lift carries the added mass."""
+        body = self._body
         mass = self._mass.at[body].add(params.added_mass)
         lift = (self._gravcomp[body] * self._mass[body] + params.added_mass) * self._gravity + params.lift
         return {
@@ -101,7 +116,9 @@ class Aerodynamics:
             "body_gravcomp": self._gravcomp.at[body].set(lift / (mass[body] * self._gravity)),
         }
 
-    def command(self, params: AirParameters, commands: Float[Array, "steps 2"]) -> Float[Array, "parts 2"]:
+    def command(
+        self, params: AirParameters, commands: Float[Array, "steps commands"]
+    ) -> Float[Array, "parts commands"]:
         """What has arrived by the start of each physics step, `delay` late.
 
         Not a mean of old and new command: a servo that saturates would turn at once as fast as it can.
@@ -113,14 +130,15 @@ class Aerodynamics:
     def wrench(
         self,
         params: AirParameters,
-        history: Float[Array, "steps 27"],
-        commands: Float[Array, "steps 2"],
+        history: Float[Array, "steps features"],
+        commands: Float[Array, "steps commands"],
         key: Array | None = None,
     ) -> Float[Array, "1 6"]:
         """Drag in still air, by the velocities in the middle of the coming control step, extrapolated from the last."""
         del commands, key
-        earlier, before, now = (rotation(seen[6:9]) for seen in history[-3:])
-        velocity = now.T @ (1.5 * history[-1, 3:6] - 0.5 * history[-2, 3:6])
+        layout = ObservationLayout
+        earlier, before, now = (rotation(seen[layout.euler_angles]) for seen in history[-3:])
+        velocity = now.T @ (1.5 * history[-1, layout.velocity] - 0.5 * history[-2, layout.velocity])
         turned = 2 * turn(before.T @ now) - turn(earlier.T @ before)
         speed = jnp.sqrt(jnp.sum(velocity**2) + _SLOW**2)
         force = -(params.linear_drag + params.quadratic_drag * speed) * velocity

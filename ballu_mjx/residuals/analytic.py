@@ -9,6 +9,7 @@ that one simulation serves some gradient steps. Then other windows are simulated
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -24,7 +25,7 @@ from ballu_mjx.residuals.envmimic import start_spread
 from ballu_mjx.residuals.network import NetworkForces, square_newtons
 from ballu_mjx.sim.force_model import to_wrenches
 from ballu_mjx.sim.linearize import ControlSteps, Linearized, Linearizer
-from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.sharding import shard_over_devices
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState
 
@@ -37,12 +38,12 @@ class AnalyticConfig:
     """Length of a window, s."""
     interval_seconds: float = 8.0
     """Time between the starts of two windows, s."""
-    rounds: int = 8
+    relinearizations: int = 8
     """Simulations of windows, each linearized and then learned on."""
     windows: int = 16
-    """Windows in a round, drawn anew for each."""
+    """Windows in a simulation, drawn anew for each."""
     updates: int = 20
-    """Gradient steps in a round, each on all its windows."""
+    """Gradient steps after each linearization, each on all its windows."""
     validate_every: int = 20
     """Gradient steps between two validations, each of which leaves a checkpoint."""
     learning_rate: float = 1e-3
@@ -62,10 +63,11 @@ class AnalyticConfig:
     """Seeds network, batches and noise."""
 
 
-def check_analytic_config(config: AnalyticConfig) -> None:
+def check_analytic_config(config: AnalyticConfig, control_timestep: float) -> None:
     """**Raises** `InputError` for options out of range, naming the option."""
-    check_segments(config.window_seconds, config.interval_seconds)
-    for name in ("rounds", "windows", "updates", "validate_every", "learning_rate", "max_grad_norm", "averaging"):
+    check_segments(config.window_seconds, config.interval_seconds, control_timestep)
+    positive = "relinearizations", "windows", "updates", "validate_every", "learning_rate", "max_grad_norm", "averaging"
+    for name in positive:
         if not getattr(config, name) > 0:
             raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name)}: it must be greater than 0.")
 
@@ -82,7 +84,7 @@ def compile_rollout(
     def run(params: Any, window: Segments) -> tuple[ControlSteps, Array]:
         def step(state: RolloutState, command: Array) -> tuple[RolloutState, tuple[ControlSteps, Array]]:
             seen = forces.inputs(state.history, state.with_command(command))
-            loads = forces.loads(params, seen, state.features[8])
+            loads = forces.loads(params, seen, state.features[ObservationLayout.yaw])
             after = simulator.step(state, command, wrench=to_wrenches(loads, forces.config.forces)).state
             return after, (ControlSteps(state, command, loads), after.features)
 
@@ -127,18 +129,22 @@ def train(
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
     plain = linearize.simulator.simulator
     starts = start_spread(plain.mj_model, plain.robot)
-    update = _updates(forces, wrap, optimizer, spread, starts, config)
+    update = _updates(forces, wrap, optimizer, spread, starts, config, plain.robot.control_timestep)
     carry = (start, optimizer.init(start), start)
     key = jax.random.key(config.seed)
     done = simulated = 0
-    for _ in range(config.rounds):
+    for _ in range(config.relinearizations):
         key, own = jax.random.split(key)
         drawn = np.asarray(jax.random.permutation(own, len(recorded.qpos)))[: config.windows]
         taken = jax.tree.map(lambda x, drawn=drawn: np.asarray(x)[drawn], recorded)
         steps, features = simulate(wrap(jax.device_get(carry[0])), taken)
         data = _in_windows(linearize(steps), steps.loads, taken)
         simulated += len(steps.loads) * (2 + linearize.directions)
-        loss = float(np.mean(jax.vmap(_loss)(features, taken.features)))
+        loss = float(
+            np.mean(
+                jax.vmap(functools.partial(_loss, control_timestep=plain.control_timestep))(features, taken.features)
+            )
+        )
         for first in range(0, config.updates, config.validate_every):
             key, own = jax.random.split(key)
             count = min(config.validate_every, config.updates - first)
@@ -158,10 +164,12 @@ def _in_windows(
 
 
 def _loss(
-    features: Float[Array | np.ndarray, "windowsteps 27"], recorded: Float[Array | np.ndarray, "windowsteps 27"]
+    features: Float[Array | np.ndarray, "windowsteps features"],
+    recorded: Float[Array | np.ndarray, "windowsteps features"],
+    control_timestep: float,
 ) -> Float[Array, ""]:
     """Of a whole window's error."""
-    return pseudo_huber(jnp.sum(segment_errors(features, recorded) ** 2))
+    return pseudo_huber(jnp.sum(segment_errors(features, recorded, control_timestep) ** 2))
 
 
 def _updates(
@@ -171,6 +179,7 @@ def _updates(
     spread: Float[np.ndarray, " inputs"],
     start_spread: Float[np.ndarray, " directions"],
     config: AnalyticConfig,
+    control_timestep: float,
 ) -> Callable[..., Any]:
     """Gradient steps on linearized windows, compiled."""
 
@@ -185,7 +194,9 @@ def _updates(
             linear, about, time, key = inputs
             commands = jax.lax.dynamic_slice_in_dim(window.commands, time, HISTORY)
             noise = config.observation_noise * spread * jax.random.normal(key, spread.shape)
-            loads = forces.loads(wrap(params), forces.inputs(history, commands) + noise, history[-1, 8])
+            loads = forces.loads(
+                wrap(params), forces.inputs(history, commands) + noise, history[-1, ObservationLayout.yaw]
+            )
             both = jnp.concatenate([moved, loads - about])
             features = linear.features + linear.seen @ both
             return (linear.state @ both, jnp.concatenate([history[1:], features[None]])), (features, loads)
@@ -193,7 +204,7 @@ def _updates(
         steps = len(window.features)
         through = linear, about, jnp.arange(steps), jax.random.split(key_noise, steps)
         _, (features, loads) = jax.lax.scan(step, (first, window.history), through)
-        tracking = _loss(features, window.features)
+        tracking = _loss(features, window.features, control_timestep)
         return tracking + config.force_cost * jnp.mean(square_newtons(loads, forces.config)), tracking
 
     @jax.jit

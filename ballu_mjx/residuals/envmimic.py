@@ -31,8 +31,9 @@ from ballu_mjx.residuals.network import (
     world_loads,
 )
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.sim.coordinates import translations
 from ballu_mjx.sim.force_model import to_wrenches
-from ballu_mjx.sim.observation import HISTORY, world_rotation, wrap_angle
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout, world_rotation, wrap_angle
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
@@ -101,8 +102,9 @@ def reward_terms(
 ) -> dict[str, Float[Array, ""]]:
     """The paper's `r_pos` and `r_orn` (`position`, `orientation`) for simulated and recorded features, and the weighted
     sum of these and of their sharper twins (`tracking`)."""
-    position_error = jnp.sum((target[:3] - seen[:3]) ** 2)
-    angles = wrap_angle(target[6:9] - seen[6:9])
+    layout = ObservationLayout
+    position_error = jnp.sum((target[layout.position] - seen[layout.position]) ** 2)
+    angles = wrap_angle(target[layout.euler_angles] - seen[layout.euler_angles])
     orientation_error = jnp.sum(jnp.array(config.orientation_axes) * angles**2)
 
     position = jnp.exp(-config.position_scale * position_error)
@@ -212,7 +214,7 @@ class EnvMimicEnv(Env):
         """Advance one control step under the recording's command and the policy's force."""
         before = tracking_state(state)
         recording, time = before.recording, before.time
-        loads = world_loads(action, before.rollout.features[8], self.config, self.robot)
+        loads = world_loads(action, before.rollout.features[ObservationLayout.yaw], self.config, self.robot)
         command, wrench = self.reference.command[recording, time], to_wrenches(loads, self.config.forces)
         after = self.simulator.step(before.rollout, command, wrench=wrench).state
 
@@ -288,31 +290,22 @@ class EnvMimicEnv(Env):
         critic = [seen]
         if self.config.critic_sees_error:
             error = self.reference.features[recording, time] - rollout.features
-            to_heading = world_rotation(rollout.features[8], self.robot.anchored).T
-            critic += [to_heading @ error[:3], to_heading @ error[3:6], wrap_angle(error[6:9])]
+            layout = ObservationLayout
+            to_heading = world_rotation(rollout.features[layout.yaw], self.robot.anchored).T
+            critic += [to_heading @ error[layout.position], to_heading @ error[layout.velocity]]
+            critic += [wrap_angle(error[layout.euler_angles])]
         return {"state": seen + noise, "critic": jnp.concatenate([*critic, commands.ravel()])}
 
 
 def start_spread(model: mujoco.MjModel, robot: RobotDescription) -> Float[np.ndarray, " directions"]:
-    """What reconstruction leaves uncertain of a state, as standard deviations of positions and velocities along the
-    directions of `qvel`: 1 mm and 0.5 deg; 1 cm/s, and 2 deg/s for the base and 5 deg/s for joints.
+    """Return what reconstruction leaves uncertain of a state, as standard deviations along the directions of `qvel`.
 
-    Held joints (BALLU's motors) hardly vary: the cable makes a degree of theirs a push on the knee that no
-    reconstruction error is.
+    Positions come first (1 mm and 0.5 deg), then velocities (1 cm/s, 2 deg/s for a free base and 5 deg/s for joints).
+    The robot's held joints hardly vary: behind a stiff transmission a degree is a push that no reconstruction error is.
     """
-    degree = np.pi / 180
-    slides = np.concatenate([_DIRECTIONS[kind] for kind in model.jnt_type]) == _ALONG
-    position, velocity = np.where(slides, 1e-3, 0.5 * degree), np.where(slides, 0.01, 5 * degree)
+    degree, along = np.pi / 180, translations(model)
+    position, velocity = np.where(along, 1e-3, 0.5 * degree), np.where(along, 0.01, 5 * degree)
     if not robot.anchored:
         velocity[3:6] = 2 * degree
     position[[model.joint(name).dofadr[0] for name in robot.held]] = 1e-3 * degree
     return np.concatenate([position, velocity])
-
-
-_ALONG, _ABOUT = 0, 1
-_DIRECTIONS = {
-    int(mujoco.mjtJoint.mjJNT_FREE): [_ALONG] * 3 + [_ABOUT] * 3,
-    int(mujoco.mjtJoint.mjJNT_SLIDE): [_ALONG],
-    int(mujoco.mjtJoint.mjJNT_HINGE): [_ABOUT],
-}
-"""What the velocities of a joint are, by its type."""

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from ballu_mjx.recordings.reference import ReferenceMotions
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.force_model import Fields, ForceSet, num_vectors, to_wrenches
-from ballu_mjx.sim.observation import HISTORY, commands_seen, heading_observation, world_rotation
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout, commands_seen, heading_observation, world_rotation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +55,7 @@ def network_input(
 
 def num_inputs(config: ForceNetworkConfig, robot: RobotDescription) -> int:
     """Return the size of `network_input`."""
-    return HISTORY * (robot.features + len(robot.commands) * config.observe_command)
+    return HISTORY * (ObservationLayout.of(robot).size + len(robot.commands) * config.observe_command)
 
 
 def num_loads(config: ForceNetworkConfig, robot: RobotDescription) -> int:
@@ -130,7 +130,7 @@ class NetworkForces:
         key: Array | None = None,
     ) -> Float[Array, "loaded 6"]:
         """The policy's loads, where they act."""
-        seen, yaw = self.inputs(history, commands), history[-1, 8]
+        seen, yaw = self.inputs(history, commands), history[-1, ObservationLayout.yaw]
         if key is None or self.sample is None:
             loads = self.loads(params, seen, yaw)
         else:

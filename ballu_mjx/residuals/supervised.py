@@ -26,8 +26,9 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.network import ForceNetworkConfig, load_units, recorded_inputs
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.sim.coordinates import translations
 from ballu_mjx.sim.linearize import ControlSteps, Linearizer
-from ballu_mjx.sim.observation import HISTORY, heading_rotation
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout, world_rotation
 from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
@@ -66,10 +67,10 @@ class SupervisedConfig:
     """Labels in a gradient step."""
     learning_rate: float = 1e-3
     """Adam's."""
-    shares: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
-    """Of the forces, of which the one that acts is chosen: whose simulation follows the validation recordings best. A
-    force that is right in recorded states may lead astray in simulated ones. `--shares 1`: all of them, as in the
-    paper."""
+    force_scales: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
+    """Fractions of the forces, of which the one that acts is chosen: whose simulation follows the validation recordings
+    best. A force that is right in recorded states may lead astray in simulated ones. `--force-scales 1`: all of them,
+    as in the paper."""
     seed: int = 0
     """Seeds network and batches."""
 
@@ -78,10 +79,10 @@ def check_supervised_config(config: SupervisedConfig) -> None:
     """**Raises** `InputError` for options out of range, naming the option."""
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        if field.name not in ("observation_noise", "shares", "seed") and not value > 0:
+        if field.name not in ("observation_noise", "force_scales", "seed") and not value > 0:
             raise InputError(f"--{field.name.replace('_', '-')} is {value}: it must be greater than 0.")
-    if not config.shares or not all(0.0 <= share <= 1.0 for share in config.shares):
-        raise InputError(f"--shares is {' '.join(map(str, config.shares))}: give one or more from 0 to 1.")
+    if not config.force_scales or not all(0.0 <= scale <= 1.0 for scale in config.force_scales):
+        raise InputError(f"--force-scales is {' '.join(map(str, config.force_scales))}: give one or more from 0 to 1.")
 
 
 class ForceLabeller:
@@ -171,8 +172,11 @@ _ANY_VELOCITY = 10.0
 def _noise(
     model: mujoco.MjModel, robot: RobotDescription, config: SupervisedConfig
 ) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, " 2*nv"]]:
-    """Standard deviations of recorded positions, and of what a control step is off by beyond its inputs; both along the
-    directions of `mjx.Data.qvel`, of the second also the velocities'."""
+    """Return standard deviations of recorded positions, and of what a control step is off by beyond its inputs.
+
+    Both are along the directions of `mjx.Data.qvel`, the second also along the velocities'. Slides count as
+    translations. A held slide is as many times less certain than others as a held hinge.
+    """
     degree = np.pi / 180
     trunk, body = [], int(model.site_bodyid[model.site(robot.tracked).id])
     while body:  # from the tracked body down to the root
@@ -180,8 +184,14 @@ def _noise(
         body = int(model.body_parentid[body])
     velocity = np.where(np.isin(model.dof_bodyid, trunk), config.rotation_noise, config.joint_noise) * degree
     measured = np.full(model.nv, config.angle_noise * degree)
-    velocity[:3], measured[:3] = config.velocity_noise, config.position_noise
-    measured[[model.joint(name).dofadr[0] for name in robot.held]] = config.held_angle_noise * degree
+    along = translations(model)
+    velocity[along], measured[along] = config.velocity_noise, config.position_noise
+    held = [model.joint(name).dofadr[0] for name in robot.held]
+    measured[held] = np.where(
+        along[held],
+        config.position_noise * config.held_angle_noise / config.angle_noise,
+        config.held_angle_noise * degree,
+    )
     return measured, np.concatenate([velocity * model.opt.timestep, velocity])
 
 
@@ -191,13 +201,17 @@ def examples(
     loads: Sequence[Float[np.ndarray, "steps loads"]],
     config: ForceNetworkConfig,
 ) -> tuple[Float[np.ndarray, "examples inputs"], Float[np.ndarray, "examples loads"]]:
-    """What the network sees of each recorded state that has a history, and the action (see `network.world_loads`) that
-    is its label."""
+    """Return what the network sees of each recorded state that has a history, and the action that is its label.
+
+    Actions are those of `network.world_loads`.
+    """
     reference, _ = stack_motions(simulator, motions)
     first = HISTORY - 1
-    yaw = [np.asarray(seen[first:count, 8]) for seen, count in zip(reference.features, reference.steps, strict=True)]
+    headings = np.asarray(reference.features[..., ObservationLayout.yaw])
+    yaw = [seen[first:count] for seen, count in zip(headings, reference.steps, strict=True)]
     labels = np.concatenate([each[first:] for each in loads])
-    to_world = np.asarray(jax.vmap(heading_rotation)(jnp.asarray(np.concatenate(yaw))))
+    anchored = simulator.robot.anchored
+    to_world = np.asarray(jax.vmap(lambda yaw: world_rotation(yaw, anchored))(jnp.asarray(np.concatenate(yaw))))
     turned = np.einsum("nji,nvj->nvi", to_world, labels.reshape(len(labels), -1, 3)).reshape(labels.shape)
     actions = turned / load_units(config, labels.shape[1])
     return np.asarray(recorded_inputs(reference, config, simulator.robot)), np.asarray(actions, np.float32)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 from pathlib import Path
 from typing import Any, Literal
@@ -14,24 +13,15 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
-from ballu_mjx.residuals.aerodynamics import AERODYNAMICS_FILE, Aerodynamics, read_air_parameters
-from ballu_mjx.residuals.envmimic import EnvMimicConfig, check_envmimic_config
-from ballu_mjx.residuals.network import NetworkForces, num_inputs, num_loads
+from ballu_mjx.residuals.kinds import KINDS, RESIDUAL_TASKS, StoredRun
 from ballu_mjx.residuals.run_config import run_actuators, run_residual, run_robot
-from ballu_mjx.rl import ppo
-from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
-from ballu_mjx.runs.checkpoints import restore_checkpoint
-from ballu_mjx.runs.folder import read_config, typed_config
+from ballu_mjx.runs.folder import read_config
 from ballu_mjx.runs.record import TrainingRecord
 from ballu_mjx.sim.force_model import BoundForces, Fields, ForceModel
 from ballu_mjx.sim.simulator import AugmentedSimulator
 
-NETWORK_TASKS = ("envmimic", "supervised", "analytic")
-"""Runs that leave a network of forces."""
-RESIDUAL_TASKS = (*NETWORK_TASKS, "aerodynamic")
-"""Runs that leave a residual."""
 MARGIN = 0.1
 """How far beyond the recorded range, in its widths, an observation still counts as inside: the range is that of a
 finite sample."""
@@ -93,31 +83,14 @@ class TrainedResidual:
         if own.sha256 != robot.sha256:
             raise InputError(f"{folder}: is of the robot {own.name}, not of {robot.name}; give one of the same robot.")
         identified = run_actuators(stored, folder, own)
-        if stored["task"] == "aerodynamic":
-            step, model = 0, Aerodynamics(robot, robot.load_model(identified))
-            params = read_air_parameters(folder / AERODYNAMICS_FILE, robot)
-            inputs = num_inputs(EnvMimicConfig(), robot)
-        else:
-            step, tree = restore_checkpoint(folder, which)
-            params = ppo.from_tree(tree)
-            inputs = params.normalizer.mean["state"].shape[0]
-            check = functools.partial(check_envmimic_config, control_timestep=robot.control_timestep)
-            config = typed_config(EnvMimicConfig, stored, "env", folder, check)
-            network = typed_config(PPOConfig, stored, "ppo", folder, ppo.check_values)
-            sizes = inputs, num_loads(config, robot), network
-            infer = ppo.make_inference(*sizes)
-            if not (inputs == num_inputs(config, robot) and ppo.fits(infer, params, inputs)):
-                raise InputError(
-                    f"{folder}: the stored parameters do not fit the networks in its config.json; restore one of them."
-                )
-            sample = ppo.make_sampler(*sizes) if stored["task"] == "envmimic" else None
-            model = NetworkForces(config, robot, infer, sample, stored["task"])
-            if (where := run_residual(stored, folder)) is not None:
-                if where.resolve() in loading:
-                    raise InputError(f"{folder}: is its own base residual; restore its config.json.")
-                base = TrainedResidual.load(where, robot, loading=loading)
-                both = base.bound.plus(BoundForces(model, params))
-                model, params = both.model, both.params
+        model, params, inputs, step = KINDS[stored["task"]].load(StoredRun(folder, stored, robot, identified, which))
+        where = run_residual(stored, folder) if KINDS[stored["task"]].network else None
+        if where is not None:
+            if where.resolve() in loading:
+                raise InputError(f"{folder}: is its own base residual; restore its config.json.")
+            base = TrainedResidual.load(where, robot, loading=loading)
+            both = base.bound.plus(BoundForces(model, params))
+            model, params = both.model, both.params
         return TrainedResidual(model, params, _read_observed(folder / _OBSERVED, inputs), step, identified)
 
     @property

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ballu_mjx.sim.coordinates import compress, expand, has_free_joint
 from ballu_mjx.sim.force_model import ForceSet, num_vectors, to_wrenches
 from ballu_mjx.sim.sharding import shard_over_devices
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
@@ -39,18 +40,21 @@ class ControlSteps(NamedTuple):
 
 
 class Linearized(NamedTuple):
-    """Control steps to first order. The state's directions are those of `mjx.Data.qvel` for positions (the base turns
-    about its own axes), then the velocities'; the inputs are the loads (N, N m) and then the joints' torques (N m)."""
+    """Control steps to first order.
+
+    The state's directions are those of `mjx.Data.qvel` for positions (a free body turns about its own axes), then the
+    velocities'. The inputs are the loads (N, N m) and then the joints' torques (N m).
+    """
 
     qpos: Float[Array | np.ndarray, "steps nq"]
     """After the step."""
     qvel: Float[Array | np.ndarray, "steps nv"]
     """After the step."""
-    features: Float[Array | np.ndarray, "steps 27"]
+    features: Float[Array | np.ndarray, "steps features"]
     """After the step."""
     state: Float[Array | np.ndarray, "steps 2nv 2nv+inputs"]
     """Derivative of the state after by the state before and the inputs."""
-    seen: Float[Array | np.ndarray, "steps 27 2nv+inputs"]
+    seen: Float[Array | np.ndarray, "steps features 2nv+inputs"]
     """Derivative of the features after, likewise."""
 
 
@@ -66,7 +70,7 @@ class Linearizer:
         """Prepare to linearize control steps of `simulator`; `joints` are those whose torques are inputs too."""
         self.simulator = simulator.with_residual(None)
         plain = self.simulator.simulator
-        self._nv = plain.nv
+        self._nv, self._free = plain.nv, has_free_joint(plain.mj_model)
         self._forces: ForceSet = forces
         self._joints = np.array([plain.mj_model.joint(name).dofadr[0] for name in joints], int)
         self.loads = 3 * num_vectors(forces, len(plain.robot.points))
@@ -94,9 +98,9 @@ class Linearizer:
         """A control step and its derivatives, those along one direction in a row."""
         nv, physics = self._nv, step.state.physics
         units = jnp.eye(self.directions)
-        turned = jax.vmap(lambda change: _expand(physics.qpos, change))(units[:, :nv])
+        rates = jax.vmap(lambda change: expand(physics.qpos, change, self._free))(units[:, :nv])
         start = PhysicsState(*map(jnp.asarray, physics)), jnp.zeros(self.directions - 2 * nv)
-        moves = PhysicsState(turned, units[:, nv : 2 * nv], jnp.zeros_like(turned[:, :nv])), units[:, 2 * nv :]
+        moves = PhysicsState(rates, units[:, nv : 2 * nv], jnp.zeros_like(units[:, :nv])), units[:, 2 * nv :]
 
         def after(moved: PhysicsState, inputs: Float[Array, " inputs"]) -> tuple[PhysicsState, Array]:
             wrench = to_wrenches(jnp.asarray(step.loads) + inputs[: self.loads], self._forces)
@@ -111,23 +115,6 @@ class Linearizer:
 
         # The step itself is the same for all directions, and simulated once for all.
         (state, features), (change, seen) = jax.vmap(lambda *move: jax.jvp(after, start, move))(*moves)
-        moved = jnp.concatenate([jax.vmap(_compress)(state.qpos, change.qpos), change.qvel], axis=1)
+        positions = jax.vmap(lambda qpos, rate: compress(qpos, rate, self._free))(state.qpos, change.qpos)
+        moved = jnp.concatenate([positions, change.qvel], axis=1)
         return state.qpos[0], state.qvel[0], features[0], moved, seen
-
-
-def _expand(qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:
-    """Rates of generalized positions of the velocities `change`, in MuJoCo's conventions: q' = q (0, omega) / 2."""
-    turn = _product(qpos[3:7], jnp.concatenate([jnp.zeros(1), change[3:6]])) / 2
-    return jnp.concatenate([change[:3], turn, change[6:]])
-
-
-def _compress(qpos: Float[Array, " nq"], change: Float[Array, " nq"]) -> Float[Array, " nv"]:
-    """The inverse of `_expand`."""
-    conjugate = qpos[3:7] * jnp.array([1.0, -1.0, -1.0, -1.0])
-    return jnp.concatenate([change[:3], 2 * _product(conjugate, change[3:7])[1:], change[7:]])
-
-
-def _product(a: Float[Array, " 4"], b: Float[Array, " 4"]) -> Float[Array, " 4"]:
-    """Of quaternions (w, x, y, z)."""
-    v, w = a[1:], b[1:]
-    return jnp.concatenate([(a[0] * b[0] - v @ w)[None], a[0] * w + b[0] * v + jnp.cross(v, w)])

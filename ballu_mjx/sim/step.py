@@ -9,7 +9,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from jaxtyping import Array, Float
 from mujoco import mjx
 from mujoco.mjx._src.solver import Context
@@ -55,11 +54,11 @@ def load_state(template: mjx.Data, state: PhysicsState) -> mjx.Data:
 
 
 def physics_step(
-    model: mjx.Model, held: mjx.Data, state: PhysicsState, load_by_place: Callable[[mjx.Data], mjx.Data] | None = None
+    model: mjx.Model, inputs: mjx.Data, state: PhysicsState, load_by_place: Callable[[mjx.Data], mjx.Data] | None = None
 ) -> PhysicsState:
-    """One physics step under the commands and forces of `held`, data of the model: `mjx.step`. `load_by_place` adds
+    """One physics step under the commands and forces of `inputs`, data of the model: `mjx.step`. `load_by_place` adds
     external forces that depend on where bodies are."""
-    data = mjx.fwd_position(model, load_state(held, state))
+    data = mjx.fwd_position(model, load_state(inputs, state))
     if load_by_place is not None:
         data = load_by_place(data)
     for stage in (mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
@@ -163,7 +162,7 @@ def control_step(
         pushed = template.xfrc_applied
         for number, body in enumerate(bodies):
             pushed = pushed.at[body].add(wrench[number])
-        held = template.replace(xfrc_applied=pushed)  # pyright: ignore
+        loaded = template.replace(xfrc_applied=pushed)  # pyright: ignore
 
         def at_points(data: mjx.Data) -> mjx.Data:
             pushed = data.xfrc_applied
@@ -172,7 +171,7 @@ def control_step(
             return data.replace(xfrc_applied=pushed)  # pyright: ignore
 
         def step(number: Array, state: PhysicsState) -> PhysicsState:
-            now = held.replace(ctrl=commands[number])  # pyright: ignore
+            now = loaded.replace(ctrl=commands[number])  # pyright: ignore
             return physics_step(model, now, state, at_points if points else None)
 
         return jax.lax.fori_loop(0, count, step, state)
@@ -189,8 +188,3 @@ def put_model(model: mujoco.MjModel) -> mjx.Model:
 def make_data(model: mujoco.MjModel) -> mjx.Data:
     """MJX data of `model` at its reference pose, on this process's first device."""
     return mjx.make_data(model, device=jax.local_devices()[0])
-
-
-def balloon_id(model: mujoco.MjModel) -> int:
-    """Body id of the balloon."""
-    return int(np.asarray(model.body("balloon").id))

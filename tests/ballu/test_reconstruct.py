@@ -353,11 +353,11 @@ def test_commands_are_means_over_control_steps(truth):
 
 
 def test_lengths_share_a_program(truth, seen_without_base):
-    before = _servo_chunk._cache_size()  # pyright: ignore[reportFunctionMemberAccess]
+    before = _servo_chunk._cache_size()  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
     recording = capture(truth, base=False)
     motion = reconstruct(cut(recording, slice(333)), load_robot(), MODEL)
     assert len(motion.qpos) == 67
-    assert _servo_chunk._cache_size() == before  # pyright: ignore[reportFunctionMemberAccess]
+    assert _servo_chunk._cache_size() == before  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
     np.testing.assert_allclose(motion.qpos[5:50, 7:], seen_without_base.qpos[5:50, 7:], atol=np.deg2rad(1.0))
 
 

@@ -353,7 +353,8 @@ def evaluation_fault(found: Any) -> str | None:
     each = [*found.vanilla, *found.residual]
     numbers = [x for errors in each for table in (errors.position, errors.yaw) for pair in table.values() for x in pair]
     numbers += [x for e in each for x in (e.mean_com_error, e.final_yaw_error, e.mean_force)]
-    return None if finite(*numbers) and finite(found.score) and printable(*(e.recording for e in each)) else "numbers"
+    numbers = [x for x in [*numbers, found.score] if x != math.inf]  # of simulations that diverged
+    return None if finite(*numbers) and printable(*(e.recording for e in each)) else "numbers"
 
 
 def replay_fault(takes: Any) -> str | None:
@@ -389,7 +390,7 @@ def formats(work: Path) -> list[Format]:
     from ballu_mjx.cli.cached_stages import read_mark, write_mark
     from ballu_mjx.evaluation import transfer
     from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_recording
-    from ballu_mjx.recordings.importers.mapping import read_mapping
+    from ballu_mjx.recordings.importers.mapping import example_mapping, read_mapping
     from ballu_mjx.recordings.recording import cut
     from ballu_mjx.residuals.aerodynamics import AERODYNAMICS_FILE, AERODYNAMICS_FORMAT, read_air_parameters
     from ballu_mjx.residuals.trained import _read_observed

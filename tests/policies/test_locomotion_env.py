@@ -105,7 +105,7 @@ def test_randomization_draws_friction_and_start_and_is_off_by_default():
     drawn = inner(draw(setting_of(MODEL, config, None), keys))
     low, high = config.friction
     assert low <= drawn["friction"].min() < low + 0.05 and high - 0.05 < drawn["friction"].max() <= high
-    yaw = np.rad2deg(np.asarray(drawn["history"])[:, -1, 8])
+    yaw = np.rad2deg(np.asarray(drawn["rollout"].features)[:, 8])
     assert config.start_yaw * 0.9 < yaw.max() <= config.start_yaw + 1 and yaw.min() < -config.start_yaw * 0.9
     knees = np.asarray(drawn["rollout"].physics.qpos)[:, 7:][:, KNEES]
     assert (knees >= standing_qpos(MODEL)[7:][KNEES] - 1e-6).all()
@@ -118,11 +118,12 @@ def test_friction_drawn_is_friction_felt():
     for friction in (0.2, 1.0):
         thrown = inner(state)["rollout"].physics
         thrown = thrown._replace(qvel=thrown.qvel.at[0].set(1.0))
-        pushed = inner(state) | {"friction": jnp.float32(friction), "physics": thrown}
+        rollout = inner(state)["rollout"]._replace(physics=thrown)
+        pushed = inner(state) | {"friction": jnp.float32(friction), "rollout": rollout}
         now = dataclasses.replace(state, pipeline_state=pushed)
         for _ in range(10):
             now = STEP(now, -jnp.ones(2))
-        way.append(float(inner(now)["history"][-1, 15]))
+        way.append(float(inner(now)["rollout"].features[15]))
     assert way[0] > way[1] + 0.02
 
 

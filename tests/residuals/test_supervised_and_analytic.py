@@ -29,7 +29,7 @@ from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.linearize import ControlSteps, Linearizer
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.simulator import Simulator
-from ballu_mjx.sim.step import balloon_id, count_substeps
+from ballu_mjx.sim.step import count_substeps
 
 BALLU = load_robot()
 SIMULATOR = Simulator(BALLU)
@@ -55,7 +55,7 @@ def pushed(name: str, height: float, model: mujoco.MjModel = MODEL, twist: float
     data.qpos[:] = standing_qpos(model)
     mujoco.mj_step(model, data, 100)
     data.qpos[2] += height
-    data.xfrc_applied[balloon_id(model)] = np.r_[PUSH, twist * TWIST]
+    data.xfrc_applied[model.body("balloon").id] = np.r_[PUSH, twist * TWIST]
     time = np.arange(steps) * CONTROL_TIMESTEP
     command = np.where((time[:, None] / 1.2 + np.array([0.0, 0.5])) % 1.0 < 0.4, 0.7, 0.0)
     states = [(data.qpos.copy(), data.qvel.copy())]
@@ -108,7 +108,7 @@ def test_derivatives_are_those_of_c_mujoco(unforced: ControlSteps, linearize: Li
     so most steps must agree, not all."""
     few = jax.tree.map(lambda x: x[::4], unforced)
     linear = linearize(few._replace(loads=np.zeros((len(few.loads), linearize.loads))))
-    data, body, nv = mujoco.MjData(MODEL), balloon_id(MODEL), MODEL.nv
+    data, body, nv = mujoco.MjData(MODEL), MODEL.body("balloon").id, MODEL.nv
     joints = [MODEL.joint(name).dofadr[0] for name in BALLU.joints]
     sizes = np.r_[np.full(nv, 1e-5), np.full(nv, 1e-4), np.full(3, 1e-3), np.full(3 + len(joints), 1e-5)]
     rng = np.random.default_rng(0)
@@ -188,7 +188,12 @@ def test_examples_are_in_the_balloon_s_heading(motions: list[Motion]):
 
 def test_gradients_find_the_push(recorded: Segments, inputs: np.ndarray, start: ppo.Params, linearize: Linearizer):
     config = AnalyticConfig(
-        window_seconds=SECONDS, rounds=4, updates=150, validate_every=150, learning_rate=1e-3, observation_noise=0.0
+        window_seconds=SECONDS,
+        relinearizations=4,
+        updates=150,
+        validate_every=150,
+        learning_rate=1e-3,
+        observation_noise=0.0,
     )
     found: list[tuple[object, dict[str, float]]] = []
     analytic.train(
@@ -214,18 +219,18 @@ def test_gradients_find_the_push(recorded: Segments, inputs: np.ndarray, start: 
 @pytest.mark.parametrize(
     ("config", "says"),
     [
-        (AnalyticConfig(rounds=0), "--rounds is 0"),
+        (AnalyticConfig(relinearizations=0), "--relinearizations is 0"),
         (AnalyticConfig(window_seconds=0.01), "--window-seconds"),
         (SupervisedConfig(force_change=-1.0), "--force-change is -1"),
-        (SupervisedConfig(shares=(0.5, 1.5)), "--shares is 0.5 1.5"),
-        (SupervisedConfig(shares=()), "--shares"),
+        (SupervisedConfig(force_scales=(0.5, 1.5)), "--force-scales is 0.5 1.5"),
+        (SupervisedConfig(force_scales=()), "--force-scales"),
         (AnalyticConfig(interval_seconds=float("inf")), "--interval-seconds"),
     ],
 )
 def test_options_out_of_range_are_refused(config: AnalyticConfig | SupervisedConfig, says: str):
     with pytest.raises(InputError, match=says):
         if isinstance(config, AnalyticConfig):
-            check_analytic_config(config)
+            check_analytic_config(config, 0.05)
         else:
             check_supervised_config(config)
 

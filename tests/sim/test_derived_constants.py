@@ -56,7 +56,7 @@ def test_constants_are_those_of_mj_setconst(robot: RobotDescription) -> None:
 def test_constants_of_unaltered_masses_are_the_models_own() -> None:
     robot = load_robot()
     model = robot.load_model()
-    found = Simulator(load_robot(), model=model).with_fields({"body_mass": jnp.asarray(model.body_mass)}).model
+    found = Simulator(robot).with_fields({"body_mass": jnp.asarray(model.body_mass)}).model
     for name in DERIVED:
         np.testing.assert_allclose(getattr(found, name), getattr(model, name), rtol=1e-6, err_msg=name)
 
@@ -64,7 +64,7 @@ def test_constants_of_unaltered_masses_are_the_models_own() -> None:
 def test_constants_change_with_mass_as_mj_setconst_s_do() -> None:
     robot = load_robot()
     model = robot.load_model()
-    simulator, body = Simulator(load_robot(), model=model), model.body("balloon").id
+    simulator, body = Simulator(robot), model.body("balloon").id
 
     def weights(added: jax.Array) -> jax.Array:
         return simulator.with_fields(
@@ -91,9 +91,7 @@ def test_an_altered_robot_walks_as_in_c_mujoco() -> None:
     mujoco.mj_step(expected, data, 200)
     start = data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy()
     with jax.enable_x64(True):
-        simulator = Simulator(load_robot(), model=model).with_fields(
-            {name: jnp.asarray(x) for name, x in fields.items()}
-        )
+        simulator = Simulator(robot).with_fields({name: jnp.asarray(x) for name, x in fields.items()})
 
         @jax.jit
         def walk(state: PhysicsState, commands: jax.Array) -> jax.Array:

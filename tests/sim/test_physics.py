@@ -33,7 +33,6 @@ from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.step import (
     _newton_step,
     _solve,
-    balloon_id,
     control_step,
     count_substeps,
     load_state,
@@ -95,7 +94,7 @@ class Samples:
 @functools.cache
 def samples() -> Samples:
     model = tight_model()
-    balloon, rng = balloon_id(model), np.random.default_rng(0)
+    balloon, rng = model.body("balloon").id, np.random.default_rng(0)
     rows = []
     for _ in range(8):
         data = mujoco.MjData(model)
@@ -129,7 +128,7 @@ def test_samples_visit_every_regime() -> None:
 def test_mjx_follows_c_mujoco_over_a_control_step() -> None:
     """The same step in float32 and in double precision, under a wrench on the balloon and forces at base and feet."""
     s, model = samples(), load_model()
-    count, balloon = count_substeps(model, CONTROL_TIMESTEP), balloon_id(model)
+    count, balloon = count_substeps(model, CONTROL_TIMESTEP), model.body("balloon").id
     points = tuple(model.site(name).id for name in load_robot().points)
     bodies = (balloon, *model.site_bodyid[list(points)].tolist())
     mjx_model, template = put_model(model), make_data(model)
@@ -316,7 +315,7 @@ def settled_in_mjx() -> tuple[np.ndarray, np.ndarray]:
 
     def knees(parameters: ActuatorParameters, command: Float[Array, " 2"]) -> Array:
         moved = with_fields(mjx_model, actuator_fields(model, parameters))
-        bodies, no_force = (balloon_id(model),), jnp.zeros((1, 6))
+        bodies, no_force = (model.body("balloon").id,), jnp.zeros((1, 6))
         state = control_step(moved, template, start, command, no_force, bodies=bodies, count=SETTLING_STEPS)
         return state.qpos[7:][KNEES]
 
