@@ -118,7 +118,7 @@ class _Fit:
     def __init__(
         self,
         setup: _Setup,
-        config: Any,
+        config: SupervisedConfig | AnalyticConfig,
         record: TrainingRecord,
         validate: Callable[[Params], float],
         progress: PhaseProgress | None,
@@ -155,6 +155,7 @@ class _Supervised(_Fit):
     def learn(self) -> None:
         """Labels for training and validation, the regression, and which share of its forces to take."""
         setup, config = self.setup, self.config
+        assert isinstance(config, SupervisedConfig)
         robot, env = setup.simulator.robot, setup.forces.config
         linearize = Linearizer(setup.simulator, robot.joints, env.forces)
         label = supervised.ForceLabeller(linearize, config, env)
@@ -184,7 +185,7 @@ class _Supervised(_Fit):
         validate(0, self.still, float(np.mean(found["training"][1] ** 2)))
         supervised.regress(infer, setup.start.policy, found["training"], config, validate)
         _, step, policy = best
-        parts = {share: ppo.with_share(policy, share) for share in config.shares}
+        parts = {share: ppo.with_share(policy, share) for share in config.force_scales}
         errors = {share: self.validate(setup.with_policy(part)) for share, part in parts.items()}
         told = ", ".join(f"{share:.0%}: {error:.2f}" for share, error in errors.items())
         self.notes.append(f"Validation error by the share of the forces that acts (ratio): {told}.")
@@ -201,10 +202,11 @@ class _Analytic(_Fit):
     def learn(self) -> None:
         """Gradients through the simulation; the validation is open loop."""
         setup, config = self.setup, self.config
+        assert isinstance(config, AnalyticConfig)
         cut = cut_segments(
             setup.simulator.simulator, setup.motions.training, config.window_seconds, config.interval_seconds
         )
-        total = config.rounds * config.updates
+        total = config.relinearizations * config.updates
 
         def report(step: int, policy: Any, metrics: dict[str, float]) -> None:
             error = self.validate(setup.with_policy(policy))

@@ -124,12 +124,13 @@ def observed_range(
     inputs: Float[Array | np.ndarray, "states inputs"],
 ) -> tuple[Float[np.ndarray, " inputs"], Float[np.ndarray, " inputs"]]:
     """Return the smallest and the largest of each input."""
-    return np.min(inputs, axis=0).astype(np.float32), np.max(inputs, axis=0).astype(np.float32)
+    seen = np.asarray(inputs, np.float32)
+    return seen.min(axis=0), seen.max(axis=0)
 
 
 def write_observed(run: TrainingRecord, inputs: Float[Array | np.ndarray, "states inputs"]) -> None:
     """Leave in the run's folder the range of what its policy saw in the recordings."""
-    low, high = (np.asarray(bound) for bound in (np.min(inputs, axis=0), np.max(inputs, axis=0)))
+    low, high = observed_range(inputs)
     run.write(_OBSERVED, json.dumps({"low": low.tolist(), "high": high.tolist()}) + "\n")
 
 
