@@ -79,15 +79,16 @@ def load(source: Path) -> list[StoredRollout]:
 
         takes = collect(source).takes
         return takes or read_rollouts(source / ROLLOUT_FILE)
-    from ballu_mjx.ballu.model import load_model
-    from ballu_mjx.ballu.reconstruct import reconstruct_ballu
     from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+    from ballu_mjx.recordings.reconstruct import reconstruct
+    from ballu_mjx.robots.registry import load_robot
 
-    recording = read_recording(list_recordings([source])[0])
+    robot = load_robot()
+    recording = read_recording(list_recordings([source])[0], robot)
     if recording.kind != "free":
         raise InputError(f"{source}: is a {recording.kind} recording; only free ones have a way to show.")
     print("Reconstructing the recorded states ...", flush=True)
-    motion = reconstruct_ballu(recording, load_model())
+    motion = reconstruct(recording, robot)
     return [
         StoredRollout(
             name=motion.name,
@@ -237,7 +238,6 @@ def _mujoco(take: StoredRollout) -> None:
     import mujoco
     import mujoco.viewer
 
-    from ballu_mjx.ballu.model import load_model
     from ballu_mjx.viz import robot_meshes
 
     model = load_model()

@@ -28,8 +28,8 @@ from ballu_mjx.residuals.run_config import run_actuators, run_residual, run_robo
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Inference, Params, PPOConfig
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, same_parameters
-from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.checkpoints import Which, restore_checkpoint
 from ballu_mjx.runs.folder import read_config, typed_config
 
@@ -43,7 +43,8 @@ class Policy:
 
     **Fields**
 
-    - `task`, `config`, `actuators` (None: nominal), `residual` (the run's folder; None: none): its simulator.
+    - `task`, `config`, `robot`, `actuators` (None: nominal), `residual` (or its run's folder; None: none): its
+      simulator.
     - `params`: what `learner.params` gave.
     - `infer`: (parameters, observation) to action.
     - `step`: control steps of training behind it.
@@ -51,11 +52,14 @@ class Policy:
 
     task: Task
     config: LocomotionConfig
+    robot: RobotDescription
     actuators: ModelParameters | None
-    residual: Path | None
+    residual: TrainedResidual | Path | None
     params: Params
     infer: Inference
     step: int
+    loop: ClosedLoop | None = dataclasses.field(default=None, repr=False, compare=False)
+    """Its simulator, where that is compiled already."""
 
     @staticmethod
     def load(folder: Path | str, which: Which = "best") -> Policy:
@@ -65,6 +69,7 @@ class Policy:
         """
         folder = Path(folder)
         stored = read_config(folder, *TASKS)
+        robot = run_robot(stored, folder)
         config = typed_config(LocomotionConfig, stored, "env", folder, check_locomotion_config)
         sizes = OBSERVATIONS, ACTIONS, typed_config(PPOConfig, stored, "ppo", folder, ppo.check_values)
         infer = ppo.make_inference(*sizes)
@@ -77,26 +82,39 @@ class Policy:
         return Policy(
             task=TASKS[stored["task"]],
             config=config,
-            actuators=run_actuators(stored, folder, run_robot(stored, folder)),
+            robot=robot,
+            actuators=run_actuators(stored, folder, robot),
             residual=run_residual(stored, folder),
             params=params,
             infer=infer,
             step=step,
         )
 
-    @functools.cached_property  # a residual's name takes reading its run
+    @functools.cached_property  # reading a run takes time, and its commands do without
+    def trained_residual(self) -> TrainedResidual | None:
+        """The residual in its simulator.
+
+        **Raises** `InputError` where its run is gone, damaged, or of other actuators.
+        """
+        if not isinstance(self.residual, Path):
+            return self.residual
+        found = TrainedResidual.load(self.residual, self.robot)
+        check_belongs(found, self.actuators, self.residual)
+        return found
+
+    @property
     def setting(self) -> str:
         """The paper's name of the simulator; see `locomotion_env.setting_name`."""
-        name = None if self.residual is None else TrainedResidual.load(self.residual, load_robot()).model.name
-        return setting_name(self.config, self.actuators is not None, name)
+        residual = self.trained_residual
+        return setting_name(self.config, self.actuators is not None, None if residual is None else residual.model.name)
 
     def environment(self) -> LocomotionEnv:
         """The simulator that the policy was trained in."""
-        return make_environment(self.task, self.config, self.actuators, self.residual)
+        return environment_of(self.robot, self.task, self.config, self.actuators, self.trained_residual)
 
     def closed_loop(self) -> ClosedLoop:
         """That simulator, for any parameters of the policy."""
-        return ClosedLoop(self.environment(), self.infer)
+        return ClosedLoop(self.environment(), self.infer) if self.loop is None else self.loop
 
     def act(self) -> Callable[[Float[np.ndarray, " 27"]], Float[np.ndarray, " 2"]]:
         """`observation.observe_features` to servo commands, for use outside of JAX, step by step."""
@@ -108,17 +126,21 @@ class Policy:
         return lambda features: np.asarray(command(jnp.asarray(features, jnp.float32)), np.float64)
 
 
-def make_environment(
-    task: Task, config: LocomotionConfig, actuators: ModelParameters | None, residual: Path | None
+def environment_of(
+    robot: RobotDescription,
+    task: Task,
+    config: LocomotionConfig,
+    actuators: ModelParameters | None = None,
+    residual: TrainedResidual | None = None,
 ) -> LocomotionEnv:
-    """A task's simulator.
+    """Return a task's simulator."""
+    return LocomotionEnv(robot.load_model(), task, config, actuators=actuators, residual=residual)
 
-    **Raises** `InputError` where `residual` holds no residual, or one that belongs to other actuators.
-    """
-    force = None if residual is None else TrainedResidual.load(residual, load_robot())
-    if force is not None and not same_parameters(force.actuators, actuators):
+
+def check_belongs(residual: TrainedResidual | None, actuators: ModelParameters | None, run: Path | None) -> None:
+    """**Raises** `InputError` where the residual of `run` belongs to other actuators than these."""
+    if residual is not None and not same_parameters(residual.actuators, actuators):
         raise InputError(
-            f"{residual}: its forces were learned beside other actuators; give --actuators the same file, or leave it "
-            "out to take the residual's."
+            f"{run}: its forces were learned beside other actuators; give --actuators the same file, or leave it out "
+            "to take the residual's."
         )
-    return LocomotionEnv(load_robot().load_model(), task, config, actuators=actuators, residual=force)

@@ -18,7 +18,8 @@ JSON with the keys
   `speed` (m/s), `angle` (rad or m);
 - `mirror` (optional): for a robot that is its own mirror image about the xz plane, pairs of names (points, commands,
   joints) that change places, as `{"foot_left": "foot_right"}`; {} where nothing does;
-- `adapter` (optional): `module:Class`, a `robots.adapter.RobotAdapter` with what only this robot has.
+- `adapter` (optional): `module:Class`, a `robots.adapter.RobotAdapter` with what only this robot has;
+- `identify` (optional): parameters that recordings may identify, a list; see `identification.parameters`.
 
 Joints are one free joint at the root or none, then hinges and slides. A robot without a free joint is anchored: what it
 sees and how it is pushed are told in the world's frame, for where it stands and how it is turned then matter.
@@ -56,6 +57,7 @@ _OPTIONAL = (
     "limits",
     "mirror",
     "adapter",
+    "identify",
 )
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 _LONGEST = 60
@@ -108,11 +110,8 @@ class RobotDescription:
     """Names that change places in the mirror image about the xz plane, both ways; None: the robot is not symmetric."""
     adapter: RobotAdapter = dataclasses.field(default_factory=RobotAdapter)
     """What only this robot has."""
-
-    @property
-    def is_ballu(self) -> bool:
-        """Whether it has BALLU's legs."""
-        return type(self.adapter) is not RobotAdapter
+    identify: tuple[Mapping[str, Any], ...] = ()
+    """Parameters that recordings may identify, as declared; `identification.parameters` reads them."""
 
     @property
     def features(self) -> int:
@@ -122,11 +121,11 @@ class RobotDescription:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Columns that its recordings may have, in order."""
-        points = (f"{point}_{axis}" for point in self.points for axis in "xyz")
-        turns = (f"{site}_q{axis}" for site in (self.tracked, *self.oriented_points) for axis in "wxyz")
-        places = (*(f"{self.tracked}_{axis}" for axis in "xyz"), *turns, *points)
-        return ("time", *(f"command_{name}" for name in self.commands), *places, *self.joints)
+        """Columns that its recordings may have."""
+        sites = (self.tracked, *self.points)
+        places = [f"{site}_{axis}" for site in sites for axis in "xyz"]
+        turns = [f"{site}_q{axis}" for site in (self.tracked, *self.oriented_points) for axis in "wxyz"]
+        return ("time", *(f"command_{name}" for name in self.commands), *places, *turns, *self.joints)
 
     def load_model(self, actuators: ModelParameters | None = None) -> mujoco.MjModel:
         """Return the robot for C MuJoCo: the nominal one, or with identified actuators."""
@@ -193,6 +192,7 @@ def read_description(path: Path | str) -> RobotDescription:
         limits=_limits(path, content.get("limits", {})),
         mirror=_mirror(path, content.get("mirror"), (*points, *driven, *joints)),
         adapter=_adapter(path, content.get("adapter")),
+        identify=_entries(path, "identify", content.get("identify", [])),
     )
     twice = [column for number, column in enumerate(found.columns) if column in found.columns[:number]]
     if twice:
@@ -386,6 +386,12 @@ def _name(path: Path, key: str, value: Any) -> str:
     if not isinstance(value, str) or not _NAME.fullmatch(value) or len(value) > _LONGEST:
         _refuse(path, f'"{key}" has {_shown(value)}', "give names of letters, digits and underscores, a letter first")
     return value
+
+
+def _entries(path: Path, key: str, value: Any) -> tuple[Mapping[str, Any], ...]:
+    if not isinstance(value, list) or not all(isinstance(each, dict) for each in value):
+        _refuse(path, f'"{key}" is {_shown(value)}', "write a list of objects")
+    return tuple(value)
 
 
 def _names(path: Path, key: str, value: Any) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ballu_mjx.common import files
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, write_rollouts
 
 if TYPE_CHECKING:
@@ -24,11 +25,12 @@ def write_evaluation(evaluator: OpenLoopEvaluator, params: Any, folder: Path) ->
 
     names = evaluator.base, evaluator.name
     replays = dict(zip(names, (evaluator.replay(params, scale=0.0), evaluator.replay(params)), strict=True))
-    result = Evaluation(*(evaluator.errors(each) for each in replays.values()), *names)  # pyright: ignore[reportCallIssue]
+    vanilla, residual = (evaluator.errors(replays[name]) for name in names)
+    result = Evaluation(vanilla, residual, *names, evaluator.nominal_errors(params))
     files.write(folder / "evaluation.txt", result.table() + "\n")
     files.write(folder / "evaluation.json", json.dumps(result.to_json(), indent=2) + "\n")
     draw_tracking(evaluator, replays, folder / "tracking.png")
-    if evaluator.robot.is_ballu:
+    if evaluator.robot.file == load_robot().file:
         write_rollouts(folder / ROLLOUT_FILE, stored_rollouts(evaluator, replays))
     return result
 

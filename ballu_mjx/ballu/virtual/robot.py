@@ -30,6 +30,7 @@ from ballu_mjx.ballu.model import (
     standing_qpos,
     suspend,
 )
+from ballu_mjx.ballu.recordings import make_recording
 from ballu_mjx.policies.deploy.estimator import Capture, Controller
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.model import assets, set_fields
@@ -341,21 +342,15 @@ def record_sweep(virtual: VirtualRobot, seed: int, name: str, *, commands: int =
                 data.ctrl[:] = servos.at(time + tick * _TICK)
                 mujoco.mj_step(model, data, round(_TICK / PHYSICS_TIMESTEP))
     table = np.array(rows)
-    return Recording(
+    return make_recording(
         name=name,
         kind="suspended",
         robot=virtual.name,
         notes="Actuator sweep, feet off the ground.",
         time=table[:, 0],
         command=np.repeat(table[:, 1:2], 2, axis=1),
-        balloon_position=None,
-        balloon_quaternion=None,
-        base_position=None,
-        base_quaternion=None,
-        foot_position=None,
         motor=table[:, 2:4],
         knee=table[:, 4:6],
-        interpolated={},
     )
 
 
@@ -410,7 +405,7 @@ def _capture_frame(
 
 
 def _finish(capture: Capture, virtual: VirtualRobot, name: str, notes: str) -> Recording:
-    return Recording(
+    return make_recording(
         name=name,
         kind="free",
         robot=virtual.name,
@@ -422,7 +417,4 @@ def _finish(capture: Capture, virtual: VirtualRobot, name: str, notes: str) -> R
         base_position=np.array(capture.base_position),
         base_quaternion=np.array(capture.base_quaternion),
         foot_position=np.array(capture.foot_position),
-        motor=None,
-        knee=None,
-        interpolated={},
     )
