@@ -27,12 +27,12 @@ QUICK: Mapping[str, Any] = {"window_seconds": 0.5, "interval_seconds": 2.0, "eva
 class AirData(RecordingsData):
     """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
-    known: Path | None = None
+    fixed_from: Path | None = None
     """Folder of an earlier run whose parameters are kept but for those of --free: balloons lose lift over weeks, and
-    `--known RUN --free lift` finds how much from one recording. Without this option nothing is known."""
+    `--fixed-from RUN --free lift` finds how much from one recording. Without this option none are kept."""
     free: tuple[Literal[AIR_PARAMETERS], ...] = AIR_PARAMETERS  # pyright: ignore[reportInvalidTypeForm]
-    """Parameters to identify; the others are as in --known, or 0. Leave the lift out where the model's was weighed:
-    what the legs' model lacks can pass for it."""
+    """Parameters to identify; the others are as in --fixed-from, or 0. Leave the lift out where the model's was
+    weighed: what the legs' model lacks can pass for it."""
 
 
 def train(data: AirData, fit: AirConfig) -> int:
@@ -41,7 +41,7 @@ def train(data: AirData, fit: AirConfig) -> int:
     loggers.check(data.wandb)
     if not data.free:
         raise InputError(f"--free names no parameter; there are {', '.join(AIR_PARAMETERS)}.")
-    known = _known(data)
+    earlier = _earlier(data)
     with written_to() as written:
         prepared = prepare("aerodynamic", data)
         folder = written.folder = prepared.folder
@@ -50,7 +50,7 @@ def train(data: AirData, fit: AirConfig) -> int:
                 prepared.simulator,
                 prepared.motions["training"],
                 fit,
-                known=known,
+                fixed_from=earlier,
                 free=data.free,
                 run=run,
                 progress=PhaseProgress(),
@@ -61,13 +61,13 @@ def train(data: AirData, fit: AirConfig) -> int:
     return 0
 
 
-def _known(data: AirData) -> TrainedResidual | None:
+def _earlier(data: AirData) -> TrainedResidual | None:
     """Return the earlier result."""
-    if data.known is None:
+    if data.fixed_from is None:
         return None
-    found = TrainedResidual.load(data.known, load_chosen_robot(data.robot))
+    found = TrainedResidual.load(data.fixed_from, load_chosen_robot(data.robot))
     if not isinstance(found.model, Aerodynamics):
-        raise InputError(f"{data.known}: is no run of `train aerodynamic`; give one.")
+        raise InputError(f"{data.fixed_from}: is no run of `train aerodynamic`; give one.")
     return found
 
 

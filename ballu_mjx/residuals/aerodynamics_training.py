@@ -37,7 +37,7 @@ def fit_aerodynamics(
     motions: Sequence[Motion],
     config: AirConfig | None = None,
     *,
-    known: TrainedResidual | None = None,
+    fixed_from: TrainedResidual | None = None,
     free: Sequence[str] = AIR_PARAMETERS,
     run: TrainingRecord | None = None,
     progress: PhaseProgress | None = None,
@@ -48,22 +48,22 @@ def fit_aerodynamics(
 
     - `motions`: what the simulator is to follow.
     - `config`: how to identify; None: the defaults.
-    - `known`: an earlier result, whose parameters are kept but for those that are `free`; None: nothing is known.
+    - `fixed_from`: an earlier result, whose parameters are kept but for those that are `free`; None: none are kept.
     - `free`: names of the parameters to identify.
     - `run`: takes measurements and files, in a folder say; None: memory.
     - `progress`: is told of every evaluation.
 
-    **Raises** `InputError` for options out of range, where `known` is no such result or belongs to another simulator,
-    and where no motion is as long as a window.
+    **Raises** `InputError` for options out of range, where `fixed_from` is no such result or belongs to another
+    simulator, and where no motion is as long as a window.
     """
     config = config or AirConfig()
     check_air_config(config, simulator.control_timestep)
     if not free:
         raise InputError(f"--free names no parameter; there are {', '.join(AIR_PARAMETERS)}.")
-    if known is not None and not same_parameters(known.actuators, simulator.actuators):
-        raise InputError("The known residual belongs to other actuators than the simulator's; take the same.")
-    if known is not None and not isinstance(known.model, Aerodynamics):
-        raise InputError(f"The known residual is of kind {known.model.name}, not aerodynamic; give another.")
+    if fixed_from is not None and not same_parameters(fixed_from.actuators, simulator.actuators):
+        raise InputError("The earlier residual belongs to other actuators than the simulator's; take the same.")
+    if fixed_from is not None and not isinstance(fixed_from.model, Aerodynamics):
+        raise InputError(f"The earlier residual is of kind {fixed_from.model.name}, not aerodynamic; give another.")
     record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run
     began, done = time.perf_counter(), 0
 
@@ -74,7 +74,7 @@ def fit_aerodynamics(
             progress.update("air", evaluation, _BESIDE + config.evaluations, cost)
         record.log(done, {"cost": cost, "seconds": time.perf_counter() - began})
 
-    values = None if known is None else known.params
+    values = None if fixed_from is None else fixed_from.params
     found = identify_air(simulator, motions, config, report, fixed_from=values, free=free)
     if progress is not None:
         progress.close()

@@ -204,6 +204,11 @@ class AugmentedSimulator:
         """The simulator's actuators; None: the nominal ones."""
         return self.simulator.actuators
 
+    @property
+    def control_timestep(self) -> float:
+        """Seconds between two commands."""
+        return self.simulator.control_timestep
+
     def without_residual(self) -> Simulator:
         """Return the simulator that the residual improves."""
         return Simulator(self.robot, self.actuators, model=self.simulator.mj_model)

@@ -95,7 +95,7 @@ def test_the_traceback_of_bad_input_is_shown_on_demand(line: str, capsys: pytest
     [
         ("train supervised", ("--force-scales", "--forces", "--robot", "--actuators")),
         ("train analytic", ("--relinearizations", "--forces", "--robot")),
-        ("train aerodynamic", ("--known", "--free", "--robot")),
+        ("train aerodynamic", ("--fixed-from", "--free", "--robot")),
         ("train walk", ("--keep-every", "--robot", "--residual", "--domain-randomization")),
         ("train sysid", ("--levels", "--robot", "--objective")),
     ],

@@ -87,7 +87,7 @@ def test_a_step_is_ask_step_observe_and_shift(start: RolloutState, scale: float)
     np.testing.assert_array_equal(after.state.commands, jnp.stack([start.commands[1], COMMAND]))
     if scale == 1.0:
         whole = jax.jit(lambda state: SIMULATOR.with_residual(BoundForces(Springs(), PARAMS)).step(state, COMMAND))
-        np.testing.assert_allclose(whole(start).state.physics.qvel, physics.qvel, atol=1e-5)
+        np.testing.assert_allclose(whole(start).state.physics.qvel, physics.qvel, atol=1e-4)  # another program
         plain = jax.jit(lambda state: SIMULATOR.with_residual(None).step(state, COMMAND))
         assert np.abs(plain(start).state.physics.qvel - physics.qvel).max() > 1e-3
 
