@@ -65,8 +65,8 @@ class ReferencePose(NamedTuple):
             for start in _TRIPLES.get(int(kind), ()):
                 block = slice(first + start, first + start + 3)
                 averages[block, block] = 1 / 3
-        frames = (x.reshape(bodies, 3, 3).copy() for x in (data.xmat, data.ximat))
-        return ReferencePose(translation, rotation, *frames, tendons, below, averages)
+        frame, inertial_frame = (x.reshape(bodies, 3, 3).copy() for x in (data.xmat, data.ximat))
+        return ReferencePose(translation, rotation, frame, inertial_frame, tendons, below, averages)
 
 
 def with_derived_constants(pose: ReferencePose, model: mjx.Model, fields: Mapping[str, Array]) -> dict[str, Array]:
@@ -85,11 +85,13 @@ def with_derived_constants(pose: ReferencePose, model: mjx.Model, fields: Mappin
         return dict(fields)
     old = _constants(pose, model, {})
     new = _constants(pose, model, fields)
-    derived = {}
+    derived: dict[str, Array] = {}
     for name, value in new.items():
         there = old[name] > 0
-        derived[name] = getattr(model, name) * jnp.where(there, value / jnp.where(there, old[name], 1.0), 1.0)
-    return dict(fields) | derived
+        derived[name] = jnp.asarray(getattr(model, name)) * jnp.where(
+            there, value / jnp.where(there, old[name], 1.0), 1.0
+        )
+    return {**fields, **derived}
 
 
 def _constants(pose: ReferencePose, model: mjx.Model, fields: Mapping[str, Array]) -> dict[str, Array]:

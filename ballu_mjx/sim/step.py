@@ -104,9 +104,9 @@ def _derivative(along: DirectionalDerivative, found: _Solution) -> _Solution:
 
 
 _ARRIVED = 0.025
-"""Length of a Newton step (m/s^2 and rad/s^2) that counts as none: a quarter of a millimetre or milliradian a second
-over a physics step. Rounding leaves up to 0.01 at rest; one in twenty steps of a walking robot is farther off, by up to
-20."""
+"""Length of a Newton step (m/s^2 and rad/s^2) that counts as none: a quarter of a mm/s or mrad/s over a physics step.
+
+Rounding leaves up to 0.01 at rest; one in twenty steps of a walking robot is farther off, by up to 20."""
 
 
 def _newton_step(found: _Solution, model: mjx.Model, data: mjx.Data) -> tuple[_Solution, Float[Array, " nv"]]:

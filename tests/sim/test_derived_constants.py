@@ -45,7 +45,7 @@ def compiled(robot: RobotDescription, fields: dict[str, np.ndarray]) -> mujoco.M
 def test_constants_are_those_of_mj_setconst(robot: RobotDescription) -> None:
     model = robot.load_model()
     altered = {name: jnp.asarray(x) for name, x in heavier(model, model.body("balloon").id).items()}
-    found = Simulator(model, robot).altered(altered).model
+    found = Simulator(robot, model=model).with_fields(altered).model
     expected = compiled(robot, heavier(model, model.body("balloon").id))
     change = np.abs(np.asarray(found.dof_invweight0) / model.dof_invweight0 - 1).max()
     assert change > 0.1, "nothing to derive"
@@ -56,7 +56,7 @@ def test_constants_are_those_of_mj_setconst(robot: RobotDescription) -> None:
 def test_constants_of_unaltered_masses_are_the_models_own() -> None:
     robot = load_robot()
     model = robot.load_model()
-    found = Simulator(model).altered({"body_mass": jnp.asarray(model.body_mass)}).model
+    found = Simulator(load_robot(), model=model).with_fields({"body_mass": jnp.asarray(model.body_mass)}).model
     for name in DERIVED:
         np.testing.assert_allclose(getattr(found, name), getattr(model, name), rtol=1e-6, err_msg=name)
 
@@ -64,10 +64,12 @@ def test_constants_of_unaltered_masses_are_the_models_own() -> None:
 def test_constants_change_with_mass_as_mj_setconst_s_do() -> None:
     robot = load_robot()
     model = robot.load_model()
-    simulator, body = Simulator(model), model.body("balloon").id
+    simulator, body = Simulator(load_robot(), model=model), model.body("balloon").id
 
     def weights(added: jax.Array) -> jax.Array:
-        return simulator.altered({"body_mass": jnp.asarray(model.body_mass).at[body].add(added)}).model.body_invweight0
+        return simulator.with_fields(
+            {"body_mass": jnp.asarray(model.body_mass).at[body].add(added)}
+        ).model.body_invweight0
 
     slope = jax.jacfwd(weights)(jnp.array(0.05))
     high, low = (compiled(robot, {"body_mass": model.body_mass + added * (np.arange(model.nbody) == body)})
@@ -89,7 +91,9 @@ def test_an_altered_robot_walks_as_in_c_mujoco() -> None:
     mujoco.mj_step(expected, data, 200)
     start = data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy()
     with jax.enable_x64(True):
-        simulator = Simulator(model).altered({name: jnp.asarray(x) for name, x in fields.items()})
+        simulator = Simulator(load_robot(), model=model).with_fields(
+            {name: jnp.asarray(x) for name, x in fields.items()}
+        )
 
         @jax.jit
         def walk(state: PhysicsState, commands: jax.Array) -> jax.Array:
