@@ -337,8 +337,8 @@ def _mean(errors: Sequence[Errors]) -> Errors:
     position = over("position")
     counts = {h: [e.diverged[h] for e in errors if h in e.diverged] for h in position}
     diverged = {h: (sum(some for some, _ in each), sum(of for _, of in each)) for h, each in counts.items() if each}
-    whole = (_mean_of_finite([getattr(e, name) for e in errors]) for name in _WHOLE)
-    return Errors(group, group, position, over("yaw"), *whole, diverged)
+    com, turn, force = (_mean_of_finite([getattr(e, name) for e in errors]) for name in _WHOLE)
+    return Errors(group, group, position, over("yaw"), com, turn, force, diverged)
 
 
 _WHOLE = ("mean_com_error", "final_yaw_error", "mean_force")

@@ -112,7 +112,7 @@ def _constants(pose: ReferencePose, model: mjx.Model, fields: Mapping[str, Array
         weights = (jnp.einsum("bij,jk,bik->b", jacobian, inverse, jacobian) / 3 for jacobian in (moved, pose.rotation))
         return {
             "body_invweight0": jnp.stack(list(weights), axis=1),
-            "body_subtreemass": pose.below @ mass,
-            "dof_invweight0": pose.averages @ jnp.diag(inverse),
+            "body_subtreemass": jnp.asarray(pose.below) @ mass,
+            "dof_invweight0": jnp.asarray(pose.averages) @ jnp.diag(inverse),
             "tendon_invweight0": jnp.einsum("ti,ij,tj->t", pose.tendons, inverse, pose.tendons),
         }

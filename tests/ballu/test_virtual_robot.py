@@ -240,7 +240,7 @@ FITTED = (
 
 def numbers(node: ast.AST) -> set[float]:
     found = (each.value for each in ast.walk(node) if isinstance(each, ast.Constant))
-    return {abs(float(value)) for value in found if type(value) in (int, float)}
+    return {abs(float(value)) for value in found if isinstance(value, int | float)}
 
 
 def test_no_number_of_the_virtual_robot_s_ranges_stands_where_it_is_identified():
