@@ -162,6 +162,7 @@ class Watchdog:
         self._folder, self._limit, self._stream = folder, limit, stream or sys.stderr
         self._step: int | None = None
         self._last = time.monotonic()
+        self._told: float | None = None  # when the standstill began that has been told of
         self._woken = threading.Condition()
         self._over = False
 
@@ -180,16 +181,19 @@ class Watchdog:
             self._over = True
             self._woken.notify()
 
+    def look(self, now: float) -> float:
+        """Tell of a standstill that has lasted for the limit at `now` (s, of `time.monotonic`), unless it has been told
+        of; return in how many seconds to look again."""
+        left = self._last + self._limit - now
+        if left <= 0 and self._told != self._last:
+            self._told = self._last
+            print(self._said(), file=self._stream, flush=True)
+        return max(left, self._limit / 10)
+
     def _watch(self) -> None:
-        told: float | None = None  # the standstill that has been told of
         with self._woken:
             while not self._over:
-                left = self._last + self._limit - time.monotonic()
-                if left > 0 or told == self._last:
-                    self._woken.wait(max(left, self._limit / 10))
-                    continue
-                told = self._last
-                print(self._said(), file=self._stream, flush=True)
+                self._woken.wait(self.look(time.monotonic()))
 
     def _said(self) -> str:
         minutes = f"{self._limit / 60:.3g} minutes"

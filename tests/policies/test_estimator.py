@@ -4,7 +4,7 @@ import copy
 import dataclasses
 import subprocess
 import sys
-import time
+from typing import Any
 
 import jax
 import mujoco
@@ -165,15 +165,12 @@ def test_the_base_orientation_is_not_needed():
 
 
 def test_a_long_trial_costs_no_more_than_a_short_one():
-    def seconds(capture: Capture) -> float:
-        taken = []
-        for _ in range(30):
-            start = time.perf_counter()
-            estimate(capture)
-            taken.append(time.perf_counter() - start)
-        return min(taken)
-
-    assert seconds(moving(10_000)) < 5 * seconds(moving(50))
+    """Old frames are not read: arrays of another size in their place would break any calculation."""
+    capture, whole = moving(10_000), estimate(moving(10_000))
+    for field in dataclasses.fields(Capture):
+        values: list[Any] = getattr(capture, field.name)
+        values[:-60] = [float("nan") if field.name == "time" else np.zeros(7)] * len(values[:-60])
+    np.testing.assert_array_equal(estimate(capture), whole)
 
 
 @pytest.fixture(scope="module")
