@@ -81,7 +81,7 @@ class MeasuredMotion:
 def measure(
     recording: Recording, robot: RobotDescription, model: mujoco.MjModel, config: SamplingConfig | None = None
 ) -> MeasuredMotion:
-    """Return the states of a recording that has every joint of an anchored robot.
+    """Return the states of a recording that has every joint of a model whose root is held.
 
     The noise of velocities is the root mean square difference between filters of the full and of half the width. It
     holds the noise that the narrow filter lets through and what the wide one smooths away.
@@ -89,11 +89,11 @@ def measure(
     **Raises** `InputError` naming the joint that was not recorded, or a recording that is too short.
     """
     config = config or SamplingConfig()
-    if not robot.anchored:
-        raise InputError(f"{recording.name}: {robot.name} has a free joint; reconstruct the motion first.")
+    if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE:
+        raise InputError(f"{recording.name}: {robot.name} has a free joint; reconstruct the motion, or hold the root.")
     joints = [model.joint(number).name for number in range(model.njnt)]
     for joint in joints:
-        if joint not in recording.angles:
+        if joint not in recording.joint_angles:
             problem = f"{recording.name}: joint {joint} was not recorded"
             raise InputError(f'{problem}; add its column, and name it in "joints" of the robot description.')
     timestep = float(model.opt.timestep)
@@ -105,7 +105,7 @@ def measure(
         raise InputError(f"{recording.name}: {time[-1]:.3f} s is too short; record {5 * sample:g} s or more.")
     fine = max(1, round(sample / float(np.median(np.diff(time)))))
     grid = np.arange((count - 1) * fine + 1) * (sample / fine)
-    angles = interpolate(grid, time, np.stack([recording.angles[joint] for joint in joints], axis=1))
+    angles = interpolate(grid, time, np.stack([recording.joint_angles[joint] for joint in joints], axis=1))
     filtered = partial(savitzky_golay, angles, step=sample / fine, order=config.order)
     rates, narrow = (filtered(width, derivative=1) for width in (config.rate_window, config.rate_window / 2))
     uncertainty = np.hypot(np.std(rates - narrow, axis=0), _SURE * np.std(rates, axis=0) + 1e-6)

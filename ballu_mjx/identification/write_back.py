@@ -62,7 +62,7 @@ def read_identified(path: Path | str, robot: RobotDescription) -> IdentifiedPara
         value = row.get("value") if isinstance(row, dict) else None
         place = parameters.names.index(name)
         low, high = parameters.parameters[place].bounds
-        if not is_number(value) or not low <= value <= high:
+        if value is None or not is_number(value) or not low <= value <= high:
             raise InputError(f"{path}: {name} is {value!r}; write a number from {low:g} to {high:g}.")
         values[place] = value
     return IdentifiedParameters(jnp.asarray(values), parameters)
