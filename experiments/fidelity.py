@@ -52,11 +52,13 @@ from ballu_mjx.evaluation.errors_table import (
     Errors,
     Evaluation,
     mean_by_group,
+    quotient,
     read_evaluation,
 )
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+from ballu_mjx.recordings.groups import OTHER
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS
 from ballu_mjx.residuals.trained import TrainedResidual
@@ -256,13 +258,14 @@ def groups_of(rows: Rows) -> list[str]:
 
 def comparison(rows: Rows, effort: Mapping[str, str], horizon: float) -> str:
     """Markdown: what simulators leave of vanilla's RMSE over `horizon` s, the range of that over seeds, and `effort`,
-    what learning took. In vanilla's row stand its errors themselves; the least of a column is bold."""
+    what learning took. In vanilla's row stand its errors themselves; the least of a column is bold, unless there is one
+    seed alone, which ranks nothing."""
     columns = [(group, quantity) for group in groups_of(rows) for quantity in ("position", "yaw")]
 
     def mean(run: Sequence[Errors], group: str, quantity: str) -> float:
         return float(np.mean([getattr(e, quantity)[horizon][0] for e in run if e.group == group]))
 
-    head = [quantity if group == "all" else f"{group}: {quantity}" for group, quantity in columns]
+    head = [quantity if group == OTHER else f"{group}: {quantity}" for group, quantity in columns]
     lines = [
         f"| {horizon:g} s | " + " | ".join(head) + " | learning (s) | thousand control steps |",
         "| --- " + "| ---: " * (2 + len(head)) + "|",
@@ -271,13 +274,15 @@ def comparison(rows: Rows, effort: Mapping[str, str], horizon: float) -> str:
     errors = [f"{whole[c]:.3f} m" if c[1] == "position" else f"{whole[c]:.1f} deg" for c in columns]
     lines.append("| vanilla | " + " | ".join(errors) + " | | |")
     left = {
-        row: [[mean(run, *column) / whole[column] for run in runs] for column in columns]
+        row: [[quotient(mean(run, *column), whole[column]) for run in runs] for column in columns]
         for row, runs in rows.items()
         if row != "vanilla"
     }
     least = [min(np.mean(cells[place]) for cells in left.values()) for place in range(len(columns))]
+    ranked = max(map(len, rows.values())) > 1
     for row, cells in left.items():
-        said = [f"**{ratios(c)}**" if np.mean(c) == low else ratios(c) for c, low in zip(cells, least, strict=True)]
+        best = [ranked and np.mean(c) == low for c, low in zip(cells, least, strict=True)]
+        said = [f"**{ratios(c)}**" if bold else ratios(c) for c, bold in zip(cells, best, strict=True)]
         lines.append(f"| {row} | " + " | ".join([*said, effort.get(row, " | ")]) + " |")
     return "\n".join(lines)
 

@@ -9,7 +9,7 @@
 #
 # The paper's robot is real and its numbers are one policy's each. Here a virtual robot stands in for it, every policy
 # is trained with several seeds and tried five times, each time in another draught; numbers are means with the 95 %
-# interval of a bootstrap over seeds and trials, beside the paper's.
+# confidence interval over seeds (Student's t), beside the paper's.
 #
 # `python experiments/table_walking.py` makes the stages of `python -m ballu_mjx.train all` that it needs; those that
 # are there are found again. This takes hours on two cores. Stages made with other options than the defaults of

@@ -57,8 +57,13 @@ def shortened(recording: bm.Recording, seconds: float) -> bm.Recording:
     """Return the first seconds of a recording."""
     rows = recording.time - recording.time[0] <= seconds
     values = {field.name: getattr(recording, field.name) for field in dataclasses.fields(recording)}
-    cut: dict[str, Any] = {name: value[rows] for name, value in values.items() if isinstance(value, np.ndarray)}
-    return dataclasses.replace(recording, **cut)
+    return dataclasses.replace(recording, **{name: _first(value, rows) for name, value in values.items()})
+
+
+def _first(value: Any, rows: np.ndarray) -> Any:
+    if isinstance(value, dict):
+        return {name: _first(each, rows) for name, each in value.items()}
+    return value[rows] if isinstance(value, np.ndarray) and len(value) == len(rows) else value
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +80,7 @@ def simulator(robot: bm.RobotDescription, actuators: bm.IdentifiedActuators) -> 
 @pytest.fixture(scope="module")
 def air(simulator: bm.Simulator, motions: list[bm.Motion]) -> bm.TrainedResidual:
     config = bm.AirConfig(window_seconds=0.5, evaluations=2)
-    return bm.fit_aerodynamics(simulator, motions, config)
+    return bm.fit_aerodynamics(simulator, motions, config, free=("added_mass", "lift"))
 
 
 def test_the_example_of_the_readme_prints_a_table_and_nothing_else(

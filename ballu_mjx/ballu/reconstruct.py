@@ -38,6 +38,8 @@ _FORCE_WINDOW = 0.15
 """Width (s) of the Savitzky-Golay filter for the accelerations in the base's torque balance."""
 _PITCH_HELD = 1e4
 """Weight (1/rad) by which the second fit holds the base's pitch where the torque balance has found it."""
+_STOP_GIVE = float(np.deg2rad(0.5))
+"""How far (rad) below its stop a knee may be: the stop is soft, and the spring holds the knee 0.35 deg inside."""
 _SERVO_SUBSTEP = 1e-3
 """Longest step (s) of the servo's simulation, whose fastest time constant is about 9 ms."""
 _SETTLING = 0.5
@@ -159,10 +161,14 @@ def complete_joints(
     qpos: Float[np.ndarray, "T nq"],
     qvel: Float[np.ndarray, "T nv"],
 ) -> tuple[Float[np.ndarray, "T nq"], Float[np.ndarray, "T nv"]]:
-    """Return states with the motors where their servos take them, unless they are recorded."""
+    """Return states with the knees at their stops or above, and the motors where their servos take them, unless they
+    are recorded."""
+    qpos, qvel = qpos.copy(), qvel.copy()
+    stops = np.array([model.joint(f"knee_{side}").range for side in SIDES])
+    knees = qpos[:, 7:][:, KNEES]
+    knees[:] = np.clip(knees, stops[:, 0] - _STOP_GIVE, stops[:, 1])
     if not all(f"motor_{side}" in grid.joint_angles for side in SIDES):
-        qpos, qvel = qpos.copy(), qvel.copy()
-        qpos[:, 7:][:, MOTORS], qvel[:, 6:][:, MOTORS] = _servos(model, grid, qpos[:, 7:][:, KNEES])
+        qpos[:, 7:][:, MOTORS], qvel[:, 6:][:, MOTORS] = _servos(model, grid, knees)
     return qpos, qvel
 
 

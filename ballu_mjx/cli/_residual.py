@@ -55,7 +55,7 @@ class Prepared:
 
     def show_evaluation(self, residual: TrainedResidual, *, quick: bool) -> None:
         """Write and print how the simulator with the residual replays the test recordings."""
-        print("Open-loop replay of the test recordings:\n")
+        print(f"{self.dataset.replayed}:\n")
         test = self.evaluators.of(residual.model, self.motions["test"])
         print(artifacts.write_evaluation(test, residual.params, self.folder).table())
         if quick:
@@ -90,8 +90,8 @@ def _announce(dataset: ResidualDataset, folder: Path, quick: bool) -> None:
     for use in USES:
         print(f"  {use}: {', '.join(recording.name for recording in dataset.recordings[use])}")
     print(f"  actuators: {dataset.where}")
-    if dataset.files["validation"] == dataset.files["training"]:
-        print("  Validation is on the training recordings: it will not show how well the residual generalizes.")
+    for sentence in dataset.reused:
+        print(f"  {sentence}")
     if quick:
         print("  --quick: sizes so small that the numbers mean little.")
     print("Reconstructing the recorded states ...", flush=True)

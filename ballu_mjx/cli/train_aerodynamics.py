@@ -15,6 +15,7 @@ from ballu_mjx.residuals.aerodynamics_fit import AirConfig, check_air_config
 from ballu_mjx.residuals.aerodynamics_training import fit_aerodynamics
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.progress import PhaseProgress
 
@@ -36,7 +37,7 @@ class AirData(RecordingsData):
 
 def train(data: AirData, fit: AirConfig) -> int:
     """Read and check everything, identify, evaluate; returns the exit status."""
-    check_air_config(fit)
+    check_air_config(fit, load_robot(data.robot or DEFAULT_ROBOT).control_timestep)
     loggers.check(data.wandb)
     if not data.free:
         raise InputError(f"--free names no parameter; there are {', '.join(AIR_PARAMETERS)}.")

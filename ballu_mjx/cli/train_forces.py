@@ -14,6 +14,7 @@ from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.force_fitting import fit_analytic, fit_supervised, network_sections
 from ballu_mjx.residuals.supervised import SupervisedConfig, check_supervised_config
 from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.metrics import read_column
 from ballu_mjx.runs.progress import PhaseProgress
@@ -52,7 +53,7 @@ def train_supervised(data: ForcesData, fit: SupervisedConfig) -> int:
 
 def train_analytic(data: ForcesData, fit: AnalyticConfig) -> int:
     """Read and check everything, learn, evaluate; returns the exit status."""
-    check_analytic_config(fit)
+    check_analytic_config(fit, load_robot(data.robot or DEFAULT_ROBOT).control_timestep)
     return _train("analytic", data, fit, fit_analytic)
 
 

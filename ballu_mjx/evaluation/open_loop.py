@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
-from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, base_name
+from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, base_name, has_diverged, summarize_starts
 from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, pad_to_bucket, stack_motions
@@ -135,10 +135,20 @@ class OpenLoopEvaluator:
         recordings = [recording for recording, _ in self.starts]
         # Of each recording, the place in `starts` of the run over (nearly) all of it.
         self.first_runs = [recordings.index(index) for index in range(len(self.motions))]
-        self._vanilla: tuple[Errors, ...] | None = None
+        self._without: tuple[tuple[Errors, ...], tuple[Errors, ...]] | None = None
 
-    def replay(self, params: Any, *, scale: float = 1.0) -> Replay:
-        """Simulate every start to its recording's end; `scale` is the residual's share (0: none, 1: all of it)."""
+    def replay(self, params: Any, *, scale: float = 1.0, nominal: bool = False) -> Replay:
+        """Simulate every start to its recording's end.
+
+        **Arguments**
+
+        - `scale`: the residual's share (0: none, 1: all of it).
+        - `nominal`: simulate with nominal actuators instead of identified ones.
+        """
+        fixed = self._fixed
+        if nominal:
+            model = jax.device_get(Simulator(self.robot).model)
+            fixed = jax.device_put((model, self._reference), self._everywhere)
         params = jax.device_get(params)  # they may live on one device; the batch is spread over all
         starts = np.array(self.starts, np.int32)
         steps = np.array([len(self.motions[recording].command) - start for recording, start in self.starts])
@@ -156,7 +166,7 @@ class OpenLoopEvaluator:
             carry = self._begin(places)
             for done in range(0, int(steps[batch].max()), _CHUNK):
                 now = places + np.array([0, done], np.int32)
-                carry, seen = self._chunk(params, np.float32(scale), *self._fixed, carry, now)
+                carry, seen = self._chunk(params, np.float32(scale), *fixed, carry, now)
                 part = slice(done, min(done + _CHUNK, longest))
                 after = slice(part.start + 1, part.stop + 1)
                 for array, where, values in zip(
@@ -190,10 +200,18 @@ class OpenLoopEvaluator:
         return states[:, ObservationLayout.position], states[:, ObservationLayout.yaw]
 
     def __call__(self, params: Any) -> Evaluation:
-        """Errors of the simulator with the residual, beside those of the one without."""
-        if self._vanilla is None:
-            self._vanilla = self.errors(self.replay(params, scale=0.0))
-        return Evaluation(self._vanilla, self.errors(self.replay(params)), self.base, self.name)
+        """Return errors of the simulator with the residual, beside those of the ones without."""
+        if self._without is None:
+            self._without = self.errors(self.replay(params, scale=0.0)), self.nominal_errors(params)
+        vanilla, nominal = self._without
+        return Evaluation(vanilla, self.errors(self.replay(params)), self.base, self.name, nominal)
+
+    def nominal_errors(self, params: Any) -> tuple[Errors, ...]:
+        """Return errors with nominal actuators and without the residual, of which `params` are any; empty where the
+        simulator's own actuators are nominal."""
+        if self._simulator.actuators is None:
+            return ()
+        return self.errors(self.replay(params, scale=0.0, nominal=True))
 
     def _advance(
         self,
@@ -229,7 +247,7 @@ class OpenLoopEvaluator:
             runs = [run for run, (recording, _) in enumerate(self.starts) if recording == index]
             position: dict[float, list[float]] = {h: [] for h in HORIZONS}
             yaw: dict[float, list[float]] = {h: [] for h in HORIZONS}
-            com_error, final_yaw, forces = float("nan"), float("nan"), []
+            com_error, final_yaw, forces = np.inf, np.inf, []
             for run in runs:
                 start = self.starts[run][1]
                 states = len(motion.qpos) - start
@@ -243,24 +261,28 @@ class OpenLoopEvaluator:
                 distance = np.linalg.norm(replay.position[run, :states] - other_position, axis=-1)
                 turn = replay.yaw[run, :states] - other_yaw
                 turn = np.rad2deg(np.arctan2(np.sin(turn), np.cos(turn)))
-                forces.append(np.linalg.norm(replay.force[run, : states - 1], axis=-1).mean())
+                forces.append(float(np.linalg.norm(replay.force[run, : states - 1], axis=-1).mean()))
                 for horizon in HORIZONS:
                     steps = round(horizon / self.robot.control_timestep)
                     if steps < states:
-                        position[horizon].append(_rms(distance[1 : steps + 1]))
-                        yaw[horizon].append(_rms(turn[1 : steps + 1]))
+                        # A start that diverged counts for neither: its angles may still be numbers.
+                        far, turned = _rms(distance[1 : steps + 1]), _rms(turn[1 : steps + 1])
+                        broken = has_diverged(far) or has_diverged(turned)
+                        position[horizon].append(np.inf if broken else far)
+                        yaw[horizon].append(np.inf if broken else turned)
                 if run == runs[0]:
-                    com_error = float(np.linalg.norm(replay.com[run, :states] - other_com, axis=-1).mean())
-                    final_yaw = float(turn[-1])
+                    com_error = _finite(float(np.linalg.norm(replay.com[run, :states] - other_com, axis=-1).mean()))
+                    final_yaw = _finite(float(turn[-1]))
             results.append(
                 Errors(
                     recording=motion.name,
                     group=group_of(motion.name),
-                    position={h: _mean_spread(v) for h, v in position.items() if v},
-                    yaw={h: _mean_spread(v) for h, v in yaw.items() if v},
+                    position={h: summarize_starts(v) for h, v in position.items() if v},
+                    yaw={h: summarize_starts(v) for h, v in yaw.items() if v},
                     mean_com_error=com_error,
                     final_yaw_error=final_yaw,
-                    mean_force=float(np.mean(forces)),
+                    mean_force=summarize_starts(forces)[0],
+                    diverged={h: (sum(map(has_diverged, v)), len(v)) for h, v in position.items() if v},
                 )
             )
         return tuple(results)
@@ -270,5 +292,5 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
 
 
-def _mean_spread(values: list[float]) -> tuple[float, float]:
-    return float(np.mean(values)), float(np.std(values))
+def _finite(error: float) -> float:
+    return np.inf if has_diverged(error) else error

@@ -4,7 +4,8 @@ Single samples may be seen equally well in several postures. Some samples along 
 several starts; of what is found, the sequence that fits best and moves least is taken (dynamic programming), and all
 samples are fitted from between its neighbours.
 
-Steps keep the joints' ranges. A closed loop (a model's `connect` or `joint` equality) is a measurement like others.
+Joints keep their ranges, unless no pose within them fits. A closed loop (a model's `connect` or `joint` equality) is a
+measurement like others.
 """
 
 from __future__ import annotations
@@ -35,19 +36,27 @@ _LONGEST_STEP = 0.5
 """rad: longer ones wind joints up."""
 _UNSEEN = 1e-9
 """Of the best seen direction's information: what a direction shows that no measurement sees."""
-_RANGE_GIVE = 0.1
-"""Of a joint's range: how far beyond it a pose may be. Stops are soft, and a recorded zero may be a little off."""
+_RANGE_GIVE = (0.05, 0.005)
+"""How far beyond its range a hinge (rad) or a slide (m) may be: measurements are noisy, and stops soft."""
 _LOOP_NOISE = 0.1
 """Of a measured position's noise: how far a closed loop may be open."""
 _PRIOR = float(np.deg2rad(60.0))
 """Standard deviation (rad, m) of a joint about its guess: keeps the problem of a single sample well posed."""
 _ANCHOR_INTERVAL = 0.2
 """s between samples that are fitted from several starts."""
-_STARTS = 8
-_MOVED = 0.1
+_STARTS, _FITS = 6, 60
+"""Random starts of each, and fits in all, at least, where the starting pose does not lead to what was measured."""
+_LOST = 25.0
+"""Squared misfit a measurement, in units of its noise, beyond which a sample's posture may not have been found."""
+_SAME = 0.1
+"""rad, m: what joints differ by at most in one posture."""
+_MOVED = 0.3
 """rad, m: what a joint moves between such samples, where two sequences of postures are told apart by it."""
-_AWAY = 1.0
-"""rad, m: the same from the starting pose, where two first postures are."""
+_MOST_JUMPS = 8
+_OUTSTANDING = 3.0
+"""Of what the quietest fifth of such samples moves at most: what a change of posture moves at least."""
+_AWAY = (1.0, 0.3)
+"""rad, m: the same from the starting pose, where two first postures are. From the reference pose; from a keyframe."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -150,10 +159,16 @@ class _Solver:
         self._hidden = np.setdiff1d(np.arange(len(self._dofs)), self._recorded)
         joints = model.dof_jntid[self._dofs]
         low, high = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.inf, np.inf]).T
-        give = _RANGE_GIVE * np.where(np.isfinite(high), high - low, 0.0)
-        self._low, self._high = low - give, high + give
+        give = np.where(self.tree.rotates[self._dofs], *_RANGE_GIVE)
+        self._low, self._high = low, high
+        self._lowest, self._highest = low - give, high + give
+        self._has_keyframe = problem.robot.keyframe is not None or model.nkey > 0
+        self.bounded = True
+        """Whether poses keep within the joints' ranges."""
         self._turns = self.tree.rotates[self._dofs] & ~(np.isfinite(self._low) & np.isfinite(self._high))
         """Hinges that may turn on and on."""
+        places = 3 * (len(grid.positions) + len(problem.orientations) + len(self._loops))
+        self._measurements = places + len(self._couplings) + len(self._recorded)
         self.joint_weight, self.prior_weight = np.zeros(model.nv), np.zeros(model.nv)
         self.joint_weight[self._dofs[self._recorded]] = 1.0 / parameters.joint_noise
         self.prior_weight[self._dofs[self._hidden]] = 1.0 / _PRIOR
@@ -198,7 +213,7 @@ class _Solver:
     def fit(
         self, guess: Float[np.ndarray, "N nq"], rows: Int[np.ndarray, " N"]
     ) -> tuple[Float[np.ndarray, "N nq"], Float[np.ndarray, " N"]]:
-        """Poses of the least misfit near `guess` within the joints' ranges, and their squared misfit."""
+        """Poses of the least misfit near `guess`, and their squared misfit to what was measured."""
         nv, diagonal = self.problem.model.nv, np.arange(self.problem.model.nv)
         wanted = np.zeros((len(guess), nv))
         wanted[:, self._dofs] = guess[:, self._addresses]
@@ -223,7 +238,8 @@ class _Solver:
             curvature = transposed @ slope
             curvature[:, diagonal, diagonal] += weight
             gradient = (transposed @ error[..., None])[..., 0] + weight * joint_error
-            self._hold_stops(qpos[active], curvature, gradient)
+            if self.bounded:
+                self._hold_stops(qpos[active], curvature, gradient)
             scale = curvature[:, diagonal, diagonal]
             scale = scale + 1e-12 * scale.sum(axis=1, keepdims=True)
             curvature[:, diagonal, diagonal] += damping[active, None] * scale
@@ -231,7 +247,8 @@ class _Solver:
             longest = np.abs(step[:, self.tree.rotates]).max(axis=1, initial=0.0)
             step /= np.maximum(longest / _LONGEST_STEP, 1.0)[:, None]
             moved = self.tree.move(qpos[active], step)
-            moved[:, self._addresses] = np.clip(moved[:, self._addresses], self._low, self._high)
+            if self.bounded:
+                moved[:, self._addresses] = np.clip(moved[:, self._addresses], self._lowest, self._highest)
             error_there, slope_there = self.misfit(moved, rows[active])
             joint_error_there = joint_errors(moved, active)
             there = square(error_there, joint_error_there)
@@ -249,12 +266,13 @@ class _Solver:
             active = active[going]
             if not len(active):
                 break
-        return qpos, cost
+        away = joint_errors(qpos, np.arange(len(qpos)))
+        return qpos, cost - np.einsum("ij,ij,j->i", away, away, self.prior_weight**2)
 
     def _hold_stops(self, qpos: np.ndarray, curvature: np.ndarray, gradient: np.ndarray) -> None:
         """Take joints at a stop, and pushed against it, out of the step, in place."""
         angles, slope = qpos[:, self._addresses], gradient[:, self._dofs]
-        held = ((angles <= self._low) & (slope > 0)) | ((angles >= self._high) & (slope < 0))
+        held = ((angles <= self._lowest) & (slope > 0)) | ((angles >= self._highest) & (slope < 0))
         for joint in np.flatnonzero(held.any(axis=0)):
             lanes, dof = np.flatnonzero(held[:, joint]), self._dofs[joint]
             own = curvature[lanes, dof, dof]
@@ -280,56 +298,104 @@ class _Solver:
         self, start: Float[np.ndarray, " nq"], anchors: Int[np.ndarray, " A"]
     ) -> Float[np.ndarray, "A joints"]:
         """Joints of some samples, of which no posture is known, continuous in time."""
-        own = start[self._addresses]
-        candidates = []
+        own, count = start[self._addresses], len(anchors)
+        everywhere = np.arange(count)
+        candidates: list[tuple[np.ndarray, np.ndarray]] = []
 
-        def add(joints: np.ndarray, which: np.ndarray) -> None:
-            qpos, cost = self.fit(self._guess(start, joints, anchors[which]), anchors[which])
+        def fitted(joints: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            rows = anchors[which]
+            qpos, cost = self.fit(self._guess(start, joints, rows), rows)
             found = qpos[:, self._addresses]
             free = self._turns & ~np.isin(np.arange(len(own)), self._recorded)
             found[:, free] = own[free] + _wrapped(found[:, free] - own[free])
-            candidates.append((found.reshape(-1, len(anchors), len(own)), cost.reshape(-1, len(anchors))))
+            return found, cost
 
-        starts = self._starts(start)
-        number = np.arange(len(anchors))
-        add(np.repeat(starts, len(anchors), axis=0), np.tile(number, len(starts)))
-        path = self._best_path(own, *(np.concatenate(each) for each in zip(*candidates, strict=True)))
-        before, after = np.maximum(number - 1, 0), np.minimum(number + 1, len(anchors) - 1)
-        add(np.concatenate([path[before], path[after]]), np.tile(number, 2))
-        path = self._best_path(own, *(np.concatenate(each) for each in zip(*candidates, strict=True)))
-        turns = self._turns
-        path[:, turns] = np.unwrap(path[:, turns], axis=0)
+        def add(joints: Float[np.ndarray, "starts n joints"], which: Int[np.ndarray, " n"]) -> None:
+            """Fit the samples in `which` from several starts each."""
+            found, cost = fitted(joints.reshape(-1, len(own)), np.tile(which, len(joints)))
+            rows = np.zeros((len(joints), count, len(own))), np.full((len(joints), count), np.inf)
+            rows[0][:, which], rows[1][:, which] = found.reshape(joints.shape), cost.reshape(joints.shape[:2])
+            candidates.append(rows)
+
+        def carry(path: np.ndarray, places: np.ndarray, ways: np.ndarray) -> None:
+            """Fit sample after sample from the one before, from each place on in its way (1 or -1), to
+            where this leads to what is known."""
+            rows = np.zeros((len(places), count, len(own))), np.full((len(places), count), np.inf)
+            joints, going = path[places], np.arange(len(places))
+            for step in range(1, count):
+                which = places + step * ways
+                going = going[(which[going] >= 0) & (which[going] < count)]
+                if not len(going):
+                    break
+                joints[going], cost = fitted(joints[going], which[going])
+                rows[0][going, which[going]], rows[1][going, which[going]] = joints[going], cost
+                going = going[self._apart(joints[going], path[which[going]]) > _SAME**2]
+            candidates.append(rows)
+
+        def best() -> tuple[np.ndarray, np.ndarray]:
+            return self._best_path(own, *(np.concatenate(each) for each in zip(*candidates, strict=True)))
+
+        def lost(cost: np.ndarray) -> np.ndarray:
+            return np.flatnonzero(cost > _LOST * self._measurements)
+
+        add(np.tile(own, (1, count, 1)), everywhere)
+        if len(which := lost(candidates[0][1][0])):
+            add(self._starts(start, len(which)), which)
+        path, cost = best()
+        apart = 1
+        while apart < count and len(lost(cost)):  # Others may have found what one has not.
+            before, after = np.maximum(everywhere - apart, 0), np.minimum(everywhere + apart, count - 1)
+            add(np.stack([path[before], path[after]]), everywhere)
+            path, cost = best()
+            apart *= 2
+        if len(which := lost(cost)):  # What is measured clearly is believed, against the model's ranges.
+            self.bounded = False
+            add(np.concatenate([self._starts(start, len(which)), path[None, which]]), which)
+            path, cost = best()
+        if len(jumps := self._jumps(path)):
+            carry(path, np.concatenate([jumps, jumps + 1]), np.repeat([1, -1], len(jumps)))
+            path, _ = best()
+        path[:, self._turns] = np.unwrap(path[:, self._turns], axis=0)
         return path
+
+    def _jumps(self, path: Float[np.ndarray, "A joints"]) -> Int[np.ndarray, " jumps"]:
+        """Samples after which joints move by much more than elsewhere: from one posture to another. The largest few."""
+        moved = np.sqrt(self._apart(path[1:], path[:-1]))
+        largest = np.argsort(-moved)[:_MOST_JUMPS]
+        return largest[moved[largest] > _SAME + _OUTSTANDING * np.percentile(moved, 20)]
+
+    def _apart(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Squared distances (rad, m) of joints, turns aside."""
+        difference = a - b
+        difference[..., self._turns] = _wrapped(difference[..., self._turns])
+        return np.sum(difference**2, axis=-1)
 
     def _best_path(
         self,
         own: Float[np.ndarray, " joints"],
         joints: Float[np.ndarray, "candidates A joints"],
         cost: Float[np.ndarray, "candidates A"],
-    ) -> Float[np.ndarray, "A joints"]:
-        """One candidate of each sample, so that misfits and movements are least in all."""
-
-        def apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-            difference = a - b
-            difference[..., self._turns] = _wrapped(difference[..., self._turns])
-            return np.sum(difference**2, axis=-1)
-
-        total = cost[:, 0] + apart(joints[:, 0], own) / _AWAY**2
+    ) -> tuple[Float[np.ndarray, "A joints"], Float[np.ndarray, " A"]]:
+        """One candidate of each sample, so that misfits and movements are least in all, and their misfits."""
+        total = cost[:, 0] + self._apart(joints[:, 0], own) / _AWAY[self._has_keyframe] ** 2
         came = []
         for sample in range(1, joints.shape[1]):
-            moved = apart(joints[:, sample, None], joints[None, :, sample - 1]) / _MOVED**2
+            moved = self._apart(joints[:, sample, None], joints[None, :, sample - 1]) / _MOVED**2
             came.append(np.argmin(total + moved, axis=1))
             total = cost[:, sample] + np.min(total + moved, axis=1)
         chosen = [int(np.argmin(total))]
         for back in reversed(came):
             chosen.append(int(back[chosen[-1]]))
-        return joints[chosen[::-1], np.arange(joints.shape[1])]
+        places = chosen[::-1], np.arange(joints.shape[1])
+        return joints[places], cost[places]
 
     def _starting_pose(self) -> Float[np.ndarray, " nq"]:
-        """Where the description says that the robot starts; without a keyframe, in the middle of ranges that do not
-        hold it."""
-        problem = self.problem
-        start = problem.robot.adapter.initial_qpos(problem.robot, problem.model)
+        """Where the description or else the model's first keyframe says that the robot starts. Without any: the
+        reference pose, with joints whose ranges do not hold it in the middle of these."""
+        problem, model = self.problem, self.problem.model
+        start = problem.robot.adapter.initial_qpos(problem.robot, model)
+        if self._has_keyframe:
+            return model.key_qpos[0].copy() if problem.robot.keyframe is None else start
         joints = start[self._addresses]
         outside = (joints < self._low) | (joints > self._high)
         start[self._addresses] = np.where(outside, self._middle(joints), joints)
@@ -340,14 +406,16 @@ class _Solver:
         with np.errstate(invalid="ignore"):
             return np.where(limited, (self._low + self._high) / 2, otherwise)
 
-    def _starts(self, start: Float[np.ndarray, " nq"]) -> Float[np.ndarray, "starts joints"]:
-        """Joints to begin with: the starting pose, the middles of the ranges, and others at random."""
-        own = start[self._addresses]
+    def _starts(self, start: Float[np.ndarray, " nq"], count: int) -> Float[np.ndarray, "starts n joints"]:
+        """Joints to begin with beside the starting pose: the model's keyframes, the middles of the ranges, and others
+        at random, more of them where few samples need them."""
+        own, model = start[self._addresses], self.problem.model
         spread = np.where(self.tree.rotates[self._dofs], np.pi, 0.1)
         low = np.where(np.isfinite(self._low), self._low, own - spread)
         high = np.where(np.isfinite(self._high), self._high, own + spread)
-        drawn = np.random.default_rng(0).uniform(low, high, (_STARTS - 2, len(own)))
-        return np.concatenate([[own, self._middle(own)], drawn])
+        drawn = np.random.default_rng(0).uniform(low, high, (max(_STARTS, _FITS // count), count, len(own)))
+        fixed = [*model.key_qpos[:, self._addresses], self._middle(own)]
+        return np.concatenate([np.tile(np.stack(fixed)[:, None], (1, count, 1)), drawn])
 
     def _guess(
         self, start: Float[np.ndarray, " nq"], joints: Float[np.ndarray, "N joints"], rows: Int[np.ndarray, " N"]
@@ -357,7 +425,8 @@ class _Solver:
         qpos[:, self._addresses] = joints
         if len(self._recorded):
             qpos[:, self._addresses[self._recorded]] = self._angles[rows]
-        qpos[:, self._addresses] = np.clip(qpos[:, self._addresses], self._low, self._high)
+        if self.bounded:
+            qpos[:, self._addresses] = np.clip(qpos[:, self._addresses], self._lowest, self._highest)
         if self.problem.robot.anchored:
             return qpos
         qpos[:, :7] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]

@@ -33,8 +33,10 @@ from ballu_mjx.recordings.motion import MeasurementGrid, Motion, ReconstructionP
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
 
-_STOP_GIVE = {False: float(np.deg2rad(0.5)), True: 1e-3}
+_STOP_GIVE = {False: float(np.deg2rad(0.5)), True: 5e-4}
 """How far beyond its range a hinge (rad) or a slide (m) may be: stops are soft, and springs hold joints inside."""
+_OVERSHOOT = {False: 0.05, True: 5e-3}
+"""How far noise and filters take a hinge (rad) or a slide (m) beyond; what is farther was measured."""
 _TURN_TOLERANCE = 0.1
 """rad over a full turn that angles counted from 0 again may span."""
 
@@ -164,8 +166,10 @@ def _to_quaternions(matrices: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, "
 
 
 def _keep_ranges(model: mujoco.MjModel, qpos: Float[np.ndarray, "T nq"]) -> None:
-    """Bring joints to within their ranges, in place: filters overshoot at a stop."""
+    """Bring joints that are a little beyond their ranges back, in place."""
     for joint in np.flatnonzero(model.jnt_limited):
-        address, (low, high) = model.jnt_qposadr[joint], model.jnt_range[joint]
-        give = _STOP_GIVE[bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE)]
-        qpos[:, address] = np.clip(qpos[:, address], low - give, high + give)
+        slides = bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE)
+        angle, (low, high) = qpos[:, model.jnt_qposadr[joint]], model.jnt_range[joint]
+        kept = np.clip(angle, low - _STOP_GIVE[slides], high + _STOP_GIVE[slides])
+        beyond = np.abs(angle - np.clip(angle, low, high)) > _OVERSHOOT[slides]
+        qpos[:, model.jnt_qposadr[joint]] = np.where(beyond, angle, kept)

@@ -17,7 +17,6 @@ from jaxtyping import Array, Float
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout, wrap_angle
 from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
@@ -44,11 +43,14 @@ class Segments(NamedTuple):
     """Recorded, after each control step."""
 
 
-def check_segments(window_seconds: float, interval_seconds: float) -> None:
-    """**Raises** `InputError` for lengths out of range, naming the option."""
+def check_segments(window_seconds: float, interval_seconds: float, control_timestep: float) -> None:
+    """Check the windows' length and distance, at least two control steps (s).
+
+    **Raises** `InputError` for lengths out of range, naming the option."""
     for name, value in (("--window-seconds", window_seconds), ("--interval-seconds", interval_seconds)):
-        if not 2 * CONTROL_TIMESTEP <= value < math.inf:
-            raise InputError(f"{name} is {value:g}: it must be 0.1 or more; 0.1 is the nearest.")
+        shortest = 2 * control_timestep
+        if not shortest <= value < math.inf:
+            raise InputError(f"{name} is {value:g}: it must be {shortest:g} or more; {shortest:g} is the nearest.")
 
 
 def cut_segments(
@@ -58,7 +60,7 @@ def cut_segments(
 
     **Raises** `InputError` where no recording is as long as a window.
     """
-    steps, every = (round(s / CONTROL_TIMESTEP) for s in (window_seconds, interval_seconds))
+    steps, every = (round(s / simulator.robot.control_timestep) for s in (window_seconds, interval_seconds))
     history = HISTORY
     places = [
         (number, start)
@@ -93,6 +95,7 @@ def start_segment(window: Segments) -> tuple[RolloutState, Float[Array, "windows
 def segment_errors(
     features: Float[Array | np.ndarray, "windowsteps features"],
     recorded: Float[Array | np.ndarray, "windowsteps features"],
+    control_timestep: float,
 ) -> Float[Array, "windowsteps 6"]:
     """Return errors of the tracked body's position and orientation, in expected errors.
 
@@ -100,7 +103,7 @@ def segment_errors(
     expected.
     """
     steps = len(recorded)
-    time = np.arange(1, steps + 1)[:, None] * CONTROL_TIMESTEP
+    time = np.arange(1, steps + 1)[:, None] * control_timestep
     start, each_second = np.array([POSITION] * 3 + [ANGLE] * 3).T
     difference = jnp.asarray(features) - recorded
     position = difference[:, ObservationLayout.position]

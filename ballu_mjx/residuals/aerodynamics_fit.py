@@ -107,9 +107,9 @@ Report = Callable[[int, float], None]
 """(evaluations so far, cost)."""
 
 
-def check_air_config(config: AirConfig) -> None:
+def check_air_config(config: AirConfig, control_timestep: float) -> None:
     """**Raises** `InputError` for options out of range, naming the option."""
-    check_segments(config.window_seconds, config.interval_seconds)
+    check_segments(config.window_seconds, config.interval_seconds, control_timestep)
     if config.evaluations < 1:
         raise InputError(f"--evaluations is {config.evaluations}: it must be 1 or more; 1 is the nearest.")
 
@@ -134,7 +134,7 @@ def identify_air(
 
     **Raises** `InputError` where no recording is as long as a window.
     """
-    check_air_config(config)
+    check_air_config(config, simulator.robot.control_timestep)
     simulated = AirWindows(simulator, motions, config)
     none = AirParameters.none()
     start, unravel = ravel_pytree(none if fixed_from is None else fixed_from)
@@ -326,4 +326,4 @@ class AirWindows:
             return after, after.features
 
         _, features = jax.lax.scan(step, state, commands)
-        return segment_errors(features, window.features).ravel()
+        return segment_errors(features, window.features, self._simulator.robot.control_timestep).ravel()

@@ -57,7 +57,7 @@ def fit_aerodynamics(
     and where no motion is as long as a window.
     """
     config = config or AirConfig()
-    check_air_config(config)
+    check_air_config(config, simulator.control_timestep)
     if not free:
         raise InputError(f"--free names no parameter; there are {', '.join(AIR_PARAMETERS)}.")
     if known is not None and not same_parameters(known.actuators, simulator.actuators):

@@ -9,6 +9,7 @@ that one simulation serves some gradient steps. Then other windows are simulated
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -62,9 +63,9 @@ class AnalyticConfig:
     """Seeds network, batches and noise."""
 
 
-def check_analytic_config(config: AnalyticConfig) -> None:
+def check_analytic_config(config: AnalyticConfig, control_timestep: float) -> None:
     """**Raises** `InputError` for options out of range, naming the option."""
-    check_segments(config.window_seconds, config.interval_seconds)
+    check_segments(config.window_seconds, config.interval_seconds, control_timestep)
     positive = "relinearizations", "windows", "updates", "validate_every", "learning_rate", "max_grad_norm", "averaging"
     for name in positive:
         if not getattr(config, name) > 0:
@@ -128,7 +129,7 @@ def train(
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
     plain = linearize.simulator.simulator
     starts = start_spread(plain.mj_model, plain.robot)
-    update = _updates(forces, wrap, optimizer, spread, starts, config)
+    update = _updates(forces, wrap, optimizer, spread, starts, config, plain.robot.control_timestep)
     carry = (start, optimizer.init(start), start)
     key = jax.random.key(config.seed)
     done = simulated = 0
@@ -139,7 +140,11 @@ def train(
         steps, features = simulate(wrap(jax.device_get(carry[0])), taken)
         data = _in_windows(linearize(steps), steps.loads, taken)
         simulated += len(steps.loads) * (2 + linearize.directions)
-        loss = float(np.mean(jax.vmap(_loss)(features, taken.features)))
+        loss = float(
+            np.mean(
+                jax.vmap(functools.partial(_loss, control_timestep=plain.control_timestep))(features, taken.features)
+            )
+        )
         for first in range(0, config.updates, config.validate_every):
             key, own = jax.random.split(key)
             count = min(config.validate_every, config.updates - first)
@@ -161,9 +166,10 @@ def _in_windows(
 def _loss(
     features: Float[Array | np.ndarray, "windowsteps features"],
     recorded: Float[Array | np.ndarray, "windowsteps features"],
+    control_timestep: float,
 ) -> Float[Array, ""]:
     """Of a whole window's error."""
-    return pseudo_huber(jnp.sum(segment_errors(features, recorded) ** 2))
+    return pseudo_huber(jnp.sum(segment_errors(features, recorded, control_timestep) ** 2))
 
 
 def _updates(
@@ -173,6 +179,7 @@ def _updates(
     spread: Float[np.ndarray, " inputs"],
     start_spread: Float[np.ndarray, " directions"],
     config: AnalyticConfig,
+    control_timestep: float,
 ) -> Callable[..., Any]:
     """Gradient steps on linearized windows, compiled."""
 
@@ -197,7 +204,7 @@ def _updates(
         steps = len(window.features)
         through = linear, about, jnp.arange(steps), jax.random.split(key_noise, steps)
         _, (features, loads) = jax.lax.scan(step, (first, window.history), through)
-        tracking = _loss(features, window.features)
+        tracking = _loss(features, window.features, control_timestep)
         return tracking + config.force_cost * jnp.mean(square_newtons(loads, forces.config)), tracking
 
     @jax.jit

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -84,6 +85,36 @@ class ResidualDataset:
         if not same_parameters(learned_with, self.identified):
             raise InputError(f"{run}: was learned with other actuators than {self.where}; give --actuators the same.")
 
+    @property
+    def one_set(self) -> bool:
+        """Whether test and validation are the same recordings."""
+        return self._same("test", "validation")
+
+    @property
+    def reused(self) -> list[str]:
+        """Return a sentence for each use whose recordings serve an earlier one too."""
+        said = []
+        if self._same("validation", "training"):
+            said.append("Validation is on the training recordings: it will not show how well the residual generalizes.")
+        if self._same("test", "training"):
+            said.append("The test is on the training recordings: it will not show how well the residual generalizes.")
+        elif self.one_set:
+            said.append("The test is on the validation recordings, which make the choices: expect low errors.")
+        return said
+
+    @property
+    def replayed(self) -> str:
+        """Return what the final table is of, in words."""
+        if self._same("test", "training"):
+            return "Open-loop replay of the training recordings (they were learned from)"
+        if self.one_set:
+            return "Open-loop replay of the validation recordings (they chose the checkpoint)"
+        return "Open-loop replay of the test recordings"
+
+    def _same(self, one: str, other: str) -> bool:
+        first, second = ({path.resolve() for path in self.files[use]} for use in (one, other))
+        return first == second
+
     def reconstruct(self, model: mujoco.MjModel) -> dict[str, list[Motion]]:
         """Return states at the control rate, by use; uses of the same files share a list."""
         motions: dict[str, list[Motion]] = {}
@@ -151,15 +182,21 @@ def _one_a_group(paths: Sequence[Path]) -> list[Path]:
 
 def _read(files: Mapping[str, Sequence[Path]], description: RobotDescription) -> dict[str, list[Recording]]:
     """All recordings, read and found fit for their use."""
-    seen = {path.resolve() for path in files["training"]}
-    for use in ("validation", "test"):
-        for path in files[use]:
-            if path.resolve() in seen and files[use] != files["training"]:
-                raise InputError(f"{path}: is among the training and the {use} recordings; take it out of one of them.")
+    check_overlap(files)
     read = {path: read_recording(path, description) for paths in files.values() for path in paths}
     for path, recording in read.items():
         check_recording(path, recording, long_enough=path in files["validation"] or path in files["test"])
     return {use: [read[path] for path in paths] for use, paths in files.items()}
+
+
+def check_overlap(files: Mapping[str, Sequence[Path]]) -> None:
+    """**Raises** `InputError` where two uses share some of their recordings, but not all."""
+    places = {use: {path.resolve(): path for path in paths} for use, paths in files.items()}
+    for one, other in itertools.combinations(USES, 2):
+        shared = places[one].keys() & places[other].keys()
+        if shared and places[one].keys() != places[other].keys():
+            path = min(places[other][place] for place in shared)
+            raise InputError(f"{path}: is among the {one} and the {other} recordings; take it out of one of them.")
 
 
 def check_recording(path: Path, recording: Recording, *, long_enough: bool) -> None:

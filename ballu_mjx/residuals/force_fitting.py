@@ -80,7 +80,7 @@ def fit_analytic(
     Arguments and errors are those of `fit_supervised`.
     """
     config = config or AnalyticConfig()
-    analytic.check_analytic_config(config)
+    analytic.check_analytic_config(config, simulator.control_timestep)
     uses = _Uses(motions, motions if validation is None else validation)
     return _fit(_Analytic, "analytic", simulator, uses, config, forces, run, progress, evaluators)
 

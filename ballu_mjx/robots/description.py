@@ -269,15 +269,31 @@ def _check_joints(path: Path, model: mujoco.MjModel, control_timestep: float) ->
 
 
 def _check_sites(path: Path, model: mujoco.MjModel, tracked: str, points: tuple[str, ...]) -> None:
-    roots = []
+    linked, roots = _linked_roots(model), []
     for key, site in (("tracked", tracked), *(("points", point) for point in points)):
         body = model.site_bodyid[_find(path, model, mujoco.mjtObj.mjOBJ_SITE, key, site)]
-        roots.append(int(model.body_rootid[body]))
+        roots.append(linked[int(model.body_rootid[body])])
         if model.body_weldid[body] == 0:
             _refuse(path, f'"{key}" names {_shown(site)}, a site that does not move', "name sites of the robot only")
         if roots[-1] != roots[0]:
             problem = f'"{key}" names {_shown(site)}, which is of another robot than {tracked}'
-            _refuse(path, problem, "give sites below one body of the world")
+            fix = "give sites below one body of the world, or close the loop between them by an equality"
+            _refuse(path, problem, fix)
+
+
+def _linked_roots(model: mujoco.MjModel) -> dict[int, int]:
+    """By body of the world: one that stands for it and all that equalities (closed loops) link it with."""
+    linked = {int(root): int(root) for root in model.body_rootid}
+    for number in range(model.neq):
+        ends = [int(model.eq_obj1id[number]), int(model.eq_obj2id[number])]
+        if int(model.eq_type[number]) not in (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)):
+            continue
+        if model.eq_objtype[number] == mujoco.mjtObj.mjOBJ_SITE:
+            ends = [int(model.site_bodyid[site]) for site in ends]
+        one, other = (linked[int(model.body_rootid[body])] for body in ends)
+        if 0 not in (one, other):
+            linked = {root: one if stand_in == other else stand_in for root, stand_in in linked.items()}
+    return linked
 
 
 def _check_actuators(

@@ -25,7 +25,8 @@ def write_evaluation(evaluator: OpenLoopEvaluator, params: Any, folder: Path) ->
 
     names = evaluator.base, evaluator.name
     replays = dict(zip(names, (evaluator.replay(params, scale=0.0), evaluator.replay(params)), strict=True))
-    result = Evaluation(*(evaluator.errors(each) for each in replays.values()), *names)  # pyright: ignore[reportCallIssue]
+    vanilla, residual = (evaluator.errors(replays[name]) for name in names)
+    result = Evaluation(vanilla, residual, *names, evaluator.nominal_errors(params))
     files.write(folder / "evaluation.txt", result.table() + "\n")
     files.write(folder / "evaluation.json", json.dumps(result.to_json(), indent=2) + "\n")
     draw_tracking(evaluator, replays, folder / "tracking.png")

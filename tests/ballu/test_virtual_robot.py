@@ -5,6 +5,7 @@ import dataclasses
 import gzip
 import importlib.util
 import json
+import subprocess
 import sys
 from pathlib import Path
 
@@ -229,6 +230,46 @@ def test_nothing_that_trains_knows_the_virtual_robot():
     for path in package.rglob("*.py"):
         if not path.relative_to(package).as_posix().startswith(USERS):
             assert not [name for name in imported(path) if "virtual" in name.split(".")], path
+
+
+FITTED = (
+    "identification/*.py",
+    "ballu/*identification*.py",
+    "ballu/leg_parameters.py",
+    "ballu/suspended_leg.py",
+    "residuals/*.py",
+)
+"""Modules that find out about the robot from recordings."""
+
+
+def numbers(node: ast.AST) -> set[float]:
+    found = (each.value for each in ast.walk(node) if isinstance(each, ast.Constant))
+    return {abs(value) for value in found if isinstance(value, int | float) and not isinstance(value, bool)}
+
+
+def test_no_number_of_the_virtual_robot_s_ranges_stands_where_it_is_identified():
+    """Ends of the ranges that robots are drawn from, of two digits or more: 0.01 and 0.1 are everybody's numbers."""
+    package = Path(ballu_mjx.__file__).parent
+    (draw,) = (
+        node
+        for node in ast.parse((package / "ballu/virtual/robot.py").read_text()).body
+        if isinstance(node, ast.FunctionDef) and node.name == "draw_robot"
+    )
+    calls = [node for node in ast.walk(draw) if isinstance(node, ast.Call)]
+    ranges = {x for call in calls for x in numbers(call) if len(f"{x:.9e}".split("e")[0].rstrip("0")) > 2}
+    assert {0.0125, 0.021, 0.28, 0.55, 0.14} < ranges, "the ranges are not found"
+    paths = {path for pattern in FITTED for path in package.glob(pattern)}
+    assert len(paths) > 10
+    for path in paths:
+        assert not numbers(ast.parse(path.read_text())) & ranges, path
+
+
+def test_identification_does_not_load_the_virtual_robot():
+    """Not by way of others either."""
+    modules = "ballu_mjx.ballu.identification, ballu_mjx.residuals.aerodynamics_fit, ballu_mjx.residuals.envmimic"
+    code = f"import sys, {modules}; print([name for name in sys.modules if 'ballu_mjx.ballu.virtual' in name])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
 
 
 def test_the_commands_that_record_look_at_no_parameter_of_the_robot():

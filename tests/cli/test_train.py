@@ -253,6 +253,10 @@ def test_wrong_path_is_refused_in_one_sentence(folder: Path):
     [
         (["--recordings", "data", "--num-envs", "7"], "--num-envs is 7"),
         (["--recordings", "data", "--test", "data/near-1.csv"], "is among the training and the test recordings"),
+        (
+            ["--recordings", "data/near-1.csv", "--validation", "data", "--test", "data/far-1.csv"],
+            "is among the training and the validation recordings",
+        ),
         (["--recordings", "{suspended}"], "EnvMimic takes free ones only"),
         (["--recordings", "data", "--output", "data"], "data: the folder is not empty"),
         (["--resume", "data"], "data: there is no run"),

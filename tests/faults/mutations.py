@@ -353,7 +353,8 @@ def evaluation_fault(found: Any) -> str | None:
     each = [*found.vanilla, *found.residual]
     numbers = [x for errors in each for table in (errors.position, errors.yaw) for pair in table.values() for x in pair]
     numbers += [x for e in each for x in (e.mean_com_error, e.final_yaw_error, e.mean_force)]
-    return None if finite(*numbers) and finite(found.score) and printable(*(e.recording for e in each)) else "numbers"
+    numbers = [x for x in [*numbers, found.score] if x != math.inf]  # of simulations that diverged
+    return None if finite(*numbers) and printable(*(e.recording for e in each)) else "numbers"
 
 
 def replay_fault(takes: Any) -> str | None:

@@ -33,7 +33,7 @@ def test_both_descriptions_declare_what_their_models_have():
 @needs_data
 def test_the_motor_identified_with_three_loads_moves_a_fourth(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.syspath_prepend(EXPERIMENTS / "go1")
-    import go1  # pyright: ignore
+    import go1  # pyright: ignore[reportMissingImports]
 
     parameters = declared("go1")
     identified = vector(parameters, motor_frictionloss=0.158, motor_damping=0.015, motor_armature=0.0074, goal_kp=9.36)
@@ -45,7 +45,7 @@ def test_the_motor_identified_with_three_loads_moves_a_fourth(monkeypatch: pytes
 @needs_data
 def test_the_double_pendulum_swings_as_recorded(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.syspath_prepend(EXPERIMENTS / "double_pendulum")
-    import double_pendulum  # pyright: ignore
+    import double_pendulum  # pyright: ignore[reportMissingImports]
 
     parameters = declared("double_pendulum")
     identified = vector(

@@ -110,7 +110,7 @@ def near(actual: Recording, expected: Recording, tolerance: float) -> None:
             # Quaternions are written with a decimal less.
             assert b is not None
             allowed = max(tolerance, 1e-4) if field.endswith("quaternion") else tolerance
-            np.testing.assert_allclose(a, b, atol=allowed, rtol=0, err_msg=field)
+            np.testing.assert_allclose(a, np.asarray(b), atol=allowed, rtol=0, err_msg=field)
 
 
 def load(path: Path) -> Table:

@@ -1,6 +1,7 @@
 """The residual-force task: its equations, its frames, its resets."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -238,6 +239,27 @@ def test_evaluator_finds_no_error_in_its_own_physics_and_some_in_pushed_ones(eva
     # The force that made the recording explains it; on the other recording it does harm, and the bound says so.
     assert result.ratio("far", "position", 2.0) < 0.1
     assert result.excess()[0] > 0 and "near-own" in result.excess()[1]
+
+
+def test_a_residual_that_breaks_the_simulation_down_is_counted_and_never_averaged(evaluator: OpenLoopEvaluator):
+    result = evaluator(jnp.full(3, jnp.nan))
+    for errors in result.residual:
+        some, starts = errors.diverged[1.0]
+        assert some == starts > 0 and errors.position[1.0] == (np.inf, 0.0) and errors.mean_com_error == np.inf
+    assert not any(errors.num_diverged(1.0) for errors in result.vanilla)
+    assert result.excess()[0] == result.score == np.inf
+    assert "diverged" in result.table() and "nan" not in result.table() + json.dumps(result.to_json()).lower()
+
+
+def test_the_nominal_robot_stands_beside_the_one_with_identified_actuators(evaluator: OpenLoopEvaluator):
+    """The first recording is the nominal robot's own: only without the identified actuators is there no error."""
+    assert evaluator(jnp.array(FORCE)).nominal == ()
+    nominal = ActuatorParameters.nominal(load_model())
+    stiffer = dataclasses.replace(nominal, knee_spring_stiffness=1.5 * nominal.knee_spring_stiffness)
+    identified = Simulator(load_robot(), stiffer)
+    result = OpenLoopEvaluator(identified, evaluator.motions, evaluator._residual, "vanilla+sysid")(jnp.array(FORCE))
+    assert list(result.simulators) == ["vanilla", "vanilla+sysid", "envmimic"]
+    assert result.nominal[0].position[1.0][0] < 1e-3 < 5e-3 < result.vanilla[0].position[1.0][0]
 
 
 def test_errors_of_starts_are_how_far_the_starts_lie_apart(evaluator: OpenLoopEvaluator):

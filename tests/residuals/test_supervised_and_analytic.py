@@ -230,7 +230,7 @@ def test_gradients_find_the_push(recorded: Segments, inputs: np.ndarray, start: 
 def test_options_out_of_range_are_refused(config: AnalyticConfig | SupervisedConfig, says: str):
     with pytest.raises(InputError, match=says):
         if isinstance(config, AnalyticConfig):
-            check_analytic_config(config)
+            check_analytic_config(config, 0.05)
         else:
             check_supervised_config(config)
 

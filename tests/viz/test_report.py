@@ -32,6 +32,7 @@ from ballu_mjx.evaluation.transfer import Transfer, walking_table
 from ballu_mjx.policies.locomotion_env import LocomotionConfig
 from ballu_mjx.policies.training import locomotion_ppo
 from ballu_mjx.recordings.csv_format import list_bundled
+from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.rl.ppo import PPOConfig
@@ -80,7 +81,7 @@ def errors(name: str, seed: int) -> Errors:
     def horizons() -> dict[float, tuple[float, float]]:
         return {horizon: tuple(rng.uniform(0.01, 1, 2)) for horizon in HORIZONS}  # pyright: ignore[reportReturnType]
 
-    return Errors(name, "near", horizons(), horizons(), *rng.uniform(0.1, 10, 3))
+    return Errors(name, group_of(name), horizons(), horizons(), *rng.uniform(0.1, 10, 3))
 
 
 def write_run(folder: Path, takes: list[StoredRollout]) -> Path:
