@@ -81,7 +81,7 @@ class MeasuredMotion:
 def measure(
     recording: Recording, robot: RobotDescription, model: mujoco.MjModel, config: SamplingConfig | None = None
 ) -> MeasuredMotion:
-    """Return the states of a recording that has every joint of an anchored robot.
+    """Return the states of a recording that has every joint of a model whose root is held.
 
     The noise of velocities is the root mean square difference between filters of the full and of half the width. It
     holds the noise that the narrow filter lets through and what the wide one smooths away.
@@ -89,8 +89,8 @@ def measure(
     **Raises** `InputError` naming the joint that was not recorded, or a recording that is too short.
     """
     config = config or SamplingConfig()
-    if not robot.anchored:
-        raise InputError(f"{recording.name}: {robot.name} has a free joint; reconstruct the motion first.")
+    if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE:
+        raise InputError(f"{recording.name}: {robot.name} has a free joint; reconstruct the motion, or hold the root.")
     joints = [model.joint(number).name for number in range(model.njnt)]
     for joint in joints:
         if joint not in recording.joint_angles:

@@ -26,7 +26,7 @@ def vector(parameters: ParameterSet, **values: float) -> np.ndarray:
 
 
 def test_both_descriptions_declare_what_their_models_have():
-    assert len(declared("double_pendulum")) == 9
+    assert len(declared("double_pendulum")) == 7
     assert len(declared("go1")) == 5
 
 
@@ -50,14 +50,11 @@ def test_the_double_pendulum_swings_as_recorded(monkeypatch: pytest.MonkeyPatch)
     parameters = declared("double_pendulum")
     identified = vector(
         parameters,
-        shoulder_frictionloss=0.259,
-        elbow_frictionloss=0.175,
-        elbow_damping=0.0054,
-        shoulder_armature=0.0036,
-        elbow_armature=0.0037,
-        shoulder_strength=1.019,
-        elbow_strength=1.042,
-        delay=0.0075,
+        shoulder_frictionloss=0.278,
+        elbow_frictionloss=0.166,
+        shoulder_armature=0.0040,
+        elbow_armature=0.0034,
+        delay=0.0077,
     )
     motions = double_pendulum.load(DATA / "double_pendulum" / "recordings", double_pendulum.VALIDATION)
     nominal, found = replay(parameters, motions, [parameters.nominal, identified], 1.0, 0.5)
