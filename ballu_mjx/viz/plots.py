@@ -23,8 +23,8 @@ class TrackingPanel:
 
     - `title`: the recording's name, say.
     - `time`: s.
-    - `recording`: the balloon's x (m), y (m) and yaw (rad).
-    - `simulations`: the same by simulator (names as of `style.colour_of`), one run, or several of which mean and range are drawn.
+    - `recording`: the tracked body's x (m), y (m) and yaw (rad).
+    - `simulations`: the same by simulator (any name), one run, or several of which mean and range are drawn.
     """
 
     title: str

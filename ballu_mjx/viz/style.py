@@ -54,8 +54,8 @@ LABELS: Mapping[str, str] = {
 def colour_of(simulator: str) -> tuple[float, float, float]:
     """Return the colour of a simulator, always the same one, whatever its name (red, green, blue; 0 to 1).
 
-    A sum of residuals (`aerodynamic+supervised`) without an entry in `COLOURS` is a dark mixture of its parts, mostly of
-    the last. A later round (`envmimic-2`) is paler than the one before. Other names get one of `_OTHERS`.
+    A sum of residuals (`aerodynamic+supervised`) without an entry in `COLOURS` is a dark mixture of its parts, mostly
+    of the last. A later round (`envmimic-2`) is paler than the one before. Other names get one of `_OTHERS`.
     """
     variant = SimulatorVariant.parse(simulator)
     red, green, blue = 1 - (1 - _first_round(variant.residual or variant.name)) * _PALER ** (variant.round - 1)
