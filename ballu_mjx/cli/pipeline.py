@@ -34,6 +34,7 @@ from ballu_mjx.policies.deploy.estimator import Controller, PolicyController
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_locomotion_config
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.policies.tasks import TASKS
+from ballu_mjx.policies.variants import SimulatorVariant
 from ballu_mjx.recordings.csv_format import write_recording
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig
 from ballu_mjx.residuals.analytic import AnalyticConfig
@@ -45,7 +46,6 @@ from ballu_mjx.runs import loggers
 from ballu_mjx.runs.checkpoints import list_checkpoints
 from ballu_mjx.runs.layout import KEPT
 from ballu_mjx.sim.force_model import ForceSet
-from ballu_mjx.viz.style import round_of
 
 TABLES = {"walk": walking_table, "turn": turning_table}
 """The paper's tables, by task."""
@@ -148,8 +148,8 @@ def residual_folder(seed: Path, task: str, setting: str) -> Path:
     """Where, in a seed's folder, the residual of a setting is learned."""
     if setting == SHARED:
         return seed / SHARED
-    method, number = round_of(ROUNDS if setting == NEAR else setting)
-    return seed / (f"{method}-{task}" if number == 1 else f"{method}-{task}-{number}")
+    variant = SimulatorVariant.parse(ROUNDS if setting == NEAR else setting)
+    return seed / (f"{variant.residual}-{task}" + (f"-{variant.round}" if variant.round > 1 else ""))
 
 
 def table_file(output: Path, task: str) -> Path:
@@ -188,7 +188,7 @@ class Story:
 
     def policy(self, task: str, setting: str) -> Path:
         """The run of a policy's training."""
-        method, _ = round_of(setting)
+        method = SimulatorVariant.parse(setting).residual
         learned = method in ("envmimic", "aerodynamic", *MORE_SETTINGS)
         config = LocomotionConfig(
             domain_randomization=learned or setting.endswith("+dr"),
@@ -267,7 +267,8 @@ class Story:
     def residual(self, task: str, setting: str) -> Path:
         """The run of a setting's residual, learned from the recordings of the task, those of all rounds up to its
         own."""
-        method, number = round_of(setting)
+        variant = SimulatorVariant.parse(setting)
+        method, number = variant.residual or "", variant.round
         if method == SHARED:
             recordings = [self.recordings(each) for each in TABLES]
         else:

@@ -130,7 +130,13 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
     rollout = trials(trained.params)
     ballu_plots.gait(folder / "gait.png", rollout.qpos[0], rollout.command[0])
     time_axis = np.arange(len(rollout.qpos[0])) * CONTROL_TIMESTEP
-    episode = StoredRollout(name=task.name, time=time_axis, qpos={setting: rollout.qpos[0]}, command=rollout.command[0])
+    episode = StoredRollout(
+        name=task.name,
+        description=load_robot(),
+        time=time_axis,
+        qpos={setting: rollout.qpos[0]},
+        command=rollout.command[0],
+    )
     write_rollouts(folder / ROLLOUT_FILE, [episode])
     print(summary(task, rollout, forces is not None))
     print(f"\nWritten to {folder}. {time.perf_counter() - started:.0f} s in all.")
