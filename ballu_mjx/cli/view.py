@@ -245,7 +245,7 @@ def _mujoco(take: StoredRollout) -> None:
     from ballu_mjx.viz import robot_meshes
 
     shapes = robot_meshes.RobotShapes(take.description)
-    model = robot_meshes.without_robot(shapes.model)
+    model = robot_meshes.load_scenery(shapes.robot)
     data, drawn = mujoco.MjData(model), mujoco.MjData(shapes.model)
     playing = True
 

@@ -5,7 +5,6 @@ Shapes are the geoms of the model, poses those of C MuJoCo's kinematics; nothing
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -25,6 +24,7 @@ _SMALLEST_SHARE = 3.5e-4
 """Of the robot's weight: the force below which no arrow is drawn."""
 _WEIGHT_SHARE = 0.065
 """The arrow of a force of this share of the robot's weight is as long as the robot."""
+_SKY = (0.93, 0.94, 0.96)
 _GRAVITY = 9.81
 _SHOWN_GROUPS = 3
 """Geoms of groups 0 to 2 are drawn, as in MuJoCo's viewer; models keep shapes for collisions in others."""
@@ -178,15 +178,28 @@ def draw(
         scene.ngeom += 1
 
 
-def without_robot(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Return a copy of the model in which a view with `option_for_scenery` sees the world alone."""
-    other = copy.copy(model)
-    other.geom_group[_moving(model)] = _HIDDEN_GROUP
-    return other
+def load_scenery(robot: RobotDescription) -> mujoco.MjModel:
+    """Return the robot's model, lit and with a sky, of which a view with `option_for_scenery` sees the world alone."""
+    spec = mujoco.MjSpec.from_file(str(robot.model))
+    if all(texture.type != mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
+        spec.add_texture(
+            name="_sky",
+            type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+            builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+            rgb1=_SKY,
+            rgb2=_SKY,
+            width=64,
+            height=64,
+        )
+    model = spec.compile()
+    if not model.nlight:
+        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.5, 0.5
+    model.geom_group[_moving(model)] = _HIDDEN_GROUP
+    return model
 
 
 def option_for_scenery(option: mujoco.MjvOption) -> None:
-    """Let a view of `without_robot` leave out what belongs to the robot."""
+    """Let a view of `load_scenery` leave out what belongs to the robot."""
     option.geomgroup[_HIDDEN_GROUP] = 0
     option.sitegroup[:] = 0
     option.flags[mujoco.mjtVisFlag.mjVIS_TENDON] = 0

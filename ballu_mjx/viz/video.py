@@ -46,7 +46,7 @@ def write(path: Path, take: StoredRollout) -> None:
     from ballu_mjx.viz import robot_meshes
 
     shapes = robot_meshes.RobotShapes(take.description)
-    model = robot_meshes.without_robot(shapes.model)
+    model = robot_meshes.load_scenery(shapes.robot)
     model.vis.global_.offwidth, model.vis.global_.offheight = WIDTH, HEIGHT
     try:
         most = (200 + 2 * model.ngeom) * (1 + len(take.qpos))
