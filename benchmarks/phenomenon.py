@@ -68,7 +68,7 @@ def replay(
     for row, (qpos, qvel) in enumerate(starts):
         data.qpos[:], data.qvel[:] = qpos, qvel
         mujoco.mj_getState(model, data, states[row], spec)
-    count = count_substeps(model)
+    count = count_substeps(model, CONTROL_TIMESTEP)
     workers = [mujoco.MjData(model) for _ in range(2)]
     simulated = np.asarray(rollout.rollout(model, workers, states, np.repeat(commands, count, axis=1))[0])
     return simulated[:, count - 1 :: count, 1 : 1 + model.nq]

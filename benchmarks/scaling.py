@@ -31,6 +31,8 @@ import tyro
 from matplotlib.figure import Figure
 
 from ballu_mjx.common import runtime
+from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.simulator import Simulator
 
 AXES = {
     "cores": "cores",
@@ -84,7 +86,7 @@ def measure(environments: int, episode_seconds: float | None, recordings: int | 
     config = EnvMimicConfig()
     if episode_seconds is not None:
         config = dataclasses.replace(config, episode_seconds=episode_seconds)
-    env = EnvMimicEnv(model, [known[path] for path in paths], config)
+    env = EnvMimicEnv(Simulator(load_robot(), model=model), [known[path] for path in paths], config)
     sizes = ppo.PPOConfig(num_envs=environments)
     sizes = dataclasses.replace(sizes, batch_size=max(environments // sizes.num_minibatches, jax.local_device_count()))
     each = sizes.batch_size * sizes.num_minibatches * sizes.unroll_length

@@ -47,7 +47,7 @@ def main(
         environments, duration = 100, 5.0
         print("--quick: these numbers mean little")
     model = load_model()
-    substeps, bodies, devices = count_substeps(model), (balloon_id(model),), jax.device_count()
+    substeps, bodies, devices = count_substeps(model, CONTROL_TIMESTEP), (balloon_id(model),), jax.device_count()
     steps = round(duration / CONTROL_TIMESTEP)
     mjx_model = put_model(model)
     template = make_data(model)

@@ -14,6 +14,8 @@ import argparse
 import time
 
 from ballu_mjx.common import runtime
+from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.simulator import Simulator
 
 runtime.prepare()
 
@@ -65,7 +67,7 @@ def rollout_rates(
     model: mujoco.MjModel, threads: int, repeats: int, commands: Float[np.ndarray, "runs steps 2"]
 ) -> list[float]:
     """Control steps per second of C MuJoCo."""
-    count, (runs, steps, _) = count_substeps(model), commands.shape
+    count, (runs, steps, _) = count_substeps(model, CONTROL_TIMESTEP), commands.shape
     data = mujoco.MjData(model)
     data.qpos[:] = standing_qpos(model)
     state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
@@ -90,7 +92,7 @@ def main() -> None:
 
     model = load_model()
     motions = [reconstruct_ballu(read_recording(p), model) for p in list_bundled("training")]
-    env = EnvMimicEnv(model, motions, EnvMimicConfig())
+    env = EnvMimicEnv(Simulator(load_robot(), model=model), motions, EnvMimicConfig())
     config = ppo.PPOConfig(num_envs=arguments.num_envs)
     step_size = config.batch_size * config.num_minibatches * config.unroll_length
     config = ppo.PPOConfig(num_envs=arguments.num_envs, num_timesteps=(repeats + 1) * step_size)

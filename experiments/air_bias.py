@@ -27,6 +27,8 @@ import argparse
 import dataclasses
 
 from ballu_mjx.common import runtime
+from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.simulator import Simulator
 
 runtime.prepare()
 
@@ -74,7 +76,7 @@ def main() -> None:
         folder = options.output / name.replace(" ", "-")
         gaits = [deflation.recorded(job, legs, 2000 + number, folder) for number, job in enumerate(training)]
         motions = [reconstruct_ballu(gait, model) for gait in gaits]
-        fit = identify_air(model, motions, config)
+        fit = identify_air(Simulator(load_robot(), model=model), motions, config)
         air, error = fit.parameters, fit.standard_errors
         lines.append(
             f"| {name} | {float(air.lift) * 1e3:.0f} ({float(error.lift) * 1e3:.0f}) | "

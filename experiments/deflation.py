@@ -32,6 +32,7 @@ import time
 from collections.abc import Sequence
 
 from ballu_mjx.common import runtime
+from ballu_mjx.robots.registry import load_robot
 
 runtime.prepare()
 
@@ -52,6 +53,7 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.sim.simulator import Simulator
 
 # %% [markdown]
 # ## Recordings: the same commands, with all of the lift and with less
@@ -111,8 +113,9 @@ def main() -> None:
     if air is None:
         air = options.output / "aerodynamic"
         fidelity.train(air, "residual", "--method", "aerodynamic", *(["--quick"] if options.quick else []))
-    known = TrainedResidual.load(air)
-    model = load_model(known.actuators)
+    known = TrainedResidual.load(air, load_robot())
+    simulator = Simulator(load_robot(), known.actuators)
+    model = simulator.mj_model
     full = virtual_robot.draw_robot(0)
     deflated = dataclasses.replace(full, buoyancy=full.buoyancy * (1 - options.loss))
     bundled = bundled_recordings.jobs()
@@ -131,18 +134,18 @@ def main() -> None:
     seconds = []
     for _ in range(2):  # the first compiles
         started = time.perf_counter()
-        fit = identify_air(model, one, AirConfig(), known=known.params, free=("lift",))
+        fit = identify_air(simulator, one, AirConfig(), fixed_from=known.params, free=("lift",))
         seconds.append(time.perf_counter() - started)
 
-    sound = OpenLoopEvaluator(model, before, known.model, base_name(True))(known.params)
-    evaluator = OpenLoopEvaluator(model, after, known.model, base_name(True))
+    sound = OpenLoopEvaluator(simulator, before, known.model, base_name(True))(known.params)
+    evaluator = OpenLoopEvaluator(simulator, after, known.model, base_name(True))
     rows = [
         row("all of the lift", sound),
         row(f"{options.loss:.0%} less, lift as it was", evaluator(known.params)),
         row(f"{options.loss:.0%} less, lift from one recording", evaluator(fit.parameters)),
     ]
     if options.anew:
-        anew = identify_air(model, every, AirConfig(**train_aerodynamics.QUICK if options.quick else {}))
+        anew = identify_air(simulator, every, AirConfig(**train_aerodynamics.QUICK if options.quick else {}))
         rows.append(
             row(f"{options.loss:.0%} less, all of the air, {len(every)} recordings", evaluator(anew.parameters))
         )

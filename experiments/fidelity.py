@@ -36,6 +36,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 from ballu_mjx.common import runtime
+from ballu_mjx.robots.registry import load_robot
 
 runtime.prepare()
 
@@ -44,7 +45,7 @@ import numpy as np
 from bundled_recordings import Job
 from jaxtyping import Float
 
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.evaluation.errors_table import (
     HORIZONS,
@@ -62,6 +63,7 @@ from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.robots.model import assets
 from ballu_mjx.runs.checkpoints import list_checkpoints
 from ballu_mjx.runs.metrics import read_column
+from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.viz import plots
 
 # %% [markdown]
@@ -200,21 +202,22 @@ def replayed_policy(options: Options) -> Path:
 
 def simulator(kind: TrainedResidual, paths: list[Path], *, nominal: bool = False) -> OpenLoopEvaluator:
     """Recordings, for the residuals of a kind on its own actuators, or on nominal ones."""
-    model = load_model(None if nominal else kind.actuators)
-    motions = [reconstruct_ballu(read_recording(path), model) for path in paths]
-    return OpenLoopEvaluator(model, motions, kind.model)
+    plain = Simulator(load_robot(), None if nominal else kind.actuators)
+    motions = [reconstruct_ballu(read_recording(path), plain.mj_model) for path in paths]
+    return OpenLoopEvaluator(plain, motions, kind.model)
 
 
 def evaluate(folders: list[Path], paths: list[Path]) -> list[Evaluation]:
     """Runs of the same configuration and actuators, on other recordings than their own."""
-    policies = [TrainedResidual.load(folder) for folder in folders]
+    robot = load_robot()
+    policies = [TrainedResidual.load(folder, robot) for folder in folders]
     evaluator = simulator(policies[0], paths)
     return [evaluator(policy.params) for policy in policies]
 
 
 def vanilla_errors(folder: Path, paths: list[Path]) -> tuple[Errors, ...]:
     """Of the nominal robot without residual. `folder` is any residual's run: none of it acts."""
-    kind = TrainedResidual.load(folder)
+    kind = TrainedResidual.load(folder, load_robot())
     evaluator = simulator(kind, paths, nominal=True)
     return evaluator.errors(evaluator.replay(kind.params, scale=0.0))
 
@@ -354,7 +357,10 @@ DRAWN = ("regression", "identified", "analytic", AIR)
 
 def figure(folders: Mapping[str, list[Path]], paths: list[Path], path: Path) -> None:
     """Replay recordings in every simulator, with every seed's forces."""
-    found = {name: [TrainedResidual.load(folder) for folder in folders[name]] for name in DRAWN if name in folders}
+    robot = load_robot()
+    found = {
+        name: [TrainedResidual.load(folder, robot) for folder in folders[name]] for name in DRAWN if name in folders
+    }
     evaluators = {name: simulator(kinds[0], paths) for name, kinds in found.items()}
     curves = {
         kinds[0].model.name: [evaluators[name].replay(kind.params) for kind in kinds] for name, kinds in found.items()

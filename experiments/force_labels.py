@@ -38,7 +38,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
@@ -132,13 +132,14 @@ def main() -> None:
     parser.add_argument("runs", type=Path, nargs="+", help="of train residual --method supervised")
     parser.add_argument("--output", type=Path, default=Path("runs/force_labels"), help="folder of table and figure")
     arguments = parser.parse_args()
-    networks = {folder.name: TrainedResidual.load(folder) for folder in arguments.runs}
+    networks = {folder.name: TrainedResidual.load(folder, load_robot()) for folder in arguments.runs}
     first = next(iter(networks.values()))
-    model, robot = load_model(first.actuators), load_robot()
+    robot = load_robot()
     config = typed_config(SupervisedConfig, read_config(arguments.runs[0], "supervised"), "fit", arguments.runs[0])
-    simulator, linearize = Simulator(model), Linearizer(model, joints=robot.joints)
-    label = ForceLabeller(model, robot, linearize, config)
-    label_well = ForceLabeller(model, robot, linearize, dataclasses.replace(config, **SEEN_WELL))
+    simulator = Simulator(robot, first.actuators)
+    linearize = Linearizer(simulator, joints=robot.joints)
+    label = ForceLabeller(linearize, config)
+    label_well = ForceLabeller(linearize, dataclasses.replace(config, **SEEN_WELL))
 
     recordings = {path.name: path for path in list_recordings([assets() / "recordings" / "validation"])}
     true, labels, twins = {}, {}, {}
@@ -147,7 +148,7 @@ def main() -> None:
             twins[job.name] = twin(job)
             true[job.name] = label_well(twins[job.name])[HISTORY - 1 :]
             seen = read_recording(recordings[f"{job.name}.csv.gz"])
-            labels[job.name] = label(reconstruct_ballu(seen, model))[HISTORY - 1 :]
+            labels[job.name] = label(reconstruct_ballu(seen, simulator.mj_model))[HISTORY - 1 :]
             print(f"{job.name}: true forces {1e3 * rms(true[job.name]):.0f} mN (RMS along an axis)", flush=True)
     lines = ["| error over that of no force | near | x, y, z | far | x, y, z |", "| --- " * 5 + "|"]
     lines.append(row("labels from motion capture", labels, true))

@@ -59,11 +59,12 @@ def _evaluate(options: Options) -> None:
     from ballu_mjx.residuals.run_config import find_recordings, run_robot
     from ballu_mjx.residuals.trained import RESIDUAL_TASKS, TrainedResidual
     from ballu_mjx.runs.folder import read_config
+    from ballu_mjx.sim.simulator import Simulator
 
     config = read_config(options.run, *RESIDUAL_TASKS)
     which = "last" if options.last else "best"
     robot = run_robot(config, options.run)
-    loaded = TrainedResidual.load(options.run, which, description=robot)
+    loaded = TrainedResidual.load(options.run, robot, which)
     paths = list_recordings(options.recordings) or find_recordings(config, "test", options.run)
     recordings = [read_recording(path, robot) for path in paths]
     for path, recording in zip(paths, recordings, strict=True):
@@ -75,10 +76,11 @@ def _evaluate(options: Options) -> None:
     if loaded.step:
         print(f"The {which} checkpoint of {options.run}: step {loaded.step:,}.", flush=True)
     print("Compiling: half a minute the first time ...", flush=True)
-    model = robot.load_model(loaded.actuators)
+    simulator = Simulator(robot, loaded.actuators)
+    model = simulator.mj_model
     motions = [reconstruct(recording, model, robot) for recording in recordings]
     base = base_name(loaded.actuators is not None)
-    evaluator = OpenLoopEvaluator(model, motions, loaded.model, base, robot)
+    evaluator = OpenLoopEvaluator(simulator, motions, loaded.model, base)
     result = (
         evaluator(loaded.params)
         if options.output is None

@@ -23,15 +23,14 @@ from ballu_mjx.residuals.aerodynamics import (
 )
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, check_air_config, identify_air
 from ballu_mjx.residuals.dataset import RecordingsData, ResidualDataset
-from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.residuals.network import recorded_inputs
+from ballu_mjx.residuals.network import ForceNetworkConfig, recorded_inputs
 from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.residuals.trained import TrainedResidual, write_observed
 from ballu_mjx.robots.model import same_parameters
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import Run, new_folder
 from ballu_mjx.runs.progress import PhaseProgress
-from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.viz import artifacts
 
 _BESIDE = 9
@@ -59,7 +58,7 @@ def fit(data: AirData, config: AirConfig) -> int:
     loggers.check(data.wandb)
     if not data.free:
         raise InputError(f"--free names no parameter; there are {', '.join(AIR_PARAMETERS)}.")
-    known = None if data.known is None else TrainedResidual.load(data.known)
+    known = None if data.known is None else TrainedResidual.load(data.known, load_robot())
     if known is not None and not isinstance(known.model, Aerodynamics):
         raise InputError(f"{data.known}: is no run of --method aerodynamic; give one.")
     prepared = ResidualDataset.read(data)
@@ -67,8 +66,8 @@ def fit(data: AirData, config: AirConfig) -> int:
         raise InputError(f"{data.known}: belongs to other actuators than {prepared.where}; give --actuators the same.")
     folder = new_folder(data.output, "aerodynamic")
     prepared.announce(folder, data.quick)
-    model = prepared.load_model()
-    motions = prepared.reconstruct(model)
+    simulator = prepared.load_simulator()
+    motions = prepared.reconstruct(simulator.mj_model)
     sections = {"fit": config, "data": data}
     devices = [str(device) for device in jax.local_devices()]
     description = describe_run("aerodynamic", sections, prepared.files, devices, prepared.identified)
@@ -84,16 +83,18 @@ def fit(data: AirData, config: AirConfig) -> int:
             run.log(done, {"cost": cost, "seconds": time.perf_counter() - began})
 
         values = None if known is None else known.params
-        result = identify_air(model, motions["training"], config, report, known=values, free=data.free)
+        result = identify_air(simulator, motions["training"], config, report, fixed_from=values, free=data.free)
         stages.close()
         run.log(done, {"control_steps": result.control_steps})
         text = table(result)
         run.write("identification.txt", text + "\n")
         run.write(AERODYNAMICS_FILE, json.dumps(details(result), indent=2) + "\n")
-        reference, _ = stack_motions(Simulator(model), motions["training"])
-        write_observed(run, recorded_inputs(reference, EnvMimicConfig()))
+        reference, _ = stack_motions(simulator, motions["training"])
+        write_observed(run, recorded_inputs(reference, ForceNetworkConfig(), prepared.robot))
     print(f"\n{text}\n\nOpen-loop replay of the test recordings:\n")
-    evaluator = OpenLoopEvaluator(model, motions["test"], Aerodynamics(model), prepared.base)
+    evaluator = OpenLoopEvaluator(
+        simulator, motions["test"], Aerodynamics(prepared.robot, simulator.mj_model), prepared.base
+    )
     print(artifacts.write_evaluation(evaluator, result.parameters, folder).table())
     print(f"\nWritten to {folder}. {time.perf_counter() - started:.0f} s in all.")
     return 0

@@ -20,14 +20,14 @@ from ballu_mjx.residuals.network import NetworkForces
 from ballu_mjx.residuals.run_config import describe_run, run_residual, run_robot
 from ballu_mjx.residuals.trained import TrainedResidual, write_observed
 from ballu_mjx.rl import distributed, learner, ppo
-from ballu_mjx.rl.ppo import Params, PPOConfig
+from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.rl.training_loop import TrainingLoop, Validation, find_resume_point
 from ballu_mjx.robots.description import RobotDescription, check_simulates, read_description
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import Run, new_folder, read_config
 from ballu_mjx.runs.progress import Progress
-from ballu_mjx.sim.force_model import ForceModel, SumOfForces
+from ballu_mjx.sim.force_model import add_to_base
 from ballu_mjx.viz import artifacts
 
 QUICK: Mapping[str, Any] = {"num_timesteps": 120_000, "num_envs": 256, "batch_size": 128}
@@ -56,39 +56,35 @@ def train(data: Data, env_config: EnvMimicConfig, ppo_config: PPOConfig) -> int:
     distributed.join(data)
     devices = [str(device) for device in jax.devices()]
     ppo.check(ppo_config, len(devices))
-    check_envmimic_config(env_config)
     loggers.check(data.wandb)
     if data.validate_every < 1:
         raise InputError(f"--validate-every is {data.validate_every}: it must be 1 or more.")
     start = find_resume_point("envmimic", data.resume, ppo_config, output=data.output, quick=data.quick)
     description = _description(data)
-    where = _where_beside(data)
-    beside = None if where is None else TrainedResidual.load(where, description=description)
+    check_envmimic_config(env_config, description.control_timestep)
+    where = _where_base(data)
+    base = None if where is None else TrainedResidual.load(where, description)
     prepared = ResidualDataset.read(data, data.resume, description)
-    if beside is not None:
-        prepared.check_beside(beside.actuators, where)
+    if base is not None:
+        prepared.check_base_residual(base.actuators, where)
     first = distributed.is_first()
     folder = data.resume or new_folder(data.output if first else None, "envmimic")
     if first:
         prepared.announce(folder, data.quick)
-    model = prepared.load_model()
-    motions = prepared.reconstruct(model)
-    env = EnvMimicEnv(model, motions["training"], env_config, None if beside is None else beside.applied, description)
+    simulator = prepared.load_simulator()
+    motions = prepared.reconstruct(simulator.mj_model)
+    bound = None if base is None else base.bound
+    env = EnvMimicEnv(simulator.with_residual(bound), motions["training"], env_config)
     if start.params is not None and start.params.normalizer.mean["state"].shape != env.observation_size["state"]:
         raise InputError(
             f"{data.resume}: its policy was trained on other observations; leave the options of env as they were."
         )
     infer = ppo.make_inference(env.observation_size, env.action_size, ppo_config)
-    forces: ForceModel = NetworkForces(env_config, infer, anchored=description.anchored)
-    whole = forces if beside is None else SumOfForces(beside.model, forces)
-
-    def all_params(params: Params) -> Any:
-        return params if beside is None else (beside.params, params)
-
+    whole, all_params = add_to_base(bound, NetworkForces(env_config, description, infer))
     sections = {"env": env_config, "ppo": ppo_config, "data": data}
     config = describe_run("envmimic", sections, prepared.files, devices, prepared.identified, description)
     config["residual"] = None if where is None else str(where.resolve())
-    validation = OpenLoopEvaluator(model, motions["validation"], whole, prepared.base, description)
+    validation = OpenLoopEvaluator(simulator, motions["validation"], whole, prepared.base)
     tells_best = Validation(lambda params: validation(all_params(params)).score)
     if not first:
         return TrainingLoop(None, None, data.validate_every, tells_best).follow(env, ppo_config, start, config)
@@ -130,8 +126,8 @@ def _description(data: Data) -> RobotDescription:
     return found
 
 
-def _where_beside(data: Data) -> Path | None:
-    """The run of the residual that acts beside the forces to be learned."""
+def _where_base(data: Data) -> Path | None:
+    """Return the run of the base residual, on top of which the forces are learned; None: there is none."""
     if data.resume is None:
         return data.residual
     if data.residual is not None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import mujoco
 import numpy as np
 from jaxtyping import Float
 
@@ -29,13 +28,14 @@ from ballu_mjx.residuals.supervised import SupervisedConfig
 from ballu_mjx.residuals.trained import TrainedResidual, write_observed
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Params, PPOConfig
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import Run, new_folder
 from ballu_mjx.runs.metrics import read_column
 from ballu_mjx.runs.progress import PhaseProgress
-from ballu_mjx.sim.force_model import BoundForces, ForceSet, SumOfForces
+from ballu_mjx.sim.force_model import ForceSet, add_to_base
 from ballu_mjx.sim.linearize import Linearizer
-from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.simulator import AugmentedSimulator
 from ballu_mjx.viz import artifacts, plots
 
 QUICK: Mapping[str, Mapping[str, Any]] = {
@@ -73,12 +73,12 @@ def fit_analytic(data: ForcesData, config: AnalyticConfig) -> int:
 class _Setup:
     """What both methods learn with."""
 
-    model: mujoco.MjModel
+    simulator: AugmentedSimulator
+    """With the base residual, where there is one."""
     motions: Mapping[str, Sequence[Motion]]
     forces: NetworkForces
     start: Params
     inputs: Float[np.ndarray, "states inputs"]
-    beside: BoundForces | None
 
     def with_policy(self, policy: Any) -> Params:
         """Parameters of `forces`."""
@@ -121,10 +121,10 @@ class _Supervised(_Fit):
     def learn(self) -> None:
         """Labels for training and validation, the regression, and which share of its forces to take."""
         setup, config = self.setup, self.config
-        simulator = Simulator(setup.model)
+        simulator = setup.simulator.simulator
         env = setup.forces.config
-        linearize = Linearizer(setup.model, setup.beside, simulator.robot.joints, env.forces)
-        label = supervised.ForceLabeller(setup.model, simulator.robot, linearize, config, env)
+        linearize = Linearizer(setup.simulator, simulator.robot.joints, env.forces)
+        label = supervised.ForceLabeller(linearize, config, env)
         found = {}
         for use in ("training", "validation"):
             motions, loads = setup.motions[use], []
@@ -167,7 +167,7 @@ class _Analytic(_Fit):
     def learn(self) -> None:
         """Gradients through the simulation; the validation is open loop."""
         setup, config = self.setup, self.config
-        robots = Simulator(setup.model)
+        robots = setup.simulator.simulator
         cut = cut_segments(robots, setup.motions["training"], config.window_seconds, config.interval_seconds)
         total = config.rounds * config.updates
 
@@ -179,7 +179,6 @@ class _Analytic(_Fit):
 
         report(0, self.still, {})
         analytic.train(
-            setup.model,
             setup.forces,
             setup.with_policy,
             setup.start.policy,
@@ -187,7 +186,7 @@ class _Analytic(_Fit):
             np.std(setup.inputs, axis=0),
             config,
             report,
-            Linearizer(setup.model, setup.beside, forces=setup.forces.config.forces),
+            Linearizer(setup.simulator, forces=setup.forces.config.forces),
         )
 
 
@@ -198,31 +197,28 @@ def _rms(values: np.ndarray) -> float:
 def _fit(task: str, data: ForcesData, config: Any, method: type[_Fit]) -> int:
     started = time.perf_counter()
     loggers.check(data.wandb)
-    beside = None if data.residual is None else TrainedResidual.load(data.residual)
+    base = None if data.residual is None else TrainedResidual.load(data.residual, load_robot())
     prepared = ResidualDataset.read(data)
-    if beside is not None:
-        prepared.check_beside(beside.actuators, data.residual)
+    if base is not None:
+        prepared.check_base_residual(base.actuators, data.residual)
     folder = new_folder(data.output, task)
     prepared.announce(folder, data.quick)
-    model = prepared.load_model()
-    motions = prepared.reconstruct(model)
+    simulator = prepared.load_simulator()
+    motions = prepared.reconstruct(simulator.mj_model)
     env, network = EnvMimicConfig(forces=data.forces), dataclasses.replace(PPOConfig(), seed=config.seed)
-    reference, _ = stack_motions(Simulator(model), motions["training"])
-    inputs, actions = np.asarray(recorded_inputs(reference, env)), num_loads(env, prepared.robot)
+    reference, _ = stack_motions(simulator, motions["training"])
+    inputs, actions = np.asarray(recorded_inputs(reference, env, prepared.robot)), num_loads(env, prepared.robot)
     infer = ppo.make_inference({ppo.STATE: (inputs.shape[1],)}, actions, network)
-    forces = NetworkForces(env, infer, name=task)
+    forces = NetworkForces(env, prepared.robot, infer, name=task)
     start = ppo.initial_policy(inputs, actions, network)
-    setup = _Setup(model, motions, forces, start, inputs, None if beside is None else beside.applied)
-    whole = forces if beside is None else SumOfForces(beside.model, forces)
-
-    def all_params(params: Params) -> Any:
-        return params if beside is None else (beside.params, params)
-
+    bound = None if base is None else base.bound
+    setup = _Setup(simulator.with_residual(bound), motions, forces, start, inputs)
+    whole, all_params = add_to_base(bound, forces)
     sections = {"env": env, "ppo": network, "fit": config, "data": data}
     devices = [str(device) for device in jax.local_devices()]
     description = describe_run(task, sections, prepared.files, devices, prepared.identified)
     description["residual"] = None if data.residual is None else str(data.residual.resolve())
-    validation = OpenLoopEvaluator(model, motions["validation"], whole, prepared.base)
+    validation = OpenLoopEvaluator(simulator, motions["validation"], whole, prepared.base)
     with Run(folder, description, wandb=data.wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)
         write_observed(run, inputs)

@@ -175,4 +175,4 @@ def _simulator(task: Task, data: Data) -> tuple[ModelParameters | None, Path | N
         return None, data.residual
     if data.actuators is not None:
         return read_actuators(data.actuators)[1], data.residual
-    return None if data.residual is None else TrainedResidual.load(data.residual).actuators, data.residual
+    return None if data.residual is None else TrainedResidual.load(data.residual, load_robot()).actuators, data.residual

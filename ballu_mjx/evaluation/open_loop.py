@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
@@ -21,11 +20,9 @@ from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation
 from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, pad_to_bucket, stack_motions
-from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
-from ballu_mjx.sim.force_model import ForceModel
-from ballu_mjx.sim.observation import HISTORY, commands_seen
-from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.force_model import BoundForces, ForceModel
+from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState
 
 START_INTERVAL = 1.0
@@ -59,18 +56,16 @@ class OpenLoopEvaluator:
 
     def __init__(
         self,
-        model: mujoco.MjModel,
+        simulator: Simulator,
         motions: Sequence[Motion],
         residual: ForceModel,
         base: str = "vanilla",
-        robot: RobotDescription | None = None,
     ) -> None:
-        """`base` is what `model`, the simulator without the residual, is called; `robot` says what is what in it (None:
-        it is BALLU)."""
+        """Prepare to replay `motions` in `simulator` without and with `residual`; `base` is the name without it."""
         self.base, self.name = base, residual.name
         self._residual = residual
-        self._simulator = Simulator(model, robot)
-        self.robot = self._simulator.robot
+        self._simulator = simulator
+        self.robot = simulator.robot
         devices = jax.local_devices()
         self._size = len(devices) * _RUNS[devices[0].platform == "cpu"]
         mesh = jax.sharding.Mesh(np.array(devices), ("batch",))
@@ -100,7 +95,7 @@ class OpenLoopEvaluator:
         self._recorded, self._recorded_com = np.asarray(reference.features), np.asarray(com)
         self._reference = jax.device_get(pad_to_bucket(reference))
         self._fixed = jax.device_put((jax.device_get(self._simulator.model), self._reference), self._everywhere)
-        interval = round(START_INTERVAL / CONTROL_TIMESTEP)
+        interval = round(START_INTERVAL / self.robot.control_timestep)
         self.starts = [
             (index, start)
             for index, motion in enumerate(self.motions)
@@ -139,13 +134,17 @@ class OpenLoopEvaluator:
                     array[batch, where] = values[: len(batch), : part.stop - part.start]
         return Replay(features[..., :3], features[..., _BALLOON_YAW], com, force, qpos[self.first_runs])
 
-    def _begin(self, places: Int[np.ndarray, "runs 2"]) -> tuple[PhysicsState, Float[Array, "runs 3 features"]]:
-        """States at their places (recording, control step), and what was seen of the last three."""
+    def _begin(self, places: Int[np.ndarray, "runs 2"]) -> RolloutState:
+        """Return the recorded states at their places (recording, control step)."""
         recording, first = places.T
         earlier = first[:, None] + np.arange(1 - HISTORY, 1)
-        qvel = self._reference.qvel[recording, first]
-        state = PhysicsState(self._reference.qpos[recording, first], qvel, np.zeros_like(qvel))  # pyright: ignore
-        return jax.device_put((state, self._reference.features[recording[:, None], earlier]), self._split)
+        qpos, qvel = (np.asarray(x)[recording, first] for x in (self._reference.qpos, self._reference.qvel))
+        features, command = (
+            np.asarray(x)[recording[:, None], when]
+            for x, when in ((self._reference.features, earlier), (self._reference.command, earlier[:, :-1]))
+        )
+        physics = PhysicsState(qpos, qvel, np.zeros_like(qvel))  # pyright: ignore
+        return jax.device_put(RolloutState(physics, features, command), self._split)  # pyright: ignore
 
     def recorded(self, run: int) -> tuple[Float[np.ndarray, "states 3"], Float[np.ndarray, " states"]]:
         """Recorded balloon position (m) and yaw (rad) from the start of `run` to the recording's end."""
@@ -165,29 +164,19 @@ class OpenLoopEvaluator:
         scale: Array,
         model: mjx.Model,
         reference: ReferenceMotions,
-        carry: tuple[PhysicsState, Array],
+        rollout: RolloutState,
         place: Int[Array, " 2"],
-    ) -> tuple[Any, tuple[Array, Array, Array, Array]]:
+    ) -> tuple[RolloutState, tuple[Array, Array, Array, Array]]:
         """One run, on by `_CHUNK` control steps: what the next ones start from, and features, centre of mass, force and
         generalized positions after each."""
-        residual = self._residual
         recording, start = place
-        fields = {
-            name: (1 - scale) * getattr(model, name) + scale * value for name, value in residual.fields(params).items()
-        }
-        simulator = self._simulator.of(model).altered(fields)
+        simulator = self._simulator.with_model(model).with_residual(BoundForces(self._residual, params), scale)
 
-        def step(carry: tuple, time: Array) -> tuple[tuple, tuple]:
-            state, history = carry
-            commands = commands_seen(reference.command[recording], time)
-            wrench = scale * residual.wrench(params, history, commands)
-            command = (1 - scale) * commands[-1] + scale * residual.command(params, commands)
-            state = simulator.step(state, command, wrench)
-            seen, com = simulator.observe(state)
-            history = jnp.concatenate([history[1:], seen[None]])
-            return (state, history), (seen, com, wrench[0, :3], state.qpos)
+        def step(rollout: RolloutState, time: Array) -> tuple[RolloutState, tuple]:
+            after = simulator.step(rollout, reference.command[recording, time])
+            return after.state, (after.state.features, after.com, after.wrench[0, :3], after.state.physics.qpos)
 
-        return jax.lax.scan(step, carry, start + jnp.arange(_CHUNK))
+        return jax.lax.scan(step, rollout, start + jnp.arange(_CHUNK))
 
     def of_starts(self, motions: Sequence[Motion], params: Any) -> tuple[Errors, ...]:
         """Return how far the simulator with the residual is from itself when it starts from the states of `motions`.
@@ -219,7 +208,7 @@ class OpenLoopEvaluator:
                 turn = np.rad2deg(np.arctan2(np.sin(turn), np.cos(turn)))
                 forces.append(np.linalg.norm(replay.force[run, : states - 1], axis=-1).mean())
                 for horizon in HORIZONS:
-                    steps = round(horizon / CONTROL_TIMESTEP)
+                    steps = round(horizon / self.robot.control_timestep)
                     if steps < states:
                         position[horizon].append(_rms(distance[1 : steps + 1]))
                         yaw[horizon].append(_rms(turn[1 : steps + 1]))

@@ -54,7 +54,7 @@ class ClosedLoop:
 
         def look(state: State) -> tuple[Array, ...]:
             s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-            return s["physics"].qpos, s["history"][-1], s["com"]
+            return s["rollout"].physics.qpos, s["rollout"].features, s["com"]
 
         def run(params: Params, contents: Contents, state: State) -> Any:
             here = env.with_contents(contents)
@@ -109,4 +109,5 @@ class ClosedLoop:
     def standing(self, count: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """`count` starting states, (qpos, qvel), as training draws them."""
         state: Any = self._reset(self._contents, jax.random.split(jax.random.key(seed), count)).pipeline_state
-        return np.asarray(state["physics"].qpos), np.asarray(state["physics"].qvel)
+        physics = state["rollout"].physics
+        return np.asarray(physics.qpos), np.asarray(physics.qvel)

@@ -87,7 +87,7 @@ class Policy:
     @functools.cached_property  # a residual's name takes reading its run
     def setting(self) -> str:
         """The paper's name of the simulator; see `locomotion_env.setting_name`."""
-        name = None if self.residual is None else TrainedResidual.load(self.residual).model.name
+        name = None if self.residual is None else TrainedResidual.load(self.residual, load_robot()).model.name
         return setting_name(self.config, self.actuators is not None, name)
 
     def environment(self) -> LocomotionEnv:
@@ -115,7 +115,7 @@ def make_environment(
 
     **Raises** `InputError` where `residual` holds no residual, or one that belongs to other actuators.
     """
-    force = None if residual is None else TrainedResidual.load(residual)
+    force = None if residual is None else TrainedResidual.load(residual, load_robot())
     if force is not None and not same_parameters(force.actuators, actuators):
         raise InputError(
             f"{residual}: its forces were learned beside other actuators; give --actuators the same file, or leave it "

@@ -19,7 +19,8 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.robots.model import CONTROL_TIMESTEP
 from ballu_mjx.sim.observation import HISTORY, wrap_angle
-from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.simulator import RolloutState, Simulator
+from ballu_mjx.sim.step import state_at
 
 POSITION = (0.002, 0.01)
 """Expected error of the balloon's position (m) at a window's start, and what each second adds."""
@@ -79,6 +80,14 @@ def cut_segments(
         of(command, 1 - history, steps + history - 1),
         of(features, 1, steps),
     )
+
+
+def start_segment(window: Segments) -> tuple[RolloutState, Float[Array, "windowsteps commands"]]:
+    """Return where one window starts, and the commands of its control steps."""
+    physics = state_at(jnp.asarray(window.qpos), jnp.asarray(window.qvel))
+    past = HISTORY - 1
+    history, commands = jnp.asarray(window.history), jnp.asarray(window.commands)
+    return RolloutState(physics, history, commands[:past]), commands[past:]
 
 
 def segment_errors(

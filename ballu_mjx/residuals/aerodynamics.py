@@ -20,9 +20,8 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
-from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.residuals.network import network_input
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
+from ballu_mjx.residuals.network import ForceNetworkConfig, network_input
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.force_model import Fields
 from ballu_mjx.sim.observation import HISTORY, heading_rotation
 from ballu_mjx.sim.step import balloon_id, count_substeps
@@ -48,7 +47,7 @@ class AirParameters:
     turning_drag: Float[Array, " 3"]
     """Torque for each rad/s about each axis (N m s)."""
     delay: Float[Array, ""]
-    """How late commands reach the servos (s, at most `LONGEST_DELAY`). No air, but what moves late passes for heavy:
+    """How late commands reach the servos (s, at most `longest_delay`). No air, but what moves late passes for heavy:
     left out, it is laid at the added mass's door."""
 
     @staticmethod
@@ -59,7 +58,6 @@ class AirParameters:
         return AirParameters(zero, zero, zero, three, three, three, three, zero)
 
 
-LONGEST_DELAY = (HISTORY - 1) * CONTROL_TIMESTEP
 AERODYNAMICS_FORMAT = "ballu-air/1"
 AERODYNAMICS_FILE = "air.json"
 AIR_PARAMETERS = tuple(field.name for field in dataclasses.fields(AirParameters))
@@ -69,21 +67,27 @@ _MOST = 100.0
 """No parameter of a balloon comes near, in SI units."""
 
 
+def longest_delay(robot: RobotDescription) -> float:
+    """Return the longest delay of commands (s): older commands are not remembered."""
+    return (HISTORY - 1) * robot.control_timestep
+
+
 class Aerodynamics:
     """The force model (see `force_model.ForceModel`) whose parameters are `AirParameters`."""
 
     name = "aerodynamic"
 
-    def __init__(self, model: mujoco.MjModel) -> None:
-        """`model` is the robot without the residual."""
-        self._balloon = balloon_id(model)
+    def __init__(self, robot: RobotDescription, model: mujoco.MjModel) -> None:
+        """Prepare for `robot`; `model` is its C model without the residual."""
+        self._robot, self._balloon = robot, balloon_id(model)
+        self._control_timestep, self._longest_delay = robot.control_timestep, longest_delay(robot)
         self._mass, self._inertia = jnp.asarray(model.body_mass), jnp.asarray(model.body_inertia)
         self._centre, self._gravcomp = jnp.asarray(model.body_ipos), jnp.asarray(model.body_gravcomp)
-        self._timestep, self._substeps = float(model.opt.timestep), count_substeps(model)
+        self._timestep, self._substeps = float(model.opt.timestep), count_substeps(model, robot.control_timestep)
         self._gravity = float(np.linalg.norm(model.opt.gravity))
 
     def inputs(self, history: Float[Array, "steps 27"], commands: Float[Array, "steps 2"]) -> Float[Array, " inputs"]:
-        return network_input(history, commands, EnvMimicConfig())
+        return network_input(history, commands, ForceNetworkConfig(), self._robot)
 
     def fields(self, params: AirParameters) -> Fields:
         """The balloon's mass, inertia, centre and lift. The lift carries the added mass."""
@@ -102,8 +106,8 @@ class Aerodynamics:
 
         Not a mean of old and new command: a servo that saturates would turn at once as fast as it can.
         """
-        late = jnp.clip(params.delay, 0.0, LONGEST_DELAY) - self._timestep * jnp.arange(self._substeps)
-        age = jnp.ceil(late / CONTROL_TIMESTEP - _JUST)
+        late = jnp.clip(params.delay, 0.0, self._longest_delay) - self._timestep * jnp.arange(self._substeps)
+        age = jnp.ceil(late / self._control_timestep - _JUST)
         return commands[HISTORY - 1 - jnp.maximum(age, 0).astype(int)]
 
     def wrench(
@@ -120,7 +124,7 @@ class Aerodynamics:
         turned = 2 * turn(before.T @ now) - turn(earlier.T @ before)
         speed = jnp.sqrt(jnp.sum(velocity**2) + _SLOW**2)
         force = -(params.linear_drag + params.quadratic_drag * speed) * velocity
-        torque = -params.turning_drag * turned / CONTROL_TIMESTEP
+        torque = -params.turning_drag * turned / self._control_timestep
         return jnp.concatenate([now @ force, now @ torque])[None]
 
 
@@ -143,7 +147,7 @@ def turn(matrix: Float[Array, "3 3"]) -> Float[Array, " 3"]:
     return jnp.stack([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2
 
 
-def read_air_parameters(path: Path) -> AirParameters:
+def read_air_parameters(path: Path, robot: RobotDescription) -> AirParameters:
     """The parameters in a file of the format `ballu-air/1`, which `train residual --method aerodynamic` writes.
 
     **Raises** `InputError` naming file, key and mend.
@@ -151,7 +155,7 @@ def read_air_parameters(path: Path) -> AirParameters:
     content = files.read_json(path, "restore it or identify again")
     if content.get("format") != AERODYNAMICS_FORMAT or not isinstance(content.get("parameters"), dict):
         raise InputError(f'{path}: is not of the format "{AERODYNAMICS_FORMAT}"; give one that this program wrote.')
-    return air_parameters_from_json(content["parameters"], path)
+    return air_parameters_from_json(content["parameters"], path, robot)
 
 
 def air_parameters_to_json(params: AirParameters) -> dict[str, Any]:
@@ -159,8 +163,8 @@ def air_parameters_to_json(params: AirParameters) -> dict[str, Any]:
     return {name: np.asarray(getattr(params, name), np.float64).round(9).tolist() for name in AIR_PARAMETERS}
 
 
-def air_parameters_from_json(values: Mapping[str, Any], path: Path) -> AirParameters:
-    """The inverse of `as_json`.
+def air_parameters_from_json(values: Mapping[str, Any], path: Path, robot: RobotDescription) -> AirParameters:
+    """Return the inverse of `air_parameters_to_json`.
 
     **Raises** `InputError` naming `path`, the parameter and the mend.
     """
@@ -178,7 +182,7 @@ def air_parameters_from_json(values: Mapping[str, Any], path: Path) -> AirParame
             raise InputError(f"{path}: {name} must be {needed}, not {reprlib.repr(value)}.")
         if name not in SIGNED_AIR_PARAMETERS and min(numbers) < 0:
             raise InputError(f"{path}: {name} is {value}; it must be 0 or more.")
-        most = LONGEST_DELAY if name == "delay" else _MOST
+        most = longest_delay(robot) if name == "delay" else _MOST
         if max(map(abs, numbers)) > most:
             raise InputError(f"{path}: {name} is {value}; it must be {most:g} or less.")
         read[name] = jnp.asarray(numbers, jnp.float32).reshape(like.shape)

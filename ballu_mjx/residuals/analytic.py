@@ -14,22 +14,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.recordings.segments import Segments, check_segments, pseudo_huber, segment_errors
+from ballu_mjx.recordings.segments import Segments, check_segments, pseudo_huber, segment_errors, start_segment
 from ballu_mjx.residuals.envmimic import start_spread
 from ballu_mjx.residuals.network import NetworkForces, square_newtons
-from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.sim.force_model import BoundForces, add_wrenches, to_wrenches
+from ballu_mjx.sim.force_model import to_wrenches
 from ballu_mjx.sim.linearize import ControlSteps, Linearized, Linearizer
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.sharding import shard_over_devices
-from ballu_mjx.sim.simulator import Simulator
-from ballu_mjx.sim.step import state_at
+from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,31 +70,23 @@ def check_analytic_config(config: AnalyticConfig) -> None:
             raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name)}: it must be greater than 0.")
 
 
-def simulator(
-    model: mujoco.MjModel, forces: NetworkForces, beside: BoundForces | None = None
-) -> Callable[[Any, Segments], tuple[ControlSteps, Float[np.ndarray, "windows windowsteps 27"]]]:
-    """A compiled simulation of windows under the forces of `forces` (and of `beside`): (its parameters, windows) to all
-    control steps, window after window, and the features after each."""
-    robot = Simulator(model)
-    if beside is not None:
-        robot = robot.altered(beside.model.fields(beside.params))
+def compile_rollout(
+    simulator: AugmentedSimulator, forces: NetworkForces
+) -> Callable[[Any, Segments], tuple[ControlSteps, Float[np.ndarray, "windows windowsteps features"]]]:
+    """Return a compiled simulation of windows under `forces`, in `simulator`.
+
+    It takes the parameters of `forces` and windows, and returns all control steps, window after window, and the
+    features after each.
+    """
 
     def run(params: Any, window: Segments) -> tuple[ControlSteps, Array]:
-        def step(carry: tuple, time: Int[Array, ""]) -> tuple[tuple, tuple]:
-            state, history = carry
-            commands = jax.lax.dynamic_slice_in_dim(window.commands, time, HISTORY)
-            loads = forces.loads(params, forces.inputs(history, commands), history[-1, 8])
-            command, wrench = commands[-1], to_wrenches(loads, forces.config.forces)
-            if beside is not None:
-                command = beside.model.command(beside.params, commands)
-                wrench = add_wrenches(wrench, beside.model.wrench(beside.params, history, commands))
-            after = robot.step(state, command, wrench)
-            features, _ = robot.observe(after)
-            done = ControlSteps(state, history, commands, loads), features
-            return (after, jnp.concatenate([history[1:], features[None]])), done
+        def step(state: RolloutState, command: Array) -> tuple[RolloutState, tuple[ControlSteps, Array]]:
+            seen = forces.inputs(state.history, state.with_command(command))
+            loads = forces.loads(params, seen, state.features[8])
+            after = simulator.step(state, command, wrench=to_wrenches(loads, forces.config.forces)).state
+            return after, (ControlSteps(state, command, loads), after.features)
 
-        first = state_at(jnp.asarray(window.qpos), jnp.asarray(window.qvel)), window.history
-        return jax.lax.scan(step, first, jnp.arange(len(window.features)))[1]
+        return jax.lax.scan(step, *start_segment(window))[1]
 
     spread = shard_over_devices(run, shared=1)
 
@@ -113,7 +102,6 @@ Report = Callable[[int, Any, dict[str, float]], None]
 
 
 def train(
-    model: mujoco.MjModel,
     forces: NetworkForces,
     wrap: Callable[[Any], Any],
     start: Any,
@@ -132,12 +120,13 @@ def train(
     - `recorded`: windows of the training recordings.
     - `spread`: of each of the network's inputs over the recordings.
     - `report`: told every `validate_every` gradient steps.
-    - `linearize`: that of the same model and force set, with the residual that the simulator has already; joints'
-      torques are left alone.
+    - `linearize`: of the same force set and the simulator to learn in, its base residual included; joints' torques
+      are left alone.
     """
-    simulate = simulator(model, forces, linearize.beside)
+    simulate = compile_rollout(linearize.simulator, forces)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
-    starts = start_spread(model, load_robot())
+    plain = linearize.simulator.simulator
+    starts = start_spread(plain.mj_model, plain.robot)
     update = _updates(forces, wrap, optimizer, spread, starts, config)
     carry = (start, optimizer.init(start), start)
     key = jax.random.key(config.seed)

@@ -22,6 +22,7 @@ from ballu_mjx.robots.model import ModelParameters, same_parameters
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import read_config
+from ballu_mjx.sim.simulator import Simulator
 
 if TYPE_CHECKING:
     from ballu_mjx.recordings.recording import Recording
@@ -90,10 +91,10 @@ class ResidualDataset:
         """What the simulator without residual is called."""
         return base_name(self.identified is not None)
 
-    def check_beside(self, learned_with: ModelParameters | None, run: Path | None) -> None:
-        """**Raises** `InputError` where the residual of `run` was learned beside other actuators than these."""
+    def check_base_residual(self, learned_with: ModelParameters | None, run: Path | None) -> None:
+        """**Raises** `InputError` where the base residual, of `run`, was learned with other actuators than these."""
         if not same_parameters(learned_with, self.identified):
-            raise InputError(f"{run}: was learned beside other actuators than {self.where}; give --actuators the same.")
+            raise InputError(f"{run}: was learned with other actuators than {self.where}; give --actuators the same.")
 
     @property
     def one_set(self) -> bool:
@@ -115,6 +116,10 @@ class ResidualDataset:
         """States at the control rate, by use."""
         print("Reconstructing the recorded states ...", flush=True)
         return {use: [reconstruct(each, model, self.robot) for each in self.recordings[use]] for use in USES}
+
+    def load_simulator(self) -> Simulator:
+        """Return the simulator of the robot with these actuators."""
+        return Simulator(self.robot, self.identified)
 
     def load_model(self) -> mujoco.MjModel:
         """The robot with these actuators."""

@@ -28,7 +28,7 @@ from ballu_mjx.residuals.network import ForceNetworkConfig, load_units, recorded
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.linearize import ControlSteps, Linearizer
 from ballu_mjx.sim.observation import HISTORY, heading_rotation
-from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
 
@@ -89,19 +89,20 @@ class ForceLabeller:
 
     def __init__(
         self,
-        model: mujoco.MjModel,
-        robot: RobotDescription,
         linearize: Linearizer,
         config: SupervisedConfig,
         env: ForceNetworkConfig | None = None,
     ) -> None:
-        """`linearize` is that of the same model and force set, with the torques of the robot's joints; where it has a
-        residual beside, labels are what that leaves. `env`: of the network to be (None: its defaults)."""
+        """Prepare to label motions of the robot that `linearize` simulates.
+
+        `linearize` has the network's force set, and the torques of the robot's joints; where its simulator has a
+        residual, labels are what that leaves. `env` is of the network to be (None: its defaults).
+        """
         env = env or ForceNetworkConfig()
-        self._model, self._config, self._linearize = model, config, linearize
+        self._simulator = linearize.simulator.simulator
+        self._model, self._config, self._linearize = self._simulator.mj_model, config, linearize
         self._in_newtons = load_units(env, linearize.loads) / env.force_scale
-        self._simulator = Simulator(model, robot)
-        self._measured, self._process = _noise(model, robot, config)
+        self._measured, self._process = _noise(self._model, self._simulator.robot, config)
 
     def __call__(self, motion: Motion) -> Float[np.ndarray, "steps loads"]:
         """The loads (N, N m; world) over each control step that explain the recorded motion."""
@@ -114,7 +115,9 @@ class ForceLabeller:
             ).swapaxes(1, 2)
             for x in (np.asarray(reference.features[0, :-1]), motion.command)
         )
-        linear = self._linearize(ControlSteps(states, history, commands, np.zeros((count, self._linearize.loads))))
+        rollout = RolloutState(states, jnp.asarray(history), jnp.asarray(commands[:, :past]))
+        loads = np.zeros((count, self._linearize.loads))
+        linear = self._linearize(ControlSteps(rollout, commands[:, past], loads))
         defect = np.zeros((count, 2 * self._model.nv))
         for step in range(count):
             recorded, after = motion.qpos[step + 1], np.asarray(linear.qpos[step], np.float64)
@@ -197,7 +200,7 @@ def examples(
     to_world = np.asarray(jax.vmap(heading_rotation)(jnp.asarray(np.concatenate(yaw))))
     turned = np.einsum("nji,nvj->nvi", to_world, labels.reshape(len(labels), -1, 3)).reshape(labels.shape)
     actions = turned / load_units(config, labels.shape[1])
-    return np.asarray(recorded_inputs(reference, config)), np.asarray(actions, np.float32)
+    return np.asarray(recorded_inputs(reference, config, simulator.robot)), np.asarray(actions, np.float32)
 
 
 Validate = Callable[[int, Any, float], None]

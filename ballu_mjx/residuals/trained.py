@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from pathlib import Path
 from typing import Any, Literal
@@ -21,10 +22,9 @@ from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
-from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.checkpoints import restore_checkpoint
 from ballu_mjx.runs.folder import Run, read_config, typed_config
-from ballu_mjx.sim.force_model import BoundForces, Fields, ForceModel, SumOfForces
+from ballu_mjx.sim.force_model import BoundForces, Fields, ForceModel
 
 NETWORK_TASKS = ("envmimic", "supervised", "analytic")
 """Runs that leave a network of forces."""
@@ -59,53 +59,52 @@ class TrainedResidual:
     @staticmethod
     def load(
         folder: Path | str,
+        robot: RobotDescription,
         which: Literal["best", "last"] = "best",
         *,
-        beside: frozenset[Path] = frozenset(),
-        description: RobotDescription | None = None,
+        loading: frozenset[Path] = frozenset(),
     ) -> TrainedResidual:
-        """The residual of a run; of a network that in the best (by validation error) or last checkpoint.
-        `beside`: runs of which it is a part; `description`: the robot that it has to be of (None: BALLU).
+        """Load the residual of a run; of a network that in the best (by validation error) or last checkpoint.
+
+        `robot` is the one that it has to be of; `loading` are the runs whose base residual it is.
 
         **Raises** `InputError` where `folder` is no such run, is of another robot or has no such checkpoint.
         """
-        description = description or load_robot()
         folder = Path(folder)
-        beside |= {folder.resolve()}
+        loading |= {folder.resolve()}
         stored = read_config(folder, *RESIDUAL_TASKS)
         own = run_robot(stored, folder)
-        if own.sha256 != description.sha256:
-            raise InputError(
-                f"{folder}: is of the robot {own.name}, not of {description.name}; give one of the same robot."
-            )
+        if own.sha256 != robot.sha256:
+            raise InputError(f"{folder}: is of the robot {own.name}, not of {robot.name}; give one of the same robot.")
         identified = run_actuators(stored, folder, own)
         if stored["task"] == "aerodynamic":
-            step, model = 0, Aerodynamics(description.load_model(identified))
-            params = read_air_parameters(folder / AERODYNAMICS_FILE)
-            inputs = num_inputs(EnvMimicConfig(), description)
+            step, model = 0, Aerodynamics(robot, robot.load_model(identified))
+            params = read_air_parameters(folder / AERODYNAMICS_FILE, robot)
+            inputs = num_inputs(EnvMimicConfig(), robot)
         else:
             step, tree = restore_checkpoint(folder, which)
             params = ppo.from_tree(tree)
             inputs = params.normalizer.mean["state"].shape[0]
-            config = typed_config(EnvMimicConfig, stored, "env", folder, check_envmimic_config)
+            check = functools.partial(check_envmimic_config, control_timestep=robot.control_timestep)
+            config = typed_config(EnvMimicConfig, stored, "env", folder, check)
             network = typed_config(PPOConfig, stored, "ppo", folder, ppo.check_values)
-            sizes = inputs, num_loads(config, description), network
+            sizes = inputs, num_loads(config, robot), network
             infer = ppo.make_inference(*sizes)
-            if not (inputs == num_inputs(config, description) and ppo.fits(infer, params, inputs)):
+            if not (inputs == num_inputs(config, robot) and ppo.fits(infer, params, inputs)):
                 raise InputError(
                     f"{folder}: the stored parameters do not fit the networks in its config.json; restore one of them."
                 )
             sample = ppo.make_sampler(*sizes) if stored["task"] == "envmimic" else None
-            model = NetworkForces(config, infer, sample, stored["task"], description.anchored)
+            model = NetworkForces(config, robot, infer, sample, stored["task"])
             if (where := run_residual(stored, folder)) is not None:
-                if where.resolve() in beside:
-                    raise InputError(f"{folder}: its residual stands beside itself; restore its config.json.")
-                other = TrainedResidual.load(where, beside=beside, description=description)
-                model, params = SumOfForces(other.model, model), (other.params, params)
+                if where.resolve() in loading:
+                    raise InputError(f"{folder}: is its own base residual; restore its config.json.")
+                base = TrainedResidual.load(where, robot, loading=loading)
+                model, params = base.bound.plus(BoundForces(model, params))
         return TrainedResidual(model, params, _read_observed(folder / _OBSERVED, inputs), step, identified)
 
     @property
-    def applied(self) -> BoundForces:
+    def bound(self) -> BoundForces:
         """Model and parameters."""
         return BoundForces(self.model, self.params)
 

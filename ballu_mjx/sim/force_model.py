@@ -6,6 +6,7 @@ Everything that simulates takes residuals by this one interface, whatever they w
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
@@ -86,6 +87,25 @@ class BoundForces(NamedTuple):
 
     model: ForceModel
     params: Any
+
+    @property
+    def fields(self) -> Fields:
+        """Model fields to simulate with; see `ForceModel.fields`."""
+        return self.model.fields(self.params)
+
+    def plus(self, further: BoundForces) -> BoundForces:
+        """Return both residuals, acting together."""
+        return BoundForces(SumOfForces(self.model, further.model), (self.params, further.params))
+
+
+def add_to_base(base: BoundForces | None, further: ForceModel) -> tuple[ForceModel, Callable[[Any], Any]]:
+    """Return `further` on top of a base residual, and what turns parameters of `further` into those of the sum.
+
+    Without base residual: `further` itself, and the identity.
+    """
+    if base is None:
+        return further, lambda params: params
+    return SumOfForces(base.model, further), lambda params: (base.params, params)
 
 
 class SumOfForces:

@@ -14,13 +14,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from ballu_mjx.sim.force_model import BoundForces, ForceSet, add_wrenches, num_vectors, to_wrenches
+from ballu_mjx.sim.force_model import ForceSet, num_vectors, to_wrenches
 from ballu_mjx.sim.sharding import shard_over_devices
-from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState
 from ballu_mjx.sim.vmap_last import nested_vmap
 
@@ -31,11 +30,10 @@ _CHUNK = 64
 class ControlSteps(NamedTuple):
     """Control steps to linearize about: states before, and what acts over them."""
 
-    physics: PhysicsState
-    history: Float[Array | np.ndarray, "steps 3 27"]
-    """`observe_features` of the last three control steps, the state's own last: what a base residual sees."""
-    commands: Float[Array | np.ndarray, "steps 3 2"]
-    """Commands of the last two control steps and the coming one."""
+    state: RolloutState
+    """Before the step; a base residual sees its history and commands."""
+    command: Float[Array | np.ndarray, "steps commands"]
+    """Of the coming control step."""
     loads: Float[Array | np.ndarray, "steps loads"]
     """What pushes the robot (N, N m; world), of the linearizer's force set."""
 
@@ -61,19 +59,17 @@ class Linearizer:
 
     def __init__(
         self,
-        model: mujoco.MjModel,
-        beside: BoundForces | None = None,
+        simulator: Simulator | AugmentedSimulator,
         joints: Sequence[str] = (),
         forces: ForceSet = "force",
     ) -> None:
-        """`beside` is a residual that the simulator has already; `joints` are those whose torques are inputs too."""
-        self._nv, self.beside = model.nv, beside
+        """Prepare to linearize control steps of `simulator`; `joints` are those whose torques are inputs too."""
+        self.simulator = simulator.with_residual(None)
+        plain = self.simulator.simulator
+        self._nv = plain.nv
         self._forces: ForceSet = forces
-        self._joints = np.array([model.joint(name).dofadr[0] for name in joints], int)
-        self._simulator = Simulator(model)
-        self.loads = 3 * num_vectors(forces, len(self._simulator.robot.points))
-        if beside is not None:
-            self._simulator = self._simulator.altered(beside.model.fields(beside.params))
+        self._joints = np.array([plain.mj_model.joint(name).dofadr[0] for name in joints], int)
+        self.loads = 3 * num_vectors(forces, len(plain.robot.points))
         over = functools.partial(nested_vmap, inner=self.directions)
         self._each = shard_over_devices(self._one, shared=0, over=over)
 
@@ -96,24 +92,22 @@ class Linearizer:
 
     def _one(self, step: ControlSteps) -> tuple[Array, ...]:
         """A control step and its derivatives, those along one direction in a row."""
-        nv, physics = self._nv, step.physics
+        nv, physics = self._nv, step.state.physics
         units = jnp.eye(self.directions)
         turned = jax.vmap(lambda change: _expand(physics.qpos, change))(units[:, :nv])
         start = PhysicsState(*map(jnp.asarray, physics)), jnp.zeros(self.directions - 2 * nv)
         moves = PhysicsState(turned, units[:, nv : 2 * nv], jnp.zeros_like(turned[:, :nv])), units[:, 2 * nv :]
 
         def after(moved: PhysicsState, inputs: Float[Array, " inputs"]) -> tuple[PhysicsState, Array]:
-            commands = jnp.asarray(step.commands)
-            command, wrench = commands[-1], to_wrenches(jnp.asarray(step.loads) + inputs[: self.loads], self._forces)
-            simulator = self._simulator.strained(jnp.zeros(nv).at[self._joints].set(inputs[self.loads :]))
-            if self.beside is not None:
-                model, params = self.beside
-                seen, _ = simulator.observe(moved)
-                history = jnp.concatenate([step.history[:-1], seen[None]])
-                command = model.command(params, commands)
-                wrench = add_wrenches(wrench, model.wrench(params, history, commands))
-            state = simulator.step(moved, command, wrench)
-            return state, simulator.observe(state)[0]
+            wrench = to_wrenches(jnp.asarray(step.loads) + inputs[: self.loads], self._forces)
+            torques = jnp.zeros(nv).at[self._joints].set(inputs[self.loads :])
+            history = jnp.asarray(step.state.history)
+            if self.simulator.residual is not None:  # which sees the moved state
+                history = history.at[-1].set(self.simulator.simulator.observe(moved)[0])
+            state = RolloutState(moved, history, jnp.asarray(step.state.commands))
+            simulator = self.simulator.with_generalized_force(torques)
+            done = simulator.step(state, jnp.asarray(step.command), wrench=wrench).state
+            return done.physics, done.features
 
         # The step itself is the same for all directions, and simulated once for all.
         (state, features), (change, seen) = jax.vmap(lambda *move: jax.jvp(after, start, move))(*moves)

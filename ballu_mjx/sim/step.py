@@ -14,20 +14,19 @@ from jaxtyping import Array, Float
 from mujoco import mjx
 from mujoco.mjx._src.solver import Context
 
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
 from ballu_mjx.sim.custom_jvp import DirectionalDerivative, with_custom_jvp
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 
 
-def count_substeps(model: mujoco.MjModel) -> int:
-    """Physics steps in a control step.
+def count_substeps(model: mujoco.MjModel, control_timestep: float) -> int:
+    """Return the number of physics steps in a control step of `control_timestep` seconds.
 
-    Raises `ValueError` where the control step is no whole number of them.
+    **Raises** `ValueError` where the control step is no whole number of them.
     """
-    count = CONTROL_TIMESTEP / model.opt.timestep
-    if abs(count - round(count)) > 1e-6:
+    count = control_timestep / model.opt.timestep
+    if abs(count - round(count)) > 1e-6 or count < 1 - 1e-6:
         raise ValueError(
-            f"The model's timestep {model.opt.timestep} s does not divide the control step of {CONTROL_TIMESTEP} s."
+            f"The model's timestep {model.opt.timestep} s does not divide the control step of {control_timestep} s."
         )
     return round(count)
 
@@ -142,7 +141,7 @@ def control_step(
     **Arguments**
 
     - `template`: data of the model, from `make_data`; of no influence but for what no step changes.
-    - `command`: actuators' commands in [0, 1], held, or a row for each physics step.
+    - `command`: commands in the actuators' own units, held, or a row for each physics step.
     - `wrench`: force (N) and torque (N m), world frame, on the bodies of the ids `bodies`: at the first one's centre of
       mass, and on each of the others at the site of its id in `points`, wherever that moves.
     """

@@ -188,7 +188,7 @@ def test_bundled_actuators_come_from_the_bundled_sweep():
 def test_envmimic_takes_identified_actuators_from_beside_the_recordings(trained: Path):
     stored = json.loads((trained / "config.json").read_text())["actuators"]
     assert stored == json.loads((trained.parent / "data" / ACTUATORS_FILE).read_text())["parameters"]
-    loaded = TrainedResidual.load(trained, "last").actuators
+    loaded = TrainedResidual.load(trained, load_robot(), "last").actuators
     assert isinstance(loaded, ActuatorParameters) and np.asarray(loaded.motor_gain) == pytest.approx(
         stored["motor_gain"]
     )

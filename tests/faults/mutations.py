@@ -431,12 +431,18 @@ def formats(work: Path) -> list[Format]:
     path.write_bytes((assets() / "ballu.robot.json").read_bytes())
     shutil.copy(assets() / "ballu.xml", folder)
     add("robot description", path, JSON, lambda path=path: read_description(path), description_fault)
-    folder = place()
+    folder, ballu = place(), read_description(assets() / "ballu.robot.json")
     path = folder / AERODYNAMICS_FILE
     values = dict.fromkeys(("centre", "linear_drag", "quadratic_drag", "turning_drag"), [0.01, 0.02, 0.03])
     values |= {"added_mass": 0.1, "added_inertia": 0.003, "lift": -0.004, "delay": 0.05}
     path.write_text(json.dumps({"format": AERODYNAMICS_FORMAT, "parameters": values, "windows": 3}))
-    add("air.json", path, JSON, lambda path=path: read_air_parameters(path), air_fault)
+    add(
+        "air.json",
+        path,
+        JSON,
+        lambda path=path: read_air_parameters(path, ballu),
+        air_fault,
+    )
     folder = place()
     path = folder / "observed.json"
     path.write_text(json.dumps({"low": [-0.5] * 87, "high": [0.5] * 87}))
@@ -532,7 +538,7 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
         """As the commands that show, compare, evaluate or go on with a run do, but for its checkpoints."""
         config = read_config(folder, "envmimic")
         found = [
-            typed_config(EnvMimicConfig, config, "env", folder, check_envmimic_config),
+            typed_config(EnvMimicConfig, config, "env", folder, lambda read: check_envmimic_config(read, 0.05)),
             typed_config(PPOConfig, config, "ppo", folder, ppo.check_values),
         ]
         run_actuators(config, folder, load_robot())

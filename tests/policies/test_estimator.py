@@ -17,6 +17,7 @@ from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model, standing_
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.policies.deploy import estimator
 from ballu_mjx.policies.deploy.estimator import Capture, PolicyController, estimate
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import euler_angles
 from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.sim.step import state_at
@@ -93,7 +94,7 @@ def test_angles_are_those_of_the_training_environment():
 def test_features_stand_in_the_order_of_the_training_environment():
     """`simulator.Simulator.observe` on a moving state, and frames of that same motion."""
     model = load_model()
-    simulator = Simulator(model)
+    simulator = Simulator(load_robot(), model=model)
     qpos = standing_qpos(model)
     qvel = np.zeros(model.nv)
     qvel[:3] = 0.3, -0.2, 0.1

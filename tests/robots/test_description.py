@@ -21,12 +21,13 @@ from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import COLUMNS, Recording
-from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, tracking_state
 from ballu_mjx.residuals.network import world_loads
 from ballu_mjx.robots.description import read_description
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, heading_observation
-from ballu_mjx.sim.step import PhysicsState, count_substeps
+from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.step import count_substeps
 
 BALLOON = Path(__file__).parents[2] / "experiments" / "tethered_balloon"
 DESCRIPTION = read_description(BALLOON / "balloon.robot.json")
@@ -241,34 +242,34 @@ def test_places_that_are_not_the_model_s_are_refused(flight: tuple[Recording, np
 @pytest.fixture(scope="module")
 def env(motion: Motion) -> EnvMimicEnv:
     config = EnvMimicConfig(start_noise=0.0, observation_noise=0.0)
-    return EnvMimicEnv(DESCRIPTION.load_model(), [motion], config, robot=DESCRIPTION)
+    return EnvMimicEnv(Simulator(DESCRIPTION), [motion], config)
 
 
 def test_the_environment_steps_as_c_mujoco_does(env: EnvMimicEnv):
     """The push that is in the recording, found again: with it as the action the simulation stays on it, and without it
     drifts off."""
     state = jax.jit(env.reset)(jax.random.key(3))
-    s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
+    start = tracking_state(state)
     model = DESCRIPTION.load_model()
     data = mujoco.MjData(model)
-    physics: PhysicsState = s["physics"]
+    physics = start.rollout.physics
     data.qpos[:], data.qvel[:] = np.asarray(physics.qpos), np.asarray(physics.qvel)
     data.xfrc_applied[model.body("balloon").id, :3] = PUSH
     step = jax.jit(env.step)
     for number in range(10):
-        data.ctrl[:] = np.asarray(env.reference.command[0, int(s["time"]) + number])
-        mujoco.mj_step(model, data, count_substeps(model))
+        data.ctrl[:] = np.asarray(env.reference.command[0, int(start.time) + number])
+        mujoco.mj_step(model, data, count_substeps(model, CONTROL_TIMESTEP))
         state = step(state, jnp.asarray(PUSH / env.config.force_scale, jnp.float32))
-    after: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-    np.testing.assert_allclose(after["physics"].qpos, data.qpos, atol=2e-4)
+    after = tracking_state(state)
+    np.testing.assert_allclose(after.rollout.physics.qpos, data.qpos, atol=2e-4)
     mujoco.mj_forward(model, data)
     velocity = np.zeros(6)
     mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, model.site("knot").id, velocity, 0)
-    features = after["history"][-1]
+    features = after.rollout.features
     assert features.shape == (DESCRIPTION.features,)
     np.testing.assert_allclose(features[9:12], data.site("knot").xpos, atol=2e-4)
     np.testing.assert_allclose(features[12:15], velocity[3:], atol=1e-3)
-    target = env.reference.features[0, int(after["time"])]
+    target = env.reference.features[0, int(after.time)]
     assert float(jnp.linalg.norm(features[:3] - target[:3])) < 0.01
 
 
@@ -280,7 +281,7 @@ def test_an_anchored_robot_sees_the_world(motion: Motion, env: EnvMimicEnv):
     changed = np.flatnonzero(np.abs(seen - other) > 1e-6)
     assert len(changed) == HISTORY, "the yaw alone"
     np.testing.assert_allclose(np.sort(np.asarray(seen)[:3]), np.sort(np.asarray(history[0, :3])), atol=1e-6)
-    force = world_loads(jnp.array([1.0, 2.0, 3.0]), turned[-1, 8], EnvMimicConfig(), anchored=True)
+    force = world_loads(jnp.array([1.0, 2.0, 3.0]), turned[-1, 8], EnvMimicConfig(), DESCRIPTION)
     np.testing.assert_allclose(force, [0.05, 0.1, 0.15], atol=1e-6)
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.ballu.model import (
     CABLE_SLACK,
+    CONTROL_TIMESTEP,
     KNEES,
     MOTORS,
     SIDES,
@@ -116,7 +117,7 @@ def test_samples_visit_every_regime() -> None:
 def test_mjx_follows_c_mujoco_over_a_control_step() -> None:
     """The same step in float32 and in double precision, under a wrench on the balloon and forces at base and feet."""
     s, model = samples(), load_model()
-    count, balloon = count_substeps(model), balloon_id(model)
+    count, balloon = count_substeps(model, CONTROL_TIMESTEP), balloon_id(model)
     points = tuple(model.site(name).id for name in load_robot().points)
     bodies = (balloon, *model.site_bodyid[list(points)].tolist())
     mjx_model, template = put_model(model), make_data(model)

@@ -20,6 +20,7 @@ from ballu_mjx.policies.deploy.estimator import PolicyController
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.reference import stack_motions
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.simulator import Simulator
 
 
@@ -48,7 +49,7 @@ def run_trials(
 
     model = load_model(policy.actuators)
     motions = [reconstruct_ballu(recording, model) for recording in recordings]
-    reference, com = stack_motions(Simulator(model), motions)
+    reference, com = stack_motions(Simulator(load_robot(), model=model), motions)
     starts = [np.stack([getattr(motion, name)[0] for motion in motions]) for name in ("qpos", "qvel")]
     rollout = (loop or policy.closed_loop())(policy.params, starts[0], starts[1], len(motions[0].command))
     recorded = np.asarray(com), np.asarray(reference.features)
