@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.ballu import actuators_file
+from ballu_mjx.ballu.features import foot_positions
+from ballu_mjx.ballu.gait import count_steps
 from ballu_mjx.ballu.model import JOINTS, SIDES, ActuatorParameters, standing_qpos
 from ballu_mjx.robots.adapter import DeploymentNotes, RobotAdapter
 from ballu_mjx.robots.description import RobotDescription
@@ -59,15 +61,28 @@ class Ballu(RobotAdapter):
                 "foot_right": "the centre of the right foot's sphere",
             },
             commands=(
-                "0 is the servo relaxed (knee at its stop, cable just taut), 1 is 90 deg. The servo's own no-load speed "
-                "is 60 deg in 0.14 s (90 deg in 0.21 s), so a faster command would ask for what it cannot do."
+                "0 is the servo relaxed (knee at its stop, cable just taut), 1 is 90 deg. The servo's own no-load "
+                "speed is 60 deg in 0.14 s (90 deg in 0.21 s), so a faster command would ask for what it cannot do."
             ),
             measure=(
                 "Pulse widths at command 0 (cable just taut, knee at its stop) and at 90 deg, of each servo; whether "
                 "one runs the other way round. Give them by --pulse-low and --pulse-high, or in send for each servo.",
-                "z of the feet standing (the foot sphere's radius, not 0), which foot is left, base and balloon height.",
+                "z of the feet standing (the foot sphere's radius, not 0), which foot is left, heights of base and "
+                "balloon.",
             ),
         )
+
+    def rollout_counts(self, features: Float[np.ndarray, "runs states features"]) -> Mapping[str, list[int]]:
+        """Return the steps of each run."""
+        return {"steps": [int(count_steps(feet)[-1]) for feet in foot_positions(features)]}
+
+    def draw_rollout(
+        self, folder: Path, qpos: Float[np.ndarray, "states nq"], command: Float[np.ndarray, "steps commands"]
+    ) -> None:
+        """Draw the gait into `gait.png`."""
+        from ballu_mjx.ballu import plots  # brings Matplotlib and the identification
+
+        plots.gait(folder / "gait.png", qpos, command)
 
     def nominal_actuators(self, model: mujoco.MjModel) -> ActuatorParameters:
         """Return the parameters that stand in `model`."""

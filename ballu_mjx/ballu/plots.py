@@ -11,10 +11,10 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
+from ballu_mjx.ballu.gait import planted_feet
 from ballu_mjx.ballu.identification import Identification
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model
 from ballu_mjx.ballu.sweep import Sweep
-from ballu_mjx.evaluation.gait import planted_feet
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.viz.style import COMMAND_COLOURS, colour_of, label_of, save_figure
 

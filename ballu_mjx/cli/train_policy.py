@@ -14,21 +14,19 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.ballu import plots as ballu_plots
 from ballu_mjx.ballu.actuators_file import read_actuators
-from ballu_mjx.ballu.features import foot_positions
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.evaluation.gait import count_steps
 from ballu_mjx.policies.closed_loop import ClosedLoop, Rollout
-from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_locomotion_config, setting_name
-from ballu_mjx.policies.policy import Policy, make_environment
+from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_locomotion_config, variant_of
+from ballu_mjx.policies.policy import Policy, check_belongs, environment_of
 from ballu_mjx.policies.tasks import Task
 from ballu_mjx.residuals.run_config import describe_run, run_actuators, run_residual
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl import distributed, learner, ppo
 from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.rl.training_loop import TrainingLoop, Validation, find_resume_point
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, ModelParameters
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.model import ModelParameters
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import Run, new_folder, read_config
@@ -88,20 +86,23 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
     devices = [str(device) for device in jax.devices()]
     ppo.check(ppo_config, len(devices))
     loggers.check(data.wandb)
-    check_locomotion_config(config)
+    robot = load_robot()
+    check_locomotion_config(config, robot.control_timestep)
     if data.keep_every < 1:
         raise InputError(f"--keep-every is {data.keep_every}: it must be 1 or more.")
     start = find_resume_point(task.name, data.resume, ppo_config, output=data.output, quick=data.quick)
     identified, forces = _simulator(task, data)
-    env = make_environment(task, config, identified, forces)
-    setting = setting_name(config, identified is not None, None if env.residual is None else env.residual.model.name)
+    residual = None if forces is None else TrainedResidual.load(forces, robot)
+    check_belongs(residual, identified, forces)
+    env = environment_of(robot, task, config, identified, residual)
+    setting = variant_of(config, identified, residual).name
 
     content = describe_run(task.name, {"env": config, "ppo": ppo_config, "data": data}, {}, devices, identified)
     content["residual"] = None if forces is None else str(forces.resolve())
     loop = ClosedLoop(env, ppo.make_inference(env.observation_size, env.action_size, ppo_config))
 
     def trials(params: Params) -> Rollout:
-        steps = round(task.trial_seconds / CONTROL_TIMESTEP)
+        steps = round(task.trial_seconds / robot.control_timestep)
         return loop(params, *loop.standing(_VALIDATION_STARTS), steps)
 
     # Training's reward says too little: exploration frees a robot that would rest without.
@@ -128,34 +129,38 @@ def train(task: Task, data: Data, config: LocomotionConfig, ppo_config: PPOConfi
     plots.reward_curve(folder / "learning_curve.png", *curves, setting)
     trained = Policy.load(folder)
     rollout = trials(trained.params)
-    ballu_plots.gait(folder / "gait.png", rollout.qpos[0], rollout.command[0])
-    time_axis = np.arange(len(rollout.qpos[0])) * CONTROL_TIMESTEP
+    robot.adapter.draw_rollout(folder, rollout.qpos[0], rollout.command[0])
+    time_axis = np.arange(len(rollout.qpos[0])) * robot.control_timestep
     episode = StoredRollout(
         name=task.name,
-        description=load_robot(),
+        description=robot,
         time=time_axis,
         qpos={setting: rollout.qpos[0]},
         command=rollout.command[0],
     )
     write_rollouts(folder / ROLLOUT_FILE, [episode])
-    print(summary(task, rollout, forces is not None))
+    print(summary(task, rollout, robot, forces is not None))
     print(f"\nWritten to {folder}. {time.perf_counter() - started:.0f} s in all.")
     return 0
 
 
-def summary(task: Task, rollout: Rollout, with_residual: bool) -> str:
+def summary(task: Task, rollout: Rollout, robot: RobotDescription, with_residual: bool) -> str:
     """What some runs did, in words: means and ranges."""
     way = rollout.com[:, -1] - rollout.com[:, 0]
     yaw = np.rad2deg(np.unwrap(rollout.yaw, axis=1))
-    steps = np.array([count_steps(feet) for feet in foot_positions(rollout.features)])
+    counts = robot.adapter.rollout_counts(rollout.features)
 
     def spread(values: Float[np.ndarray, " runs"], digits: int) -> str:
         return f"{values.mean():.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
 
-    text = (
-        f"In its own simulator, {len(way)} times {task.trial_seconds:g} s from standing: x {spread(way[:, 0], 2)} m, "
-        f"y {spread(way[:, 1], 2)} m, yaw {spread(yaw[:, -1] - yaw[:, 0], 0)} deg, {spread(steps, 0)} steps."
-    )
+    figures = [
+        f"x {spread(way[:, 0], 2)} m",
+        f"y {spread(way[:, 1], 2)} m",
+        f"yaw {spread(yaw[:, -1] - yaw[:, 0], 0)} deg",
+        *(f"{spread(np.array(values, float), 0)} {name}" for name, values in counts.items()),
+    ]
+    runs = f"{len(way)} times {task.trial_seconds:g} s from its initial pose"
+    text = f"In its own simulator, {runs}: {', '.join(figures)}."
     if with_residual:
         text += (
             f" The residual left the range seen in its training in {rollout.outside.mean():.0%} of the control steps."

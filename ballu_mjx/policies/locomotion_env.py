@@ -63,20 +63,28 @@ class LocomotionConfig:
     the residual knows what it does, which a policy paid for speed otherwise leaves. 0: nothing."""
 
 
-def check_locomotion_config(config: LocomotionConfig, robot: RobotDescription) -> None:
-    """Check the options for a robot.
+def check_locomotion_config(config: LocomotionConfig, control_timestep: float) -> None:
+    """Check the options for a robot with so many seconds between two commands.
 
     **Raises** `InputError` for options out of range, naming the option and the fix.
     """
     low, high = config.friction
     if not 0 < low <= high < math.inf:
         raise InputError(f"--friction is {low:g} {high:g}: give two numbers above 0, the smaller first.")
-    least = 2 * robot.control_timestep
+    least = 2 * control_timestep
     if not least <= config.episode_seconds < math.inf:
         raise InputError(
             f"--episode-seconds is {config.episode_seconds:g}: it must be {least:g} or more; {least:g} is the nearest."
         )
-    names = ("start_yaw", "start_tilt", "start_angle", "start_offset", "start_velocity", "residual_decay", "outside_cost")
+    names = (
+        "start_yaw",
+        "start_tilt",
+        "start_angle",
+        "start_offset",
+        "start_velocity",
+        "residual_decay",
+        "outside_cost",
+    )
     for name in names:
         if not 0 <= getattr(config, name) < math.inf:
             raise InputError(
@@ -157,7 +165,9 @@ def num_observations(robot: RobotDescription) -> int:
     return robot.features + 1
 
 
-def locomotion_observation(features: Float[Array, " features"], anchored: bool = False) -> Float[Array, " observations"]:
+def locomotion_observation(
+    features: Float[Array, " features"], anchored: bool = False
+) -> Float[Array, " observations"]:
     """Return what a locomotion policy sees of `observe_features`: the paper's state, of the current control step only.
 
     Of a free robot, horizontal positions are relative to the tracked body's and turned into its heading, like
@@ -359,7 +369,9 @@ def make_setting(
         joint_range=jnp.asarray(np.where(limited, improved.jnt_range[first:], [-np.inf, np.inf]), jnp.float32),
         friction=jnp.asarray(drawn if config.domain_randomization else np.stack([own, own], axis=1), jnp.float32),
         spread=StartSpread(
-            turn=jnp.asarray(on * np.array([config.start_tilt, config.start_tilt, config.start_yaw]) * degree, jnp.float32),
+            turn=jnp.asarray(
+                on * np.array([config.start_tilt, config.start_tilt, config.start_yaw]) * degree, jnp.float32
+            ),
             joint=jnp.asarray(on * joint, jnp.float32),
             velocity=jnp.asarray(on * config.start_velocity * np.where(along, 1.0, 5.0), jnp.float32),
         ),

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
-from ballu_mjx.residuals.aerodynamics import AERODYNAMICS_FILE, Aerodynamics, read_air_parameters
+from ballu_mjx.residuals.aerodynamics import AERODYNAMICS_FILE, Aerodynamics, AirParameters, read_air_parameters
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, check_envmimic_config
 from ballu_mjx.residuals.network import NetworkForces, num_inputs, num_loads
 from ballu_mjx.residuals.run_config import run_actuators, run_residual, run_robot
@@ -24,7 +24,7 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 from ballu_mjx.runs.checkpoints import restore_checkpoint
 from ballu_mjx.runs.folder import Run, read_config, typed_config
-from ballu_mjx.sim.force_model import BoundForces, Fields, ForceModel
+from ballu_mjx.sim.force_model import BoundForces, Fields, ForceModel, SumOfForces
 
 NETWORK_TASKS = ("envmimic", "supervised", "analytic")
 """Runs that leave a network of forces."""
@@ -113,6 +113,11 @@ class TrainedResidual:
         """Model fields to simulate with; see `force_model.ForceModel.fields`."""
         return self.model.fields(self.params)
 
+    @property
+    def latency(self) -> float:
+        """Seconds by which commands are delayed on their way to the actuators."""
+        return _latency(self.model, self.params)
+
     def command(self, commands: Float[Array, "steps commands"]) -> Float[Array, "parts commands"]:
         """What the actuators get; see `force_model.ForceModel.command`."""
         return self.model.command(self.params, commands)
@@ -135,6 +140,12 @@ class TrainedResidual:
         low, high = (jnp.asarray(bound) for bound in self.observed)
         beyond = jnp.maximum(low - seen, seen - high) / jnp.maximum(high - low, _NARROW)
         return jnp.maximum(jnp.max(beyond) - MARGIN, 0.0)
+
+
+def _latency(model: ForceModel, params: Any) -> float:
+    if isinstance(model, SumOfForces):
+        return sum(_latency(part, own) for part, own in zip(model.parts, params, strict=True))
+    return float(params.delay) if isinstance(params, AirParameters) else 0.0
 
 
 def write_observed(run: Run, inputs: Float[Array | np.ndarray, "states inputs"]) -> None:

@@ -63,6 +63,19 @@ class RobotAdapter:
         del robot
         return DeploymentNotes()
 
+    # ---- rollouts of policies ----
+
+    def rollout_counts(self, features: Float[np.ndarray, "runs states features"]) -> Mapping[str, list[int]]:
+        """Return what else is to be counted in rollouts of a policy, such as steps: numbers by name, one a run."""
+        del features
+        return {}
+
+    def draw_rollout(
+        self, folder: Path, qpos: Float[np.ndarray, "states nq"], command: Float[np.ndarray, "steps commands"]
+    ) -> None:
+        """Draw what only this robot has to show of a rollout into PNG files in `folder`."""
+        del folder, qpos, command
+
     # ---- identified actuators ----
 
     def nominal_actuators(self, model: mujoco.MjModel) -> ModelParameters | None:

@@ -185,7 +185,7 @@ def sources() -> dict[str, str]:
 def open_loop(policy: Policy, steps: int) -> Float[np.ndarray, "steps commands"]:
     """Return the policy's commands in its own simulator, from the initial pose."""
     loop = policy.closed_loop()
-    return np.asarray(loop(policy.params, *loop.initial(), steps).command[0], float)
+    return np.asarray(loop(policy.params, *loop.standing(), steps).command[0], float)
 
 
 _FILES = ("controller.py", "estimator.py")
