@@ -63,6 +63,10 @@ class LocomotionConfig:
     the residual knows what it does, which a policy paid for speed otherwise leaves. 0: nothing."""
 
 
+_STARTS = ("start_yaw", "start_tilt", "start_angle", "start_offset", "start_velocity")
+_NOT_NEGATIVE = (*_STARTS, "residual_decay", "outside_cost")
+
+
 def check_locomotion_config(config: LocomotionConfig, control_timestep: float) -> None:
     """Check the options for a robot with so many seconds between two commands.
 
@@ -76,16 +80,7 @@ def check_locomotion_config(config: LocomotionConfig, control_timestep: float) -
         raise InputError(
             f"--episode-seconds is {config.episode_seconds:g}: it must be {least:g} or more; {least:g} is the nearest."
         )
-    names = (
-        "start_yaw",
-        "start_tilt",
-        "start_angle",
-        "start_offset",
-        "start_velocity",
-        "residual_decay",
-        "outside_cost",
-    )
-    for name in names:
+    for name in _NOT_NEGATIVE:
         if not 0 <= getattr(config, name) < math.inf:
             raise InputError(
                 f"--{name.replace('_', '-')} is {getattr(config, name):g}: it must be 0 or more; 0 is the nearest."
@@ -361,6 +356,7 @@ def make_setting(
     joint[[model.joint(name).id - first for name in robot.held]] = 0.0
     limited = improved.jnt_limited[first:, None].astype(bool)
     along = np.concatenate([[True] * 3 + [False] * 3] * first + [~hinges])
+    turn = np.array([config.start_tilt, config.start_tilt, config.start_yaw])
     own = model.geom_friction[colliding_geoms(model), 0]
     drawn = np.tile(config.friction, (len(own), 1))
     return Setting(
@@ -369,9 +365,7 @@ def make_setting(
         joint_range=jnp.asarray(np.where(limited, improved.jnt_range[first:], [-np.inf, np.inf]), jnp.float32),
         friction=jnp.asarray(drawn if config.domain_randomization else np.stack([own, own], axis=1), jnp.float32),
         spread=StartSpread(
-            turn=jnp.asarray(
-                on * np.array([config.start_tilt, config.start_tilt, config.start_yaw]) * degree, jnp.float32
-            ),
+            turn=jnp.asarray(on * turn * degree, jnp.float32),
             joint=jnp.asarray(on * joint, jnp.float32),
             velocity=jnp.asarray(on * config.start_velocity * np.where(along, 1.0, 5.0), jnp.float32),
         ),

@@ -18,16 +18,21 @@ from ballu_mjx.cli import export as export_command
 from ballu_mjx.cli import train_policy
 from ballu_mjx.cli.export import Options
 from ballu_mjx.policies.deploy import controller, estimator, export
-from ballu_mjx.policies.deploy.controller import CONTROL_PERIOD, FULL_TRAVEL, TIMEOUT, Controller
+from ballu_mjx.policies.deploy.controller import TIMEOUT, Controller, observation_names
 from ballu_mjx.policies.deploy.estimator import Capture
-from ballu_mjx.policies.locomotion_env import OBSERVATIONS, LocomotionConfig, locomotion_observation
-from ballu_mjx.policies.policy import ACTIONS, Policy
+from ballu_mjx.policies.locomotion_env import LocomotionConfig, locomotion_observation, num_observations
+from ballu_mjx.policies.policy import Policy
 from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Normalizer, Params, PPOConfig
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.folder import Run
 
-LIMIT = CONTROL_PERIOD / FULL_TRAVEL
+BALLU = load_robot()
+NAMES = ("balloon", "base", "foot_left", "foot_right")
+FULL_TRAVEL = 0.2
+LIMIT = BALLU.control_timestep / FULL_TRAVEL
 CLEAN = """
 import sys
 
@@ -48,18 +53,22 @@ np.save(sys.argv[3], [controller.act(row) for row in features])
 """Runs an exported policy where there is nothing but NumPy."""
 
 
-def write_run(folder: Path, task: str = "walk", **settings: Any) -> Path:
-    """A run whose policy is drawn at random, with commands all over [0, 1]."""
+def write_run(
+    folder: Path, task: str = "walk", robot: RobotDescription = BALLU, residual: Path | None = None, **settings: Any
+) -> Path:
+    """A run whose policy is drawn at random, with commands all over their ranges."""
     config = PPOConfig(policy_layers=(16, 12), value_layers=(4,), **settings)
-    networks = ppo.make_networks(OBSERVATIONS, ACTIONS, config)
+    observations = num_observations(robot)
+    networks = ppo.make_networks(observations, len(robot.commands), config)
     tree: Any = jax.device_get(networks.policy_network.init(jax.random.key(1)))
     tree["params"]["Dense_0"]["kernel"] = 100.0 * tree["params"]["Dense_0"]["kernel"]
     rng = np.random.default_rng(2)
-    moments = ({"state": rng.uniform(0.1, 0.5, OBSERVATIONS).astype(np.float32)} for _ in range(3))
+    moments = ({"state": rng.uniform(0.1, 0.5, observations).astype(np.float32)} for _ in range(3))
     normalizer = Normalizer(np.float32(100.0), *moments)  # pyright: ignore[reportArgumentType]
     value = jax.device_get(networks.value_network.init(jax.random.key(3)))
     sections = {"env": LocomotionConfig(), "ppo": config, "data": train_policy.Data()}
-    content = describe_run(task, sections, {}, []) | {"residual": None}
+    content = describe_run(task, sections, {}, [], description=robot)
+    content["residual"] = None if residual is None else str(residual)
     with Run(folder, content) as run:
         run.save(7, ppo.as_tree(Params(normalizer, tree, value)), -1.0)
     return folder
@@ -89,7 +98,8 @@ def frame_at(time: float) -> dict[str, np.ndarray]:
         "balloon_position": np.array([0.1, 0.0, 1.1]) + 0.2 * sway,
         "balloon_quaternion": np.array([np.cos(sway[0]), 0.0, 0.0, np.sin(sway[0])]),
         "base_position": np.array([0.1, 0.0, 0.75]) + 0.1 * sway,
-        "foot_position": np.array([sway, -sway]),
+        "foot_left_position": sway,
+        "foot_right_position": -sway,
     }
 
 
@@ -155,18 +165,19 @@ def test_observation_is_named_and_that_of_training():
         np.testing.assert_allclose(
             controller.observation(row), locomotion_observation(jax.numpy.asarray(row)), atol=1e-5
         )
-    assert len(controller.OBSERVATION) == len(set(controller.OBSERVATION)) == OBSERVATIONS
+    names = observation_names(NAMES)
+    assert len(names) == len(set(names)) == num_observations(BALLU)
     row = np.zeros(27)
     row[[2, 13, 7]] = 1.1, 0.3, 0.2
-    seen = dict(zip(controller.OBSERVATION, controller.observation(row), strict=True))
-    names = ("balloon position z, m", "base velocity y, m/s", "balloon pitch, rad", "cosine of balloon yaw")
-    assert [seen[name] for name in names] == [1.1, 0.3, 0.2, 1.0]
+    seen = dict(zip(names, controller.observation(row), strict=True))
+    some = ("balloon position z, m", "base velocity y, m/s", "balloon pitch, rad", "cosine of balloon yaw")
+    assert [seen[name] for name in some] == [1.1, 0.3, 0.2, 1.0]
 
 
-def test_steps_are_those_of_the_policy_controller(exported: Path):
+def test_steps_are_those_of_the_policy_on_estimates(exported: Path):
     """Frame by frame at 100 Hz, some hidden: the policy on `estimator.estimate`'s features every 50 ms."""
     robot = Controller(exported, full_travel=1e-3)  # in effect without the limit
-    capture = Capture([], [], [], [], [], [], [])
+    capture = Capture(NAMES)
     start, rng = 1.7e9, np.random.default_rng(5)
     for number in range(300):
         frame = frame_at(number * 0.01)
@@ -174,8 +185,8 @@ def test_steps_are_those_of_the_policy_controller(exported: Path):
             if number > 3 and rng.uniform() < 0.2:
                 values[...] = np.nan
         capture.time.append(number * 0.01)
-        for name, values in frame.items():
-            getattr(capture, name).append(values)
+        capture.position.append(np.stack([frame[f"{name}_position"] for name in NAMES]))
+        capture.quaternion.append(frame["balloon_quaternion"])
         command = robot.step(start + number * 0.01, frame)
         if number % 5 == 0:
             assert robot.status == "running"
@@ -217,8 +228,8 @@ def without(name: str, value: Any) -> Callable[[float], Any]:
         without("base_position", [np.inf, 0, 0]),
         without("base_position", [1e9, 0, 0]),
         without("base_position", None),
-        without("foot_position", np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])),
-        without("foot_position", np.zeros(3)),
+        without("foot_right_position", np.array([np.nan, 0.0, 0.0])),
+        without("foot_left_position", np.zeros((2, 3))),
         without("balloon_quaternion", np.zeros(4)),
         without("balloon_quaternion", ["w", "x", "y", "z"]),
     ],
@@ -322,7 +333,9 @@ def test_command_refuses_what_it_cannot_use(run: Path, tmp_path: Path, capsys: p
 
 def test_commands_are_written_as_pulses(tmp_path: Path):
     commands = np.array([[0.0, 1.0], [0.5, 0.25]])
-    export._write_commands(tmp_path / "commands.csv", commands, Options(tmp_path, pulse_low=900, pulse_high=2100))
+    export._write_commands(
+        tmp_path / "commands.csv", commands, BALLU, Options(tmp_path, pulse_low=900, pulse_high=2100)
+    )
     assert (tmp_path / "commands.csv").read_text().splitlines() == [
         "time,command_left,command_right,pulse_left_us,pulse_right_us",
         "0.00,0.0000,1.0000,900.0,2100.0",

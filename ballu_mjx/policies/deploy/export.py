@@ -283,7 +283,7 @@ def _readme(
 ) -> str:
     robot = policy.robot
     notes, names = robot.adapter.deployment_notes(robot), (robot.tracked, *robot.points)
-    step, travel = robot.control_timestep, float(stored["full_travel"])
+    step, travel, simulator = robot.control_timestep, float(stored["full_travel"]), policy.variant.name
     low, high = options.pulse_low, options.pulse_high
 
     def indented(text: str, hang: int = 4) -> str:
@@ -312,8 +312,8 @@ def _readme(
     commanded = [f"In the actuators' own units: {ranges}.", notes.commands]
     commanded += [f"Pulses: {low:g} us at the smallest value, {high:g} us at the largest.", _limit(step, travel)]
     commanded.append(
-        f"If a marker has not been seen for {controller.TIMEOUT:g} s, or its pose has not changed for as long, commands "
-        "go to those at rest until all have been seen again."
+        f"If a marker has not been seen for {controller.TIMEOUT:g} s, or its pose has not changed for as long, "
+        "commands go to those at rest until all have been seen again."
     )
     estimation = (
         f"Each position is a straight line through the frames of the last {estimator.POSITION_WINDOW:g} s "
@@ -334,7 +334,7 @@ def _readme(
         "First runs with the robot held, at a fraction of the speed (Controller(folder, full_travel=1.0)).",
     ]
     return f"""\
-A policy for {robot.name}: task '{policy.task.name}', trained in the simulator '{policy.variant.name}', step {policy.step}.
+A policy for {robot.name}: task '{policy.task.name}', trained in the simulator '{simulator}', step {policy.step}.
 
 Files
     controller.py    the controller: Controller(folder).step(time, frame) -> {", ".join(robot.commands)}
@@ -392,8 +392,8 @@ def _limit(step: float, travel: float) -> str:
     if travel == 0:
         return f"{changing}, without a limit of their rate; Controller's full_travel sets one."
     return (
-        f"{changing}, by {step / travel:g} of their range at most: full travel in {travel:g} s; Controller's full_travel "
-        "sets it."
+        f"{changing}, by {step / travel:g} of their range at most: full travel in {travel:g} s; Controller's "
+        "full_travel sets it."
     )
 
 
