@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.csv_format import sidecar_path
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, assets
 from ballu_mjx.robots.registry import BUNDLED, describe_robot, find_robot, load_robot, portable_path
@@ -82,9 +83,11 @@ def describe_run(
 
 
 def describe_recording(path: Path) -> dict[str, str]:
-    """Where a recording lies (bundled ones independently of the installation), and the SHA-256 of its content."""
-    place = portable_path(path, assets() / "recordings")
-    return {"path": place, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    """Where a recording lies (bundled ones independently of the installation), and the SHA-256 of its content and of
+    the JSON beside it."""
+    place, sidecar = portable_path(path, assets() / "recordings"), sidecar_path(path)
+    described = sidecar.read_bytes() if sidecar.is_file() else b""
+    return {"path": place, "sha256": hashlib.sha256(path.read_bytes() + b"\0" + described).hexdigest()}
 
 
 def find_recordings(config: Mapping[str, Any], use: str, folder: Path) -> list[Path]:

@@ -24,6 +24,7 @@ from ballu_mjx.rl.learner import Learner, TrainingState
 from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.runs.checkpoints import Checkpoint, last_checkpoint, list_checkpoints
 from ballu_mjx.runs.folder import Run, read_config, typed_config
+from ballu_mjx.runs.metrics import read_metrics
 from ballu_mjx.runs.progress import Progress
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE
 
@@ -140,6 +141,14 @@ def _made_with(config: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _seconds_until(folder: Path, step: int) -> float:
+    """Return the wall time that a run trained for up to a control step, its validations included."""
+    found = 0.0
+    for row in read_metrics(folder, step):
+        found = row.get("seconds") or found + (row.get("validation_seconds") or 0.0)
+    return found
+
+
 class Watchdog:
     """Tells the user when no training step has finished for long: a context manager around the training.
 
@@ -219,6 +228,7 @@ class TrainingLoop:
         self._validated: float | None = None
         self._warned = False
         self._started = time.perf_counter()
+        self._seconds_before = 0.0
         self._watchdog = Watchdog(Path("RUN") if run is None else run.folder)
 
     def train(self, env: Env, config: PPOConfig, start: ResumePoint, content: Mapping[str, Any]) -> None:
@@ -231,6 +241,8 @@ class TrainingLoop:
         if start.checkpoint is not None:
             self._saved = start.checkpoint.step
             self._due = start.checkpoint.notes.get("due", self._saved)
+            if self._run is not None:
+                self._seconds_before = _seconds_until(self._run.folder, self._saved)
         try:
             with self._interrupts_noted(), self._watchdog:
                 state, _ = learner.train(
@@ -276,7 +288,8 @@ class TrainingLoop:
                 file=sys.stderr,
             )
         if metrics:
-            self._log(step, metrics | {"seconds": time.perf_counter() - self._started})
+            seconds = self._seconds_before + time.perf_counter() - self._started
+            self._log(step, metrics | {"seconds": seconds})
         if self._due is None or step - self._due >= self._every:
             self._keep(step, state)
         if metrics and self._progress is not None:

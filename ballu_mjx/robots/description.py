@@ -93,7 +93,7 @@ class RobotDescription:
     anchored: bool
     """Whether the model has no free joint."""
     sha256: str
-    """Of description and MJCF file."""
+    """Of description, MJCF file, and all files that it names: included ones, meshes, height fields, textures."""
     command_ranges: tuple[tuple[float, float], ...]
     """Smallest and largest value of each command, in its actuator's units."""
     control_timestep: float = DEFAULT_CONTROL_TIMESTEP
@@ -175,7 +175,6 @@ def read_description(path: Path | str) -> RobotDescription:
     if keyframe is not None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, _text(path, content, "keyframe")) < 0:
         own = ", ".join(model.key(index).name for index in range(model.nkey)) or "none"
         _refuse(path, f'"keyframe" is {_shown(keyframe)}, no keyframe of the model', f"there are {own}")
-    digest = hashlib.sha256(path.read_bytes() + b"\0" + place.read_bytes()).hexdigest()
     found = RobotDescription(
         file=path,
         name=name,
@@ -186,7 +185,7 @@ def read_description(path: Path | str) -> RobotDescription:
         joints=joints,
         held=held,
         anchored=bool(model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE),
-        sha256=digest,
+        sha256=_checksum(path, place),
         command_ranges=ranges,
         control_timestep=float(step),
         oriented_points=oriented,
@@ -226,6 +225,32 @@ def _load(path: Path, place: Path) -> mujoco.MjModel:
         return mujoco.MjModel.from_xml_path(str(place))
     except (ValueError, mujoco.FatalError) as error:
         _refuse(path, f'"model" is {_shown(place.name)}, which MuJoCo cannot read ({_said(error)})', mend)
+
+
+def _checksum(path: Path, place: Path) -> str:
+    """Return the SHA-256 of a description and of all files of its model."""
+    parts = [path, place, *_named_files(place)]
+    return hashlib.sha256(b"\0".join(part.read_bytes() for part in parts)).hexdigest()
+
+
+def _named_files(place: Path) -> list[Path]:
+    """Return the files that an MJCF file names, at any depth, but for itself.
+
+    MuJoCo looks for an asset in its compiler's folders and beside the file that names it, whichever it finds first. All
+    that it could find belong to the model.
+    """
+    found = [Path(name) for name in mujoco.mju_getXMLDependencies(str(place))]
+    spec = mujoco.MjSpec.from_file(str(place))
+    assets = [
+        name
+        for asset in (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins)
+        for name in (asset.file, *getattr(asset, "cubefiles", ()))
+        if name
+    ]
+    texts = [file.parent for file in found if file.suffix == ".xml"]
+    folders = {folder / sub for folder in (place.parent, *texts) for sub in ("", spec.meshdir, spec.texturedir)}
+    found += [folder / name for folder in folders for name in assets]
+    return sorted({file.resolve() for file in found if file.is_file()} - {place.resolve()})
 
 
 def _check_joints(path: Path, model: mujoco.MjModel, control_timestep: float) -> None:

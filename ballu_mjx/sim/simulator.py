@@ -18,6 +18,7 @@ from mujoco import mjx
 
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, with_fields
+from ballu_mjx.sim.derived_constants import ReferencePose, with_derived_constants
 from ballu_mjx.sim.force_model import BoundForces, add_wrenches
 from ballu_mjx.sim.observation import observe_features
 from ballu_mjx.sim.step import PhysicsState, control_step, count_substeps, load_state, make_data, put_model, state_at
@@ -55,6 +56,7 @@ class Simulator:
         """Physics steps in a control step."""
         self.model = put_model(self.mj_model)
         self._template = make_data(self.mj_model)
+        self._reference_pose = ReferencePose.of(self.mj_model)
         sites = [self.mj_model.site(name).id for name in (robot.tracked, *robot.points)]
         bodies = self.mj_model.site_bodyid[sites]
         self._root = int(self.mj_model.body_rootid[bodies[0]])
@@ -62,11 +64,13 @@ class Simulator:
         self._masses = jnp.asarray(self.mj_model.body_mass / self.mj_model.body_mass.sum())
 
     def with_fields(self, fields: Mapping[str, Array]) -> Simulator:
-        """Return the same simulator with other model fields, which may be traced.
+        """Return the same simulator with other model fields, which may be traced, and the constants that follow.
 
         The centre of mass stays that of the model's own masses: air that the robot drags along is no part of it.
         """
-        return self.with_model(with_fields(self.model, dict(fields)))
+        return self.with_model(
+            with_fields(self.model, with_derived_constants(self._reference_pose, self.model, fields))
+        )
 
     def with_model(self, model: mjx.Model) -> Simulator:
         """Return the same simulator of another MJX model of this structure, which may be traced."""

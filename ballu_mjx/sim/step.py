@@ -103,18 +103,21 @@ def _derivative(along: DirectionalDerivative, found: _Solution) -> _Solution:
     return jax.tree.map(lambda x, y: jnp.where(arrived, x, y), at_place, on_the_way)
 
 
-_ARRIVED = 0.05
-"""m/s^2 and rad/s^2: half a millimetre or milliradian a second over a physics step. Rounding leaves up to 0.02 at rest;
-one in twenty steps of a walking robot is farther off, by up to 40."""
+_ARRIVED = 0.025
+"""Length of a Newton step (m/s^2 and rad/s^2) that counts as none: a quarter of a mm/s or mrad/s over a physics step.
+
+Rounding leaves up to 0.01 at rest; one in twenty steps of a walking robot is farther off, by up to 20."""
 
 
 def _newton_step(found: _Solution, model: mjx.Model, data: mjx.Data) -> tuple[_Solution, Float[Array, " nv"]]:
-    """From where the solver ended; and the step. The cost's Hessian is held: what multiplies its derivative is zero."""
+    """Return where a Newton step leads from where the solver ended; and the step. The cost's Hessian is held: what
+    multiplies its derivative is zero."""
     data = data.replace(qacc=found.qacc)  # pyright: ignore
     here = Context.create(model, data, grad=False)
     slope = here.Ma - data.qfrc_smooth - here.qfrc_constraint
     held_model, held = jax.lax.stop_gradient((model, data))
-    step = Context.create(held_model, held.replace(qfrc_smooth=held.qfrc_smooth - slope)).search
+    moved = slope - jax.lax.stop_gradient(slope)  # zero, but for its derivative
+    step = Context.create(held_model, held.replace(qfrc_smooth=held.qfrc_smooth - moved)).search
     qacc = found.qacc + step
     # Where the cost is least, forces are in balance.
     return _Solution(qacc, mjx.mul_m(model, data, qacc) - data.qfrc_smooth), step

@@ -104,7 +104,7 @@ def test_each_round_learns_from_all_recordings_so_far_and_keeps_what_came_before
             forces[folder.name] = options[0].forces
         return folder
 
-    monkeypatch.setattr(pipeline, "_stage", stage)
+    monkeypatch.setattr(pipeline, "cached_stage", stage)
     also = "envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised"
     options = Options(output=tmp_path, rounds=3, also=also, outside_cost=2.0)
     told = pipeline.Story(options, seed=0)

@@ -23,7 +23,7 @@ SETTLED_BY_PREPARE = (
 )
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 THREADS = 2 * CORES + 5
-PREPARE = "from ballu_mjx import runtime; runtime.prepare(); import jax\n"
+PREPARE = "from ballu_mjx.common import runtime; runtime.prepare(); import jax\n"
 COMPILE = "import jax.numpy as jnp; jax.jit(lambda x: jnp.linalg.cholesky(x @ x.T + jnp.eye(3)))(jnp.ones((3, 3)))"
 
 
@@ -81,7 +81,7 @@ def test_threads_share_heaps(environment: dict[str, str], most: int, tmp_path: P
 
 
 def test_nothing_appears_on_the_screen_with_a_cold_or_a_warm_cache(tmp_path: Path) -> None:
-    code = PREPARE + "from ballu_mjx import simulation\n" + COMPILE
+    code = PREPARE + "from ballu_mjx.sim import step\n" + COMPILE
     for _ in range(2):
         done = python(code, tmp_path, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="0")
         assert (done.stdout, done.stderr) == ("", "")
@@ -117,7 +117,9 @@ def test_a_cache_that_cannot_be_written_stops_nobody(tmp_path: Path) -> None:
 
 
 def test_importing_the_module_settles_nothing(tmp_path: Path) -> None:
-    code = "import os, sys; from ballu_mjx import runtime; print('jax' in sys.modules, os.environ.get('XLA_FLAGS'))"
+    code = (
+        "import os, sys; from ballu_mjx.common import runtime; print('jax' in sys.modules, os.environ.get('XLA_FLAGS'))"
+    )
     assert python(code, tmp_path).stdout == "False None\n"
 
 

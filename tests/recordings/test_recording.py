@@ -17,8 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu import model
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings import csv_format
 from ballu_mjx.recordings.csv_format import list_bundled, list_recordings, read_recording, write_recording
 from ballu_mjx.recordings.recording import COLUMNS, Recording
 
@@ -500,7 +500,7 @@ def test_paths_without_a_recording_are_refused(tmp_path: Path) -> None:
 
 
 def test_bundled_looks_in_the_packages_assets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(model, "assets", lambda: tmp_path)
+    monkeypatch.setattr(csv_format, "assets", lambda: tmp_path)
     (tmp_path / "recordings" / "test").mkdir(parents=True)
     write_recording(steady(), tmp_path / "recordings" / "test" / "far.csv.gz")
     assert [read_recording(p).name for p in list_bundled("test")] == ["far"]

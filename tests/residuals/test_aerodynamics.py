@@ -57,6 +57,7 @@ def windy_model() -> mujoco.MjModel:
     model.body_inertia[body] += 3e-3
     model.body_ipos[body] += [0.004, 0.013, 0.0]
     model.body_gravcomp[body] = lift / (model.body_mass[body] * 9.81)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
 

@@ -21,11 +21,12 @@ from ballu_mjx.runs.metrics import read_metrics
 
 TRAINING = """
 import json, sys
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 runtime.prepare()
 from pathlib import Path
-from ballu_mjx import distributed, ppo, runs
-from ballu_mjx.session import Session, Start, Validation
+from ballu_mjx.rl import distributed, ppo
+from ballu_mjx.rl.training_loop import ResumePoint, TrainingLoop, Validation
+from ballu_mjx.runs.folder import Run
 from follower import Follower, weight
 
 options, folder = json.loads(sys.argv[1]), Path(sys.argv[2])
@@ -35,30 +36,32 @@ config = ppo.PPOConfig(num_envs=32, batch_size=16, num_minibatches=2, unroll_len
 sections = {"env": Follower.limit, "ppo": config}
 content = {"task": "follow", "starts": [], "recordings": {}, "ppo": {"learning_rate": 1e-4, "seed": 0}}
 if distributed.is_first():
-    with runs.Run(folder, content) as run:
-        Session(run, None, 320, Validation(weight)).train(Follower(), config, Start(), content)
+    with Run(folder, content) as run:
+        TrainingLoop(run, None, 320, Validation(weight)).train(Follower(), config, ResumePoint(), content)
 else:
-    sys.exit(Session(None, None, 320, Validation(weight)).follow(Follower(), config, Start(), content))
+    sys.exit(TrainingLoop(None, None, 320, Validation(weight)).follow(Follower(), config, ResumePoint(), content))
 """
 
 
 PHYSICS = """
 import json, sys
-from ballu_mjx import runtime
+from ballu_mjx.common import runtime
 runtime.prepare()
-from ballu_mjx import distributed, robot, simulation
+from ballu_mjx.ballu.model import load_model
+from ballu_mjx.rl import distributed
+from ballu_mjx.sim.step import make_data, put_model
 import jax
 
 distributed.join(distributed.DistributedOptions(**json.loads(sys.argv[1])))
-model = robot.load_model()
-for leaf in jax.tree.leaves((simulation.put_model(model), simulation.make_data(model))):
+model = load_model()
+for leaf in jax.tree.leaves((put_model(model), make_data(model))):
     assert not isinstance(leaf, jax.Array) or leaf.is_fully_addressable, leaf.sharding
 distributed.meet()
 """
 
 FAILURE = """
 import json, sys
-from ballu_mjx import distributed
+from ballu_mjx.rl import distributed
 
 options = json.loads(sys.argv[1])
 distributed.join(distributed.DistributedOptions(**options))

@@ -206,6 +206,20 @@ def test_a_run_of_an_older_version_goes_on_from_its_parameters(tmp_path, small, 
     assert list_checkpoints(folder) == [160, 240] and last_checkpoint(folder).step == 240
 
 
+def test_the_seconds_of_a_run_that_goes_on_go_on_too(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with Run(folder, content()) as run:
+        TrainingLoop(run, None, 10_000, Validation(weight)).train(Follower(), CONFIG, ResumePoint(), content())
+    first = [row["seconds"] for row in read_metrics(folder) if "seconds" in row]
+    longer = dataclasses.replace(CONFIG, num_timesteps=2000)
+    start = resumed(folder, longer)
+    with Run(folder, content(longer), resumed_at=start.resumed_at) as run:
+        TrainingLoop(run, None, 10_000, Validation(weight)).train(Follower(), longer, start, content(longer))
+    seconds = [row["seconds"] for row in read_metrics(folder) if "seconds" in row]
+    assert len(seconds) > len(first) and seconds[: len(first)] == first
+    assert seconds == sorted(seconds)
+
+
 def test_a_run_without_a_checkpoint_begins_again_in_its_folder(tmp_path, capsys):
     folder = tmp_path / "run"
     with open_run(folder) as run:

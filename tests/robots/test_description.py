@@ -23,6 +23,7 @@ from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import COLUMNS, Recording
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, tracking_state
 from ballu_mjx.residuals.network import world_loads
+from ballu_mjx.residuals.run_config import describe_recording, find_recordings, run_robot
 from ballu_mjx.robots.description import read_description
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, heading_observation
@@ -152,6 +153,73 @@ def test_a_damaged_description_is_refused_by_file_key_and_mend(
     with pytest.raises(InputError) as refused:
         read_description(copy)
     assert said in str(refused.value) and copy.name in str(refused.value) and "\n" not in str(refused.value)
+
+
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+HULL = """<mujoco>
+  <asset><mesh name="hull" file="hull.obj"/></asset>
+  <worldbody><body name="hull" pos="0 0 1">
+    <freejoint/> <inertial pos="0 0 0" mass="0.15" diaginertia="2e-3 2e-3 2e-3"/>
+    <geom type="mesh" mesh="hull"/> <site name="imu"/> <site name="thruster"/>
+  </body></worldbody>
+  <include file="thruster.xml"/>
+</mujoco>"""
+THRUSTER = '<mujoco><actuator><general site="thruster" name="thruster" ctrlrange="0 1"/></actuator></mujoco>'
+
+
+@pytest.fixture
+def split_model(tmp_path: Path) -> Path:
+    """A description whose model includes a file that includes another, and has meshes in two places."""
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "robot.xml").write_text(
+        '<mujoco><option timestep="0.01"/><compiler meshdir="meshes"/><include file="parts/hull.xml"/>'
+        '<asset><mesh name="fin" file="fin.obj"/></asset></mujoco>'
+    )
+    (tmp_path / "parts" / "hull.xml").write_text(HULL)
+    (tmp_path / "parts" / "thruster.xml").write_text(THRUSTER)
+    (tmp_path / "parts" / "hull.obj").write_text(TETRAHEDRON)  # MuJoCo finds it beside what names it
+    (tmp_path / "meshes" / "fin.obj").write_text(TETRAHEDRON)
+    content = {"format": "ballu-robot/1", "name": "blimp", "model": "robot.xml", "tracked": "imu"}
+    content |= {"points": [], "commands": {"up": "thruster"}}
+    (tmp_path / "blimp.robot.json").write_text(json.dumps(content))
+    return tmp_path / "blimp.robot.json"
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("robot.xml", 'timestep="0.01"', 'timestep="0.005"'),
+        ("parts/hull.xml", "0.15", "0.30"),
+        ("parts/thruster.xml", "0 1", "0 2"),
+        ("parts/hull.obj", "v 1 0 0", "v 2 0 0"),
+        ("meshes/fin.obj", "v 1 0 0", "v 2 0 0"),
+    ],
+)
+def test_a_change_of_any_file_of_the_model_is_noticed(split_model: Path, name: str, old: str, new: str) -> None:
+    stored = {"robot_description": {"path": str(split_model), "sha256": read_description(split_model).sha256}}
+    run_robot(stored, split_model.parent)
+    changed = split_model.parent / name
+    text = changed.read_text()
+    assert old in text
+    changed.write_text(text.replace(old, new))
+    with pytest.raises(InputError, match="the robot description, or its model, has changed since the run began"):
+        run_robot(stored, split_model.parent)
+    changed.write_text(text)
+    run_robot(stored, split_model.parent)
+
+
+def test_a_change_of_a_recording_or_of_its_description_is_noticed(
+    flight: tuple[Recording, np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    path = tmp_path / "flight.csv"
+    write_recording(flight[0], path, DESCRIPTION)
+    before = describe_recording(path)
+    content = json.loads((tmp_path / "flight.json").read_text())
+    (tmp_path / "flight.json").write_text(json.dumps(content | {"robot": "another"}))
+    assert describe_recording(path)["sha256"] != before["sha256"]
+    with pytest.raises(InputError, match="the recording has changed"):
+        find_recordings({"recordings": {"test": [before]}}, "test", tmp_path)
 
 
 def test_commands_for_ballu_alone_refuse_another_robot(capsys: pytest.CaptureFixture[str]):
