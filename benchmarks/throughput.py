@@ -27,8 +27,8 @@ from jaxtyping import Float
 from mujoco import rollout
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.rl import learner, ppo
 from ballu_mjx.sim.step import count_substeps
@@ -91,7 +91,7 @@ def main() -> None:
     repeats = 3 if arguments.quick else 10
 
     model = load_model()
-    motions = [reconstruct_ballu(read_recording(p), model) for p in list_bundled("training")]
+    motions = [reconstruct(read_recording(p, load_robot()), load_robot(), model) for p in list_bundled("training")]
     env = EnvMimicEnv(Simulator(load_robot(), model=model), motions, EnvMimicConfig())
     config = ppo.PPOConfig(num_envs=arguments.num_envs)
     step_size = config.batch_size * config.num_minibatches * config.unroll_length

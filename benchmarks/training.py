@@ -288,9 +288,9 @@ def plot(path: Path, rows: list[dict[str, Any]], target: float, machine: str) ->
 
 def main(options: Options) -> None:
     runtime.prepare()
-    from ballu_mjx.cli import train_policy
+    from ballu_mjx.policies.training import locomotion_ppo
 
-    config = dataclasses.asdict(train_policy.defaults())
+    config = dataclasses.asdict(locomotion_ppo())
     if options.quick:
         options = dataclasses.replace(options, seeds=(0,), steps=21_000)
     counts = [len(common.cores()) * each for each in ((2,) if options.quick else (1, 2, 4))]

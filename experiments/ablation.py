@@ -28,11 +28,11 @@ import jax
 import numpy as np
 
 from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.residuals.network import NetworkForces
 from ballu_mjx.rl import learner, ppo
@@ -168,7 +168,7 @@ def main() -> None:
     simulator = Simulator(load_robot(), identified)
     read = {"training": training, "validation": validation}
     motions = {
-        use: [reconstruct_ballu(read_recording(path), simulator.mj_model) for path in paths]
+        use: [reconstruct(read_recording(path, load_robot()), load_robot(), simulator.mj_model) for path in paths]
         for use, paths in read.items()
     }
     options.output.mkdir(parents=True, exist_ok=True)

@@ -41,8 +41,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.segments import Segments, pseudo_huber
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirWindows
 from ballu_mjx.residuals.trained import TrainedResidual
@@ -108,7 +108,7 @@ def slopes(simulated: AirWindows, known: Float[np.ndarray, " parameters"], lift:
 # %%
 def main() -> None:
     parser = argparse.ArgumentParser(description="Derivatives and differences of windows of motion, by the lift.")
-    parser.add_argument("--air", type=Path, required=True, help="run of `train residual`, before the loss")
+    parser.add_argument("--air", type=Path, required=True, help="run of `train aerodynamic`, before the loss")
     parser.add_argument("--output", type=Path, default=Path("runs/air-slopes"), help="folder of the table and figure")
     parser.add_argument("--quick", action="store_true", help="windows of half a second alone")
     options = parser.parse_args()
@@ -121,7 +121,7 @@ def main() -> None:
     lost = deflation.lift(LOSS * full.buoyancy)
     gait = next(job for job in bundled_recordings.jobs() if job.split == "training")
     recorded = deflation.recorded(gait, deflated, 2000, options.output / "recordings")
-    motions = [reconstruct_ballu(recorded, model)]
+    motions = [reconstruct(recorded, load_robot(), model)]
     # At a whole delay, where errors can be differentiated.
     timestep = float(model.opt.timestep)
     delay = np.round(float(known.params.delay) / timestep) * timestep

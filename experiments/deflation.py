@@ -42,7 +42,6 @@ import numpy as np
 from bundled_recordings import Job
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.cli import train_aerodynamics
@@ -50,6 +49,7 @@ from ballu_mjx.evaluation.errors_table import Evaluation, base_name
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.residuals.trained import TrainedResidual
@@ -72,8 +72,8 @@ def recorded(job: Job, virtual: VirtualRobot, trial: int, folder: Path) -> Recor
     )
     path = folder / job.split / f"{job.name}.csv.gz"
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_recording(taken, path)
-    return read_recording(path)  # which fills the gaps of hidden markers
+    write_recording(taken, path, load_robot())
+    return read_recording(path, load_robot())  # which fills the gaps of hidden markers
 
 
 def lift(buoyancy: float) -> float:
@@ -101,7 +101,7 @@ def row(label: str, result: Evaluation) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Lost lift, found again from one recording.")
-    parser.add_argument("--air", type=Path, help="run of `train residual`; without it, one is made")
+    parser.add_argument("--air", type=Path, help="run of `train aerodynamic`; without it, one is made")
     parser.add_argument("--loss", type=float, default=0.05, help="share of the lift that is lost")
     parser.add_argument("--anew", action="store_true", help="also identify all of the air anew: ten minutes more")
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the larger test set")
@@ -112,7 +112,7 @@ def main() -> None:
     air = options.air
     if air is None:
         air = options.output / "aerodynamic"
-        fidelity.train(air, "residual", "--method", "aerodynamic", *(["--quick"] if options.quick else []))
+        fidelity.train(air, "aerodynamic", *(["--quick"] if options.quick else []))
     known = TrainedResidual.load(air, load_robot())
     simulator = Simulator(load_robot(), known.actuators)
     model = simulator.mj_model
@@ -124,7 +124,7 @@ def main() -> None:
     def motions(virtual: VirtualRobot, jobs: Sequence[Job], first: int, name: str) -> list[Motion]:
         folder = options.output / name
         recordings = [recorded(job, virtual, first + number, folder) for number, job in enumerate(jobs)]
-        return [reconstruct_ballu(each, model) for each in recordings]
+        return [reconstruct(each, load_robot(), model) for each in recordings]
 
     tests = tests[:1] if options.quick else tests
     before, after = motions(full, tests, 1000, "before"), motions(deflated, tests, 1000, "after")

@@ -46,7 +46,6 @@ from bundled_recordings import Job
 from jaxtyping import Float
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.evaluation.errors_table import (
     HORIZONS,
     SCORE_HORIZONS,
@@ -58,6 +57,7 @@ from ballu_mjx.evaluation.errors_table import (
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.robots.model import assets
@@ -91,17 +91,17 @@ METHODS = {
     "identified": Method("EnvMimic", ("envmimic",)),
     "wrench": Method("EnvMimic, wrench", ("envmimic", "--forces", "wrench")),
     "multi": Method("EnvMimic, forces at balloon, base and feet", ("envmimic", "--forces", "multi")),
-    "regression": Method("supervised, all of its forces", ("residual", "--method", "supervised", "--shares", "1")),
-    "supervised": Method("supervised", ("residual", "--method", "supervised")),
-    "analytic": Method("analytic", ("residual", "--method", "analytic")),
-    "analytic-wrench": Method("analytic, wrench", ("residual", "--method", "analytic", "--forces", "wrench")),
-    AIR: Method("aerodynamic", ("residual", "--method", "aerodynamic"), seeded=False),
+    "regression": Method("supervised, all of its forces", ("supervised", "--shares", "1")),
+    "supervised": Method("supervised", ("supervised",)),
+    "analytic": Method("analytic", ("analytic",)),
+    "analytic-wrench": Method("analytic, wrench", ("analytic", "--forces", "wrench")),
+    AIR: Method("aerodynamic", ("aerodynamic",), seeded=False),
     "air-lift": Method(
         "aerodynamic, the model's lift",
-        ("residual", "--method", "aerodynamic", "--free", *(name for name in AIR_PARAMETERS if name != "lift")),
+        ("aerodynamic", "--free", *(name for name in AIR_PARAMETERS if name != "lift")),
         seeded=False,
     ),
-    "air-analytic": Method("aerodynamic+analytic", ("residual", "--method", "analytic"), beside_air=True),
+    "air-analytic": Method("aerodynamic+analytic", ("analytic",), beside_air=True),
     "air-envmimic": Method("aerodynamic+EnvMimic", ("envmimic",), beside_air=True),
 }
 
@@ -203,7 +203,7 @@ def replayed_policy(options: Options) -> Path:
 def simulator(kind: TrainedResidual, paths: list[Path], *, nominal: bool = False) -> OpenLoopEvaluator:
     """Recordings, for the residuals of a kind on its own actuators, or on nominal ones."""
     plain = Simulator(load_robot(), None if nominal else kind.actuators)
-    motions = [reconstruct_ballu(read_recording(path), plain.mj_model) for path in paths]
+    motions = [reconstruct(read_recording(path, load_robot()), load_robot(), plain.mj_model) for path in paths]
     return OpenLoopEvaluator(plain, motions, kind.model)
 
 

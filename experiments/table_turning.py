@@ -42,6 +42,7 @@ import transfer_figure
 
 from ballu_mjx.cli import pipeline
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.evaluation import story_layout
 
 # %% [markdown]
 # ## The table
@@ -54,7 +55,7 @@ from ballu_mjx.common.errors import InputError
 def table(options: pipeline.Options) -> Path:
     """Run what is missing, print the table; the file that holds it."""
     pipeline.run(options)
-    return pipeline.table_file(options.output, "turn")
+    return story_layout.table_file(options.output, "turn")
 
 
 # %% [markdown]

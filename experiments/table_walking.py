@@ -40,6 +40,7 @@ import transfer_figure
 
 from ballu_mjx.cli import pipeline
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.evaluation import story_layout
 
 # %% [markdown]
 # ## The table
@@ -52,7 +53,7 @@ from ballu_mjx.common.errors import InputError
 def table(options: pipeline.Options) -> Path:
     """Run what is missing, print the table; the file that holds it."""
     pipeline.run(options)
-    return pipeline.table_file(options.output, "walk")
+    return story_layout.table_file(options.output, "walk")
 
 
 # %% [markdown]

@@ -90,7 +90,7 @@ def load(source: Path, robot: str = "ballu") -> list[StoredRollout]:
     if recording.kind != "free":
         raise InputError(f"{source}: is a {recording.kind} recording; only free ones have a way to show.")
     print("Reconstructing the recorded states ...", flush=True)
-    motion = reconstruct(recording, description.load_model(), description)
+    motion = reconstruct(recording, description)
     return [
         StoredRollout(
             name=motion.name,

@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
-from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation
+from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, base_name
 from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, pad_to_bucket, stack_motions
 from ballu_mjx.sim.force_model import BoundForces, ForceModel
 from ballu_mjx.sim.observation import HISTORY
-from ballu_mjx.sim.simulator import RolloutState, Simulator
+from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState
 
 START_INTERVAL = 1.0
@@ -48,6 +48,38 @@ class Replay(NamedTuple):
     """Residual force (N, world)."""
     qpos: Float[np.ndarray, "recordings states nq"]
     """Generalized positions from each recording's first start."""
+
+
+def evaluate(simulator: AugmentedSimulator, motions: Sequence[Motion]) -> Evaluation:
+    """Return how well a simulator with a residual predicts recorded motions, beside the one without it.
+
+    **Raises** `ValueError` where the simulator has no residual.
+    """
+    if simulator.residual is None:
+        raise ValueError("The simulator has no residual; give one that `with_residual` made.")
+    evaluator = Evaluators(simulator.without_residual()).of(simulator.residual.model, motions)
+    return evaluator(simulator.residual.params)
+
+
+class Evaluators:
+    """Evaluators of one simulator: those of the same residual share a compiled program."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        """`simulator` is the one without residual."""
+        self._simulator = simulator
+        self._made: list[tuple[ForceModel, Sequence[Motion], OpenLoopEvaluator]] = []
+
+    def of(self, residual: ForceModel, motions: Sequence[Motion]) -> OpenLoopEvaluator:
+        """Return the evaluator of `residual` on `motions`; the same one for the same arguments."""
+        made = None
+        for known, on, evaluator in self._made:
+            if known is residual and on is motions:
+                return evaluator
+            made = evaluator if known is residual else made
+        base = base_name(self._simulator.actuators is not None)
+        made = OpenLoopEvaluator(self._simulator, motions, residual, base) if made is None else made.on(motions)
+        self._made.append((residual, motions, made))
+        return made
 
 
 class OpenLoopEvaluator:

@@ -148,7 +148,7 @@ def turn(matrix: Float[Array, "3 3"]) -> Float[Array, " 3"]:
 
 
 def read_air_parameters(path: Path, robot: RobotDescription) -> AirParameters:
-    """The parameters in a file of the format `ballu-air/1`, which `train residual --method aerodynamic` writes.
+    """The parameters in a file of the format `ballu-air/1`, which `train aerodynamic` writes.
 
     **Raises** `InputError` naming file, key and mend.
     """

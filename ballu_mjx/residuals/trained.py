@@ -23,8 +23,10 @@ from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 from ballu_mjx.runs.checkpoints import restore_checkpoint
-from ballu_mjx.runs.folder import Run, read_config, typed_config
+from ballu_mjx.runs.folder import read_config, typed_config
+from ballu_mjx.runs.record import TrainingRecord
 from ballu_mjx.sim.force_model import BoundForces, Fields, ForceModel, SumOfForces
+from ballu_mjx.sim.simulator import AugmentedSimulator
 
 NETWORK_TASKS = ("envmimic", "supervised", "analytic")
 """Runs that leave a network of forces."""
@@ -35,6 +37,7 @@ MARGIN = 0.1
 finite sample."""
 _OBSERVED = "observed.json"
 _NARROW = 1e-3
+_ANYTHING = 1e30
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,13 +51,26 @@ class TrainedResidual:
     - `observed`: smallest and largest of each of the model's inputs over the recordings it was learned from.
     - `step`: control steps of training behind it.
     - `actuators`: of the simulator that it belongs to; None for the nominal ones.
+    - `report`: what the training says of it, for the user; empty where that is nothing.
     """
 
     model: ForceModel
     params: Any
-    observed: tuple[Float[np.ndarray, " inputs"], Float[np.ndarray, " inputs"]]
+    observed: tuple[Float[np.ndarray, ...], Float[np.ndarray, ...]]
     step: int
     actuators: ModelParameters | None
+    report: str = ""
+
+    @staticmethod
+    def of(simulator: AugmentedSimulator) -> TrainedResidual | None:
+        """Return the residual in a simulator; None where it has none."""
+        bound = simulator.residual
+        if bound is None:
+            return None
+        observed = bound.observed
+        if observed is None:
+            observed = np.array(-_ANYTHING, np.float32), np.array(_ANYTHING, np.float32)
+        return TrainedResidual(bound.model, bound.params, observed, 0, simulator.actuators)
 
     @staticmethod
     def load(
@@ -100,13 +116,14 @@ class TrainedResidual:
                 if where.resolve() in loading:
                     raise InputError(f"{folder}: is its own base residual; restore its config.json.")
                 base = TrainedResidual.load(where, robot, loading=loading)
-                model, params = base.bound.plus(BoundForces(model, params))
+                both = base.bound.plus(BoundForces(model, params))
+                model, params = both.model, both.params
         return TrainedResidual(model, params, _read_observed(folder / _OBSERVED, inputs), step, identified)
 
     @property
     def bound(self) -> BoundForces:
         """Model and parameters."""
-        return BoundForces(self.model, self.params)
+        return BoundForces(self.model, self.params, self.observed)
 
     @property
     def fields(self) -> Fields:
@@ -148,9 +165,16 @@ def _latency(model: ForceModel, params: Any) -> float:
     return float(params.delay) if isinstance(params, AirParameters) else 0.0
 
 
-def write_observed(run: Run, inputs: Float[Array | np.ndarray, "states inputs"]) -> None:
+def observed_range(
+    inputs: Float[Array | np.ndarray, "states inputs"],
+) -> tuple[Float[np.ndarray, " inputs"], Float[np.ndarray, " inputs"]]:
+    """Return the smallest and the largest of each input."""
+    return np.min(inputs, axis=0).astype(np.float32), np.max(inputs, axis=0).astype(np.float32)
+
+
+def write_observed(run: TrainingRecord, inputs: Float[Array | np.ndarray, "states inputs"]) -> None:
     """Leave in the run's folder the range of what its policy saw in the recordings."""
-    low, high = np.min(inputs, axis=0), np.max(inputs, axis=0)
+    low, high = (np.asarray(bound) for bound in (np.min(inputs, axis=0), np.max(inputs, axis=0)))
     run.write(_OBSERVED, json.dumps({"low": low.tolist(), "high": high.tolist()}) + "\n")
 
 

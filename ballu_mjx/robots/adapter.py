@@ -6,13 +6,14 @@ are the general answers.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.robots.model import ModelParameters
@@ -30,6 +31,32 @@ class DeploymentNotes(NamedTuple):
     """What the smallest and largest commands do, and why they are limited in rate."""
     measure: tuple[str, ...] = ()
     """What to measure before the first run."""
+
+
+IdentificationProgress = Callable[[str, int, int, float], None]
+"""(stage, iteration, most iterations, the lowest loss so far)."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class IdentifiedActuators:
+    """Actuator parameters with what is known of them; `Simulator` takes it for the parameters.
+
+    **Fields**
+
+    - `robot`: the name that the recordings carry.
+    - `parameters`: what was identified.
+    - `report`: values, standard errors and fit, as text.
+    - `details`: the same as JSON's types, to stand beside the parameters in a file.
+    """
+
+    robot: str
+    parameters: ModelParameters
+    report: str
+    details: Mapping[str, Any]
+
+    def fields(self, model: mujoco.MjModel) -> dict[str, Array]:
+        """Return the fields of `model` that carry the parameters, by name."""
+        return self.parameters.fields(model)
 
 
 class RobotAdapter:
@@ -82,6 +109,33 @@ class RobotAdapter:
         """Return the actuator parameters that stand in `model`; None where this robot has none to identify."""
         del model
 
+    def identify_actuators(
+        self,
+        robot: RobotDescription,
+        recordings: Mapping[Path, Any],
+        config: Any = None,
+        levels: int | None = None,
+        progress: IdentificationProgress | None = None,
+    ) -> IdentifiedActuators:
+        """Return the actuators identified from suspended `recordings` (`recordings.recording.Recording`, by file);
+        see `identification.actuators.identify_actuators`.
+
+        **Raises** `InputError` where the recordings cannot be used, or this robot's actuators cannot be identified.
+        """
+        self.check_sweep(robot, recordings, levels)
+        raise NotImplementedError
+
+    def check_sweep(self, robot: RobotDescription, recordings: Mapping[Path, Any], levels: int | None = None) -> None:
+        """Check that `identify_actuators` can use the recordings.
+
+        **Raises** `InputError` where it cannot, or this robot's actuators cannot be identified.
+        """
+        del recordings, levels
+        raise InputError(
+            f"{robot.file}: the actuators of {robot.name} cannot be identified; give it an adapter with "
+            "`identify_actuators` (docs/own_robot.md)."
+        )
+
     def read_actuators(self, robot: RobotDescription, path: Path) -> tuple[str, ModelParameters]:
         """Return the robot's name and the parameters in a file of identified actuators.
 
@@ -95,6 +149,10 @@ class RobotAdapter:
     def find_actuators(self, recordings: Iterable[Path], name: str) -> Path | None:
         """Return the file of identified actuators of the robot called `name` beside its recordings; None: none."""
         del recordings, name
+
+    def write_actuators(self, path: Path, found: IdentifiedActuators, more: Mapping[str, Any]) -> None:
+        """Write a file that `read_actuators` reads, with the details, and `more` keys beside them."""
+        raise NotImplementedError
 
     def actuators_to_json(self, parameters: ModelParameters) -> dict[str, Any]:
         """Return identified parameters as JSON's types."""

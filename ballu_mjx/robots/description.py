@@ -110,11 +110,6 @@ class RobotDescription:
     """What only this robot has."""
 
     @property
-    def is_ballu(self) -> bool:
-        """Whether it has BALLU's legs."""
-        return type(self.adapter) is not RobotAdapter
-
-    @property
     def features(self) -> int:
         """Return the size of `observe_features`: place, velocity and Euler angles of the tracked body, place
         and velocity of each point."""
@@ -122,11 +117,11 @@ class RobotDescription:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Columns that its recordings may have, in order."""
-        points = (f"{point}_{axis}" for point in self.points for axis in "xyz")
-        turns = (f"{site}_q{axis}" for site in (self.tracked, *self.oriented_points) for axis in "wxyz")
-        places = (*(f"{self.tracked}_{axis}" for axis in "xyz"), *turns, *points)
-        return ("time", *(f"command_{name}" for name in self.commands), *places, *self.joints)
+        """Columns that its recordings may have."""
+        sites = (self.tracked, *self.points)
+        places = [f"{site}_{axis}" for site in sites for axis in "xyz"]
+        turns = [f"{site}_q{axis}" for site in (self.tracked, *self.oriented_points) for axis in "wxyz"]
+        return ("time", *(f"command_{name}" for name in self.commands), *places, *turns, *self.joints)
 
     def load_model(self, actuators: ModelParameters | None = None) -> mujoco.MjModel:
         """Return the robot for C MuJoCo: the nominal one, or with identified actuators."""

@@ -87,6 +87,13 @@ class BoundForces(NamedTuple):
 
     model: ForceModel
     params: Any
+    observed: Any = None
+    """Smallest and largest of each of its inputs in what it was learned from; None: unknown."""
+
+    @property
+    def bound(self) -> BoundForces:
+        """Itself: what has parameters bound may be given for it (`HasForces`)."""
+        return self
 
     @property
     def fields(self) -> Fields:
@@ -95,7 +102,15 @@ class BoundForces(NamedTuple):
 
     def plus(self, further: BoundForces) -> BoundForces:
         """Return both residuals, acting together."""
-        return BoundForces(SumOfForces(self.model, further.model), (self.params, further.params))
+        both = SumOfForces(self.model, further.model)
+        return BoundForces(both, (self.params, further.params), further.observed)
+
+
+class HasForces(Protocol):
+    """A residual with its parameters, or what holds one, such as what a training returns."""
+
+    @property
+    def bound(self) -> BoundForces: ...
 
 
 def add_to_base(base: BoundForces | None, further: ForceModel) -> tuple[ForceModel, Callable[[Any], Any]]:

@@ -17,9 +17,9 @@ from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.robots.model import ModelParameters, with_fields
+from ballu_mjx.robots.model import ModelParameters, bare_parameters, with_fields
 from ballu_mjx.sim.derived_constants import ReferencePose, with_derived_constants
-from ballu_mjx.sim.force_model import BoundForces, add_wrenches
+from ballu_mjx.sim.force_model import BoundForces, HasForces, add_wrenches
 from ballu_mjx.sim.observation import observe_features
 from ballu_mjx.sim.step import PhysicsState, control_step, count_substeps, load_state, make_data, put_model, state_at
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
@@ -47,7 +47,7 @@ class Simulator:
 
         **Raises** `ValueError` where the model's time step does not divide the robot's control time step.
         """
-        self.robot, self.actuators = robot, actuators
+        self.robot, self.actuators = robot, bare_parameters(actuators)
         self.mj_model = robot.load_model(actuators) if model is None else model
         self.control_timestep = robot.control_timestep
         """Seconds between two commands."""
@@ -114,7 +114,7 @@ class Simulator:
         )
 
     def with_residual(
-        self, residual: BoundForces | None, scale: Float[Array, ""] | float | None = None
+        self, residual: HasForces | None, scale: Float[Array, ""] | float | None = None
     ) -> AugmentedSimulator:
         """Return the simulator that the residual improves, its model fields included.
 
@@ -123,11 +123,12 @@ class Simulator:
         """
         if residual is None:
             return AugmentedSimulator(self)
-        fields = residual.fields
+        bound = residual.bound
+        fields = bound.fields
         if scale is not None:
             own = {name: getattr(self.model, name) for name in fields}
             fields = {name: (1 - scale) * own[name] + scale * value for name, value in fields.items()}
-        return AugmentedSimulator(self.with_fields(fields), residual, scale)
+        return AugmentedSimulator(self.with_fields(fields), bound, scale)
 
 
 class RolloutState(NamedTuple):
@@ -193,12 +194,26 @@ class AugmentedSimulator:
     residual: BoundForces | None = None
     scale: Float[Array, ""] | float | None = None
 
-    def with_residual(self, residual: BoundForces | None) -> AugmentedSimulator:
+    @property
+    def robot(self) -> RobotDescription:
+        """Whose simulator it is."""
+        return self.simulator.robot
+
+    @property
+    def actuators(self) -> ModelParameters | None:
+        """The simulator's actuators; None: the nominal ones."""
+        return self.simulator.actuators
+
+    def without_residual(self) -> Simulator:
+        """Return the simulator that the residual improves."""
+        return Simulator(self.robot, self.actuators, model=self.simulator.mj_model)
+
+    def with_residual(self, residual: HasForces | None) -> AugmentedSimulator:
         """Return the simulator with a further residual, which acts together with its own (`SumOfForces`)."""
         if residual is None:
             return self
         assert self.scale is None, "A scaled residual takes no further one."
-        both = residual if self.residual is None else self.residual.plus(residual)
+        both = residual.bound if self.residual is None else self.residual.plus(residual.bound)
         return AugmentedSimulator(self.simulator.with_fields(both.fields), both)
 
     def with_fields(self, fields: Mapping[str, Array]) -> AugmentedSimulator:
@@ -253,7 +268,7 @@ class AugmentedSimulator:
     ) -> tuple[Float[Array, "*parts commands"], Float[Array, "loaded 6"]]:
         """Return the residual's commands and wrenches."""
         assert self.residual is not None
-        model, params = self.residual
+        model, params = self.residual.model, self.residual.params
         wrench = model.wrench(params, history, commands, key)
         sent = model.command(params, commands)
         if self.scale is None:

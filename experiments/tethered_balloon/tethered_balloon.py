@@ -107,10 +107,8 @@ def record(description: RobotDescription, name: str, seconds: float, seed: int) 
         notes=f"Simulated; wind {WIND.tolist()} m/s.",
         time=np.arange(steps) / RATE,
         command=sent[before:],
-        balloon_position=seen[:, 0],
-        balloon_quaternion=turn.as_quat(scalar_first=True),
-        base_position=None,
-        foot_position=None,
+        tracked_position=seen[:, 0],
+        tracked_quaternion=turn.as_quat(scalar_first=True),
         points={point: seen[:, 1 + number] for number, point in enumerate(description.points)},
     )
 
@@ -142,7 +140,7 @@ def learn(recordings: Path, run: Path, seed: int, quick: bool) -> Evaluation:
             command += ["--resume", str(run)]
         else:
             shutil.rmtree(run, ignore_errors=True)
-            command += ["--robot-description", str(DESCRIPTION), "--seed", str(seed), "--output", str(run)]
+            command += ["--robot", str(DESCRIPTION), "--seed", str(seed), "--output", str(run)]
             for option, use in (("recordings", "training"), ("validation", "validation"), ("test", "test")):
                 command += [f"--{option}", str(recordings / use)]
             command += QUICK if quick else []

@@ -16,11 +16,11 @@ from ballu_mjx.ballu.reconstruct import (
     _forward_kinematics,
     _servo_chunk,
     _Skeleton,
-    reconstruct_ballu,
 )
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion, ReconstructionParameters, add_capture_noise
 from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.robots.registry import load_robot
 
 DURATION = 10.0
 STEP = 0.01
@@ -101,20 +101,20 @@ def head(recording: Recording, count: int) -> Recording:
 
 @pytest.fixture(scope="module")
 def seen_with_base(truth: Truth) -> Motion:
-    return reconstruct_ballu(capture(truth), MODEL)
+    return reconstruct(capture(truth), load_robot(), MODEL)
 
 
 @pytest.fixture(scope="module")
 def seen_without_base(truth: Truth) -> Motion:
-    return reconstruct_ballu(capture(truth, base=False), MODEL)
+    return reconstruct(capture(truth, base=False), load_robot(), MODEL)
 
 
 def test_as_much_noise_again_errs_as_much_again(truth: Truth):
     """What `noisier` recordings are reconstructed to is off from the original's states by as much as these from the
     truth: a simulator's error by its starting states can be had without the truth."""
     seen = capture(truth)
-    once = reconstruct_ballu(seen, MODEL).qpos
-    again = [reconstruct_ballu(add_capture_noise(seen, seed=seed), MODEL).qpos for seed in (1, 2)]
+    once = reconstruct(seen, load_robot(), MODEL).qpos
+    again = [reconstruct(add_capture_noise(seen, seed=seed), load_robot(), MODEL).qpos for seed in (1, 2)]
     own = once[2:-2] - truth.qpos[::5][: len(once)][2:-2]
     for twin in again:
         places = [*range(3), *HIPS]  # what no stop clips
@@ -221,7 +221,7 @@ def test_pitch_follows_the_measured_base_against_the_torque_balance(truth):
         base_position=recording.base_position + moved,
         foot_position=recording.foot_position + moved[:, None],
     )
-    motion = reconstruct_ballu(recording, MODEL)
+    motion = reconstruct(recording, load_robot(), MODEL)
     change = np.rad2deg(motion.qpos - truth.qpos[::5])
     assert np.median(np.abs(change[:, HIPS] + 10.0)) < 0.2
     assert np.median(np.abs(change[:, 7] + 10.0)) < 0.2
@@ -261,7 +261,7 @@ def test_velocities_are_mujocos(truth):
         balloon_quaternion=turned(plain.balloon_quaternion),
         base_quaternion=turned(plain.base_quaternion),
     )
-    motion, reference = reconstruct_ballu(recording, MODEL), reconstruct_ballu(plain, MODEL)
+    motion, reference = reconstruct(recording, load_robot(), MODEL), reconstruct(plain, load_robot(), MODEL)
     np.testing.assert_allclose(motion.qvel[:, :3], turn.apply(reference.qvel[:, :3]), atol=1e-6)
     np.testing.assert_allclose(motion.qvel[:, 3:], reference.qvel[:, 3:], atol=1e-5)
 
@@ -299,7 +299,7 @@ def test_residuals_are_the_noise(seen_with_base, seen_without_base):
 def test_residuals_show_a_wrong_skeleton(truth):
     longer = load_model()
     longer.body_pos[longer.body("balloon").id, 2] += 0.02
-    motion = reconstruct_ballu(capture(truth, noise=0.0), longer)
+    motion = reconstruct(capture(truth, noise=0.0), load_robot(), longer)
     assert motion.residual_mm["balloon"] > 3.0
 
 
@@ -336,7 +336,7 @@ def test_jitter_and_rates(truth, rate):
     time = np.arange(0.0, DURATION - 0.02, 1.0 / rate)
     time = 7.0 + time + np.concatenate([[0.0], rng.uniform(-0.3, 0.3, len(time) - 1) / rate])
     recording = dataclasses.replace(capture(truth, time=time - 7.0), time=time)
-    motion = reconstruct_ballu(recording, MODEL)
+    motion = reconstruct(recording, load_robot(), MODEL)
     np.testing.assert_allclose(motion.time, np.arange(len(motion.time)) * CONTROL_TIMESTEP)
     errors = position_errors(truth, motion)
     assert np.median(errors["knees"]) < 0.5
@@ -353,8 +353,8 @@ def test_hidden_markers(truth, tmp_path):
     balloon, feet = recording.balloon_position.copy(), recording.foot_position.copy()
     balloon[200:205], feet[400:403, 1], feet[700:705, 0] = np.nan, np.nan, np.nan
     recording = dataclasses.replace(recording, balloon_position=balloon, foot_position=feet)
-    write_recording(recording, tmp_path / "walk.csv")
-    motion = reconstruct_ballu(read_recording(tmp_path / "walk.csv"), MODEL)
+    write_recording(recording, tmp_path / "walk.csv", load_robot())
+    motion = reconstruct(read_recording(tmp_path / "walk.csv", load_robot()), load_robot(), MODEL)
     assert motion.interpolated["balloon_x"] == 5 and motion.interpolated["foot_left_z"] == 5
     errors = position_errors(truth, motion)
     assert np.median(errors["knees"]) < 0.3
@@ -365,7 +365,7 @@ def test_measured_joints_are_taken(truth):
     recording = capture(truth)
     recording = dataclasses.replace(recording, motor=truth.qpos[:, MOTORS] + 0.1, knee=truth.qpos[:, KNEES])
     precise = ReconstructionParameters(joint_noise=1e-4)
-    motion = reconstruct_ballu(recording, MODEL, precise)
+    motion = reconstruct(recording, load_robot(), MODEL, precise)
     change = np.median(np.abs(motion.qpos[:, MOTORS] - truth.qpos[::5, MOTORS]))
     assert abs(change - 0.1) < 0.01
     assert np.median(position_errors(truth, motion)["knees"]) < 0.03
@@ -375,7 +375,7 @@ def test_commands_are_means_over_control_steps(truth):
     recording = capture(truth, noise=0.0)
     command = np.zeros_like(recording.command)
     command[12:27, 0] = 1.0  # from 0.12 s to 0.27 s
-    motion = reconstruct_ballu(dataclasses.replace(recording, command=command), MODEL)
+    motion = reconstruct(dataclasses.replace(recording, command=command), load_robot(), MODEL)
     np.testing.assert_allclose(motion.command[:7, 0], [0.0, 0.0, 0.6, 1.0, 1.0, 0.4, 0.0], atol=1e-9)
     np.testing.assert_array_equal(motion.command[:, 1], 0.0)
     assert len(motion.command) == len(motion.qpos) - 1 == len(motion.time) - 1
@@ -388,7 +388,7 @@ def test_lengths_share_a_program(truth, seen_without_base):
 
     before = programs()
     recording = capture(truth, base=False)
-    motion = reconstruct_ballu(head(recording, 333), MODEL)
+    motion = reconstruct(head(recording, 333), load_robot(), MODEL)
     assert len(motion.qpos) == 67
     assert programs() == before
     np.testing.assert_allclose(motion.qpos[5:50, 7:], seen_without_base.qpos[5:50, 7:], atol=np.deg2rad(1.0))
@@ -397,6 +397,6 @@ def test_lengths_share_a_program(truth, seen_without_base):
 def test_suspended_and_short_recordings_are_refused(truth):
     recording = capture(truth)
     with pytest.raises(ValueError, match="suspended"):
-        reconstruct_ballu(dataclasses.replace(recording, kind="suspended"), MODEL)
+        reconstruct(dataclasses.replace(recording, kind="suspended"), load_robot(), MODEL)
     with pytest.raises(ValueError, match="too short"):
-        reconstruct_ballu(head(recording, 8), MODEL)
+        reconstruct(head(recording, 8), load_robot(), MODEL)

@@ -12,6 +12,7 @@ from ballu_mjx.ballu.sweep import read_sweep
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.robots.registry import load_robot
 
 PATH = Path("sweep.csv")
 
@@ -116,6 +117,6 @@ def test_recordings_of_two_robots_are_refused() -> None:
 
 
 def test_the_bundled_sweep_holds_twenty_commands_for_both_legs() -> None:
-    sweep = read_sweep({path: read_recording(path) for path in list_bundled("suspended")})
+    sweep = read_sweep({path: read_recording(path, load_robot()) for path in list_bundled("suspended")})
     assert sweep.command == pytest.approx(both(), abs=1e-4)
     assert np.all(np.diff(sweep.settled[:, 0], axis=0) > 0), "motors follow the command"

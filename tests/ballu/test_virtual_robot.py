@@ -19,6 +19,7 @@ from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.robots.model import assets
+from ballu_mjx.robots.registry import load_robot
 
 ROOT = Path(__file__).parents[2]
 
@@ -171,7 +172,7 @@ def test_a_bundled_recording_is_made_again_bit_for_bit(tmp_path: Path, monkeypat
 
 def test_the_sweep_holds_twenty_levels_until_the_joints_settle():
     (path,) = list_bundled("suspended")
-    sweep = read_recording(path)
+    sweep = read_recording(path, load_robot())
     assert sweep.kind == "suspended" and sweep.motor is not None and sweep.knee is not None
     levels, first = np.unique(sweep.command[:, 0], return_index=True)
     assert len(levels) == 20 and (levels[0], levels[-1]) == (0.0, 1.0)
@@ -196,7 +197,7 @@ def test_bundled_actuators_are_the_robots(virtual: virtual_robot.VirtualRobot):
 def test_bundled_free_recordings_show_no_motors_and_weigh_two_megabytes_at_most():
     for split in ("training", "validation", "test"):
         for path in list_bundled(split):
-            seen = read_recording(path)
+            seen = read_recording(path, load_robot())
             assert seen.motor is None and seen.knee is None
             assert seen.time[-1] - seen.time[0] >= 19.9
     assert sum(path.stat().st_size for path in (assets() / "recordings").rglob("*.*")) < 2 * 2**20

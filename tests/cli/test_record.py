@@ -19,6 +19,7 @@ from ballu_mjx.cli import record
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_recording
 from ballu_mjx.recordings.importers.mapping import EXAMPLE
 from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.robots.registry import load_robot
 
 ROLES = ("balloon", "base", "foot_left", "foot_right")
 
@@ -27,7 +28,7 @@ ROLES = ("balloon", "base", "foot_left", "foot_right")
 def recorded() -> Recording:
     """Random jumps, told from each other everywhere."""
     (path,) = [path for path in list_bundled("test") if path.name.startswith("far-1")]
-    return first(read_recording(path), 15.0)
+    return first(read_recording(path, load_robot()), 15.0)
 
 
 def first(recording: Recording, seconds: float) -> Recording:
@@ -82,7 +83,7 @@ LINE = "import walk.csv --mapping room.toml --commands log.csv --output out/walk
 
 def test_import_by_hand_gives_the_recording_back(room: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]):
     assert record.main([*LINE, "--offset", "-512.25"]) == 0
-    read = read_recording(room / "out" / "walk.csv.gz")
+    read = read_recording(room / "out" / "walk.csv.gz", load_robot())
     assert (read.robot, read.kind, len(read.time)) == ("mine", "free", len(recorded.time))
     np.testing.assert_allclose(read.command, recorded.command, atol=1e-4)
     # Turned and shifted to the start, it is the same walk: distances and heights are.
@@ -102,7 +103,7 @@ def test_import_finds_the_offset_and_says_how_sure_it_is(room: Path, capsys: pyt
 
 def test_a_periodic_log_is_told(room: Path, capsys: pytest.CaptureFixture[str]):
     (path,) = [path for path in list_bundled("test") if path.name.startswith("near-1")]
-    walk = first(read_recording(path), 15.0)
+    walk = first(read_recording(path, load_robot()), 15.0)
     vicon_file(walk, room / "walk.csv")
     log_file(walk, room / "log.csv", 0.0)
     assert record.main(LINE) == 2
@@ -150,7 +151,7 @@ def test_import_overwrites_nothing(room: Path, capsys: pytest.CaptureFixture[str
 def test_a_sweep_comes_from_a_table_with_its_commands(tmp_path: Path):
     """Degrees, a knee that counts the other way round, and milliseconds of an absolute clock."""
     (path,) = list_bundled("suspended")
-    sweep = read_recording(path)
+    sweep = read_recording(path, load_robot())
     assert sweep.motor is not None and sweep.knee is not None
     columns = [1e3 * sweep.time + 1e9, *sweep.command.T, *np.rad2deg(sweep.motor).T, 90 - np.rad2deg(sweep.knee).T[0]]
     columns.append(np.rad2deg(sweep.knee).T[1])
@@ -164,7 +165,7 @@ def test_a_sweep_comes_from_a_table_with_its_commands(tmp_path: Path):
     (tmp_path / "room.toml").write_text(room)
     line = ["import", tmp_path / "bench.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "sweep.csv"]
     assert record.main(list(map(str, line))) == 0
-    read = read_recording(tmp_path / "sweep.csv")
+    read = read_recording(tmp_path / "sweep.csv", load_robot())
     np.testing.assert_allclose(np.asarray(read.knee), sweep.knee, atol=2e-5)
     np.testing.assert_allclose(np.asarray(read.motor), sweep.motor, atol=2e-5)
     np.testing.assert_allclose(read.command, sweep.command, atol=1e-4)
@@ -177,7 +178,7 @@ def test_a_sweep_comes_from_a_table_with_its_commands(tmp_path: Path):
 def test_check_counts_what_is_missing(tmp_path: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]):
     base = np.array(recorded.base_position)
     base[100:112] = base[500:503] = np.nan
-    write_recording(dataclasses.replace(recorded, base_position=base), tmp_path / "walk.csv")
+    write_recording(dataclasses.replace(recorded, base_position=base), tmp_path / "walk.csv", load_robot())
     gaps = record.missing(tmp_path / "walk.csv")
     assert gaps == {f"base_{axis}": [(1.0, 1.11), (5.0, 5.02)] for axis in "xyz"}
     assert record.main(["check", str(tmp_path), "--output", str(tmp_path / "figures")]) == 0
@@ -191,7 +192,7 @@ def test_check_counts_what_is_missing(tmp_path: Path, recorded: Recording, capsy
 
 def test_check_goes_on_after_a_broken_one(tmp_path: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]):
     for name in ("a", "b"):
-        write_recording(recorded, tmp_path / f"{name}.csv")
+        write_recording(recorded, tmp_path / f"{name}.csv", load_robot())
     text = (tmp_path / "a.csv").read_text().split("\n")
     (tmp_path / "a.csv").write_text("\n".join([*text[:10], "x" + text[10], *text[11:]]))
     assert record.main(["check", str(tmp_path)]) == 2
@@ -208,7 +209,7 @@ def test_simulate_plays_a_log_of_commands(tmp_path: Path):
     path = tmp_path / "walk.csv"
     line = ["simulate", "--commands", log, "--output", path, "--robot-seed", 3, "--trial-seed", 4]
     assert record.main(list(map(str, line))) == 0
-    read = read_recording(path)
+    read = read_recording(path, load_robot())
     assert read.robot == virtual_robot.draw_robot(3).name
     assert read.time[-1] == pytest.approx(2.05)
     at = [read.command[round(100 * t)].tolist() for t in (0.0, 0.48, 0.5, 1.98, 2.0)]
@@ -226,7 +227,7 @@ def test_simulate_repeats_itself_by_its_seeds(tmp_path: Path):
 def test_simulate_sweeps(tmp_path: Path):
     line = ["simulate", "--suspended", "--levels", 5, "--hold", 0.5, "--output", tmp_path / "sweep.csv"]
     assert record.main(list(map(str, line))) == 0
-    read = read_recording(tmp_path / "sweep.csv")
+    read = read_recording(tmp_path / "sweep.csv", load_robot())
     assert read.kind == "suspended" and np.unique(read.command[:, 0]).tolist() == [0.0, 0.25, 0.5, 0.75, 1.0]
 
 

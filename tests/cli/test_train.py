@@ -62,8 +62,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("cli")
     (folder / "data").mkdir()
     for path in list_bundled("validation")[1:3]:
-        recording = first_seconds(read_recording(path), 6.0)
-        write_recording(recording, folder / "data" / f"{recording.name}.csv")
+        recording = first_seconds(read_recording(path, load_robot()), 6.0)
+        write_recording(recording, folder / "data" / f"{recording.name}.csv", load_robot())
     shutil.copy(assets() / "recordings" / ACTUATORS_FILE, folder / "data")
     return folder
 
@@ -178,7 +178,7 @@ def test_sysid_explains_the_sweep_and_writes_what_it_found(identified: Path):
 
 def test_bundled_actuators_come_from_the_bundled_sweep():
     path = assets() / "recordings" / ACTUATORS_FILE
-    sweep = read_sweep({p: read_recording(p) for p in list_bundled("suspended")})
+    sweep = read_sweep({p: read_recording(p, load_robot()) for p in list_bundled("suspended")})
     name, _ = read_actuators(path)
     assert name == sweep.robot
     sources = json.loads(path.read_text())["source"]
@@ -229,7 +229,7 @@ def test_damaged_actuators_are_refused(tmp_path: Path, folder: Path, change: dic
 
 
 def test_quick_validates_on_own_recordings_where_there_are_no_others(folder: Path):
-    files = _choose(train_envmimic.Data(recordings=(folder / "data",), quick=True), None)
+    files = _choose(train_envmimic.Data(recordings=(folder / "data",), quick=True), load_robot(), None)
     assert len(files["training"]) == 2 and files["validation"] == files["training"] == files["test"]
     _read(files, load_robot())
 
@@ -268,7 +268,9 @@ def test_wrong_path_is_refused_in_one_sentence(folder: Path):
 def test_input_that_cannot_be_used_is_refused(trained, monkeypatch, capsys, arguments, sentence):
     monkeypatch.chdir(trained.parent)
     if "short.csv" in arguments:
-        write_recording(first_seconds(read_recording(Path("data/near-1.csv")), 3.0), "short.csv")
+        write_recording(
+            first_seconds(read_recording(Path("data/near-1.csv"), load_robot()), 3.0), "short.csv", load_robot()
+        )
     suspended = str(list_bundled("suspended")[0])
     assert train.main(["envmimic", *(a.format(suspended=suspended) for a in arguments)]) == 2
     error = capsys.readouterr().err

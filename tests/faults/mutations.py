@@ -392,7 +392,7 @@ def formats(work: Path) -> list[Format]:
     from ballu_mjx.robots.description import read_description
     from ballu_mjx.robots.model import assets
 
-    whole = read_recording(list_bundled("test")[0])
+    whole = read_recording(list_bundled("test")[0], load_robot())
     fields = {field.name: getattr(whole, field.name) for field in dataclasses.fields(whole)}
     cut = {name: value[:130] for name, value in fields.items() if isinstance(value, np.ndarray)}
     short = dataclasses.replace(whole, **cut)
@@ -412,14 +412,21 @@ def formats(work: Path) -> list[Format]:
     ):
         folder = place()
         path = folder / f"walk{ending}"
-        write_recording(short, path)
-        add(name, folder / damaged, damages, lambda path=path: read_recording(path), recording_fault, share=share)
+        write_recording(short, path, load_robot())
+        add(
+            name,
+            folder / damaged,
+            damages,
+            lambda path=path: read_recording(path, load_robot()),
+            recording_fault,
+            share=share,
+        )
     folder = place()
-    sweep = read_recording(list_bundled("suspended")[0])
+    sweep = read_recording(list_bundled("suspended")[0], load_robot())
     fields = {field.name: getattr(sweep, field.name) for field in dataclasses.fields(sweep)}
     cut = {name: value[:130] for name, value in fields.items() if isinstance(value, np.ndarray)}
-    write_recording(dataclasses.replace(sweep, **cut), folder / "sweep.csv")
-    add("suspended recording, .csv", folder / "sweep.csv", CSV, lambda p=folder / "sweep.csv": read_recording(p),
+    write_recording(dataclasses.replace(sweep, **cut), folder / "sweep.csv", load_robot())
+    add("suspended recording, .csv", folder / "sweep.csv", CSV, lambda p=folder / "sweep.csv": read_recording(p, load_robot()),
         recording_fault)  # fmt: skip
 
     folder = place()
@@ -660,7 +667,7 @@ def _import_formats(place: Callable[[], Path], short: Any) -> list[Format]:
             for path in (output, sidecar_path(output)):
                 path.unlink(missing_ok=True)
             record._import(options)
-            return read_recording(output)
+            return read_recording(output, load_robot())
 
         written = (output, sidecar_path(output))
         found.append(Format(name, folder / damaged, damages, read, recording_fault, share, written))

@@ -25,6 +25,7 @@ from ballu_mjx.recordings.importers.table import Table, commands_in, read_comman
 from ballu_mjx.recordings.importers.trajectories import rigid_body
 from ballu_mjx.recordings.importers.vicon import read_vicon
 from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.robots.registry import load_robot
 
 ROLES = ("balloon", "base", "foot_left", "foot_right")
 BODIES = "\n".join(f'[{role}]\nbody = "ballu:{role}"' for role in ROLES)
@@ -38,7 +39,7 @@ Y_UP = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 @functools.cache
 def source() -> Recording:
     """Three seconds of a bundled recording."""
-    recording = read_recording(list_bundled("test")[0])
+    recording = read_recording(list_bundled("test")[0], load_robot())
     fields = {field.name: getattr(recording, field.name) for field in dataclasses.fields(recording)}
     return dataclasses.replace(
         recording, **{name: value[:300] for name, value in fields.items() if isinstance(value, np.ndarray)}

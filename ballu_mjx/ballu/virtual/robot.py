@@ -31,6 +31,7 @@ from ballu_mjx.ballu.model import (
     standing_qpos,
     suspend,
 )
+from ballu_mjx.ballu.recordings import make_recording
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.model import assets, set_fields
@@ -353,21 +354,15 @@ def record_sweep(virtual: VirtualRobot, seed: int, name: str, *, commands: int =
                 data.ctrl[:] = servos.at(time + tick * _TICK)
                 mujoco.mj_step(model, data, round(_TICK / PHYSICS_TIMESTEP))
     table = np.array(rows)
-    return Recording(
+    return make_recording(
         name=name,
         kind="suspended",
         robot=virtual.name,
         notes="Actuator sweep, feet off the ground.",
         time=table[:, 0],
         command=np.repeat(table[:, 1:2], 2, axis=1),
-        balloon_position=None,
-        balloon_quaternion=None,
-        base_position=None,
-        base_quaternion=None,
-        foot_position=None,
         motor=table[:, 2:4],
         knee=table[:, 4:6],
-        interpolated={},
     )
 
 
@@ -424,7 +419,7 @@ def _finish(
     capture: Capture, base_quaternion: Float[np.ndarray, "T 4"], virtual: VirtualRobot, name: str, notes: str
 ) -> Recording:
     position = np.array(capture.position)
-    return Recording(
+    return make_recording(
         name=name,
         kind="free",
         robot=virtual.name,
@@ -436,7 +431,4 @@ def _finish(
         base_position=position[:, 1],
         base_quaternion=base_quaternion,
         foot_position=position[:, 2:],
-        motor=None,
-        knee=None,
-        interpolated={},
     )

@@ -12,7 +12,6 @@ from ballu_mjx.ballu import plots as ballu_plots
 from ballu_mjx.ballu.features import foot_positions
 from ballu_mjx.ballu.gait import count_steps
 from ballu_mjx.ballu.model import load_model
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import TrialConditions, VirtualRobot
 from ballu_mjx.evaluation.transfer import Trajectory, Transfer, compare_trajectories
@@ -22,6 +21,7 @@ from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.policies.deploy.export import weights
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.simulator import Simulator
@@ -68,12 +68,12 @@ def run_trials(
         notes = f"{policy.task.name}, trained in {setting}, closed loop."
         recording = virtual_robot.record(hardware, draw, ExportedPolicy(stored), seconds, name, notes)
         path = folder / f"{name}.csv.gz"
-        write_recording(recording, path, decimals=4)
-        recordings.append(read_recording(path))  # reading fills the gaps
+        write_recording(recording, path, load_robot(), decimals=4)
+        recordings.append(read_recording(path, load_robot()))  # reading fills the gaps
         print(f"{policy.task.name}, {setting}: {name} of {len(draws)} done", flush=True)
 
     model = load_model(policy.actuators)
-    motions = [reconstruct_ballu(recording, model) for recording in recordings]
+    motions = [reconstruct(recording, load_robot(), model) for recording in recordings]
     reference, com = stack_motions(Simulator(load_robot(), model=model), motions)
     starts = [np.stack([getattr(motion, name)[0] for motion in motions]) for name in ("qpos", "qvel")]
     rollout = (loop or policy.closed_loop())(policy.params, starts[0], starts[1], len(motions[0].command))
