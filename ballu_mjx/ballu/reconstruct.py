@@ -27,8 +27,8 @@ from ballu_mjx.recordings.inverse_kinematics import KinematicFit
 from ballu_mjx.recordings.motion import MeasurementGrid
 
 BASE_PITCH = "base_pitch"
-"""Under this name, a `Motion.uncertainty` has the standard deviation (rad) of the base's pitch. Neck and hips share this
-error with the opposite sign; balloon, legs and feet in the world do not."""
+"""Key of `Motion.uncertainty`: the standard deviation (rad) of the base's pitch. Neck and hips share this error with
+the opposite sign; balloon, legs and feet in the world do not."""
 
 _CHUNK = 512
 """Samples in a compiled call: recordings of any length share one program."""

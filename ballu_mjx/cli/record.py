@@ -17,7 +17,6 @@ import tyro
 
 from ballu_mjx.common import files, runtime
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.robots.registry import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -58,7 +57,7 @@ class Import(runtime.CommandOptions):
     was looked for does not count as the clock's."""
     format: Literal["auto", "vicon", "c3d", "table"] = "auto"
     """Of the file. auto: by its ending and first line."""
-    robot: str = DEFAULT_ROBOT
+    robot: str = "ballu"
     """The robot: a name, or a description file."""
 
 
@@ -70,7 +69,7 @@ class Check(runtime.CommandOptions):
     """Recordings, or folders of them."""
     output: Path | None = None
     """Folder for a figure of each, NAME.png. Without this option there are none."""
-    robot: str = DEFAULT_ROBOT
+    robot: str = "ballu"
     """The robot: a name, or a description file."""
 
 
@@ -125,7 +124,7 @@ def subcommands() -> dict[str, type]:
 class _Example(runtime.CommandOptions):
     """Print a mapping file with every key and its default: to be saved, and cut down to what your room needs."""
 
-    robot: str = DEFAULT_ROBOT
+    robot: str = "ballu"
     """The robot: a name, or a description file."""
 
 
@@ -168,7 +167,7 @@ def _import(options: Import) -> None:
         raise InputError(f"{options.file}: lasts less than {SHORTEST:g} s; capture for longer.")
     print(f"{options.file}: {len(recording.time)} samples, {recording.time[-1] - recording.time[0]:.2f} s")
     if options.commands is None:
-        if table is None or mapping.commands.names[0] not in table.header:
+        if table is None or next(iter(mapping.commands.columns.values())) not in table.header:
             raise InputError(
                 f"{options.file}: holds no commands; give their log by --commands, or name their columns under "
                 f"[commands] in {options.mapping}."

@@ -46,9 +46,9 @@ def read_recording(path: Path | str, robot: RobotDescription) -> Recording:
     being row 1) and fix.
     """
     path = Path(path)
-    known = column_groups(robot)
+    description, known = sidecar_path(path), column_groups(robot)
     columns = _read_columns(path, known)
-    kind, made_by, notes = _read_description(sidecar_path(path))
+    kind, made_by, notes = _read_description(description)
     groups = present_groups(path, columns, known, kind)
     check_time(path, columns["time"], robot)
     check_cells(path, columns, groups, robot, kind)
@@ -232,13 +232,13 @@ def _check_header(path: Path, groups: Sequence[ColumnGroup], header: list[str]) 
     for i, name in enumerate(header):
         if name not in known:
             close = difflib.get_close_matches(name[:40].lower(), known, 1)
-            mend = (
+            fix = (
                 f"rename it to {close[0]} or delete it"
                 if close
                 else "the robot's description does not have it, delete it"
             )
             refuse_recording(
-                path, "unknown column", mend, column=_shorten(name) if name else f"{i + 1} (no name)", row=-1
+                path, "unknown column", fix, column=_shorten(name) if name else f"{i + 1} (no name)", row=-1
             )
         if name in header[:i]:
             refuse_recording(path, "the column stands there twice", "delete one", column=name, row=-1)
@@ -262,8 +262,8 @@ def _parse_row(path: Path, header: list[str], cells: list[str], row: int) -> lis
         except ValueError:
             plain, number = not cell.strip(), math.nan
         if not plain:
-            mend = "write a finite number, or leave the cell empty if the sample is missing"
-            refuse_recording(path, f"{_shorten(cell)!r} is not a finite number", mend, column=name, row=row)
+            fix = "write a finite number, or leave the cell empty if the sample is missing"
+            refuse_recording(path, f"{_shorten(cell)!r} is not a finite number", fix, column=name, row=row)
         numbers.append(number)
     return numbers
 

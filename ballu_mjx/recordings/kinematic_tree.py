@@ -1,4 +1,4 @@
-"""Forward kinematics and Jacobians of many poses at once, in NumPy and double precision: MuJoCo's, without compiling."""
+"""Forward kinematics and Jacobians of many poses at once, in NumPy and double precision: as MuJoCo has them."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """From a recording to generalized states at the control rate, for robots of any build.
 
 1. Measurements are brought to a uniform grid at their own rate, of which the control grid is a part.
-2. Positions: least-squares inverse kinematics over all joints at once (`inverse_kinematics`). Joints that no measurement
-   shows are refused.
+2. Positions: least-squares inverse kinematics over all joints at once (`inverse_kinematics`). Joints that no
+   measurement shows are refused.
 3. The robot's adapter completes what single samples show badly (`hooks.RecordingHooks.complete_positions`).
 4. Velocities: a centred (hence lag-free) Savitzky-Golay differentiator, widest for the tracked body's rotation: its
    rates matter most to what a simulator does next.
@@ -34,7 +34,7 @@ from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
 
 _STOP_GIVE = {False: float(np.deg2rad(0.5)), True: 1e-3}
-"""How far beyond its range a hinge (rad) or a slide (m) may be: stops are soft, and a spring may hold a joint inside."""
+"""How far beyond its range a hinge (rad) or a slide (m) may be: stops are soft, and springs hold joints inside."""
 _TURN_TOLERANCE = 0.1
 """rad over a full turn that angles counted from 0 again may span."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.recordings.recording import Column, ColumnGroup, Kind
+from ballu_mjx.recordings.recording import Column, ColumnGroup, Kind, Quantity
 from ballu_mjx.robots.description import RobotDescription
 
 LONGEST_GAP = 0.5
@@ -26,7 +26,7 @@ _QUATERNION_TOLERANCE = 0.02
 
 
 def refuse_recording(
-    path: Path, problem: str, mend: str, *, column: str | None = None, row: int | None = None
+    path: Path, problem: str, fix: str, *, column: str | None = None, row: int | None = None
 ) -> NoReturn:
     """Raise the sentence; `row` counts samples from 0."""
     place = [str(path)]
@@ -34,7 +34,7 @@ def refuse_recording(
         place.append(f"column {column}")
     if row is not None:
         place.append(f"row {row + 2}")
-    raise InputError(f"{', '.join(place)}: {problem}; {mend}.")
+    raise InputError(f"{', '.join(place)}: {problem}; {fix}.")
 
 
 # ---- validation ----
@@ -92,60 +92,59 @@ def check_cells(
         if row is not None:
             refuse_recording(path, f"{columns[name][row]:g} {problem}", fix, column=name, row=row)
 
-    bounds = _angle_bounds(robot)
-    for group in groups:
-        if group.quantity == "command":
-            for name, (low, high) in zip(group.names, robot.command_ranges, strict=True):
-                row = first_true(np.isnan(columns[name]))
-                if row is not None:
-                    fix = "fill in what was being sent"
-                    refuse_recording(path, "the command is missing", fix, column=name, row=row)
-                outside = (columns[name] < low) | (columns[name] > high)
-                fix = "convert it to the actuator's units, or give its range in the robot's description"
-                check(name, outside, f"is outside {low:g} to {high:g}", fix)
-        elif group.quantity == "position":
-            for name in group.names:
-                _check_place(path, name, columns, robot, kind, check)
-        elif group.quantity == "quaternion":
-            with np.errstate(over="ignore"):
-                length = np.linalg.norm(np.stack([columns[name] for name in group.names], 1), axis=1)
-            row = first_true(np.abs(length - 1) > _QUATERNION_TOLERANCE)
-            if row is not None:
-                shown = f"{group.names[0]} ... {group.names[-1]}"
-                problem = f"the quaternion {shown} has length {length[row]:.3g} instead of 1"
-                fix = "export unit quaternions in w, x, y, z order"
-                refuse_recording(path, problem, fix, column=group.names[0], row=row)
-        elif group.quantity == "angle" and group.part in bounds:
-            (name,), (low, high) = group.names, bounds[group.part]
-            fix = "convert degrees to radians (millimetres to metres), or mend the description's limits"
-            check(name, (columns[name] < low) | (columns[name] > high), f"is beyond {low:g} to {high:g} rad or m", fix)
+    def names(quantity: Quantity) -> list[str]:
+        return [name for group in groups if group.quantity == quantity for name in group.names]
 
-
-def _check_place(
-    path: Path,
-    name: str,
-    columns: dict[str, Column],
-    robot: RobotDescription,
-    kind: Kind,
-    check: Callable[[str, np.ndarray, str, str], None],
-) -> None:
-    """Refuse heights, distances and jumps beyond the robot's limits."""
-    limits, value = robot.limits, columns[name]
-    if limits.height is not None and name.endswith("_z") and kind == "free":
-        low, high = limits.height
-        fix = "convert millimetres to metres, or mend the frame: z up, the floor at 0"
-        check(name, (value < low) | (value > high), f"m is not a height between {low:g} and {high:g} m", fix)
-    if limits.distance is not None:
-        far = np.abs(value) > limits.distance
-        check(name, far, f"m is farther than {limits.distance:g} m", "convert millimetres to metres")
-    if limits.speed is not None:
-        seen = np.flatnonzero(~np.isnan(value))
-        steps = np.abs(np.diff(value[seen]))
-        row = first_true(steps > _LARGEST_STEP + limits.speed * np.diff(columns["time"][seen]))
+    for name, (low, high) in zip(names("command"), robot.command_ranges, strict=True):
+        value = columns[name]
+        row = first_true(np.isnan(value))
         if row is not None:
-            fix = "convert millimetres to metres, or empty the cells where markers were mixed up"
-            problem = f"jumps by {steps[row]:.3g} m, farther than the robot can move between samples"
-            refuse_recording(path, problem, fix, column=name, row=int(seen[row + 1]))
+            refuse_recording(path, "the command is missing", "fill in what was being sent", column=name, row=row)
+        fix = "convert it to the actuator's units, or give its range in the robot's description"
+        check(name, (value < low) | (value > high), f"is outside {low:g} to {high:g}", fix)
+    bounds = _angle_bounds(robot)
+    for name in names("angle"):
+        low, high = bounds.get(name, (-np.inf, np.inf))
+        fix = "convert degrees to radians (millimetres to metres), or correct the description's limits"
+        outside = (columns[name] < low) | (columns[name] > high)
+        check(name, outside, f"is beyond {low:g} to {high:g} rad or m", fix)
+    limits, positions = robot.limits, names("position")
+    if limits.height is not None and kind == "free":
+        low, high = limits.height
+        fix = "convert millimetres to metres, or correct the frame: z up, the floor at 0"
+        for name in positions:
+            if name.endswith("_z"):
+                outside = (columns[name] < low) | (columns[name] > high)
+                check(name, outside, f"m is not a height between {low:g} and {high:g} m", fix)
+    for name in positions:
+        if limits.distance is not None:
+            far = np.abs(columns[name]) > limits.distance
+            check(name, far, f"m is farther than {limits.distance:g} m", "convert millimetres to metres")
+        if limits.speed is not None:
+            _check_jumps(path, name, columns, limits.speed)
+    for group in groups:
+        if group.quantity == "quaternion":
+            _check_lengths(path, group.names, columns)
+
+
+def _check_jumps(path: Path, name: str, columns: dict[str, Column], speed: float) -> None:
+    value = columns[name]
+    seen = np.flatnonzero(~np.isnan(value))
+    steps = np.abs(np.diff(value[seen]))
+    row = first_true(steps > _LARGEST_STEP + speed * np.diff(columns["time"][seen]))
+    if row is not None:
+        fix = "convert millimetres to metres, or empty the cells where markers were mixed up"
+        problem = f"jumps by {steps[row]:.3g} m, farther than the robot can move between samples"
+        refuse_recording(path, problem, fix, column=name, row=int(seen[row + 1]))
+
+
+def _check_lengths(path: Path, names: Sequence[str], columns: dict[str, Column]) -> None:
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(np.stack([columns[name] for name in names], 1), axis=1)
+    row = first_true(np.abs(length - 1) > _QUATERNION_TOLERANCE)
+    if row is not None:
+        problem = f"the quaternion {names[0]} ... {names[-1]} has length {length[row]:.3g} instead of 1"
+        refuse_recording(path, problem, "export unit quaternions in w, x, y, z order", column=names[0], row=row)
 
 
 def _angle_bounds(robot: RobotDescription) -> dict[str, tuple[float, float]]:
@@ -171,9 +170,9 @@ def check_gaps(path: Path, columns: dict[str, Column], groups: Sequence[ColumnGr
     first, last = 0, len(time) - 1
     for group in groups:
         names = group.names
-        mend = "cut the recording there"
+        fix = "cut the recording there"
         if kind not in group.mandatory:
-            mend += f", or delete {', '.join(names)}"
+            fix += f", or delete {', '.join(names)}"
         # A quaternion is seen or missing as a whole, all else column by column.
         for together in [names] if group.quantity == "quaternion" else [(name,) for name in names]:
             seen = np.flatnonzero(has_sample(columns, together))
@@ -185,7 +184,7 @@ def check_gaps(path: Path, columns: dict[str, Column], groups: Sequence[ColumnGr
                 row = int(seen[gap - 1]) + 1 if gap else 0
                 name = next(n for n in together if np.isnan(columns[n][row]))
                 problem = f"{lacking[gap]:.3g} s are missing in a row, more than {LONGEST_GAP:g} s"
-                refuse_recording(path, problem, mend, column=name, row=row)
+                refuse_recording(path, problem, fix, column=name, row=row)
             first, last = max(first, int(seen[0])), min(last, int(seen[-1]))
     if time[last] - time[first] < SHORTEST * (1 - 1e-6):
         problem = f"all columns have samples for {max(0.0, time[last] - time[first]):.3g} s only"

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import mujoco
 import numpy as np
 import pytest
@@ -10,16 +9,12 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model, standing_qpos
-from ballu_mjx.ballu.reconstruct import (
-    _differentiate,
-    _fit_chunk,
-    _forward_kinematics,
-    _servo_chunk,
-    _Skeleton,
-)
+from ballu_mjx.ballu.reconstruct import BASE_PITCH, _servo_chunk
+from ballu_mjx.ballu.recordings import make_recording
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion, ReconstructionParameters, add_capture_noise
-from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.recordings.reconstruct import differentiate, reconstruct
+from ballu_mjx.recordings.recording import Recording, cut
 from ballu_mjx.robots.registry import load_robot
 
 DURATION = 10.0
@@ -79,7 +74,7 @@ def capture(
         return seen * np.concatenate([[1.0], np.cumprod(np.where(flips, -1.0, 1.0))])[:, None]
 
     held = np.clip(np.searchsorted(truth.time, time + 1e-9, side="right") - 1, 0, len(truth.time) - 1)
-    return Recording(
+    return make_recording(
         name="made",
         kind="free",
         robot="nominal",
@@ -91,12 +86,6 @@ def capture(
         base_quaternion=orientation(truth.qpos[:, 3:7]) if base else None,
         foot_position=sites[:, 2:],
     )
-
-
-def head(recording: Recording, count: int) -> Recording:
-    """The first `count` samples."""
-    arrays = {name: value[:count] for name, value in vars(recording).items() if isinstance(value, np.ndarray)}
-    return dataclasses.replace(recording, **arrays)
 
 
 @pytest.fixture(scope="module")
@@ -165,22 +154,6 @@ def leg_angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def test_kinematics_are_mujocos():
-    data = mujoco.MjData(MODEL)
-    rng = np.random.default_rng(0)
-    qpos = rng.normal(size=(10, MODEL.nq))
-    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
-    skeleton = _Skeleton.of(MODEL)
-    with jax.enable_x64(True):
-        found = [np.asarray(x) for x in jax.vmap(lambda q: _forward_kinematics(skeleton, q))(qpos)]
-    for i, row in enumerate(qpos):
-        data.qpos[:] = row
-        mujoco.mj_kinematics(MODEL, data)
-        np.testing.assert_allclose(found[0][i], data.site("balloon").xpos, atol=1e-12)
-        np.testing.assert_allclose(found[1][i], data.body("balloon").xquat, atol=1e-12)
-        np.testing.assert_allclose(found[2][i], [data.site(f"foot_{s}").xpos for s in SIDES], atol=1e-12)
-
-
 @pytest.mark.parametrize("motion_name", ["seen_with_base", "seen_without_base"])
 def test_positions(truth, motion_name, request):
     motion = request.getfixturevalue(motion_name)
@@ -198,28 +171,26 @@ def test_positions(truth, motion_name, request):
 def test_hips_and_pitch(truth, seen_with_base, seen_without_base):
     errors = position_errors(truth, seen_with_base)
     assert np.median(errors["hips"]) < 0.3
-    assert np.rad2deg(seen_with_base.pitch_deviation) < 0.3
+    assert np.rad2deg(seen_with_base.uncertainty[BASE_PITCH]) < 0.3
     # A sample's markers alone leave 7 deg; the torque balance, here exact, brings it down to the tenths.
     errors = position_errors(truth, seen_without_base)
     assert np.median(errors["hips"]) < 1.0
     assert np.median(errors["pitch"]) < 1.0
-    assert 0.5 < np.rad2deg(seen_without_base.pitch_deviation) < 2.0
-    assert np.sqrt(np.mean(errors["pitch"] ** 2)) < 2 * np.rad2deg(seen_without_base.pitch_deviation)
+    assert 0.5 < np.rad2deg(seen_without_base.uncertainty[BASE_PITCH]) < 2.0
+    assert np.sqrt(np.mean(errors["pitch"] ** 2)) < 2 * np.rad2deg(seen_without_base.uncertainty[BASE_PITCH])
 
 
 def test_pitch_follows_the_measured_base_against_the_torque_balance(truth):
     """What is measured is believed: a base held 10 deg off its equilibrium is found there."""
     recording = capture(truth, noise=0.0)
-    assert recording.base_quaternion is not None
     tilt = Rotation.from_rotvec([0.0, np.deg2rad(10.0), 0.0])
-    base = Rotation.from_quat(recording.base_quaternion, scalar_first=True) * tilt
+    base = Rotation.from_quat(recording.orientations["base"], scalar_first=True) * tilt
     neck = Rotation.from_quat(truth.qpos[:, 3:7], scalar_first=True).apply(MODEL.body("balloon").pos)
     moved = neck - base.apply(MODEL.body("balloon").pos)
     recording = dataclasses.replace(
         recording,
-        base_quaternion=base.as_quat(scalar_first=True),
-        base_position=recording.base_position + moved,
-        foot_position=recording.foot_position + moved[:, None],
+        orientations={"base": base.as_quat(scalar_first=True)},
+        points={site: place + moved for site, place in recording.points.items()},
     )
     motion = reconstruct(recording, load_robot(), MODEL)
     change = np.rad2deg(motion.qpos - truth.qpos[::5])
@@ -246,8 +217,7 @@ def test_velocities_have_no_lag(truth, seen_with_base, seen_without_base):
 def test_velocities_are_mujocos(truth):
     """In a world turned by 130 deg, only the linear velocity turns; integrating qvel leads to the next qpos."""
     plain = capture(truth, noise=0.0)
-    assert plain.balloon_quaternion is not None and plain.base_quaternion is not None
-    assert plain.foot_position is not None
+    assert plain.tracked_position is not None and plain.tracked_quaternion is not None
     turn = Rotation.from_euler("z", 130.0, degrees=True)
 
     def turned(quaternion: np.ndarray) -> np.ndarray:
@@ -255,11 +225,10 @@ def test_velocities_are_mujocos(truth):
 
     recording = dataclasses.replace(
         plain,
-        balloon_position=turn.apply(plain.balloon_position),
-        base_position=turn.apply(plain.base_position),
-        foot_position=turn.apply(plain.foot_position.reshape(-1, 3)).reshape(-1, 2, 3),
-        balloon_quaternion=turned(plain.balloon_quaternion),
-        base_quaternion=turned(plain.base_quaternion),
+        tracked_position=turn.apply(plain.tracked_position),
+        tracked_quaternion=turned(plain.tracked_quaternion),
+        points={site: turn.apply(place) for site, place in plain.points.items()},
+        orientations={site: turned(quaternion) for site, quaternion in plain.orientations.items()},
     )
     motion, reference = reconstruct(recording, load_robot(), MODEL), reconstruct(plain, load_robot(), MODEL)
     np.testing.assert_allclose(motion.qvel[:, :3], turn.apply(reference.qvel[:, :3]), atol=1e-6)
@@ -283,7 +252,7 @@ def test_turning_quickly(truth):
     spin = (tilt * Rotation.from_rotvec(np.outer(time, rate))).as_quat(scalar_first=True)
     qpos = np.tile(standing_qpos(MODEL), (len(time), 1))
     qpos[:, 3:7] = spin
-    found, velocity = _differentiate(qpos, STEP, ReconstructionParameters())
+    found, velocity = differentiate(qpos, MODEL, load_robot(), STEP, ReconstructionParameters())
     np.testing.assert_allclose(velocity[:, 3:6], np.tile(rate, (len(time), 1)), atol=0.05)
     np.testing.assert_allclose(np.abs(np.sum(found[:, 3:7] * spin, axis=1)), 1.0, atol=1e-5)
     assert np.all(np.sum(found[1:, 3:7] * found[:-1, 3:7], axis=1) > 0.9)
@@ -291,7 +260,7 @@ def test_turning_quickly(truth):
 
 def test_residuals_are_the_noise(seen_with_base, seen_without_base):
     for motion in (seen_with_base, seen_without_base):
-        assert set(motion.residual_mm) == {"balloon", "base", "feet"}
+        assert set(motion.residual_mm) == {"balloon", "base", "foot_left", "foot_right"}
         # Three axes of 0.5 mm are 0.87 mm; eleven unknowns take part of it.
         assert all(0.1 < value < 0.87 for value in motion.residual_mm.values())
 
@@ -349,10 +318,10 @@ def test_jitter_and_rates(truth, rate):
 
 def test_hidden_markers(truth, tmp_path):
     recording = capture(truth, base=False)
-    assert recording.balloon_position is not None and recording.foot_position is not None
-    balloon, feet = recording.balloon_position.copy(), recording.foot_position.copy()
-    balloon[200:205], feet[400:403, 1], feet[700:705, 0] = np.nan, np.nan, np.nan
-    recording = dataclasses.replace(recording, balloon_position=balloon, foot_position=feet)
+    balloon = np.array(recording.tracked_position)
+    points = {site: place.copy() for site, place in recording.points.items()}
+    balloon[200:205], points["foot_right"][400:403], points["foot_left"][700:705] = np.nan, np.nan, np.nan
+    recording = dataclasses.replace(recording, tracked_position=balloon, points=points)
     write_recording(recording, tmp_path / "walk.csv", load_robot())
     motion = reconstruct(read_recording(tmp_path / "walk.csv", load_robot()), load_robot(), MODEL)
     assert motion.interpolated["balloon_x"] == 5 and motion.interpolated["foot_left_z"] == 5
@@ -363,7 +332,9 @@ def test_hidden_markers(truth, tmp_path):
 
 def test_measured_joints_are_taken(truth):
     recording = capture(truth)
-    recording = dataclasses.replace(recording, motor=truth.qpos[:, MOTORS] + 0.1, knee=truth.qpos[:, KNEES])
+    joints = {"motor_left": MOTORS[0], "motor_right": MOTORS[1], "knee_left": KNEES[0], "knee_right": KNEES[1]}
+    angles = {joint: truth.qpos[:, place] + 0.1 * joint.startswith("motor") for joint, place in joints.items()}
+    recording = dataclasses.replace(recording, joint_angles=angles)
     precise = ReconstructionParameters(joint_noise=1e-4)
     motion = reconstruct(recording, load_robot(), MODEL, precise)
     change = np.median(np.abs(motion.qpos[:, MOTORS] - truth.qpos[::5, MOTORS]))
@@ -382,15 +353,11 @@ def test_commands_are_means_over_control_steps(truth):
 
 
 def test_lengths_share_a_program(truth, seen_without_base):
-    def programs() -> list[int]:
-        compiled = (_fit_chunk, _servo_chunk)
-        return [function._cache_size() for function in compiled]  # pyright: ignore[reportAttributeAccessIssue]
-
-    before = programs()
+    before = _servo_chunk._cache_size()  # pyright: ignore[reportFunctionMemberAccess]
     recording = capture(truth, base=False)
-    motion = reconstruct(head(recording, 333), load_robot(), MODEL)
+    motion = reconstruct(cut(recording, slice(333)), load_robot(), MODEL)
     assert len(motion.qpos) == 67
-    assert programs() == before
+    assert _servo_chunk._cache_size() == before  # pyright: ignore[reportFunctionMemberAccess]
     np.testing.assert_allclose(motion.qpos[5:50, 7:], seen_without_base.qpos[5:50, 7:], atol=np.deg2rad(1.0))
 
 
@@ -399,4 +366,4 @@ def test_suspended_and_short_recordings_are_refused(truth):
     with pytest.raises(ValueError, match="suspended"):
         reconstruct(dataclasses.replace(recording, kind="suspended"), load_robot(), MODEL)
     with pytest.raises(ValueError, match="too short"):
-        reconstruct(head(recording, 8), load_robot(), MODEL)
+        reconstruct(cut(recording, slice(8)), load_robot(), MODEL)

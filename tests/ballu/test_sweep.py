@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ballu_mjx.ballu.recordings import make_recording
 from ballu_mjx.ballu.sweep import read_sweep
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
@@ -27,9 +28,8 @@ def made(
     since = np.tile(np.arange(count) / rate, len(levels))[:, None]
     before = np.repeat(np.concatenate([levels[:1], levels[:-1]]), count, axis=0)
     angle = 0.5 + command + (before - command) * np.exp(-since / settle)
-    return Recording(
-        name="sweep", kind="suspended", robot=robot, time=time, command=command, balloon_position=None,
-        balloon_quaternion=None, base_position=None, foot_position=None, motor=angle, knee=angle + 0.1,
+    return make_recording(
+        name="sweep", kind="suspended", robot=robot, time=time, command=command, motor=angle, knee=angle + 0.1,
     )  # fmt: skip
 
 
@@ -55,8 +55,9 @@ def test_a_jittered_clock_from_any_origin_changes_nothing() -> None:
     steady = made(both(), rate=200.0)
     rng = np.random.default_rng(0)
     kept = np.sort(rng.choice(len(steady.time), round(0.7 * len(steady.time)), replace=False))
-    values = {name: getattr(steady, name)[kept] for name in ("time", "command", "motor", "knee")}
-    jittered = dataclasses.replace(steady, **{**values, "time": values["time"] + 1234.5})
+    angles = {joint: angle[kept] for joint, angle in steady.joint_angles.items()}
+    time, command = steady.time[kept] + 1234.5, steady.command[kept]
+    jittered = dataclasses.replace(steady, time=time, command=command, joint_angles=angles)
     expected, sweep = read_sweep({PATH: steady}), read_sweep({PATH: jittered})
     assert sweep.settled == pytest.approx(expected.settled, abs=1e-3)
     length = min(len(sweep.motion), len(expected.motion))

@@ -15,6 +15,7 @@ import pytest
 import ballu_mjx
 from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE
 from ballu_mjx.ballu.model import load_model, standing_qpos
+from ballu_mjx.ballu.recordings import base_position, foot_position, knee, motor
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
@@ -113,10 +114,11 @@ def test_capture_is_as_noisy_and_as_patchy_as_stated(virtual: virtual_robot.Virt
     trial = virtual_robot.draw_trial(7)
     seen = virtual_robot.record(virtual, trial, virtual_robot.open_loop(commands), 20.0, "standing")
     qpos, _ = virtual_robot.record_truth(virtual, trial, virtual_robot.open_loop(commands), 20.0)
-    assert seen.base_position is not None and seen.foot_position is not None
-    noise = seen.base_position - qpos[:, :3]
+    base, feet = base_position(seen), foot_position(seen)
+    assert base is not None and feet is not None
+    noise = base - qpos[:, :3]
     assert np.nanstd(noise, axis=0) == pytest.approx(np.full(3, 5e-4), rel=0.1)
-    hidden = np.isnan(np.concatenate([seen.base_position, seen.foot_position.reshape(-1, 6)], axis=1))
+    hidden = np.isnan(np.concatenate([base, feet.reshape(-1, 6)], axis=1))
     assert 0.0 < hidden.mean() < 0.05
 
 
@@ -126,7 +128,7 @@ def test_a_controller_sees_only_what_was_captured_before(virtual: virtual_robot.
 
     def controller(capture: Capture) -> np.ndarray:
         lengths.append(len(capture.time))
-        assert len(capture.balloon_position) == len(capture.time) == len(capture.command) + 1
+        assert len(capture.position) == len(capture.time) == len(capture.command) + 1
         return np.array([0.1, 0.2]) * (len(lengths) % 2)
 
     seen = virtual_robot.record(virtual, virtual_robot.draw_trial(1), controller, 1.0, "closed")
@@ -173,14 +175,15 @@ def test_a_bundled_recording_is_made_again_bit_for_bit(tmp_path: Path, monkeypat
 def test_the_sweep_holds_twenty_levels_until_the_joints_settle():
     (path,) = list_bundled("suspended")
     sweep = read_recording(path, load_robot())
-    assert sweep.kind == "suspended" and sweep.motor is not None and sweep.knee is not None
+    knees = knee(sweep)
+    assert sweep.kind == "suspended" and motor(sweep) is not None and knees is not None
     levels, first = np.unique(sweep.command[:, 0], return_index=True)
     assert len(levels) == 20 and (levels[0], levels[-1]) == (0.0, 1.0)
     for start, end in zip(first, [*first[1:], len(sweep.time)], strict=True):
         # In deg/s; noise alone gives 0.6.
-        settled = np.rad2deg(sweep.knee[end - (end - start) // 3 : end])
+        settled = np.rad2deg(knees[end - (end - start) // 3 : end])
         assert np.abs(np.polyfit(np.arange(len(settled)) * 0.01, settled, 1)[0]).max() < 1.0
-    lifted = np.rad2deg(sweep.knee[-1] - sweep.knee[0])
+    lifted = np.rad2deg(knees[-1] - knees[0])
     assert lifted.min() > 15 and lifted.max() < 44  # weak servos: the nominal robot's knees gain 45 deg
 
 
@@ -198,7 +201,7 @@ def test_bundled_free_recordings_show_no_motors_and_weigh_two_megabytes_at_most(
     for split in ("training", "validation", "test"):
         for path in list_bundled(split):
             seen = read_recording(path, load_robot())
-            assert seen.motor is None and seen.knee is None
+            assert not seen.joint_angles
             assert seen.time[-1] - seen.time[0] >= 19.9
     assert sum(path.stat().st_size for path in (assets() / "recordings").rglob("*.*")) < 2 * 2**20
 

@@ -23,7 +23,7 @@ from ballu_mjx.ballu.model import CABLE_SLACK, ActuatorParameters
 from ballu_mjx.ballu.sweep import read_sweep
 from ballu_mjx.cli import evaluate, train, train_envmimic
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_recording
-from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.recordings.recording import Recording, cut
 from ballu_mjx.residuals.dataset import _choose, _read
 from ballu_mjx.residuals.run_config import describe_recording
 from ballu_mjx.residuals.trained import TrainedResidual
@@ -50,10 +50,7 @@ def command(module: str, *arguments: object, folder: Path) -> subprocess.Complet
 
 
 def first_seconds(recording: Recording, duration: float) -> Recording:
-    rows = recording.time - recording.time[0] <= duration
-    values = {field.name: getattr(recording, field.name) for field in dataclasses.fields(recording)}
-    cut = {name: value[rows] for name, value in values.items() if isinstance(value, np.ndarray)}
-    return dataclasses.replace(recording, **cut)
+    return cut(recording, slice(int((recording.time - recording.time[0] <= duration).sum())))
 
 
 @pytest.fixture(scope="module")

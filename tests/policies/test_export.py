@@ -1,7 +1,9 @@
 """The exported controller: alone on NumPy it is the policy, and nothing it is given gets past its limits."""
 
 import ast
+import dataclasses
 import importlib.util
+import json
 import math
 import re
 import subprocess
@@ -11,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -22,12 +25,23 @@ from ballu_mjx.policies.deploy.controller import TIMEOUT, Controller, observatio
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, locomotion_observation, num_observations
 from ballu_mjx.policies.policy import Policy
+from ballu_mjx.residuals.aerodynamics import (
+    AERODYNAMICS_FILE,
+    AERODYNAMICS_FORMAT,
+    Aerodynamics,
+    AirParameters,
+    air_parameters_to_json,
+)
+from ballu_mjx.residuals.aerodynamics_fit import AirConfig
 from ballu_mjx.residuals.run_config import describe_run
+from ballu_mjx.residuals.trained import write_observed
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Normalizer, Params, PPOConfig
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.folder import Run
+from ballu_mjx.sim.simulator import Simulator
+from tests.rover import write_rover
 
 BALLU = load_robot()
 NAMES = ("balloon", "base", "foot_left", "foot_right")
@@ -319,7 +333,7 @@ def test_command_refuses_what_it_cannot_use(run: Path, tmp_path: Path, capsys: p
     (tmp_path / "other" / "config.json").write_text('{"format": "ballu-run/1", "task": "envmimic"}')
     for arguments, words in (
         ([tmp_path / "nothing"], "there is no run"),
-        ([tmp_path / "other"], "is of a run of 'envmimic'"),
+        ([tmp_path / "other"], "is a residual (envmimic)"),
         ([run, "--output", tmp_path / "full", "--no-open-loop"], "not empty"),
         ([run, "--seconds", "0"], "--seconds"),
         ([run, "--pulse-low", "-1"], "--pulse-low"),
@@ -347,6 +361,75 @@ def test_readme_tells_of_the_run(exported: Path):
     text = (exported / "README.txt").read_text()
     assert "task 'walk'" in text and "step 7" in text and "27: sine of balloon yaw" in text
     assert max(map(len, text.splitlines())) <= 120
+
+
+def test_readme_tells_the_delay_of_training(tmp_path: Path):
+    """With the air's delay, which training has in its commands, the README said that there was none."""
+    text = (export.export_policy(Options(write_run(tmp_path / "plain"), open_loop=False)) / "README.txt").read_text()
+    assert "trained without delay" in text
+    air = dataclasses.replace(AirParameters.none(), delay=jnp.asarray(0.045))
+    with Run(tmp_path / "air", describe_run("aerodynamic", {"fit": AirConfig()}, {}, [])) as made:
+        content = {"format": AERODYNAMICS_FORMAT, **air_parameters_to_json(air)}
+        made.write(AERODYNAMICS_FILE, json.dumps(content))
+        size = Aerodynamics(Simulator(BALLU)).inputs(jnp.zeros((3, 27)), jnp.zeros((3, 2))).shape[0]
+        write_observed(made, np.zeros((2, size)))
+    delayed = write_run(tmp_path / "delayed", residual=tmp_path / "air")
+    text = (export.export_policy(Options(delayed, open_loop=False)) / "README.txt").read_text()
+    assert "trained with a delay of 45 ms" in text and "without delay" not in text
+    assert "simulator 'aerodynamic'" in text
+
+
+@pytest.mark.parametrize("stuck", ["balloon_position", "balloon_quaternion", "foot_right_position"])
+def test_a_pose_that_does_not_change_relaxes(exported: Path, monkeypatch: pytest.MonkeyPatch, stuck: str):
+    """A stream that repeats its last frame, of one marker too, is no measurement."""
+    robot = Controller(exported)
+    monkeypatch.setattr(robot, "act", lambda features: np.ones(2))
+    frames = [frame_at(number * 0.01) for number in range(101)]
+    for number, frame in enumerate(frames):
+        robot.step(number * 0.01, frame)
+    assert robot.command.tolist() == [1.0, 1.0]
+    for number in range(101, 170):
+        command = robot.step(number * 0.01, frame_at(number * 0.01) | {stuck: frames[-1][stuck]})
+        assert command == (1.0, 1.0) or number * 0.01 > 1.0 + TIMEOUT - 0.001
+    assert command == (0.0, 0.0)
+    assert robot.status.startswith("relaxed: ") and "unchanged" in robot.status
+    for number in range(170, 200):
+        command = robot.step(number * 0.01, frame_at(number * 0.01))
+    assert command == (1.0, 1.0) and robot.status == "running"
+
+
+def test_a_policy_of_another_robot_is_exported(tmp_path: Path):
+    """Names, ranges, control rate and resting commands are those of its description, in files and controller."""
+    rover = write_rover(tmp_path)
+    folder = export.export_policy(Options(write_run(tmp_path / "run", robot=rover), open_loop=False))
+    done = subprocess.run([sys.executable, "controller.py"], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0 and "Passed." in done.stdout, done.stdout + done.stderr
+    robot = Controller(folder)
+    assert (robot.names, robot.commands, robot.period) == (("hull", "tip"), ("arm", "push"), 0.04)
+    assert robot.step(0.0, None) == (0.3, 1.0)  # the keyframe's
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(200, rover.features))
+    commands = np.array([robot.act(row) for row in features])
+    act = Policy.load(tmp_path / "run").act()
+    np.testing.assert_allclose(commands, [act(row) for row in features], atol=1e-4)
+    assert commands.min(axis=0) == pytest.approx([-0.4, 0.0]) and commands.max(axis=0) == pytest.approx([0.6, 10.0])
+    for number in range(50):
+        frame = {"hull_position": rng.normal(size=3), "tip_position": rng.normal(size=3)}
+        frame["hull_quaternion"] = np.array([1.0, *rng.normal(0, 0.1, 3)])
+        robot.step(number * 0.04, frame)
+    assert robot.steps == 50 and robot.status == "running"
+    text = (folder / "README.txt").read_text()
+    for words in ("policy for rover", "arm from -0.4 to 0.6", "push from 0 to 10, at rest 1", "every 0.04 s", "hull yaw"):
+        assert words in text, words
+    assert not re.search("balloon|servo|knee|foot", text)
+    assert max(map(len, text.splitlines())) <= 120
+
+
+def test_a_policy_of_an_anchored_robot_sees_the_world():
+    features = jnp.asarray(np.random.default_rng(0).normal(size=15), jnp.float32)
+    seen = controller.observation(np.asarray(features), anchored=True)
+    np.testing.assert_allclose(seen, locomotion_observation(features, anchored=True), atol=1e-6)
+    np.testing.assert_allclose(seen[:3], features[:3], atol=1e-6)
 
 
 def test_export_can_be_imported_from_anywhere(exported: Path, monkeypatch: pytest.MonkeyPatch):

@@ -54,7 +54,7 @@ def make_motion(force: np.ndarray, name: str = "made", steps: int = STEPS) -> Mo
     )
 
 
-_EMPTY = {"residual_mm": {}, "pitch_deviation": 0.0, "interpolated": {}}
+_EMPTY = {"residual_mm": {}, "uncertainty": {}, "interpolated": {}}
 
 
 @pytest.fixture(scope="module")

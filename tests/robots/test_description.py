@@ -1,6 +1,7 @@
 """Robots other than BALLU: what is refused of a description, whether the second robot is simulated and recovered."""
 
 import dataclasses
+import gzip
 import json
 import shutil
 from collections.abc import Callable
@@ -20,11 +21,12 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
-from ballu_mjx.recordings.recording import COLUMNS, Recording
+from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, tracking_state
 from ballu_mjx.residuals.network import world_loads
 from ballu_mjx.residuals.run_config import describe_recording, find_recordings, run_robot
 from ballu_mjx.robots.description import read_description
+from ballu_mjx.robots.model import assets
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, heading_observation
 from ballu_mjx.sim.simulator import Simulator
@@ -54,7 +56,7 @@ def fly(seconds: float = SECONDS) -> tuple[Recording, np.ndarray, np.ndarray]:
     seen = np.array(places)
     flight = Recording(
         name="flight", kind="free", robot="balloon-0", time=np.arange(len(sent)) / 100, command=sent,
-        balloon_position=seen[:, 0], balloon_quaternion=np.array(turns), base_position=None, foot_position=None,
+        tracked_position=seen[:, 0], tracked_quaternion=np.array(turns),
         points={"knot": seen[:, 1]},
     )  # fmt: skip
     return flight, np.array(qpos), np.array(qvel)
@@ -79,8 +81,11 @@ def copy(tmp_path: Path) -> Path:
 
 def test_ballu_s_description_says_what_its_recordings_hold():
     description = load_robot()
-    assert set(description.columns) == {name for names in COLUMNS.values() for name in names}
-    assert description.is_ballu and not description.anchored
+    header = (assets() / "recordings" / "training" / "gait-00-take-1.csv.gz").open("rb")
+    with header, gzip.open(header) as stream:
+        first = stream.readline().decode().strip().split(",")
+    assert set(description.columns) == {*first, *description.joints}
+    assert not description.anchored
 
 
 def in_json(**changes: Any) -> Callable[[Path], None]:
@@ -233,10 +238,10 @@ def test_recordings_go_through_files(flight: tuple[Recording, np.ndarray, np.nda
     write_recording(flight[0], tmp_path / "flight.csv", DESCRIPTION)
     found = read_recording(tmp_path / "flight.csv", DESCRIPTION)
     np.testing.assert_allclose(found.points["knot"], flight[0].points["knot"], atol=6e-6)
-    assert found.balloon_position is not None and flight[0].balloon_position is not None
-    np.testing.assert_allclose(found.balloon_position, flight[0].balloon_position, atol=6e-6)
+    assert found.tracked_position is not None and flight[0].tracked_position is not None
+    np.testing.assert_allclose(found.tracked_position, flight[0].tracked_position, atol=6e-6)
     with pytest.raises(InputError, match="unknown column"):
-        read_recording(tmp_path / "flight.csv")
+        read_recording(tmp_path / "flight.csv", load_robot())
     header, rest = (tmp_path / "flight.csv").read_text().split("\n", 1)
     (tmp_path / "flight.csv").write_text(header.replace("knot_y", "knot_w") + "\n" + rest)
     with pytest.raises(InputError, match="knot_w"):
@@ -278,16 +283,16 @@ def test_a_free_robot_is_recovered_wherever_it_is(tmp_path: Path):
     seen = np.array(places)
     made = Recording(
         name="loose", kind="free", robot="loose", time=time, command=np.zeros((len(time), 2)),
-        balloon_position=seen[:, 0], balloon_quaternion=np.array(turns), base_position=None, foot_position=None,
+        tracked_position=seen[:, 0], tracked_quaternion=np.array(turns),
         points={"knot": seen[:, 1]},
-        angles={"bend_x": 0.2 * np.sin(3 * time), "bend_y": np.full(len(time), 0.1), "swivel": 0.3 * time},
+        joint_angles={"bend_x": 0.2 * np.sin(3 * time), "bend_y": np.full(len(time), 0.1), "swivel": 0.3 * time},
     )  # fmt: skip
     motion = reconstruct(made, found, model)
     np.testing.assert_allclose(motion.qvel[10, :3], [0.3, 0, 0], atol=0.02)
     np.testing.assert_allclose(motion.qvel[10, -1], 0.3, atol=0.02)
     np.testing.assert_allclose(motion.qpos[10, :3], [1.15, -2, 0.5], atol=0.005)
     with pytest.raises(InputError, match="nothing that is measured shows the joint"):
-        reconstruct(dataclasses.replace(made, angles={}), open_ended, model)
+        reconstruct(dataclasses.replace(made, joint_angles={}), open_ended, model)
 
 
 def test_a_joint_that_nothing_shows_is_named(flight: tuple[Recording, np.ndarray, np.ndarray], copy: Path):

@@ -66,8 +66,8 @@ class Joint:
 class Commands:
     """Columns of a command log."""
 
-    names: tuple[str, ...]
-    """Of the columns, in the order of the robot's commands."""
+    columns: Mapping[str, str]
+    """By the robot's commands, in their order."""
     limits: tuple[tuple[float, float], ...]
     """Smallest and largest value of each command, in its actuator's units."""
     ranges: tuple[tuple[float, float], ...]
@@ -78,8 +78,8 @@ class Commands:
     @staticmethod
     def of(robot: RobotDescription) -> Commands:
         """Return the columns that a log without a mapping has."""
-        names = tuple(f"command_{name}" for name in robot.commands)
-        return Commands(names, robot.command_ranges, robot.command_ranges)
+        columns = {name: f"command_{name}" for name in robot.commands}
+        return Commands(columns, robot.command_ranges, robot.command_ranges)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -332,8 +332,7 @@ def _commands(keys: _Keys, robot: RobotDescription) -> Commands:
     default = Commands.of(robot)
     time = keys.text("time", default.time)
     unit = keys.choice("time_unit", TIMES, default.time_unit)
-    pairs = zip(robot.commands, default.names, strict=True)
-    names = tuple(keys.text(command, column) for command, column in pairs)
+    columns = {command: keys.text(command, column) for command, column in default.columns.items()}
     ranges = []
     for command, limits in zip(robot.commands, default.limits, strict=True):
         key = f"range_{command}"
@@ -342,7 +341,7 @@ def _commands(keys: _Keys, robot: RobotDescription) -> Commands:
             keys.bad(key, f"write what the column shows at command {limits[0]:g} and at command {limits[1]:g}")
         ranges.append((low, high))
     keys.finish()
-    return Commands(names, default.limits, tuple(ranges), time, unit or "s")
+    return Commands(columns, default.limits, tuple(ranges), time, unit or "s")
 
 
 # ---- example ----

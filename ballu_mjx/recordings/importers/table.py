@@ -171,12 +171,12 @@ def commands_in(table: Table, columns: Commands) -> Float[np.ndarray, "N command
 
     **Raises** `InputError` naming file, line, column and fix.
     """
-    each = zip(columns.names, columns.ranges, columns.limits, strict=True)
-    return np.stack([_command(table, name, shown, limits) for name, shown, limits in each], axis=1)
+    each = zip(columns.columns.items(), columns.ranges, columns.limits, strict=True)
+    return np.stack([_command(table, *names, shown, limits) for names, shown, limits in each], axis=1)
 
 
 def _command(
-    table: Table, name: str, shown: tuple[float, float], limits: tuple[float, float]
+    table: Table, command: str, name: str, shown: tuple[float, float], limits: tuple[float, float]
 ) -> Float[np.ndarray, " N"]:
     raw = table.column(name)
     held = np.maximum.accumulate(np.where(np.isnan(raw), -1, np.arange(len(raw))))
@@ -191,7 +191,7 @@ def _command(
         problem = f"{raw[held][row]:g} is outside of {shown[0]:g} to {shown[1]:g}"
         fix = (
             "write under [commands] in the mapping what the column shows at the smallest and the largest command, as "
-            "range_ with the command's name"
+            f"range_{command}"
         )
         refuse(table.path, f"line {table.lines[row]}, column {shorten(name)}", problem, fix)
     return limits[0] + np.clip(share, 0.0, 1.0) * (limits[1] - limits[0])
