@@ -419,7 +419,13 @@ def test_a_policy_of_another_robot_is_exported(tmp_path: Path):
         robot.step(number * 0.04, frame)
     assert robot.steps == 50 and robot.status == "running"
     text = (folder / "README.txt").read_text()
-    for words in ("policy for rover", "arm from -0.4 to 0.6", "push from 0 to 10, at rest 1", "every 0.04 s", "hull yaw"):
+    for words in (
+        "policy for rover",
+        "arm from -0.4 to 0.6",
+        "push from 0 to 10, at rest 1",
+        "every 0.04 s",
+        "hull yaw",
+    ):
         assert words in text, words
     assert not re.search("balloon|servo|knee|foot", text)
     assert max(map(len, text.splitlines())) <= 120
