@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import io
 import subprocess
 import sys
 import typing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 import ballu_mjx as bm
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
+from ballu_mjx.recordings.recording import cut
 from ballu_mjx.runs.record import MemoryRecord
 
 SIZES = bm.PPOConfig(
@@ -49,16 +48,11 @@ def robot() -> bm.RobotDescription:
 @pytest.fixture(scope="module")
 def motions(robot: bm.RobotDescription) -> list[bm.Motion]:
     """Two short ones."""
-    recordings = [shortened(each, 6.0) for each in bm.load_recordings("validation", robot)[1:3]]
+    recordings = [
+        cut(each, slice(int(np.searchsorted(each.time, each.time[0] + 6.0))))
+        for each in bm.load_recordings("validation", robot)[1:3]
+    ]
     return [bm.reconstruct(each, robot) for each in recordings]
-
-
-def shortened(recording: bm.Recording, seconds: float) -> bm.Recording:
-    """Return the first seconds of a recording."""
-    rows = recording.time - recording.time[0] <= seconds
-    values = {field.name: getattr(recording, field.name) for field in dataclasses.fields(recording)}
-    cut: dict[str, Any] = {name: value[rows] for name, value in values.items() if isinstance(value, np.ndarray)}
-    return dataclasses.replace(recording, **cut)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +69,7 @@ def simulator(robot: bm.RobotDescription, actuators: bm.IdentifiedActuators) -> 
 @pytest.fixture(scope="module")
 def air(simulator: bm.Simulator, motions: list[bm.Motion]) -> bm.TrainedResidual:
     config = bm.AirConfig(window_seconds=0.5, evaluations=2)
-    return bm.fit_aerodynamics(simulator, motions, config)
+    return bm.fit_aerodynamics(simulator, motions, config, free=("added_mass", "lift"))
 
 
 def test_the_example_of_the_readme_prints_a_table_and_nothing_else(

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from ballu_mjx.runs.layout import NO_SCORE
 
 
+@runtime_checkable
 class TrainingRecord(Protocol):
     """Measurements and checkpoints of a training: `folder.Run` writes them to disk, `MemoryRecord` keeps them."""
 
@@ -25,7 +26,7 @@ class TrainingRecord(Protocol):
         """What a run's `config.json` holds; see `residuals.run_config.describe_run`."""
         ...
 
-    def log(self, step: int, metrics: Mapping[str, float]) -> None:
+    def log(self, step: int, metrics: Mapping[str, float | int]) -> None:
         """Add measurements at `step`; steps do not decrease."""
         ...
 
@@ -61,7 +62,7 @@ class MemoryRecord:
         self.texts: dict[str, str] = {}
         self._best: tuple[float, int, dict[str, Any]] | None = None
 
-    def log(self, step: int, metrics: Mapping[str, float]) -> None:
+    def log(self, step: int, metrics: Mapping[str, float | int]) -> None:
         self.metrics.append({"step": step, **metrics})
 
     def save(

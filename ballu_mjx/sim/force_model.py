@@ -106,6 +106,7 @@ class BoundForces(NamedTuple):
         return BoundForces(both, (self.params, further.params), further.observed)
 
 
+@runtime_checkable
 class HasForces(Protocol):
     """A residual with its parameters, or what holds one, such as what a training returns."""
 
