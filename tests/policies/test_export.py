@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rover import write_rover
 
 from ballu_mjx.cli import export as export_command
 from ballu_mjx.cli import train_policy
@@ -40,8 +41,6 @@ from ballu_mjx.rl.ppo import Normalizer, Params, PPOConfig
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.folder import Run
-from ballu_mjx.sim.simulator import Simulator
-from tests.rover import write_rover
 
 BALLU = load_robot()
 NAMES = ("balloon", "base", "foot_left", "foot_right")
@@ -337,7 +336,7 @@ def test_command_refuses_what_it_cannot_use(run: Path, tmp_path: Path, capsys: p
         ([run, "--output", tmp_path / "full", "--no-open-loop"], "not empty"),
         ([run, "--seconds", "0"], "--seconds"),
         ([run, "--pulse-low", "-1"], "--pulse-low"),
-        ([run, "--pulse-low", "1500", "--pulse-high", "1500"], "would not move"),
+        ([run, "--pulse-low", "1500", "--pulse-high", "1500"], "nothing would move"),
     ):
         assert export_command.main(list(map(str, arguments))) == 2
         error = capsys.readouterr().err
@@ -369,9 +368,9 @@ def test_readme_tells_the_delay_of_training(tmp_path: Path):
     assert "trained without delay" in text
     air = dataclasses.replace(AirParameters.none(), delay=jnp.asarray(0.045))
     with Run(tmp_path / "air", describe_run("aerodynamic", {"fit": AirConfig()}, {}, [])) as made:
-        content = {"format": AERODYNAMICS_FORMAT, **air_parameters_to_json(air)}
+        content = {"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(air)}
         made.write(AERODYNAMICS_FILE, json.dumps(content))
-        size = Aerodynamics(Simulator(BALLU)).inputs(jnp.zeros((3, 27)), jnp.zeros((3, 2))).shape[0]
+        size = Aerodynamics(BALLU, BALLU.load_model()).inputs(jnp.zeros((3, 27)), jnp.zeros((3, 2))).shape[0]
         write_observed(made, np.zeros((2, size)))
     delayed = write_run(tmp_path / "delayed", residual=tmp_path / "air")
     text = (export.export_policy(Options(delayed, open_loop=False)) / "README.txt").read_text()
