@@ -51,7 +51,7 @@ from ballu_mjx.evaluation import story_layout
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.viz.style import LABELS
+from ballu_mjx.viz.style import colour_of, label_of
 
 TIMES = {"walk": (0.0, 5.0, 11.0, 16.0, 24.0), "turn": (0.0, 4.0, 10.0, 18.0, 22.0)}
 """When the paper's pictures were taken (s)."""
@@ -179,7 +179,7 @@ def draw(trials: Sequence[Shown], times: Sequence[float], view: tuple[float, flo
     figure = Figure(figsize=(size[0], size[1]))
     for row, trial in enumerate(trials):
         corner = np.array([0.4, size[1] - cell[1] * (row + 1)])
-        label, colour = LABELS[trial.setting], COLOURS[trial.setting]
+        label, colour = label_of(trial.setting), colour_of(trial.setting)
         middle = (corner[1] + (cell[1] - 0.5) / 2) / size[1]
         figure.text(
             0.2 / size[0], middle, label, rotation=90, ha="center", va="center", color=colour, size=13, weight="bold"

@@ -85,7 +85,7 @@ def test_the_example_of_the_readme_prints_a_table_and_nothing_else(
     assert said.getvalue() == ""
     assert "vanilla+sysid" in found.table() and "aerodynamic" in found.table()
     assert "motor gain, left" in actuators.report and "std. error" in air.report
-    assert policy.setting == "aerodynamic" and policy.step % 160 == 0
+    assert policy.variant.name == "aerodynamic" and policy.step % 160 == 0
     command = policy.act()(np.zeros(simulator.robot.features))
     assert command.shape == (2,) and np.all((command >= 0) & (command <= 1))
 

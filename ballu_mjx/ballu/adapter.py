@@ -11,13 +11,15 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.ballu import actuators_file, leg_response, reconstruct, recordings
+from ballu_mjx.ballu.features import foot_positions
+from ballu_mjx.ballu.gait import count_steps
 from ballu_mjx.ballu.model import JOINTS, SIDES, ActuatorParameters, standing_qpos
 from ballu_mjx.ballu.sweep import LEVELS, read_sweep
 from ballu_mjx.recordings.hooks import RecordingHooks
 from ballu_mjx.recordings.inverse_kinematics import KinematicFit
 from ballu_mjx.recordings.motion import MeasurementGrid
 from ballu_mjx.recordings.recording import Recording
-from ballu_mjx.robots.adapter import IdentificationProgress, IdentifiedActuators, RobotAdapter
+from ballu_mjx.robots.adapter import DeploymentNotes, IdentificationProgress, IdentifiedActuators, RobotAdapter
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 
@@ -47,6 +49,45 @@ class Ballu(RobotAdapter, RecordingHooks):
         """Return the standing pose: knees at their stops, feet on the floor."""
         del robot
         return standing_qpos(model)
+
+    def full_travel(self, robot: RobotDescription) -> float:
+        """Return 0.2 s: the servo takes 0.14 s for 60 deg without load, 0.21 s for 90."""
+        del robot
+        return 0.2
+
+    def deployment_notes(self, robot: RobotDescription) -> DeploymentNotes:
+        """Return what markers and commands are on BALLU, and what to measure."""
+        del robot
+        return DeploymentNotes(
+            markers={
+                "balloon": "the balloon cluster's centre of mass, 0.38 m above the neck's hinge, on the robot's middle",
+                "base": "the middle of the hip axis",
+                "foot_left": "the centre of the left foot's sphere",
+                "foot_right": "the centre of the right foot's sphere",
+            },
+            commands=(
+                "0 is the servo relaxed (knee at its stop, cable just taut), 1 is 90 deg. The servo's own no-load "
+                "speed is 60 deg in 0.14 s (90 deg in 0.21 s), so a faster command would ask for what it cannot do."
+            ),
+            measure=(
+                "Pulse widths at command 0 (cable just taut, knee at its stop) and at 90 deg, of each servo; whether "
+                "one runs the other way round. Give them by --pulse-low and --pulse-high, or in send for each servo.",
+                "z of the feet standing (the foot sphere's radius, not 0), which foot is left, heights of base and "
+                "balloon.",
+            ),
+        )
+
+    def rollout_counts(self, features: Float[np.ndarray, "runs states features"]) -> Mapping[str, list[int]]:
+        """Return the steps of each run."""
+        return {"steps": [int(count_steps(feet)[-1]) for feet in foot_positions(features)]}
+
+    def draw_rollout(
+        self, folder: Path, qpos: Float[np.ndarray, "states nq"], command: Float[np.ndarray, "steps commands"]
+    ) -> None:
+        """Draw the gait into `gait.png`."""
+        from ballu_mjx.ballu import plots  # brings Matplotlib and the identification
+
+        plots.gait(folder / "gait.png", qpos, command)
 
     def nominal_actuators(self, model: mujoco.MjModel) -> ActuatorParameters:
         """Return the parameters that stand in `model`."""

@@ -10,11 +10,14 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from ballu_mjx.ballu.gait import planted_feet
 from ballu_mjx.ballu.identification import Identification
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model
 from ballu_mjx.ballu.sweep import Sweep
-from ballu_mjx.evaluation.gait import planted_feet
-from ballu_mjx.viz.style import COLOURS, LABELS, SIDE_COLOURS, save_figure
+from ballu_mjx.viz.style import COMMAND_COLOURS, colour_of, label_of, save_figure
+
+SIDE_COLOURS = COMMAND_COLOURS[:2]
+"""Left and right, as in the model."""
 
 
 def gait(
@@ -76,9 +79,9 @@ def draw_trajectories(
     axis = figure.subplots()
     for name, runs in ((simulator, simulated), ("recording", hardware)):
         for index, com in enumerate(runs):
-            label = {"recording": "robot"}.get(name, f"{LABELS[name]} (simulated)") if not index else None
-            axis.plot(com[:, 0], com[:, 1], color=COLOURS[name], label=label, linewidth=1.2)
-            axis.plot(com[-1, 0], com[-1, 1], "o", color=COLOURS[name], markersize=4)
+            label = {"recording": "robot"}.get(name, f"{label_of(name)} (simulated)") if not index else None
+            axis.plot(com[:, 0], com[:, 1], color=colour_of(name), label=label, linewidth=1.2)
+            axis.plot(com[-1, 0], com[-1, 1], "o", color=colour_of(name), markersize=4)
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_xlabel("x (m)")
     axis.set_ylabel("y (m)")
@@ -118,13 +121,13 @@ def actuator_curves(path: Path, sweep: Sweep, result: Identification) -> None:
             command = sweep.command[order, column]
             for name, angles in simulations.items():
                 curve = np.rad2deg(angles[order, row, column])
-                axis.plot(command, curve, color=COLOURS[name], label=LABELS[name], linewidth=1.5)
+                axis.plot(command, curve, color=colour_of(name), label=label_of(name), linewidth=1.5)
             if result.with_drivetrain is not None:
                 curve = np.rad2deg(result.with_drivetrain[order, row, column])
-                label = f"{LABELS['vanilla+sysid']}, with friction and backlash"
-                axis.plot(command, curve, ":", color=COLOURS["vanilla+sysid"], label=label, linewidth=1.5)
+                label = f"{label_of('vanilla+sysid')}, with friction and backlash"
+                axis.plot(command, curve, ":", color=colour_of("vanilla+sysid"), label=label, linewidth=1.5)
             measured = np.rad2deg(sweep.settled[order, row, column])
-            axis.plot(command, measured, "o", color=COLOURS["recording"], label="measured", markersize=3.5)
+            axis.plot(command, measured, "o", color=colour_of("recording"), label="measured", markersize=3.5)
             axis.set_title(f"{joint}, {side}")
             axis.grid(alpha=0.3)
         axes[row, 0].set_ylabel("angle (deg)")

@@ -21,7 +21,8 @@ import numpy as np
 from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
 from ballu_mjx.ballu.virtual import robot as virtual_robot
-from ballu_mjx.ballu.virtual.trials import run_trials
+from ballu_mjx.ballu.virtual.robot import CaptureController
+from ballu_mjx.ballu.virtual.trials import ExportedPolicy, run_trials
 from ballu_mjx.cli import train_aerodynamics, train_envmimic, train_forces, train_policy, train_sysid
 from ballu_mjx.cli._command import TrainCommand, written_to
 from ballu_mjx.cli.cached_stages import cached_stage
@@ -35,16 +36,16 @@ from ballu_mjx.evaluation.story_layout import (
     SHARED,
     TABLES,
     WRENCH,
-    SimulatorVariant,
     residual_folder,
     table_file,
 )
 from ballu_mjx.evaluation.transfer import Transfer
-from ballu_mjx.policies.deploy.estimator import Controller, PolicyController
+from ballu_mjx.policies.deploy.export import weights
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_locomotion_config
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.policies.tasks import TASKS
 from ballu_mjx.policies.training import locomotion_ppo
+from ballu_mjx.policies.variants import SimulatorVariant
 from ballu_mjx.recordings.csv_format import write_recording
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig
 from ballu_mjx.residuals.analytic import AnalyticConfig
@@ -220,12 +221,12 @@ class Story:
         takes, seconds = self.options.takes, 6.0 if self.options.quick else 20.0
 
         def make(folder: Path) -> None:
-            act = {step: Policy.load(source, step).act() for step in _last_steps(source)}
-            jobs = [("training", step, take, seconds) for step in act for take in range(takes)]
-            jobs.append(("validation", max(act), takes, seconds + 5.0))
+            policies = {step: weights(Policy.load(source, step)) for step in _last_steps(source)}
+            jobs = [("training", step, take, seconds) for step in policies for take in range(takes)]
+            jobs.append(("validation", max(policies), takes, seconds + 5.0))
             for job, (use, step, take, length) in enumerate(jobs):
                 name = f"round-{number}-policy-{step}-take-{take + 1}"
-                controller = PolicyController(act[step])
+                controller = ExportedPolicy(policies[step])
                 draw, notes = _draw(self.seed, task, f"round {number}", job), f"A policy for {task}, closed loop."
                 self._record(folder / use, name, controller, length, draw, notes)
                 print(f"Recorded {name} ({use}), {job + 1} of {len(jobs)}", flush=True)
@@ -233,7 +234,9 @@ class Story:
         options = {"robot": self.options.robot_seed, "seed": self.seed, "takes": takes, "seconds": seconds}
         return cached_stage(self._own / f"recordings-{task}-{number}", options, [source], make)
 
-    def _record(self, folder: Path, name: str, controller: Controller, seconds: float, draw: int, notes: str) -> None:
+    def _record(
+        self, folder: Path, name: str, controller: CaptureController, seconds: float, draw: int, notes: str
+    ) -> None:
         recording = virtual_robot.record(self._robot, virtual_robot.draw_trial(draw), controller, seconds, name, notes)
         folder.mkdir(exist_ok=True)
         write_recording(recording, folder / f"{name}.csv.gz", load_robot(), decimals=_DECIMALS)
@@ -333,7 +336,7 @@ def _check(options: Options) -> None:
         raise InputError("--seeds and --robot-seed take numbers of 0 or more; give at least one seed.")
     if not options.tasks:
         raise InputError("--tasks is empty; name walk, turn, or both.")
-    check_locomotion_config(LocomotionConfig(outside_cost=options.outside_cost))
+    check_locomotion_config(LocomotionConfig(outside_cost=options.outside_cost), CONTROL_TIMESTEP)
     if options.output.exists() and not options.output.is_dir():
         raise InputError(f"{options.output}: is a file; give --output a folder.")
     files.check_folder(options.output)

@@ -12,13 +12,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.ballu import plots as ballu_plots
-from ballu_mjx.ballu.features import foot_positions
 from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, open_run, written_to
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.evaluation.gait import count_steps
 from ballu_mjx.policies.closed_loop import Rollout
-from ballu_mjx.policies.locomotion_env import LocomotionConfig, setting_name
+from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_task, variant_of
 from ballu_mjx.policies.policy import check_belongs
 from ballu_mjx.policies.tasks import Task
 from ballu_mjx.policies.training import (
@@ -78,10 +75,11 @@ class Data(loggers.LoggingOptions, distributed.DistributedOptions):
 def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
     """Check everything, train, show the gait; returns the exit status."""
     distributed.join(data)
-    check_policy_options(env, ppo, data.keep_every)
     loggers.check(data.wandb)
     start = find_resume_point(task.name, data.resume, ppo, output=data.output, quick=data.quick)
     robot = load_chosen_robot(data.robot, data.resume, task.name)
+    check_task(task, robot)
+    check_policy_options(env, ppo, data.keep_every, robot)
     identified, where = _parts(task, data, robot)
     residual = None if where is None else TrainedResidual.load(where, robot)
     check_belongs(residual, identified, where)
@@ -89,7 +87,7 @@ def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
     first = distributed.is_first()
     with written_to(first=first) as written:
         folder = written.folder = data.resume or new_folder(data.output if first else None, task.name)
-        setting = setting_name(env, identified is not None, None if residual is None else residual.model.name)
+        setting = variant_of(env, identified, residual).name
         if first:
             print(f"Run folder: {folder}")
             print(f"  task: {task.name}; simulator: {setting}" + (f", residual {where}" if where is not None else ""))
@@ -113,28 +111,33 @@ def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
             curves = (*read_column(folder, "reward"), *read_column(folder, VALIDATION_METRIC))
             plots.reward_curve(folder / "learning_curve.png", *curves, setting)
             rollout = validation_trials(policy.closed_loop(), policy.params, task, robot.control_timestep)
-            ballu_plots.gait(folder / "gait.png", rollout.qpos[0], rollout.command[0])
+            robot.adapter.draw_rollout(folder, rollout.qpos[0], rollout.command[0])
             seconds = np.arange(len(rollout.qpos[0])) * robot.control_timestep
             qpos = {setting: rollout.qpos[0]}
-            episode = StoredRollout(name=task.name, time=seconds, qpos=qpos, command=rollout.command[0])
+            command = rollout.command[0]
+            episode = StoredRollout(name=task.name, description=robot, time=seconds, qpos=qpos, command=command)
             write_rollouts(folder / ROLLOUT_FILE, [episode])
-            print(summary(task, rollout, residual is not None))
+            print(summary(task, rollout, robot, residual is not None))
     return 0
 
 
-def summary(task: Task, rollout: Rollout, with_residual: bool) -> str:
+def summary(task: Task, rollout: Rollout, robot: RobotDescription, with_residual: bool) -> str:
     """Return what some runs did, in words: means and ranges."""
     way = rollout.com[:, -1] - rollout.com[:, 0]
     yaw = np.rad2deg(np.unwrap(rollout.yaw, axis=1))
-    steps = np.array([count_steps(feet) for feet in foot_positions(rollout.features)])
+    counts = robot.adapter.rollout_counts(rollout.features)
 
     def spread(values: Float[np.ndarray, " runs"], digits: int) -> str:
         return f"{values.mean():.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
 
-    text = (
-        f"In its own simulator, {len(way)} times {task.trial_seconds:g} s from standing: x {spread(way[:, 0], 2)} m, "
-        f"y {spread(way[:, 1], 2)} m, yaw {spread(yaw[:, -1] - yaw[:, 0], 0)} deg, {spread(steps, 0)} steps."
-    )
+    figures = [
+        f"x {spread(way[:, 0], 2)} m",
+        f"y {spread(way[:, 1], 2)} m",
+        f"yaw {spread(yaw[:, -1] - yaw[:, 0], 0)} deg",
+        *(f"{spread(np.array(values, float), 0)} {name}" for name, values in counts.items()),
+    ]
+    runs = f"{len(way)} times {task.trial_seconds:g} s from its initial pose"
+    text = f"In its own simulator, {runs}: {', '.join(figures)}."
     if with_residual:
         text += (
             f" The residual left the range seen in its training in {rollout.outside.mean():.0%} of the control steps."

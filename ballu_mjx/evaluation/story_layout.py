@@ -6,12 +6,12 @@ The folder holds `table-TASK.md` for each task and, for each seed, `seed-N/` wit
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from ballu_mjx.evaluation.transfer import Transfer, turning_table, walking_table
+from ballu_mjx.policies.variants import SimulatorVariant
 
 TABLES: Mapping[str, Callable[[Mapping[str, Sequence[Sequence[Transfer]]]], str]] = {
     "walk": walking_table,
@@ -30,39 +30,6 @@ MORE_SETTINGS = (NEAR, SHARED, WRENCH, "supervised", "analytic")
 """Simulators on request; the last two have networks that regression and gradients learn."""
 ROUNDS = "envmimic"
 """The residual that is learned again in each round. A later round has its number behind the name."""
-_VANILLA = "vanilla"
-
-
-@dataclasses.dataclass(frozen=True)
-class SimulatorVariant:
-    """A simulator that policies are trained in: `vanilla`, as it may be improved, or one with a residual."""
-
-    residual: str | None = None
-    """How the residual was learned; None: there is none."""
-    identified: bool = False
-    """Whether a vanilla simulator has identified actuators (`+sysid`)."""
-    randomized: bool = False
-    """Whether a vanilla simulator is randomized (`+dr`)."""
-    round: int = 1
-    """In which round the residual was learned."""
-
-    @property
-    def name(self) -> str:
-        """What the simulator is called in tables and folders."""
-        if self.residual is None:
-            return _VANILLA + "+sysid" * self.identified + "+dr" * self.randomized
-        return self.residual if self.round == 1 else f"{self.residual}-{self.round}"
-
-    @staticmethod
-    def parse(name: str) -> SimulatorVariant:
-        """Return the simulator that is called `name`."""
-        base, *improvements = name.split("+")
-        if base == _VANILLA:
-            return SimulatorVariant(identified="sysid" in improvements, randomized="dr" in improvements)
-        method, _, number = name.rpartition("-")
-        if method == ROUNDS and number.isdecimal():
-            return SimulatorVariant(method, round=int(number))
-        return SimulatorVariant(name)
 
 
 def settings_beyond(folder: Path, task: str) -> tuple[str, ...]:

@@ -12,11 +12,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
-from ballu_mjx.evaluation.gait import count_steps
 from ballu_mjx.evaluation.statistics import LEVEL, seed_means, t_interval
 from ballu_mjx.robots.model import CONTROL_TIMESTEP
 
@@ -46,9 +45,9 @@ class Trajectory:
     com: Float[np.ndarray, "T 3"]
     """Centre of mass (m, world)."""
     yaw: Float[np.ndarray, " T"]
-    """Of the balloon (rad, world), not unwrapped."""
-    feet: Float[np.ndarray, "T 2 3"]
-    """Left and right (m, world)."""
+    """Of the tracked body (rad, world), not unwrapped."""
+    steps: Int[np.ndarray, " T"]
+    """How many steps a walking robot has made by each state."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +74,7 @@ class Transfer:
     sim_yaw_change: float
     """Simulation (deg); full turns count."""
     steps: float
-    """Robot: see `gait.count_steps`."""
+    """Robot: steps made."""
     sim_steps: float
     """Simulation."""
 
@@ -122,10 +121,11 @@ def compare_trajectories(simulation: Trajectory, robot: Trajectory) -> Transfer:
     Both must start from (nearly) the same state: nothing is aligned, and an offset at the start counts as error. Only
     yaws at the start on either side of the half turn are taken as the near neighbours that they are.
 
-    **Raises** `ValueError` where a path has fewer than 2 states, or not as many yaws or feet as centres of mass.
+    **Raises** `ValueError` where a path has fewer than 2 states, or not as many yaws or numbers of steps as centres of
+    mass.
     """
     for name, path in (("simulation", simulation), ("robot", robot)):
-        for what, states in (("yaws", path.yaw), ("pairs of feet", path.feet)):
+        for what, states in (("yaws", path.yaw), ("numbers of steps", path.steps)):
             if len(path.com) != len(states):
                 raise ValueError(f"The {name} has {len(path.com)} centres of mass, but {len(states)} {what}.")
         if len(path.com) < 2:
@@ -145,8 +145,8 @@ def compare_trajectories(simulation: Trajectory, robot: Trajectory) -> Transfer:
         sim_x_distance=float(sim_way[0]),
         sim_y_distance=float(sim_way[1]),
         sim_yaw_change=float(sim_turn),
-        steps=count_steps(robot.feet[:states]),
-        sim_steps=count_steps(simulation.feet[:states]),
+        steps=float(robot.steps[states - 1]),
+        sim_steps=float(simulation.steps[states - 1]),
     )
 
 

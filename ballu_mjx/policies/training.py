@@ -17,6 +17,7 @@ from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.rl.training_loop import ResumePoint, TrainingLoop, Validation
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.progress import Progress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
@@ -77,9 +78,9 @@ def train_policy(
     """
     config, ppo_config = config or LocomotionConfig(), ppo_config or locomotion_ppo()
     start = start or ResumePoint()
-    check_policy_options(config, ppo_config, keep_every)
-    chosen = _task(task) if isinstance(task, str) else task
     augmented = simulator.with_residual(None)
+    check_policy_options(config, ppo_config, keep_every, augmented.robot)
+    chosen = _task(task) if isinstance(task, str) else task
     actuators, residual = augmented.actuators, TrainedResidual.of(augmented)
     env = environment_of(augmented.robot, chosen, config, actuators, residual)
     infer = ppo.make_inference(env.observation_size, env.action_size, ppo_config)
@@ -99,6 +100,7 @@ def train_policy(
         robot=augmented.robot,
         actuators=actuators,
         residual=residual,
+        network=ppo_config,
         params=ppo.from_tree(tree),
         infer=infer,
         step=step,
@@ -106,10 +108,12 @@ def train_policy(
     )
 
 
-def check_policy_options(config: LocomotionConfig, ppo_config: PPOConfig, keep_every: int) -> None:
+def check_policy_options(
+    config: LocomotionConfig, ppo_config: PPOConfig, keep_every: int, robot: RobotDescription
+) -> None:
     """**Raises** `InputError` for options of `train_policy` that are out of range, or do not fit the devices."""
     ppo.check(ppo_config, len(jax.devices()))
-    check_locomotion_config(config)
+    check_locomotion_config(config, robot.control_timestep)
     if keep_every < 1:
         raise InputError(f"--keep-every is {keep_every}: it must be 1 or more.")
 

@@ -13,13 +13,14 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
+from ballu_mjx.residuals.aerodynamics import AirParameters
 from ballu_mjx.residuals.kinds import KINDS, RESIDUAL_TASKS, StoredRun
 from ballu_mjx.residuals.run_config import run_actuators, run_residual, run_robot
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 from ballu_mjx.runs.folder import read_config
 from ballu_mjx.runs.record import TrainingRecord
-from ballu_mjx.sim.force_model import BoundForces, ForceModel
+from ballu_mjx.sim.force_model import BoundForces, ForceModel, SumOfForces
 from ballu_mjx.sim.simulator import AugmentedSimulator
 
 MARGIN = 0.1
@@ -98,6 +99,11 @@ class TrainedResidual:
         """Return the model with its parameters."""
         return BoundForces(self.model, self.params, self.observed)
 
+    @property
+    def latency(self) -> float:
+        """Seconds by which commands are delayed on their way to the actuators."""
+        return _latency(self.model, self.params)
+
     def wrench(
         self,
         history: Float[Array, "steps features"],
@@ -118,6 +124,12 @@ class TrainedResidual:
         low, high = (jnp.asarray(bound) for bound in self.observed)
         beyond = jnp.maximum(low - seen, seen - high) / jnp.maximum(high - low, _NARROW)
         return jnp.maximum(jnp.max(beyond) - MARGIN, 0.0)
+
+
+def _latency(model: ForceModel, params: Any) -> float:
+    if isinstance(model, SumOfForces):
+        return sum(_latency(part, own) for part, own in zip(model.parts, params, strict=True))
+    return float(params.delay) if isinstance(params, AirParameters) else 0.0
 
 
 def observed_range(

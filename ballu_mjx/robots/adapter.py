@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -20,6 +20,17 @@ from ballu_mjx.robots.model import ModelParameters
 
 if TYPE_CHECKING:
     from ballu_mjx.robots.description import RobotDescription
+
+
+class DeploymentNotes(NamedTuple):
+    """What an exported controller tells of a robot, beyond what its description says."""
+
+    markers: Mapping[str, str] = {}
+    """What each name that motion capture sees stands for on the robot."""
+    commands: str = ""
+    """What the smallest and largest commands do, and why they are limited in rate."""
+    measure: tuple[str, ...] = ()
+    """What to measure before the first run."""
 
 
 IdentificationProgress = Callable[[str, int, int, float], None]
@@ -60,6 +71,37 @@ class RobotAdapter:
         if robot.keyframe is None:
             return model.qpos0.copy()
         return model.key(robot.keyframe).qpos.copy()
+
+    def rest_command(self, robot: RobotDescription, model: mujoco.MjModel) -> Float[np.ndarray, " commands"]:
+        """Return the commands of a robot at rest: those of its keyframe, or as near to 0 as their ranges go."""
+        given = np.zeros(model.nu) if robot.keyframe is None else model.key(robot.keyframe).ctrl
+        low, high = np.array(robot.command_ranges).T
+        return np.clip(given, low, high)
+
+    # ---- deployment ----
+
+    def full_travel(self, robot: RobotDescription) -> float:
+        """Return the seconds in which a command may go through the whole of its range on the robot; 0: no limit."""
+        del robot
+        return 0.0
+
+    def deployment_notes(self, robot: RobotDescription) -> DeploymentNotes:
+        """Return what an exported controller tells whoever puts it on the robot."""
+        del robot
+        return DeploymentNotes()
+
+    # ---- rollouts of policies ----
+
+    def rollout_counts(self, features: Float[np.ndarray, "runs states features"]) -> Mapping[str, list[int]]:
+        """Return what else is to be counted in rollouts of a policy, such as steps: numbers by name, one a run."""
+        del features
+        return {}
+
+    def draw_rollout(
+        self, folder: Path, qpos: Float[np.ndarray, "states nq"], command: Float[np.ndarray, "steps commands"]
+    ) -> None:
+        """Draw what only this robot has to show of a rollout into PNG files in `folder`."""
+        del folder, qpos, command
 
     # ---- identified actuators ----
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ballu_mjx.common import files
-from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, write_rollouts
 
 if TYPE_CHECKING:
@@ -19,8 +18,7 @@ if TYPE_CHECKING:
 
 
 def write_evaluation(evaluator: OpenLoopEvaluator, params: Any, folder: Path) -> Evaluation:
-    """Evaluate, and write `evaluation.txt`, `evaluation.json`, `tracking.png` and, of BALLU, which alone can be drawn,
-    `replay.npz` into `folder`."""
+    """Evaluate, and write `evaluation.txt`, `evaluation.json`, `tracking.png` and `replay.npz` into `folder`."""
     from ballu_mjx.evaluation.errors_table import Evaluation
 
     names = evaluator.base, evaluator.name
@@ -30,15 +28,13 @@ def write_evaluation(evaluator: OpenLoopEvaluator, params: Any, folder: Path) ->
     files.write(folder / "evaluation.txt", result.table() + "\n")
     files.write(folder / "evaluation.json", json.dumps(result.to_json(), indent=2) + "\n")
     draw_tracking(evaluator, replays, folder / "tracking.png")
-    if evaluator.robot.file == load_robot().file:
-        write_rollouts(folder / ROLLOUT_FILE, stored_rollouts(evaluator, replays))
+    write_rollouts(folder / ROLLOUT_FILE, stored_rollouts(evaluator, replays))
     return result
 
 
 def draw_tracking(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay], path: Path) -> None:
     """Draw whole-recording replays, by simulator: of the first recording of each group."""
     from ballu_mjx.recordings.groups import group_of
-    from ballu_mjx.robots.model import CONTROL_TIMESTEP
     from ballu_mjx.viz import plots
 
     shown: dict[str, plots.TrackingPanel] = {}
@@ -53,7 +49,7 @@ def draw_tracking(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay], p
         }
         shown[group_of(motion.name)] = plots.TrackingPanel(
             title=motion.name,
-            time=np.arange(states) * CONTROL_TIMESTEP,
+            time=np.arange(states) * evaluator.robot.control_timestep,
             recording=np.column_stack([position[:, :2], yaw]),
             simulations=simulations,
         )
@@ -72,6 +68,7 @@ def stored_rollouts(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay])
         found.append(
             StoredRollout(
                 name=motion.name,
+                description=evaluator.robot,
                 robot=motion.robot,
                 time=motion.time[first:],
                 qpos={"recording": motion.qpos[first:], **simulated},

@@ -129,7 +129,7 @@ def test_a_controller_sees_only_what_was_captured_before(virtual: virtual_robot.
 
     def controller(capture: Capture) -> np.ndarray:
         lengths.append(len(capture.time))
-        assert len(capture.balloon_position) == len(capture.time) == len(capture.command) + 1
+        assert len(capture.position) == len(capture.time) == len(capture.command) + 1
         return np.array([0.1, 0.2]) * (len(lengths) % 2)
 
     seen = virtual_robot.record(virtual, virtual_robot.draw_trial(1), controller, 1.0, "closed")

@@ -30,8 +30,8 @@ def clock(seconds: float) -> Float[np.ndarray, " T"]:
 
 
 def resting(com: Float[np.ndarray, "T 3"], yaw: Float[np.ndarray, " T"]) -> Trajectory:
-    """Feet stay where they are."""
-    return Trajectory(com, yaw, np.zeros((len(com), 2, 3)))
+    """Without a step."""
+    return Trajectory(com, yaw, np.zeros(len(com), int))
 
 
 def straight(seconds: float, speed: float, yaw: float = 0.0) -> Trajectory:
@@ -117,7 +117,7 @@ def test_refuses_paths_that_are_none() -> None:
         with pytest.raises(ValueError, match=f"The {name} has 1 states"):
             compare_trajectories(*pair)
     with pytest.raises(ValueError, match="21 centres of mass, but 20 yaws"):
-        compare_trajectories(way, Trajectory(way.com, way.yaw[:-1], way.feet))
+        compare_trajectories(way, Trajectory(way.com, way.yaw[:-1], way.steps))
 
 
 def test_json_round_trip() -> None:

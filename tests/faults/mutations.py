@@ -527,6 +527,7 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
             StoredRollout(
                 name=name,
                 robot=robot_name,
+                description=load_robot(),
                 time=0.05 * np.arange(12),
                 qpos={"recording": qpos(), "vanilla": qpos()},
                 command=np.full((11, 2), 0.5),
@@ -706,7 +707,14 @@ def _write_weights(folder: Path) -> Path:
     arrays: dict[str, np.ndarray] = {"mean": np.zeros(28), "std": np.ones(28), "observation_clip": np.array(10.0)}
     for i, (rows, columns) in enumerate(zip(sizes, sizes[1:], strict=False)):
         arrays |= {f"kernel_{i}": random.normal(size=(rows, columns)), f"bias_{i}": np.zeros(columns)}
-    arrays = {name: value.astype(np.float32) for name, value in arrays.items()} | {"activation": np.array("swish")}
+    levels = {"command_low": np.zeros(2), "command_high": np.ones(2), "command_rest": np.zeros(2)}
+    arrays |= levels | {"control_timestep": np.array(0.05), "full_travel": np.array(0.2)}
+    arrays = {name: value.astype(np.float32) for name, value in arrays.items()} | {
+        "activation": np.array("swish"),
+        "anchored": np.array(False),
+        "names": np.array(["balloon", "base", "foot_left", "foot_right"]),
+        "commands": np.array(["left", "right"]),
+    }
     np.savez(folder / "weights.npz", **arrays)  # pyright: ignore[reportArgumentType]
     return folder / "weights.npz"
 

@@ -323,8 +323,8 @@ def test_replays_kept_to_be_looked_at_are_those_evaluated(evaluator: OpenLoopEva
         assert take.time[0] == pytest.approx(first * CONTROL_TIMESTEP)
         for name, replay in replays.items():
             states = len(take.time)
-            seen = robot_meshes.poses(load_model(), take.qpos[name])
-            np.testing.assert_allclose(seen.balloon, replay.position[run, :states], atol=1e-4)
+            seen = robot_meshes.poses(load_model(), load_robot(), take.qpos[name])
+            np.testing.assert_allclose(seen.tracked, replay.position[run, :states], atol=1e-4)
             np.testing.assert_allclose(seen.yaw, replay.yaw[run, :states], atol=1e-3)
         assert take.force is not None
         np.testing.assert_allclose(take.force, np.tile(FORCE, (len(take.time) - 1, 1)), atol=0.02)

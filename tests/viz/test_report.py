@@ -36,6 +36,7 @@ from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.folder import Run
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, read_rollouts, write_rollouts
 from ballu_mjx.viz import report, robot_meshes, video, viser_scene
@@ -63,6 +64,7 @@ def take(name: str, states: int, seed: int = 0, robot_name: str = "") -> StoredR
     rng = np.random.default_rng(seed)
     return StoredRollout(
         name=name,
+        description=load_robot(),
         robot=robot_name,
         time=0.1 + np.arange(states) * CONTROL_TIMESTEP,
         qpos={
@@ -209,7 +211,7 @@ class Bomb:
         (lambda arrays, path: arrays | {"0/qpos/vanilla": np.full((21, 14), np.nan)}, "0/qpos/vanilla is not"),
         (lambda arrays, path: arrays | {"0/time": np.array(["x"] * 21)}, "0/time is not an array"),
         (lambda arrays, path: {k: v for k, v in arrays.items() if "qpos" not in k}, "has no robot"),
-        (lambda arrays, path: arrays | {"format": np.array("other/1")}, "is not of the format ballu-replay/1"),
+        (lambda arrays, path: arrays | {"format": np.array("other/1")}, "is not of the format ballu-replay/2"),
     ],
 )
 def test_damaged_replay_is_refused(short: Path, tmp_path: Path, capsys, damage: Callable, says: str):
@@ -280,7 +282,10 @@ def test_story_shows_its_tables_and_policies_over_each_other(tmp_path: Path):
         with Run(folder, describe_run("walk", sections, {}, [])) as run:
             run.log(100, {"reward": 0.1})
         episode = StoredRollout(
-            name="walk", time=np.arange(states) * 0.05, qpos={setting.removesuffix("-2"): walk(states, 0.2, 0.0, 1)}
+            name="walk",
+            description=load_robot(),
+            time=np.arange(states) * 0.05,
+            qpos={setting.removesuffix("-2"): walk(states, 0.2, 0.0, 1)},
         )
         write_rollouts(folder / ROLLOUT_FILE, [episode])
     write_run(tmp_path / "seed-0" / "envmimic-walk", [take("actions-1", 21)])
@@ -306,7 +311,7 @@ def test_story_shows_its_tables_and_policies_over_each_other(tmp_path: Path):
 def test_shape_stands_on_the_floor_as_high_as_the_model():
     model = load_model()
     qpos = standing_qpos(model)
-    poses = robot_meshes.poses(model, qpos[None])
+    poses = robot_meshes.poses(model, load_robot(), qpos[None])
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
@@ -333,7 +338,7 @@ def test_mujoco_scene_holds_every_robot_in_its_colour_and_the_force():
     scene = mujoco.MjvScene(model, 500)
     shown = take("near-1", 3)
     robots = {name: qpos[1] for name, qpos in shown.qpos.items()}
-    robot_meshes.draw(scene, model, data, robots, np.array([0.0, 0.1, 0.0]))
+    robot_meshes.draw(scene, model, data, load_robot(), robots, np.array([0.0, 0.8, 0.0]))
     geoms = scene.geoms[: scene.ngeom]
     for name in robots:
         own = [geom for geom in geoms if np.allclose(geom.rgba[:3], colour_of(name), atol=1e-3)]
