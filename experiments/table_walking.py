@@ -9,7 +9,7 @@
 #
 # The paper's robot is real and its numbers are one policy's each. Here a virtual robot stands in for it, every policy
 # is trained with several seeds and tried five times, each time in another draught; numbers are means with the 95 %
-# confidence interval over seeds (Student's t), beside the paper's.
+# interval of a bootstrap over seeds and trials, beside the paper's.
 #
 # `python experiments/table_walking.py` makes the stages of `python -m ballu_mjx.train all` that it needs; those that
 # are there are found again. This takes hours on two cores. Stages made with other options than the defaults of
@@ -40,7 +40,6 @@ import transfer_figure
 
 from ballu_mjx.cli import pipeline
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.evaluation import story_layout
 
 # %% [markdown]
 # ## The table
@@ -53,7 +52,7 @@ from ballu_mjx.evaluation import story_layout
 def table(options: pipeline.Options) -> Path:
     """Run what is missing, print the table; the file that holds it."""
     pipeline.run(options)
-    return story_layout.table_file(options.output, "walk")
+    return pipeline.table_file(options.output, "walk")
 
 
 # %% [markdown]

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from ballu_mjx.recordings.importers.table import Table
     from ballu_mjx.recordings.importers.trajectories import Trajectories
     from ballu_mjx.recordings.recording import Recording
-    from ballu_mjx.robots.description import RobotDescription
 
 
 LEAST_CONFIDENCE = 0.4
@@ -48,8 +47,7 @@ class Import(runtime.CommandOptions):
     """Log of the commands: a CSV. Without this option they must be columns of the table itself."""
     offset: float | None = None
     """Seconds to add to the log's times for those of the capture (whose first sample is at 0, or at its own time in a
-    table); 0 for one clock. Without this option the offset is looked for in how the robot moves, where its adapter
-    predicts that."""
+    table); 0 for one clock. Without this option the offset is looked for in how the legs move."""
     offset_range: tuple[float, float] | None = None
     """Look for the offset between these two only: what tells the periods of a gait apart."""
     delay: float = 0.05
@@ -57,30 +55,26 @@ class Import(runtime.CommandOptions):
     was looked for does not count as the clock's."""
     format: Literal["auto", "vicon", "c3d", "table"] = "auto"
     """Of the file. auto: by its ending and first line."""
-    robot: str = "ballu"
-    """The robot: a name, or a description file."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Check(runtime.CommandOptions):
-    """Tell what recordings hold: rate, gaps, ranges and commands. Broken ones are refused, with the place and fix."""
+    """Tell what recordings hold: rate, gaps, ranges and commands. Broken ones are refused, with the place and mend."""
 
     recordings: tyro.conf.Positional[tuple[Path, ...]]
     """Recordings, or folders of them."""
     output: Path | None = None
     """Folder for a figure of each, NAME.png. Without this option there are none."""
-    robot: str = "ballu"
-    """The robot: a name, or a description file."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Simulate(runtime.CommandOptions):
-    """Record on the virtual BALLU: try out a method, or what to send, before the hardware does."""
+    """Record on the virtual robot: try out a method, or what to send, before the hardware does."""
 
     output: Path
     """The recording to write, NAME.csv or NAME.csv.gz; NAME.json comes beside it."""
     commands: Path | None = None
-    """CSV with the columns time (s), command_left and command_right in [0, 1], played at the control rate."""
+    """CSV with the columns time (s), command_left and command_right in [0, 1], played at 20 Hz."""
     gait: Literal["walking", "turning", "hopping", "one-legged", "telegraph", "waves"] | None = None
     """A command sequence by name, in place of --commands."""
     seconds: float = 20.0
@@ -124,9 +118,6 @@ def subcommands() -> dict[str, type]:
 class _Example(runtime.CommandOptions):
     """Print a mapping file with every key and its default: to be saved, and cut down to what your room needs."""
 
-    robot: str = "ballu"
-    """The robot: a name, or a description file."""
-
 
 def _run(options: Import | Check | Simulate | _Example) -> int:
     if isinstance(options, Import):
@@ -136,10 +127,9 @@ def _run(options: Import | Check | Simulate | _Example) -> int:
     elif isinstance(options, Simulate):
         _simulate(options)
     else:
-        from ballu_mjx.recordings.importers.mapping import example_mapping
-        from ballu_mjx.robots.registry import load_robot
+        from ballu_mjx.recordings.importers.mapping import EXAMPLE
 
-        print(example_mapping(load_robot(options.robot)), end="")
+        print(EXAMPLE, end="")
     return 0
 
 
@@ -152,22 +142,20 @@ def _import(options: Import) -> None:
     from ballu_mjx.recordings.importers.placement import place, with_commands
     from ballu_mjx.recordings.importers.table import Table, commands_in, read_commands
     from ballu_mjx.recordings.validation import SHORTEST
-    from ballu_mjx.robots.registry import load_robot
 
     _check_output(options.output)
     if options.offset is not None and options.offset_range is not None:
         raise InputError("--offset and --offset-range: the one gives what the other looks for; give one of them.")
     if options.commands is None and (options.offset is not None or options.offset_range is not None):
         raise InputError("--offset: it is a command log's, and there is none; add --commands.")
-    robot = load_robot(options.robot)
-    mapping = read_mapping(options.mapping, robot)
+    mapping = read_mapping(options.mapping)
     trajectories, table = _read(options, mapping)
-    recording = place(trajectories, mapping, robot, recording_name(options.output))
+    recording = place(trajectories, mapping, recording_name(options.output))
     if recording.time[-1] - recording.time[0] < SHORTEST:
         raise InputError(f"{options.file}: lasts less than {SHORTEST:g} s; capture for longer.")
     print(f"{options.file}: {len(recording.time)} samples, {recording.time[-1] - recording.time[0]:.2f} s")
     if options.commands is None:
-        if table is None or next(iter(mapping.commands.columns.values())) not in table.header:
+        if table is None or mapping.commands.left not in table.header:
             raise InputError(
                 f"{options.file}: holds no commands; give their log by --commands, or name their columns under "
                 f"[commands] in {options.mapping}."
@@ -175,12 +163,11 @@ def _import(options: Import) -> None:
         time, command = trajectories.time, commands_in(table, mapping.commands)
     else:
         time, command = read_commands(Table(options.commands, options.mapping), mapping.commands)
-        found = _offset(options, robot, recording, time, command) if options.offset is None else options.offset
-        time = time + found
+        time = time + (_offset(options, recording, time, command) if options.offset is None else options.offset)
     recording, cut = with_commands(options.commands or options.file, recording, time, command)
     if max(cut) > 0:
         print(f"cut off, for there are no commands: {cut[0]:.2f} s at the start, {cut[1]:.2f} s at the end")
-    _write(options, robot, recording)
+    _write(options, recording)
 
 
 def _read(options: Import, mapping: RoomMapping) -> tuple[Trajectories, Table | None]:
@@ -203,46 +190,42 @@ def _read(options: Import, mapping: RoomMapping) -> tuple[Trajectories, Table | 
 
 
 def _offset(
-    options: Import,
-    robot: RobotDescription,
-    recording: Recording,
-    time: Float[np.ndarray, " N"],
-    command: Float[np.ndarray, "N commands"],
+    options: Import, recording: Recording, time: Float[np.ndarray, " N"], command: Float[np.ndarray, "N 2"]
 ) -> float:
-    """The log's offset by how the robot moves; prints it, and raises `InputError` where it is not clear."""
+    """The log's offset by how the legs move; prints it, and raises `InputError` where it is not clear."""
+    from ballu_mjx.ballu.leg_response import measured_response, nominal_response
     from ballu_mjx.recordings.clock_alignment import align
-    from ballu_mjx.recordings.hooks import hooks_of
 
     log, by_hand = options.commands, "give the offset by --offset"
+    motion = measured_response(recording)
+    if motion is None:
+        raise InputError(f"{log}: neither knees nor base and feet were captured to find its offset by; {by_hand}.")
     for path, clock in ((log, time), (options.file, recording.time)):
         if not 1.0 <= clock[-1] - clock[0] <= _LONGEST_SEARCH:
             raise InputError(
                 f"{path}: lasts {clock[-1] - clock[0]:.4g} s; offsets are found for 1 to {_LONGEST_SEARCH:g} s, cut it "
                 f"or {by_hand}."
             )
-    response = hooks_of(robot).response(recording, time, command)
-    if response is None:
-        raise InputError(f"{log}: nothing that {robot.name} is known to do on commands was captured; {by_hand}.")
-    motion, grid, predicted = response
+    grid, legs = nominal_response(time, command, recording.kind, knees=recording.knee is not None)
     within = options.offset_range
     if within is not None:
         within = min(within) + options.delay, max(within) + options.delay
-    found = align(recording.time, motion, grid, predicted, within=within)
+    found = align(recording.time, motion, grid, legs, within=within)
     if found is None:
         raise InputError(
-            f"{log}: nothing moves in it or in the capture, or too little of the two overlaps; {by_hand}, or fix "
+            f"{log}: nothing moves in it or in the capture, or too little of the two overlaps; {by_hand}, or mend "
             "--offset-range."
         )
     best, offset = found.best, found.best.offset - options.delay
     told = f"offset {offset:+.3f} s: correlation {best.correlation:.2f} over {found.overlap:.1f} s"
     if abs(best.correlation) < LEAST_CORRELATION:
         raise InputError(
-            f"{log}: fits the motion nowhere, best at {told}; give this trial's log, correct [commands] in "
-            f"{options.mapping}, or {by_hand}."
+            f"{log}: fits the motion nowhere, best at {told}; give this trial's log, mend left, right and their ranges "
+            f"in {options.mapping}, or {by_hand}."
         )
     if best.correlation < 0:
         raise InputError(
-            f"{log}: the robot moves against the commands, at {told}; turn the ranges of [commands] round in "
+            f"{log}: the legs move against the commands, at {told}; turn range_left and range_right round in "
             f"{options.mapping}, or {by_hand}."
         )
     other = found.second
@@ -265,14 +248,14 @@ _ALIGNMENT_ERROR = 0.05
 """s; nine of ten trials of virtual robots (benchmarks/alignment.py)."""
 
 
-def _write(options: Import, robot: RobotDescription, recording: Recording) -> None:
+def _write(options: Import, recording: Recording) -> None:
     """Write, and read back what was written: the format's own reader judges it."""
     from ballu_mjx.recordings.csv_format import read_recording, sidecar_path, write_recording
 
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    write_recording(recording, options.output, robot)
+    write_recording(recording, options.output)
     try:
-        read = read_recording(options.output, robot)
+        read = read_recording(options.output)
     except InputError as error:
         for path in (options.output, sidecar_path(options.output)):
             path.unlink()
@@ -298,11 +281,9 @@ def _check_output(output: Path) -> None:
 
 
 def _check(options: Check) -> int:
+    from ballu_mjx.ballu import plots as ballu_plots
     from ballu_mjx.recordings.csv_format import list_recordings, read_recording
-    from ballu_mjx.robots.registry import load_robot
-    from ballu_mjx.viz.recording import draw_recording
 
-    robot = load_robot(options.robot)
     paths = list_recordings(options.recordings)
     if not paths:
         raise InputError("There is nothing to check; name a recording, or a folder of them.")
@@ -311,16 +292,16 @@ def _check(options: Check) -> int:
     broken = 0
     for path in paths:
         try:
-            recording = read_recording(path, robot)
+            recording = read_recording(path)
         except InputError as error:
             print(error, file=sys.stderr)
             broken += 1
             continue
         gaps = missing(path)
-        print(report(path, recording, robot, gaps))
+        print(report(path, recording, gaps))
         if options.output is not None:
             figure = options.output / f"{recording.name}.png"
-            draw_recording(figure, recording, robot, gaps)
+            ballu_plots.recording(figure, recording, gaps)
             print(f"  drawn in {figure}")
     return 2 if broken else 0
 
@@ -340,9 +321,7 @@ def missing(path: Path) -> dict[str, list[tuple[float, float]]]:
     return found
 
 
-def report(
-    path: Path, recording: Recording, robot: RobotDescription, gaps: dict[str, list[tuple[float, float]]]
-) -> str:
+def report(path: Path, recording: Recording, gaps: dict[str, list[tuple[float, float]]]) -> str:
     """What a recording holds, in lines."""
     time = recording.time
     steps = np.diff(time)
@@ -366,37 +345,32 @@ def report(
         lines.append(f"  {shown}: " + (told if len(spans) > 1 else f"1 drop-out of {lengths[0]:.2f} s"))
     if not gaps:
         lines.append("  no drop-outs")
-    for label, value in _ranges(recording, robot):
+    for label, value in _ranges(recording):
         low, high = value.min(axis=0), value.max(axis=0)
         lines.append(f"  {label}: " + ", ".join(f"{a:.3f} to {b:.3f}" for a, b in zip(low, high, strict=True)))
-    for name, command in zip(robot.commands, recording.command.T, strict=True):
+    for leg, side in enumerate(("left", "right")):
+        command = recording.command[:, leg]
         changes = int((np.diff(command) != 0).sum())
         held = (time[-1] - time[0]) / (changes + 1)
         lines.append(
-            f"  command_{name}: {command.min():.2f} to {command.max():.2f}, mean {command.mean():.2f}, "
+            f"  command_{side}: {command.min():.2f} to {command.max():.2f}, mean {command.mean():.2f}, "
             f"{changes} changes, held for {held:.2f} s on average"
         )
     return "\n".join(lines)
 
 
-def _ranges(recording: Recording, robot: RobotDescription) -> list[tuple[str, np.ndarray]]:
-    """Columns by what they are called in a report; orientations are unwound."""
-    from scipy.spatial.transform import Rotation
-
-    def degrees(quaternion: np.ndarray) -> np.ndarray:
-        angles = Rotation.from_quat(quaternion, scalar_first=True).as_euler("ZYX", degrees=True)
-        return np.unwrap(angles, axis=0, period=360.0)
-
-    places = {robot.tracked: recording.tracked_position, **recording.points}
-    turns = {robot.tracked: recording.tracked_quaternion, **recording.orientations}
-    values = []
-    for site in (robot.tracked, *robot.points):
-        if (place := places.get(site)) is not None:
-            values.append((f"{site} x, y, z (m)", place))
-        if (quaternion := turns.get(site)) is not None:
-            values.append((f"{site} yaw, pitch, roll (deg)", degrees(quaternion)))
-    values += [(f"{joint} (rad or m)", angle[:, None]) for joint, angle in recording.joint_angles.items()]
-    return values
+def _ranges(recording: Recording) -> list[tuple[str, np.ndarray]]:
+    """Columns by what they are called in a report."""
+    feet = recording.foot_position
+    values = [
+        ("balloon x, y, z (m)", recording.balloon_position),
+        ("base x, y, z (m)", recording.base_position),
+        ("left foot x, y, z (m)", None if feet is None else feet[:, 0]),
+        ("right foot x, y, z (m)", None if feet is None else feet[:, 1]),
+        ("motors, left and right (rad)", recording.motor),
+        ("knees, left and right (rad)", recording.knee),
+    ]
+    return [(label, value) for label, value in values if value is not None]
 
 
 # ---- simulate ----
@@ -405,42 +379,42 @@ def _ranges(recording: Recording, robot: RobotDescription) -> list[tuple[str, np
 def _simulate(options: Simulate) -> None:
     from ballu_mjx.ballu.virtual import robot as virtual_robot
     from ballu_mjx.recordings.csv_format import read_recording, recording_name, write_recording
-    from ballu_mjx.robots.registry import load_robot
+    from ballu_mjx.robots.model import CONTROL_TIMESTEP
 
     _check_output(options.output)
     for name in ("robot_seed", "trial_seed"):
         if getattr(options, name) < 0:
             raise InputError(f"--{name.replace('_', '-')} {getattr(options, name)}: seeds are 0 or more.")
-    robot, name = load_robot(), recording_name(options.output)
-    virtual = virtual_robot.draw_robot(options.robot_seed)
+    robot, name = virtual_robot.draw_robot(options.robot_seed), recording_name(options.output)
     if options.suspended:
         if options.commands is not None or options.gait is not None:
             raise InputError("--suspended: a sweep has its own commands; leave --commands and --gait out.")
         if not (2 <= options.levels <= 1000 and 0.1 <= options.hold <= 60.0):
             raise InputError("--levels, --hold: give 2 levels or more, and 0.1 to 60 s.")
         result = virtual_robot.record_sweep(
-            virtual, options.trial_seed, name, commands=options.levels, hold=options.hold
+            robot, options.trial_seed, name, commands=options.levels, hold=options.hold
         )  # fmt: skip
     else:
-        commands, notes = _commands(options, robot)
+        commands, notes = _commands(options)
         result = virtual_robot.record(
-            virtual,
+            robot,
             virtual_robot.draw_trial(options.trial_seed),
             virtual_robot.open_loop(commands),
-            len(commands) * robot.control_timestep,
+            len(commands) * CONTROL_TIMESTEP,
             name,
             notes,
         )
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    write_recording(result, options.output, robot, decimals=4)
-    print(report(options.output, read_recording(options.output, robot), robot, missing(options.output)))
+    write_recording(result, options.output, decimals=4)
+    print(report(options.output, read_recording(options.output), missing(options.output)))
 
 
-def _commands(options: Simulate, robot: RobotDescription) -> tuple[Float[np.ndarray, "steps 2"], str]:
+def _commands(options: Simulate) -> tuple[Float[np.ndarray, "steps 2"], str]:
     """Commands at the control rate, and what to say of them."""
     from ballu_mjx.ballu.gaits import GAITS
     from ballu_mjx.recordings.importers.mapping import Commands
     from ballu_mjx.recordings.importers.table import Table, read_commands
+    from ballu_mjx.robots.model import CONTROL_TIMESTEP
 
     if (options.commands is None) == (options.gait is None):
         raise InputError("--commands, --gait: give one of them, or --suspended for a sweep.")
@@ -450,10 +424,9 @@ def _commands(options: Simulate, robot: RobotDescription) -> tuple[Float[np.ndar
         assert options.gait is not None
         gaits: dict[str, Callable[[float], Float[np.ndarray, "steps 2"]]] = dict(GAITS)
         return gaits[options.gait](options.seconds), f"{options.gait}, open loop."
-    time, command = read_commands(Table(options.commands), Commands.of(robot))
-    step = robot.control_timestep
-    steps = int(round((time[-1] - time[0]) / step, 6)) + 1
-    if not 1.0 <= steps * step <= 3600.0:
-        raise InputError(f"{options.commands}: lasts {steps * step:g} s; give 1 to 3600 s.")
-    held = np.searchsorted(time, time[0] + step * np.arange(steps) + 1e-6, side="right") - 1
+    time, command = read_commands(Table(options.commands), Commands())
+    steps = int(round((time[-1] - time[0]) / CONTROL_TIMESTEP, 6)) + 1
+    if not 1.0 <= steps * CONTROL_TIMESTEP <= 3600.0:
+        raise InputError(f"{options.commands}: lasts {steps * CONTROL_TIMESTEP:g} s; give 1 to 3600 s.")
+    held = np.searchsorted(time, time[0] + CONTROL_TIMESTEP * np.arange(steps) + 1e-6, side="right") - 1
     return command[held], f"{options.commands.name}, open loop."

@@ -43,9 +43,9 @@ class Trajectories:
     time: Float[np.ndarray, " T"]
     """s, strictly increasing."""
     bodies: Mapping[str, Body]
-    """By the robot's site."""
+    """By role ("balloon", "foot_left", ...)."""
     columns: Mapping[str, Float[np.ndarray, " T"]] = dataclasses.field(default_factory=dict)
-    """Joint angles (rad; of slides, m) by joint."""
+    """Motor and knee angles (rad) by the format's column name."""
 
 
 def refuse(path: Path, place: str, problem: str, mend: str) -> NoReturn:
