@@ -1,8 +1,126 @@
-"""Sim-to-real for BALLU, a 0.29 kg biped held up by helium balloons, in MJX and Brax.
+"""Sim-to-real for BALLU, a 0.29 kg biped held up by helium balloons, and for robots like it, in MJX and Brax.
 
 The package follows the order of Sontakke et al., "Residual Physics Learning and System Identification for
 Sim-to-real Transfer of Policies on Buoyancy Assisted Legged Robots": recording, identification, residual,
 policy, evaluation. Imports run one way along it.
+
+The names below are imported when they are first used, for JAX's start-up options must be settled before it is imported
+(`common.runtime.prepare`).
 """
 
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ballu_mjx.common.errors import InputError
+    from ballu_mjx.evaluation.errors_table import Evaluation
+    from ballu_mjx.evaluation.open_loop import evaluate
+    from ballu_mjx.identification.actuators import identify_actuators
+    from ballu_mjx.policies.locomotion_env import LocomotionConfig
+    from ballu_mjx.policies.policy import Policy
+    from ballu_mjx.policies.training import locomotion_ppo, train_policy
+    from ballu_mjx.recordings.load import load_recordings
+    from ballu_mjx.recordings.motion import Motion
+    from ballu_mjx.recordings.reconstruct import reconstruct
+    from ballu_mjx.recordings.recording import Recording
+    from ballu_mjx.residuals.aerodynamics_fit import AirConfig
+    from ballu_mjx.residuals.aerodynamics_training import fit_aerodynamics
+    from ballu_mjx.residuals.analytic import AnalyticConfig
+    from ballu_mjx.residuals.envmimic import EnvMimicConfig
+    from ballu_mjx.residuals.envmimic_training import train_envmimic
+    from ballu_mjx.residuals.force_fitting import fit_analytic, fit_supervised
+    from ballu_mjx.residuals.supervised import SupervisedConfig
+    from ballu_mjx.residuals.trained import TrainedResidual
+    from ballu_mjx.rl.ppo import PPOConfig
+    from ballu_mjx.robots.adapter import IdentifiedActuators
+    from ballu_mjx.robots.description import RobotDescription
+    from ballu_mjx.robots.registry import load_robot
+    from ballu_mjx.runs.folder import Run
+    from ballu_mjx.runs.progress import PhaseProgress, Progress
+    from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
+
 __version__ = "0.1.0"
+
+_MODULES = {
+    "AirConfig": "residuals.aerodynamics_fit",
+    "AnalyticConfig": "residuals.analytic",
+    "AugmentedSimulator": "sim.simulator",
+    "EnvMimicConfig": "residuals.envmimic",
+    "Evaluation": "evaluation.errors_table",
+    "IdentifiedActuators": "robots.adapter",
+    "InputError": "common.errors",
+    "LocomotionConfig": "policies.locomotion_env",
+    "Motion": "recordings.motion",
+    "PPOConfig": "rl.ppo",
+    "PhaseProgress": "runs.progress",
+    "Policy": "policies.policy",
+    "Progress": "runs.progress",
+    "Recording": "recordings.recording",
+    "RobotDescription": "robots.description",
+    "Run": "runs.folder",
+    "Simulator": "sim.simulator",
+    "SupervisedConfig": "residuals.supervised",
+    "TrainedResidual": "residuals.trained",
+    "evaluate": "evaluation.open_loop",
+    "fit_aerodynamics": "residuals.aerodynamics_training",
+    "fit_analytic": "residuals.force_fitting",
+    "fit_supervised": "residuals.force_fitting",
+    "identify_actuators": "identification.actuators",
+    "load_recordings": "recordings.load",
+    "load_robot": "robots.registry",
+    "locomotion_ppo": "policies.training",
+    "reconstruct": "recordings.reconstruct",
+    "train_envmimic": "residuals.envmimic_training",
+    "train_policy": "policies.training",
+}
+"""Where the names are defined."""
+
+__all__ = [
+    "AirConfig",
+    "AnalyticConfig",
+    "AugmentedSimulator",
+    "EnvMimicConfig",
+    "Evaluation",
+    "IdentifiedActuators",
+    "InputError",
+    "LocomotionConfig",
+    "Motion",
+    "PPOConfig",
+    "PhaseProgress",
+    "Policy",
+    "Progress",
+    "Recording",
+    "RobotDescription",
+    "Run",
+    "Simulator",
+    "SupervisedConfig",
+    "TrainedResidual",
+    "evaluate",
+    "fit_aerodynamics",
+    "fit_analytic",
+    "fit_supervised",
+    "identify_actuators",
+    "load_recordings",
+    "load_robot",
+    "locomotion_ppo",
+    "reconstruct",
+    "train_envmimic",
+    "train_policy",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import what the package's root exports, at its first use."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    runtime = importlib.import_module(f"{__name__}.common.runtime")
+    runtime.prepare()
+    found = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULES})

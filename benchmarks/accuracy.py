@@ -37,7 +37,7 @@ from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
-from ballu_mjx.sim.step import PhysicsState, balloon_id, control_step, count_substeps, make_data, put_model, state_at
+from ballu_mjx.sim.step import PhysicsState, control_step, count_substeps, make_data, put_model, state_at
 
 INTEGRATORS = {"implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST, "Euler": mujoco.mjtIntegrator.mjINT_EULER}
 SOLVERS = {"Newton": mujoco.mjtSolver.mjSOL_NEWTON, "CG": mujoco.mjtSolver.mjSOL_CG}
@@ -165,7 +165,7 @@ def c_rollout(
     threads: int,
 ) -> Float[np.ndarray, "count 3"]:
     """Balloon positions (m) at the end, by C MuJoCo on `threads` threads."""
-    control = commands.repeat(count_substeps(model), axis=1)
+    control = commands.repeat(count_substeps(model, CONTROL_TIMESTEP), axis=1)
     data = [mujoco.MjData(model) for _ in range(threads)]
     data[0].qpos[:] = qpos
     kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -188,7 +188,7 @@ def mjx_program(
     model: mujoco.MjModel, qpos: Float[np.ndarray, " nq"], devices: int
 ) -> Callable[[Float[Array, "batch steps 2"]], Float[Array, "batch nq"]]:
     """The same by MJX in float32: from commands to final generalized positions, the batch sharded over `devices`."""
-    step_count, balloon = count_substeps(model), balloon_id(model)
+    step_count, balloon = count_substeps(model, CONTROL_TIMESTEP), model.body("balloon").id
     mjx_model, template = put_model(model), make_data(model)
     start = state_at(jnp.asarray(qpos, jnp.float32), jnp.zeros(model.nv))
 

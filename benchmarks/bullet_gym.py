@@ -14,7 +14,7 @@ from ballu_mjx.policies.deploy.controller import observation
 from ballu_mjx.policies.tasks import TASKS, Step
 
 OBSERVATIONS = 28
-"""As `locomotion_env.OBSERVATIONS`, which would bring MJX and Brax into every process."""
+"""As `locomotion_env.num_observations`, which would bring MJX and Brax into every process."""
 
 
 class LocomotionEnv(gymnasium.Env):

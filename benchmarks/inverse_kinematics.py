@@ -33,11 +33,14 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+from ballu_mjx.ballu.reconstruct import BASE_PITCH
+from ballu_mjx.ballu.recordings import make_recording
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion, ReconstructionParameters
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.robots.registry import load_robot
 
 CAPTURE_STEP = 0.01
 HORIZONS = (0.25, 1.0, 2.0)
@@ -99,7 +102,7 @@ def capture(
         flips = np.sum(seen[1:] * seen[:-1], axis=1) < 0
         return seen * np.concatenate([[1.0], np.cumprod(np.where(flips, -1.0, 1.0))])[:, None]
 
-    return Recording(
+    return make_recording(
         name="walk",
         kind="free",
         robot="nominal",
@@ -184,7 +187,7 @@ def divergence(model: mujoco.MjModel, walked: Walk, motion: Motion) -> tuple[np.
 def crude(model: mujoco.MjModel, motion: Motion, recording: Recording) -> Motion:
     """`motion` with velocities from neighbouring samples, at the recording's rate, of unfiltered positions."""
     unfiltered = ReconstructionParameters(position_window=0.05, rate_window=0.05, rotation_window=0.05)
-    return dataclasses.replace(motion, qvel=reconstruct_ballu(recording, model, unfiltered).qvel)
+    return dataclasses.replace(motion, qvel=reconstruct(recording, load_robot(), model, unfiltered).qvel)
 
 
 def spread(values: np.ndarray, digits: int = 2) -> str:
@@ -231,10 +234,10 @@ def main(quick: bool = False, duration: float = 20.0, seed: int = 0) -> None:
     for case, level, base in (("recorded base", noise, True), ("no base", noise, False), ("exact", None, False)):
         recordings = [capture(model, walked, level, base, seed + i) for i, walked in enumerate(walks)]
         start = time.perf_counter()
-        motions = [reconstruct_ballu(recordings[0], model)]
+        motions = [reconstruct(recordings[0], load_robot(), model)]
         first = time.perf_counter() - start
         start = time.perf_counter()
-        motions = [reconstruct_ballu(recording, model) for recording in recordings]
+        motions = [reconstruct(recording, load_robot(), model) for recording in recordings]
         each = (time.perf_counter() - start) / len(recordings)
         print(f"{case}: {first:.1f} s for the first recording, {each:.1f} s for each after", flush=True)
         runs[case] = walks, motions
@@ -248,9 +251,9 @@ def main(quick: bool = False, duration: float = 20.0, seed: int = 0) -> None:
         every = round(CONTROL_TIMESTEP / CAPTURE_STEP)
         commands = walked.command[:-1:every]
         recording = virtual_robot.record(stand_in, trial, virtual_robot.open_loop(commands), duration, "stand-in")
-        filled = fill(dataclasses.replace(recording, base_quaternion=None))
+        filled = fill(dataclasses.replace(recording, orientations={}))
         qpos, qvel = virtual_robot.record_truth(stand_in, trial, virtual_robot.open_loop(commands), duration)
-        seen.append(reconstruct_ballu(filled, model))
+        seen.append(reconstruct(filled, load_robot(), model))
         true.append(Walk(walked.command, qpos, qvel))
     runs["stand-in"] = true, seen
 
@@ -258,7 +261,7 @@ def main(quick: bool = False, duration: float = 20.0, seed: int = 0) -> None:
         pairs = [errors(truth, motion) for truth, motion in zip(truths, motions, strict=True)]
         positions, velocities = gather([p for p, _ in pairs]), gather([v for _, v in pairs])
         medians[case] = {name: float(np.median(value)) for name, value in positions.items()}
-        said = np.rad2deg(np.mean([motion.pitch_deviation for motion in motions]))
+        said = np.rad2deg(np.mean([motion.uncertainty[BASE_PITCH] for motion in motions]))
         residuals = {name: np.mean([m.residual_mm[name] for m in motions]) for name in motions[0].residual_mm}
         columns[case] = {
             **{name: spread(value) for name, value in positions.items()},
@@ -291,8 +294,8 @@ def fill(recording: Recording) -> Recording:
     """Hidden markers interpolated, by way of a file, as users' recordings come."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording.csv"
-        write_recording(recording, path)
-        return read_recording(path)
+        write_recording(recording, path, load_robot())
+        return read_recording(path, load_robot())
 
 
 if __name__ == "__main__":

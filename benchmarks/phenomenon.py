@@ -25,10 +25,11 @@ from mujoco import rollout
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.step import count_substeps
 
 SECONDS = 20.0
@@ -68,7 +69,7 @@ def replay(
     for row, (qpos, qvel) in enumerate(starts):
         data.qpos[:], data.qvel[:] = qpos, qvel
         mujoco.mj_getState(model, data, states[row], spec)
-    count = count_substeps(model)
+    count = count_substeps(model, CONTROL_TIMESTEP)
     workers = [mujoco.MjData(model) for _ in range(2)]
     simulated = np.asarray(rollout.rollout(model, workers, states, np.repeat(commands, count, axis=1))[0])
     return simulated[:, count - 1 :: count, 1 : 1 + model.nq]
@@ -130,7 +131,7 @@ def main() -> None:
     for split in ("validation", "test", "training"):
         paths = list_bundled(split)
         for path in paths[:1] if arguments.quick else paths:
-            motion = reconstruct_ballu(read_recording(path), vanilla)
+            motion = reconstruct(read_recording(path, load_robot()), load_robot(), vanilla)
             (p, y), (q, z) = horizon_errors(vanilla, motion), horizon_errors(known, motion)
             wide.append((p >= 0.2, y >= 10.0, q / p, z / y))
             print(f"{split + ' ' + motion.name:>26}{p:>10.3f} m{y:>6.1f}{q:>12.3f} m{z:>6.1f}")

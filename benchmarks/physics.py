@@ -198,7 +198,7 @@ def main(options: Options) -> None:
     import bullet
 
     model = load_model()
-    count = count_substeps(model)
+    count = count_substeps(model, CONTROL_TIMESTEP)
     found = common.child(__file__, {"engine": "errors", "sequences": options.sequences})
     rows: list[dict[str, Any]] = []
     print(f"{'':28}{'cores':>6}{'batch':>7}{'control steps/s':>34}{'physics steps/s':>17}{'simulated s/s':>15}  error")

@@ -31,6 +31,8 @@ import tyro
 from matplotlib.figure import Figure
 
 from ballu_mjx.common import runtime
+from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.simulator import Simulator
 
 AXES = {
     "cores": "cores",
@@ -72,19 +74,19 @@ def measure(environments: int, episode_seconds: float | None, recordings: int | 
     import jax
 
     from ballu_mjx.ballu.model import load_model
-    from ballu_mjx.ballu.reconstruct import reconstruct_ballu
     from ballu_mjx.recordings.csv_format import list_bundled, read_recording
+    from ballu_mjx.recordings.reconstruct import reconstruct
     from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
     from ballu_mjx.rl import learner, ppo
 
     model = load_model()
     paths = list_bundled("training")
     paths = list(itertools.islice(itertools.cycle(paths), recordings or len(paths)))
-    known = {path: reconstruct_ballu(read_recording(path), model) for path in set(paths)}
+    known = {path: reconstruct(read_recording(path, load_robot()), load_robot(), model) for path in set(paths)}
     config = EnvMimicConfig()
     if episode_seconds is not None:
         config = dataclasses.replace(config, episode_seconds=episode_seconds)
-    env = EnvMimicEnv(model, [known[path] for path in paths], config)
+    env = EnvMimicEnv(Simulator(load_robot(), model=model), [known[path] for path in paths], config)
     sizes = ppo.PPOConfig(num_envs=environments)
     sizes = dataclasses.replace(sizes, batch_size=max(environments // sizes.num_minibatches, jax.local_device_count()))
     each = sizes.batch_size * sizes.num_minibatches * sizes.unroll_length

@@ -25,7 +25,7 @@ from jax import Array
 from jax.sharding import PartitionSpec
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, JOINTS, load_model, standing_qpos
-from ballu_mjx.sim.step import PhysicsState, balloon_id, control_step, count_substeps, make_data, put_model, state_at
+from ballu_mjx.sim.step import PhysicsState, control_step, count_substeps, make_data, put_model, state_at
 
 MAX_JOINT_SPEED = 100.0
 """rad/s"""
@@ -47,7 +47,7 @@ def main(
         environments, duration = 100, 5.0
         print("--quick: these numbers mean little")
     model = load_model()
-    substeps, bodies, devices = count_substeps(model), (balloon_id(model),), jax.device_count()
+    substeps, bodies, devices = count_substeps(model, CONTROL_TIMESTEP), (model.body("balloon").id,), jax.device_count()
     steps = round(duration / CONTROL_TIMESTEP)
     mjx_model = put_model(model)
     template = make_data(model)

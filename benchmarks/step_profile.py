@@ -49,6 +49,7 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
     import throughput
 
     from ballu_mjx.ballu.model import load_model, standing_qpos
+    from ballu_mjx.robots.registry import load_robot
     from ballu_mjx.sim.step import (
         PhysicsState,
         count_substeps,
@@ -64,7 +65,7 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
     if layout == C:
         commands = rng.integers(0, 2, (64, 40, 2)).astype(float)
         rates = throughput.rollout_rates(model, 1, 5, commands)
-        return {"whole": 1e6 / float(np.median(rates)) / count_substeps(model)}
+        return {"whole": 1e6 / float(np.median(rates)) / count_substeps(model, load_robot().control_timestep)}
 
     mjx_model, template = put_model(model), make_data(model)
     commands = jnp.asarray(rng.uniform(size=(batch, 2)), jnp.float32)

@@ -57,6 +57,7 @@ from ballu_mjx.identification.curves import curve_distances
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.model import assets, set_fields
+from ballu_mjx.robots.registry import load_robot
 
 THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 LEFT_OUT_EVERY = 4
@@ -384,7 +385,7 @@ def main() -> None:
 
 def measure(quick: bool) -> list[Row]:
     (path,) = list_bundled("suspended")
-    source = read_recording(path)
+    source = read_recording(path, load_robot())
     whole = read_sweep({path: source})
     everything = np.arange(len(whole.command))
     out = everything[LEFT_OUT_EVERY - 1 :: LEFT_OUT_EVERY]

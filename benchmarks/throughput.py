@@ -14,6 +14,8 @@ import argparse
 import time
 
 from ballu_mjx.common import runtime
+from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.simulator import Simulator
 
 runtime.prepare()
 
@@ -25,8 +27,8 @@ from jaxtyping import Float
 from mujoco import rollout
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.rl import learner, ppo
 from ballu_mjx.sim.step import count_substeps
@@ -65,7 +67,7 @@ def rollout_rates(
     model: mujoco.MjModel, threads: int, repeats: int, commands: Float[np.ndarray, "runs steps 2"]
 ) -> list[float]:
     """Control steps per second of C MuJoCo."""
-    count, (runs, steps, _) = count_substeps(model), commands.shape
+    count, (runs, steps, _) = count_substeps(model, CONTROL_TIMESTEP), commands.shape
     data = mujoco.MjData(model)
     data.qpos[:] = standing_qpos(model)
     state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
@@ -89,8 +91,8 @@ def main() -> None:
     repeats = 3 if arguments.quick else 10
 
     model = load_model()
-    motions = [reconstruct_ballu(read_recording(p), model) for p in list_bundled("training")]
-    env = EnvMimicEnv(model, motions, EnvMimicConfig())
+    motions = [reconstruct(read_recording(p, load_robot()), load_robot(), model) for p in list_bundled("training")]
+    env = EnvMimicEnv(Simulator(load_robot(), model=model), motions, EnvMimicConfig())
     config = ppo.PPOConfig(num_envs=arguments.num_envs)
     step_size = config.batch_size * config.num_minibatches * config.unroll_length
     config = ppo.PPOConfig(num_envs=arguments.num_envs, num_timesteps=(repeats + 1) * step_size)

@@ -115,25 +115,28 @@ def timeline(rows: list[dict[str, Any]], marks: dict[str, float], imported: floa
 def vanilla_ratio(folder: str) -> float:
     """A run's best validation error as a share of vanilla's, over its error as a share of its base's."""
     runtime.prepare()
-    from ballu_mjx.ballu.model import load_model
-    from ballu_mjx.ballu.reconstruct import reconstruct_ballu
     from ballu_mjx.evaluation.errors_table import Evaluation
     from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
     from ballu_mjx.recordings.csv_format import read_recording
+    from ballu_mjx.recordings.reconstruct import reconstruct
     from ballu_mjx.residuals.run_config import find_recordings
     from ballu_mjx.residuals.trained import TrainedResidual
+    from ballu_mjx.robots.registry import load_robot
     from ballu_mjx.runs.folder import read_config
+    from ballu_mjx.sim.simulator import Simulator
 
     path = Path(folder)
-    trained = TrainedResidual.load(path, "best")
-    recordings = [read_recording(each) for each in find_recordings(read_config(path, "envmimic"), "validation", path)]
+    robot = load_robot()
+    trained = TrainedResidual.load(path, robot)
+    paths = find_recordings(read_config(path, "envmimic"), "validation", path)
+    recordings = [read_recording(each, robot) for each in paths]
 
-    def evaluate(model: Any) -> Evaluation:
-        motions = [reconstruct_ballu(each, model) for each in recordings]
-        return OpenLoopEvaluator(model, motions, trained.model)(trained.params)
+    def evaluate(simulator: Simulator) -> Evaluation:
+        motions = [reconstruct(each, load_robot(), simulator.mj_model) for each in recordings]
+        return OpenLoopEvaluator(simulator, motions, trained.model)(trained.params)
 
-    best = evaluate(load_model(trained.actuators))
-    vanilla = best.vanilla if trained.actuators is None else evaluate(load_model()).vanilla
+    best = evaluate(Simulator(robot, trained.actuators))
+    vanilla = best.vanilla if trained.actuators is None else evaluate(Simulator(robot)).vanilla
     return dataclasses.replace(best, vanilla=vanilla).score / best.score
 
 

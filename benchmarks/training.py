@@ -84,9 +84,10 @@ def train_ours(launched: float, seed: int, steps: int, target: float, config: di
     """`python -m ballu_mjx.train walk` without its run folder; `config` is a `PPOConfig`."""
     runtime.prepare()
     from ballu_mjx.policies.locomotion_env import LocomotionConfig
-    from ballu_mjx.policies.policy import make_environment
+    from ballu_mjx.policies.policy import environment_of
     from ballu_mjx.policies.tasks import TASKS
     from ballu_mjx.rl import learner, ppo
+    from ballu_mjx.robots.registry import load_robot
 
     curve: Curve = []
 
@@ -96,7 +97,7 @@ def train_ours(launched: float, seed: int, steps: int, target: float, config: di
             if seconds_to(curve, target) is not None:
                 raise _ReachedError
 
-    env = make_environment(TASKS[TASK], LocomotionConfig(episode_seconds=EPISODE_SECONDS), None, None)
+    env = environment_of(load_robot(), TASKS[TASK], LocomotionConfig(episode_seconds=EPISODE_SECONDS))
     try:
         learner.train(env, dataclasses.replace(ppo.PPOConfig(**config), num_timesteps=steps, seed=seed), note)
     except _ReachedError:
@@ -287,9 +288,9 @@ def plot(path: Path, rows: list[dict[str, Any]], target: float, machine: str) ->
 
 def main(options: Options) -> None:
     runtime.prepare()
-    from ballu_mjx.cli import train_policy
+    from ballu_mjx.policies.training import locomotion_ppo
 
-    config = dataclasses.asdict(train_policy.defaults())
+    config = dataclasses.asdict(locomotion_ppo())
     if options.quick:
         options = dataclasses.replace(options, seeds=(0,), steps=21_000)
     counts = [len(common.cores()) * each for each in ((2,) if options.quick else (1, 2, 4))]

@@ -10,27 +10,32 @@ from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-_OUTSIDE = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "benchmarks/README.md": "benchmarks.md"}
+_OUTSIDE = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+    "benchmarks/README.md": "benchmarks.md",
+}
+_LINKED = ("CITATION.cff", "LICENSE")
+"""No pages, but linked to from the README."""
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add README, CONTRIBUTING and the benchmarks' README, their links as seen from docs/."""
+    """Add the pages that stand outside of docs/, and what the README links to."""
     root = Path(config.config_file_path).parent
     for source, page in _OUTSIDE.items():
-        text = (root / source).read_text(encoding="utf-8").replace("](docs/", "](")
-        for other, its_page in _OUTSIDE.items():
-            text = text.replace(f"]({other})", f"]({its_page})")
-        files.append(File.generated(config, page, content=text))
-    # No page, but linked to from the README.
-    files.append(File.generated(config, "CITATION.cff", abs_src_path=str(root / "CITATION.cff")))
+        files.append(File.generated(config, page, content=(root / source).read_text(encoding="utf-8")))
+    for name in _LINKED:
+        files.append(File.generated(config, name, abs_src_path=str(root / name)))
     return files
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
-    """Links to what stands outside of docs/, as written for GitHub."""
-    for other, its_page in _OUTSIDE.items():
-        markdown = markdown.replace(f"](../{other})", f"]({its_page})")
+    """Turn links that are written for GitHub into links as seen from docs/."""
+    markdown = re.sub(r"\]\((?:\.\./)?docs/", "](", markdown)
+    for source, page in _OUTSIDE.items():
+        markdown = re.sub(rf"\]\((?:\.\./)?{re.escape(source)}(#[^)]*)?\)", rf"]({page}\1)", markdown)
     return markdown
 
 

@@ -25,21 +25,21 @@ runtime.prepare()
 
 import bundled_recordings
 import jax
-import mujoco
 import numpy as np
 
 from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
-from ballu_mjx.ballu.model import load_model
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.residuals.network import NetworkForces
 from ballu_mjx.rl import learner, ppo
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.model import assets
+from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.simulator import Simulator
 
 # %% [markdown]
 # ## The rows
@@ -88,15 +88,17 @@ class Sizes:
 
 
 def train(
-    row: Row, seed: int, sizes: Sizes, model: mujoco.MjModel, motions: Mapping[str, Sequence[Motion]]
+    row: Row, seed: int, sizes: Sizes, simulator: Simulator, motions: Mapping[str, Sequence[Motion]]
 ) -> list[dict[str, Any]]:
     """Validations of one training: step, score, and the ratios to the simulator without forces by group, quantity and
     horizon."""
     env_config = EnvMimicConfig(**row.env)
     ppo_config = PPOConfig(**{**sizes.ppo, "num_timesteps": sizes.steps, "seed": seed, **row.ppo})
-    env = EnvMimicEnv(model, motions["training"], env_config)
-    forces = NetworkForces(env_config, ppo.make_inference(env.observation_size, env.action_size, ppo_config))
-    evaluator = OpenLoopEvaluator(model, motions["validation"], forces)
+    env = EnvMimicEnv(simulator, motions["training"], env_config)
+    forces = NetworkForces(
+        env_config, simulator.robot, ppo.make_inference(env.observation_size, env.action_size, ppo_config)
+    )
+    evaluator = OpenLoopEvaluator(simulator, motions["validation"], forces)
     last = learner.total_timesteps(ppo_config)
     history: list[dict[str, Any]] = []
     due = sizes.validate_every
@@ -163,9 +165,12 @@ def main() -> None:
         sizes = Sizes(20_000, 20_000, {"num_envs": 256, "batch_size": 128})
     validation = bundled_recordings.fresh(options.fresh, options.output, 1 if options.quick else 6)
     _, identified = read_actuators(assets() / "recordings" / ACTUATORS_FILE)
-    model = load_model(identified)
+    simulator = Simulator(load_robot(), identified)
     read = {"training": training, "validation": validation}
-    motions = {use: [reconstruct_ballu(read_recording(path), model) for path in paths] for use, paths in read.items()}
+    motions = {
+        use: [reconstruct(read_recording(path, load_robot()), load_robot(), simulator.mj_model) for path in paths]
+        for use, paths in read.items()
+    }
     options.output.mkdir(parents=True, exist_ok=True)
     results: dict[str, list[list[dict[str, Any]]]] = {}
     for seed in seeds:
@@ -173,7 +178,7 @@ def main() -> None:
             path = options.output / f"{list(ROWS).index(label):02d}-seed-{seed}.json"
             if not path.exists():
                 started = time.perf_counter()
-                history = train(ROWS[label], seed, sizes, model, motions)
+                history = train(ROWS[label], seed, sizes, simulator, motions)
                 path.write_text(json.dumps({"row": label, "seed": seed, "validations": history}, indent=1) + "\n")
                 jax.clear_caches()  # a dozen trainings' programs are more than a process may map
                 seconds = time.perf_counter() - started

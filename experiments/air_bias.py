@@ -27,6 +27,8 @@ import argparse
 import dataclasses
 
 from ballu_mjx.common import runtime
+from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.simulator import Simulator
 
 runtime.prepare()
 
@@ -35,9 +37,9 @@ import deflation
 
 from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
 from ballu_mjx.ballu.model import buoyancy_ratio, load_model
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.cli import train_aerodynamics
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.robots.model import assets
 
@@ -73,8 +75,8 @@ def main() -> None:
         legs = dataclasses.replace(full, **changes)
         folder = options.output / name.replace(" ", "-")
         gaits = [deflation.recorded(job, legs, 2000 + number, folder) for number, job in enumerate(training)]
-        motions = [reconstruct_ballu(gait, model) for gait in gaits]
-        fit = identify_air(model, motions, config)
+        motions = [reconstruct(gait, load_robot(), model) for gait in gaits]
+        fit = identify_air(Simulator(load_robot(), model=model), motions, config)
         air, error = fit.parameters, fit.standard_errors
         lines.append(
             f"| {name} | {float(air.lift) * 1e3:.0f} ({float(error.lift) * 1e3:.0f}) | "

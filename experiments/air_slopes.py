@@ -29,6 +29,7 @@ import argparse
 import dataclasses
 
 from ballu_mjx.common import runtime
+from ballu_mjx.robots.registry import load_robot
 
 runtime.prepare()
 
@@ -40,13 +41,13 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ballu_mjx.ballu.model import load_model
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.segments import Segments, pseudo_huber
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirWindows
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.sim.sharding import shard_over_devices
+from ballu_mjx.sim.simulator import Simulator
 
 STEPS = (0.1e-3, 1e-3, 3e-3, 10e-3, 30e-3, 100e-3)
 """Of the lift (N)."""
@@ -107,19 +108,20 @@ def slopes(simulated: AirWindows, known: Float[np.ndarray, " parameters"], lift:
 # %%
 def main() -> None:
     parser = argparse.ArgumentParser(description="Derivatives and differences of windows of motion, by the lift.")
-    parser.add_argument("--air", type=Path, required=True, help="run of `train residual`, before the loss")
+    parser.add_argument("--air", type=Path, required=True, help="run of `train aerodynamic`, before the loss")
     parser.add_argument("--output", type=Path, default=Path("runs/air-slopes"), help="folder of the table and figure")
     parser.add_argument("--quick", action="store_true", help="windows of half a second alone")
     options = parser.parse_args()
 
-    known = TrainedResidual.load(options.air)
-    model = load_model(known.actuators)
+    known = TrainedResidual.load(options.air, load_robot())
+    simulator = Simulator(load_robot(), known.actuators)
+    model = simulator.mj_model
     full = virtual_robot.draw_robot(0)
     deflated = dataclasses.replace(full, buoyancy=full.buoyancy * (1 - LOSS))
     lost = deflation.lift(LOSS * full.buoyancy)
     gait = next(job for job in bundled_recordings.jobs() if job.split == "training")
     recorded = deflation.recorded(gait, deflated, 2000, options.output / "recordings")
-    motions = [reconstruct_ballu(recorded, model)]
+    motions = [reconstruct(recorded, load_robot(), model)]
     # At a whole delay, where errors can be differentiated.
     timestep = float(model.opt.timestep)
     delay = np.round(float(known.params.delay) / timestep) * timestep
@@ -134,7 +136,7 @@ def main() -> None:
     figure, axes = plt.subplots(1, len(lengths), figsize=(3.6 * len(lengths), 3.2), layout="constrained", squeeze=False)
     for length, axis in zip(lengths, axes[0], strict=True):
         config = AirConfig(window_seconds=length, interval_seconds=1.0)
-        found = slopes(AirWindows(model, motions, config), np.asarray(vector, np.float64), lift, lost)
+        found = slopes(AirWindows(simulator, motions, config), np.asarray(vector, np.float64), lift, lost)
         same = [float(np.median(cosines(found.derivative, found.differences[step]))) for step in STEPS]
         smooth = np.linalg.norm(found.differences[30e-3], axis=1)
         ratio = np.median(np.linalg.norm(found.derivative, axis=1) / smooth)

@@ -20,6 +20,7 @@ from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.recordings.csv_format import write_recording
 from ballu_mjx.robots.model import assets
+from ballu_mjx.robots.registry import load_robot
 
 ROBOT_SEED = 0
 DECIMALS = 4
@@ -135,7 +136,7 @@ def make(job: Job, robot_seed: int, output: Path) -> Path:
     )
     path = output / job.split / f"{job.name}.csv.gz"
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_recording(recording, path, decimals=DECIMALS)
+    write_recording(recording, path, load_robot(), decimals=DECIMALS)
     return path
 
 
@@ -153,7 +154,7 @@ def data_set(robot_seed: int, folder: Path) -> list[Path]:
     sweep = folder / "suspended" / "sweep.csv.gz"
     sweep.parent.mkdir(parents=True, exist_ok=True)
     suspended = virtual_robot.record_sweep(virtual_robot.draw_robot(robot_seed), seed=robot_seed, name="sweep")
-    write_recording(suspended, sweep, decimals=DECIMALS)
+    write_recording(suspended, sweep, load_robot(), decimals=DECIMALS)
     return [*paths, sweep]
 
 

@@ -32,6 +32,7 @@ import time
 from collections.abc import Sequence
 
 from ballu_mjx.common import runtime
+from ballu_mjx.robots.registry import load_robot
 
 runtime.prepare()
 
@@ -41,7 +42,6 @@ import numpy as np
 from bundled_recordings import Job
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.cli import train_aerodynamics
@@ -49,9 +49,11 @@ from ballu_mjx.evaluation.errors_table import Evaluation, base_name
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.sim.simulator import Simulator
 
 # %% [markdown]
 # ## Recordings: the same commands, with all of the lift and with less
@@ -70,8 +72,8 @@ def recorded(job: Job, virtual: VirtualRobot, trial: int, folder: Path) -> Recor
     )
     path = folder / job.split / f"{job.name}.csv.gz"
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_recording(taken, path)
-    return read_recording(path)  # which fills the gaps of hidden markers
+    write_recording(taken, path, load_robot())
+    return read_recording(path, load_robot())  # which fills the gaps of hidden markers
 
 
 def lift(buoyancy: float) -> float:
@@ -99,7 +101,7 @@ def row(label: str, result: Evaluation) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Lost lift, found again from one recording.")
-    parser.add_argument("--air", type=Path, help="run of `train residual`; without it, one is made")
+    parser.add_argument("--air", type=Path, help="run of `train aerodynamic`; without it, one is made")
     parser.add_argument("--loss", type=float, default=0.05, help="share of the lift that is lost")
     parser.add_argument("--anew", action="store_true", help="also identify all of the air anew: ten minutes more")
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the larger test set")
@@ -110,9 +112,10 @@ def main() -> None:
     air = options.air
     if air is None:
         air = options.output / "aerodynamic"
-        fidelity.train(air, "residual", "--method", "aerodynamic", *(["--quick"] if options.quick else []))
-    known = TrainedResidual.load(air)
-    model = load_model(known.actuators)
+        fidelity.train(air, "aerodynamic", *(["--quick"] if options.quick else []))
+    known = TrainedResidual.load(air, load_robot())
+    simulator = Simulator(load_robot(), known.actuators)
+    model = simulator.mj_model
     full = virtual_robot.draw_robot(0)
     deflated = dataclasses.replace(full, buoyancy=full.buoyancy * (1 - options.loss))
     bundled = bundled_recordings.jobs()
@@ -121,7 +124,7 @@ def main() -> None:
     def motions(virtual: VirtualRobot, jobs: Sequence[Job], first: int, name: str) -> list[Motion]:
         folder = options.output / name
         recordings = [recorded(job, virtual, first + number, folder) for number, job in enumerate(jobs)]
-        return [reconstruct_ballu(each, model) for each in recordings]
+        return [reconstruct(each, load_robot(), model) for each in recordings]
 
     tests = tests[:1] if options.quick else tests
     before, after = motions(full, tests, 1000, "before"), motions(deflated, tests, 1000, "after")
@@ -131,18 +134,18 @@ def main() -> None:
     seconds = []
     for _ in range(2):  # the first compiles
         started = time.perf_counter()
-        fit = identify_air(model, one, AirConfig(), known=known.params, free=("lift",))
+        fit = identify_air(simulator, one, AirConfig(), fixed_from=known.params, free=("lift",))
         seconds.append(time.perf_counter() - started)
 
-    sound = OpenLoopEvaluator(model, before, known.model, base_name(True))(known.params)
-    evaluator = OpenLoopEvaluator(model, after, known.model, base_name(True))
+    sound = OpenLoopEvaluator(simulator, before, known.model, base_name(True))(known.params)
+    evaluator = OpenLoopEvaluator(simulator, after, known.model, base_name(True))
     rows = [
         row("all of the lift", sound),
         row(f"{options.loss:.0%} less, lift as it was", evaluator(known.params)),
         row(f"{options.loss:.0%} less, lift from one recording", evaluator(fit.parameters)),
     ]
     if options.anew:
-        anew = identify_air(model, every, AirConfig(**train_aerodynamics.QUICK if options.quick else {}))
+        anew = identify_air(simulator, every, AirConfig(**train_aerodynamics.QUICK if options.quick else {}))
         rows.append(
             row(f"{options.loss:.0%} less, all of the air, {len(every)} recordings", evaluator(anew.parameters))
         )

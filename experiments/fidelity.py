@@ -36,6 +36,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 from ballu_mjx.common import runtime
+from ballu_mjx.robots.registry import load_robot
 
 runtime.prepare()
 
@@ -44,24 +45,27 @@ import numpy as np
 from bundled_recordings import Job
 from jaxtyping import Float
 
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.evaluation.errors_table import (
     HORIZONS,
     SCORE_HORIZONS,
     Errors,
     Evaluation,
     mean_by_group,
+    quotient,
     read_evaluation,
 )
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+from ballu_mjx.recordings.groups import OTHER
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.robots.model import assets
 from ballu_mjx.runs.checkpoints import list_checkpoints
 from ballu_mjx.runs.metrics import read_column
+from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.viz import plots
 
 # %% [markdown]
@@ -89,17 +93,17 @@ METHODS = {
     "identified": Method("EnvMimic", ("envmimic",)),
     "wrench": Method("EnvMimic, wrench", ("envmimic", "--forces", "wrench")),
     "multi": Method("EnvMimic, forces at balloon, base and feet", ("envmimic", "--forces", "multi")),
-    "regression": Method("supervised, all of its forces", ("residual", "--method", "supervised", "--shares", "1")),
-    "supervised": Method("supervised", ("residual", "--method", "supervised")),
-    "analytic": Method("analytic", ("residual", "--method", "analytic")),
-    "analytic-wrench": Method("analytic, wrench", ("residual", "--method", "analytic", "--forces", "wrench")),
-    AIR: Method("aerodynamic", ("residual", "--method", "aerodynamic"), seeded=False),
+    "regression": Method("supervised, all of its forces", ("supervised", "--force-scales", "1")),
+    "supervised": Method("supervised", ("supervised",)),
+    "analytic": Method("analytic", ("analytic",)),
+    "analytic-wrench": Method("analytic, wrench", ("analytic", "--forces", "wrench")),
+    AIR: Method("aerodynamic", ("aerodynamic",), seeded=False),
     "air-lift": Method(
         "aerodynamic, the model's lift",
-        ("residual", "--method", "aerodynamic", "--free", *(name for name in AIR_PARAMETERS if name != "lift")),
+        ("aerodynamic", "--free", *(name for name in AIR_PARAMETERS if name != "lift")),
         seeded=False,
     ),
-    "air-analytic": Method("aerodynamic+analytic", ("residual", "--method", "analytic"), beside_air=True),
+    "air-analytic": Method("aerodynamic+analytic", ("analytic",), beside_air=True),
     "air-envmimic": Method("aerodynamic+EnvMimic", ("envmimic",), beside_air=True),
 }
 
@@ -200,21 +204,22 @@ def replayed_policy(options: Options) -> Path:
 
 def simulator(kind: TrainedResidual, paths: list[Path], *, nominal: bool = False) -> OpenLoopEvaluator:
     """Recordings, for the residuals of a kind on its own actuators, or on nominal ones."""
-    model = load_model(None if nominal else kind.actuators)
-    motions = [reconstruct_ballu(read_recording(path), model) for path in paths]
-    return OpenLoopEvaluator(model, motions, kind.model)
+    plain = Simulator(load_robot(), None if nominal else kind.actuators)
+    motions = [reconstruct(read_recording(path, load_robot()), load_robot(), plain.mj_model) for path in paths]
+    return OpenLoopEvaluator(plain, motions, kind.model)
 
 
 def evaluate(folders: list[Path], paths: list[Path]) -> list[Evaluation]:
     """Runs of the same configuration and actuators, on other recordings than their own."""
-    policies = [TrainedResidual.load(folder) for folder in folders]
+    robot = load_robot()
+    policies = [TrainedResidual.load(folder, robot) for folder in folders]
     evaluator = simulator(policies[0], paths)
     return [evaluator(policy.params) for policy in policies]
 
 
 def vanilla_errors(folder: Path, paths: list[Path]) -> tuple[Errors, ...]:
     """Of the nominal robot without residual. `folder` is any residual's run: none of it acts."""
-    kind = TrainedResidual.load(folder)
+    kind = TrainedResidual.load(folder, load_robot())
     evaluator = simulator(kind, paths, nominal=True)
     return evaluator.errors(evaluator.replay(kind.params, scale=0.0))
 
@@ -253,13 +258,14 @@ def groups_of(rows: Rows) -> list[str]:
 
 def comparison(rows: Rows, effort: Mapping[str, str], horizon: float) -> str:
     """Markdown: what simulators leave of vanilla's RMSE over `horizon` s, the range of that over seeds, and `effort`,
-    what learning took. In vanilla's row stand its errors themselves; the least of a column is bold."""
+    what learning took. In vanilla's row stand its errors themselves; the least of a column is bold, unless there is one
+    seed alone, which ranks nothing."""
     columns = [(group, quantity) for group in groups_of(rows) for quantity in ("position", "yaw")]
 
     def mean(run: Sequence[Errors], group: str, quantity: str) -> float:
         return float(np.mean([getattr(e, quantity)[horizon][0] for e in run if e.group == group]))
 
-    head = [quantity if group == "all" else f"{group}: {quantity}" for group, quantity in columns]
+    head = [quantity if group == OTHER else f"{group}: {quantity}" for group, quantity in columns]
     lines = [
         f"| {horizon:g} s | " + " | ".join(head) + " | learning (s) | thousand control steps |",
         "| --- " + "| ---: " * (2 + len(head)) + "|",
@@ -268,13 +274,15 @@ def comparison(rows: Rows, effort: Mapping[str, str], horizon: float) -> str:
     errors = [f"{whole[c]:.3f} m" if c[1] == "position" else f"{whole[c]:.1f} deg" for c in columns]
     lines.append("| vanilla | " + " | ".join(errors) + " | | |")
     left = {
-        row: [[mean(run, *column) / whole[column] for run in runs] for column in columns]
+        row: [[quotient(mean(run, *column), whole[column]) for run in runs] for column in columns]
         for row, runs in rows.items()
         if row != "vanilla"
     }
     least = [min(np.mean(cells[place]) for cells in left.values()) for place in range(len(columns))]
+    ranked = max(map(len, rows.values())) > 1
     for row, cells in left.items():
-        said = [f"**{ratios(c)}**" if np.mean(c) == low else ratios(c) for c, low in zip(cells, least, strict=True)]
+        best = [ranked and np.mean(c) == low for c, low in zip(cells, least, strict=True)]
+        said = [f"**{ratios(c)}**" if bold else ratios(c) for c, bold in zip(cells, best, strict=True)]
         lines.append(f"| {row} | " + " | ".join([*said, effort.get(row, " | ")]) + " |")
     return "\n".join(lines)
 
@@ -354,7 +362,10 @@ DRAWN = ("regression", "identified", "analytic", AIR)
 
 def figure(folders: Mapping[str, list[Path]], paths: list[Path], path: Path) -> None:
     """Replay recordings in every simulator, with every seed's forces."""
-    found = {name: [TrainedResidual.load(folder) for folder in folders[name]] for name in DRAWN if name in folders}
+    robot = load_robot()
+    found = {
+        name: [TrainedResidual.load(folder, robot) for folder in folders[name]] for name in DRAWN if name in folders
+    }
     evaluators = {name: simulator(kinds[0], paths) for name, kinds in found.items()}
     curves = {
         kinds[0].model.name: [evaluators[name].replay(kind.params) for kind in kinds] for name, kinds in found.items()

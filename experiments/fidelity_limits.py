@@ -44,11 +44,12 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.evaluation.open_loop import START_INTERVAL
 from ballu_mjx.recordings.groups import group_of
+from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.robots.registry import load_robot
 
 HORIZON = 5.0
 """Seconds from each start."""
@@ -127,7 +128,7 @@ def errors(virtual: VirtualRobot, job: Job) -> tuple[str, Float[np.ndarray, "var
     trial = virtual_robot.draw_trial(job.trial)
     with tempfile.TemporaryDirectory() as folder:
         recorded = deflation.recorded(job, virtual, job.trial, Path(folder))
-    motion = reconstruct_ballu(recorded, load_model(virtual.actuators))
+    motion = reconstruct(recorded, load_robot(), load_model(virtual.actuators))
     steps, interval = (round(s / CONTROL_TIMESTEP) for s in (HORIZON, START_INTERVAL))
     starts = range(2, len(job.commands) - steps + 1, interval)
     nominal = load_model()

@@ -6,7 +6,7 @@
 # the validation recordings, with true states instead of motion capture's. The force that explains *these* is what the
 # network should have said.
 #
-# `python experiments/force_labels.py RUN [RUN ...]`, of `train residual --method supervised` on the bundled recordings,
+# `python experiments/force_labels.py RUN [RUN ...]`, of `train supervised` on the bundled recordings,
 # takes two minutes. The table is in docs/fidelity.md, beside what the same networks do in open loop.
 
 # %%
@@ -38,11 +38,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.supervised import ForceLabeller, SupervisedConfig
 from ballu_mjx.residuals.trained import TrainedResidual
@@ -129,16 +129,17 @@ def figure(shown: dict[str, np.ndarray], title: str, path: Path, seconds: float 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Are the forces that regression finds the right ones?")
-    parser.add_argument("runs", type=Path, nargs="+", help="of train residual --method supervised")
+    parser.add_argument("runs", type=Path, nargs="+", help="of train supervised")
     parser.add_argument("--output", type=Path, default=Path("runs/force_labels"), help="folder of table and figure")
     arguments = parser.parse_args()
-    networks = {folder.name: TrainedResidual.load(folder) for folder in arguments.runs}
+    networks = {folder.name: TrainedResidual.load(folder, load_robot()) for folder in arguments.runs}
     first = next(iter(networks.values()))
-    model, robot = load_model(first.actuators), load_robot()
+    robot = load_robot()
     config = typed_config(SupervisedConfig, read_config(arguments.runs[0], "supervised"), "fit", arguments.runs[0])
-    simulator, linearize = Simulator(model), Linearizer(model, joints=robot.joints)
-    label = ForceLabeller(model, robot, linearize, config)
-    label_well = ForceLabeller(model, robot, linearize, dataclasses.replace(config, **SEEN_WELL))
+    simulator = Simulator(robot, first.actuators)
+    linearize = Linearizer(simulator, joints=robot.joints)
+    label = ForceLabeller(linearize, config)
+    label_well = ForceLabeller(linearize, dataclasses.replace(config, **SEEN_WELL))
 
     recordings = {path.name: path for path in list_recordings([assets() / "recordings" / "validation"])}
     true, labels, twins = {}, {}, {}
@@ -146,8 +147,8 @@ def main() -> None:
         if job.split == "validation":
             twins[job.name] = twin(job)
             true[job.name] = label_well(twins[job.name])[HISTORY - 1 :]
-            seen = read_recording(recordings[f"{job.name}.csv.gz"])
-            labels[job.name] = label(reconstruct_ballu(seen, model))[HISTORY - 1 :]
+            seen = read_recording(recordings[f"{job.name}.csv.gz"], load_robot())
+            labels[job.name] = label(reconstruct(seen, load_robot(), simulator.mj_model))[HISTORY - 1 :]
             print(f"{job.name}: true forces {1e3 * rms(true[job.name]):.0f} mN (RMS along an axis)", flush=True)
     lines = ["| error over that of no force | near | x, y, z | far | x, y, z |", "| --- " * 5 + "|"]
     lines.append(row("labels from motion capture", labels, true))

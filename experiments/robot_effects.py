@@ -28,6 +28,7 @@ from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.ballu.virtual.trials import run_trials
 from ballu_mjx.cli import pipeline
+from ballu_mjx.evaluation import story_layout
 from ballu_mjx.evaluation.transfer import Transfer
 from ballu_mjx.policies.policy import Policy
 
@@ -129,14 +130,14 @@ def table(results: dict[str, dict[str, list[Transfer]]], quantity: str, label: s
 def main() -> None:
     parser = argparse.ArgumentParser(description="Which of the virtual robot's effects cost a policy its way.")
     parser.add_argument("--output", type=Path, default=Path("runs/all"), help="folder of `train all`")
-    parser.add_argument("--robot", type=int, default=0, help="the robot that `train all` ran on")
+    parser.add_argument("--robot-seed", type=int, default=0, help="the robot that `train all` ran on")
     parser.add_argument("--seed", type=int, default=0, help="whose policies")
     parser.add_argument("--task", default="walk", choices=("walk", "turn"))
-    parser.add_argument("--settings", nargs="+", default=list(pipeline.SETTINGS), choices=pipeline.SETTINGS)
+    parser.add_argument("--settings", nargs="+", default=list(story_layout.SETTINGS), choices=story_layout.SETTINGS)
     parser.add_argument("--trials", type=int, default=3, help="trials of each policy on each robot")
     arguments = parser.parse_args()
-    story = pipeline.Story(pipeline.Options(output=arguments.output, robot=arguments.robot), arguments.seed)
-    robots = variants(virtual_robot.draw_robot(arguments.robot))
+    story = pipeline.Story(pipeline.Options(output=arguments.output, robot_seed=arguments.robot_seed), arguments.seed)
+    robots = variants(virtual_robot.draw_robot(arguments.robot_seed))
     folder = arguments.output / f"effects-{arguments.task}-seed-{arguments.seed}"
     results = {}
     for setting in arguments.settings:

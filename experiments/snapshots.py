@@ -46,11 +46,12 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
-from ballu_mjx.cli import pipeline
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.evaluation import story_layout
 from ballu_mjx.recordings.csv_format import read_recording
-from ballu_mjx.viz.style import LABELS
+from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.viz.style import colour_of, label_of
 
 TIMES = {"walk": (0.0, 5.0, 11.0, 16.0, 24.0), "turn": (0.0, 4.0, 10.0, 18.0, 22.0)}
 """When the paper's pictures were taken (s)."""
@@ -102,7 +103,7 @@ def read_trial(run: Path, task: str, setting: str, seed: int, trial: int, until:
             f"{task} --seeds {seed}`, or name one that is there by --run, --tasks, --settings, --seed and --trial."
         )
     model = load_model()
-    motion = reconstruct_ballu(read_recording(path), model)
+    motion = reconstruct(read_recording(path, load_robot()), load_robot(), model)
     if motion.time[-1] < until - 0.5:
         raise InputError(f"{path}: ends at {motion.time[-1]:.1f} s, before {until:g} s; name earlier --times.")
     data = mujoco.MjData(model)
@@ -178,7 +179,7 @@ def draw(trials: Sequence[Shown], times: Sequence[float], view: tuple[float, flo
     figure = Figure(figsize=(size[0], size[1]))
     for row, trial in enumerate(trials):
         corner = np.array([0.4, size[1] - cell[1] * (row + 1)])
-        label, colour = LABELS[trial.setting], COLOURS[trial.setting]
+        label, colour = label_of(trial.setting), colour_of(trial.setting)
         middle = (corner[1] + (cell[1] - 0.5) / 2) / size[1]
         figure.text(
             0.2 / size[0], middle, label, rotation=90, ha="center", va="center", color=colour, size=13, weight="bold"
@@ -260,7 +261,11 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--run", type=Path, default=Path("runs/all"), help="folder of `train all` (runs/all)")
     parser.add_argument("--tasks", nargs="+", choices=list(TIMES), default=list(TIMES), help="a figure each (both)")
     parser.add_argument(
-        "--settings", nargs="+", choices=pipeline.SETTINGS, default=list(SETTINGS), help="a row each (the paper's two)"
+        "--settings",
+        nargs="+",
+        choices=story_layout.SETTINGS,
+        default=list(SETTINGS),
+        help="a row each (the paper's two)",
     )
     parser.add_argument("--seed", type=int, default=0, help="which training (0)")
     parser.add_argument("--trial", type=int, default=1, help="which trial of it (1, the first)")

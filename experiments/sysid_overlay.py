@@ -39,7 +39,7 @@ from matplotlib.figure import Figure
 from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
 from ballu_mjx.ballu.model import KNEES, MOTORS, SIDES, load_model, standing_qpos
 from ballu_mjx.robots.model import assets
-from ballu_mjx.viz.style import COLOURS, LABELS
+from ballu_mjx.viz.style import colour_of, label_of
 
 PERIODS = (0.8, 1.0, 1.2, 1.4, 1.6)
 """Seconds; the legs half a period apart, each at full command for 0.4 of it."""
@@ -98,15 +98,15 @@ def draw(models: dict[str, mujoco.MjModel], period: float, path: Path) -> None:
         data = mujoco.MjData(model)
         data.qpos[:] = qpos[-1]
         mujoco.mj_kinematics(model, data)
-        colour = COLOURS[name]
+        colour = colour_of(name)
         for leg, style in zip(SIDES, ("-", "--"), strict=True):
             points = [data.body("base").xpos, data.body(f"tibia_{leg}").xpos, data.site(f"foot_{leg}").xpos]
-            label = f"{LABELS[name]}, {leg} leg"
+            label = f"{label_of(name)}, {leg} leg"
             side.plot(*np.array(points)[:, [0, 2]].T, style, color=colour, linewidth=2, marker="o", label=label)
         neck, balloon = data.body("base").xpos, data.site("balloon").xpos
         side.plot(*np.array([neck, balloon])[:, [0, 2]].T, ":", color=colour)
         side.plot(balloon[0], balloon[2], "o", markersize=22, color=colour, alpha=0.3)
-        above.plot(*(com - com[0])[:, :2].T, color=colour, label=LABELS[name])
+        above.plot(*(com - com[0])[:, :2].T, color=colour, label=label_of(name))
     side.axhline(0, color="grey", linewidth=0.8)
     for axis, title, second in ((side, f"after {SECONDS:g} s, from the side", "z (m)"), (above, "from above", "y (m)")):
         axis.set(title=title, xlabel="x (m)", ylabel=second)

@@ -10,8 +10,8 @@
 #
 # The paper's robot is real, its numbers are one policy's each, and its yaw errors are signed. Here a virtual robot
 # stands in for it, every policy is trained with several seeds and tried five times, each time in another draught;
-# numbers are means (of the error: of its absolute value, for errors to either side cancel) with the 95 % interval of a
-# bootstrap over seeds and trials, beside the paper's.
+# numbers are means (of the error: of its absolute value, for errors to either side cancel) with the 95 %
+# confidence interval over seeds (Student's t), beside the paper's.
 #
 # `python experiments/table_turning.py` makes the stages of `python -m ballu_mjx.train all` that it needs; those that
 # are there are found again. This takes hours on two cores. Stages made with other options than the defaults of
@@ -42,6 +42,7 @@ import transfer_figure
 
 from ballu_mjx.cli import pipeline
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.evaluation import story_layout
 
 # %% [markdown]
 # ## The table
@@ -54,7 +55,7 @@ from ballu_mjx.common.errors import InputError
 def table(options: pipeline.Options) -> Path:
     """Run what is missing, print the table; the file that holds it."""
     pipeline.run(options)
-    return pipeline.table_file(options.output, "turn")
+    return story_layout.table_file(options.output, "turn")
 
 
 # %% [markdown]

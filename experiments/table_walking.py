@@ -9,7 +9,7 @@
 #
 # The paper's robot is real and its numbers are one policy's each. Here a virtual robot stands in for it, every policy
 # is trained with several seeds and tried five times, each time in another draught; numbers are means with the 95 %
-# interval of a bootstrap over seeds and trials, beside the paper's.
+# confidence interval over seeds (Student's t), beside the paper's.
 #
 # `python experiments/table_walking.py` makes the stages of `python -m ballu_mjx.train all` that it needs; those that
 # are there are found again. This takes hours on two cores. Stages made with other options than the defaults of
@@ -40,6 +40,7 @@ import transfer_figure
 
 from ballu_mjx.cli import pipeline
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.evaluation import story_layout
 
 # %% [markdown]
 # ## The table
@@ -52,7 +53,7 @@ from ballu_mjx.common.errors import InputError
 def table(options: pipeline.Options) -> Path:
     """Run what is missing, print the table; the file that holds it."""
     pipeline.run(options)
-    return pipeline.table_file(options.output, "walk")
+    return story_layout.table_file(options.output, "walk")
 
 
 # %% [markdown]

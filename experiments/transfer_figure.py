@@ -12,9 +12,12 @@ from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from ballu_mjx.ballu.recordings import base_position
 from ballu_mjx.cli import pipeline
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.evaluation import story_layout
 from ballu_mjx.recordings.csv_format import read_recording
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.viz.style import colour_of, label_of
 
 OUTPUT, QUICK_OUTPUT = Path("runs/all"), Path("runs/all-quick")
@@ -30,7 +33,7 @@ def options(description: str, task: str) -> tuple[pipeline.Options, bool]:
     """The command line of a table's script, and whether nothing but the figure is asked for."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="trainings of every policy (0 1 2)")
-    parser.add_argument("--robot", type=int, default=0, help="which virtual robot stands in for the hardware (0)")
+    parser.add_argument("--robot-seed", type=int, default=0, help="which virtual robot stands in for the hardware (0)")
     parser.add_argument(
         "--output", type=Path, help=f"folder of `train all`'s stages ({OUTPUT}, or {QUICK_OUTPUT} under --quick)"
     )
@@ -38,7 +41,7 @@ def options(description: str, task: str) -> tuple[pipeline.Options, bool]:
     parser.add_argument(
         "--also",
         nargs="+",
-        choices=pipeline.MORE_SETTINGS,
+        choices=story_layout.MORE_SETTINGS,
         default=[],
         help="further simulators; see `train all --help` (none)",
     )
@@ -48,7 +51,7 @@ def options(description: str, task: str) -> tuple[pipeline.Options, bool]:
     output = given.output or (QUICK_OUTPUT if given.quick else OUTPUT)
     chosen = pipeline.Options(
         output=output,
-        robot=given.robot,
+        robot_seed=given.robot_seed,
         seeds=tuple(given.seeds),
         tasks=(task,),  # pyright: ignore[reportArgumentType]  # a literal at every call
         quick=given.quick,
@@ -64,7 +67,7 @@ def read_ways(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[l
     **Raises** `InputError` where `folder` holds no such trials.
     """
     found = {}
-    for setting in (*pipeline.SETTINGS, *pipeline.settings_beyond(folder / f"seed-{seeds[0]}", task)):
+    for setting in (*story_layout.SETTINGS, *story_layout.settings_beyond(folder / f"seed-{seeds[0]}", task)):
         trials = [folder / f"seed-{seed}" / f"trials-{task}-{setting}" for seed in seeds]
         if all(_finished(trial) for trial in trials):
             found[setting] = [[_way(path) for path in sorted(trial.glob("trial-*.csv.gz"))] for trial in trials]
@@ -84,7 +87,7 @@ def _finished(trials: Path) -> bool:
 
 
 def _way(path: Path) -> Way:
-    base = read_recording(path).base_position
+    base = base_position(read_recording(path, load_robot()))
     if base is None:  # only in suspended recordings
         raise InputError(f"{path}: has no base position; it is no recording of a trial, take it out of the folder.")
     return base[:, :2] - base[0, :2]

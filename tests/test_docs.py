@@ -1,14 +1,29 @@
-"""The pages leave nothing out; `mkdocs build --strict` finds what they name in vain."""
+"""README and docs leave nothing out, name what there is, and are short. `mkdocs build --strict` checks their links."""
 
+import ast
 import pkgutil
 import re
 from pathlib import Path
 
-import ballu_mjx
+import prose  # pyright: ignore[reportMissingImports]  # docs/, on pytest's path
+import pytest
 
-API = Path(__file__).parents[1] / "docs" / "api"
+import ballu_mjx
+from ballu_mjx.__main__ import NAMES
+from ballu_mjx.cli import completion, record
+
+ROOT = Path(__file__).parents[1]
+API = ROOT / "docs" / "api"
 PROGRAMS = {"ballu_mjx.__main__", "ballu_mjx.train", "ballu_mjx.recordings.importers.c3d_process"}
 """Run as processes, imported by nobody."""
+FOLDERS = ("", "ballu_mjx", "ballu_mjx/recordings/importers", "ballu_mjx/policies", "benchmarks")
+"""Where the pages' paths begin."""
+TO_BE_WRITTEN = {"gp.py", "gp_training.py", "train_gp.py", "test_gp.py", "stroll.py", "trc.py"}
+"""Files of CONTRIBUTING's worked examples."""
+COMMAND = re.compile(r"(?:ballu_mjx[ .]|`)((?:train|record) [\w-]+|evaluate|report|view|compare|export)\b([^`\n#;]*)")
+"""A command, and what follows it, in a page's code."""
+IMAGINED = {"train gp", "train stroll"}
+"""Commands of the worked examples."""
 
 
 def test_every_module_or_its_package_stands_in_the_reference():
@@ -17,3 +32,84 @@ def test_every_module_or_its_package_stands_in_the_reference():
     assert len(named) == len(set(named))
     modules = {module.name for module in pkgutil.walk_packages(ballu_mjx.__path__, "ballu_mjx.") if not module.ispkg}
     assert not {m for m in modules - PROGRAMS if m not in named and m.rpartition(".")[0] not in named}
+
+
+def test_files_that_the_pages_name_are_there():
+    names = {path.name for path in ROOT.glob("ballu_mjx/**/*.py")} | {
+        path.name for path in ROOT.glob("benchmarks/*.py")
+    }
+    missing = set()
+    for page in prose.pages():
+        for path in re.findall(r"[\w./]*\w\.py\b", page.read_text(encoding="utf-8")):
+            path = re.sub(r"^(\.\./|RUN/|tour/walk/export/)+", "", path)
+            there = path in names if "/" not in path else any((ROOT / folder / path).exists() for folder in FOLDERS)
+            if not there and Path(path).name not in TO_BE_WRITTEN:
+                missing.add(f"{page.relative_to(ROOT)}: {path}")
+    assert not missing
+
+
+def test_commands_and_options_that_the_pages_name_are_there():
+    script = completion.completion_script("bash", NAMES)
+    spec = next(line for line in script.splitlines() if line.startswith("COMPLETION_SPEC = "))
+    top = ast.literal_eval(spec.removeprefix("COMPLETION_SPEC = "))["subcommands"]
+    parsers = dict(top)
+    for name, command in top.items():
+        parsers |= {f"{name} {each}": parser for each, parser in command.get("subcommands", {}).items()}
+    options = {
+        name: {flag for option in parser["options"] for flag in option["flags"]} for name, parser in parsers.items()
+    }
+    missing = set()
+    for page in prose.pages():
+        if page.name == "CHANGELOG.md":  # it names what there was
+            continue
+        text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+        for command, rest in COMMAND.findall(text):
+            named = {*re.findall(r"--[a-z][\w-]*", rest)}
+            if command not in options and command not in IMAGINED:
+                missing.add(f"{page.name}: {command}")
+            missing |= {f"{page.name}: {command} {flag}" for flag in named - options.get(command, named)}
+    assert not missing
+
+
+def test_the_page_on_recordings_shows_the_mapping_that_the_command_prints(capsys: pytest.CaptureFixture[str]):
+    assert record.main(["example-mapping"]) == 0
+    assert f"```toml\n{capsys.readouterr().out}```\n" in (ROOT / "docs" / "data.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("page", prose.pages(), ids=lambda page: str(page.relative_to(ROOT)))
+def test_no_sentence_is_too_long(page: Path):
+    assert prose.long_sentences(page.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize("page", prose.pages(), ids=lambda page: str(page.relative_to(ROOT)))
+def test_results_are_of_current_commands(page: Path):
+    assert "earlier version" not in " ".join(page.read_text(encoding="utf-8").split())
+
+
+def test_sentences_are_short_on_average():
+    assert prose.mean_words() <= prose.MOST_WORDS_ON_AVERAGE
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= prose.README_LINES
+
+
+def test_prose_is_counted_as_it_is_read():
+    text = """# A heading of several words
+
+One `python -m ballu_mjx.train envmimic` here, e.g. this. Two $a + b$ *here*.
+- An item without an end
+- *Another* item
+  that goes on. It has [a link](https://example.org/a.b), i.e. one.
+
+```sh
+no sentence. Here.
+```
+
+| a cell. Another | |
+| --- | --- |
+"""
+    counts = [prose.count_words(sentence) for sentence in prose.sentences(text)]
+    assert counts == [5, 3, 5, 5, 6]
+    assert [prose.count_words(s) for s in prose.cell_sentences(text)] == [2, 1]
+    assert prose.long_sentences("word " * 36 + "end.") and not prose.long_sentences("word " * 34 + "end.")

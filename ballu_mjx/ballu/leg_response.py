@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.ballu.model import SIDES, load_model, standing_qpos, suspend
+from ballu_mjx.ballu.recordings import base_position, foot_position, knee
 from ballu_mjx.recordings.recording import Kind, Recording
 from ballu_mjx.robots.model import assets
 
@@ -21,11 +22,21 @@ def measured_response(recording: Recording) -> Float[np.ndarray, "T 2"] | None:
 
     None where the recording holds neither.
     """
-    if recording.knee is not None:
-        return recording.knee
-    if recording.base_position is None or recording.foot_position is None:
+    if (knees := knee(recording)) is not None:
+        return knees
+    base, feet = base_position(recording), foot_position(recording)
+    return None if base is None or feet is None else -np.linalg.norm(feet - base[:, None], axis=2)
+
+
+def response(
+    recording: Recording, time: Float[np.ndarray, " N"], command: Float[np.ndarray, "N 2"]
+) -> tuple[Float[np.ndarray, "T 2"], Float[np.ndarray, " n"], Float[np.ndarray, "n 2"]] | None:
+    """Return `measured_response` of a recording and, with its times (s), `nominal_response` to `command` sent at `time`
+    (s); None where the recording shows no leg."""
+    measured = measured_response(recording)
+    if measured is None:
         return None
-    return -np.linalg.norm(recording.foot_position - recording.base_position[:, None], axis=2)
+    return measured, *nominal_response(time, command, recording.kind, knees=knee(recording) is not None)
 
 
 def nominal_response(

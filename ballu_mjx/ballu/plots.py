@@ -1,22 +1,23 @@
-"""Figures of BALLU: gaits, actuator curves, recordings, ways from above."""
+"""Figures of BALLU: gaits, actuator curves, ways from above."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
-from scipy.spatial.transform import Rotation
 
+from ballu_mjx.ballu.gait import planted_feet
 from ballu_mjx.ballu.identification import Identification
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model
 from ballu_mjx.ballu.sweep import Sweep
-from ballu_mjx.evaluation.gait import planted_feet
-from ballu_mjx.recordings.recording import Recording
-from ballu_mjx.viz.style import COLOURS, LABELS, SIDE_COLOURS, save_figure
+from ballu_mjx.viz.style import COMMAND_COLOURS, colour_of, label_of, save_figure
+
+SIDE_COLOURS = COMMAND_COLOURS[:2]
+"""Left and right, as in the model."""
 
 
 def gait(
@@ -78,9 +79,9 @@ def draw_trajectories(
     axis = figure.subplots()
     for name, runs in ((simulator, simulated), ("recording", hardware)):
         for index, com in enumerate(runs):
-            label = {"recording": "robot"}.get(name, f"{LABELS[name]} (simulated)") if not index else None
-            axis.plot(com[:, 0], com[:, 1], color=COLOURS[name], label=label, linewidth=1.2)
-            axis.plot(com[-1, 0], com[-1, 1], "o", color=COLOURS[name], markersize=4)
+            label = {"recording": "robot"}.get(name, f"{label_of(name)} (simulated)") if not index else None
+            axis.plot(com[:, 0], com[:, 1], color=colour_of(name), label=label, linewidth=1.2)
+            axis.plot(com[-1, 0], com[-1, 1], "o", color=colour_of(name), markersize=4)
     axis.set_aspect("equal", adjustable="datalim")
     axis.set_xlabel("x (m)")
     axis.set_ylabel("y (m)")
@@ -120,51 +121,17 @@ def actuator_curves(path: Path, sweep: Sweep, result: Identification) -> None:
             command = sweep.command[order, column]
             for name, angles in simulations.items():
                 curve = np.rad2deg(angles[order, row, column])
-                axis.plot(command, curve, color=COLOURS[name], label=LABELS[name], linewidth=1.5)
+                axis.plot(command, curve, color=colour_of(name), label=label_of(name), linewidth=1.5)
             if result.with_drivetrain is not None:
                 curve = np.rad2deg(result.with_drivetrain[order, row, column])
-                label = f"{LABELS['vanilla+sysid']}, with friction and backlash"
-                axis.plot(command, curve, ":", color=COLOURS["vanilla+sysid"], label=label, linewidth=1.5)
+                label = f"{label_of('vanilla+sysid')}, with friction and backlash"
+                axis.plot(command, curve, ":", color=colour_of("vanilla+sysid"), label=label, linewidth=1.5)
             measured = np.rad2deg(sweep.settled[order, row, column])
-            axis.plot(command, measured, "o", color=COLOURS["recording"], label="measured", markersize=3.5)
+            axis.plot(command, measured, "o", color=colour_of("recording"), label="measured", markersize=3.5)
             axis.set_title(f"{joint}, {side}")
             axis.grid(alpha=0.3)
         axes[row, 0].set_ylabel("angle (deg)")
     for axis in axes[-1]:
         axis.set_xlabel("command")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    save_figure(figure, path)
-
-
-def recording(path: Path, seen: Recording, gaps: Mapping[str, Sequence[tuple[float, float]]]) -> None:
-    """A recording over time: where the robot goes, heights, how the legs bend, commands. Drop-outs (first and last time
-    by column) are shaded."""
-    panels: list[tuple[str, list[tuple[str, np.ndarray, str]], str]] = []
-    if seen.base_position is not None:
-        panels.append(("base (m)", [(axis, seen.base_position[:, i], f"C{i}") for i, axis in enumerate("xyz")], "base"))
-    if seen.balloon_position is not None and seen.balloon_quaternion is not None:
-        angles = np.rad2deg(Rotation.from_quat(seen.balloon_quaternion, scalar_first=True).as_euler("ZYX"))
-        angles = np.unwrap(angles, axis=0, period=360.0)
-        lines = [(name, angles[:, i], f"C{i}") for i, name in enumerate(("yaw", "pitch", "roll"))]
-        panels.append(("balloon (deg)", lines, "balloon"))
-    if seen.foot_position is not None:
-        lines = [(s, seen.foot_position[:, i, 2], SIDE_COLOURS[i]) for i, s in enumerate(SIDES)]
-        panels.append(("feet, height (m)", lines, "foot"))
-    for name, value in (("motor", seen.motor), ("knee", seen.knee)):
-        if value is not None:
-            lines = [(s, np.rad2deg(value[:, i]), SIDE_COLOURS[i]) for i, s in enumerate(SIDES)]
-            panels.append((f"{name}s (deg)", lines, name))
-    lines = [(s, seen.command[:, i], SIDE_COLOURS[i]) for i, s in enumerate(SIDES)]
-    panels.append(("command", lines, "command"))
-    figure = Figure(figsize=(9.0, 1.0 + 1.7 * len(panels)), layout="constrained")
-    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-    for axis, (title, lines, prefix) in zip(axes, panels, strict=True):
-        for label, value, colour in lines:
-            axis.plot(seen.time, value, color=colour, label=label, linewidth=0.9)
-        for first, last in {span for name, spans in gaps.items() if name.startswith(prefix) for span in spans}:
-            axis.axvspan(first, last, color="0.85", linewidth=0)
-        axis.set_ylabel(title)
-        axis.legend(loc="upper right", fontsize="small", ncols=3)
-    axes[-1].set_xlabel("time (s)")
-    axes[0].set_title(f"{seen.name} ({seen.kind}, {seen.robot})")
     save_figure(figure, path)

@@ -1,399 +1,74 @@
-"""From a recording to the robot's full generalized state at the control rate.
+"""What BALLU adds to the reconstruction of its recordings.
 
-1. Measurements are brought to a uniform grid at their own rate, of which the control grid is a part.
-2. Positions: a batched least-squares inverse kinematics, one small problem a sample.
-3. The base's pitch: with the neck's lever of 15 mm, markers show it to some 7 deg a sample. Unless the base's
-   orientation is recorded, it is fitted over the whole recording at once to markers and the base's torque balance.
-4. Velocities: a centred (hence lag-free) Savitzky-Golay differentiator, widest for the balloon's rotation: it is slow,
-   and its rates matter most to what a simulator does next.
-5. Motor angles: the model's own servo, driven by the recorded commands and held back by the cable at the knee angles
-   found, so that motor, cable and knee agree. A recording's motor columns, where there are any, are taken instead.
+- The base's pitch: with the neck's lever of 15 mm, markers show it to some 7 deg a sample. Unless the base's
+  orientation is recorded, it is fitted over the whole recording at once to markers and the base's torque balance.
+- Motor angles: the model's own servo, driven by the recorded commands and held back by the cable at the knee angles
+  found, so that motor, cable and knee agree. A recording's motor columns, where there are any, are taken instead.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-import optimistix as optx
 import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Array, Float
 from scipy.signal import savgol_coeffs
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP, HIPS, KNEES, MOTORS, SIDES
-from ballu_mjx.recordings.filters import (
-    control_grid,
-    interpolate,
-    mean_command,
-    odd_window,
-    savitzky_golay,
-    sign_continuous,
-    smooth_rotation,
-)
-from ballu_mjx.recordings.motion import Motion, ReconstructionParameters
-from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.ballu.model import HIPS, KNEES, MOTORS, SIDES
+from ballu_mjx.recordings.filters import odd_window, savitzky_golay
+from ballu_mjx.recordings.inverse_kinematics import KinematicFit
+from ballu_mjx.recordings.motion import MeasurementGrid
+
+BASE_PITCH = "base_pitch"
+"""Key of `Motion.uncertainty`: the standard deviation (rad) of the base's pitch. Neck and hips share this error with
+the opposite sign; balloon, legs and feet in the world do not."""
 
 _CHUNK = 512
 """Samples in a compiled call: recordings of any length share one program."""
-_MAX_STEPS = 15
-"""Levenberg-Marquardt steps. Four suffice; only a base pitch that one sample cannot show goes on wandering."""
+_TORQUE_NOISE = 1e-3
+"""Standard deviation (N m) of the base's torque balance, a sample at 100 Hz; 1 deg of pitch is 2e-4 N m."""
+_FORCE_WINDOW = 0.15
+"""Width (s) of the Savitzky-Golay filter for the accelerations in the base's torque balance."""
 _PITCH_HELD = 1e4
-"""Weight (1/rad) by which the second pass holds the base's pitch where the first two have found it."""
+"""Weight (1/rad) by which the second fit holds the base's pitch where the torque balance has found it."""
+_STOP_GIVE = float(np.deg2rad(0.5))
+"""How far (rad) below its stop a knee may be: the stop is soft, and the spring holds the knee 0.35 deg inside."""
 _SERVO_SUBSTEP = 1e-3
 """Longest step (s) of the servo's simulation, whose fastest time constant is about 9 ms."""
 _SETTLING = 0.5
 """Seconds for which the first command is held before the recording starts, for the servo to arrive."""
-_STOP_GIVE = float(np.deg2rad(0.5))
-"""How far (rad) below its stop a knee may be: the stop is soft, and the spring holds the knee 0.35 deg inside."""
-
-_Smoothing = tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]
 
 
-def reconstruct_ballu(
-    recording: Recording, model: mujoco.MjModel, parameters: ReconstructionParameters | None = None
-) -> Motion:
-    """States and commands at the control rate from a free recording.
+# ---- the base's pitch ----
 
-    **Arguments**
 
-    - `recording`: as `csv_format.read_recording` gives it: no missing values. Its floor is at z = 0.
-    - `model`: the robot to be simulated from these states; lengths, servo, cable, stops and masses are taken from it.
-    - `parameters`: noise and filters; the defaults suit motion capture of 0.5 mm and 0.3 deg.
+def complete_positions(fit: KinematicFit) -> KinematicFit:
+    """Return the fit with the base's pitch by its torque balance, unless the base's orientation is recorded.
 
-    **Raises** `ValueError` for a suspended recording, and for one shorter than two control steps.
+    `fit.uncertainty` has the pitch's standard deviation as `BASE_PITCH`.
     """
-    parameters = parameters or ReconstructionParameters()
-    grid = _resample(recording)
-    skeleton = _Skeleton.of(model)
-
-    fitted = _inverse_kinematics(skeleton, grid, parameters)
-    if grid.base_quaternion is None:
-        held, pitch_deviation = _base_pitch(model, skeleton, grid, fitted, parameters)
-        fitted = _inverse_kinematics(skeleton, grid, parameters, held)
-    else:
-        window = odd_window(parameters.position_window, grid.step, parameters.order, len(fitted))
+    grid, parameters = fit.problem.grid, fit.problem.parameters
+    if "base" in grid.orientations:
+        window = odd_window(parameters.position_window, grid.step, parameters.order, len(fit.qpos))
         shrinkage = np.linalg.norm(savgol_coeffs(window, parameters.order))
-        pitch_deviation = float(parameters.rotation_noise * shrinkage)
-
-    qpos, qvel = _differentiate(fitted, grid.step, parameters)
-    # A semi-implicit integrator's velocity is the mean over the time step that led to the position.
-    qvel -= np.gradient(qvel, grid.step, axis=0) * model.opt.timestep / 2
-    knees = qpos[:, 7:][:, KNEES]
-    stops = np.array([model.joint(f"knee_{side}").range for side in SIDES])
-    knees[:] = np.clip(knees, stops[:, 0] - _STOP_GIVE, stops[:, 1])
-    if grid.motor is None:
-        qpos[:, 7:][:, MOTORS], qvel[:, 6:][:, MOTORS] = _servos(model, grid, knees)
-
-    states = slice(None, None, grid.samples_per_step)
-    count = len(qpos[states])
-    edges = np.arange(count) * CONTROL_TIMESTEP
-    return Motion(
-        name=recording.name,
-        time=edges,
-        command=mean_command(recording, edges),
-        qpos=qpos[states],
-        qvel=qvel[states],
-        residual_mm=_residuals(skeleton, grid, fitted),
-        interpolated=dict(recording.interpolated),
-        robot=recording.robot,
-        pitch_deviation=pitch_deviation,
-    )
+        deviation = float(parameters.rotation_noise * shrinkage)
+        return dataclasses.replace(fit, uncertainty={BASE_PITCH: deviation})
+    held, deviation = _base_pitch(fit)
+    return fit.refit("base", held, np.array([0.0, _PITCH_HELD, 0.0]), **{BASE_PITCH: deviation})
 
 
-# 1. Measurements on a uniform grid
+_PITCH_DOF = 4
+"""Place in qvel of the base's rotation about its y axis."""
 
 
-@dataclasses.dataclass(frozen=True)
-class _Grid:
-    """A free recording at uniform times from 0, `step` (s) apart; `samples_per_step` of them to a control step."""
-
-    step: float
-    samples_per_step: int
-    command: Float[np.ndarray, "T 2"]
-    balloon_position: Float[np.ndarray, "T 3"]
-    balloon_quaternion: Float[np.ndarray, "T 4"]
-    base_position: Float[np.ndarray, "T 3"]
-    base_quaternion: Float[np.ndarray, "T 4"] | None
-    foot_position: Float[np.ndarray, "T 2 3"]
-    motor: Float[np.ndarray, "T 2"] | None
-    knee: Float[np.ndarray, "T 2"] | None
-
-
-def _resample(recording: Recording) -> _Grid:
-    """Linear interpolation: with noise, jittered samples close together would make a spline overshoot."""
-    balloon_position, balloon_quaternion = recording.balloon_position, recording.balloon_quaternion
-    base_position, foot_position = recording.base_position, recording.foot_position
-    if (
-        recording.kind != "free"
-        or balloon_position is None
-        or balloon_quaternion is None
-        or base_position is None
-        or foot_position is None
-    ):
-        raise ValueError(f"{recording.name}: a suspended recording has no walk to reconstruct; give a free one.")
-    time = recording.time - recording.time[0]
-    per_step, grid = control_grid(recording)
-
-    linear = partial(interpolate, grid, time)
-
-    def unit(values: np.ndarray) -> np.ndarray:
-        values = linear(values)
-        return values / np.linalg.norm(values, axis=-1, keepdims=True)
-
-    command = mean_command(recording, grid)
-    return _Grid(
-        step=CONTROL_TIMESTEP / per_step,
-        samples_per_step=per_step,
-        command=np.concatenate([command, command[-1:]]),
-        balloon_position=linear(balloon_position),
-        balloon_quaternion=unit(balloon_quaternion),
-        base_position=linear(base_position),
-        base_quaternion=None if recording.base_quaternion is None else unit(recording.base_quaternion),
-        foot_position=linear(foot_position),
-        motor=None if recording.motor is None else linear(recording.motor),
-        knee=None if recording.knee is None else linear(recording.knee),
-    )
-
-
-# 2. Inverse kinematics
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class _Skeleton:
-    """Places (m) of joints and sites in their parents' frames; pairs are (left, right). All hinges turn about y."""
-
-    neck: Float[Array | np.ndarray, " 3"]
-    balloon: Float[Array | np.ndarray, " 3"]
-    hips: Float[Array | np.ndarray, "2 3"]
-    knees: Float[Array | np.ndarray, "2 3"]
-    feet: Float[Array | np.ndarray, "2 3"]
-
-    @staticmethod
-    def of(model: mujoco.MjModel) -> _Skeleton:
-        return _Skeleton(
-            neck=model.body("balloon").pos.copy(),
-            balloon=model.site("balloon").pos.copy(),
-            hips=np.stack([model.body(f"femur_{side}").pos for side in SIDES]),
-            knees=np.stack([model.body(f"tibia_{side}").pos for side in SIDES]),
-            feet=np.stack([model.site(f"foot_{side}").pos for side in SIDES]),
-        )
-
-
-def _multiply(a: Float[Array, " 4"], b: Float[Array, " 4"]) -> Float[Array, " 4"]:
-    vector = a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])
-    return jnp.concatenate([(a[0] * b[0] - a[1:] @ b[1:])[None], vector])
-
-
-def _rotate(quaternion: Float[Array, " 4"], vector: Float[Array | np.ndarray, " 3"]) -> Float[Array, " 3"]:
-    w, axis, vector = quaternion[0], quaternion[1:], jnp.asarray(vector)
-    return vector + 2.0 * jnp.cross(axis, jnp.cross(axis, vector) + w * vector)
-
-
-def _turn(quaternion: Float[Array, " 4"], angle: Float[Array, ""]) -> Float[Array, " 4"]:
-    """`quaternion`, then `angle` about its own y axis."""
-    zero = jnp.zeros_like(angle)
-    return _multiply(quaternion, jnp.stack([jnp.cos(angle / 2), zero, jnp.sin(angle / 2), zero]))
-
-
-def _forward_kinematics(
-    skeleton: _Skeleton, qpos: Float[Array, " nq"]
-) -> tuple[Float[Array, " 3"], Float[Array, " 4"], Float[Array, "2 3"]]:
-    """Balloon's position and quaternion, and the feet, in the world.
-
-    MJX's kinematics for the few points that are measured: it compiles in a tenth of the time and runs a hundred times
-    faster, which pays for every sample's Jacobians.
-    """
-    base, quaternion, hinges = qpos[:3], qpos[3:7], qpos[7:]
-    balloon_quaternion = _turn(quaternion, hinges[0])
-    balloon = base + _rotate(quaternion, skeleton.neck) + _rotate(balloon_quaternion, skeleton.balloon)
-
-    def foot(hip: Array, knee: Array, foot: Array, hip_angle: Array, knee_angle: Array) -> Array:
-        femur = _turn(quaternion, hip_angle)
-        tibia = _turn(femur, knee_angle)
-        return base + _rotate(quaternion, hip) + _rotate(femur, knee) + _rotate(tibia, foot)
-
-    feet = jax.vmap(foot)(
-        jnp.asarray(skeleton.hips),
-        jnp.asarray(skeleton.knees),
-        jnp.asarray(skeleton.feet),
-        hinges[HIPS],
-        hinges[KNEES],
-    )
-    return balloon, balloon_quaternion, feet
-
-
-def _retract(qpos: Float[Array, " nq"], step: Float[Array, " 11"]) -> Float[Array, " nq"]:
-    """`qpos` moved by `step`: base position, base rotation (body frame), then all hinges but the motors."""
-    quaternion = _multiply(qpos[3:7], jnp.concatenate([jnp.ones(1), step[3:6] / 2]))
-    hinges = qpos[7:].at[0].add(step[6]).at[HIPS].add(step[jnp.array([7, 9])]).at[KNEES].add(step[jnp.array([8, 10])])
-    return jnp.concatenate([qpos[:3] + step[:3], quaternion / jnp.linalg.norm(quaternion), hinges])
-
-
-def _rotation_between(a: Float[Array, " 4"], b: Float[Array, " 4"]) -> Float[Array, " 3"]:
-    """Rotation vector (rad, in the frame of `a`) from `a` to `b`, for small angles."""
-    difference = _multiply(a * jnp.array([1.0, -1.0, -1.0, -1.0]), b)
-    return 2.0 * difference[1:] * jnp.where(difference[0] < 0, -1.0, 1.0)
-
-
-def _misfit(
-    step: Float[Array, " 11"],
-    arguments: tuple[_Skeleton, Float[Array, " nq"], dict[str, Array], dict[str, Array]],
-) -> Float[Array, " 20"]:
-    """Differences to the measurements in units of their noise, `step` away from a guess."""
-    skeleton, guess, measured, weights = arguments
-    qpos = _retract(guess, step)
-    balloon, balloon_quaternion, feet = _forward_kinematics(skeleton, qpos)
-    return jnp.concatenate(
-        [
-            (balloon - measured["balloon"]) * weights["position"],
-            (qpos[:3] - measured["base"]) * weights["position"],
-            (feet - measured["feet"]).ravel() * weights["position"],
-            _rotation_between(measured["balloon_quaternion"], balloon_quaternion) * weights["rotation"],
-            _rotation_between(measured["base_quaternion"], qpos[3:7]) * weights["base_rotation"],
-            (qpos[7:][KNEES] - measured["knee"]) * weights["knee"],
-        ]
-    )
-
-
-@jax.jit
-def _fit_chunk(
-    skeleton: _Skeleton, guess: Float[Array, "chunk nq"], measured: dict[str, Array], weights: dict[str, Array]
-) -> Float[Array, "chunk nq"]:
-    """argmin over qpos of |misfit|^2, sample by sample."""
-    solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-6)
-
-    def one(guess: Array, measured: dict[str, Array]) -> Array:
-        solution = optx.least_squares(
-            _misfit,
-            solver,
-            jnp.zeros(11),
-            (skeleton, guess, measured, weights),
-            options={"jac": "fwd"},
-            max_steps=_MAX_STEPS,
-            throw=False,
-        )
-        return _retract(guess, solution.value)
-
-    return jax.vmap(one)(guess, measured)
-
-
-def _in_chunks(function: Callable[..., Any], count: int, *arguments: Any) -> Any:
-    """`function` of `arguments`' first `count` entries, `_CHUNK` at a time, in double precision, as NumPy arrays.
-
-    In single precision the rounding of the balloon's distance, over the neck's lever of 15 mm, would show in the pitch.
-    """
-    results = []
-    with jax.enable_x64(True):
-        for start in range(0, count, _CHUNK):
-            chunk = np.minimum(np.arange(start, start + _CHUNK), count - 1)
-            results.append(function(*jax.tree.map(lambda array, at=chunk: array[at], arguments)))
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *results)
-
-
-def _inverse_kinematics(
-    skeleton: _Skeleton,
-    grid: _Grid,
-    parameters: ReconstructionParameters,
-    held: Float[np.ndarray, "T 4"] | None = None,
-) -> Float[np.ndarray, "T nq"]:
-    """Generalized positions that fit the measurements; motors as measured, or 0.
-
-    `held` are base quaternions whose pitch is to be kept.
-    """
-    weights = _weights(grid, parameters)
-    if held is not None:
-        base_quaternion = held
-        weights["base_rotation"] = np.array([0.0, _PITCH_HELD, 0.0])
-    else:
-        base_quaternion = grid.balloon_quaternion if grid.base_quaternion is None else grid.base_quaternion
-    count = len(base_quaternion)
-    measured = {
-        "balloon": grid.balloon_position,
-        "base": grid.base_position,
-        "feet": grid.foot_position,
-        "balloon_quaternion": grid.balloon_quaternion,
-        "base_quaternion": base_quaternion,
-        "knee": np.zeros((count, 2)) if grid.knee is None else grid.knee,
-    }
-    guess = _guess(skeleton, grid, base_quaternion)
-    qpos = _in_chunks(lambda *each: _fit_chunk(skeleton, *each, weights), count, guess, measured)
-    if grid.motor is not None:
-        qpos[:, 7:][:, MOTORS] = grid.motor
-    return qpos
-
-
-def _weights(grid: _Grid, parameters: ReconstructionParameters) -> dict[str, np.ndarray]:
-    """Inverse standard deviations of the measurements; 0 for what is not there."""
-    prior = np.array([0.0, 1.0 / parameters.pitch_prior, 0.0])
-    return {
-        "position": np.array(1.0 / parameters.position_noise),
-        "rotation": np.array(1.0 / parameters.rotation_noise),
-        "base_rotation": prior if grid.base_quaternion is None else np.full(3, 1.0 / parameters.rotation_noise),
-        "knee": np.array(0.0 if grid.knee is None else 1.0 / parameters.joint_noise),
-    }
-
-
-def _guess(skeleton: _Skeleton, grid: _Grid, base_quaternion: Float[np.ndarray, "T 4"]) -> Float[np.ndarray, "T nq"]:
-    """Base as measured, legs by the law of cosines between hip and foot; the neck at its angle to the balloon."""
-    base = Rotation.from_quat(base_quaternion, scalar_first=True)
-    balloon = Rotation.from_quat(grid.balloon_quaternion, scalar_first=True)
-    qpos = np.zeros((len(base_quaternion), 14))
-    qpos[:, :3], qpos[:, 3:7] = grid.base_position, base_quaternion
-    hinges = qpos[:, 7:]
-    hinges[:, 0] = (base.inv() * balloon).as_rotvec()[:, 1]
-    for i in range(2):
-        leg = base.inv().apply(grid.foot_position[:, i] - grid.base_position) - np.asarray(skeleton.hips[i])
-        femur, tibia = -skeleton.knees[i][2], -skeleton.feet[i][2]
-        cosine = (leg[:, 0] ** 2 + leg[:, 2] ** 2 - femur**2 - tibia**2) / (2 * femur * tibia)
-        knee = np.arccos(np.clip(cosine, -0.99, 0.999))
-        straight = np.arctan2(leg[:, 0], leg[:, 2])
-        hip = straight - np.arctan2(-tibia * np.sin(knee), -femur - tibia * np.cos(knee))
-        hinges[:, HIPS][:, i] = (hip + np.pi) % (2 * np.pi) - np.pi
-        hinges[:, KNEES][:, i] = knee
-    return qpos
-
-
-@jax.jit
-def _points_chunk(
-    skeleton: _Skeleton, qpos: Float[Array, "chunk nq"]
-) -> tuple[Float[Array, "chunk 3"], Float[Array, "chunk 2 3"]]:
-    """Balloon and feet in the world."""
-    balloon, _, feet = jax.vmap(partial(_forward_kinematics, skeleton))(qpos)
-    return balloon, feet
-
-
-def _residuals(skeleton: _Skeleton, grid: _Grid, qpos: Float[np.ndarray, "T nq"]) -> dict[str, float]:
-    balloon, feet = _in_chunks(lambda each: _points_chunk(skeleton, each), len(qpos), qpos)
-
-    def rms(fitted: np.ndarray, measured: np.ndarray) -> float:
-        return 1e3 * float(np.sqrt(np.mean(np.sum((fitted - measured) ** 2, axis=-1))))
-
-    return {
-        "balloon": rms(balloon, grid.balloon_position),
-        "base": rms(qpos[:, :3], grid.base_position),
-        "feet": rms(feet, grid.foot_position),
-    }
-
-
-# 3. The base's pitch
-
-
-def _base_pitch(
-    model: mujoco.MjModel,
-    skeleton: _Skeleton,
-    grid: _Grid,
-    qpos: Float[np.ndarray, "T nq"],
-    parameters: ReconstructionParameters,
-) -> tuple[Float[np.ndarray, "T 4"], float]:
+def _base_pitch(fit: KinematicFit) -> tuple[Float[np.ndarray, "T 4"], float]:
     """Base quaternions with a pitch that agrees with markers and torques, and the pitch's standard deviation (rad).
 
     The hips' axes run through the base's frame, so legs and balloon in the world are known without its pitch theta.
@@ -405,7 +80,8 @@ def _base_pitch(
     Its least-squares fit over all samples, together with the inverse kinematics' pitches, is a banded problem, solved
     by Gauss-Newton.
     """
-    step, count = grid.step, len(qpos)
+    model, grid, parameters = fit.problem.model, fit.problem.grid, fit.problem.parameters
+    qpos, step, count = fit.qpos, grid.step, len(fit.qpos)
     measured, forward, up = _pitch(qpos[:, 3:7])
     base, balloon = model.body("base").id, model.body("balloon").id
     dofs = [model.joint(name).dofadr[0] for name in ("neck", "hip_left", "hip_right")]
@@ -416,10 +92,9 @@ def _base_pitch(
 
     gravity = model.opt.gravity
     lifted = gravity * (1.0 - model.body_gravcomp[balloon])
-    force = parameters.force_window
-    pull = model.body_mass[balloon] * (lifted - smooth(grid.balloon_position, force, 2))
-    weight = model.body_mass[base] * (gravity - smooth(grid.base_position, force, 2))
-    levers = [(np.asarray(skeleton.neck), pull), (model.body_ipos[base], weight)]
+    pull = model.body_mass[balloon] * (lifted - smooth(grid.positions["balloon"], _FORCE_WINDOW, 2))
+    weight = model.body_mass[base] * (gravity - smooth(grid.positions["base"], _FORCE_WINDOW, 2))
+    levers = [(model.body("balloon").pos, pull), (model.body_ipos[base], weight)]
 
     hinges = qpos[:, 7:]
     others = measured[:, None] + np.column_stack([hinges[:, 0], hinges[:, HIPS]])
@@ -435,10 +110,9 @@ def _base_pitch(
     before, now, after = (scipy.sparse.eye_array(*shape, k=k) for k in range(3))
     first, second = (after - before) / (2 * step), (after - 2 * now + before) / step**2
 
-    weights = _weights(grid, parameters)
     # It varies little; the median does not believe samples whose pitch has wandered to where it would be well seen.
-    information = np.median(_in_chunks(lambda each: _pitch_information(skeleton, each, weights), count, qpos))
-    torque_noise = parameters.torque_noise * np.sqrt(0.01 / step)
+    information = np.median(1.0 / np.linalg.inv(fit.information)[:, _PITCH_DOF, _PITCH_DOF])
+    torque_noise = _TORQUE_NOISE * np.sqrt(0.01 / step)
     pitch = np.full(count, np.mean(measured))
     for _ in range(10):
         torque, slope = np.zeros(count), np.zeros(count)
@@ -478,70 +152,28 @@ def _pitch(
     return np.unwrap(np.arctan2(-np.sum(x * up, axis=1), np.sum(x * forward, axis=1))), forward, up
 
 
-@jax.jit
-def _pitch_information(
-    skeleton: _Skeleton, qpos: Float[Array, "chunk nq"], weights: dict[str, Any]
-) -> Float[Array, " chunk"]:
-    """What each sample's measurements alone say of the base's pitch (1/rad^2): its inverse variance, Gauss-Newton."""
-
-    def one(qpos: Array) -> Array:
-        balloon, quaternion, feet = _forward_kinematics(skeleton, qpos)
-        measured = {
-            "balloon": balloon,
-            "base": qpos[:3],
-            "feet": feet,
-            "balloon_quaternion": quaternion,
-            "base_quaternion": qpos[3:7],
-            "knee": qpos[7:][KNEES],
-        }
-        jacobian = jax.jacfwd(_misfit)(jnp.zeros(11), (skeleton, qpos, measured, weights))
-        return 1.0 / jnp.linalg.inv(jacobian.T @ jacobian)[4, 4]
-
-    return jax.vmap(one)(qpos)
+# ---- motors ----
 
 
-def _differentiate(
-    qpos: Float[np.ndarray, "T nq"], step: float, parameters: ReconstructionParameters
+def complete_joints(
+    model: mujoco.MjModel,
+    grid: MeasurementGrid,
+    qpos: Float[np.ndarray, "T nq"],
+    qvel: Float[np.ndarray, "T nv"],
 ) -> tuple[Float[np.ndarray, "T nq"], Float[np.ndarray, "T nv"]]:
-    """Smoothed generalized positions and their velocities at the same instants, in MuJoCo's conventions.
-
-    Filtered are the base's position, the balloon's orientation, the neck, the femurs' angles to the balloon, the knees
-    and the motors. The base, light and loosely tied, follows from balloon and neck.
-    """
-
-    def smooth(values: np.ndarray, width: float, rate_width: float) -> _Smoothing:
-        order = parameters.order
-        return savitzky_golay(values, width, step, order, 0), savitzky_golay(values, rate_width, step, order, 1)
-
-    narrow, wide, rotation = parameters.position_window, parameters.rate_window, parameters.rotation_window
-    hinges = qpos[:, 7:]
-    y = np.array([0.0, 1.0, 0.0])
-    base = Rotation.from_quat(qpos[:, 3:7], scalar_first=True)
-    balloon = (base * Rotation.from_rotvec(np.outer(hinges[:, 0], y))).as_quat(scalar_first=True)
-
-    position, linear = smooth(qpos[:, :3], narrow, wide)
-    quaternion, angular = smooth_rotation(sign_continuous(balloon), rotation, step, parameters.order)
-
-    to_balloon = hinges.copy()
-    to_balloon[:, HIPS] -= hinges[:, :1]
-    angles, rates = smooth(to_balloon, narrow, wide)
-    angles[:, HIPS] += angles[:, :1]
-    rates[:, HIPS] += rates[:, :1]
-
-    back = Rotation.from_rotvec(np.outer(-angles[:, 0], y))
-    base_quaternion = (Rotation.from_quat(quaternion, scalar_first=True) * back).as_quat(scalar_first=True)
-    base_angular = back.inv().apply(angular) - rates[:, :1] * y
-    return (
-        np.concatenate([position, sign_continuous(base_quaternion), angles], axis=1),
-        np.concatenate([linear, base_angular, rates], axis=1),
-    )
-
-
-# 5. Motors
+    """Return states with the knees at their stops or above, and the motors where their servos take them, unless they
+    are recorded."""
+    qpos, qvel = qpos.copy(), qvel.copy()
+    stops = np.array([model.joint(f"knee_{side}").range for side in SIDES])
+    knees = qpos[:, 7:][:, KNEES]
+    knees[:] = np.clip(knees, stops[:, 0] - _STOP_GIVE, stops[:, 1])
+    if not all(f"motor_{side}" in grid.joint_angles for side in SIDES):
+        qpos[:, 7:][:, MOTORS], qvel[:, 6:][:, MOTORS] = _servos(model, grid, knees)
+    return qpos, qvel
 
 
 def _servos(
-    model: mujoco.MjModel, grid: _Grid, knee: Float[np.ndarray, "T 2"]
+    model: mujoco.MjModel, grid: MeasurementGrid, knee: Float[np.ndarray, "T 2"]
 ) -> tuple[Float[np.ndarray, "T 2"], Float[np.ndarray, "T 2"]]:
     """Motor angles (rad) and rates that the model's servos take under the commands, with the knees going as they do."""
     servos = [model.actuator(f"servo_{side}").id for side in SIDES]

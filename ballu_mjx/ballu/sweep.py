@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ballu_mjx.ballu.model import SIDES
+from ballu_mjx.ballu.recordings import knee, motor
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.recording import Recording
 
@@ -121,8 +122,9 @@ def _check_levels(names: str, side: str, command: Float[np.ndarray, " holds"], l
 def _holds(path: Path, recording: Recording) -> tuple[np.ndarray, ...]:
     """Command, settled angles, drift and samples of each hold of one recording; its motion, and the hold at each
     time."""
-    assert recording.motor is not None and recording.knee is not None  # mandatory in suspended recordings
-    time, angles = recording.time, np.stack([recording.motor, recording.knee], axis=1)
+    motors, knees = motor(recording), knee(recording)
+    assert motors is not None and knees is not None  # mandatory in suspended recordings
+    time, angles = recording.time, np.stack([motors, knees], axis=1)
     changes = 1 + np.flatnonzero(np.any(np.abs(np.diff(recording.command, axis=0)) > 1e-9, axis=1))
     starts, ends = np.concatenate([[0], changes]), np.concatenate([changes, [len(time)]])
     durations = time[ends - 1] - time[starts]

@@ -105,7 +105,7 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
     return "\n".join(lines)
 
 
-def identification_details(result: Identification, source: Any) -> dict[str, Any]:
+def identification_details(result: Identification) -> dict[str, Any]:
     """What stands beside the parameters in `actuators.json`."""
     return {
         "standard_errors": {
@@ -120,7 +120,6 @@ def identification_details(result: Identification, source: Any) -> dict[str, Any
             name: [float(f"{getattr(fit.drivetrain, name):.4g}") if fit.drivetrain else None for fit in result.fits]
             for name in Drivetrain._fields
         },
-        "source": source,
     }
 
 

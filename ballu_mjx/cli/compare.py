@@ -14,13 +14,11 @@ from typing import Any
 
 import numpy as np
 import tyro
-from scipy import stats
 
 from ballu_mjx.common import runtime
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.evaluation.statistics import LEVEL, t_interval
 
-LEVEL = 0.95
-"""Of the confidence intervals."""
 _LAST = 0.1
 """Part of a training, at its end, over which its reward is averaged."""
 _POINTS = 200
@@ -58,21 +56,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return runtime.exit_status(run, arguments)
 
 
-def interval(values: Sequence[float]) -> tuple[float, float]:
-    """Mean, and half the width of its confidence interval: not a number for a single value."""
-    mean = float(np.mean(values))
-    if len(values) < 2:
-        return mean, float("nan")
-    return mean, float(stats.t.ppf((1 + LEVEL) / 2, len(values) - 1) * stats.sem(values))
-
-
 def rows(folders: Sequence[Path]) -> list[Row]:
     """Runs by what they have in common.
 
     **Raises** `InputError` where one is no run, or the tasks differ.
     """
     from ballu_mjx.policies.tasks import TASKS
-    from ballu_mjx.residuals.trained import RESIDUAL_TASKS
+    from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
     from ballu_mjx.runs.folder import read_config
 
     if len({folder.resolve() for folder in folders}) < len(folders):
@@ -102,7 +92,7 @@ def figures(folder: Path) -> dict[str, float]:
     """
     from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS, read_evaluation
     from ballu_mjx.policies.tasks import TASKS
-    from ballu_mjx.residuals.trained import RESIDUAL_TASKS
+    from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
     from ballu_mjx.runs.folder import read_config
     from ballu_mjx.runs.metrics import read_column
 
@@ -131,9 +121,16 @@ def table(found: Mapping[str, Sequence[Mapping[str, float]]]) -> str:
     for label, members in found.items():
         cells = []
         for name in names:
-            mean, half = interval([figures[name] for figures in members])
-            cells.append(f"{mean:.3f}" if np.isnan(half) else f"{mean:.3f} ± {half:.3f}")
+            values = [figures[name] for figures in members]
+            broken = sum(map(np.isinf, values))
+            if broken:
+                cells.append(f"diverged in {broken} of {len(values)}")
+                continue
+            mean, half = t_interval(values)
+            cells.append(f"{mean:.3f}" + ("" if half is None else f" ± {half:.3f}"))
         lines.append(f"| {label} | {len(members)} | " + " | ".join(cells) + " |")
+    if max(map(len, found.values())) > 1:
+        lines += ["", f"± is half the {LEVEL:.0%} confidence interval of the mean over runs (Student's t)."]
     return "\n".join(lines)
 
 
@@ -150,7 +147,8 @@ def curve(folders: Sequence[Path], name: str) -> tuple[np.ndarray, np.ndarray, n
         return None
     at = np.linspace(low, high, _POINTS)
     values = np.array([np.interp(at, steps, measured) for steps, measured in columns])
-    mean, half = np.array([interval(column) for column in values.T.tolist()]).T
+    intervals = [t_interval(column) for column in values.T.tolist()]
+    mean, half = np.array([(each.mean, np.nan if each.half is None else each.half) for each in intervals]).T
     return at, mean, half
 
 
@@ -196,7 +194,7 @@ def _options(config: Mapping[str, Any]) -> dict[str, str]:
 
 def _kind(config: Mapping[str, Any]) -> str:
     """What runs may be compared: residuals of whatever kind, and policies of one task."""
-    from ballu_mjx.residuals.trained import RESIDUAL_TASKS
+    from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
 
     return "residual" if config["task"] in RESIDUAL_TASKS else config["task"]
 

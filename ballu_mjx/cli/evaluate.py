@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -16,9 +16,6 @@ from ballu_mjx.common import files, runtime
 
 if TYPE_CHECKING:
     from ballu_mjx.evaluation.errors_table import Errors
-    from ballu_mjx.rl.ppo import Params
-from ballu_mjx.residuals.dataset import check_recording
-from ballu_mjx.viz.artifacts import write_evaluation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,19 +48,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _evaluate(options: Options) -> None:
-    from ballu_mjx.evaluation.errors_table import base_name
-    from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
+    from ballu_mjx.evaluation.open_loop import Evaluators
     from ballu_mjx.recordings.csv_format import list_recordings, read_recording
     from ballu_mjx.recordings.motion import add_capture_noise
     from ballu_mjx.recordings.reconstruct import reconstruct
+    from ballu_mjx.residuals.dataset import check_recording
+    from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
     from ballu_mjx.residuals.run_config import find_recordings, run_robot
-    from ballu_mjx.residuals.trained import RESIDUAL_TASKS, TrainedResidual
+    from ballu_mjx.residuals.trained import TrainedResidual
     from ballu_mjx.runs.folder import read_config
+    from ballu_mjx.sim.simulator import Simulator
+    from ballu_mjx.viz.artifacts import write_evaluation
 
     config = read_config(options.run, *RESIDUAL_TASKS)
     which = "last" if options.last else "best"
     robot = run_robot(config, options.run)
-    loaded = TrainedResidual.load(options.run, which, description=robot)
+    loaded = TrainedResidual.load(options.run, robot, which)
     paths = list_recordings(options.recordings) or find_recordings(config, "test", options.run)
     recordings = [read_recording(path, robot) for path in paths]
     for path, recording in zip(paths, recordings, strict=True):
@@ -75,10 +75,10 @@ def _evaluate(options: Options) -> None:
     if loaded.step:
         print(f"The {which} checkpoint of {options.run}: step {loaded.step:,}.", flush=True)
     print("Compiling: half a minute the first time ...", flush=True)
-    model = robot.load_model(loaded.actuators)
-    motions = [reconstruct(recording, model, robot) for recording in recordings]
-    base = base_name(loaded.actuators is not None)
-    evaluator = OpenLoopEvaluator(model, motions, loaded.model, base, robot)
+    simulator = Simulator(robot, loaded.actuators)
+    model = simulator.mj_model
+    motions = [reconstruct(recording, robot, model) for recording in recordings]
+    evaluator = Evaluators(simulator).of(loaded.model, motions)
     result = (
         evaluator(loaded.params)
         if options.output is None
@@ -87,7 +87,7 @@ def _evaluate(options: Options) -> None:
     print(result.table())
     if options.noise_floor:
         shaken = [add_capture_noise(recording, seed=number) for number, recording in enumerate(recordings)]
-        floor = evaluator.of_starts([reconstruct(each, model, robot) for each in shaken], loaded.params)
+        floor = evaluator.of_starts([reconstruct(each, robot, model) for each in shaken], loaded.params)
         print(f"\n{noise_floor(floor, result.residual)}")
 
 
@@ -105,12 +105,3 @@ def noise_floor(floor: Sequence[Errors], errors: Sequence[Errors]) -> str:
                 f"{noise.yaw[horizon][0]:>6.1f} deg of {ours.yaw[horizon][0]:.1f} deg"
             )
     return "\n".join(lines)
-
-
-def load_params(folder: Path, which: Literal["best", "last"]) -> tuple[int, Params]:
-    """Step and parameters of a run's checkpoint; `InputError` where there is none."""
-    from ballu_mjx.rl import ppo
-    from ballu_mjx.runs.checkpoints import restore_checkpoint
-
-    step, tree = restore_checkpoint(folder, which)
-    return step, ppo.from_tree(tree)

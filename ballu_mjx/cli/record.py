@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ballu_mjx.recordings.importers.table import Table
     from ballu_mjx.recordings.importers.trajectories import Trajectories
     from ballu_mjx.recordings.recording import Recording
+    from ballu_mjx.robots.description import RobotDescription
 
 
 LEAST_CONFIDENCE = 0.4
@@ -47,7 +48,8 @@ class Import(runtime.CommandOptions):
     """Log of the commands: a CSV. Without this option they must be columns of the table itself."""
     offset: float | None = None
     """Seconds to add to the log's times for those of the capture (whose first sample is at 0, or at its own time in a
-    table); 0 for one clock. Without this option the offset is looked for in how the legs move."""
+    table); 0 for one clock. Without this option the offset is looked for in how the robot moves, where its adapter
+    predicts that."""
     offset_range: tuple[float, float] | None = None
     """Look for the offset between these two only: what tells the periods of a gait apart."""
     delay: float = 0.05
@@ -55,26 +57,30 @@ class Import(runtime.CommandOptions):
     was looked for does not count as the clock's."""
     format: Literal["auto", "vicon", "c3d", "table"] = "auto"
     """Of the file. auto: by its ending and first line."""
+    robot: str = "ballu"
+    """The robot: a name, or a description file."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Check(runtime.CommandOptions):
-    """Tell what recordings hold: rate, gaps, ranges and commands. Broken ones are refused, with the place and mend."""
+    """Tell what recordings hold: rate, gaps, ranges and commands. Broken ones are refused, with the place and fix."""
 
     recordings: tyro.conf.Positional[tuple[Path, ...]]
     """Recordings, or folders of them."""
     output: Path | None = None
     """Folder for a figure of each, NAME.png. Without this option there are none."""
+    robot: str = "ballu"
+    """The robot: a name, or a description file."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Simulate(runtime.CommandOptions):
-    """Record on the virtual robot: try out a method, or what to send, before the hardware does."""
+    """Record on the virtual BALLU: try out a method, or what to send, before the hardware does."""
 
     output: Path
     """The recording to write, NAME.csv or NAME.csv.gz; NAME.json comes beside it."""
     commands: Path | None = None
-    """CSV with the columns time (s), command_left and command_right in [0, 1], played at 20 Hz."""
+    """CSV with the columns time (s), command_left and command_right in [0, 1], played at the control rate."""
     gait: Literal["walking", "turning", "hopping", "one-legged", "telegraph", "waves"] | None = None
     """A command sequence by name, in place of --commands."""
     seconds: float = 20.0
@@ -118,6 +124,9 @@ def subcommands() -> dict[str, type]:
 class _Example(runtime.CommandOptions):
     """Print a mapping file with every key and its default: to be saved, and cut down to what your room needs."""
 
+    robot: str = "ballu"
+    """The robot: a name, or a description file."""
+
 
 def _run(options: Import | Check | Simulate | _Example) -> int:
     if isinstance(options, Import):
@@ -127,9 +136,10 @@ def _run(options: Import | Check | Simulate | _Example) -> int:
     elif isinstance(options, Simulate):
         _simulate(options)
     else:
-        from ballu_mjx.recordings.importers.mapping import EXAMPLE
+        from ballu_mjx.recordings.importers.mapping import example_mapping
+        from ballu_mjx.robots.registry import load_robot
 
-        print(EXAMPLE, end="")
+        print(example_mapping(load_robot(options.robot)), end="")
     return 0
 
 
@@ -142,20 +152,22 @@ def _import(options: Import) -> None:
     from ballu_mjx.recordings.importers.placement import place, with_commands
     from ballu_mjx.recordings.importers.table import Table, commands_in, read_commands
     from ballu_mjx.recordings.validation import SHORTEST
+    from ballu_mjx.robots.registry import load_robot
 
     _check_output(options.output)
     if options.offset is not None and options.offset_range is not None:
         raise InputError("--offset and --offset-range: the one gives what the other looks for; give one of them.")
     if options.commands is None and (options.offset is not None or options.offset_range is not None):
         raise InputError("--offset: it is a command log's, and there is none; add --commands.")
-    mapping = read_mapping(options.mapping)
+    robot = load_robot(options.robot)
+    mapping = read_mapping(options.mapping, robot)
     trajectories, table = _read(options, mapping)
-    recording = place(trajectories, mapping, recording_name(options.output))
+    recording = place(trajectories, mapping, robot, recording_name(options.output))
     if recording.time[-1] - recording.time[0] < SHORTEST:
         raise InputError(f"{options.file}: lasts less than {SHORTEST:g} s; capture for longer.")
     print(f"{options.file}: {len(recording.time)} samples, {recording.time[-1] - recording.time[0]:.2f} s")
     if options.commands is None:
-        if table is None or mapping.commands.left not in table.header:
+        if table is None or next(iter(mapping.commands.columns.values())) not in table.header:
             raise InputError(
                 f"{options.file}: holds no commands; give their log by --commands, or name their columns under "
                 f"[commands] in {options.mapping}."
@@ -163,11 +175,12 @@ def _import(options: Import) -> None:
         time, command = trajectories.time, commands_in(table, mapping.commands)
     else:
         time, command = read_commands(Table(options.commands, options.mapping), mapping.commands)
-        time = time + (_offset(options, recording, time, command) if options.offset is None else options.offset)
+        found = _offset(options, robot, recording, time, command) if options.offset is None else options.offset
+        time = time + found
     recording, cut = with_commands(options.commands or options.file, recording, time, command)
     if max(cut) > 0:
         print(f"cut off, for there are no commands: {cut[0]:.2f} s at the start, {cut[1]:.2f} s at the end")
-    _write(options, recording)
+    _write(options, robot, recording)
 
 
 def _read(options: Import, mapping: RoomMapping) -> tuple[Trajectories, Table | None]:
@@ -190,42 +203,46 @@ def _read(options: Import, mapping: RoomMapping) -> tuple[Trajectories, Table | 
 
 
 def _offset(
-    options: Import, recording: Recording, time: Float[np.ndarray, " N"], command: Float[np.ndarray, "N 2"]
+    options: Import,
+    robot: RobotDescription,
+    recording: Recording,
+    time: Float[np.ndarray, " N"],
+    command: Float[np.ndarray, "N commands"],
 ) -> float:
-    """The log's offset by how the legs move; prints it, and raises `InputError` where it is not clear."""
-    from ballu_mjx.ballu.leg_response import measured_response, nominal_response
+    """The log's offset by how the robot moves; prints it, and raises `InputError` where it is not clear."""
     from ballu_mjx.recordings.clock_alignment import align
+    from ballu_mjx.recordings.hooks import hooks_of
 
     log, by_hand = options.commands, "give the offset by --offset"
-    motion = measured_response(recording)
-    if motion is None:
-        raise InputError(f"{log}: neither knees nor base and feet were captured to find its offset by; {by_hand}.")
     for path, clock in ((log, time), (options.file, recording.time)):
         if not 1.0 <= clock[-1] - clock[0] <= _LONGEST_SEARCH:
             raise InputError(
                 f"{path}: lasts {clock[-1] - clock[0]:.4g} s; offsets are found for 1 to {_LONGEST_SEARCH:g} s, cut it "
                 f"or {by_hand}."
             )
-    grid, legs = nominal_response(time, command, recording.kind, knees=recording.knee is not None)
+    response = hooks_of(robot).response(recording, time, command)
+    if response is None:
+        raise InputError(f"{log}: nothing that {robot.name} is known to do on commands was captured; {by_hand}.")
+    motion, grid, predicted = response
     within = options.offset_range
     if within is not None:
         within = min(within) + options.delay, max(within) + options.delay
-    found = align(recording.time, motion, grid, legs, within=within)
+    found = align(recording.time, motion, grid, predicted, within=within)
     if found is None:
         raise InputError(
-            f"{log}: nothing moves in it or in the capture, or too little of the two overlaps; {by_hand}, or mend "
+            f"{log}: nothing moves in it or in the capture, or too little of the two overlaps; {by_hand}, or fix "
             "--offset-range."
         )
     best, offset = found.best, found.best.offset - options.delay
     told = f"offset {offset:+.3f} s: correlation {best.correlation:.2f} over {found.overlap:.1f} s"
     if abs(best.correlation) < LEAST_CORRELATION:
         raise InputError(
-            f"{log}: fits the motion nowhere, best at {told}; give this trial's log, mend left, right and their ranges "
-            f"in {options.mapping}, or {by_hand}."
+            f"{log}: fits the motion nowhere, best at {told}; give this trial's log, correct [commands] in "
+            f"{options.mapping}, or {by_hand}."
         )
     if best.correlation < 0:
         raise InputError(
-            f"{log}: the legs move against the commands, at {told}; turn range_left and range_right round in "
+            f"{log}: the robot moves against the commands, at {told}; turn the ranges of [commands] round in "
             f"{options.mapping}, or {by_hand}."
         )
     other = found.second
@@ -248,14 +265,14 @@ _ALIGNMENT_ERROR = 0.05
 """s; nine of ten trials of virtual robots (benchmarks/alignment.py)."""
 
 
-def _write(options: Import, recording: Recording) -> None:
+def _write(options: Import, robot: RobotDescription, recording: Recording) -> None:
     """Write, and read back what was written: the format's own reader judges it."""
     from ballu_mjx.recordings.csv_format import read_recording, sidecar_path, write_recording
 
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    write_recording(recording, options.output)
+    write_recording(recording, options.output, robot)
     try:
-        read = read_recording(options.output)
+        read = read_recording(options.output, robot)
     except InputError as error:
         for path in (options.output, sidecar_path(options.output)):
             path.unlink()
@@ -281,9 +298,11 @@ def _check_output(output: Path) -> None:
 
 
 def _check(options: Check) -> int:
-    from ballu_mjx.ballu import plots as ballu_plots
     from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+    from ballu_mjx.robots.registry import load_robot
+    from ballu_mjx.viz.recording import draw_recording
 
+    robot = load_robot(options.robot)
     paths = list_recordings(options.recordings)
     if not paths:
         raise InputError("There is nothing to check; name a recording, or a folder of them.")
@@ -292,16 +311,16 @@ def _check(options: Check) -> int:
     broken = 0
     for path in paths:
         try:
-            recording = read_recording(path)
+            recording = read_recording(path, robot)
         except InputError as error:
             print(error, file=sys.stderr)
             broken += 1
             continue
         gaps = missing(path)
-        print(report(path, recording, gaps))
+        print(report(path, recording, robot, gaps))
         if options.output is not None:
             figure = options.output / f"{recording.name}.png"
-            ballu_plots.recording(figure, recording, gaps)
+            draw_recording(figure, recording, robot, gaps)
             print(f"  drawn in {figure}")
     return 2 if broken else 0
 
@@ -321,7 +340,9 @@ def missing(path: Path) -> dict[str, list[tuple[float, float]]]:
     return found
 
 
-def report(path: Path, recording: Recording, gaps: dict[str, list[tuple[float, float]]]) -> str:
+def report(
+    path: Path, recording: Recording, robot: RobotDescription, gaps: dict[str, list[tuple[float, float]]]
+) -> str:
     """What a recording holds, in lines."""
     time = recording.time
     steps = np.diff(time)
@@ -345,32 +366,37 @@ def report(path: Path, recording: Recording, gaps: dict[str, list[tuple[float, f
         lines.append(f"  {shown}: " + (told if len(spans) > 1 else f"1 drop-out of {lengths[0]:.2f} s"))
     if not gaps:
         lines.append("  no drop-outs")
-    for label, value in _ranges(recording):
+    for label, value in _ranges(recording, robot):
         low, high = value.min(axis=0), value.max(axis=0)
         lines.append(f"  {label}: " + ", ".join(f"{a:.3f} to {b:.3f}" for a, b in zip(low, high, strict=True)))
-    for leg, side in enumerate(("left", "right")):
-        command = recording.command[:, leg]
+    for name, command in zip(robot.commands, recording.command.T, strict=True):
         changes = int((np.diff(command) != 0).sum())
         held = (time[-1] - time[0]) / (changes + 1)
         lines.append(
-            f"  command_{side}: {command.min():.2f} to {command.max():.2f}, mean {command.mean():.2f}, "
+            f"  command_{name}: {command.min():.2f} to {command.max():.2f}, mean {command.mean():.2f}, "
             f"{changes} changes, held for {held:.2f} s on average"
         )
     return "\n".join(lines)
 
 
-def _ranges(recording: Recording) -> list[tuple[str, np.ndarray]]:
-    """Columns by what they are called in a report."""
-    feet = recording.foot_position
-    values = [
-        ("balloon x, y, z (m)", recording.balloon_position),
-        ("base x, y, z (m)", recording.base_position),
-        ("left foot x, y, z (m)", None if feet is None else feet[:, 0]),
-        ("right foot x, y, z (m)", None if feet is None else feet[:, 1]),
-        ("motors, left and right (rad)", recording.motor),
-        ("knees, left and right (rad)", recording.knee),
-    ]
-    return [(label, value) for label, value in values if value is not None]
+def _ranges(recording: Recording, robot: RobotDescription) -> list[tuple[str, np.ndarray]]:
+    """Columns by what they are called in a report; orientations are unwound."""
+    from scipy.spatial.transform import Rotation
+
+    def degrees(quaternion: np.ndarray) -> np.ndarray:
+        angles = Rotation.from_quat(quaternion, scalar_first=True).as_euler("ZYX", degrees=True)
+        return np.unwrap(angles, axis=0, period=360.0)
+
+    places = {robot.tracked: recording.tracked_position, **recording.points}
+    turns = {robot.tracked: recording.tracked_quaternion, **recording.orientations}
+    values = []
+    for site in (robot.tracked, *robot.points):
+        if (place := places.get(site)) is not None:
+            values.append((f"{site} x, y, z (m)", place))
+        if (quaternion := turns.get(site)) is not None:
+            values.append((f"{site} yaw, pitch, roll (deg)", degrees(quaternion)))
+    values += [(f"{joint} (rad or m)", angle[:, None]) for joint, angle in recording.joint_angles.items()]
+    return values
 
 
 # ---- simulate ----
@@ -379,42 +405,42 @@ def _ranges(recording: Recording) -> list[tuple[str, np.ndarray]]:
 def _simulate(options: Simulate) -> None:
     from ballu_mjx.ballu.virtual import robot as virtual_robot
     from ballu_mjx.recordings.csv_format import read_recording, recording_name, write_recording
-    from ballu_mjx.robots.model import CONTROL_TIMESTEP
+    from ballu_mjx.robots.registry import load_robot
 
     _check_output(options.output)
     for name in ("robot_seed", "trial_seed"):
         if getattr(options, name) < 0:
             raise InputError(f"--{name.replace('_', '-')} {getattr(options, name)}: seeds are 0 or more.")
-    robot, name = virtual_robot.draw_robot(options.robot_seed), recording_name(options.output)
+    robot, name = load_robot(), recording_name(options.output)
+    virtual = virtual_robot.draw_robot(options.robot_seed)
     if options.suspended:
         if options.commands is not None or options.gait is not None:
             raise InputError("--suspended: a sweep has its own commands; leave --commands and --gait out.")
         if not (2 <= options.levels <= 1000 and 0.1 <= options.hold <= 60.0):
             raise InputError("--levels, --hold: give 2 levels or more, and 0.1 to 60 s.")
         result = virtual_robot.record_sweep(
-            robot, options.trial_seed, name, commands=options.levels, hold=options.hold
+            virtual, options.trial_seed, name, commands=options.levels, hold=options.hold
         )  # fmt: skip
     else:
-        commands, notes = _commands(options)
+        commands, notes = _commands(options, robot)
         result = virtual_robot.record(
-            robot,
+            virtual,
             virtual_robot.draw_trial(options.trial_seed),
             virtual_robot.open_loop(commands),
-            len(commands) * CONTROL_TIMESTEP,
+            len(commands) * robot.control_timestep,
             name,
             notes,
         )
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    write_recording(result, options.output, decimals=4)
-    print(report(options.output, read_recording(options.output), missing(options.output)))
+    write_recording(result, options.output, robot, decimals=4)
+    print(report(options.output, read_recording(options.output, robot), robot, missing(options.output)))
 
 
-def _commands(options: Simulate) -> tuple[Float[np.ndarray, "steps 2"], str]:
+def _commands(options: Simulate, robot: RobotDescription) -> tuple[Float[np.ndarray, "steps 2"], str]:
     """Commands at the control rate, and what to say of them."""
     from ballu_mjx.ballu.gaits import GAITS
     from ballu_mjx.recordings.importers.mapping import Commands
     from ballu_mjx.recordings.importers.table import Table, read_commands
-    from ballu_mjx.robots.model import CONTROL_TIMESTEP
 
     if (options.commands is None) == (options.gait is None):
         raise InputError("--commands, --gait: give one of them, or --suspended for a sweep.")
@@ -424,9 +450,10 @@ def _commands(options: Simulate) -> tuple[Float[np.ndarray, "steps 2"], str]:
         assert options.gait is not None
         gaits: dict[str, Callable[[float], Float[np.ndarray, "steps 2"]]] = dict(GAITS)
         return gaits[options.gait](options.seconds), f"{options.gait}, open loop."
-    time, command = read_commands(Table(options.commands), Commands())
-    steps = int(round((time[-1] - time[0]) / CONTROL_TIMESTEP, 6)) + 1
-    if not 1.0 <= steps * CONTROL_TIMESTEP <= 3600.0:
-        raise InputError(f"{options.commands}: lasts {steps * CONTROL_TIMESTEP:g} s; give 1 to 3600 s.")
-    held = np.searchsorted(time, time[0] + CONTROL_TIMESTEP * np.arange(steps) + 1e-6, side="right") - 1
+    time, command = read_commands(Table(options.commands), Commands.of(robot))
+    step = robot.control_timestep
+    steps = int(round((time[-1] - time[0]) / step, 6)) + 1
+    if not 1.0 <= steps * step <= 3600.0:
+        raise InputError(f"{options.commands}: lasts {steps * step:g} s; give 1 to 3600 s.")
+    held = np.searchsorted(time, time[0] + step * np.arange(steps) + 1e-6, side="right") - 1
     return command[held], f"{options.commands.name}, open loop."

@@ -7,16 +7,12 @@ import sys
 import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tyro
 
 from ballu_mjx.common import files, runtime
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.viz import video
-
-if TYPE_CHECKING:
-    pass
 from ballu_mjx.viz.report import REPORT_FILE, collect, render
 
 
@@ -61,8 +57,8 @@ def _report(options: Options) -> None:
     print(f"Written to {path}, {path.stat().st_size / 1e6:.1f} MB.")
     if not content.takes:
         print(
-            "It has no replay in 3D: identifications have none, nor have robots but BALLU; an EnvMimic's is written "
-            "by `python -m ballu_mjx evaluate RUN --output RUN`."
+            "It has no replay in 3D: identifications have none; that of a residual is written by "
+            "`python -m ballu_mjx evaluate RUN --output RUN`."
         )
     elif options.video:
         shown = next(take for take in content.takes if options.show in (None, take.name))

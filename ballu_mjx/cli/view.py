@@ -42,6 +42,8 @@ class Options(runtime.CommandOptions):
     """Show it in the browser at once."""
     mujoco: bool = False
     """Open MuJoCo's own viewer instead, which needs a screen."""
+    robot: str = "ballu"
+    """Robot of a recording: its name, or the file of its description. A run knows its own."""
     show: str | None = None
     """Recording (or task) to begin with. Without this option: the first."""
 
@@ -57,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if options.mujoco:
                 check_screen()
             runtime.prepare()
-            takes = load(options.source)
+            takes = load(options.source, options.robot)
             first = choose(takes, options.show)
             if options.mujoco:
                 _mujoco(takes[first])
@@ -69,8 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return runtime.exit_status(run, arguments)
 
 
-def load(source: Path) -> list[StoredRollout]:
-    """What there is to show of a run's folder or a recording.
+def load(source: Path, robot: str = "ballu") -> list[StoredRollout]:
+    """Return what there is to show of a run's folder, or of a recording of a robot.
 
     **Raises** `InputError` where it is neither, or holds no replay.
     """
@@ -79,18 +81,20 @@ def load(source: Path) -> list[StoredRollout]:
 
         takes = collect(source).takes
         return takes or read_rollouts(source / ROLLOUT_FILE)
-    from ballu_mjx.ballu.model import load_model
-    from ballu_mjx.ballu.reconstruct import reconstruct_ballu
     from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+    from ballu_mjx.recordings.reconstruct import reconstruct
+    from ballu_mjx.robots.registry import load_robot
 
-    recording = read_recording(list_recordings([source])[0])
+    description = load_robot(robot)
+    recording = read_recording(list_recordings([source])[0], description)
     if recording.kind != "free":
         raise InputError(f"{source}: is a {recording.kind} recording; only free ones have a way to show.")
     print("Reconstructing the recorded states ...", flush=True)
-    motion = reconstruct_ballu(recording, load_model())
+    motion = reconstruct(recording, description)
     return [
         StoredRollout(
             name=motion.name,
+            description=description,
             robot=motion.robot,
             time=motion.time,
             qpos={"recording": motion.qpos},
@@ -195,8 +199,9 @@ class Player:
 
     def _close(self) -> tuple[np.ndarray, np.ndarray]:
         """A camera beside robots that are followed."""
-        target = np.array([0.0, 0.0, 0.65])
-        return target + np.array([-0.9, -2.6, 0.5]), target
+        shapes = self._stage.shapes
+        target = np.array([0.0, 0.0, self._stage.centre(0)[2]])
+        return target + shapes.extent * np.array([-0.6, -1.8, 0.35]), target
 
     def _show(self, state: int) -> None:
         from ballu_mjx.viz import robot_meshes
@@ -237,12 +242,11 @@ def _mujoco(take: StoredRollout) -> None:
     import mujoco
     import mujoco.viewer
 
-    from ballu_mjx.ballu.model import load_model
     from ballu_mjx.viz import robot_meshes
 
-    model = load_model()
-    data = mujoco.MjData(model)
-    drawn = mujoco.MjData(model)
+    shapes = robot_meshes.RobotShapes(take.description)
+    model = robot_meshes.load_scenery(shapes.robot)
+    data, drawn = mujoco.MjData(model), mujoco.MjData(shapes.model)
     playing = True
 
     def key(code: int) -> None:
@@ -254,7 +258,7 @@ def _mujoco(take: StoredRollout) -> None:
     except RuntimeError as error:
         raise InputError(f"--mujoco: {str(error).strip()}") from None
     with window:
-        robot_meshes.hide_robot(window.opt)
+        robot_meshes.option_for_scenery(window.opt)
         now, before = 0.0, time.perf_counter()
         while window.is_running():
             time.sleep(_FRAME)
@@ -262,12 +266,12 @@ def _mujoco(take: StoredRollout) -> None:
             now = (now + elapsed * playing) % float(take.time[-1] - take.time[0])
             state = int(np.argmin(np.abs(take.time - take.time[0] - now)))
             robots = {name: qpos[state] for name, qpos in take.qpos.items()}
-            force = robot_meshes.force_at(take, state) if robot_meshes.pushed(take) else None
             with window.lock():
                 scene = window.user_scn
                 if scene is not None:
                     scene.ngeom = 0
-                    robot_meshes.draw(scene, model, drawn, robots, force)
+                    arrow = shapes.arrow(take, state)
+                    robot_meshes.draw(scene, shapes.model, drawn, shapes.robot, robots, arrow)
             window.sync()
 
 

@@ -79,8 +79,11 @@ def parse_json(text: str, where: str, mend: str) -> Any:
 
 
 def write(path: Path, content: str | bytes) -> None:
-    """Write all of a file or nothing, to the disk: what is there when this returns outlives a power failure."""
-    draft = path.with_name(path.name + ".tmp")
+    """Write all of a file or nothing, to the disk: what is there when this returns outlives a power failure.
+
+    The temporary file beside it is this process's own: two processes that write one file end with one of both.
+    """
+    draft = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
         with draft.open("wb") as file:
             file.write(content.encode() if isinstance(content, str) else content)

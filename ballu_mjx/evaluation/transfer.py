@@ -12,11 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
-from ballu_mjx.evaluation.gait import count_steps
+from ballu_mjx.evaluation.statistics import LEVEL, seed_means, t_interval
 from ballu_mjx.robots.model import CONTROL_TIMESTEP
 
 STRIDE = 1.0
@@ -45,9 +45,9 @@ class Trajectory:
     com: Float[np.ndarray, "T 3"]
     """Centre of mass (m, world)."""
     yaw: Float[np.ndarray, " T"]
-    """Of the balloon (rad, world), not unwrapped."""
-    feet: Float[np.ndarray, "T 2 3"]
-    """Left and right (m, world)."""
+    """Of the tracked body (rad, world), not unwrapped."""
+    steps: Int[np.ndarray, " T"]
+    """How many steps a walking robot has made by each state."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +63,8 @@ class Transfer:
     y_distance: float
     """Robot (m, paper, Table II)."""
     yaw_error: float
-    """Final yaw in simulation less the robot's (deg, signed, paper, Table II); full turns count."""
+    """Final yaw in simulation less the robot's (deg, signed, paper, Table II); full turns count. Errors of yaw in
+    `errors_table` are wrapped to 180 deg instead."""
     yaw_change: float
     """Robot (deg, paper, Table II); full turns count."""
     sim_x_distance: float
@@ -73,7 +74,7 @@ class Transfer:
     sim_yaw_change: float
     """Simulation (deg); full turns count."""
     steps: float
-    """Robot: see `gait.count_steps`."""
+    """Robot: steps made."""
     sim_steps: float
     """Simulation."""
 
@@ -120,10 +121,11 @@ def compare_trajectories(simulation: Trajectory, robot: Trajectory) -> Transfer:
     Both must start from (nearly) the same state: nothing is aligned, and an offset at the start counts as error. Only
     yaws at the start on either side of the half turn are taken as the near neighbours that they are.
 
-    **Raises** `ValueError` where a path has fewer than 2 states, or not as many yaws or feet as centres of mass.
+    **Raises** `ValueError` where a path has fewer than 2 states, or not as many yaws or numbers of steps as centres of
+    mass.
     """
     for name, path in (("simulation", simulation), ("robot", robot)):
-        for what, states in (("yaws", path.yaw), ("pairs of feet", path.feet)):
+        for what, states in (("yaws", path.yaw), ("numbers of steps", path.steps)):
             if len(path.com) != len(states):
                 raise ValueError(f"The {name} has {len(path.com)} centres of mass, but {len(states)} {what}.")
         if len(path.com) < 2:
@@ -143,8 +145,8 @@ def compare_trajectories(simulation: Trajectory, robot: Trajectory) -> Transfer:
         sim_x_distance=float(sim_way[0]),
         sim_y_distance=float(sim_way[1]),
         sim_yaw_change=float(sim_turn),
-        steps=count_steps(robot.feet[:states]),
-        sim_steps=count_steps(simulation.feet[:states]),
+        steps=float(robot.steps[states - 1]),
+        sim_steps=float(simulation.steps[states - 1]),
     )
 
 
@@ -156,50 +158,6 @@ def path_length(com: Float[np.ndarray, "T 3"]) -> float:
     points = com[:: round(STRIDE / CONTROL_TIMESTEP), :2]
     points = np.concatenate([points, com[-1:, :2]])  # adds nothing where the last is there already
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-
-
-class Interval(NamedTuple):
-    """A mean with its confidence interval."""
-
-    mean: float
-    low: float
-    high: float
-
-
-def bootstrap(
-    values: Sequence[Sequence[float]], *, draws: int = 10_000, level: float = 0.95, seed: int = 0
-) -> Interval:
-    """Mean of the seeds' means, with the percentile interval of a hierarchical bootstrap.
-
-    Each draw takes as many seeds as there are, with replacement, then as many trials within each as it has, with
-    replacement. With one seed only trials are resampled: the interval then speaks of that one training alone. With few
-    seeds percentile intervals are too narrow: where seeds differ as much as trials (5 each), those of 95 % were found
-    to hold the mean over all trainings in 93 % of datasets with 20 seeds, 89 % with 5, 81 % with 3, and 47 % with one.
-
-    **Arguments** `values[seed][trial]`; numbers of trials may differ, and a seed counts the same with few as with many.
-
-    **Raises** `ValueError` where there is no seed, or one without trials.
-    """
-    counts = np.array([len(trials) for trials in values])
-    if not counts.size or not counts.all():
-        raise ValueError("The bootstrap needs a seed or more, each with a trial or more.")
-    table = np.zeros((len(counts), counts.max()))
-    for row, trials in zip(table, values, strict=True):
-        row[: len(trials)] = trials
-    rng = np.random.default_rng(seed)
-    seeds = rng.integers(len(counts), size=(draws, len(counts)))
-    count = counts[seeds][..., None]
-    chosen = rng.integers(count, size=(*seeds.shape, counts.max()))
-    drawn = table[seeds[..., None], chosen]
-    there = np.arange(counts.max()) < count
-    means = (drawn.sum(axis=-1, where=there) / count[..., 0]).mean(axis=-1)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    return Interval(float(np.mean([np.mean(trials) for trials in values])), float(low), float(high))
-
-
-def separated(a: Interval, b: Interval) -> bool:
-    """Whether two intervals do not overlap."""
-    return a.high < b.low or b.high < a.low
 
 
 class _Column(NamedTuple):
@@ -222,17 +180,18 @@ _TURNING = (
 
 
 def walking_table(results: Mapping[str, Sequence[Sequence[Transfer]]]) -> str:
-    """Table I in Markdown, `results[setting][seed][trial]`: `mean [low, high]` of `bootstrap`, and the paper's number.
+    """Return Table I in Markdown, `results[setting][seed][trial]`: `mean [low, high]`, and the paper's number.
 
-    Rows in the order given. A setting that the paper does not have shows `-` for its numbers, and a mean over one
-    trial has no interval. The last column, which the paper does not have, tells gaits from what is none: mean and range
-    of `gait.count_steps` over all trials, on the robot and in the policies' own simulators.
+    The interval is `statistics.t_interval` of the seeds' means; a mean over one seed has none. Rows are in the order
+    given. A setting that the paper does not have shows `-` for its numbers. The last column, which the paper does not
+    have, tells gaits from what is none: mean and range of `gait.count_steps` over all trials, on the robot and in the
+    policies' own simulators. The caption says what the brackets are.
     """
     return _table(results, _WALKING, PAPER_WALKING)
 
 
 def turning_table(results: Mapping[str, Sequence[Sequence[Transfer]]]) -> str:
-    """Table II in Markdown, as `walking_table`.
+    """Return Table II in Markdown, as `walking_table`.
 
     The final yaw error is the mean of absolute values, for errors to either side cancel; the paper's is signed.
     """
@@ -255,14 +214,25 @@ def _table(
         trials = [trial for trials in seeds for trial in trials]
         cells.append(f"{_range([each.steps for each in trials])}; {_range([each.sim_steps for each in trials])}")
         lines.append(cells)
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines) + f"\n\n{_caption(results)}"
+
+
+def _caption(results: Mapping[str, Sequence[Sequence[Transfer]]]) -> str:
+    seeds = {len(each) for each in results.values()}
+    if seeds == {1}:
+        return "One seed a setting: no interval, and no ranking."
+    count = f"{min(seeds)} to {max(seeds)}" if len(seeds) > 1 else f"{max(seeds)}"
+    return (
+        f"Means over {count} seeds, each the mean of its trials. Brackets are {LEVEL:.0%} confidence intervals over "
+        "seeds (Student's t); a single seed has none."
+    )
 
 
 def _cell(values: Sequence[Sequence[float]], digits: int) -> str:
-    mean, low, high = bootstrap(values)
-    if sum(len(trials) for trials in values) == 1:
-        return f"{mean:.{digits}f}"
-    return f"{mean:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+    found = t_interval(seed_means(values))
+    if found.half is None:
+        return f"{found.mean:.{digits}f}"
+    return f"{found.mean:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
 
 
 def _range(values: Sequence[float]) -> str:

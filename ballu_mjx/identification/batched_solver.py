@@ -73,15 +73,30 @@ class BatchedSolver:
         self._step = eqx.filter_jit(eqx.filter_vmap(step))
 
     def __call__(
-        self, evaluate: Evaluate, start: np.ndarray, steps: int, report: Callable[[int, int, float], None]
+        self,
+        evaluate: Evaluate,
+        start: np.ndarray,
+        steps: int,
+        report: Callable[[int, int, float], None],
+        patience: int | None = None,
     ) -> tuple[Float[np.ndarray, "batch size"], Float[np.ndarray, " batch"]]:
-        """Coordinates and losses at the end of each search: sums of squares, or the minimized function itself."""
+        """Coordinates and losses at the end of each search: sums of squares, or the minimized function itself.
+
+        After `patience` iterations in which no search gained anything worth it, they end.
+        """
         evaluated = tuple(map(jnp.asarray, evaluate(start)))
         y, state, loss = jnp.asarray(start), self._init(jnp.asarray(start), evaluated), np.zeros(len(start))
+        lowest, idle = np.full(len(start), np.inf), 0
         for iteration in range(steps):
             y, state, loss, done = self._step(y, evaluated, state)
             report(iteration + 1, steps, float(jnp.min(loss)))
-            if bool(jnp.all(done)):
+            idle = idle + 1 if bool(np.all(loss >= (1 - _WORTH) * lowest)) else 0
+            lowest = np.minimum(lowest, loss)
+            if bool(jnp.all(done)) or idle == patience:
                 break
             evaluated = tuple(map(jnp.asarray, evaluate(np.asarray(state.y_eval))))
         return np.asarray(y), np.asarray(loss)
+
+
+_WORTH = 1e-4
+"""Of the loss: what an iteration gains at least."""

@@ -10,11 +10,7 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
-from ballu_mjx.policies.locomotion_env import (
-    Contents,
-    LocomotionEnv,
-    command_of,
-)
+from ballu_mjx.policies.locomotion_env import Contents, LocomotionEnv, locomotion_state
 from ballu_mjx.rl.ppo import Inference, Params
 
 
@@ -22,12 +18,12 @@ class Rollout(NamedTuple):
     """Closed-loop simulations at the control rate, the starting state first."""
 
     qpos: Float[np.ndarray, "runs states nq"]
-    features: Float[np.ndarray, "runs states 27"]
+    features: Float[np.ndarray, "runs states features"]
     """`observation.observe_features`."""
     com: Float[np.ndarray, "runs states 3"]
     """Centre of mass (m, world)."""
-    command: Float[np.ndarray, "runs steps 2"]
-    """Servo commands."""
+    command: Float[np.ndarray, "runs steps commands"]
+    """In the actuators' units."""
     outside: Float[np.ndarray, "runs steps"]
     """1 where the residual's observation lay outside of what its training had seen."""
     reward: Float[np.ndarray, "runs steps"]
@@ -35,7 +31,7 @@ class Rollout(NamedTuple):
 
     @property
     def yaw(self) -> Float[np.ndarray, "runs states"]:
-        """Of the balloon (rad), not unwrapped."""
+        """Of the tracked body (rad), not unwrapped."""
         return self.features[..., 8]
 
 
@@ -53,8 +49,8 @@ class ClosedLoop:
         self._contents = env.contents
 
         def look(state: State) -> tuple[Array, ...]:
-            s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-            return s["physics"].qpos, s["history"][-1], s["com"]
+            now = locomotion_state(state)
+            return now.rollout.physics.qpos, now.rollout.features, now.com
 
         def run(params: Params, contents: Contents, state: State) -> Any:
             here = env.with_contents(contents)
@@ -62,7 +58,7 @@ class ClosedLoop:
             def advance(state: State, _: None) -> tuple[State, Any]:
                 action = infer(params, state.obs)  # pyright: ignore[reportArgumentType]
                 after = here.step(state, action)
-                return after, (*look(after), command_of(action), after.metrics["outside"], after.reward)
+                return after, (*look(after), env.command_of(action), after.metrics["outside"], after.reward)
 
             return jax.lax.scan(advance, state, None, _CHUNK)
 
@@ -107,6 +103,7 @@ class ClosedLoop:
         return Rollout(*states, *per_step)
 
     def standing(self, count: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """`count` starting states, (qpos, qvel), as training draws them."""
-        state: Any = self._reset(self._contents, jax.random.split(jax.random.key(seed), count)).pipeline_state
-        return np.asarray(state["physics"].qpos), np.asarray(state["physics"].qvel)
+        """Return `count` starting states, (qpos, qvel), as training draws them."""
+        state = self._reset(self._contents, jax.random.split(jax.random.key(seed), count))
+        physics = locomotion_state(state).rollout.physics
+        return np.asarray(physics.qpos), np.asarray(physics.qvel)

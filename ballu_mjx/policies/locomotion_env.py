@@ -11,24 +11,24 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from brax.envs.base import Env, State
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from ballu_mjx.ballu.model import KNEES, MOTORS, SIDES, standing_qpos
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.tasks import Step, Task
+from ballu_mjx.policies.variants import SimulatorVariant
 from ballu_mjx.residuals.trained import TrainedResidual
-from ballu_mjx.robots.model import CONTROL_TIMESTEP, ModelParameters
-from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.model import ModelParameters
 from ballu_mjx.sim.observation import HISTORY, heading_observation
-from ballu_mjx.sim.simulator import Simulator
-from ballu_mjx.sim.step import PhysicsState, state_at
+from ballu_mjx.sim.simulator import RolloutState, Simulator
+from ballu_mjx.sim.step import state_at
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,15 +39,18 @@ class LocomotionConfig:
     """Draw friction and starting state anew for every episode, as the paper does (not masses, not buoyancy: gaits
     depend on these too finely)."""
     friction: tuple[float, float] = (0.5, 1.1)
-    """Range of the coefficient of friction between feet and floor (nominal: 0.9)."""
+    """Range of the coefficient of sliding friction, one for all geoms that collide (BALLU's feet: 0.9 nominally)."""
     start_yaw: float = 20.0
     """Starting headings are drawn from plus or minus this, deg."""
     start_tilt: float = 2.0
-    """Spread of the base's starting roll and pitch, deg."""
+    """Starting roll and pitch of the base are drawn from plus or minus this, deg."""
     start_angle: float = 3.0
-    """Spread of starting hip and neck angles, deg; knees are drawn as far from their stops, motors stay at 0."""
+    """Spread of the starting angles of hinges, deg, within their ranges; joints that the robot's description holds stay
+    where they are."""
+    start_offset: float = 0.005
+    """Spread of the starting positions of slides, m, likewise."""
     start_velocity: float = 0.03
-    """Spread of the starting velocity, m/s; joints and base turn at five times as much, rad/s."""
+    """Spread of the starting velocity, m/s; hinges and base turn at five times as much, rad/s."""
     episode_seconds: float = 12.0
     """Mean length of an episode, s; each lasts between half and one and a half times as long."""
     sampled_residual: bool = False
@@ -60,53 +63,121 @@ class LocomotionConfig:
     the residual knows what it does, which a policy paid for speed otherwise leaves. 0: nothing."""
 
 
-def check_locomotion_config(config: LocomotionConfig) -> None:
-    """**Raises** `InputError` for options out of range, naming the option and the mend."""
+_STARTS = ("start_yaw", "start_tilt", "start_angle", "start_offset", "start_velocity")
+_NOT_NEGATIVE = (*_STARTS, "residual_decay", "outside_cost")
+
+
+def check_locomotion_config(config: LocomotionConfig, control_timestep: float) -> None:
+    """Check the options for a robot with so many seconds between two commands.
+
+    **Raises** `InputError` for options out of range, naming the option and the fix.
+    """
     low, high = config.friction
     if not 0 < low <= high < math.inf:
         raise InputError(f"--friction is {low:g} {high:g}: give two numbers above 0, the smaller first.")
-    least = 2 * CONTROL_TIMESTEP
+    least = 2 * control_timestep
     if not least <= config.episode_seconds < math.inf:
         raise InputError(
             f"--episode-seconds is {config.episode_seconds:g}: it must be {least:g} or more; {least:g} is the nearest."
         )
-    for name in ("start_yaw", "start_tilt", "start_angle", "start_velocity", "residual_decay", "outside_cost"):
+    for name in _NOT_NEGATIVE:
         if not 0 <= getattr(config, name) < math.inf:
             raise InputError(
                 f"--{name.replace('_', '-')} is {getattr(config, name):g}: it must be 0 or more; 0 is the nearest."
             )
 
 
-def setting_name(config: LocomotionConfig, identified: bool, residual: str | None) -> str:
-    """What the paper calls a simulator: the residual's name, or `vanilla` with `+sysid` and `+dr` as they apply."""
-    if residual is not None:
-        return residual
-    return "vanilla" + "+sysid" * identified + "+dr" * config.domain_randomization
+def check_task(task: Task, robot: RobotDescription) -> None:
+    """Check that a robot can do a task.
+
+    **Raises** `InputError` where it cannot.
+    """
+    if robot.anchored:
+        raise InputError(
+            f"{task.name} needs a free-floating robot; {robot.name} is anchored ({robot.model.name} has no free joint)."
+        )
 
 
-Setting = dict[str, Any]
-"""What tells one simulator from another, as arrays; see `setting_of`."""
-Contents = dict[str, Any]
-"""See `LocomotionEnv.contents`."""
-OBSERVATIONS = 28
+class StartSpread(NamedTuple):
+    """How starting states vary."""
+
+    turn: Float[Array, " 3"]
+    """Largest roll, pitch and yaw (rad)."""
+    joint: Float[Array, " joints"]
+    """Standard deviation of each joint (rad, m)."""
+    velocity: Float[Array, " nv"]
+    """Standard deviation of each velocity (m/s, rad/s)."""
+
+
+class Setting(NamedTuple):
+    """What tells one simulator from another, as arrays; see `make_setting`."""
+
+    fields: dict[str, Array]
+    """Fields of the MJX model that identified actuators change."""
+    initial: Float[Array, " nq"]
+    """Pose that episodes start from."""
+    joint_range: Float[Array, "joints 2"]
+    """Smallest and largest value of each joint (rad, m); infinite where it has no limit."""
+    friction: Float[Array, "colliding 2"]
+    """Range of the sliding friction of each geom that collides."""
+    spread: StartSpread
+
+
+class Contents(NamedTuple):
+    """What tells one environment from another of the same task, configuration and kind of residual, as arrays."""
+
+    model: Any
+    """The MJX model."""
+    setting: Setting
+    residual: Any
+    """Parameters of the residual, and the range of what it has seen; None: there is no residual."""
+
+
+class LocomotionState(NamedTuple):
+    """Where an episode stands, and in which simulator."""
+
+    setting: Setting
+    friction: Float[Array, " colliding"]
+    """Sliding friction of the geoms that collide."""
+    rollout: RolloutState
+    com: Float[Array, " 3"]
+    """Centre of mass (m, world)."""
+    remaining: Int[Array, ""]
+    """Control steps until the episode ends."""
+    key: Array
+
+
 _METRICS = ("velocity_x", "velocity_y", "force", "outside", "excess", "diverged")
 
 
-def locomotion_observation(features: Float[Array, " 27"]) -> Float[Array, " 28"]:
+def locomotion_state(state: State) -> LocomotionState:
+    """Return what `LocomotionEnv` keeps in `state`: Brax types it as its own physics' state."""
+    return cast(LocomotionState, state.pipeline_state)
+
+
+def num_observations(robot: RobotDescription) -> int:
+    """Return the size of `locomotion_observation`."""
+    return robot.features + 1
+
+
+def locomotion_observation(
+    features: Float[Array, " features"], anchored: bool = False
+) -> Float[Array, " observations"]:
     """Return what a locomotion policy sees of `observe_features`: the paper's state, of the current control step only.
 
-    Horizontal positions are relative to the balloon's and turned into its heading, like velocities, for a gait is the
-    same one wherever it goes. The heading itself stands at the end, as cosine and sine: the task's direction is fixed
-    in the world.
+    Of a free robot, horizontal positions are relative to the tracked body's and turned into its heading, like
+    velocities, for a gait is the same one wherever it goes. The heading itself stands at the end, as cosine and sine:
+    the task's direction is fixed in the world.
     """
     yaw = features[8]
-    relative = heading_observation(features[None])  # its last entry, the yaw relative to itself, is 0
+    relative = heading_observation(features[None], anchored)  # its last entry is the yaw
     return jnp.concatenate([relative[:-1], jnp.cos(yaw)[None], jnp.sin(yaw)[None]])
 
 
-def command_of(action: Float[Array, " 2"]) -> Float[Array, " 2"]:
-    """Servo commands in [0, 1] for a policy's output: -1 to 1 is the whole range."""
-    return jnp.clip((action + 1) / 2, 0.0, 1.0)
+def command_of(action: Float[Array, " commands"], robot: RobotDescription) -> Float[Array, " commands"]:
+    """Return the commands (in the actuators' units) for a policy's output: -1 to 1 is the whole range of each."""
+    low, high = (jnp.asarray(bound, jnp.float32) for bound in np.array(robot.command_ranges).T)
+    return low + jnp.clip((action + 1) / 2, 0.0, 1.0) * (high - low)
 
 
 class LocomotionEnv(Env):
@@ -114,186 +185,203 @@ class LocomotionEnv(Env):
 
     def __init__(
         self,
-        model: mujoco.MjModel,
+        robot: RobotDescription,
         task: Task,
         config: LocomotionConfig,
         *,
         actuators: ModelParameters | None = None,
         residual: TrainedResidual | None = None,
     ) -> None:
-        """`model` is the nominal robot; `actuators` (None: nominal ones) and `residual` (None: none) improve it."""
-        self.task, self.config, self.residual = task, config, residual
-        self.simulator = Simulator(model)
-        if residual is not None:
-            self.simulator = self.simulator.altered(residual.fields)
-        self.setting = setting_of(model, config, actuators)
-        self._feet = np.array([model.geom(f"foot_{side}").id for side in SIDES])
+        """Make the environment; `actuators` (None: nominal ones) and `residual` (None: none) improve the simulator.
+
+        **Raises** `InputError` where the robot cannot do the task.
+        """
+        check_task(task, robot)
+        self.robot, self.task, self.config, self.residual = robot, task, config, residual
+        simulator = Simulator(robot)
+        self.simulator = simulator.with_residual(None if residual is None else residual.bound)
+        model = simulator.mj_model
+        self.setting = make_setting(robot, model, config, actuators)
+        self._colliding = colliding_geoms(model)
         self._friction = jnp.asarray(model.geom_friction)
-        self._knees = jnp.asarray(np.arange(model.nq)[7:][KNEES])
+        self._rest = jnp.asarray(robot.adapter.rest_command(robot, model), jnp.float32)
+        self._root = 0 if robot.anchored else 7
+        """Numbers of the root's pose in `qpos`."""
 
     @property
     def contents(self) -> Contents:
-        """The model's numbers, and what the residual has learned and seen: what tells one environment from another of
-        the same task, configuration and kind of residual, as arrays (beside the setting, which may differ from robot to
-        robot). Programs that take it as an argument serve them all."""
+        """The model's numbers, the setting, and what the residual has learned and seen. Programs that take them as an
+        argument serve all environments that differ in nothing else. Settings may differ from robot to robot of a batch.
+        """
         residual = None if self.residual is None else (self.residual.params, self.residual.observed)
-        return {"model": self.simulator.model, "setting": self.setting, "residual": residual}
+        return Contents(self.simulator.simulator.model, self.setting, residual)
 
     def with_contents(self, contents: Contents) -> LocomotionEnv:
-        """The same with other contents, which may be traced."""
+        """Return the same environment with other contents, which may be traced."""
         other = copy.copy(self)
-        other.simulator, other.setting = self.simulator.of(contents["model"]), contents["setting"]
+        params, observed = (None, None) if self.residual is None else contents.residual
+        other.simulator, other.setting = self.simulator.with_model(contents.model, params), contents.setting
         if self.residual is not None:
-            params, observed = contents["residual"]
             other.residual = dataclasses.replace(self.residual, params=params, observed=observed)
         return other
 
     def reset(self, rng: Array) -> State:
-        """Standing, at the origin, facing x; with domain randomization, nearly so."""
+        """Start from the initial pose, at the origin, facing x; with domain randomization, nearly so."""
         return self._start(self.setting, rng)
 
     def renew(self, state: State, rng: Array) -> State:
         """`reset` into the simulator that `state` belongs to."""
-        s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-        return self._start(s["setting"], rng)
+        return self._start(locomotion_state(state).setting, rng)
 
     def at(self, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], rng: Array) -> State:
         """Start from a given state, with nominal friction, and without an end."""
-        state = self._begin(self.setting, qpos, qvel, jnp.asarray(self._friction[self._feet[0], 0]), rng)
-        s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-        return dataclasses.replace(state, pipeline_state=s | {"remaining": jnp.asarray(2**30, jnp.int32)})  # pyright: ignore
+        state = self._begin(self.setting, qpos, qvel, self._friction[self._colliding, 0], rng)
+        endless = locomotion_state(state)._replace(remaining=jnp.asarray(2**30, jnp.int32))
+        return dataclasses.replace(state, pipeline_state=cast(Any, endless))
 
     def step(self, state: State, action: Array) -> State:
         """Advance one control step under the policy's commands and the residual's force."""
-        s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-        command = command_of(action)
-        commands = jnp.concatenate([s["commands"][1:], command[None]])
-        key, key_force = jax.random.split(s["key"])
-        wrench, excess = self._wrench(s["history"], commands, key_force)
+        before = locomotion_state(state)
+        command = self.command_of(action)
+        key, key_force = jax.random.split(before.key)
+        excess = self._excess(before.rollout, command)
+        decay = jnp.exp(-self.config.residual_decay * excess)
 
-        fields = s["setting"]["fields"] | {"geom_friction": self._friction.at[self._feet, 0].set(s["friction"])}
-        simulator = self.simulator.altered(fields)
-        earlier: PhysicsState = s["physics"]
-        arriving = command if self.residual is None else self.residual.command(commands)
-        after = simulator.step(earlier, arriving, wrench)
-        features, com = simulator.observe(after)
+        friction = {"geom_friction": self._friction.at[self._colliding, 0].set(before.friction)}
+        drawn = key_force if self.config.sampled_residual else None
+        simulator = self.simulator.with_fields(before.setting.fields | friction)
+        after = simulator.step(before.rollout, command, wrench_scale=decay, key=drawn)
 
-        finite = jnp.all(jnp.isfinite(features)) & jnp.all(jnp.isfinite(after.qvel))
-        before: Array = s["com"]
-        last: Array = s["history"][-1]
-        features, com = jnp.where(finite, features, last), jnp.where(finite, com, before)
-        velocity = (com - before) / CONTROL_TIMESTEP
-        earned = self.task.reward(Step(velocity, features, command)) - self.config.outside_cost * excess
+        rollout, finite = after.state.keep_finite(before.rollout, before.rollout.features)
+        com = jnp.where(finite, after.com, before.com)
+        velocity = (com - before.com) / self.robot.control_timestep
+        earned = self.task.reward(Step(velocity, rollout.features, command)) - self.config.outside_cost * excess
         reward = jnp.where(finite, earned, 0.0)
-        remaining = s["remaining"] - 1
-        s = s | {
-            "physics": jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, earlier),
-            "com": com,
-            "history": jnp.concatenate([s["history"][1:], features[None]]),
-            "commands": commands,
-            "remaining": remaining,
-            "key": key,
-        }
+        remaining = before.remaining - 1
+        now = before._replace(rollout=rollout, com=com, remaining=remaining, key=key)
         metrics = {
             "velocity_x": velocity[0],
             "velocity_y": velocity[1],
-            "force": jnp.linalg.norm(wrench[0, :3]),
+            "force": jnp.linalg.norm(after.wrench[0, :3]),
             "outside": jnp.asarray(excess > 0.0, jnp.float32),
             "excess": excess,
             "diverged": jnp.asarray(~finite, jnp.float32),
         }
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
-            pipeline_state=s,
-            obs=locomotion_observation(features),
+            pipeline_state=now,
+            obs=self._observe(rollout),
             reward=reward,
             done=jnp.asarray((remaining <= 0) | ~finite, jnp.float32),
             metrics=state.metrics | metrics,
             info=state.info | {"truncation": jnp.asarray((remaining <= 0) & finite, jnp.float32)},
         )
 
+    def command_of(self, action: Float[Array, " commands"]) -> Float[Array, " commands"]:
+        """Return the commands for a policy's output; see the function of the same name."""
+        return command_of(action, self.robot)
+
     @property
     def observation_size(self) -> int:
-        return OBSERVATIONS
+        return num_observations(self.robot)
 
     @property
     def action_size(self) -> int:
-        return 2
+        return len(self.robot.commands)
 
     @property
     def backend(self) -> str:
         return "mjx"
 
+    def _observe(self, rollout: RolloutState) -> Float[Array, " observations"]:
+        return locomotion_observation(rollout.features, self.robot.anchored)
+
     def _start(self, setting: Setting, rng: Array) -> State:
-        key_friction, key_turn, key_hinge, key_velocity, rng = jax.random.split(rng, 5)
-        low, high = setting["friction"]
-        friction = jax.random.uniform(key_friction, minval=low, maxval=high)
-        spread, standing = setting["spread"], setting["standing"]
-        turn = spread["turn"] * jax.random.uniform(key_turn, (3,), minval=-1.0)
-        half = turn / 2
-        quaternion = jnp.concatenate([jnp.ones(1), half])  # from upright, which `standing` is
-        hinges = standing[7:] + spread["hinge"] * jax.random.normal(key_hinge, (standing.shape[0] - 7,))
-        hinges = hinges.at[MOTORS].set(standing[7:][MOTORS])
-        hinges = hinges.at[KNEES].set(jnp.maximum(hinges, standing[7:])[KNEES])
-        qpos = jnp.concatenate([standing[:3], quaternion / jnp.linalg.norm(quaternion), hinges])
-        qvel = spread["velocity"] * jax.random.normal(key_velocity, (self.simulator.nv,))
-        qvel = qvel * jnp.where(jnp.arange(self.simulator.nv) < 3, 1.0, 5.0)
-        return self._begin(setting, qpos, qvel, friction, rng)
+        key_friction, key_turn, key_joint, key_velocity, rng = jax.random.split(rng, 5)
+        low, high = setting.friction.T
+        friction = low + (high - low) * jax.random.uniform(key_friction)
+        initial, spread, root = setting.initial, setting.spread, self._root
+        joints = initial[root:] + spread.joint * jax.random.normal(key_joint, (len(initial) - root,))
+        joints = jnp.clip(joints, *setting.joint_range.T)
+        if root:
+            half = spread.turn * jax.random.uniform(key_turn, (3,), minval=-1.0) / 2
+            quaternion = _product(jnp.concatenate([jnp.ones(1), half]), initial[3:7])
+            joints = jnp.concatenate([initial[:3], quaternion / jnp.linalg.norm(quaternion), joints])
+        qvel = spread.velocity * jax.random.normal(key_velocity, spread.velocity.shape)
+        return self._begin(setting, joints, qvel, friction, rng)
 
     def _begin(self, setting: Setting, qpos: Array, qvel: Array, friction: Array, rng: Array) -> State:
         key, key_length = jax.random.split(rng)
-        mean = max(round(self.config.episode_seconds / CONTROL_TIMESTEP), 2)
+        mean = max(round(self.config.episode_seconds / self.robot.control_timestep), 2)
         physics = state_at(qpos, qvel)
-        features, com = self.simulator.observe(physics)
-        s = {
-            "setting": setting,
-            "friction": friction,
-            "physics": physics,
-            "com": com,
-            "history": jnp.tile(features, (HISTORY, 1)),
-            "commands": jnp.zeros((HISTORY, 2)),
-            "remaining": jax.random.randint(key_length, (), mean // 2, mean + mean // 2 + 1),
-            "key": key,
-        }
+        features, com = self.simulator.simulator.observe(physics)
+        rollout = RolloutState(physics, jnp.tile(features, (HISTORY, 1)), jnp.tile(self._rest, (HISTORY - 1, 1)))
+        remaining = jax.random.randint(key_length, (), mean // 2, mean + mean // 2 + 1)
+        now = LocomotionState(setting, friction, rollout, com, remaining, key)
         zero = jnp.zeros(())
         metrics: dict[str, Array] = {name: zero for name in _METRICS}
         return State(
-            pipeline_state=s,  # pyright: ignore[reportArgumentType]
-            obs=locomotion_observation(features),
+            pipeline_state=cast(Any, now),
+            obs=self._observe(rollout),
             reward=zero,
             done=zero,
             metrics=metrics,
             info={"truncation": zero},
         )
 
-    def _wrench(
-        self, history: Float[Array, "3 27"], commands: Float[Array, "3 2"], key: Array
-    ) -> tuple[Float[Array, "loaded 6"], Float[Array, ""]]:
-        """The residual's wrenches (N, N m; world), and how far its observation lies outside of its data."""
+    def _excess(self, rollout: RolloutState, command: Float[Array, " commands"]) -> Float[Array, ""]:
+        """Return how far the residual's observation lies outside of its data."""
         if self.residual is None:
-            return jnp.zeros((1, 6)), jnp.zeros(())
-        excess = self.residual.excess(history, commands)
-        wrench = self.residual.wrench(history, commands, key if self.config.sampled_residual else None)
-        return wrench * jnp.exp(-self.config.residual_decay * excess), excess
+            return jnp.zeros(())
+        return self.residual.out_of_range(rollout.history, rollout.with_command(command))
 
 
-def setting_of(model: mujoco.MjModel, config: LocomotionConfig, actuators: ModelParameters | None) -> Setting:
-    """What tells a simulator from another, as arrays: model fields, starting pose, ranges of what is drawn."""
-    parameters = load_robot().adapter.nominal_actuators(model) if actuators is None else actuators
-    assert parameters is not None
-    improved = load_robot().load_model(actuators)
-    nominal = float(model.geom_friction[model.geom("foot_left").id, 0])
+def colliding_geoms(model: mujoco.MjModel) -> Int[np.ndarray, " colliding"]:
+    """Return the ids of the geoms that may touch others, the world's included."""
+    return np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0))
+
+
+def make_setting(
+    robot: RobotDescription, model: mujoco.MjModel, config: LocomotionConfig, actuators: ModelParameters | None
+) -> Setting:
+    """Return what tells a simulator from another; `model` is the nominal robot, `actuators` None: nominal ones."""
+    parameters = robot.adapter.nominal_actuators(model) if actuators is None else actuators
+    improved = robot.load_model(actuators)
     on = 1.0 if config.domain_randomization else 0.0
     degree = np.pi / 180
     # One program: thirty small ones take half a second of every start.
-    fields = jax.jit(lambda parameters: parameters.fields(model))(parameters)
-    turn = np.array([config.start_tilt, config.start_tilt, config.start_yaw]) * degree
-    return {
-        "fields": jax.tree.map(jnp.float32, fields),
-        "standing": jnp.asarray(standing_qpos(improved), jnp.float32),
-        "friction": jnp.array(config.friction if config.domain_randomization else (nominal, nominal)),
-        "spread": {
-            "turn": jnp.asarray(on * turn, jnp.float32),
-            "hinge": jnp.asarray(on * config.start_angle * degree, jnp.float32),
-            "velocity": jnp.asarray(on * config.start_velocity, jnp.float32),
-        },
-    }
+    fields = {} if parameters is None else jax.jit(lambda parameters: parameters.fields(model))(parameters)
+    first = 0 if robot.anchored else 1
+    hinges = model.jnt_type[first:] == int(mujoco.mjtJoint.mjJNT_HINGE)
+    joint = np.where(hinges, config.start_angle * degree, config.start_offset)
+    joint[[model.joint(name).id - first for name in robot.held]] = 0.0
+    limited = improved.jnt_limited[first:, None].astype(bool)
+    along = np.concatenate([[True] * 3 + [False] * 3] * first + [~hinges])
+    turn = np.array([config.start_tilt, config.start_tilt, config.start_yaw])
+    own = model.geom_friction[colliding_geoms(model), 0]
+    drawn = np.tile(config.friction, (len(own), 1))
+    return Setting(
+        fields=jax.tree.map(jnp.float32, fields),
+        initial=jnp.asarray(robot.adapter.initial_qpos(robot, improved), jnp.float32),
+        joint_range=jnp.asarray(np.where(limited, improved.jnt_range[first:], [-np.inf, np.inf]), jnp.float32),
+        friction=jnp.asarray(drawn if config.domain_randomization else np.stack([own, own], axis=1), jnp.float32),
+        spread=StartSpread(
+            turn=jnp.asarray(on * turn * degree, jnp.float32),
+            joint=jnp.asarray(on * joint, jnp.float32),
+            velocity=jnp.asarray(on * config.start_velocity * np.where(along, 1.0, 5.0), jnp.float32),
+        ),
+    )
+
+
+def variant_of(
+    config: LocomotionConfig, actuators: ModelParameters | None, residual: TrainedResidual | None
+) -> SimulatorVariant:
+    """Return which of the paper's simulators this is."""
+    if residual is not None:
+        return SimulatorVariant(residual.model.name)
+    return SimulatorVariant(identified=actuators is not None, randomized=config.domain_randomization)
+
+
+def _product(one: Float[Array, " 4"], other: Float[Array, " 4"]) -> Float[Array, " 4"]:
+    """Return the product of two quaternions (w, x, y, z): `other` first, then `one`."""
+    scalar = one[0] * other[0] - one[1:] @ other[1:]
+    return jnp.concatenate([scalar[None], one[0] * other[1:] + other[0] * one[1:] + jnp.cross(one[1:], other[1:])])

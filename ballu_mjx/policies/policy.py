@@ -15,35 +15,35 @@ from jaxtyping import Array, Float
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.closed_loop import ClosedLoop
 from ballu_mjx.policies.locomotion_env import (
-    OBSERVATIONS,
     LocomotionConfig,
     LocomotionEnv,
     check_locomotion_config,
     command_of,
     locomotion_observation,
-    setting_name,
+    num_observations,
+    variant_of,
 )
 from ballu_mjx.policies.tasks import TASKS, Task
+from ballu_mjx.policies.variants import SimulatorVariant
 from ballu_mjx.residuals.run_config import run_actuators, run_residual, run_robot
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Inference, Params, PPOConfig
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, same_parameters
-from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.checkpoints import Which, restore_checkpoint
 from ballu_mjx.runs.folder import read_config, typed_config
-
-ACTIONS = 2
-"""One command a servo."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Policy:
-    """The deterministic policy of a run, and what it was trained in.
+    """A deterministic policy, and what it was trained in.
 
     **Fields**
 
-    - `task`, `config`, `actuators` (None: nominal), `residual` (the run's folder; None: none): its simulator.
+    - `task`, `config`, `robot`, `actuators` (None: nominal), `residual` (or its run's folder; None: none): its
+      simulator.
+    - `network`: options of its networks.
     - `params`: what `learner.params` gave.
     - `infer`: (parameters, observation) to action.
     - `step`: control steps of training behind it.
@@ -51,74 +51,115 @@ class Policy:
 
     task: Task
     config: LocomotionConfig
+    robot: RobotDescription
     actuators: ModelParameters | None
-    residual: Path | None
+    residual: TrainedResidual | Path | None
+    network: PPOConfig
     params: Params
     infer: Inference
     step: int
+    loop: ClosedLoop | None = dataclasses.field(default=None, repr=False, compare=False)
+    """Its simulator, where that is compiled already."""
 
     @staticmethod
     def load(folder: Path | str, which: Which = "best") -> Policy:
-        """The policy in a run's best checkpoint, by its reward without exploration; in the last, or that of a step.
+        """Return the policy in a run's best checkpoint, by its reward without exploration; in the last, or that of a
+        step.
 
         **Raises** `InputError` where `folder` is no run of a locomotion task, or has no such checkpoint.
         """
         folder = Path(folder)
         stored = read_config(folder, *TASKS)
-        config = typed_config(LocomotionConfig, stored, "env", folder, check_locomotion_config)
-        sizes = OBSERVATIONS, ACTIONS, typed_config(PPOConfig, stored, "ppo", folder, ppo.check_values)
-        infer = ppo.make_inference(*sizes)
+        robot = run_robot(stored, folder)
+        config = typed_config(
+            LocomotionConfig,
+            stored,
+            "env",
+            folder,
+            lambda found: check_locomotion_config(found, robot.control_timestep),
+        )
+        network = typed_config(PPOConfig, stored, "ppo", folder, ppo.check_values)
+        infer = ppo.make_inference(num_observations(robot), len(robot.commands), network)
         step, tree = restore_checkpoint(folder, which)
         params = ppo.from_tree(tree)
-        if not ppo.fits(infer, params, OBSERVATIONS):
+        if not ppo.fits(infer, params, num_observations(robot)):
             raise InputError(
                 f"{folder}: the stored parameters are not of the network in its config.json; restore one of the two."
             )
         return Policy(
             task=TASKS[stored["task"]],
             config=config,
-            actuators=run_actuators(stored, folder, run_robot(stored, folder)),
+            robot=robot,
+            actuators=run_actuators(stored, folder, robot),
             residual=run_residual(stored, folder),
+            network=network,
             params=params,
             infer=infer,
             step=step,
         )
 
-    @functools.cached_property  # a residual's name takes reading its run
-    def setting(self) -> str:
-        """The paper's name of the simulator; see `locomotion_env.setting_name`."""
-        name = None if self.residual is None else TrainedResidual.load(self.residual).model.name
-        return setting_name(self.config, self.actuators is not None, name)
+    @functools.cached_property  # reading a run takes time, and its commands do without
+    def trained_residual(self) -> TrainedResidual | None:
+        """The residual in its simulator.
+
+        **Raises** `InputError` where its run is gone, damaged, or of other actuators.
+        """
+        if not isinstance(self.residual, Path):
+            return self.residual
+        found = TrainedResidual.load(self.residual, self.robot)
+        check_belongs(found, self.actuators, self.residual)
+        return found
+
+    @property
+    def variant(self) -> SimulatorVariant:
+        """Which of the paper's simulators the policy was trained in."""
+        return variant_of(self.config, self.actuators, self.trained_residual)
+
+    @property
+    def latency(self) -> float:
+        """Seconds from a command to the actuators in the simulator that the policy was trained in."""
+        return 0.0 if self.trained_residual is None else self.trained_residual.latency
 
     def environment(self) -> LocomotionEnv:
-        """The simulator that the policy was trained in."""
-        return make_environment(self.task, self.config, self.actuators, self.residual)
+        """Return the simulator that the policy was trained in."""
+        return environment_of(self.robot, self.task, self.config, self.actuators, self.trained_residual)
 
     def closed_loop(self) -> ClosedLoop:
-        """That simulator, for any parameters of the policy."""
-        return ClosedLoop(self.environment(), self.infer)
+        """Return that simulator in closed loop, for any parameters of the policy."""
+        return ClosedLoop(self.environment(), self.infer) if self.loop is None else self.loop
 
-    def act(self) -> Callable[[Float[np.ndarray, " 27"]], Float[np.ndarray, " 2"]]:
-        """`observation.observe_features` to servo commands, for use outside of JAX, step by step."""
+    def act(self) -> Callable[[Float[np.ndarray, " features"]], Float[np.ndarray, " commands"]]:
+        """Return what turns `observation.observe_features` into commands, for use outside of JAX, step by step."""
 
         @jax.jit
         def command(features: Array) -> Array:
-            return command_of(self.infer(self.params, locomotion_observation(features)))
+            seen = locomotion_observation(features, self.robot.anchored)
+            return command_of(self.infer(self.params, seen), self.robot)
 
         return lambda features: np.asarray(command(jnp.asarray(features, jnp.float32)), np.float64)
 
 
-def make_environment(
-    task: Task, config: LocomotionConfig, actuators: ModelParameters | None, residual: Path | None
+def environment_of(
+    robot: RobotDescription,
+    task: Task,
+    config: LocomotionConfig,
+    actuators: ModelParameters | None = None,
+    residual: TrainedResidual | None = None,
 ) -> LocomotionEnv:
-    """A task's simulator.
+    """Return a task's simulator.
 
-    **Raises** `InputError` where `residual` holds no residual, or one that belongs to other actuators.
+    **Raises** `InputError` where the robot cannot do the task.
     """
-    force = None if residual is None else TrainedResidual.load(residual)
-    if force is not None and not same_parameters(force.actuators, actuators):
+    return LocomotionEnv(robot, task, config, actuators=actuators, residual=residual)
+
+
+def check_belongs(residual: TrainedResidual | None, actuators: ModelParameters | None, run: Path | None) -> None:
+    """Check that the residual (None: none) of `run` was learned beside these actuators.
+
+    **Raises** `InputError` where it was not.
+    """
+    if residual is not None and not same_parameters(residual.actuators, actuators):
         raise InputError(
-            f"{residual}: its forces were learned beside other actuators; give --actuators the same file, or leave it "
+            f"{run}: its forces were learned beside other actuators; give --actuators the same file, or leave it "
             "out to take the residual's."
         )
-    return LocomotionEnv(load_robot().load_model(), task, config, actuators=actuators, residual=force)

@@ -16,7 +16,7 @@ _PEAK_DISTANCE = 0.2
 _FILLED_GAP = 0.1
 """s; longer gaps of the motion are left out of the comparison."""
 _RESTING = 0.2
-"""A leg that moves by less of what the other does is not scaled up any further."""
+"""A signal that moves by less of what the other does is not scaled up any further."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Match:
     offset: float
     """s, to add to the log's times for the capture's."""
     correlation: float
-    """Over both legs, in [-1, 1]; negative where the legs move against the prediction."""
+    """Over all signals, in [-1, 1]; negative where they move against the prediction."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,9 +50,9 @@ class Alignment:
 
 def align(
     time: Float[np.ndarray, " T"],
-    motion: Float[np.ndarray, "T legs"],
+    motion: Float[np.ndarray, "T signals"],
     log_time: Float[np.ndarray, " N"],
-    predicted: Float[np.ndarray, "N legs"],
+    predicted: Float[np.ndarray, "N signals"],
     *,
     within: tuple[float, float] | None = None,
     overlap: float = 0.7,
@@ -60,13 +60,13 @@ def align(
     """The offset of the log's clock at which `predicted` correlates best with `motion`.
 
     Normalized cross-correlation, over all offsets at which the two overlap by `overlap` of the shorter one at least;
-    covariances and variances are summed over the legs, each scaled to the same variance. The sign is free. The peak is
+    covariances and variances are summed over signals, each scaled to the same variance. The sign is free. The peak is
     interpolated by a parabola.
 
     **Arguments**
 
-    - `time`, `motion`: s and any unit; how far each leg is bent or drawn in, NaN where not seen.
-    - `log_time`, `predicted`: s, on the log's clock; how far each leg should be.
+    - `time`, `motion`: s and any unit; what moved on commands, NaN where not seen.
+    - `log_time`, `predicted`: s, on the log's clock; what should have.
     - `within`: the offsets (s) to search. None: all with enough overlap.
 
     **Returns** None where nothing moves, or no offset in question leaves enough overlap.
@@ -76,8 +76,8 @@ def align(
     x, y = _scaled(x, seen), _scaled(y, known)
     lags = (np.arange(len(x) + len(y) - 1) - (len(y) - 1)) * TIMESTEP + time[0] - log_time[0]
     samples, covariance, variance_x, variance_y = (np.zeros(len(lags)) for _ in range(4))
-    for leg in range(x.shape[1]):
-        a, b, m, n = x[:, leg], y[:, leg], seen[:, leg].astype(float), known[:, leg].astype(float)
+    for signal in range(x.shape[1]):
+        a, b, m, n = x[:, signal], y[:, signal], seen[:, signal].astype(float), known[:, signal].astype(float)
         count = np.maximum(_correlate(m, n), 1e-9)
         mean_a, mean_b = _correlate(a, n) / count, _correlate(m, b) / count
         covariance += _correlate(a, b) - count * mean_a * mean_b
@@ -127,25 +127,27 @@ def _correlate(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " m"]) -> Float[
 
 
 def _on_grid(
-    time: Float[np.ndarray, " T"], values: Float[np.ndarray, "T legs"]
-) -> tuple[Float[np.ndarray, "n legs"], Float[np.ndarray, "n legs"]]:
+    time: Float[np.ndarray, " T"], values: Float[np.ndarray, "T signals"]
+) -> tuple[Float[np.ndarray, "n signals"], Float[np.ndarray, "n signals"]]:
     """Values every `TIMESTEP` from the first time on, and 1 where they are known, else 0."""
     grid = time[0] + TIMESTEP * np.arange(int((time[-1] - time[0]) / TIMESTEP + 1e-6) + 1)
     columns, known = np.zeros((len(grid), values.shape[1])), np.zeros((len(grid), values.shape[1]))
-    for leg, column in enumerate(values.T):
+    for signal, column in enumerate(values.T):
         seen = ~np.isnan(column)
         if seen.sum() < 2:
             continue
-        columns[:, leg] = np.interp(grid, time[seen], column[seen])
+        columns[:, signal] = np.interp(grid, time[seen], column[seen])
         after = np.clip(np.searchsorted(time[seen], grid), 1, int(seen.sum()) - 1)
         step = time[seen][after] - time[seen][after - 1]
         inside = (grid >= time[seen][0] - 1e-9) & (grid <= time[seen][-1] + 1e-9)
-        known[:, leg] = inside & (step <= max(_FILLED_GAP, 1.5 * float(np.median(np.diff(time)))))
+        known[:, signal] = inside & (step <= max(_FILLED_GAP, 1.5 * float(np.median(np.diff(time)))))
     return columns, known
 
 
-def _scaled(values: Float[np.ndarray, "n legs"], known: Float[np.ndarray, "n legs"]) -> Float[np.ndarray, "n legs"]:
-    """Values with mean 0 and variance 1 where they are known, else 0; a leg that rests beside another stays small."""
+def _scaled(
+    values: Float[np.ndarray, "n signals"], known: Float[np.ndarray, "n signals"]
+) -> Float[np.ndarray, "n signals"]:
+    """Values with mean 0 and variance 1 where they are known, else 0; one that rests beside another stays small."""
     count = np.maximum(known.sum(axis=0), 1.0)
     centred = (values - (values * known).sum(axis=0) / count) * known
     deviation = np.sqrt((centred**2).sum(axis=0) / count)

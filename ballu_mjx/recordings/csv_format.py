@@ -1,4 +1,4 @@
-"""TODO."""
+"""Recordings as files, format `ballu-recording/1`: a CSV with a row a sample, and a JSON description beside it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import gzip
 import io
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,21 +18,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.recordings.recording import (
-    ANGLE,
-    COLUMNS,
-    POINT,
-    QUATERNIONS,
-    Column,
-    ColumnLayout,
-    Kind,
-    Recording,
-    Split,
-    column_layout,
-)
+from ballu_mjx.recordings.hooks import hooks_of
+from ballu_mjx.recordings.recording import Column, ColumnGroup, Kind, Recording, Split, column_groups, values_of
 from ballu_mjx.recordings.validation import (
     check_cells,
-    check_frame,
     check_gaps,
     check_time,
     has_sample,
@@ -48,63 +37,54 @@ _ENDINGS = (".csv", ".csv.gz")
 _COMMAND_DECIMALS = 4
 
 
-def read_recording(path: Path | str, robot: RobotDescription | None = None) -> Recording:
-    """Read, validate and fill in the recording at `path`, a `.csv` or `.csv.gz` with its `.json` beside it.
-
-    `robot` is whose it is; None: BALLU's.
+def read_recording(path: Path | str, robot: RobotDescription) -> Recording:
+    """Read, validate and fill in the recording of `robot` at `path`, a `.csv` or `.csv.gz` with its `.json` beside it.
 
     Gaps of up to 0.5 s are interpolated, linearly or, for orientations, along the shortest rotation.
 
     **Raises** `InputError` at the first fault found, with file, column, row (as a spreadsheet counts them, the header
-    being row 1) and mend.
+    being row 1) and fix.
     """
     path = Path(path)
-    description = sidecar_path(path)
-    layout = column_layout(robot)
-    columns = _read_columns(path, layout)
+    description, known = sidecar_path(path), column_groups(robot)
+    columns = _read_columns(path, known)
     kind, made_by, notes = _read_description(description)
-    if robot is not None and not robot.is_ballu and kind != "free":
-        refuse_recording(
-            description, f'"kind" is "{kind}"', f'it must be "free" for {robot.name}: only BALLU is suspended'
-        )
-    groups = present_groups(path, columns, layout, kind)
-    check_time(path, columns["time"])
-    check_cells(path, columns, layout, kind)
-    first, last = check_gaps(path, columns, groups, layout, kind)
-    fields, interpolated = _fill(columns, layout, groups, slice(first, last + 1))
-    rows = len(columns["time"])
+    groups = present_groups(path, columns, known, kind)
+    check_time(path, columns["time"], robot)
+    check_cells(path, columns, groups, robot, kind)
+    first, last = check_gaps(path, columns, groups, kind)
+    values, interpolated = _fill(columns, groups, slice(first, last + 1))
+
+    def by_part(quantity: str) -> dict[str, np.ndarray]:
+        return {group.part: value for group, value in values.items() if group.quantity == quantity}
+
+    positions, quaternions = by_part("position"), by_part("quaternion")
     recording = Recording(
         name=recording_name(path),
         kind=kind,
         robot=made_by,
         notes=notes,
-        time=fields["time"][:, 0],
-        command=fields["command"],
-        balloon_position=fields.get("balloon_position"),
-        balloon_quaternion=fields.get("balloon_quaternion"),
-        base_position=fields.get("base_position"),
-        base_quaternion=fields.get("base_quaternion"),
-        foot_position=fields["foot_position"].reshape(-1, 2, 3) if "foot_position" in fields else None,
-        motor=fields.get("motor"),
-        knee=fields.get("knee"),
-        points={name: fields[POINT + name] for name in layout.points},
-        angles={name: fields[ANGLE + name][:, 0] for name in layout.joints if ANGLE + name in fields},
+        time=by_part("time")[""][:, 0],
+        command=by_part("command")[""],
+        tracked_position=positions.pop(robot.tracked, None),
+        tracked_quaternion=quaternions.pop(robot.tracked, None),
+        points=positions,
+        orientations=quaternions,
+        joint_angles={joint: value[:, 0] for joint, value in by_part("angle").items()},
         interpolated=interpolated,
-        trimmed=(first, rows - 1 - last),
+        trimmed=(first, len(columns["time"]) - 1 - last),
     )
-    if kind == "free" and layout.columns is COLUMNS:
-        check_frame(path, recording)
+    hooks_of(robot).check_recording(path, recording)
     return recording
 
 
-def write_recording(
-    recording: Recording, path: Path | str, robot: RobotDescription | None = None, *, decimals: int = 5
-) -> None:
-    """Write `recording` to `path` (`.csv`, or `.csv.gz`: compressed) and its description to the `.json` beside it.
+def write_recording(recording: Recording, path: Path | str, robot: RobotDescription, *, decimals: int = 5) -> None:
+    """Write `recording` of `robot` to `path` (`.csv`, or `.csv.gz`: compressed) and its description to the `.json`
+    beside it.
 
-    Positions and angles get `decimals`, quaternions one fewer, commands 4, time 3 to 6, as it needs; NaN becomes an
-    empty cell. The same recording always gives the same bytes (compressed ones: with the same zlib).
-    `robot` is whose it is; None: BALLU's.
+    Positions and angles get `decimals`, quaternions one fewer, commands 4 behind their range's first digit (at least
+    4), time 3 to 6, as it needs; NaN becomes an empty cell. The same recording always gives the same bytes (compressed
+    ones: with the same zlib).
 
     **Raises** `ValueError` for infinite values or shapes that do not fit; `InputError` for another ending of `path`.
     """
@@ -113,21 +93,21 @@ def write_recording(
     length = len(recording.time)
     header: list[str] = []
     cells: list[list[str]] = []
-    for field, names in column_layout(robot).columns.items():
-        value = _value(recording, field)
+    for group in column_groups(robot):
+        value = values_of(recording, group, robot)
         if value is None:
             continue
-        value = np.asarray(value, float).reshape(length, len(names))
+        value = np.asarray(value, float).reshape(length, len(group.names))
         if np.isinf(value).any():
-            raise ValueError(f"{field} is infinite somewhere")
-        if field == "time":
-            places = _time_decimals(value)
-        elif field == "command":
-            places = _COMMAND_DECIMALS
+            raise ValueError(f"{', '.join(group.names)}: infinite somewhere")
+        if group.quantity == "time":
+            places = [_time_decimals(value)]
+        elif group.quantity == "command":
+            places = [_command_decimals(*limits) for limits in robot.command_ranges]
         else:
-            places = decimals - (field in QUATERNIONS)
-        header += names
-        cells += [[_text(x, places) for x in column] for column in value.T.tolist()]
+            places = [decimals - (group.quantity == "quaternion")] * len(group.names)
+        header += group.names
+        cells += [[_text(x, p) for x in column] for column, p in zip(value.T.tolist(), places, strict=True)]
     lines = [",".join(header), *(",".join(row) for row in zip(*cells, strict=True))]
     content = ("\n".join(lines) + "\n").encode()
     if path.name.endswith(".gz"):
@@ -169,14 +149,6 @@ def list_bundled(split: Split) -> list[Path]:
     return list_recordings([assets() / "recordings" / split])
 
 
-def _value(recording: Recording, field: str) -> np.ndarray | None:
-    if field.startswith(POINT):
-        return recording.points[field.removeprefix(POINT)]
-    if field.startswith(ANGLE):
-        return recording.angles.get(field.removeprefix(ANGLE))
-    return getattr(recording, field)
-
-
 def recording_name(path: Path) -> str:
     """The name of the recording in a file: the file's, without its ending."""
     return path.name.removesuffix(".gz").removesuffix(".csv")
@@ -206,9 +178,7 @@ def _read_description(path: Path) -> tuple[Kind, str, str]:
         )
     kind, made_by, notes = keys.get("kind"), keys.get("robot"), keys.get("notes", "")
     if kind not in ("free", "suspended"):
-        refuse_recording(
-            path, f'"kind" is {_quote(keys, "kind")}', 'write "free", or "suspended" if the feet are off the ground'
-        )
+        refuse_recording(path, f'"kind" is {_quote(keys, "kind")}', 'write "free", or "suspended" if the root is held')
     if not isinstance(made_by, str) or not made_by.strip():
         refuse_recording(path, f'"robot" is {_quote(keys, "robot")}', "write which robot was recorded, as text")
     if not isinstance(notes, str):
@@ -223,7 +193,7 @@ def _quote(keys: dict, key: str) -> str:
     return text if len(text) <= 40 else text[:40] + "..."
 
 
-def _read_columns(path: Path, layout: ColumnLayout) -> dict[str, Column]:
+def _read_columns(path: Path, groups: Sequence[ColumnGroup]) -> dict[str, Column]:
     """The CSV's columns by name, missing samples as NaN."""
     text = files.read_text(path)
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
@@ -233,7 +203,7 @@ def _read_columns(path: Path, layout: ColumnLayout) -> dict[str, Column]:
     try:
         for cells in reader:
             if header is None:
-                header = _check_header(path, layout, [name.strip() for name in cells])
+                header = _check_header(path, groups, [name.strip() for name in cells])
                 continue
             if not any(map(str.strip, cells)):
                 blank += 1  # Blank lines at the end are no fault; one further up lacks its time.
@@ -253,8 +223,8 @@ def _read_columns(path: Path, layout: ColumnLayout) -> dict[str, Column]:
     return {name: table[:, i] for i, name in enumerate(header)}
 
 
-def _check_header(path: Path, layout: ColumnLayout, header: list[str]) -> list[str]:
-    known = [name for names in layout.columns.values() for name in names]
+def _check_header(path: Path, groups: Sequence[ColumnGroup], header: list[str]) -> list[str]:
+    known = [name for group in groups for name in group.names]
     if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
         refuse_recording(
             path, "the header has no commas", "save it with commas between cells and points in numbers", row=-1
@@ -262,11 +232,13 @@ def _check_header(path: Path, layout: ColumnLayout, header: list[str]) -> list[s
     for i, name in enumerate(header):
         if name not in known:
             close = difflib.get_close_matches(name[:40].lower(), known, 1)
-            mend = (
-                f"rename it to {close[0]} or delete it" if close else f"{RECORDING_FORMAT} does not have it, delete it"
+            fix = (
+                f"rename it to {close[0]} or delete it"
+                if close
+                else "the robot's description does not have it, delete it"
             )
             refuse_recording(
-                path, "unknown column", mend, column=_shorten(name) if name else f"{i + 1} (no name)", row=-1
+                path, "unknown column", fix, column=_shorten(name) if name else f"{i + 1} (no name)", row=-1
             )
         if name in header[:i]:
             refuse_recording(path, "the column stands there twice", "delete one", column=name, row=-1)
@@ -290,8 +262,8 @@ def _parse_row(path: Path, header: list[str], cells: list[str], row: int) -> lis
         except ValueError:
             plain, number = not cell.strip(), math.nan
         if not plain:
-            mend = "write a finite number, or leave the cell empty if the sample is missing"
-            refuse_recording(path, f"{_shorten(cell)!r} is not a finite number", mend, column=name, row=row)
+            fix = "write a finite number, or leave the cell empty if the sample is missing"
+            refuse_recording(path, f"{_shorten(cell)!r} is not a finite number", fix, column=name, row=row)
         numbers.append(number)
     return numbers
 
@@ -307,6 +279,10 @@ def _text(value: float, decimals: int) -> str:
     return "0" if text == "-0" else text
 
 
+def _command_decimals(low: float, high: float) -> int:
+    return _COMMAND_DECIMALS + max(0, -math.floor(math.log10(high - low)))
+
+
 def _time_decimals(time: np.ndarray) -> int:
     exact = (d for d in range(3, 6) if np.abs(np.round(time, d) - time).max(initial=0.0) < 1e-9)
     return next(exact, 6)
@@ -316,28 +292,27 @@ def _time_decimals(time: np.ndarray) -> int:
 
 
 def _fill(
-    columns: dict[str, Column], layout: ColumnLayout, groups: list[str], rows: slice
-) -> tuple[dict[str, Float[np.ndarray, "_ _"]], dict[str, int]]:
-    """Fields without gaps over `rows`, and the number of samples filled in by column."""
+    columns: dict[str, Column], groups: Sequence[ColumnGroup], rows: slice
+) -> tuple[dict[ColumnGroup, Float[np.ndarray, "_ _"]], dict[str, int]]:
+    """Groups without gaps over `rows`, and the number of samples filled in by column."""
     time = columns["time"]
-    fields: dict[str, np.ndarray] = {}
+    values: dict[ColumnGroup, np.ndarray] = {}
     interpolated: dict[str, int] = {}
-    for field in groups:
-        names = layout.columns[field]
-        value = np.stack([columns[name] for name in names], axis=1)
-        if field in QUATERNIONS:
-            seen = has_sample(columns, names)
-            filled = dict.fromkeys(names, int((~seen[rows]).sum()))
+    for group in groups:
+        value = np.stack([columns[name] for name in group.names], axis=1)
+        if group.quantity == "quaternion":
+            seen = has_sample(columns, group.names)
+            filled = dict.fromkeys(group.names, int((~seen[rows]).sum()))
             value = _fill_quaternions(time, value, seen)[rows]
         else:
-            filled = {name: int(np.isnan(columns[name][rows]).sum()) for name in names}
+            filled = {name: int(np.isnan(columns[name][rows]).sum()) for name in group.names}
             for column in value.T:
                 gap = np.isnan(column)
                 column[gap] = np.interp(time[gap], time[~gap], column[~gap])
             value = value[rows]
-        fields[field] = value
+        values[group] = value
         interpolated |= {name: count for name, count in filled.items() if count}
-    return fields, interpolated
+    return values, interpolated
 
 
 def _fill_quaternions(

@@ -7,7 +7,6 @@ from jaxtyping import Float
 from scipy.signal import savgol_filter
 
 from ballu_mjx.recordings.recording import Recording
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
 
 
 def interpolate(
@@ -18,19 +17,20 @@ def interpolate(
     return np.stack(columns, axis=-1).reshape(len(grid), *values.shape[1:])
 
 
-def control_grid(recording: Recording) -> tuple[int, Float[np.ndarray, " T"]]:
-    """Uniform times (s from the recording's start) at about its own rate, and how many of them make a control step.
+def control_grid(recording: Recording, control_timestep: float) -> tuple[int, Float[np.ndarray, " T"]]:
+    """Return how many samples make a control step (s), and uniform times (s from the recording's start) at that rate,
+    which is about the recording's own.
 
     **Raises** `ValueError` for a recording of less than two control steps.
     """
     time = recording.time - recording.time[0]
-    control_steps = int(np.floor(time[-1] / CONTROL_TIMESTEP + 1e-6))
+    control_steps = int(np.floor(time[-1] / control_timestep + 1e-6))
     if control_steps < 2:
         raise ValueError(
-            f"{recording.name}: {time[-1]:.3f} s is too short; at least {2 * CONTROL_TIMESTEP} s are needed."
+            f"{recording.name}: {time[-1]:.3f} s is too short; at least {2 * control_timestep} s are needed."
         )
-    per_step = max(2, round(CONTROL_TIMESTEP / float(np.median(np.diff(time)))))
-    return per_step, np.arange(control_steps * per_step + 1) * (CONTROL_TIMESTEP / per_step)
+    per_step = max(2, round(control_timestep / float(np.median(np.diff(time)))))
+    return per_step, np.arange(control_steps * per_step + 1) * (control_timestep / per_step)
 
 
 def mean_command(recording: Recording, edges: Float[np.ndarray, " edges"]) -> Float[np.ndarray, "intervals commands"]:
@@ -39,10 +39,8 @@ def mean_command(recording: Recording, edges: Float[np.ndarray, " edges"]) -> Fl
     integral = np.cumsum(np.diff(time)[:, None] * recording.command[:-1], axis=0)
     integral = np.concatenate([np.zeros((1, integral.shape[1])), integral])
     at_edges = np.stack([np.interp(edges, time, column) for column in integral.T], axis=-1)
-    return np.clip(np.diff(at_edges, axis=0) / np.diff(edges)[:, None], 0.0, 1.0)
-
-
-# 4. Velocities
+    mean = np.diff(at_edges, axis=0) / np.diff(edges)[:, None]
+    return np.clip(mean, recording.command.min(axis=0), recording.command.max(axis=0))  # rounding
 
 
 def odd_window(width: float, step: float, order: int, count: int) -> int:

@@ -1,8 +1,12 @@
 """From a recording to generalized states at the control rate, for robots of any build.
 
-Positions are a least-squares inverse kinematics over all joints at once, sample after sample, each from where the last
-one ended; velocities a centred Savitzky-Golay derivative. Joints that no measurement shows are refused. What only BALLU
-has, a base that hardly shows its pitch and servos behind cables, is `reconstruction.py`'s.
+1. Measurements are brought to a uniform grid at their own rate, of which the control grid is a part.
+2. Positions: least-squares inverse kinematics over all joints at once (`inverse_kinematics`). Joints that no
+   measurement shows are refused.
+3. The robot's adapter completes what single samples show badly (`hooks.RecordingHooks.complete_positions`).
+4. Velocities: a centred (hence lag-free) Savitzky-Golay differentiator, widest for the tracked body's rotation: its
+   rates matter most to what a simulator does next.
+5. The adapter fills in joints that follow from the commands (`complete_joints`).
 """
 
 from __future__ import annotations
@@ -12,8 +16,8 @@ import functools
 import mujoco
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.recordings.filters import (
     control_grid,
     interpolate,
@@ -22,34 +26,49 @@ from ballu_mjx.recordings.filters import (
     sign_continuous,
     smooth_rotation,
 )
-from ballu_mjx.recordings.inverse_kinematics import MeasurementGrid, solve_inverse_kinematics
-from ballu_mjx.recordings.motion import Motion, ReconstructionParameters
+from ballu_mjx.recordings.hooks import hooks_of
+from ballu_mjx.recordings.inverse_kinematics import solve_inverse_kinematics
+from ballu_mjx.recordings.kinematic_tree import KinematicTree, to_matrices
+from ballu_mjx.recordings.motion import MeasurementGrid, Motion, ReconstructionParameters
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
+
+_STOP_GIVE = {False: float(np.deg2rad(0.5)), True: 5e-4}
+"""How far beyond its range a hinge (rad) or a slide (m) may be: stops are soft, and springs hold joints inside."""
+_OVERSHOOT = {False: 0.05, True: 5e-3}
+"""How far noise and filters take a hinge (rad) or a slide (m) beyond; what is farther was measured."""
+_TURN_TOLERANCE = 0.1
+"""rad over a full turn that angles counted from 0 again may span."""
 
 
 def reconstruct(
     recording: Recording,
-    model: mujoco.MjModel,
     robot: RobotDescription,
+    model: mujoco.MjModel | None = None,
     parameters: ReconstructionParameters | None = None,
 ) -> Motion:
-    """States and commands at the control rate from a free recording; see `reconstruct.reconstruct_ballu`, which does it
-    for robots built like BALLU.
+    """Return states and commands at the control rate from a free recording.
 
-    **Raises** `InputError` where measurements leave a joint open, or do not fit the model.
+    **Arguments**
+
+    - `recording`: as `csv_format.read_recording` gives it: no missing values.
+    - `model`: the robot to be simulated from these states, with its identified actuators, say; None: the nominal one.
+    - `parameters`: noise and filters; the defaults suit motion capture of 0.5 mm and 0.3 deg.
+
+    **Raises** `InputError` where measurements leave a joint open, or do not fit the model; `ValueError` for a suspended
+    recording, and for one shorter than two control steps.
     """
-    if robot.is_ballu:
-        return reconstruct_ballu(recording, model, parameters)
-    parameters = parameters or ReconstructionParameters()
-    grid = _resample(recording, robot)
-    fitted, distance = solve_inverse_kinematics(model, robot, grid, parameters, recording.name)
-    qpos, qvel = _differentiate(fitted, grid.step, robot.anchored, parameters)
+    parameters, hooks = parameters or ReconstructionParameters(), hooks_of(robot)
+    simulated = robot.load_model() if model is None else model
+    grid = resample(recording, simulated, robot)
+    fit, distance = solve_inverse_kinematics(simulated, robot, grid, parameters, recording.name)
+    qpos, qvel = differentiate(fit.qpos, simulated, robot, grid.step, parameters)
     # A semi-implicit integrator's velocity is the mean over the time step that led to the position.
-    qvel -= np.gradient(qvel, grid.step, axis=0) * model.opt.timestep / 2
+    qvel -= np.gradient(qvel, grid.step, axis=0) * simulated.opt.timestep / 2
+    _keep_ranges(simulated, qpos)
+    qpos, qvel = hooks.complete_joints(simulated, grid, qpos, qvel)
     states = slice(None, None, grid.samples_per_step)
-    edges = np.arange(len(qpos[states])) * CONTROL_TIMESTEP
+    edges = np.arange(len(qpos[states])) * robot.control_timestep
     return Motion(
         name=recording.name,
         time=edges,
@@ -59,39 +78,98 @@ def reconstruct(
         residual_mm=distance,
         interpolated=dict(recording.interpolated),
         robot=recording.robot,
+        uncertainty=fit.uncertainty,
     )
 
 
-def _resample(recording: Recording, robot: RobotDescription) -> MeasurementGrid:
-    assert recording.balloon_position is not None and recording.balloon_quaternion is not None
-    per_step, grid = control_grid(recording)
-    time = recording.time - recording.time[0]
+def resample(recording: Recording, model: mujoco.MjModel, robot: RobotDescription) -> MeasurementGrid:
+    """Return the measurements at uniform times, by linear interpolation: with noise, jittered samples close together
+    would make a spline overshoot.
 
-    linear = functools.partial(interpolate, grid, time)
-    quaternion = linear(recording.balloon_quaternion)
+    **Raises** `ValueError` for a suspended recording, and for one shorter than two control steps.
+    """
+    position, quaternion = recording.tracked_position, recording.tracked_quaternion
+    if recording.kind != "free" or position is None or quaternion is None:
+        raise ValueError(f"{recording.name}: a suspended recording has no motion to reconstruct; give a free one.")
+    per_step, grid = control_grid(recording, robot.control_timestep)
+    linear = functools.partial(interpolate, grid, recording.time - recording.time[0])
+
+    def unit(values: np.ndarray) -> np.ndarray:
+        values = linear(values)
+        return values / np.linalg.norm(values, axis=1, keepdims=True)
+
+    command = mean_command(recording, grid)
     return MeasurementGrid(
-        step=CONTROL_TIMESTEP / per_step,
+        step=robot.control_timestep / per_step,
         samples_per_step=per_step,
-        places=linear(np.stack([recording.balloon_position, *(recording.points[p] for p in robot.points)], axis=1)),
-        quaternion=quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
-        angles={name: linear(value) for name, value in recording.angles.items()},
+        command=np.concatenate([command, command[-1:]]),
+        positions={robot.tracked: linear(position)}
+        | {point: linear(recording.points[point]) for point in robot.points},
+        orientations={robot.tracked: unit(quaternion)}
+        | {point: unit(value) for point, value in recording.orientations.items()},
+        joint_angles={joint: linear(_unwound(model, joint, value)) for joint, value in recording.joint_angles.items()},
     )
 
 
-def _differentiate(
-    qpos: Float[np.ndarray, "T nq"], step: float, anchored: bool, parameters: ReconstructionParameters
+def _unwound(model: mujoco.MjModel, joint: str, angle: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
+    """A wheel's angle without jumps, where the recording counts each turn from 0 again."""
+    hinge = model.joint(joint)
+    turns = hinge.type[0] == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_limited[hinge.id]
+    return np.unwrap(angle) if turns and np.ptp(angle) < 2 * np.pi + _TURN_TOLERANCE else angle
+
+
+def differentiate(
+    qpos: Float[np.ndarray, "T nq"],
+    model: mujoco.MjModel,
+    robot: RobotDescription,
+    step: float,
+    parameters: ReconstructionParameters,
 ) -> tuple[Float[np.ndarray, "T nq"], Float[np.ndarray, "T nv"]]:
-    """Smoothed generalized positions and their velocities at the same instants, in MuJoCo's conventions."""
+    """Return smoothed generalized positions, `step` (s) apart, and their velocities at the same instants, in MuJoCo's
+    conventions.
+
+    Filtered are the root's place, the tracked body's orientation and all joints. A root that is another body than the
+    tracked one follows from this and the joints between them.
+    """
     order = parameters.order
-    narrow, wide, rotation = parameters.position_window, parameters.rate_window, parameters.rotation_window
-    smooth = savitzky_golay(qpos, narrow, step, order, 0)
-    rates = savitzky_golay(qpos, wide, step, order, 1)
-    if anchored:
+    smooth = savitzky_golay(qpos, parameters.position_window, step, order, 0)
+    rates = savitzky_golay(qpos, parameters.rate_window, step, order, 1)
+    if robot.anchored:
         return smooth, rates
-    quaternion = sign_continuous(qpos[:, 3:7])
-    turned, angular = smooth_rotation(quaternion, rotation, step, order)
-    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    body = int(model.site_bodyid[model.site(robot.tracked).id])
+    tree = KinematicTree(model, [], [body])
+    relative, _ = _from_root(tree, qpos)
+    tracked = _to_quaternions(to_matrices(qpos[:, 3:7]) @ relative)
+    quaternion, angular = smooth_rotation(sign_continuous(tracked), parameters.rotation_window, step, order)
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    relative, slope = _from_root(tree, smooth)
+    root = _to_quaternions(to_matrices(quaternion) @ relative.transpose(0, 2, 1))
+    turning = (slope[:, :, 6:] @ rates[:, 7:, None])[..., 0]
+    angular = (relative @ angular[..., None])[..., 0] - turning
     return (
-        np.concatenate([smooth[:, :3], turned, smooth[:, 7:]], axis=1),
+        np.concatenate([smooth[:, :3], sign_continuous(root), smooth[:, 7:]], axis=1),
         np.concatenate([rates[:, :3], angular, rates[:, 7:]], axis=1),
     )
+
+
+def _from_root(
+    tree: KinematicTree, qpos: Float[np.ndarray, "T nq"]
+) -> tuple[Float[np.ndarray, "T 3 3"], Float[np.ndarray, "T 3 nv"]]:
+    """The tracked body's orientation in the root's frame, and how the joints turn it there."""
+    placed = np.concatenate([np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(qpos), 1)), qpos[:, 7:]], axis=1)
+    poses = tree.pose(placed)
+    return poses.rotations[0], tree.turn_jacobian(poses, 0)
+
+
+def _to_quaternions(matrices: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, "T 4"]:
+    return Rotation.from_matrix(matrices).as_quat(scalar_first=True)
+
+
+def _keep_ranges(model: mujoco.MjModel, qpos: Float[np.ndarray, "T nq"]) -> None:
+    """Bring joints that are a little beyond their ranges back, in place."""
+    for joint in np.flatnonzero(model.jnt_limited):
+        slides = bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE)
+        angle, (low, high) = qpos[:, model.jnt_qposadr[joint]], model.jnt_range[joint]
+        kept = np.clip(angle, low - _STOP_GIVE[slides], high + _STOP_GIVE[slides])
+        beyond = np.abs(angle - np.clip(angle, low, high)) > _OVERSHOOT[slides]
+        qpos[:, model.jnt_qposadr[joint]] = np.where(beyond, angle, kept)

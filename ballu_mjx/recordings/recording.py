@@ -1,4 +1,7 @@
-"""The recording of a robot's motion: commands, places, orientation and joint angles over time."""
+"""The recording of a robot's motion: commands, places, orientations and joint angles over time.
+
+A robot's description says which columns its recordings have. The file format is `csv_format`'s.
+"""
 
 from __future__ import annotations
 
@@ -9,41 +12,18 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.ballu.model import SIDES
 from ballu_mjx.robots.description import RobotDescription
 
 Kind = Literal["free", "suspended"]
 Split = Literal["training", "validation", "test", "suspended"]
-COLUMNS: Mapping[str, tuple[str, ...]] = {
-    "time": ("time",),
-    "command": ("command_left", "command_right"),
-    "balloon_position": tuple(f"balloon_{axis}" for axis in "xyz"),
-    "balloon_quaternion": tuple(f"balloon_q{axis}" for axis in "wxyz"),
-    "base_position": tuple(f"base_{axis}" for axis in "xyz"),
-    "base_quaternion": tuple(f"base_q{axis}" for axis in "wxyz"),
-    "foot_position": tuple(f"foot_{side}_{axis}" for side in SIDES for axis in "xyz"),
-    "motor": tuple(f"motor_{side}" for side in SIDES),
-    "knee": tuple(f"knee_{side}" for side in SIDES),
-}
-"""Columns of BALLU's recordings by field of `Recording`, in the order in which they are written."""
-
-POSITIONS = ("balloon_position", "base_position", "foot_position")
-QUATERNIONS = ("balloon_quaternion", "base_quaternion")
-ANGLES = ("motor", "knee")
-MANDATORY = {
-    "free": ("time", "command", "balloon_position", "balloon_quaternion", "base_position", "foot_position"),
-    "suspended": ("time", "command", "motor", "knee"),
-}
+Quantity = Literal["time", "command", "position", "quaternion", "angle"]
 
 Column = Float[np.ndarray, " T"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
-    """One recording, T samples. World frame, SI units, radians; pairs are (left, right).
-
-    Of robots that are not built like BALLU, base, feet, motors and knees are None: their parts stand in `points` and
-    `angles`.
+    """One recording of a robot, T samples. World frame (z up), SI units, radians.
 
     `read_recording` promises: time strictly increasing, no missing values, quaternions of unit length and continuous
     in sign. A recording that is to be written may hold NaN for missing samples.
@@ -51,68 +31,97 @@ class Recording:
 
     name: str
     kind: Kind
+    """free: the robot moves about. suspended: its root is held, and joint angles alone must be recorded."""
     robot: str
-    """Which robot was recorded."""
+    """Which specimen was recorded."""
     notes: str = ""
     time: Float[np.ndarray, " T"]
     """s, from any origin."""
     command: Float[np.ndarray, "T commands"]
-    """In [0, 1], held until the next sample."""
-    balloon_position: Float[np.ndarray, "T 3"] | None
-    """m, the model's site `balloon` (the tracked one). None only in suspended recordings, as are base and feet."""
-    balloon_quaternion: Float[np.ndarray, "T 4"] | None
-    """w, x, y, z: the balloon's frame in the world."""
-    base_position: Float[np.ndarray, "T 3"] | None
-    """m, the model's site `base`."""
-    base_quaternion: Float[np.ndarray, "T 4"] | None = None
-    """w, x, y, z."""
-    foot_position: Float[np.ndarray, "T 2 3"] | None
-    """m, centres of the foot spheres."""
-    motor: Float[np.ndarray, "T 2"] | None = None
-    """rad."""
-    knee: Float[np.ndarray, "T 2"] | None = None
-    """rad."""
+    """In the units of the description's actuators, held until the next sample."""
+    tracked_position: Float[np.ndarray, "T 3"] | None = None
+    """m, of the tracked site. None only in suspended recordings, as is the orientation."""
+    tracked_quaternion: Float[np.ndarray, "T 4"] | None = None
+    """w, x, y, z: the tracked site's body in the world."""
     points: Mapping[str, Float[np.ndarray, "T 3"]] = dataclasses.field(default_factory=dict)
-    """m, by site."""
-    angles: Mapping[str, Float[np.ndarray, " T"]] = dataclasses.field(default_factory=dict)
-    """rad (hinges) or m (slides), by joint."""
+    """m, by site: all of the description's, but in suspended recordings."""
+    orientations: Mapping[str, Float[np.ndarray, "T 4"]] = dataclasses.field(default_factory=dict)
+    """w, x, y, z, by site: of some of the description's `oriented_points`."""
+    joint_angles: Mapping[str, Float[np.ndarray, " T"]] = dataclasses.field(default_factory=dict)
+    """rad (hinges) or m (slides), by joint: of some of the description's, of all in suspended recordings."""
     interpolated: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """Samples filled in, by column; columns without any are left out."""
     trimmed: tuple[int, int] = (0, 0)
     """Rows cut off the file's start and end, where some column has a gap with a sample on one side only."""
 
 
-# ---- robots ----
+def cut(recording: Recording, rows: slice) -> Recording:
+    """Return the samples in `rows`."""
 
-POINT, ANGLE = "point ", "angle "
-"""What the fields of other robots' points and joints begin with."""
+    def some(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {name: value[rows] for name, value in values.items()}
+
+    position, quaternion = recording.tracked_position, recording.tracked_quaternion
+    return dataclasses.replace(
+        recording,
+        time=recording.time[rows],
+        command=recording.command[rows],
+        tracked_position=None if position is None else position[rows],
+        tracked_quaternion=None if quaternion is None else quaternion[rows],
+        points=some(recording.points),
+        orientations=some(recording.orientations),
+        joint_angles=some(recording.joint_angles),
+    )
+
+
+# ---- columns ----
 
 
 @dataclasses.dataclass(frozen=True)
-class ColumnLayout:
-    """Columns by field, and which fields are what: those of BALLU, or of another robot's description."""
+class ColumnGroup:
+    """Columns that a file holds together or not at all."""
 
-    columns: Mapping[str, tuple[str, ...]]
-    mandatory: Mapping[str, tuple[str, ...]]
-    positions: tuple[str, ...]
-    angles: tuple[str, ...]
-    points: tuple[str, ...] = ()
-    joints: tuple[str, ...] = ()
+    quantity: Quantity
+    part: str
+    """The site or joint; empty for time and commands."""
+    names: tuple[str, ...]
+    mandatory: tuple[Kind, ...]
+    """Kinds of recordings that need them."""
 
 
-def column_layout(robot: RobotDescription | None) -> ColumnLayout:
-    if robot is None or robot.is_ballu:
-        return ColumnLayout(COLUMNS, MANDATORY, POSITIONS, ANGLES)
-    columns = {
-        "time": ("time",),
-        "command": tuple(f"command_{name}" for name in robot.commands),
-        "balloon_position": tuple(f"{robot.tracked}_{axis}" for axis in "xyz"),
-        "balloon_quaternion": tuple(f"{robot.tracked}_q{axis}" for axis in "wxyz"),
-    }
-    columns |= {POINT + name: tuple(f"{name}_{axis}" for axis in "xyz") for name in robot.points}
-    mandatory = {"free": tuple(columns)}
-    columns |= {ANGLE + name: (name,) for name in robot.joints}
-    positions = ("balloon_position", *(POINT + name for name in robot.points))
-    return ColumnLayout(
-        columns, mandatory, positions, tuple(ANGLE + name for name in robot.joints), robot.points, robot.joints
-    )
+def column_groups(robot: RobotDescription) -> tuple[ColumnGroup, ...]:
+    """Return all columns that recordings of `robot` may have, in the order in which they are written."""
+
+    def position(site: str) -> ColumnGroup:
+        return ColumnGroup("position", site, tuple(f"{site}_{axis}" for axis in "xyz"), ("free",))
+
+    def quaternion(site: str, *mandatory: Kind) -> ColumnGroup:
+        return ColumnGroup("quaternion", site, tuple(f"{site}_q{axis}" for axis in "wxyz"), mandatory)
+
+    groups = [
+        ColumnGroup("time", "", ("time",), ("free", "suspended")),
+        ColumnGroup("command", "", tuple(f"command_{name}" for name in robot.commands), ("free", "suspended")),
+        position(robot.tracked),
+        quaternion(robot.tracked, "free"),
+    ]
+    for point in robot.points:
+        groups.append(position(point))
+        if point in robot.oriented_points:
+            groups.append(quaternion(point))
+    groups += [ColumnGroup("angle", joint, (joint,), ("suspended",)) for joint in robot.joints]
+    return tuple(groups)
+
+
+def values_of(
+    recording: Recording, group: ColumnGroup, robot: RobotDescription
+) -> Float[np.ndarray, "T columns"] | None:
+    """Return a group's columns; None where the recording does not hold them."""
+    tracked = group.part == robot.tracked
+    if group.quantity == "position":
+        return recording.tracked_position if tracked else recording.points.get(group.part)
+    if group.quantity == "quaternion":
+        return recording.tracked_quaternion if tracked else recording.orientations.get(group.part)
+    if group.quantity == "command":
+        return recording.command
+    column = recording.time if group.quantity == "time" else recording.joint_angles.get(group.part)
+    return None if column is None else column[:, None]

@@ -1,7 +1,8 @@
 """Short windows of recorded motion, and how far a simulated one is off: what residuals are fitted to by derivatives.
 
 A window starts in a recorded state and runs under the recorded commands. It is short enough for errors not to compound,
-and long enough for a force of hundredths of a newton to move the balloon by more than the starting state's uncertainty.
+and long enough for a force of hundredths of a newton to move the tracked body by more than the starting state's
+uncertainty.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from jaxtyping import Array, Float
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
-from ballu_mjx.sim.observation import HISTORY, wrap_angle
-from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout, wrap_angle
+from ballu_mjx.sim.simulator import RolloutState, Simulator
+from ballu_mjx.sim.step import state_at
 
 POSITION = (0.002, 0.01)
-"""Expected error of the balloon's position (m) at a window's start, and what each second adds."""
+"""Expected error of the tracked body's position (m) at a window's start, and what each second adds."""
 ANGLE = (np.deg2rad(0.3), np.deg2rad(0.6))
 """Likewise of its orientation (rad)."""
 OUTLYING = 3.0
@@ -35,19 +36,22 @@ class Segments(NamedTuple):
     qpos: Float[Array | np.ndarray, "windows nq"]
     """First states."""
     qvel: Float[Array | np.ndarray, "windows nv"]
-    history: Float[Array | np.ndarray, "windows 3 27"]
+    history: Float[Array | np.ndarray, "windows steps features"]
     """`observation.observe_features` of the first state and the two before."""
-    commands: Float[Array | np.ndarray, "windows commands 2"]
+    commands: Float[Array | np.ndarray, "windows allsteps commands"]
     """From two control steps before the first on."""
-    features: Float[Array | np.ndarray, "windows windowsteps 27"]
+    features: Float[Array | np.ndarray, "windows windowsteps features"]
     """Recorded, after each control step."""
 
 
-def check_segments(window_seconds: float, interval_seconds: float) -> None:
-    """**Raises** `InputError` for lengths out of range, naming the option."""
+def check_segments(window_seconds: float, interval_seconds: float, control_timestep: float) -> None:
+    """Check the windows' length and distance, at least two control steps (s).
+
+    **Raises** `InputError` for lengths out of range, naming the option."""
     for name, value in (("--window-seconds", window_seconds), ("--interval-seconds", interval_seconds)):
-        if not 2 * CONTROL_TIMESTEP <= value < math.inf:
-            raise InputError(f"{name} is {value:g}: it must be 0.1 or more; 0.1 is the nearest.")
+        shortest = 2 * control_timestep
+        if not shortest <= value < math.inf:
+            raise InputError(f"{name} is {value:g}: it must be {shortest:g} or more; {shortest:g} is the nearest.")
 
 
 def cut_segments(
@@ -57,7 +61,7 @@ def cut_segments(
 
     **Raises** `InputError` where no recording is as long as a window.
     """
-    steps, every = (round(s / CONTROL_TIMESTEP) for s in (window_seconds, interval_seconds))
+    steps, every = (round(s / simulator.robot.control_timestep) for s in (window_seconds, interval_seconds))
     history = HISTORY
     places = [
         (number, start)
@@ -81,16 +85,30 @@ def cut_segments(
     )
 
 
+def start_segment(window: Segments) -> tuple[RolloutState, Float[Array, "windowsteps commands"]]:
+    """Return where one window starts, and the commands of its control steps."""
+    physics = state_at(jnp.asarray(window.qpos), jnp.asarray(window.qvel))
+    past = HISTORY - 1
+    history, commands = jnp.asarray(window.history), jnp.asarray(window.commands)
+    return RolloutState(physics, history, commands[:past]), commands[past:]
+
+
 def segment_errors(
-    features: Float[Array | np.ndarray, "windowsteps 27"], recorded: Float[Array | np.ndarray, "windowsteps 27"]
+    features: Float[Array | np.ndarray, "windowsteps features"],
+    recorded: Float[Array | np.ndarray, "windowsteps features"],
+    control_timestep: float,
 ) -> Float[Array, "windowsteps 6"]:
-    """Of the balloon's position and orientation, in expected errors. Neighbours in time say the same: all of a window's
-    squares add up to one for each of the six where errors are as expected."""
+    """Return errors of the tracked body's position and orientation, in expected errors.
+
+    Neighbours in time say the same: all of a window's squares add up to one for each of the six where errors are as
+    expected.
+    """
     steps = len(recorded)
-    time = np.arange(1, steps + 1)[:, None] * CONTROL_TIMESTEP
+    time = np.arange(1, steps + 1)[:, None] * control_timestep
     start, each_second = np.array([POSITION] * 3 + [ANGLE] * 3).T
     difference = jnp.asarray(features) - recorded
-    position, angles = difference[:, :3], wrap_angle(difference[:, 6:9])
+    position = difference[:, ObservationLayout.position]
+    angles = wrap_angle(difference[:, ObservationLayout.euler_angles])
     return jnp.concatenate([position, angles], axis=1) / ((start + each_second * time) * np.sqrt(steps))
 
 

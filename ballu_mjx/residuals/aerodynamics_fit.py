@@ -1,8 +1,8 @@
 """Identifying the air from recordings of free motion, by least squares through MJX.
 
 The recordings are cut into short windows. Each is simulated from its recorded first state under its recorded commands;
-what the simulated balloon's place and orientation differ by from the recorded ones is made small, by nonlinear least
-squares with a loss that a slipped foot does not rule.
+what the place and orientation of the simulated tracked body differ by from the recorded ones is made small, by
+nonlinear least squares with a loss that single bad windows, such as one where a foot slipped, do not rule.
 
 Slopes are taken over a parameter's order of magnitude, not at a point. Where feet come down at other times than in the
 recording, derivatives hold for less than a millinewton of lift and point nowhere beyond, while errors over thirty
@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import scipy.optimize
 from jax.flatten_util import ravel_pytree
@@ -26,18 +25,25 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.recordings.segments import OUTLYING, Segments, check_segments, cut_segments, pseudo_huber, segment_errors
+from ballu_mjx.recordings.segments import (
+    OUTLYING,
+    Segments,
+    check_segments,
+    cut_segments,
+    pseudo_huber,
+    segment_errors,
+    start_segment,
+)
 from ballu_mjx.residuals.aerodynamics import (
     AIR_PARAMETERS,
-    LONGEST_DELAY,
     SIGNED_AIR_PARAMETERS,
     Aerodynamics,
     AirParameters,
+    longest_delay,
 )
-from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.force_model import BoundForces
 from ballu_mjx.sim.sharding import shard_over_devices
-from ballu_mjx.sim.simulator import Simulator
-from ballu_mjx.sim.step import state_at
+from ballu_mjx.sim.simulator import RolloutState, Simulator
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +80,7 @@ SCALES: dict[str, Scale] = {
 }
 """By name; SI units."""
 _AGAIN = 4
-"""Most steps of the solver at each of the two whole delays beside the best."""
+"""Most steps of the solver at each of the two whole delays next to the best."""
 _INSIDE = 0.01
 """Of `typical`: so far from its bounds a search begins. On one, the solver takes its first steps for nothing."""
 _GAIN, _STEP = 1e-4, 1e-3
@@ -101,43 +107,43 @@ Report = Callable[[int, float], None]
 """(evaluations so far, cost)."""
 
 
-def check_air_config(config: AirConfig) -> None:
+def check_air_config(config: AirConfig, control_timestep: float) -> None:
     """**Raises** `InputError` for options out of range, naming the option."""
-    check_segments(config.window_seconds, config.interval_seconds)
+    check_segments(config.window_seconds, config.interval_seconds, control_timestep)
     if config.evaluations < 1:
         raise InputError(f"--evaluations is {config.evaluations}: it must be 1 or more; 1 is the nearest.")
 
 
 def identify_air(
-    model: mujoco.MjModel,
+    simulator: Simulator,
     motions: Sequence[Motion],
     config: AirConfig,
     report: Report = lambda evaluations, cost: None,
     *,
-    known: AirParameters | None = None,
+    fixed_from: AirParameters | None = None,
     free: Sequence[str] = AIR_PARAMETERS,
 ) -> AirFit:
     """Fit `AirParameters` to recorded motions.
 
     **Arguments**
 
-    - `model`: the robot without the residual, its actuators identified.
+    - `simulator`: the robot without the residual, its actuators identified.
     - `report`: told of every evaluation.
-    - `known`: where to start, and the values of what is not `free`; None: no air.
+    - `fixed_from`: where to start, and the values of what is not `free`; None: no air.
     - `free`: names of the parameters to fit.
 
     **Raises** `InputError` where no recording is as long as a window.
     """
-    check_air_config(config)
-    simulated = AirWindows(model, motions, config)
+    check_air_config(config, simulator.robot.control_timestep)
+    simulated = AirWindows(simulator, motions, config)
     none = AirParameters.none()
-    start, unravel = ravel_pytree(none if known is None else known)
+    start, unravel = ravel_pytree(none if fixed_from is None else fixed_from)
     start = np.asarray(start, np.float64)
     owner = np.repeat(AIR_PARAMETERS, [getattr(none, name).size for name in AIR_PARAMETERS])
     scale, prior = np.array([SCALES[name] for name in owner]).T
     is_delay = owner == "delay"
     low = np.where(np.isin(owner, SIGNED_AIR_PARAMETERS), -np.inf, 0.0)
-    high = np.where(is_delay, LONGEST_DELAY, np.inf)
+    high = np.where(is_delay, simulated.longest_delay, np.inf)
     evaluations = 0
 
     def fitted(vector: np.ndarray, places: Int[np.ndarray, " free"], most: int) -> Optimum:
@@ -180,7 +186,7 @@ def identify_air(
 
     without = fitted(start, np.zeros(0, int), 1).cost
     places = np.flatnonzero(np.isin(owner, list(free)))
-    if known is None:  # not from the bounds, where what must be positive has nowhere to go but up
+    if fixed_from is None:  # not from the bounds, where what must be positive has nowhere to go but up
         start[places] = np.where(np.isin(owner, SIGNED_AIR_PARAMETERS), 0.0, scale)[places]
     found = fitted(start, places, config.evaluations)
     if "delay" in free:
@@ -207,12 +213,12 @@ class Optimum(NamedTuple):
 def at_whole_delay(
     found: Optimum, delay: Bool[np.ndarray, " parameters"], step: float, fitted: Callable[[np.ndarray], Optimum]
 ) -> Optimum:
-    """The better one of the two whole delays beside the one `found`, with all else fitted again. To the covariance of
+    """The better one of the two whole delays next to the one `found`, with all else fitted again. To the covariance of
     `found` comes what rounding the delay does to it and to what passes for it."""
     place = int(np.flatnonzero(delay)[0])
     steps = found.vector[place] / step
-    beside = {int(np.floor(steps + _JUST)), int(np.ceil(steps - _JUST))}
-    best = min((fitted(np.where(delay, step * whole, found.vector)) for whole in beside), key=lambda fit: fit.cost)
+    neighbours = {int(np.floor(steps + _JUST)), int(np.ceil(steps - _JUST))}
+    best = min((fitted(np.where(delay, step * whole, found.vector)) for whole in neighbours), key=lambda fit: fit.cost)
     with_it = found.covariance[place] / max(found.covariance[place, place], np.finfo(float).tiny)
     return best._replace(covariance=found.covariance + np.outer(with_it, with_it) * step**2 / 12)
 
@@ -247,13 +253,16 @@ class AirWindows:
     """Windows of recorded motions, and their simulation in any air; compiles once. A vector is a flattened
     `AirParameters`."""
 
-    def __init__(self, model: mujoco.MjModel, motions: Sequence[Motion], config: AirConfig) -> None:
-        self._simulator, self._air = Simulator(model), Aerodynamics(model)
+    def __init__(self, simulator: Simulator, motions: Sequence[Motion], config: AirConfig) -> None:
+        self._simulator = simulator
+        self._air = Aerodynamics(simulator.robot, simulator.mj_model)
+        self.longest_delay = longest_delay(simulator.robot)
+        """s."""
         none, self._unravel = ravel_pytree(AirParameters.none())
         self._delay = int(self._unravel(jnp.arange(len(none), dtype=none.dtype)).delay)
         self.windows = cut_segments(self._simulator, motions, config.window_seconds, config.interval_seconds)
         self._run = shard_over_devices(self.simulate, shared=1)
-        self.timestep = float(model.opt.timestep)
+        self.timestep = float(simulator.mj_model.opt.timestep)
         self.control_steps = 0
         """Simulated so far, in all windows."""
 
@@ -274,7 +283,7 @@ class AirWindows:
         Commands arrive with a physics step; for a delay between two, errors are a mean of what the one and the other
         give, and change by it as from the one to the other. Along other parameters: at the nearest whole delay.
         """
-        before, after, share = self._beside(vector)
+        before, after, share = self._neighbours(vector)
         nearest = before if share < 0.5 else after
         between, is_delay = share >= _JUST, places == self._delay
         first = self._whole(before)
@@ -290,9 +299,9 @@ class AirWindows:
                 slopes[..., number] = (self._whole(moved) - near) / step
         return (1 - share) * first + share * second if between else first, slopes
 
-    def _beside(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """With the two whole delays beside that of `vector`, and how far it is from the first to the second."""
-        most = round(LONGEST_DELAY / self.timestep)
+    def _neighbours(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """With the two whole delays next to that of `vector`, and how far it is from the first to the second."""
+        most = round(self.longest_delay / self.timestep)
         steps = vector[self._delay] / self.timestep
         first = min(int(steps + _JUST), most - 1)
         before, after = vector.copy(), vector.copy()
@@ -309,16 +318,12 @@ class AirWindows:
     def simulate(self, vector: Float[Array, " parameters"], window: Segments) -> Float[Array, " entries"]:
         """`errors` of one window, at a whole delay; JAX's own transformations apply."""
         air = self._unravel(vector)
-        simulator = self._simulator.altered(self._air.fields(air))
-        state = state_at(jnp.asarray(window.qpos), jnp.asarray(window.qvel))
+        simulator = self._simulator.with_residual(BoundForces(self._air, air))
+        state, commands = start_segment(window)
 
-        def step(carry: tuple, time: Int[Array, ""]) -> tuple[tuple, Array]:
-            state, history = carry
-            seen = jax.lax.dynamic_slice_in_dim(window.commands, time, HISTORY)
-            wrench = self._air.wrench(air, history, seen)
-            state = simulator.step(state, self._air.command(air, seen), wrench)
-            features, _ = simulator.observe(state)
-            return (state, jnp.concatenate([history[1:], features[None]])), features
+        def step(state: RolloutState, command: Array) -> tuple[RolloutState, Array]:
+            after = simulator.step(state, command).state
+            return after, after.features
 
-        _, features = jax.lax.scan(step, (state, window.history), jnp.arange(len(window.features)))
-        return segment_errors(features, window.features).ravel()
+        _, features = jax.lax.scan(step, state, commands)
+        return segment_errors(features, window.features, self._simulator.robot.control_timestep).ravel()

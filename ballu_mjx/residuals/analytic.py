@@ -9,27 +9,25 @@ that one simulation serves some gradient steps. Then other windows are simulated
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import optax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.recordings.segments import Segments, check_segments, pseudo_huber, segment_errors
+from ballu_mjx.recordings.segments import Segments, check_segments, pseudo_huber, segment_errors, start_segment
 from ballu_mjx.residuals.envmimic import start_spread
 from ballu_mjx.residuals.network import NetworkForces, square_newtons
-from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.sim.force_model import BoundForces, add_wrenches, to_wrenches
+from ballu_mjx.sim.force_model import to_wrenches
 from ballu_mjx.sim.linearize import ControlSteps, Linearized, Linearizer
-from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.sharding import shard_over_devices
-from ballu_mjx.sim.simulator import Simulator
-from ballu_mjx.sim.step import state_at
+from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,12 +38,12 @@ class AnalyticConfig:
     """Length of a window, s."""
     interval_seconds: float = 8.0
     """Time between the starts of two windows, s."""
-    rounds: int = 8
+    relinearizations: int = 8
     """Simulations of windows, each linearized and then learned on."""
     windows: int = 16
-    """Windows in a round, drawn anew for each."""
+    """Windows in a simulation, drawn anew for each."""
     updates: int = 20
-    """Gradient steps in a round, each on all its windows."""
+    """Gradient steps after each linearization, each on all its windows."""
     validate_every: int = 20
     """Gradient steps between two validations, each of which leaves a checkpoint."""
     learning_rate: float = 1e-3
@@ -65,39 +63,32 @@ class AnalyticConfig:
     """Seeds network, batches and noise."""
 
 
-def check_analytic_config(config: AnalyticConfig) -> None:
+def check_analytic_config(config: AnalyticConfig, control_timestep: float) -> None:
     """**Raises** `InputError` for options out of range, naming the option."""
-    check_segments(config.window_seconds, config.interval_seconds)
-    for name in ("rounds", "windows", "updates", "validate_every", "learning_rate", "max_grad_norm", "averaging"):
+    check_segments(config.window_seconds, config.interval_seconds, control_timestep)
+    positive = "relinearizations", "windows", "updates", "validate_every", "learning_rate", "max_grad_norm", "averaging"
+    for name in positive:
         if not getattr(config, name) > 0:
             raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name)}: it must be greater than 0.")
 
 
-def simulator(
-    model: mujoco.MjModel, forces: NetworkForces, beside: BoundForces | None = None
-) -> Callable[[Any, Segments], tuple[ControlSteps, Float[np.ndarray, "windows windowsteps 27"]]]:
-    """A compiled simulation of windows under the forces of `forces` (and of `beside`): (its parameters, windows) to all
-    control steps, window after window, and the features after each."""
-    robot = Simulator(model)
-    if beside is not None:
-        robot = robot.altered(beside.model.fields(beside.params))
+def compile_rollout(
+    simulator: AugmentedSimulator, forces: NetworkForces
+) -> Callable[[Any, Segments], tuple[ControlSteps, Float[np.ndarray, "windows windowsteps features"]]]:
+    """Return a compiled simulation of windows under `forces`, in `simulator`.
+
+    It takes the parameters of `forces` and windows, and returns all control steps, window after window, and the
+    features after each.
+    """
 
     def run(params: Any, window: Segments) -> tuple[ControlSteps, Array]:
-        def step(carry: tuple, time: Int[Array, ""]) -> tuple[tuple, tuple]:
-            state, history = carry
-            commands = jax.lax.dynamic_slice_in_dim(window.commands, time, HISTORY)
-            loads = forces.loads(params, forces.inputs(history, commands), history[-1, 8])
-            command, wrench = commands[-1], to_wrenches(loads, forces.config.forces)
-            if beside is not None:
-                command = beside.model.command(beside.params, commands)
-                wrench = add_wrenches(wrench, beside.model.wrench(beside.params, history, commands))
-            after = robot.step(state, command, wrench)
-            features, _ = robot.observe(after)
-            done = ControlSteps(state, history, commands, loads), features
-            return (after, jnp.concatenate([history[1:], features[None]])), done
+        def step(state: RolloutState, command: Array) -> tuple[RolloutState, tuple[ControlSteps, Array]]:
+            seen = forces.inputs(state.history, state.with_command(command))
+            loads = forces.loads(params, seen, state.features[ObservationLayout.yaw])
+            after = simulator.step(state, command, wrench=to_wrenches(loads, forces.config.forces)).state
+            return after, (ControlSteps(state, command, loads), after.features)
 
-        first = state_at(jnp.asarray(window.qpos), jnp.asarray(window.qvel)), window.history
-        return jax.lax.scan(step, first, jnp.arange(len(window.features)))[1]
+        return jax.lax.scan(step, *start_segment(window))[1]
 
     spread = shard_over_devices(run, shared=1)
 
@@ -113,7 +104,6 @@ Report = Callable[[int, Any, dict[str, float]], None]
 
 
 def train(
-    model: mujoco.MjModel,
     forces: NetworkForces,
     wrap: Callable[[Any], Any],
     start: Any,
@@ -132,24 +122,29 @@ def train(
     - `recorded`: windows of the training recordings.
     - `spread`: of each of the network's inputs over the recordings.
     - `report`: told every `validate_every` gradient steps.
-    - `linearize`: that of the same model and force set, with the residual that the simulator has already; joints'
-      torques are left alone.
+    - `linearize`: of the same force set and the simulator to learn in, its base residual included; joints' torques
+      are left alone.
     """
-    simulate = simulator(model, forces, linearize.beside)
+    simulate = compile_rollout(linearize.simulator, forces)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
-    starts = start_spread(model, load_robot())
-    update = _updates(forces, wrap, optimizer, spread, starts, config)
+    plain = linearize.simulator.simulator
+    starts = start_spread(plain.mj_model, plain.robot)
+    update = _updates(forces, wrap, optimizer, spread, starts, config, plain.robot.control_timestep)
     carry = (start, optimizer.init(start), start)
     key = jax.random.key(config.seed)
     done = simulated = 0
-    for _ in range(config.rounds):
+    for _ in range(config.relinearizations):
         key, own = jax.random.split(key)
         drawn = np.asarray(jax.random.permutation(own, len(recorded.qpos)))[: config.windows]
         taken = jax.tree.map(lambda x, drawn=drawn: np.asarray(x)[drawn], recorded)
         steps, features = simulate(wrap(jax.device_get(carry[0])), taken)
         data = _in_windows(linearize(steps), steps.loads, taken)
         simulated += len(steps.loads) * (2 + linearize.directions)
-        loss = float(np.mean(jax.vmap(_loss)(features, taken.features)))
+        loss = float(
+            np.mean(
+                jax.vmap(functools.partial(_loss, control_timestep=plain.control_timestep))(features, taken.features)
+            )
+        )
         for first in range(0, config.updates, config.validate_every):
             key, own = jax.random.split(key)
             count = min(config.validate_every, config.updates - first)
@@ -169,10 +164,12 @@ def _in_windows(
 
 
 def _loss(
-    features: Float[Array | np.ndarray, "windowsteps 27"], recorded: Float[Array | np.ndarray, "windowsteps 27"]
+    features: Float[Array | np.ndarray, "windowsteps features"],
+    recorded: Float[Array | np.ndarray, "windowsteps features"],
+    control_timestep: float,
 ) -> Float[Array, ""]:
     """Of a whole window's error."""
-    return pseudo_huber(jnp.sum(segment_errors(features, recorded) ** 2))
+    return pseudo_huber(jnp.sum(segment_errors(features, recorded, control_timestep) ** 2))
 
 
 def _updates(
@@ -182,6 +179,7 @@ def _updates(
     spread: Float[np.ndarray, " inputs"],
     start_spread: Float[np.ndarray, " directions"],
     config: AnalyticConfig,
+    control_timestep: float,
 ) -> Callable[..., Any]:
     """Gradient steps on linearized windows, compiled."""
 
@@ -196,7 +194,9 @@ def _updates(
             linear, about, time, key = inputs
             commands = jax.lax.dynamic_slice_in_dim(window.commands, time, HISTORY)
             noise = config.observation_noise * spread * jax.random.normal(key, spread.shape)
-            loads = forces.loads(wrap(params), forces.inputs(history, commands) + noise, history[-1, 8])
+            loads = forces.loads(
+                wrap(params), forces.inputs(history, commands) + noise, history[-1, ObservationLayout.yaw]
+            )
             both = jnp.concatenate([moved, loads - about])
             features = linear.features + linear.seen @ both
             return (linear.state @ both, jnp.concatenate([history[1:], features[None]])), (features, loads)
@@ -204,7 +204,7 @@ def _updates(
         steps = len(window.features)
         through = linear, about, jnp.arange(steps), jax.random.split(key_noise, steps)
         _, (features, loads) = jax.lax.scan(step, (first, window.history), through)
-        tracking = _loss(features, window.features)
+        tracking = _loss(features, window.features, control_timestep)
         return tracking + config.force_cost * jnp.mean(square_newtons(loads, forces.config)), tracking
 
     @jax.jit

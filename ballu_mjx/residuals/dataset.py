@@ -3,31 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import mujoco
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.evaluation.errors_table import base_name
-from ballu_mjx.recordings.csv_format import list_bundled, list_recordings, read_recording
+from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS
+from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.groups import group_of
+from ballu_mjx.recordings.load import bundled_recordings
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
-from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.recordings.recording import Recording, Split
 from ballu_mjx.residuals.run_config import find_recordings, run_actuators
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, same_parameters
-from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import read_config
 
-if TYPE_CHECKING:
-    from ballu_mjx.recordings.recording import Recording
-
-
-USES = ("training", "validation", "test")
+USES: tuple[Split, ...] = ("training", "validation", "test")
 QUICK_RECORDINGS = 2
 """Recordings of each kind that `--quick` reads."""
 
@@ -43,6 +39,9 @@ class RecordingsData(loggers.LoggingOptions):
     your own: those."""
     test: tuple[Path, ...] = ()
     """Recordings for the final table. Without this option, where --recordings are your own: those for validation."""
+    robot: str | None = None
+    """Whose recordings these are: the name of a robot that comes with the package, or the file of a description
+    (docs/own_robot.md). Without this option: ballu; with --resume, where there is that: the run's."""
     actuators: Path | None = None
     """File of identified actuators (`train sysid` writes it), or the word nominal. Without this option: actuators.json
     beside the recordings or in the folder above, if it names their robot; else nominal."""
@@ -71,57 +70,64 @@ class ResidualDataset:
     robot: RobotDescription
 
     @staticmethod
-    def read(
-        data: RecordingsData, earlier: Path | None = None, description: RobotDescription | None = None
-    ) -> ResidualDataset:
-        """Find and read everything, so that nothing wrong with it comes up later; `earlier` is the run that goes on,
-        `description` the robot (None: BALLU).
+    def read(data: RecordingsData, robot: RobotDescription, earlier: Path | None = None) -> ResidualDataset:
+        """Find and read everything, so that nothing wrong with it comes up later; `earlier` is the run that goes on.
 
         **Raises** `InputError` for recordings or actuators that cannot be used, naming them.
         """
-        description = description or load_robot()
-        files = _choose(data, earlier)
-        recordings = _read(files, description)
-        found = _actuators(data, earlier, files["training"], recordings["training"], description)
-        return ResidualDataset(files, recordings, *found, description)
+        files = _choose(data, robot, earlier)
+        recordings = _read(files, robot)
+        found = _actuators(data, earlier, files["training"], recordings["training"], robot)
+        return ResidualDataset(files, recordings, *found, robot)
 
-    @property
-    def base(self) -> str:
-        """What the simulator without residual is called."""
-        return base_name(self.identified is not None)
-
-    def check_beside(self, learned_with: ModelParameters | None, run: Path | None) -> None:
-        """**Raises** `InputError` where the residual of `run` was learned beside other actuators than these."""
+    def check_base_residual(self, learned_with: ModelParameters | None, run: Path | None) -> None:
+        """**Raises** `InputError` where the base residual, of `run`, was learned with other actuators than these."""
         if not same_parameters(learned_with, self.identified):
-            raise InputError(f"{run}: was learned beside other actuators than {self.where}; give --actuators the same.")
+            raise InputError(f"{run}: was learned with other actuators than {self.where}; give --actuators the same.")
 
     @property
     def one_set(self) -> bool:
         """Whether test and validation are the same recordings."""
-        return self.files["test"] == self.files["validation"]
+        return self._same("test", "validation")
 
-    def announce(self, folder: Path, quick: bool) -> None:
-        """Tell the user what will be used for what."""
-        print(f"Run folder: {folder}")
-        for use in USES:
-            print(f"  {use}: {', '.join(recording.name for recording in self.recordings[use])}")
-        print(f"  actuators: {self.where}")
-        if self.files["validation"] == self.files["training"]:
-            print("  Validation is on the training recordings: it will not show how well the residual generalizes.")
-        if quick:
-            print("  --quick: sizes so small that the numbers mean little.")
+    @property
+    def reused(self) -> list[str]:
+        """Return a sentence for each use whose recordings serve an earlier one too."""
+        said = []
+        if self._same("validation", "training"):
+            said.append("Validation is on the training recordings: it will not show how well the residual generalizes.")
+        if self._same("test", "training"):
+            said.append("The test is on the training recordings: it will not show how well the residual generalizes.")
+        elif self.one_set:
+            said.append("The test is on the validation recordings, which make the choices: expect low errors.")
+        return said
+
+    @property
+    def replayed(self) -> str:
+        """Return what the final table is of, in words."""
+        if self._same("test", "training"):
+            return "Open-loop replay of the training recordings (they were learned from)"
+        if self.one_set:
+            return "Open-loop replay of the validation recordings (they chose the checkpoint)"
+        return "Open-loop replay of the test recordings"
+
+    def _same(self, one: str, other: str) -> bool:
+        first, second = ({path.resolve() for path in self.files[use]} for use in (one, other))
+        return first == second
 
     def reconstruct(self, model: mujoco.MjModel) -> dict[str, list[Motion]]:
-        """States at the control rate, by use."""
-        print("Reconstructing the recorded states ...", flush=True)
-        return {use: [reconstruct(each, model, self.robot) for each in self.recordings[use]] for use in USES}
+        """Return states at the control rate, by use; uses of the same files share a list."""
+        motions: dict[str, list[Motion]] = {}
+        for use in USES:
+            same = next((other for other in motions if self.files[other] == self.files[use]), None)
+            if same is not None:
+                motions[use] = motions[same]
+            else:
+                motions[use] = [reconstruct(each, self.robot, model) for each in self.recordings[use]]
+        return motions
 
-    def load_model(self) -> mujoco.MjModel:
-        """The robot with these actuators."""
-        return self.robot.load_model(self.identified)
 
-
-def _choose(data: RecordingsData, earlier: Path | None) -> dict[str, list[Path]]:
+def _choose(data: RecordingsData, robot: RobotDescription, earlier: Path | None) -> dict[str, list[Path]]:
     """The files for each use."""
     own = dict(zip(USES, (data.recordings, data.validation, data.test), strict=True))
     files = {use: list_recordings(paths) for use, paths in own.items() if paths}
@@ -132,7 +138,7 @@ def _choose(data: RecordingsData, earlier: Path | None) -> dict[str, list[Path]]
         files.setdefault("validation", files["training"])
         files.setdefault("test", files["validation"])
     else:
-        files = {use: list_bundled(use) for use in USES if use not in files} | files
+        files = {use: bundled_recordings(use, robot) for use in USES if use not in files} | files
     if data.quick:
         few = files["training"][:QUICK_RECORDINGS]
         on_training = files["validation"] == files["training"]
@@ -176,21 +182,25 @@ def _one_a_group(paths: Sequence[Path]) -> list[Path]:
 
 def _read(files: Mapping[str, Sequence[Path]], description: RobotDescription) -> dict[str, list[Recording]]:
     """All recordings, read and found fit for their use."""
-    seen = {path.resolve() for path in files["training"]}
-    for use in ("validation", "test"):
-        for path in files[use]:
-            if path.resolve() in seen and files[use] != files["training"]:
-                raise InputError(f"{path}: is among the training and the {use} recordings; take it out of one of them.")
+    check_overlap(files)
     read = {path: read_recording(path, description) for paths in files.values() for path in paths}
     for path, recording in read.items():
         check_recording(path, recording, long_enough=path in files["validation"] or path in files["test"])
     return {use: [read[path] for path in paths] for use, paths in files.items()}
 
 
+def check_overlap(files: Mapping[str, Sequence[Path]]) -> None:
+    """**Raises** `InputError` where two uses share some of their recordings, but not all."""
+    places = {use: {path.resolve(): path for path in paths} for use, paths in files.items()}
+    for one, other in itertools.combinations(USES, 2):
+        shared = places[one].keys() & places[other].keys()
+        if shared and places[one].keys() != places[other].keys():
+            path = min(places[other][place] for place in shared)
+            raise InputError(f"{path}: is among the {one} and the {other} recordings; take it out of one of them.")
+
+
 def check_recording(path: Path, recording: Recording, *, long_enough: bool) -> None:
     """Refuse, with an `InputError`, a recording that EnvMimic cannot use: `long_enough` for an evaluation or not."""
-    from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS
-
     if recording.kind != "free":
         raise InputError(f"{path}: is a {recording.kind} recording; EnvMimic takes free ones only, leave it out.")
     shortest = min(SCORE_HORIZONS) + 0.5

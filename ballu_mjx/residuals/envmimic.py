@@ -1,7 +1,8 @@
 """EnvMimic: the residual-force policy's Markov decision process (paper, section "Residual Dynamics Learning").
 
-The actuators replay a recording's commands; the policy pushes on the balloon; the reward is high while the simulated
-balloon follows the recorded one. What the policy learns is the part of the physics that the simulator lacks.
+The actuators replay a recording's commands; the policy pushes on the tracked body (BALLU's balloon); the reward is high
+while the simulated body follows the recorded one. What the policy learns is the part of the physics that the simulator
+lacks.
 """
 
 from __future__ import annotations
@@ -10,14 +11,14 @@ import copy
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from brax.envs.base import Env, State
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
@@ -31,11 +32,11 @@ from ballu_mjx.residuals.network import (
     world_loads,
 )
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
-from ballu_mjx.sim.force_model import BoundForces, add_wrenches, to_wrenches
-from ballu_mjx.sim.observation import HISTORY, commands_seen, world_rotation, wrap_angle
-from ballu_mjx.sim.simulator import Simulator
-from ballu_mjx.sim.step import PhysicsState, state_at
+from ballu_mjx.sim.coordinates import translations
+from ballu_mjx.sim.force_model import to_wrenches
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout, world_rotation, wrap_angle
+from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
+from ballu_mjx.sim.step import state_at
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,8 +78,11 @@ class EnvMimicConfig(ForceNetworkConfig):
     (1 mm and 0.5 deg; 1 cm/s, 2 deg/s for base and 5 deg/s for joints)."""
 
 
-def check_envmimic_config(config: EnvMimicConfig) -> None:
-    """**Raises** `InputError` for options out of range, naming the option and the nearest value that fits."""
+def check_envmimic_config(config: EnvMimicConfig, control_timestep: float) -> None:
+    """Check the options for a robot with so many seconds between two commands.
+
+    **Raises** `InputError` for options out of range, naming the option and the nearest value that fits.
+    """
     for field in dataclasses.fields(config):
         option, value = f"--{field.name.replace('_', '-')}", getattr(config, field.name)
         if isinstance(value, bool | str):
@@ -87,7 +91,7 @@ def check_envmimic_config(config: EnvMimicConfig) -> None:
             if not (value > 0 and math.isfinite(value)):
                 raise InputError(f"{option} is {value:g}: it must be greater than 0; {field.default:g} is usual.")
         elif field.name == "episode_seconds":
-            least = 2 * CONTROL_TIMESTEP
+            least = 2 * control_timestep
             if not (value >= least and math.isfinite(value)):
                 raise InputError(f"{option} is {value:g}: it must be {least:g} or more; {least:g} is the nearest.")
         elif not all(x >= 0 and math.isfinite(x) for x in (value if isinstance(value, tuple) else (value,))):
@@ -99,8 +103,9 @@ def reward_terms(
 ) -> dict[str, Float[Array, ""]]:
     """The paper's `r_pos` and `r_orn` (`position`, `orientation`) for simulated and recorded features, and the weighted
     sum of these and of their sharper twins (`tracking`)."""
-    position_error = jnp.sum((target[:3] - seen[:3]) ** 2)
-    angles = wrap_angle(target[6:9] - seen[6:9])
+    layout = ObservationLayout
+    position_error = jnp.sum((target[layout.position] - seen[layout.position]) ** 2)
+    angles = wrap_angle(target[layout.euler_angles] - seen[layout.euler_angles])
     orientation_error = jnp.sum(jnp.array(config.orientation_axes) * angles**2)
 
     position = jnp.exp(-config.position_scale * position_error)
@@ -116,30 +121,45 @@ def reward_terms(
     return {"position": position, "orientation": orientation, "tracking": tracking}
 
 
+class TrackingState(NamedTuple):
+    """Where an episode stands."""
+
+    rollout: RolloutState
+    recording: Int[Array, ""]
+    """Number of the recording that the episode follows."""
+    time: Int[Array, ""]
+    """Control steps since the recording's start."""
+    remaining: Int[Array, ""]
+    """Control steps until the episode is cut short."""
+    key: Array
+    """Of the noise on the observation."""
+
+
+def tracking_state(state: State) -> TrackingState:
+    """Return what `EnvMimicEnv` keeps in `state`: Brax types it as its own physics' state."""
+    return cast(TrackingState, state.pipeline_state)
+
+
 class EnvMimicEnv(Env):
     """Tracking of recorded motions by forces on the robot; Brax's environment interface, one robot, unbatched."""
 
     def __init__(
         self,
-        model: mujoco.MjModel,
+        simulator: Simulator | AugmentedSimulator,
         motions: Sequence[Motion],
         config: EnvMimicConfig,
-        beside: BoundForces | None = None,
-        robot: RobotDescription | None = None,
     ) -> None:
-        """`beside` is a residual that the simulator has already: the policy learns what it leaves. `robot` says what
-        is what in `model`; None: it is BALLU."""
-        self.config, self.beside = config, beside
-        self.simulator = Simulator(model, robot)
-        self.robot = self.simulator.robot
+        """Make the task of following `motions`. Where `simulator` has a residual, the policy learns what it leaves."""
+        self.config = config
+        self.simulator = simulator.with_residual(None)
+        plain = self.simulator.simulator
+        model, self.robot = plain.mj_model, plain.robot
         self._held = np.array([model.joint(name).dofadr[0] for name in self.robot.held], int)
         self._spread_of_starts = jnp.asarray(start_spread(model, self.robot), jnp.float32)
-        if beside is not None:
-            self.simulator = self.simulator.altered(beside.model.fields(beside.params))
-        reference, _ = stack_motions(self.simulator, motions)
+        reference, _ = stack_motions(plain, motions)
         self.reference = pad_to_bucket(reference)
-        self.episode_length = round(config.episode_seconds / CONTROL_TIMESTEP)
-        self.recorded_inputs = recorded_inputs(reference, config, self.robot.anchored)
+        self.episode_length = round(config.episode_seconds / self.robot.control_timestep)
+        self.recorded_inputs = recorded_inputs(reference, config, self.robot)
         self._spread = jnp.std(self.recorded_inputs, axis=0)
         shapes = jax.eval_shape(self.reset, jax.random.key(0)).obs
         self._observation_size = {name: shape.shape for name, shape in shapes.items()}
@@ -147,23 +167,22 @@ class EnvMimicEnv(Env):
     @property
     def contents(self) -> dict[str, Any]:
         """What tells one environment from another of the same configuration, as arrays: the model's numbers, the
-        recordings, and what a residual beside has learned. Programs that take it as an argument (see
+        recordings, and what a base residual has learned. Programs that take it as an argument (see
         `learner.wrap_for_training`) serve them all."""
         return {
-            "model": self.simulator.model,
+            "model": self.simulator.simulator.model,
             "reference": self.reference,
             "spread": self._spread,
             "spread of starts": self._spread_of_starts,
-            "beside": None if self.beside is None else self.beside.params,
+            "base residual": None if self.simulator.residual is None else self.simulator.residual.params,
         }
 
     def with_contents(self, contents: Mapping[str, Any]) -> EnvMimicEnv:
         """The same with other contents, which may be traced."""
         other = copy.copy(self)
-        other.simulator = self.simulator.of(contents["model"])
+        other.simulator = self.simulator.with_model(contents["model"], contents["base residual"])
         other.reference = contents["reference"]
         other._spread, other._spread_of_starts = contents["spread"], contents["spread of starts"]
-        other.beside = None if self.beside is None else self.beside._replace(params=contents["beside"])
         return other
 
     def reset(self, rng: Array) -> State:
@@ -175,21 +194,17 @@ class EnvMimicEnv(Env):
         qpos, qvel = reference.qpos[recording, time], reference.qvel[recording, time]
         qpos, qvel = self._perturb(key_noise, qpos, qvel, self.config.start_noise)
         history = jax.lax.dynamic_slice_in_dim(reference.features[recording], time - HISTORY + 1, HISTORY)
-        simulation_state = {
-            "physics": state_at(qpos, qvel),
-            "history": history,
-            "recording": recording,
-            "time": time,
-            "remaining": jax.random.randint(
-                key_length, (), max(self.episode_length // 2, 1), self.episode_length + self.episode_length // 2 + 1
-            ),
-            "key": key_sensor,
-        }
+        commands = jax.lax.dynamic_slice_in_dim(reference.command[recording], time - HISTORY + 1, HISTORY - 1)
+        remaining = jax.random.randint(
+            key_length, (), max(self.episode_length // 2, 1), self.episode_length + self.episode_length // 2 + 1
+        )
+        rollout = RolloutState(state_at(qpos, qvel), history, commands)
+        tracking = TrackingState(rollout, recording, time, remaining, key_sensor)
         zero = jnp.zeros(())
         metrics = {"reward_position": zero, "reward_orientation": zero, "force": zero, "diverged": zero}
         return State(
-            pipeline_state=simulation_state,  # pyright: ignore[reportArgumentType]
-            obs=self._observe(simulation_state),
+            pipeline_state=cast(Any, tracking),
+            obs=self._observe(tracking),
             reward=zero,
             done=zero,
             metrics=metrics,
@@ -198,35 +213,22 @@ class EnvMimicEnv(Env):
 
     def step(self, state: State, action: Array) -> State:
         """Advance one control step under the recording's command and the policy's force."""
-        s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-        recording, time = s["recording"], s["time"]
-        loads = world_loads(action, s["history"][-1, 8], self.config, self.robot.anchored)
+        before = tracking_state(state)
+        recording, time = before.recording, before.time
+        loads = world_loads(action, before.rollout.features[ObservationLayout.yaw], self.config, self.robot)
         command, wrench = self.reference.command[recording, time], to_wrenches(loads, self.config.forces)
-        if self.beside is not None:
-            model, params = self.beside
-            commands = commands_seen(self.reference.command[recording], time)
-            command = model.command(params, commands)
-            wrench = add_wrenches(wrench, model.wrench(params, s["history"], commands))
-        before: PhysicsState = s["physics"]
-        after = self.simulator.step(before, command, wrench)
-        seen, _ = self.simulator.observe(after)
+        after = self.simulator.step(before.rollout, command, wrench=wrench).state
 
         target = self.reference.features[recording, time + 1]
-        finite = jnp.all(jnp.isfinite(seen)) & jnp.all(jnp.isfinite(after.qvel))
-        seen = jnp.where(finite, seen, target)
-        terms = reward_terms(seen, target, self.config)
+        rollout, finite = after.keep_finite(before.rollout, target)
+        terms = reward_terms(rollout.features, target, self.config)
         cost = self.config.force_cost * square_newtons(loads, self.config)
         reward = jnp.where(finite, terms["tracking"] - cost, 0.0)
 
-        remaining = s["remaining"] - 1
+        remaining = before.remaining - 1
         timed_out = (remaining <= 0) | (time + 1 >= self.reference.steps[recording])
-        s = s | {
-            "physics": jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, before),
-            "history": jnp.concatenate([s["history"][1:], seen[None]]),
-            "time": time + 1,
-            "remaining": remaining,
-            "key": jax.random.split(s["key"], 1)[0],
-        }
+        key = jax.random.split(before.key, 1)[0]
+        tracking = TrackingState(rollout, recording, time + 1, remaining, key)
         metrics = {
             "reward_position": terms["position"],
             "reward_orientation": terms["orientation"],
@@ -234,8 +236,8 @@ class EnvMimicEnv(Env):
             "diverged": jnp.asarray(~finite, jnp.float32),
         }
         return state.replace(  # pyright: ignore[reportAttributeAccessIssue]
-            pipeline_state=s,
-            obs=self._observe(s),
+            pipeline_state=tracking,
+            obs=self._observe(tracking),
             reward=reward,
             done=jnp.asarray(timed_out | ~finite, jnp.float32),
             metrics=state.metrics | metrics,
@@ -276,44 +278,35 @@ class EnvMimicEnv(Env):
     def backend(self) -> str:
         return "mjx"
 
-    def _observe(self, s: dict[str, Any]) -> dict[str, Array]:
+    def _observe(self, tracking: TrackingState) -> dict[str, Array]:
         """The policy's state, and for the value function also what the policy must not see: how far off it is.
 
         Why (`critic_sees_error`): an error once made lowers the reward for the rest of the episode whatever the policy
         does now. A value function blind to it leaves that in the advantages, where it drowns the force's own effect.
         """
-        recording, time = s["recording"], s["time"]
-        commands = commands_seen(self.reference.command[recording], time)
-        seen = network_input(s["history"], commands, self.config, self.robot.anchored)
-        noise = self.config.observation_noise * self._spread * jax.random.normal(s["key"], seen.shape)
+        rollout, recording, time = tracking.rollout, tracking.recording, tracking.time
+        commands = rollout.with_command(self.reference.command[recording, time])
+        seen = network_input(rollout.history, commands, self.config, self.robot)
+        noise = self.config.observation_noise * self._spread * jax.random.normal(tracking.key, seen.shape)
         critic = [seen]
         if self.config.critic_sees_error:
-            error = self.reference.features[recording, time] - s["history"][-1]
-            to_heading = world_rotation(s["history"][-1, 8], self.robot.anchored).T
-            critic += [to_heading @ error[:3], to_heading @ error[3:6], wrap_angle(error[6:9])]
+            error = self.reference.features[recording, time] - rollout.features
+            layout = ObservationLayout
+            to_heading = world_rotation(rollout.features[layout.yaw], self.robot.anchored).T
+            critic += [to_heading @ error[layout.position], to_heading @ error[layout.velocity]]
+            critic += [wrap_angle(error[layout.euler_angles])]
         return {"state": seen + noise, "critic": jnp.concatenate([*critic, commands.ravel()])}
 
 
 def start_spread(model: mujoco.MjModel, robot: RobotDescription) -> Float[np.ndarray, " directions"]:
-    """What reconstruction leaves uncertain of a state, as standard deviations of positions and velocities along the
-    directions of `qvel`: 1 mm and 0.5 deg; 1 cm/s, and 2 deg/s for the base and 5 deg/s for joints.
+    """Return what reconstruction leaves uncertain of a state, as standard deviations along the directions of `qvel`.
 
-    Held joints (BALLU's motors) hardly vary: the cable makes a degree of theirs a push on the knee that no
-    reconstruction error is.
+    Positions come first (1 mm and 0.5 deg), then velocities (1 cm/s, 2 deg/s for a free base and 5 deg/s for joints).
+    The robot's held joints hardly vary: behind a stiff transmission a degree is a push that no reconstruction error is.
     """
-    degree = np.pi / 180
-    slides = np.concatenate([_DIRECTIONS[kind] for kind in model.jnt_type]) == _ALONG
-    position, velocity = np.where(slides, 1e-3, 0.5 * degree), np.where(slides, 0.01, 5 * degree)
+    degree, along = np.pi / 180, translations(model)
+    position, velocity = np.where(along, 1e-3, 0.5 * degree), np.where(along, 0.01, 5 * degree)
     if not robot.anchored:
         velocity[3:6] = 2 * degree
     position[[model.joint(name).dofadr[0] for name in robot.held]] = 1e-3 * degree
     return np.concatenate([position, velocity])
-
-
-_ALONG, _ABOUT = 0, 1
-_DIRECTIONS = {
-    int(mujoco.mjtJoint.mjJNT_FREE): [_ALONG] * 3 + [_ABOUT] * 3,
-    int(mujoco.mjtJoint.mjJNT_SLIDE): [_ALONG],
-    int(mujoco.mjtJoint.mjJNT_HINGE): [_ABOUT],
-}
-"""What the velocities of a joint are, by its type."""

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from ballu_mjx.recordings.reference import ReferenceMotions
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.force_model import Fields, ForceSet, num_vectors, to_wrenches
-from ballu_mjx.sim.observation import HISTORY, commands_seen, heading_observation, world_rotation
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout, commands_seen, heading_observation, world_rotation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,8 +22,8 @@ class ForceNetworkConfig:
     """What a force network sees, and what its output means."""
 
     forces: ForceSet = "force"
-    """What the policy pushes with: a force on the balloon (the paper's), a force and a torque there (wrench), or forces
-    at balloon, base and feet (multi)."""
+    """What the policy pushes with: a force on the tracked body (the paper's), a force and a torque there (wrench), or
+    forces there and at all measured points (multi)."""
     force_limit: float = 1.0
     """Largest force along each axis, N (paper: 1)."""
     force_scale: float = 0.05
@@ -40,20 +40,26 @@ def network_input(
     history: Float[Array, "3 features"],
     commands: Float[Array, "3 commands"],
     config: ForceNetworkConfig,
-    anchored: bool = False,
+    robot: RobotDescription,
 ) -> Float[Array, " inputs"]:
-    """`observation`, with the commands (the coming one last) where the configuration asks for them."""
-    seen = heading_observation(history, anchored)
-    return jnp.concatenate([seen, commands.ravel()]) if config.observe_command else seen
+    """Return `heading_observation`, with the commands (the coming one last) where the configuration asks for them.
+
+    Commands come as fractions of their ranges, 0 to 1, whatever their units.
+    """
+    seen = heading_observation(history, robot.anchored)
+    if not config.observe_command:
+        return seen
+    low, high = np.array(robot.command_ranges, np.float32).T
+    return jnp.concatenate([seen, ((commands - low) / (high - low)).ravel()])
 
 
 def num_inputs(config: ForceNetworkConfig, robot: RobotDescription) -> int:
-    """Numbers in `policy_input`."""
-    return HISTORY * (robot.features + len(robot.commands) * config.observe_command)
+    """Return the size of `network_input`."""
+    return HISTORY * (ObservationLayout.of(robot).size + len(robot.commands) * config.observe_command)
 
 
 def num_loads(config: ForceNetworkConfig, robot: RobotDescription) -> int:
-    """Numbers in an action."""
+    """Return the size of an action."""
     return 3 * num_vectors(config.forces, len(robot.points))
 
 
@@ -72,16 +78,16 @@ def square_newtons(loads: Float[Array, "*batch loads"], config: ForceNetworkConf
 
 
 def world_loads(
-    action: Float[Array, " loads"], yaw: Float[Array, ""], config: ForceNetworkConfig, anchored: bool = False
+    action: Float[Array, " loads"], yaw: Float[Array, ""], config: ForceNetworkConfig, robot: RobotDescription
 ) -> Float[Array, " loads"]:
     """Return the loads (N, N m; world; see `to_wrenches`) that an action stands for, within the limit along each axis.
 
-    Actions are in the balloon's heading frame, like the observation: the same situation met in another direction
+    Actions are in the tracked body's heading frame, like the observation: the same situation met in another direction
     calls for the same force, turned. Those on an anchored robot are in the world's.
     """
     most = config.force_limit / config.force_scale
     loads = jnp.asarray(load_units(config, len(action))) * jnp.clip(action, -most, most)
-    return (loads.reshape(-1, 3) @ world_rotation(yaw, anchored).T).ravel()
+    return (loads.reshape(-1, 3) @ world_rotation(yaw, robot.anchored).T).ravel()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,22 +97,22 @@ class NetworkForces:
     **Fields**
 
     - `config`: what the policy sees, and what its actions mean.
+    - `robot`: which it pushes.
     - `infer`: (parameters, observation) to the most likely action.
     - `sample`: (parameters, observation, key) to a drawn one; None: there is none to be had.
-    - `anchored`: whether the robot is (`description.RobotDescription`).
     """
 
     config: ForceNetworkConfig
+    robot: RobotDescription
     infer: Callable[[Any, Float[Array, " inputs"]], Float[Array, " loads"]]
     sample: Callable[[Any, Float[Array, " inputs"], Array], Float[Array, " loads"]] | None = None
     name: str = "envmimic"
-    anchored: bool = False
 
     def inputs(
         self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]
     ) -> Float[Array, " inputs"]:
         """What the policy sees."""
-        return network_input(history, commands, self.config, self.anchored)
+        return network_input(history, commands, self.config, self.robot)
 
     def fields(self, params: Any) -> Fields:
         """None: forces are all there is."""
@@ -124,26 +130,26 @@ class NetworkForces:
         key: Array | None = None,
     ) -> Float[Array, "loaded 6"]:
         """The policy's loads, where they act."""
-        seen, yaw = self.inputs(history, commands), history[-1, 8]
+        seen, yaw = self.inputs(history, commands), history[-1, ObservationLayout.yaw]
         if key is None or self.sample is None:
             loads = self.loads(params, seen, yaw)
         else:
-            loads = world_loads(self.sample(params, seen, key), yaw, self.config, self.anchored)
+            loads = world_loads(self.sample(params, seen, key), yaw, self.config, self.robot)
         return to_wrenches(loads, self.config.forces)
 
     def loads(self, params: Any, seen: Float[Array, " inputs"], yaw: Float[Array, ""]) -> Float[Array, " loads"]:
         """The most likely loads (N, N m; world) for what the policy sees, at a heading."""
-        return world_loads(self.infer(params, seen), yaw, self.config, self.anchored)
+        return world_loads(self.infer(params, seen), yaw, self.config, self.robot)
 
 
 def recorded_inputs(
-    reference: ReferenceMotions, config: ForceNetworkConfig, anchored: bool = False
+    reference: ReferenceMotions, config: ForceNetworkConfig, robot: RobotDescription
 ) -> Float[Array, "states inputs"]:
     """What the policy would see of every recorded state."""
 
     def inputs(recording: Array, time: Array) -> Array:
         history = jax.lax.dynamic_slice_in_dim(reference.features[recording], time - HISTORY + 1, HISTORY)
-        return network_input(history, commands_seen(reference.command[recording], time), config, anchored)
+        return network_input(history, commands_seen(reference.command[recording], time), config, robot)
 
     steps = np.asarray(reference.steps)
     pairs = np.array([(r, k) for r, count in enumerate(steps) for k in range(HISTORY - 1, count)])

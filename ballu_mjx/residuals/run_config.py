@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.robots.description import RobotDescription, read_description
+from ballu_mjx.recordings.csv_format import sidecar_path
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, assets
-from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.robots.registry import BUNDLED, describe_robot, find_robot, load_robot, portable_path
 from ballu_mjx.runs.folder import config_section
 from ballu_mjx.runs.layout import CONFIG_FILE, RUN_FORMAT
 
-_BUNDLED = "bundled:"
 _LONGEST_PATH = 300
 _PACKAGES = ("ballu-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "optimistix", "numpy")
 
@@ -39,18 +39,7 @@ def run_robot(config: Mapping[str, Any], folder: Path) -> RobotDescription:
     **Raises** `InputError` where its description is gone, has changed, or its model has.
     """
     stored = config.get("robot_description")
-    if stored is None:
-        return load_robot()
-    mend = f"restore it: {folder / CONFIG_FILE} names it"
-    there, path = False, _installed(stored["path"])
-    with contextlib.suppress(OSError, ValueError):  # a name that no file can have
-        there = path.is_file()
-    if not there:
-        raise InputError(f"{_cut(stored['path'])}: the robot description is gone; {mend}.")
-    found = read_description(path)
-    if found.sha256 != stored["sha256"]:
-        raise InputError(f"{path}: the robot description, or its model, has changed since the run began; {mend}.")
-    return found
+    return load_robot() if stored is None else find_robot(stored, folder / CONFIG_FILE)
 
 
 def run_residual(config: Mapping[str, Any], folder: Path) -> Path | None:
@@ -80,7 +69,7 @@ def describe_run(
         **{name: dataclasses.asdict(section) for name, section in sections.items()},
         "actuators": None if identified is None else description.adapter.actuators_to_json(identified),
         "recordings": {use: [describe_recording(path) for path in paths] for use, paths in recordings.items()},
-        "robot_description": _described(description),
+        "robot_description": describe_robot(description),
         "starts": [
             {
                 "time": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
@@ -94,9 +83,11 @@ def describe_run(
 
 
 def describe_recording(path: Path) -> dict[str, str]:
-    """Where a recording lies (bundled ones independently of the installation), and the SHA-256 of its content."""
-    place = _portable(path, assets() / "recordings")
-    return {"path": place, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    """Where a recording lies (bundled ones independently of the installation), and the SHA-256 of its content and of
+    the JSON beside it."""
+    place, sidecar = portable_path(path, assets() / "recordings"), sidecar_path(path)
+    described = sidecar.read_bytes() if sidecar.is_file() else b""
+    return {"path": place, "sha256": hashlib.sha256(path.read_bytes() + b"\0" + described).hexdigest()}
 
 
 def find_recordings(config: Mapping[str, Any], use: str, folder: Path) -> list[Path]:
@@ -111,8 +102,8 @@ def find_recordings(config: Mapping[str, Any], use: str, folder: Path) -> list[P
     for entry in described:
         place = entry["path"]
         path, there = Path(place), False
-        if place.startswith(_BUNDLED):
-            path = assets() / "recordings" / place.removeprefix(_BUNDLED)
+        if place.startswith(BUNDLED):
+            path = assets() / "recordings" / place.removeprefix(BUNDLED)
         with contextlib.suppress(OSError):  # a name that no file can have
             there = path.is_file()
         if not there:
@@ -127,21 +118,6 @@ def find_recordings(config: Mapping[str, Any], use: str, folder: Path) -> list[P
             )
         paths.append(path)
     return paths
-
-
-def _described(description: RobotDescription) -> dict[str, str]:
-    return {"path": _portable(description.file, assets()), "sha256": description.sha256}
-
-
-def _portable(path: Path, bundled: Path) -> str:
-    """Return where a file lies; of a bundled one, independently of the installation."""
-    absolute, bundled = path.resolve(), bundled.resolve()
-    return _BUNDLED + absolute.relative_to(bundled).as_posix() if absolute.is_relative_to(bundled) else str(absolute)
-
-
-def _installed(stored: str) -> Path:
-    """Return the inverse of `_portable`, of what comes with the package."""
-    return assets() / stored.removeprefix(_BUNDLED) if stored.startswith(_BUNDLED) else Path(stored)
 
 
 def _cut(place: str) -> str:

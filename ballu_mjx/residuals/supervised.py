@@ -2,9 +2,9 @@
 for it.
 
 One control step alone says little: half a millimetre of motion capture's noise over 0.05 s looks like a tenth of a
-newton. And not all that a recorded step differs in from the simulated one is a matter of the force: servos are late,
-legs slip, air turns the balloon. A label is therefore the most likely force given the whole recording, where capture,
-joints' torques and the motion itself err as well: a smoothing problem, linear along the recorded motion.
+newton. And not all that a recorded step differs in from the simulated one is a matter of the force: actuators are late,
+feet slip, air turns the tracked body. A label is therefore the most likely force given the whole recording, where
+capture, joints' torques and the motion itself err as well: a smoothing problem, linear along the recorded motion.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.network import ForceNetworkConfig, load_units, recorded_inputs
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.sim.coordinates import translations
 from ballu_mjx.sim.linearize import ControlSteps, Linearizer
-from ballu_mjx.sim.observation import HISTORY, heading_rotation
-from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout, world_rotation
+from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
 
@@ -40,22 +41,22 @@ class SupervisedConfig:
     """Standard deviation of the prior on the force along each axis, N. That on a torque is, in units of the network's
     output, as wide."""
     force_change: float = 0.1
-    """Standard deviation of the prior on how it changes from one control step to the next, N. Air that the balloon
+    """Standard deviation of the prior on how it changes from one control step to the next, N. Air that a balloon
     drags along pushes back at every footfall: a prior that smooths more takes most of that away."""
     torque_spread: float = 0.05
-    """Standard deviation of what motors and knees pull beyond the model, N m."""
+    """Standard deviation of what the robot's joints pull beyond the model, N m."""
     position_noise: float = 0.0005
     """Standard deviation of the recorded place, m."""
     angle_noise: float = 0.3
     """Likewise of recorded angles, deg."""
     held_angle_noise: float = 10.0
-    """Likewise of the joints that motion capture does not show (BALLU's motors), deg."""
+    """Likewise of the robot's held joints, which motion capture hardly shows, deg."""
     velocity_noise: float = 0.01
-    """Standard deviation of what a control step changes the base's velocity by beyond all this, m/s."""
+    """Standard deviation of what a control step changes the root's velocity by beyond all this, m/s."""
     rotation_noise: float = 3.0
-    """Likewise of the base's angular velocity and the balloon's against it, deg/s."""
+    """Likewise of angular velocities from the root to the tracked body, deg/s."""
     joint_noise: float = 20.0
-    """Likewise of the legs' joints, deg/s."""
+    """Likewise of all other joints, deg/s."""
     observation_noise: float = 1.0
     """Noise on what the network sees in training, in multiples of each entry's spread over the recordings."""
     updates: int = 4000
@@ -66,10 +67,10 @@ class SupervisedConfig:
     """Labels in a gradient step."""
     learning_rate: float = 1e-3
     """Adam's."""
-    shares: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
-    """Of the forces, of which the one that acts is chosen: whose simulation follows the validation recordings best. A
-    force that is right in recorded states may lead astray in simulated ones. `--shares 1`: all of them, as in the
-    paper."""
+    force_scales: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
+    """Fractions of the forces, of which the one that acts is chosen: whose simulation follows the validation recordings
+    best. A force that is right in recorded states may lead astray in simulated ones. `--force-scales 1`: all of them,
+    as in the paper."""
     seed: int = 0
     """Seeds network and batches."""
 
@@ -78,10 +79,10 @@ def check_supervised_config(config: SupervisedConfig) -> None:
     """**Raises** `InputError` for options out of range, naming the option."""
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        if field.name not in ("observation_noise", "shares", "seed") and not value > 0:
+        if field.name not in ("observation_noise", "force_scales", "seed") and not value > 0:
             raise InputError(f"--{field.name.replace('_', '-')} is {value}: it must be greater than 0.")
-    if not config.shares or not all(0.0 <= share <= 1.0 for share in config.shares):
-        raise InputError(f"--shares is {' '.join(map(str, config.shares))}: give one or more from 0 to 1.")
+    if not config.force_scales or not all(0.0 <= scale <= 1.0 for scale in config.force_scales):
+        raise InputError(f"--force-scales is {' '.join(map(str, config.force_scales))}: give one or more from 0 to 1.")
 
 
 class ForceLabeller:
@@ -89,19 +90,20 @@ class ForceLabeller:
 
     def __init__(
         self,
-        model: mujoco.MjModel,
-        robot: RobotDescription,
         linearize: Linearizer,
         config: SupervisedConfig,
         env: ForceNetworkConfig | None = None,
     ) -> None:
-        """`linearize` is that of the same model and force set, with the torques of the robot's joints; where it has a
-        residual beside, labels are what that leaves. `env`: of the network to be (None: its defaults)."""
+        """Prepare to label motions of the robot that `linearize` simulates.
+
+        `linearize` has the network's force set, and the torques of the robot's joints; where its simulator has a
+        residual, labels are what that leaves. `env` is of the network to be (None: its defaults).
+        """
         env = env or ForceNetworkConfig()
-        self._model, self._config, self._linearize = model, config, linearize
+        self._simulator = linearize.simulator.simulator
+        self._model, self._config, self._linearize = self._simulator.mj_model, config, linearize
         self._in_newtons = load_units(env, linearize.loads) / env.force_scale
-        self._simulator = Simulator(model, robot)
-        self._measured, self._process = _noise(model, robot, config)
+        self._measured, self._process = _noise(self._model, self._simulator.robot, config)
 
     def __call__(self, motion: Motion) -> Float[np.ndarray, "steps loads"]:
         """The loads (N, N m; world) over each control step that explain the recorded motion."""
@@ -114,7 +116,9 @@ class ForceLabeller:
             ).swapaxes(1, 2)
             for x in (np.asarray(reference.features[0, :-1]), motion.command)
         )
-        linear = self._linearize(ControlSteps(states, history, commands, np.zeros((count, self._linearize.loads))))
+        rollout = RolloutState(states, jnp.asarray(history), jnp.asarray(commands[:, :past]))
+        loads = np.zeros((count, self._linearize.loads))
+        linear = self._linearize(ControlSteps(rollout, commands[:, past], loads))
         defect = np.zeros((count, 2 * self._model.nv))
         for step in range(count):
             recorded, after = motion.qpos[step + 1], np.asarray(linear.qpos[step], np.float64)
@@ -168,8 +172,11 @@ _ANY_VELOCITY = 10.0
 def _noise(
     model: mujoco.MjModel, robot: RobotDescription, config: SupervisedConfig
 ) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, " 2*nv"]]:
-    """Standard deviations of recorded positions, and of what a control step is off by beyond its inputs; both along the
-    directions of `mjx.Data.qvel`, of the second also the velocities'."""
+    """Return standard deviations of recorded positions, and of what a control step is off by beyond its inputs.
+
+    Both are along the directions of `mjx.Data.qvel`, the second also along the velocities'. Slides count as
+    translations. A held slide is as many times less certain than others as a held hinge.
+    """
     degree = np.pi / 180
     trunk, body = [], int(model.site_bodyid[model.site(robot.tracked).id])
     while body:  # from the tracked body down to the root
@@ -177,8 +184,14 @@ def _noise(
         body = int(model.body_parentid[body])
     velocity = np.where(np.isin(model.dof_bodyid, trunk), config.rotation_noise, config.joint_noise) * degree
     measured = np.full(model.nv, config.angle_noise * degree)
-    velocity[:3], measured[:3] = config.velocity_noise, config.position_noise
-    measured[[model.joint(name).dofadr[0] for name in robot.held]] = config.held_angle_noise * degree
+    along = translations(model)
+    velocity[along], measured[along] = config.velocity_noise, config.position_noise
+    held = [model.joint(name).dofadr[0] for name in robot.held]
+    measured[held] = np.where(
+        along[held],
+        config.position_noise * config.held_angle_noise / config.angle_noise,
+        config.held_angle_noise * degree,
+    )
     return measured, np.concatenate([velocity * model.opt.timestep, velocity])
 
 
@@ -188,16 +201,20 @@ def examples(
     loads: Sequence[Float[np.ndarray, "steps loads"]],
     config: ForceNetworkConfig,
 ) -> tuple[Float[np.ndarray, "examples inputs"], Float[np.ndarray, "examples loads"]]:
-    """What the network sees of each recorded state that has a history, and the action (see `network.world_loads`) that
-    is its label."""
+    """Return what the network sees of each recorded state that has a history, and the action that is its label.
+
+    Actions are those of `network.world_loads`.
+    """
     reference, _ = stack_motions(simulator, motions)
     first = HISTORY - 1
-    yaw = [np.asarray(seen[first:count, 8]) for seen, count in zip(reference.features, reference.steps, strict=True)]
+    headings = np.asarray(reference.features[..., ObservationLayout.yaw])
+    yaw = [seen[first:count] for seen, count in zip(headings, reference.steps, strict=True)]
     labels = np.concatenate([each[first:] for each in loads])
-    to_world = np.asarray(jax.vmap(heading_rotation)(jnp.asarray(np.concatenate(yaw))))
+    anchored = simulator.robot.anchored
+    to_world = np.asarray(jax.vmap(lambda yaw: world_rotation(yaw, anchored))(jnp.asarray(np.concatenate(yaw))))
     turned = np.einsum("nji,nvj->nvi", to_world, labels.reshape(len(labels), -1, 3)).reshape(labels.shape)
     actions = turned / load_units(config, labels.shape[1])
-    return np.asarray(recorded_inputs(reference, config)), np.asarray(actions, np.float32)
+    return np.asarray(recorded_inputs(reference, config, simulator.robot)), np.asarray(actions, np.float32)
 
 
 Validate = Callable[[int, Any, float], None]

@@ -13,28 +13,22 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
-from ballu_mjx.residuals.aerodynamics import AERODYNAMICS_FILE, Aerodynamics, read_air_parameters
-from ballu_mjx.residuals.envmimic import EnvMimicConfig, check_envmimic_config
-from ballu_mjx.residuals.network import NetworkForces, num_inputs, num_loads
+from ballu_mjx.residuals.aerodynamics import AirParameters
+from ballu_mjx.residuals.kinds import KINDS, RESIDUAL_TASKS, StoredRun
 from ballu_mjx.residuals.run_config import run_actuators, run_residual, run_robot
-from ballu_mjx.rl import ppo
-from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
-from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.runs.checkpoints import restore_checkpoint
-from ballu_mjx.runs.folder import Run, read_config, typed_config
-from ballu_mjx.sim.force_model import BoundForces, Fields, ForceModel, SumOfForces
+from ballu_mjx.runs.folder import read_config
+from ballu_mjx.runs.record import TrainingRecord
+from ballu_mjx.sim.force_model import BoundForces, ForceModel, SumOfForces
+from ballu_mjx.sim.simulator import AugmentedSimulator
 
-NETWORK_TASKS = ("envmimic", "supervised", "analytic")
-"""Runs that leave a network of forces."""
-RESIDUAL_TASKS = (*NETWORK_TASKS, "aerodynamic")
-"""Runs that leave a residual."""
 MARGIN = 0.1
 """How far beyond the recorded range, in its widths, an observation still counts as inside: the range is that of a
 finite sample."""
 _OBSERVED = "observed.json"
 _NARROW = 1e-3
+_ANYTHING = 1e30
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,75 +42,67 @@ class TrainedResidual:
     - `observed`: smallest and largest of each of the model's inputs over the recordings it was learned from.
     - `step`: control steps of training behind it.
     - `actuators`: of the simulator that it belongs to; None for the nominal ones.
+    - `report`: what the training says of it, for the user; empty where that is nothing.
     """
 
     model: ForceModel
     params: Any
-    observed: tuple[Float[np.ndarray, " inputs"], Float[np.ndarray, " inputs"]]
+    observed: tuple[Float[np.ndarray, ...], Float[np.ndarray, ...]]
     step: int
     actuators: ModelParameters | None
+    report: str = ""
+
+    @staticmethod
+    def of(simulator: AugmentedSimulator) -> TrainedResidual | None:
+        """Return the residual in a simulator; None where it has none."""
+        bound = simulator.residual
+        if bound is None:
+            return None
+        observed = bound.observed
+        if observed is None:
+            observed = np.array(-_ANYTHING, np.float32), np.array(_ANYTHING, np.float32)
+        return TrainedResidual(bound.model, bound.params, observed, 0, simulator.actuators)
 
     @staticmethod
     def load(
         folder: Path | str,
+        robot: RobotDescription,
         which: Literal["best", "last"] = "best",
         *,
-        beside: frozenset[Path] = frozenset(),
-        description: RobotDescription | None = None,
+        loading: frozenset[Path] = frozenset(),
     ) -> TrainedResidual:
-        """The residual of a run; of a network that in the best (by validation error) or last checkpoint.
-        `beside`: runs of which it is a part; `description`: the robot that it has to be of (None: BALLU).
+        """Load the residual of a run; of a network that in the best (by validation error) or last checkpoint.
+
+        `robot` is the one that it has to be of; `loading` are the runs whose base residual it is.
 
         **Raises** `InputError` where `folder` is no such run, is of another robot or has no such checkpoint.
         """
-        description = description or load_robot()
         folder = Path(folder)
-        beside |= {folder.resolve()}
+        loading |= {folder.resolve()}
         stored = read_config(folder, *RESIDUAL_TASKS)
         own = run_robot(stored, folder)
-        if own.sha256 != description.sha256:
-            raise InputError(
-                f"{folder}: is of the robot {own.name}, not of {description.name}; give one of the same robot."
-            )
+        if own.sha256 != robot.sha256:
+            raise InputError(f"{folder}: is of the robot {own.name}, not of {robot.name}; give one of the same robot.")
         identified = run_actuators(stored, folder, own)
-        if stored["task"] == "aerodynamic":
-            step, model = 0, Aerodynamics(description.load_model(identified))
-            params = read_air_parameters(folder / AERODYNAMICS_FILE)
-            inputs = num_inputs(EnvMimicConfig(), description)
-        else:
-            step, tree = restore_checkpoint(folder, which)
-            params = ppo.from_tree(tree)
-            inputs = params.normalizer.mean["state"].shape[0]
-            config = typed_config(EnvMimicConfig, stored, "env", folder, check_envmimic_config)
-            network = typed_config(PPOConfig, stored, "ppo", folder, ppo.check_values)
-            sizes = inputs, num_loads(config, description), network
-            infer = ppo.make_inference(*sizes)
-            if not (inputs == num_inputs(config, description) and ppo.fits(infer, params, inputs)):
-                raise InputError(
-                    f"{folder}: the stored parameters do not fit the networks in its config.json; restore one of them."
-                )
-            sample = ppo.make_sampler(*sizes) if stored["task"] == "envmimic" else None
-            model = NetworkForces(config, infer, sample, stored["task"], description.anchored)
-            if (where := run_residual(stored, folder)) is not None:
-                if where.resolve() in beside:
-                    raise InputError(f"{folder}: its residual stands beside itself; restore its config.json.")
-                other = TrainedResidual.load(where, beside=beside, description=description)
-                model, params = SumOfForces(other.model, model), (other.params, params)
+        model, params, inputs, step = KINDS[stored["task"]].load(StoredRun(folder, stored, robot, identified, which))
+        where = run_residual(stored, folder) if KINDS[stored["task"]].network else None
+        if where is not None:
+            if where.resolve() in loading:
+                raise InputError(f"{folder}: is its own base residual; restore its config.json.")
+            base = TrainedResidual.load(where, robot, loading=loading)
+            both = base.bound.plus(BoundForces(model, params))
+            model, params = both.model, both.params
         return TrainedResidual(model, params, _read_observed(folder / _OBSERVED, inputs), step, identified)
 
     @property
-    def applied(self) -> BoundForces:
-        """Model and parameters."""
-        return BoundForces(self.model, self.params)
+    def bound(self) -> BoundForces:
+        """Return the model with its parameters."""
+        return BoundForces(self.model, self.params, self.observed)
 
     @property
-    def fields(self) -> Fields:
-        """Model fields to simulate with; see `force_model.ForceModel.fields`."""
-        return self.model.fields(self.params)
-
-    def command(self, commands: Float[Array, "steps commands"]) -> Float[Array, "parts commands"]:
-        """What the actuators get; see `force_model.ForceModel.command`."""
-        return self.model.command(self.params, commands)
+    def latency(self) -> float:
+        """Seconds by which commands are delayed on their way to the actuators."""
+        return _latency(self.model, self.params)
 
     def wrench(
         self,
@@ -127,20 +113,36 @@ class TrainedResidual:
         """Forces and torques over the coming control step; see `force_model.ForceModel.wrench`."""
         return self.model.wrench(self.params, history, commands, key)
 
-    def excess(
+    def out_of_range(
         self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]
     ) -> Float[Array, ""]:
-        """How far an observation lies outside of what the recordings showed: by the worst of its entries, in widths of
-        that entry's range, `MARGIN` taken off; 0 inside."""
+        """Return how far an observation lies outside of what the recordings showed.
+
+        It is that of the worst entry, in widths of the entry's range, `MARGIN` taken off; 0 inside.
+        """
         seen = self.model.inputs(history, commands)
         low, high = (jnp.asarray(bound) for bound in self.observed)
         beyond = jnp.maximum(low - seen, seen - high) / jnp.maximum(high - low, _NARROW)
         return jnp.maximum(jnp.max(beyond) - MARGIN, 0.0)
 
 
-def write_observed(run: Run, inputs: Float[Array | np.ndarray, "states inputs"]) -> None:
+def _latency(model: ForceModel, params: Any) -> float:
+    if isinstance(model, SumOfForces):
+        return sum(_latency(part, own) for part, own in zip(model.parts, params, strict=True))
+    return float(params.delay) if isinstance(params, AirParameters) else 0.0
+
+
+def observed_range(
+    inputs: Float[Array | np.ndarray, "states inputs"],
+) -> tuple[Float[np.ndarray, " inputs"], Float[np.ndarray, " inputs"]]:
+    """Return the smallest and the largest of each input."""
+    seen = np.asarray(inputs, np.float32)
+    return seen.min(axis=0), seen.max(axis=0)
+
+
+def write_observed(run: TrainingRecord, inputs: Float[Array | np.ndarray, "states inputs"]) -> None:
     """Leave in the run's folder the range of what its policy saw in the recordings."""
-    low, high = np.min(inputs, axis=0), np.max(inputs, axis=0)
+    low, high = observed_range(inputs)
     run.write(_OBSERVED, json.dumps({"low": low.tolist(), "high": high.tolist()}) + "\n")
 
 

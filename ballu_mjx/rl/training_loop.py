@@ -23,8 +23,10 @@ from ballu_mjx.rl import distributed, learner, ppo
 from ballu_mjx.rl.learner import Learner, TrainingState
 from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.runs.checkpoints import Checkpoint, last_checkpoint, list_checkpoints
-from ballu_mjx.runs.folder import Run, read_config, typed_config
+from ballu_mjx.runs.folder import read_config, typed_config
+from ballu_mjx.runs.metrics import read_metrics
 from ballu_mjx.runs.progress import Progress
+from ballu_mjx.runs.record import TrainingRecord
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE
 
 _DIVERGED = 1e-3
@@ -130,7 +132,7 @@ class Validation:
 def _made_with(config: Mapping[str, Any]) -> dict[str, Any]:
     """What of a run's `config.json` a training state depends on beyond its shapes. Kept with every checkpoint: the
     `config.json` beside it may be that of a later start."""
-    recordings = [entry["sha256"] for entry in config["recordings"].get("training", [])]
+    recordings = [entry["sha256"] for entry in config.get("recordings", {}).get("training", [])]
     parts = {name: config.get(name) for name in ("env", "actuators", "residual")} | {"recordings": recordings}
     text = json.dumps(parts, sort_keys=True, default=str)
     return {
@@ -138,6 +140,14 @@ def _made_with(config: Mapping[str, Any]) -> dict[str, Any]:
         "seed": config["ppo"]["seed"],
         "environments": hashlib.sha256(text.encode()).hexdigest(),
     }
+
+
+def _seconds_until(folder: Path, step: int) -> float:
+    """Return the wall time that a run trained for up to a control step, its validations included."""
+    found = 0.0
+    for row in read_metrics(folder, step):
+        found = row.get("seconds") or found + (row.get("validation_seconds") or 0.0)
+    return found
 
 
 class Watchdog:
@@ -152,6 +162,7 @@ class Watchdog:
         self._folder, self._limit, self._stream = folder, limit, stream or sys.stderr
         self._step: int | None = None
         self._last = time.monotonic()
+        self._told: float | None = None  # when the standstill began that has been told of
         self._woken = threading.Condition()
         self._over = False
 
@@ -170,16 +181,19 @@ class Watchdog:
             self._over = True
             self._woken.notify()
 
+    def look(self, now: float) -> float:
+        """Tell of a standstill that has lasted for the limit at `now` (s, of `time.monotonic`), unless it has been told
+        of; return in how many seconds to look again."""
+        left = self._last + self._limit - now
+        if left <= 0 and self._told != self._last:
+            self._told = self._last
+            print(self._said(), file=self._stream, flush=True)
+        return max(left, self._limit / 10)
+
     def _watch(self) -> None:
-        told: float | None = None  # the standstill that has been told of
         with self._woken:
             while not self._over:
-                left = self._last + self._limit - time.monotonic()
-                if left > 0 or told == self._last:
-                    self._woken.wait(max(left, self._limit / 10))
-                    continue
-                told = self._last
-                print(self._said(), file=self._stream, flush=True)
+                self._woken.wait(self.look(time.monotonic()))
 
     def _said(self) -> str:
         minutes = f"{self._limit / 60:.3g} minutes"
@@ -196,6 +210,15 @@ class Watchdog:
         )
 
 
+class TrainingInterrupted(KeyboardInterrupt):
+    """A signal ended a training, whose last state is saved."""
+
+    def __init__(self, status: int) -> None:
+        """`status`: a shell's for the signal."""
+        super().__init__()
+        self.status = status
+
+
 class TrainingLoop:
     """One stretch of training."""
 
@@ -204,13 +227,13 @@ class TrainingLoop:
 
     def __init__(
         self,
-        run: Run | None,
+        run: TrainingRecord | None,
         progress: Progress | None,
         keep_every: int,
         validation: Validation,
     ) -> None:
         """A checkpoint is kept every `keep_every` control steps, with what `validation` measures, which tells the best.
-        Processes that write nothing (see `ballu_mjx.rl.distributed`) have neither `run` nor `progress`."""
+        Without `progress` nothing is told on the terminal, of trouble neither."""
         self._run, self._progress, self._validation = run, progress, validation
         self._every = keep_every
         self._due: int | None = None  # step of the last checkpoint that was not an interruption's
@@ -219,20 +242,25 @@ class TrainingLoop:
         self._validated: float | None = None
         self._warned = False
         self._started = time.perf_counter()
-        self._watchdog = Watchdog(Path("RUN") if run is None else run.folder)
+        self._seconds_before = 0.0
+        folder = None if run is None else run.folder
+        self._watchdog = Watchdog(folder or Path("RUN"))
 
     def train(self, env: Env, config: PPOConfig, start: ResumePoint, content: Mapping[str, Any]) -> None:
         """Train `env` from `start` on; `content` is the run's `config.json`.
 
-        **Raises** `KeyboardInterrupt` after SIGINT (Ctrl-C) or SIGTERM, the last state saved, and `InputError`
+        **Raises** `TrainingInterrupted` after SIGINT (Ctrl-C) or SIGTERM, the last state saved, and `InputError`
         where learning broke down, with the last good checkpoint named.
         """
         self._made_with = _made_with(content)
         if start.checkpoint is not None:
             self._saved = start.checkpoint.step
             self._due = start.checkpoint.notes.get("due", self._saved)
+            if self._run is not None and self._run.folder is not None:
+                self._seconds_before = _seconds_until(self._run.folder, self._saved)
         try:
-            with self._interrupts_noted(), self._watchdog:
+            watched = contextlib.nullcontext() if self._progress is None else self._watchdog
+            with self._interrupts_noted(), watched:
                 state, _ = learner.train(
                     env, config, self._step_done, start=lambda new: start.state(new, config, self._made_with)
                 )
@@ -240,18 +268,10 @@ class TrainingLoop:
                     self._keep(int(state.steps), state)
         except KeyboardInterrupt:
             self._close()
-            if self._run is not None:
+            if self._progress is not None:
                 print(f"Interrupted; saved at step {self._saved:,}.", file=sys.stderr)
-            raise
+            raise TrainingInterrupted(self.exit_status) from None
         self._close()
-
-    def follow(self, env: Env, config: PPOConfig, start: ResumePoint, content: Mapping[str, Any]) -> int:
-        """`train` in a process that writes nothing; returns the exit status."""
-        try:
-            self.train(env, config, start, content)
-        except KeyboardInterrupt:
-            return self.exit_status
-        return 0
 
     @property
     def exit_status(self) -> int:
@@ -268,7 +288,7 @@ class TrainingLoop:
                 f"checkpoint is that of step {self._saved:,}; go on from it with --resume and a smaller "
                 "--learning-rate, or look for recordings or options that throw the robot about."
             )
-        if metrics.get("diverged", 0.0) > _DIVERGED and not self._warned and self._run is not None:
+        if metrics.get("diverged", 0.0) > _DIVERGED and not self._warned and self._progress is not None:
             self._warned = True
             print(
                 f"Physics diverged in {metrics['diverged']:.2%} of the control steps (these robots were reset); the "
@@ -276,7 +296,8 @@ class TrainingLoop:
                 file=sys.stderr,
             )
         if metrics:
-            self._log(step, metrics | {"seconds": time.perf_counter() - self._started})
+            seconds = self._seconds_before + time.perf_counter() - self._started
+            self._log(step, metrics | {"seconds": seconds})
         if self._due is None or step - self._due >= self._every:
             self._keep(step, state)
         if metrics and self._progress is not None:

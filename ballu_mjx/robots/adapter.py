@@ -6,19 +6,57 @@ are the general answers.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.robots.model import ModelParameters
 
 if TYPE_CHECKING:
     from ballu_mjx.robots.description import RobotDescription
+
+
+class DeploymentNotes(NamedTuple):
+    """What an exported controller tells of a robot, beyond what its description says."""
+
+    markers: Mapping[str, str] = {}
+    """What each name that motion capture sees stands for on the robot."""
+    commands: str = ""
+    """What the smallest and largest commands do, and why they are limited in rate."""
+    measure: tuple[str, ...] = ()
+    """What to measure before the first run."""
+
+
+IdentificationProgress = Callable[[str, int, int, float], None]
+"""(stage, iteration, most iterations, the lowest loss so far)."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class IdentifiedActuators:
+    """Actuator parameters with what is known of them; `Simulator` takes it for the parameters.
+
+    **Fields**
+
+    - `robot`: the name that the recordings carry.
+    - `parameters`: what was identified.
+    - `report`: values, standard errors and fit, as text.
+    - `details`: the same as JSON's types, to stand beside the parameters in a file.
+    """
+
+    robot: str
+    parameters: ModelParameters
+    report: str
+    details: Mapping[str, Any]
+
+    def fields(self, model: mujoco.MjModel) -> dict[str, Array]:
+        """Return the fields of `model` that carry the parameters, by name."""
+        return self.parameters.fields(model)
 
 
 class RobotAdapter:
@@ -34,11 +72,69 @@ class RobotAdapter:
             return model.qpos0.copy()
         return model.key(robot.keyframe).qpos.copy()
 
+    def rest_command(self, robot: RobotDescription, model: mujoco.MjModel) -> Float[np.ndarray, " commands"]:
+        """Return the commands of a robot at rest: those of its keyframe, or as near to 0 as their ranges go."""
+        given = np.zeros(model.nu) if robot.keyframe is None else model.key(robot.keyframe).ctrl
+        low, high = np.array(robot.command_ranges).T
+        return np.clip(given, low, high)
+
+    # ---- deployment ----
+
+    def full_travel(self, robot: RobotDescription) -> float:
+        """Return the seconds in which a command may go through the whole of its range on the robot; 0: no limit."""
+        del robot
+        return 0.0
+
+    def deployment_notes(self, robot: RobotDescription) -> DeploymentNotes:
+        """Return what an exported controller tells whoever puts it on the robot."""
+        del robot
+        return DeploymentNotes()
+
+    # ---- rollouts of policies ----
+
+    def rollout_counts(self, features: Float[np.ndarray, "runs states features"]) -> Mapping[str, list[int]]:
+        """Return what else is to be counted in rollouts of a policy, such as steps: numbers by name, one a run."""
+        del features
+        return {}
+
+    def draw_rollout(
+        self, folder: Path, qpos: Float[np.ndarray, "states nq"], command: Float[np.ndarray, "steps commands"]
+    ) -> None:
+        """Draw what only this robot has to show of a rollout into PNG files in `folder`."""
+        del folder, qpos, command
+
     # ---- identified actuators ----
 
     def nominal_actuators(self, model: mujoco.MjModel) -> ModelParameters | None:
         """Return the actuator parameters that stand in `model`; None where this robot has none to identify."""
         del model
+
+    def identify_actuators(
+        self,
+        robot: RobotDescription,
+        recordings: Mapping[Path, Any],
+        config: Any = None,
+        levels: int | None = None,
+        progress: IdentificationProgress | None = None,
+    ) -> IdentifiedActuators:
+        """Return the actuators identified from suspended `recordings` (`recordings.recording.Recording`, by file);
+        see `identification.actuators.identify_actuators`.
+
+        **Raises** `InputError` where the recordings cannot be used, or this robot's actuators cannot be identified.
+        """
+        self.check_sweep(robot, recordings, levels)
+        raise NotImplementedError
+
+    def check_sweep(self, robot: RobotDescription, recordings: Mapping[Path, Any], levels: int | None = None) -> None:
+        """Check that `identify_actuators` can use the recordings.
+
+        **Raises** `InputError` where it cannot, or this robot's actuators cannot be identified.
+        """
+        del recordings, levels
+        raise InputError(
+            f"{robot.file}: the actuators of {robot.name} cannot be identified; give it an adapter with "
+            "`identify_actuators` (docs/own_robot.md)."
+        )
 
     def read_actuators(self, robot: RobotDescription, path: Path) -> tuple[str, ModelParameters]:
         """Return the robot's name and the parameters in a file of identified actuators.
@@ -53,6 +149,10 @@ class RobotAdapter:
     def find_actuators(self, recordings: Iterable[Path], name: str) -> Path | None:
         """Return the file of identified actuators of the robot called `name` beside its recordings; None: none."""
         del recordings, name
+
+    def write_actuators(self, path: Path, found: IdentifiedActuators, more: Mapping[str, Any]) -> None:
+        """Write a file that `read_actuators` reads, with the details, and `more` keys beside them."""
+        raise NotImplementedError
 
     def actuators_to_json(self, parameters: ModelParameters) -> dict[str, Any]:
         """Return identified parameters as JSON's types."""

@@ -18,7 +18,8 @@ JSON with the keys
   `speed` (m/s), `angle` (rad or m);
 - `mirror` (optional): for a robot that is its own mirror image about the xz plane, pairs of names (points, commands,
   joints) that change places, as `{"foot_left": "foot_right"}`; {} where nothing does;
-- `adapter` (optional): `module:Class`, a `robots.adapter.RobotAdapter` with what only this robot has.
+- `adapter` (optional): `module:Class`, a `robots.adapter.RobotAdapter` with what only this robot has;
+- `identify` (optional): parameters that recordings may identify, a list; see `identification.parameters`.
 
 Joints are one free joint at the root or none, then hinges and slides. A robot without a free joint is anchored: what it
 sees and how it is pushed are told in the world's frame, for where it stands and how it is turned then matter.
@@ -56,6 +57,7 @@ _OPTIONAL = (
     "limits",
     "mirror",
     "adapter",
+    "identify",
 )
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 _LONGEST = 60
@@ -93,7 +95,7 @@ class RobotDescription:
     anchored: bool
     """Whether the model has no free joint."""
     sha256: str
-    """Of description and MJCF file."""
+    """Of description, MJCF file, and all files that it names: included ones, meshes, height fields, textures."""
     command_ranges: tuple[tuple[float, float], ...]
     """Smallest and largest value of each command, in its actuator's units."""
     control_timestep: float = DEFAULT_CONTROL_TIMESTEP
@@ -108,11 +110,8 @@ class RobotDescription:
     """Names that change places in the mirror image about the xz plane, both ways; None: the robot is not symmetric."""
     adapter: RobotAdapter = dataclasses.field(default_factory=RobotAdapter)
     """What only this robot has."""
-
-    @property
-    def is_ballu(self) -> bool:
-        """Whether it has BALLU's legs."""
-        return type(self.adapter) is not RobotAdapter
+    identify: tuple[Mapping[str, Any], ...] = ()
+    """Parameters that recordings may identify, as declared; `identification.parameters` reads them."""
 
     @property
     def features(self) -> int:
@@ -122,11 +121,11 @@ class RobotDescription:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Columns that its recordings may have, in order."""
-        points = (f"{point}_{axis}" for point in self.points for axis in "xyz")
-        turns = (f"{site}_q{axis}" for site in (self.tracked, *self.oriented_points) for axis in "wxyz")
-        places = (*(f"{self.tracked}_{axis}" for axis in "xyz"), *turns, *points)
-        return ("time", *(f"command_{name}" for name in self.commands), *places, *self.joints)
+        """Columns that its recordings may have."""
+        sites = (self.tracked, *self.points)
+        places = [f"{site}_{axis}" for site in sites for axis in "xyz"]
+        turns = [f"{site}_q{axis}" for site in (self.tracked, *self.oriented_points) for axis in "wxyz"]
+        return ("time", *(f"command_{name}" for name in self.commands), *places, *turns, *self.joints)
 
     def load_model(self, actuators: ModelParameters | None = None) -> mujoco.MjModel:
         """Return the robot for C MuJoCo: the nominal one, or with identified actuators."""
@@ -175,7 +174,6 @@ def read_description(path: Path | str) -> RobotDescription:
     if keyframe is not None and mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, _text(path, content, "keyframe")) < 0:
         own = ", ".join(model.key(index).name for index in range(model.nkey)) or "none"
         _refuse(path, f'"keyframe" is {_shown(keyframe)}, no keyframe of the model', f"there are {own}")
-    digest = hashlib.sha256(path.read_bytes() + b"\0" + place.read_bytes()).hexdigest()
     found = RobotDescription(
         file=path,
         name=name,
@@ -186,7 +184,7 @@ def read_description(path: Path | str) -> RobotDescription:
         joints=joints,
         held=held,
         anchored=bool(model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE),
-        sha256=digest,
+        sha256=_checksum(path, place),
         command_ranges=ranges,
         control_timestep=float(step),
         oriented_points=oriented,
@@ -194,6 +192,7 @@ def read_description(path: Path | str) -> RobotDescription:
         limits=_limits(path, content.get("limits", {})),
         mirror=_mirror(path, content.get("mirror"), (*points, *driven, *joints)),
         adapter=_adapter(path, content.get("adapter")),
+        identify=_entries(path, "identify", content.get("identify", [])),
     )
     twice = [column for number, column in enumerate(found.columns) if column in found.columns[:number]]
     if twice:
@@ -228,6 +227,32 @@ def _load(path: Path, place: Path) -> mujoco.MjModel:
         _refuse(path, f'"model" is {_shown(place.name)}, which MuJoCo cannot read ({_said(error)})', mend)
 
 
+def _checksum(path: Path, place: Path) -> str:
+    """Return the SHA-256 of a description and of all files of its model."""
+    parts = [path, place, *_named_files(place)]
+    return hashlib.sha256(b"\0".join(part.read_bytes() for part in parts)).hexdigest()
+
+
+def _named_files(place: Path) -> list[Path]:
+    """Return the files that an MJCF file names, at any depth, but for itself.
+
+    MuJoCo looks for an asset in its compiler's folders and beside the file that names it, whichever it finds first. All
+    that it could find belong to the model.
+    """
+    found = [Path(name) for name in mujoco.mju_getXMLDependencies(str(place))]
+    spec = mujoco.MjSpec.from_file(str(place))
+    assets = [
+        name
+        for asset in (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins)
+        for name in (asset.file, *getattr(asset, "cubefiles", ()))
+        if name
+    ]
+    texts = [file.parent for file in found if file.suffix == ".xml"]
+    folders = {folder / sub for folder in (place.parent, *texts) for sub in ("", spec.meshdir, spec.texturedir)}
+    found += [folder / name for folder in folders for name in assets]
+    return sorted({file.resolve() for file in found if file.is_file()} - {place.resolve()})
+
+
 def _check_joints(path: Path, model: mujoco.MjModel, control_timestep: float) -> None:
     kinds = mujoco.mjtJoint
     if not model.njnt:
@@ -244,15 +269,31 @@ def _check_joints(path: Path, model: mujoco.MjModel, control_timestep: float) ->
 
 
 def _check_sites(path: Path, model: mujoco.MjModel, tracked: str, points: tuple[str, ...]) -> None:
-    roots = []
+    linked, roots = _linked_roots(model), []
     for key, site in (("tracked", tracked), *(("points", point) for point in points)):
         body = model.site_bodyid[_find(path, model, mujoco.mjtObj.mjOBJ_SITE, key, site)]
-        roots.append(int(model.body_rootid[body]))
+        roots.append(linked[int(model.body_rootid[body])])
         if model.body_weldid[body] == 0:
             _refuse(path, f'"{key}" names {_shown(site)}, a site that does not move', "name sites of the robot only")
         if roots[-1] != roots[0]:
             problem = f'"{key}" names {_shown(site)}, which is of another robot than {tracked}'
-            _refuse(path, problem, "give sites below one body of the world")
+            fix = "give sites below one body of the world, or close the loop between them by an equality"
+            _refuse(path, problem, fix)
+
+
+def _linked_roots(model: mujoco.MjModel) -> dict[int, int]:
+    """By body of the world: one that stands for it and all that equalities (closed loops) link it with."""
+    linked = {int(root): int(root) for root in model.body_rootid}
+    for number in range(model.neq):
+        ends = [int(model.eq_obj1id[number]), int(model.eq_obj2id[number])]
+        if int(model.eq_type[number]) not in (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)):
+            continue
+        if model.eq_objtype[number] == mujoco.mjtObj.mjOBJ_SITE:
+            ends = [int(model.site_bodyid[site]) for site in ends]
+        one, other = (linked[int(model.body_rootid[body])] for body in ends)
+        if 0 not in (one, other):
+            linked = {root: one if stand_in == other else stand_in for root, stand_in in linked.items()}
+    return linked
 
 
 def _check_actuators(
@@ -361,6 +402,12 @@ def _name(path: Path, key: str, value: Any) -> str:
     if not isinstance(value, str) or not _NAME.fullmatch(value) or len(value) > _LONGEST:
         _refuse(path, f'"{key}" has {_shown(value)}', "give names of letters, digits and underscores, a letter first")
     return value
+
+
+def _entries(path: Path, key: str, value: Any) -> tuple[Mapping[str, Any], ...]:
+    if not isinstance(value, list) or not all(isinstance(each, dict) for each in value):
+        _refuse(path, f'"{key}" is {_shown(value)}', "write a list of objects")
+    return tuple(value)
 
 
 def _names(path: Path, key: str, value: Any) -> tuple[str, ...]:

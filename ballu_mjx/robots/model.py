@@ -44,6 +44,11 @@ def load_model(file: Path, parameters: ModelParameters | None = None) -> mujoco.
     return model
 
 
+def bare_parameters(parameters: ModelParameters | None) -> ModelParameters | None:
+    """Return the parameters in what may hold more, such as `adapter.IdentifiedActuators`."""
+    return getattr(parameters, "parameters", parameters)
+
+
 def same_parameters(one: ModelParameters | None, other: ModelParameters | None) -> bool:
     """Return whether two simulators have equal parameters (None: nominal)."""
     if one is None or other is None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+from collections.abc import Mapping
 from pathlib import Path
 
 from ballu_mjx.common.errors import InputError
@@ -11,7 +13,10 @@ from ballu_mjx.robots.model import assets
 
 DEFAULT_ROBOT = "ballu"
 """The robot of commands without `--robot`, and of runs whose configuration names none."""
+BUNDLED = "bundled:"
+"""Begins the path of a file that comes with the package."""
 _ENDING = ".robot.json"
+_LONGEST_PATH = 300
 
 
 def load_robot(robot: str | Path = DEFAULT_ROBOT) -> RobotDescription:
@@ -31,6 +36,38 @@ def bundled_robots() -> tuple[str, ...]:
 @functools.cache
 def _bundled(name: str) -> RobotDescription:
     return read_description(assets() / f"{name}{_ENDING}")
+
+
+def describe_robot(robot: RobotDescription) -> dict[str, str]:
+    """Return what files say of the robot that they are of: path of its description, and hash."""
+    return {"path": portable_path(robot.file, assets()), "sha256": robot.sha256}
+
+
+def find_robot(described: Mapping[str, str], named_in: Path) -> RobotDescription:
+    """Return the robot that `describe_robot` described in the file `named_in`.
+
+    **Raises** `InputError` where its description is gone, has changed, or its model has.
+    """
+    fix = f"restore it: {named_in} names it"
+    if not isinstance(described, Mapping) or not all(isinstance(described.get(key), str) for key in ("path", "sha256")):
+        raise InputError(f"{named_in}: does not say of which robot it is; restore it.")
+    stored, there = described["path"], False
+    path = assets() / stored.removeprefix(BUNDLED) if stored.startswith(BUNDLED) else Path(stored)
+    with contextlib.suppress(OSError, ValueError):  # a name that no file can have
+        there = path.is_file()
+    if not there:
+        shown = stored if len(stored) < _LONGEST_PATH else stored[:_LONGEST_PATH] + "..."
+        raise InputError(f"{shown}: the robot description is gone; {fix}.")
+    found = read_description(path)
+    if found.sha256 != described["sha256"]:
+        raise InputError(f"{path}: the robot description, or its model, has changed since; {fix}.")
+    return found
+
+
+def portable_path(path: Path, bundled: Path) -> str:
+    """Return where a file lies; of one below the folder `bundled`, independently of the installation."""
+    absolute, bundled = path.resolve(), bundled.resolve()
+    return BUNDLED + absolute.relative_to(bundled).as_posix() if absolute.is_relative_to(bundled) else str(absolute)
 
 
 def _file(name: str) -> Path:

@@ -42,6 +42,7 @@ from ballu_mjx.runs.checkpoints import (
     file_checksums,
     quiet_when_full,
     record_checksum,
+    restore_checkpoint,
 )
 from ballu_mjx.runs.layout import (
     CHECKPOINTS_FOLDER,
@@ -187,7 +188,7 @@ class Run:
 
         What an old run measured and saved after that step is dropped: it will be measured again.
         """
-        self.folder = folder
+        self.folder, self.config = folder, config
         self._whole = None if resumed_at == -1 else resumed_at
         """Step of the last checkpoint that was written to the end."""
         self._loggers: list[loggers.Logger] = []
@@ -294,6 +295,13 @@ class Run:
     def write(self, name: str, text: str) -> None:
         """Write a text file into the folder."""
         files.write(self.folder / name, text)
+
+    def best(self) -> tuple[int, dict[str, Any]]:
+        """Return step and parameters of the best checkpoint.
+
+        **Raises** `InputError` where there is none, or it is damaged.
+        """
+        return restore_checkpoint(self.folder, "best")
 
 
 def _locked(path: Path) -> IO[str]:

@@ -1,8 +1,11 @@
-"""What the robot did, kept for looking at: `replay.npz` in a run's folder, format `ballu-replay/1`.
+"""Rollouts kept for looking at: `replay.npz` in a run's folder, format `ballu-replay/2`.
 
-An archive of NumPy arrays without pickled objects. `format` and `names` (one a take) are strings; the arrays of take
-number i are `i/time`, `i/qpos/NAME` for each of its robots (a key of `style.COLOURS`: `recording`, or a simulator),
-and where they are known `i/command` and `i/force`; `i/robot` says which robot was recorded.
+An archive of NumPy arrays without pickled objects. `format`, `robot/path` and `robot/sha256` (the description of the
+robot, as in `config.json`) and `names` (one a rollout) are strings. The arrays of rollout number i are `i/time`,
+`i/qpos/NAME` for each of its robots (`recording`, or a simulator), and where they are known `i/command` and `i/force`;
+`i/robot` says which robot was recorded.
+
+JAX and MuJoCo are imported inside functions: commands read this module before `runtime.prepare`.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ import textwrap
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -20,13 +24,15 @@ from jaxtyping import Float
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
 
-ROLLOUT_FORMAT = "ballu-replay/1"
+if TYPE_CHECKING:
+    from ballu_mjx.robots.description import RobotDescription
+
+ROLLOUT_FORMAT = "ballu-replay/2"
 ROLLOUT_FILE = "replay.npz"
 
 _MEND = "python -m ballu_mjx evaluate RUN --output RUN writes it anew"
-_COORDINATES = 14
 _TOLERANCE = 0.02
-"""Of a quaternion's length."""
+"""Of a quaternion's length, and of commands in widths of their ranges."""
 _LARGEST = 1e6
 """m, rad and s; what is beyond is no motion."""
 
@@ -37,30 +43,42 @@ class StoredRollout:
 
     name: str
     """The recording's, or the task's."""
+    description: RobotDescription
+    """What kind of robot they are."""
     robot: str = ""
     """Which robot was recorded, where one was."""
     time: Float[np.ndarray, " states"]
     """s, of the recording."""
     qpos: Mapping[str, Float[np.ndarray, "states nq"]]
     """MuJoCo's generalized positions of each robot, by its name."""
-    command: Float[np.ndarray, "steps 2"] | None = None
-    """Servo commands (left, right), from each state to the next; one fewer than states."""
+    command: Float[np.ndarray, "steps commands"] | None = None
+    """Commands, in the actuators' units, from each state to the next; one fewer than states."""
     force: Float[np.ndarray, "steps 3"] | None = None
-    """Residual force (N, world) on the balloon of the robot with a residual, likewise."""
+    """Residual force (N, world) on the tracked body of the last robot, likewise."""
 
 
-def write_rollouts(path: Path, takes: Sequence[StoredRollout]) -> None:
-    """Write takes in single precision, compressed."""
+def write_rollouts(path: Path, rollouts: Sequence[StoredRollout]) -> None:
+    """Write rollouts of one robot in single precision, compressed.
+
+    **Raises** `ValueError` where there are none, or they are of several robots.
+    """
+    from ballu_mjx.robots.registry import describe_robot
+
+    if len({rollout.description.sha256 for rollout in rollouts}) != 1:
+        raise ValueError("Rollouts in a file must be of one robot.")
+    described = describe_robot(rollouts[0].description)
     arrays: dict[str, np.ndarray] = {
         "format": np.array(ROLLOUT_FORMAT),
-        "names": np.array([take.name for take in takes], str),
+        "robot/path": np.array(described["path"]),
+        "robot/sha256": np.array(described["sha256"]),
+        "names": np.array([rollout.name for rollout in rollouts], str),
     }
-    for index, take in enumerate(takes):
-        arrays[f"{index}/robot"] = np.array(take.robot)
-        arrays[f"{index}/time"] = take.time
-        arrays |= {f"{index}/qpos/{name}": qpos for name, qpos in take.qpos.items()}
+    for index, rollout in enumerate(rollouts):
+        arrays[f"{index}/robot"] = np.array(rollout.robot)
+        arrays[f"{index}/time"] = rollout.time
+        arrays |= {f"{index}/qpos/{name}": qpos for name, qpos in rollout.qpos.items()}
         arrays |= {
-            f"{index}/{name}": value for name in ("command", "force") if (value := getattr(take, name)) is not None
+            f"{index}/{name}": value for name in ("command", "force") if (value := getattr(rollout, name)) is not None
         }
     single = {name: a.astype(np.float32) if a.dtype.kind == "f" else a for name, a in arrays.items()}
     archive = io.BytesIO()
@@ -69,10 +87,13 @@ def write_rollouts(path: Path, takes: Sequence[StoredRollout]) -> None:
 
 
 def read_rollouts(path: Path) -> list[StoredRollout]:
-    """The takes in a file.
+    """Return the rollouts in a file.
 
-    **Raises** `InputError` where it is none of the format, damaged, or holds pickled objects, which are never loaded.
+    **Raises** `InputError` where it is none of the format, damaged, or holds pickled objects, which are never loaded;
+    and where the robot's description is gone or has changed.
     """
+    from ballu_mjx.robots.registry import find_robot
+
     if not path.exists():
         raise InputError(f"{path}: there is no replay; {_MEND}.")
     try:
@@ -86,21 +107,24 @@ def read_rollouts(path: Path) -> list[StoredRollout]:
     found = arrays.pop("format", None)
     if found is None or str(found) != ROLLOUT_FORMAT:
         raise InputError(f"{path}: is not of the format {ROLLOUT_FORMAT}; {_MEND}.")
-    names = arrays.pop("names", np.array([], str))
-    return [_take(path, str(name), f"{index}/", arrays) for index, name in enumerate(names.ravel())]
+    robot = find_robot({key: str(arrays.pop(f"robot/{key}", "")) for key in ("path", "sha256")}, path)
+    names, nq = arrays.pop("names", np.array([], str)), robot.load_model().nq
+    return [_rollout(path, str(name), f"{index}/", arrays, robot, nq) for index, name in enumerate(names.ravel())]
 
 
 def _array(content: bytes) -> np.ndarray:
     return np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
 
 
-def _take(path: Path, name: str, prefix: str, arrays: Mapping[str, np.ndarray]) -> StoredRollout:
+def _rollout(
+    path: Path, name: str, prefix: str, arrays: Mapping[str, np.ndarray], robot: RobotDescription, nq: int
+) -> StoredRollout:
     own = {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
     qpos = {key.removeprefix("qpos/"): value for key, value in own.items() if key.startswith("qpos/")}
     time = own.get("time")
     states = 0 if time is None else len(np.atleast_1d(time))
-    shapes = {"time": (states,), "command": (states - 1, 2), "force": (states - 1, 3)}
-    shapes |= {f"qpos/{robot}": (states, _COORDINATES) for robot in qpos}
+    shapes = {"time": (states,), "command": (states - 1, len(robot.commands)), "force": (states - 1, 3)}
+    shapes |= {f"qpos/{each}": (states, nq) for each in qpos}
     for key, shape in shapes.items():
         value = own.get(key)
         if value is None and key in ("command", "force"):
@@ -108,20 +132,24 @@ def _take(path: Path, name: str, prefix: str, arrays: Mapping[str, np.ndarray]) 
         if value is None or value.dtype.kind != "f" or value.shape != shape or not (np.abs(value) < _LARGEST).all():
             raise InputError(f"{path}: {prefix}{key} is not an array of {shape} finite numbers; {_MEND}.")
     if time is None or states < 2 or not qpos:
-        raise InputError(f"{path}: take {name!r} has no robot, or less than two states; {_MEND}.")
-    command = own.get("command", np.zeros(0))
-    turns = [np.linalg.norm(value[:, 3:7], axis=1) for value in qpos.values()]
-    if (
-        not (np.diff(time) > 0).all()
-        or ((command < 0) | (command > 1)).any()
-        or max(np.abs(turn - 1).max() for turn in turns) > _TOLERANCE
+        raise InputError(f"{path}: rollout {name!r} has no robot, or less than two states; {_MEND}.")
+    problem = None
+    if not (np.diff(time) > 0).all():
+        problem = "times that run back"
+    elif not robot.anchored and any(
+        np.abs(np.linalg.norm(value[:, 3:7], axis=1) - 1).max() > _TOLERANCE for value in qpos.values()
     ):
-        raise InputError(
-            f"{path}: take {name!r} has times that run back, commands outside of 0 to 1, or quaternions that are none; "
-            f"{_MEND}."
-        )
+        problem = "quaternions that are none"
+    elif (command := own.get("command")) is not None:
+        low, high = np.array(robot.command_ranges).T
+        slack = _TOLERANCE * (high - low)
+        if ((command < low - slack) | (command > high + slack)).any():
+            problem = "commands outside of their ranges"
+    if problem is not None:
+        raise InputError(f"{path}: rollout {name!r} has {problem}; {_MEND}.")
     return StoredRollout(
         name=name,
+        description=robot,
         robot=str(own.get("robot", "")),
         time=time,
         qpos=qpos,

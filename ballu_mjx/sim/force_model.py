@@ -6,6 +6,7 @@ Everything that simulates takes residuals by this one interface, whatever they w
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
@@ -14,8 +15,8 @@ from jaxtyping import Array, Float
 Fields = dict[str, Array]
 """Fields of `mjx.Model` by name."""
 ForceSet = Literal["force", "wrench", "multi"]
-"""What a network pushes with: a force on the tracked body, the balloon (the paper's); a force and a torque on it; or
-forces on it and at every measured point (BALLU's base and feet)."""
+"""What a network pushes with: a force on the tracked body (the paper's), a force and a torque on it, or forces on it
+and at every measured point."""
 
 
 def num_vectors(forces: ForceSet, points: int) -> int:
@@ -86,6 +87,41 @@ class BoundForces(NamedTuple):
 
     model: ForceModel
     params: Any
+    observed: Any = None
+    """Smallest and largest of each of its inputs in what it was learned from; None: unknown."""
+
+    @property
+    def bound(self) -> BoundForces:
+        """Itself: what has parameters bound may be given for it (`HasForces`)."""
+        return self
+
+    @property
+    def fields(self) -> Fields:
+        """Model fields to simulate with; see `ForceModel.fields`."""
+        return self.model.fields(self.params)
+
+    def plus(self, further: BoundForces) -> BoundForces:
+        """Return both residuals, acting together."""
+        both = SumOfForces(self.model, further.model)
+        return BoundForces(both, (self.params, further.params), further.observed)
+
+
+@runtime_checkable
+class HasForces(Protocol):
+    """A residual with its parameters, or what holds one, such as what a training returns."""
+
+    @property
+    def bound(self) -> BoundForces: ...
+
+
+def add_to_base(base: BoundForces | None, further: ForceModel) -> tuple[ForceModel, Callable[[Any], Any]]:
+    """Return `further` on top of a base residual, and what turns parameters of `further` into those of the sum.
+
+    Without base residual: `further` itself, and the identity.
+    """
+    if base is None:
+        return further, lambda params: params
+    return SumOfForces(base.model, further), lambda params: (base.params, params)
 
 
 class SumOfForces:

@@ -2,24 +2,71 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import ClassVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
+from ballu_mjx.robots.description import RobotDescription
+
 HISTORY = 3
 """Control steps that the policy sees: the current one and the last two (paper)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ObservationLayout:
+    """Where `observe_features` has what: slices and indices of its last axis; m, m/s, rad, world frame.
+
+    What is said of the tracked body comes first, for all robots in the same places.
+    """
+
+    points: tuple[str, ...]
+    """The robot's points, in order."""
+
+    position: ClassVar[slice] = slice(0, 3)
+    """Of the tracked body."""
+    velocity: ClassVar[slice] = slice(3, 6)
+    """Of the tracked body."""
+    euler_angles: ClassVar[slice] = slice(6, 9)
+    """Roll, pitch and yaw of the tracked body."""
+    yaw: ClassVar[int] = 8
+    """Of the tracked body: its heading."""
+    first_point: ClassVar[int] = 9
+    """Where the points begin."""
+
+    @staticmethod
+    def of(robot: RobotDescription) -> ObservationLayout:
+        """Return the layout of a robot's features."""
+        return ObservationLayout(robot.points)
+
+    @property
+    def size(self) -> int:
+        """Number of features."""
+        return self.first_point + 6 * len(self.points)
+
+    def point_position(self, point: str) -> slice:
+        """Return where the position of a point stands."""
+        first = self.first_point + 6 * self.points.index(point)
+        return slice(first, first + 3)
+
+    def point_velocity(self, point: str) -> slice:
+        """Return where the velocity of a point stands."""
+        first = self.point_position(point).stop
+        return slice(first, first + 3)
 
 
 def observe_features(
     data: mjx.Data, sites: Int[np.ndarray, " sites"], bodies: Int[np.ndarray, " sites"], root: int = 1
 ) -> Float[Array, " features"]:
-    """What motion capture sees of a state, in the world frame.
+    """Return what motion capture sees of a state, in the world frame; `ObservationLayout` says what stands where.
 
-    Position, velocity and Euler angles (roll, pitch, yaw) of the tracked body (the balloon), position and velocity of
-    each point (base, left and right foot); m, m/s, rad. `sites`, of `bodies` below the body `root` of the world, begin
-    with the tracked one. `data` must hold current `com_vel`.
+    Position, velocity and Euler angles (roll, pitch, yaw) of the tracked body, position and velocity of each point; m,
+    m/s, rad. `sites`, of `bodies` below the body `root` of the world, begin with the tracked one. `data` must hold
+    current `com_vel`.
     """
     position = data.site_xpos[sites]
     offset = position - data.subtree_com[root]
@@ -45,36 +92,41 @@ def wrap_angle(angle: Array) -> Array:
 
 
 def heading_rotation(yaw: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Rotation about z that takes vectors in the balloon's heading frame to the world."""
+    """Return the rotation about z that takes vectors in the tracked body's heading frame to the world."""
     c, s = jnp.cos(yaw), jnp.sin(yaw)
     return jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def world_rotation(yaw: Float[Array, ""], anchored: bool) -> Float[Array, "3 3"]:
-    """Rotation that takes vectors in the frame of observations and forces to the world: by heading, or none."""
+    """Return the rotation that takes vectors in the frame of observations and forces to the world.
+
+    It is the one by the heading, or, of an anchored robot, none.
+    """
     return heading_rotation(jnp.zeros_like(yaw) if anchored else yaw)
 
 
 def heading_observation(
     history: Float[Array, "steps features"], anchored: bool = False
 ) -> Float[Array, " observations"]:
-    """The policy's state, from the features of the last control steps (three in the paper; the current one last).
+    """Return what policies see of the features of the last control steps (three in the paper; the current one last).
 
-    The paper's state, made independent of place and heading: horizontal positions are taken from the current
-    balloon's, and positions, velocities and yaw from its heading. A force that depends on where in the room the
-    robot stands would fit the recordings and nothing else. Heights stay absolute, for the floor is. Of an anchored
+    It is the paper's state, made independent of place and heading: horizontal positions are taken from the tracked
+    body's current one, and positions, velocities and yaw from its heading. A force that depends on where in the room
+    the robot stands would fit the recordings and nothing else. Heights stay absolute, for the floor is. Of an anchored
     robot everything is absolute: its place and heading are part of its physics.
     """
-    now = history[-1]
-    origin = now[:3] * jnp.array([0.0, 0.0, 0.0] if anchored else [1.0, 1.0, 0.0])
-    heading = jnp.zeros_like(now[8]) if anchored else now[8]
+    now, layout = history[-1], ObservationLayout
+    origin = now[layout.position] * jnp.array([0.0, 0.0, 0.0] if anchored else [1.0, 1.0, 0.0])
+    heading = jnp.zeros_like(now[layout.yaw]) if anchored else now[layout.yaw]
     to_heading = heading_rotation(heading).T
 
     def relative(frame: Float[Array, " features"]) -> Array:
-        vectors = jnp.concatenate([frame[:6], frame[9:]]).reshape(-1, 3)
+        parts = frame[layout.position], frame[layout.velocity], frame[layout.first_point :]
+        vectors = jnp.concatenate(parts).reshape(-1, 3)
         is_position = jnp.tile(jnp.array([True, False]), len(vectors) // 2)
         vectors = jnp.where(is_position[:, None], vectors - origin, vectors) @ to_heading.T
-        return jnp.concatenate([vectors.ravel(), frame[6:8], wrap_angle(frame[8:9] - heading)])
+        roll, pitch, yaw = frame[layout.euler_angles]
+        return jnp.concatenate([vectors.ravel(), jnp.stack([roll, pitch, wrap_angle(yaw - heading)])])
 
     return jax.vmap(relative)(history).ravel()
 

@@ -1,58 +1,87 @@
-"""The MJX robot between control steps."""
+"""The MJX robot between control steps, alone and improved by a residual."""
 
 from __future__ import annotations
 
 import copy
+import dataclasses
 import functools
 import math
 from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.robots.model import with_fields
-from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.robots.model import ModelParameters, bare_parameters, with_fields
+from ballu_mjx.sim.derived_constants import ReferencePose, with_derived_constants
+from ballu_mjx.sim.force_model import BoundForces, HasForces, add_wrenches
 from ballu_mjx.sim.observation import observe_features
 from ballu_mjx.sim.step import PhysicsState, control_step, count_substeps, load_state, make_data, put_model, state_at
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 
 
 class Simulator:
-    """The MJX robot between control steps: states in, states and features out."""
+    """The MJX robot between control steps: states in, states and features out.
 
-    def __init__(self, model: mujoco.MjModel, robot: RobotDescription | None = None) -> None:
-        """`robot` says what is what in `model`; None: it is BALLU."""
-        robot = robot or load_robot()
-        self.robot = robot
-        self.nv = model.nv
-        self.model = put_model(model)
-        self._template = make_data(model)
-        self._count = count_substeps(model)
-        sites = [model.site(name).id for name in (robot.tracked, *robot.points)]
-        self._root = int(model.body_rootid[model.site_bodyid[sites[0]]])
-        self._sites = tuple(zip(sites, model.site_bodyid[sites].tolist(), strict=True))
-        self._masses = jnp.asarray(model.body_mass / model.body_mass.sum())
+    Commands are in the actuators' own units. `model` is the MJX model, `mj_model` the C model that it was made from.
+    """
 
-    def altered(self, fields: Mapping[str, Array]) -> Simulator:
-        """The same with other model fields, which may be traced. The centre of mass stays that of the model's own
-        masses: air that the robot drags along is no part of it."""
-        return self.of(with_fields(self.model, dict(fields)))
+    def __init__(
+        self,
+        robot: RobotDescription,
+        actuators: ModelParameters | None = None,
+        *,
+        model: mujoco.MjModel | None = None,
+    ) -> None:
+        """Put the robot on this process's first device.
 
-    def of(self, model: mjx.Model) -> Simulator:
-        """The same of another model of this structure, which may be traced."""
+        **Arguments**
+
+        - `actuators`: identified actuators; None: the nominal ones.
+        - `model`: a model of this robot to simulate instead of `robot.load_model(actuators)`.
+
+        **Raises** `ValueError` where the model's time step does not divide the robot's control time step.
+        """
+        self.robot, self.actuators = robot, bare_parameters(actuators)
+        self.mj_model = robot.load_model(actuators) if model is None else model
+        self.control_timestep = robot.control_timestep
+        """Seconds between two commands."""
+        self.nv = self.mj_model.nv
+        self.substeps = count_substeps(self.mj_model, robot.control_timestep)
+        """Physics steps in a control step."""
+        self.model = put_model(self.mj_model)
+        self._template = make_data(self.mj_model)
+        self._reference_pose = ReferencePose.of(self.mj_model)
+        sites = [self.mj_model.site(name).id for name in (robot.tracked, *robot.points)]
+        bodies = self.mj_model.site_bodyid[sites]
+        self._root = int(self.mj_model.body_rootid[bodies[0]])
+        self._sites = tuple(zip(sites, bodies.tolist(), strict=True))
+        self._masses = jnp.asarray(self.mj_model.body_mass / self.mj_model.body_mass.sum())
+
+    def with_fields(self, fields: Mapping[str, Array]) -> Simulator:
+        """Return the same simulator with other model fields, which may be traced, and the constants that follow.
+
+        The centre of mass stays that of the model's own masses: air that the robot drags along is no part of it.
+        """
+        return self.with_model(
+            with_fields(self.model, with_derived_constants(self._reference_pose, self.model, fields))
+        )
+
+    def with_model(self, model: mjx.Model) -> Simulator:
+        """Return the same simulator of another MJX model of this structure, which may be traced."""
         other = copy.copy(self)
         other.model = model
         return other
 
-    def strained(self, generalized: Float[Array, " nv"]) -> Simulator:
-        """The same under generalized forces (N, N m, along `mjx.Data.qvel`), which may be traced."""
+    def with_generalized_force(self, force: Float[Array, " nv"]) -> Simulator:
+        """Return the same simulator under generalized forces (N, N m, along `mjx.Data.qvel`), which may be traced."""
         other = copy.copy(self)
-        other._template = self._template.replace(qfrc_applied=generalized)  # pyright: ignore
+        other._template = self._template.replace(qfrc_applied=force)  # pyright: ignore
         return other
 
     def observe(self, state: PhysicsState) -> tuple[Float[Array, " features"], Float[Array, " 3"]]:
@@ -78,11 +107,178 @@ class Simulator:
         """One control step under a command, or one for each of equal parts of it; wrenches are on the tracked body
         and, if more, at the robot's points. See `step.control_step`."""
         parts = command.reshape(-1, command.shape[-1])
-        commands = jnp.repeat(parts, self._count // len(parts), axis=0)
+        commands = jnp.repeat(parts, self.substeps // len(parts), axis=0)
         sites, bodies = zip(*self._sites[: len(wrench)], strict=True)
         return control_step(
-            self.model, self._template, state, commands, wrench, bodies=bodies, points=sites[1:], count=self._count
+            self.model, self._template, state, commands, wrench, bodies=bodies, points=sites[1:], count=self.substeps
         )
+
+    def with_residual(
+        self, residual: HasForces | None, scale: Float[Array, ""] | float | None = None
+    ) -> AugmentedSimulator:
+        """Return the simulator that the residual improves, its model fields included.
+
+        `scale` is the fraction of the residual that acts (0: nothing); None: all of it. `residual` None: a simulator
+        with the same interface that nothing improves.
+        """
+        if residual is None:
+            return AugmentedSimulator(self)
+        bound = residual.bound
+        fields = bound.fields
+        if scale is not None:
+            own = {name: getattr(self.model, name) for name in fields}
+            fields = {name: (1 - scale) * own[name] + scale * value for name, value in fields.items()}
+        return AugmentedSimulator(self.with_fields(fields), bound, scale)
+
+
+class RolloutState(NamedTuple):
+    """A simulation between two control steps: the physics, and what a residual remembers.
+
+    With B leading batch axes it is a batch of simulations.
+    """
+
+    physics: PhysicsState
+    history: Float[Array, "steps features"]
+    """`observe_features` of the last `HISTORY` control steps, the current one last."""
+    commands: Float[Array, "earlier commands"]
+    """Commands of the `HISTORY` - 1 control steps before the coming one, the latest last."""
+
+    @property
+    def features(self) -> Float[Array, "*batch features"]:
+        """`observe_features` of the current state."""
+        return self.history[..., -1, :]
+
+    def with_command(self, command: Float[Array, " commands"]) -> Float[Array, "steps commands"]:
+        """Return the commands that residuals see: the earlier ones and the coming one."""
+        return jnp.concatenate([self.commands, command[None]])
+
+    def keep_finite(
+        self, before: RolloutState, features: Float[Array, " features"]
+    ) -> tuple[RolloutState, Bool[Array, ""]]:
+        """Return this state, the successor of `before`, and whether all its numbers are finite.
+
+        Where they are not, the physics is that of `before`, and `features` stand for the current observation.
+        """
+        finite = jnp.all(jnp.isfinite(self.features)) & jnp.all(jnp.isfinite(self.physics.qvel))
+        seen = jnp.where(finite, self.features, features)
+        physics = jax.tree.map(lambda new, old: jnp.where(finite, new, old), self.physics, before.physics)
+        history = jnp.concatenate([self.history[:-1], seen[None]])
+        return RolloutState(physics, history, self.commands), finite
+
+
+class RolloutStep(NamedTuple):
+    """What one control step gives."""
+
+    state: RolloutState
+    """After the step."""
+    com: Float[Array, " 3"]
+    """Centre of mass (m, world) after the step."""
+    wrench: Float[Array, "loaded 6"]
+    """Force (N) and torque (N m, world) that pushed over the step: on the tracked body, then at the points."""
+
+
+@dataclasses.dataclass(frozen=True)
+class AugmentedSimulator:
+    """A simulator with a residual: the paper's improved simulator. All methods are pure.
+
+    **Fields**
+
+    - `simulator`: the robot, with the residual's model fields.
+    - `residual`: the residual with its parameters, which may be traced; None: none.
+    - `scale`: the fraction of the residual that acts; None: all of it.
+
+    `Simulator.with_residual` makes one. The constructor takes the simulator as it is.
+    """
+
+    simulator: Simulator
+    residual: BoundForces | None = None
+    scale: Float[Array, ""] | float | None = None
+
+    @property
+    def robot(self) -> RobotDescription:
+        """Whose simulator it is."""
+        return self.simulator.robot
+
+    @property
+    def actuators(self) -> ModelParameters | None:
+        """The simulator's actuators; None: the nominal ones."""
+        return self.simulator.actuators
+
+    @property
+    def control_timestep(self) -> float:
+        """Seconds between two commands."""
+        return self.simulator.control_timestep
+
+    def without_residual(self) -> Simulator:
+        """Return the simulator that the residual improves."""
+        return Simulator(self.robot, self.actuators, model=self.simulator.mj_model)
+
+    def with_residual(self, residual: HasForces | None) -> AugmentedSimulator:
+        """Return the simulator with a further residual, which acts together with its own (`SumOfForces`)."""
+        if residual is None:
+            return self
+        assert self.scale is None, "A scaled residual takes no further one."
+        both = residual.bound if self.residual is None else self.residual.plus(residual.bound)
+        return AugmentedSimulator(self.simulator.with_fields(both.fields), both)
+
+    def with_fields(self, fields: Mapping[str, Array]) -> AugmentedSimulator:
+        """Return the same with other model fields; see `Simulator.with_fields`."""
+        return dataclasses.replace(self, simulator=self.simulator.with_fields(fields))
+
+    def with_model(self, model: mjx.Model, params: Any) -> AugmentedSimulator:
+        """Return the same of another MJX model, and with other parameters of the residual; both may be traced.
+
+        `model` has the residual's fields already. Without a residual, `params` are of no influence.
+        """
+        residual = None if self.residual is None else self.residual._replace(params=params)
+        return dataclasses.replace(self, simulator=self.simulator.with_model(model), residual=residual)
+
+    def with_generalized_force(self, force: Float[Array, " nv"]) -> AugmentedSimulator:
+        """Return the same under generalized forces; see `Simulator.with_generalized_force`."""
+        return dataclasses.replace(self, simulator=self.simulator.with_generalized_force(force))
+
+    def step(
+        self,
+        state: RolloutState,
+        command: Float[Array, " commands"],
+        *,
+        wrench: Float[Array, "others 6"] | None = None,
+        wrench_scale: Float[Array, ""] | float | None = None,
+        key: Array | None = None,
+    ) -> RolloutStep:
+        """Advance by one control step: ask the residual, step the physics, observe, shift the history.
+
+        **Arguments**
+
+        - `state`: where the simulation stands; the residual sees its history and commands.
+        - `command`: of the coming control step, in the actuators' own units.
+        - `wrench`: further force (N) and torque (N m, world), on the tracked body and, if more, at the points.
+        - `wrench_scale`: multiplies the residual's wrenches, not its commands and model fields.
+        - `key`: to draw the residual's wrenches; None: the most likely ones.
+        """
+        commands = state.with_command(command)
+        if self.residual is None:
+            sent, total = command, jnp.zeros((1, 6)) if wrench is None else wrench
+        else:
+            sent, total = self._ask(state.history, commands, key)
+            total = total if wrench_scale is None else wrench_scale * total
+            total = total if wrench is None else add_wrenches(wrench, total)
+        physics = self.simulator.step(state.physics, sent, total)
+        features, com = self.simulator.observe(physics)
+        history = jnp.concatenate([state.history[1:], features[None]])
+        return RolloutStep(RolloutState(physics, history, commands[1:]), com, total)
+
+    def _ask(
+        self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"], key: Array | None
+    ) -> tuple[Float[Array, "*parts commands"], Float[Array, "loaded 6"]]:
+        """Return the residual's commands and wrenches."""
+        assert self.residual is not None
+        model, params = self.residual.model, self.residual.params
+        wrench = model.wrench(params, history, commands, key)
+        sent = model.command(params, commands)
+        if self.scale is None:
+            return sent, wrench
+        return (1 - self.scale) * commands[-1] + self.scale * sent, self.scale * wrench
 
 
 @functools.partial(jax.jit, static_argnames=("sites", "root"))

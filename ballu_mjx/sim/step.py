@@ -9,25 +9,23 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from jaxtyping import Array, Float
 from mujoco import mjx
 from mujoco.mjx._src.solver import Context
 
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
 from ballu_mjx.sim.custom_jvp import DirectionalDerivative, with_custom_jvp
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 
 
-def count_substeps(model: mujoco.MjModel) -> int:
-    """Physics steps in a control step.
+def count_substeps(model: mujoco.MjModel, control_timestep: float) -> int:
+    """Return the number of physics steps in a control step of `control_timestep` seconds.
 
-    Raises `ValueError` where the control step is no whole number of them.
+    **Raises** `ValueError` where the control step is no whole number of them.
     """
-    count = CONTROL_TIMESTEP / model.opt.timestep
-    if abs(count - round(count)) > 1e-6:
+    count = control_timestep / model.opt.timestep
+    if abs(count - round(count)) > 1e-6 or count < 1 - 1e-6:
         raise ValueError(
-            f"The model's timestep {model.opt.timestep} s does not divide the control step of {CONTROL_TIMESTEP} s."
+            f"The model's timestep {model.opt.timestep} s does not divide the control step of {control_timestep} s."
         )
     return round(count)
 
@@ -56,11 +54,11 @@ def load_state(template: mjx.Data, state: PhysicsState) -> mjx.Data:
 
 
 def physics_step(
-    model: mjx.Model, held: mjx.Data, state: PhysicsState, load_by_place: Callable[[mjx.Data], mjx.Data] | None = None
+    model: mjx.Model, inputs: mjx.Data, state: PhysicsState, load_by_place: Callable[[mjx.Data], mjx.Data] | None = None
 ) -> PhysicsState:
-    """One physics step under the commands and forces of `held`, data of the model: `mjx.step`. `load_by_place` adds
+    """One physics step under the commands and forces of `inputs`, data of the model: `mjx.step`. `load_by_place` adds
     external forces that depend on where bodies are."""
-    data = mjx.fwd_position(model, load_state(held, state))
+    data = mjx.fwd_position(model, load_state(inputs, state))
     if load_by_place is not None:
         data = load_by_place(data)
     for stage in (mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
@@ -104,18 +102,21 @@ def _derivative(along: DirectionalDerivative, found: _Solution) -> _Solution:
     return jax.tree.map(lambda x, y: jnp.where(arrived, x, y), at_place, on_the_way)
 
 
-_ARRIVED = 0.05
-"""m/s^2 and rad/s^2: half a millimetre or milliradian a second over a physics step. Rounding leaves up to 0.02 at rest;
-one in twenty steps of a walking robot is farther off, by up to 40."""
+_ARRIVED = 0.025
+"""Length of a Newton step (m/s^2 and rad/s^2) that counts as none: a quarter of a mm/s or mrad/s over a physics step.
+
+Rounding leaves up to 0.01 at rest; one in twenty steps of a walking robot is farther off, by up to 20."""
 
 
 def _newton_step(found: _Solution, model: mjx.Model, data: mjx.Data) -> tuple[_Solution, Float[Array, " nv"]]:
-    """From where the solver ended; and the step. The cost's Hessian is held: what multiplies its derivative is zero."""
+    """Return where a Newton step leads from where the solver ended; and the step. The cost's Hessian is held: what
+    multiplies its derivative is zero."""
     data = data.replace(qacc=found.qacc)  # pyright: ignore
     here = Context.create(model, data, grad=False)
     slope = here.Ma - data.qfrc_smooth - here.qfrc_constraint
     held_model, held = jax.lax.stop_gradient((model, data))
-    step = Context.create(held_model, held.replace(qfrc_smooth=held.qfrc_smooth - slope)).search
+    moved = slope - jax.lax.stop_gradient(slope)  # zero, but for its derivative
+    step = Context.create(held_model, held.replace(qfrc_smooth=held.qfrc_smooth - moved)).search
     qacc = found.qacc + step
     # Where the cost is least, forces are in balance.
     return _Solution(qacc, mjx.mul_m(model, data, qacc) - data.qfrc_smooth), step
@@ -142,7 +143,7 @@ def control_step(
     **Arguments**
 
     - `template`: data of the model, from `make_data`; of no influence but for what no step changes.
-    - `command`: actuators' commands in [0, 1], held, or a row for each physics step.
+    - `command`: commands in the actuators' own units, held, or a row for each physics step.
     - `wrench`: force (N) and torque (N m), world frame, on the bodies of the ids `bodies`: at the first one's centre of
       mass, and on each of the others at the site of its id in `points`, wherever that moves.
     """
@@ -161,7 +162,7 @@ def control_step(
         pushed = template.xfrc_applied
         for number, body in enumerate(bodies):
             pushed = pushed.at[body].add(wrench[number])
-        held = template.replace(xfrc_applied=pushed)  # pyright: ignore
+        loaded = template.replace(xfrc_applied=pushed)  # pyright: ignore
 
         def at_points(data: mjx.Data) -> mjx.Data:
             pushed = data.xfrc_applied
@@ -170,7 +171,7 @@ def control_step(
             return data.replace(xfrc_applied=pushed)  # pyright: ignore
 
         def step(number: Array, state: PhysicsState) -> PhysicsState:
-            now = held.replace(ctrl=commands[number])  # pyright: ignore
+            now = loaded.replace(ctrl=commands[number])  # pyright: ignore
             return physics_step(model, now, state, at_points if points else None)
 
         return jax.lax.fori_loop(0, count, step, state)
@@ -187,8 +188,3 @@ def put_model(model: mujoco.MjModel) -> mjx.Model:
 def make_data(model: mujoco.MjModel) -> mjx.Data:
     """MJX data of `model` at its reference pose, on this process's first device."""
     return mjx.make_data(model, device=jax.local_devices()[0])
-
-
-def balloon_id(model: mujoco.MjModel) -> int:
-    """Body id of the balloon."""
-    return int(np.asarray(model.body("balloon").id))

@@ -18,25 +18,23 @@ if TYPE_CHECKING:
 
 
 def write_evaluation(evaluator: OpenLoopEvaluator, params: Any, folder: Path) -> Evaluation:
-    """Evaluate, and write `evaluation.txt`, `evaluation.json`, `tracking.png` and, of BALLU, which alone can be drawn,
-    `replay.npz` into `folder`."""
+    """Evaluate, and write `evaluation.txt`, `evaluation.json`, `tracking.png` and `replay.npz` into `folder`."""
     from ballu_mjx.evaluation.errors_table import Evaluation
 
     names = evaluator.base, evaluator.name
     replays = dict(zip(names, (evaluator.replay(params, scale=0.0), evaluator.replay(params)), strict=True))
-    result = Evaluation(*(evaluator.errors(each) for each in replays.values()), *names)  # pyright: ignore[reportCallIssue]
+    vanilla, residual = (evaluator.errors(replays[name]) for name in names)
+    result = Evaluation(vanilla, residual, *names, evaluator.nominal_errors(params))
     files.write(folder / "evaluation.txt", result.table() + "\n")
     files.write(folder / "evaluation.json", json.dumps(result.to_json(), indent=2) + "\n")
     draw_tracking(evaluator, replays, folder / "tracking.png")
-    if evaluator.robot.is_ballu:
-        write_rollouts(folder / ROLLOUT_FILE, stored_rollouts(evaluator, replays))
+    write_rollouts(folder / ROLLOUT_FILE, stored_rollouts(evaluator, replays))
     return result
 
 
 def draw_tracking(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay], path: Path) -> None:
     """Draw whole-recording replays, by simulator: of the first recording of each group."""
     from ballu_mjx.recordings.groups import group_of
-    from ballu_mjx.robots.model import CONTROL_TIMESTEP
     from ballu_mjx.viz import plots
 
     shown: dict[str, plots.TrackingPanel] = {}
@@ -51,7 +49,7 @@ def draw_tracking(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay], p
         }
         shown[group_of(motion.name)] = plots.TrackingPanel(
             title=motion.name,
-            time=np.arange(states) * CONTROL_TIMESTEP,
+            time=np.arange(states) * evaluator.robot.control_timestep,
             recording=np.column_stack([position[:, :2], yaw]),
             simulations=simulations,
         )
@@ -70,6 +68,7 @@ def stored_rollouts(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay])
         found.append(
             StoredRollout(
                 name=motion.name,
+                description=evaluator.robot,
                 robot=motion.robot,
                 time=motion.time[first:],
                 qpos={"recording": motion.qpos[first:], **simulated},

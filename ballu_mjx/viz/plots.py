@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from ballu_mjx.viz.style import COLOURS, LABELS, save_figure, unwrapped
+from ballu_mjx.viz.style import colour_of, label_of, save_figure, unwrapped
 
 _QUANTITIES = ("x (m)", "y (m)", "yaw (deg)")
 
@@ -23,8 +23,8 @@ class TrackingPanel:
 
     - `title`: the recording's name, say.
     - `time`: s.
-    - `recording`: the balloon's x (m), y (m) and yaw (rad).
-    - `simulations`: the same by simulator (keys of `COLOURS`), one run, or several of which mean and range are drawn.
+    - `recording`: the tracked body's x (m), y (m) and yaw (rad).
+    - `simulations`: the same by simulator (any name), one run, or several of which mean and range are drawn.
     """
 
     title: str
@@ -45,10 +45,10 @@ def tracking(path: Path, panels: Sequence[TrackingPanel]) -> None:
             runs = unwrapped(values if values.ndim == 3 else values[None], float(panel.recording[0, 2]))
             for index, axis in enumerate(column):
                 mean = runs[..., index].mean(axis=0)
-                axis.plot(panel.time, mean, color=COLOURS[name], label=LABELS[name], linewidth=1.5)
+                axis.plot(panel.time, mean, color=colour_of(name), label=label_of(name), linewidth=1.5)
                 if len(runs) > 1:
                     low, high = runs[..., index].min(axis=0), runs[..., index].max(axis=0)
-                    axis.fill_between(panel.time, low, high, color=COLOURS[name], alpha=0.2, linewidth=0)
+                    axis.fill_between(panel.time, low, high, color=colour_of(name), alpha=0.2, linewidth=0)
         for axis in column:
             axis.grid(alpha=0.3)
     for axis, label in zip(axes[:, 0], _QUANTITIES, strict=True):
@@ -69,10 +69,10 @@ def learning_curve(
     """Mean reward per control step, and the validation error as a ratio to vanilla's, against control steps."""
     figure = Figure(figsize=(7.0, 6.0), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
-    upper.plot(steps / 1e6, reward, color=COLOURS["envmimic"])
+    upper.plot(steps / 1e6, reward, color=colour_of("envmimic"))
     upper.set_ylabel("reward per control step")
-    lower.plot(validation_steps / 1e6, validation_error, color=COLOURS["envmimic"], marker="o", markersize=4)
-    lower.axhline(1.0, color=COLOURS["vanilla"], linestyle="--", label="vanilla")
+    lower.plot(validation_steps / 1e6, validation_error, color=colour_of("envmimic"), marker="o", markersize=4)
+    lower.axhline(1.0, color=colour_of("vanilla"), linestyle="--", label="vanilla")
     if best_step is not None:
         lower.axvline(best_step / 1e6, color="grey", linestyle=":", label="best checkpoint")
     lower.set_ylabel("validation error (ratio to vanilla)")
@@ -95,9 +95,9 @@ def fit_curve(
     figure = Figure(figsize=(7.0, 6.0), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
     for (name, curve), style in zip(losses.items(), ("-", "--"), strict=False):
-        upper.plot(*curve, color=COLOURS[simulator], linestyle=style, label=name)
-    lower.plot(*validation, color=COLOURS[simulator], marker="o", markersize=4)
-    lower.axhline(1.0, color=COLOURS["vanilla"], linestyle="--", label="no force")
+        upper.plot(*curve, color=colour_of(simulator), linestyle=style, label=name)
+    lower.plot(*validation, color=colour_of(simulator), marker="o", markersize=4)
+    lower.axhline(1.0, color=colour_of("vanilla"), linestyle="--", label="no force")
     lower.axvline(best_step, color="grey", linestyle=":", label="best checkpoint")
     upper.set_ylabel("loss")
     lower.set_ylabel(label)
@@ -139,9 +139,11 @@ def reward_curve(
     policy without exploration."""
     figure = Figure(figsize=(7.0, 3.5), layout="constrained")
     axis = figure.subplots()
-    axis.plot(steps / 1e6, reward, color=COLOURS[simulator], label=f"{LABELS[simulator]}, training")
+    axis.plot(steps / 1e6, reward, color=colour_of(simulator), label=f"{label_of(simulator)}, training")
     validated = "without exploration, whole trials"
-    axis.plot(validation_steps / 1e6, validation_reward, "o--", color=COLOURS[simulator], markersize=4, label=validated)
+    axis.plot(
+        validation_steps / 1e6, validation_reward, "o--", color=colour_of(simulator), markersize=4, label=validated
+    )
     axis.set_xlabel("control steps (millions)")
     axis.set_ylabel("reward per control step (m/s)")
     axis.grid(alpha=0.3)

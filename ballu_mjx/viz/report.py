@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 REPORT_FILE = "report.html"
 _TEMPLATE = "report.html"
-_IMAGES = ("gait.png", "actuator_curves.png")
-"""Figures of a run's folder that have no interactive twin."""
+_INTERACTIVE = ("tracking.png", "learning_curve.png")
+"""Figures of a run's folder that the page has an interactive twin of."""
 _CURVES = {
     "reward": "reward per control step",
     "validation_error": "validation error (ratio to vanilla)",
@@ -91,9 +91,9 @@ def collect(folder: Path) -> Content:
 
     **Raises** `InputError` where `folder` is neither, or a file in it is damaged.
     """
-    from ballu_mjx.cli import pipeline
+    from ballu_mjx.evaluation import story_layout
 
-    tables = [(task, pipeline.table_file(folder, task)) for task in pipeline.TABLES]
+    tables = [(task, story_layout.table_file(folder, task)) for task in story_layout.TABLES]
     if not (folder / "config.json").is_file() and any(path.is_file() for _, path in tables):
         return _story(folder, {task: files.read_text(path) for task, path in tables if path.is_file()})
     return _run(folder)
@@ -101,7 +101,7 @@ def collect(folder: Path) -> Content:
 
 def _run(folder: Path) -> Content:
     from ballu_mjx.policies.tasks import TASKS
-    from ballu_mjx.residuals.trained import RESIDUAL_TASKS
+    from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
     from ballu_mjx.runs.folder import read_config
 
     config = read_config(folder, *RESIDUAL_TASKS, "sysid", *TASKS)
@@ -115,7 +115,8 @@ def _run(folder: Path) -> Content:
     if (folder / "identification.txt").is_file():
         content.texts.append(("Identification", files.read_text(folder / "identification.txt")))
     content.curves = _curves({config["task"]: folder})
-    content.images = [(n, (folder / n).read_bytes()) for n in _IMAGES if (folder / n).is_file()]
+    figures = sorted(path for path in folder.glob("*.png") if path.name not in _INTERACTIVE)
+    content.images = [(path.name, path.read_bytes()) for path in figures]
     if (folder / ROLLOUT_FILE).is_file():
         content.takes = read_rollouts(folder / ROLLOUT_FILE)
     robots = dict.fromkeys(take.robot for take in content.takes if take.robot)
@@ -127,7 +128,7 @@ def _run(folder: Path) -> Content:
 
 def _story(folder: Path, tables: Mapping[str, str]) -> Content:
     """A folder of `train all`: its tables, and of each seed and task the policies over each other."""
-    from ballu_mjx.cli import pipeline
+    from ballu_mjx.evaluation import story_layout
     from ballu_mjx.viz.style import label_of
 
     content = Content(f"train all: {folder.resolve().name}", facts=[("folder", str(folder.resolve()))])
@@ -135,7 +136,7 @@ def _story(folder: Path, tables: Mapping[str, str]) -> Content:
     for seed in sorted(path for path in folder.glob("seed-*") if path.is_dir()):
         for task in tables:
             where = f"{task}, {seed.name}"
-            settings = ("vanilla", *pipeline.SETTINGS, *pipeline.settings_beyond(seed, task))
+            settings = ("vanilla", *story_layout.SETTINGS, *story_layout.settings_beyond(seed, task))
             policies = {setting: seed / f"{task}-{setting}" for setting in settings}
             policies = {setting: path for setting, path in policies.items() if (path / "config.json").is_file()}
             content.curves += [dataclasses.replace(c, title=f"{c.title} ({where})") for c in _curves(policies)]
@@ -147,8 +148,8 @@ def _story(folder: Path, tables: Mapping[str, str]) -> Content:
                 if image.is_file():
                     content.images.append((f"Trials on the robot: {where}, {setting}", image.read_bytes()))
             residuals: dict[Path, str] = {}  # two settings may have one
-            for setting in (pipeline.ROUNDS, *pipeline.settings_beyond(seed, task)):
-                residuals.setdefault(pipeline.residual_folder(seed, task, setting), setting)
+            for setting in (story_layout.ROUNDS, *story_layout.settings_beyond(seed, task)):
+                residuals.setdefault(story_layout.residual_folder(seed, task, setting), setting)
             for learned, setting in residuals.items():
                 name = f"{label_of(setting)}: {where}"
                 if (learned / "config.json").is_file():
@@ -166,7 +167,7 @@ def _over_each_other(name: str, own: Mapping[str, StoredRollout]) -> StoredRollo
     states = min(len(take.time) for take in own.values())
     first = next(iter(own.values()))
     qpos = {setting: next(iter(take.qpos.values()))[:states] for setting, take in own.items()}
-    return StoredRollout(name=name, time=first.time[:states], qpos=qpos)
+    return StoredRollout(name=name, description=first.description, time=first.time[:states], qpos=qpos)
 
 
 def _add_evaluation(content: Content, folder: Path, prefix: str = "") -> None:
@@ -268,6 +269,8 @@ def render(content: Content) -> str:
     markdown = markdown_it.MarkdownIt("commonmark", {"html": False}).enable("table")
     takes = [dataclasses.replace(take, time=take.time - take.time[0]) for take in content.takes]
     head, own, tail = viser_scene.shared([viser_scene.page(take) for take in takes]) if takes else ("", [], "")
+    pushed = {take.description.sha256: take.description for take in takes if robot_meshes.pushed_robot(take)}
+    arrows = [robot_meshes.RobotShapes(robot).arrow_scale for robot in pushed.values()]
     shown = {
         "curves": [_plot(_curve_rows([curve]), "control steps (millions)") for curve in content.curves],
         "takes": [_plot(_take_rows(take), "time (s)") for take in takes],
@@ -278,8 +281,7 @@ def render(content: Content) -> str:
         markdown=[(title, markupsafe.Markup(markdown.render(text))) for title, text in content.markdown],
         images=[(title, base64.b64encode(png).decode()) for title, png in content.images],
         legends=[[(label_of(name), _hex(name)) for name in take.qpos] for take in takes],
-        arrow=robot_meshes.ARROW_LENGTH / 10,
-        with_force=any(robot_meshes.pushed(take) for take in takes),
+        arrows=arrows,
         shown=shown,
         plotly=markupsafe.Markup(get_plotlyjs()),
     )
@@ -314,15 +316,15 @@ def _curve_rows(curves: Sequence[Curve]) -> _Rows:
 
 
 def _take_rows(take: StoredRollout) -> _Rows:
-    """x, y and yaw of each robot's balloon, the residual force, the commands."""
-    from ballu_mjx.ballu.model import SIDES, load_model
+    """x, y and yaw of each robot's tracked body, the residual force, the commands."""
     from ballu_mjx.viz import robot_meshes
-    from ballu_mjx.viz.style import SIDE_COLOURS, label_of, unwrapped
+    from ballu_mjx.viz.style import COMMAND_COLOURS, label_of, unwrapped
 
-    model = load_model()
-    poses = {name: robot_meshes.poses(model, qpos) for name, qpos in take.qpos.items()}
+    robot = take.description
+    model = robot.load_model()
+    poses = {name: robot_meshes.poses(model, robot, qpos) for name, qpos in take.qpos.items()}
     start = next(iter(poses.values())).yaw[0]
-    ways = {name: unwrapped(np.column_stack([p.balloon[:, :2], p.yaw])[None], start)[0] for name, p in poses.items()}
+    ways = {name: unwrapped(np.column_stack([p.tracked[:, :2], p.yaw])[None], start)[0] for name, p in poses.items()}
     rows: list[tuple[str, Sequence[_Line]]] = [
         (title, [_Line(label_of(name), _hex(name), take.time, way[:, i]) for name, way in ways.items()])
         for i, title in enumerate(("x (m)", "y (m)", "yaw (deg)"))
@@ -332,8 +334,11 @@ def _take_rows(take: StoredRollout) -> _Rows:
         forces = zip("xyz", _FORCE_COLOURS, take.force.T, strict=True)
         rows.append(("residual force (N)", [_Line(f"force {axis}", c, steps, value) for axis, c, value in forces]))
     if take.command is not None:
-        sides = zip(SIDES, SIDE_COLOURS, ("solid", "dot"), take.command.T, strict=True)
-        rows.append(("command", [_Line(f"command, {side}", c, steps, value, dash) for side, c, dash, value in sides]))
+        commands = []
+        for index, name in enumerate(robot.commands):
+            colour, dash = COMMAND_COLOURS[index % len(COMMAND_COLOURS)], ("solid", "dot")[index % 2]
+            commands.append(_Line(f"command, {name}", colour, steps, take.command[:, index], dash))
+        rows.append(("command", commands))
     return rows
 
 

@@ -13,18 +13,24 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.rollout_file import StoredRollout
 from ballu_mjx.viz.style import colour_of
 
-OPACITY, BALLOON_OPACITY = 0.8, 0.12
-"""Of frame and legs, and of balloons."""
-ARROW_LENGTH = 8.0
-"""Length (m) of the arrow of a force of 1 N."""
+OPACITY, TRANSLUCENT_OPACITY = 0.8, 0.12
+"""Of geoms that are opaque in the model, and of those that are not (alpha below 1), such as big hulls."""
 ARROW_COLOUR = (0.8, 0.0, 0.0)
-SMALLEST_FORCE = 1e-3
-"""N: no arrow below."""
-_ROBOT_GROUP = 1
-"""The robot's geoms; the floor is of group 0."""
+_SMALLEST_SHARE = 3.5e-4
+"""Of the robot's weight: the force below which no arrow is drawn."""
+_WEIGHT_SHARE = 0.065
+"""The arrow of a force of this share of the robot's weight is as long as the robot."""
+_SKY = (0.93, 0.94, 0.96)
+_GRAVITY = 9.81
+_SHOWN_GROUPS = 3
+"""Geoms of groups 0 to 2 are drawn, as in MuJoCo's viewer; models keep shapes for collisions in others."""
+_HIDDEN_GROUP = mujoco.mjNGROUP - 1
+_MOST_FACES = 5_000
+"""Of a mesh; what has more is drawn as its convex hull, for pages hold a copy for each robot."""
 
 
 class Part(NamedTuple):
@@ -37,32 +43,75 @@ class Part(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """Each body over time in its parent's frame, and the balloon in the world."""
+    """Each body over time in its parent's frame, and the tracked one in the world."""
 
     position: Float[np.ndarray, "states bodies 3"]
     """m."""
     quaternion: Float[np.ndarray, "states bodies 4"]
     """w, x, y, z."""
-    balloon: Float[np.ndarray, "states 3"]
-    """The site `balloon` (m), the balloon's centre of mass, at which the residual force acts."""
+    tracked: Float[np.ndarray, "states 3"]
+    """The tracked site (m)."""
+    pushed: Float[np.ndarray, "states 3"]
+    """Centre of mass (m) of the tracked site's body, at which the residual force acts."""
     yaw: Float[np.ndarray, " states"]
-    """Of the balloon (rad), not unwrapped."""
+    """Of the tracked body (rad), not unwrapped."""
+
+
+class RobotShapes:
+    """What a robot looks like, and how large it is.
+
+    **Fields**
+
+    - `robot`, `model`: the nominal robot.
+    - `parts`: see `parts`.
+    - `extent`: the longest side (m) of the box around it in its initial pose.
+    - `above`: height (m) of that box's middle above the tracked site; below 0 where it is lower.
+    - `arrow_scale`: length (m) of the arrow of a force of 1 N.
+    """
+
+    def __init__(self, robot: RobotDescription) -> None:
+        self.robot, self.model = robot, robot.load_model()
+        self.parts = parts(self.model)
+        data = mujoco.MjData(self.model)
+        data.qpos[:] = robot.adapter.initial_qpos(robot, self.model)
+        mujoco.mj_kinematics(self.model, data)
+        corners = [data.xpos[p.body] + p.vertices @ data.xmat[p.body].reshape(3, 3).T for p in self.parts]
+        # A robot without shapes is as large as its bodies are apart.
+        points = np.concatenate(corners) if corners else data.xpos[1:]
+        low, high = points.min(axis=0), points.max(axis=0)
+        site = self.model.site(robot.tracked).id
+        self.extent = max(float((high - low).max()), 1e-2)
+        self.above = float(low[2] + high[2]) / 2 - float(data.site_xpos[site, 2])
+        root = self.model.body_rootid[self.model.site_bodyid[site]]
+        self._weight = float(self.model.body_subtreemass[root]) * _GRAVITY
+        # To one digit: it stands in the report.
+        self.arrow_scale = float(f"{self.extent / (_WEIGHT_SHARE * self._weight):.1g}")
+
+    def poses(self, qpos: Float[np.ndarray, "states nq"]) -> Poses:
+        """Return `poses` of this robot."""
+        return poses(self.model, self.robot, qpos)
+
+    def arrow(self, rollout: StoredRollout, state: int) -> Float[np.ndarray, " 3"] | None:
+        """Return the arrow (m, world) of the residual force in a state; None: there is none, or hardly one."""
+        force = force_at(rollout, state)
+        if force is None or np.linalg.norm(force) <= _SMALLEST_SHARE * self._weight:
+            return None
+        return self.arrow_scale * force
 
 
 def parts(model: mujoco.MjModel) -> list[Part]:
-    """The robot's geoms, without the floor."""
+    """Return the geoms of all bodies that move, without the world's."""
     found: dict[tuple[int, float], list[trimesh.Trimesh]] = {}
-    for geom in range(model.ngeom):
-        body = int(model.geom_bodyid[geom])
-        if body == 0:
+    for geom in _shown_geoms(model):
+        mesh = _mesh(model, geom)
+        if mesh is None:
             continue
         pose = np.eye(4)
         rotation = np.zeros(9)
         mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
         pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), model.geom_pos[geom]
-        mesh = _mesh(int(model.geom_type[geom]), model.geom_size[geom])
         mesh.apply_transform(pose)
-        found.setdefault((body, _opacity(model, geom)), []).append(mesh)
+        found.setdefault((int(model.geom_bodyid[geom]), _opacity(model, geom)), []).append(mesh)
     result = []
     for (body, opacity), meshes in found.items():
         starts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
@@ -72,13 +121,14 @@ def parts(model: mujoco.MjModel) -> list[Part]:
     return result
 
 
-def poses(model: mujoco.MjModel, qpos: Float[np.ndarray, "states nq"]) -> Poses:
-    """Where a robot's bodies are."""
+def poses(model: mujoco.MjModel, robot: RobotDescription, qpos: Float[np.ndarray, "states nq"]) -> Poses:
+    """Return where a robot's bodies are."""
     data = mujoco.MjData(model)
-    site, balloon = model.site("balloon").id, model.body("balloon").id
+    site = model.site(robot.tracked).id
+    tracked = int(model.site_bodyid[site])
     states = len(qpos)
     position, quaternion = np.zeros((states, model.nbody, 3)), np.zeros((states, model.nbody, 4))
-    place, yaw = np.zeros((states, 3)), np.zeros(states)
+    place, pushed, yaw = np.zeros((states, 3)), np.zeros((states, 3)), np.zeros(states)
     inverse, offset = np.zeros(4), np.zeros(3)
     for state, q in enumerate(qpos):
         data.qpos[:] = q
@@ -89,64 +139,97 @@ def poses(model: mujoco.MjModel, qpos: Float[np.ndarray, "states nq"]) -> Poses:
             mujoco.mju_rotVecQuat(offset, data.xpos[body] - data.xpos[parent], inverse)
             position[state, body] = offset
             mujoco.mju_mulQuat(quaternion[state, body], inverse, data.xquat[body])
-        place[state] = data.site_xpos[site]
-        forward = data.xmat[balloon].reshape(3, 3)[:, 0]
+        place[state], pushed[state] = data.site_xpos[site], data.xipos[tracked]
+        forward = data.xmat[tracked].reshape(3, 3)[:, 0]
         yaw[state] = np.arctan2(forward[1], forward[0])
-    return Poses(position, quaternion, place, yaw)
+    return Poses(position, quaternion, place, pushed, yaw)
 
 
 def draw(
     scene: mujoco.MjvScene,
     model: mujoco.MjModel,
     data: mujoco.MjData,
-    robots: Mapping[str, Float[np.ndarray, " nq"]],
-    force: Float[np.ndarray, " 3"] | None,
+    robot: RobotDescription,
+    states: Mapping[str, Float[np.ndarray, " nq"]],
+    arrow: Float[np.ndarray, " 3"] | None,
 ) -> None:
-    """Add robots to a MuJoCo scene, each in its colour, and the arrow of a force (N, world) on the last one's balloon.
+    """Add robots to a MuJoCo scene, each in its colour, and an arrow (m, world) at the last one's tracked body.
 
     `data` is left at the last one's state.
     """
     option, perturbation = mujoco.MjvOption(), mujoco.MjvPerturb()
     option.sitegroup[:] = 0
-    for name, qpos in robots.items():
+    for name, qpos in states.items():
         data.qpos[:] = qpos
         mujoco.mj_fwdPosition(model, data)
         first = scene.ngeom
         mujoco.mjv_addGeoms(model, data, option, perturbation, mujoco.mjtCatBit.mjCAT_DYNAMIC, scene)
         for geom in scene.geoms[first : scene.ngeom]:
-            opacity = BALLOON_OPACITY if geom.rgba[3] < 1 else OPACITY
+            opacity = TRANSLUCENT_OPACITY if geom.rgba[3] < 1 else OPACITY
             geom.matid = -1
             geom.rgba[:] = (*colour_of(name), opacity)
-    if force is not None and np.linalg.norm(force) > SMALLEST_FORCE and scene.ngeom < scene.maxgeom:
-        start = data.site("balloon").xpos
-        arrow = scene.geoms[scene.ngeom]
+    if arrow is not None and scene.ngeom < scene.maxgeom:
+        start = data.xipos[model.site_bodyid[model.site(robot.tracked).id]]
+        geom = scene.geoms[scene.ngeom]
         rgba = np.array([*ARROW_COLOUR, 1.0], np.float32)
-        mujoco.mjv_initGeom(arrow, mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), np.zeros(3), np.zeros(9), rgba)
-        mujoco.mjv_connector(arrow, mujoco.mjtGeom.mjGEOM_ARROW, 0.015, start, start + ARROW_LENGTH * force)
+        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_ARROW, np.zeros(3), np.zeros(3), np.zeros(9), rgba)
+        width = 0.01 * float(model.stat.extent)
+        mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, width, start, start + arrow)
         scene.ngeom += 1
 
 
-def hide_robot(option: mujoco.MjvOption) -> None:
-    """Let a view show the floor without the model's own robot, which `draw` then puts there in its place."""
-    option.geomgroup[_ROBOT_GROUP] = 0
+def load_scenery(robot: RobotDescription) -> mujoco.MjModel:
+    """Return the robot's model, lit and with a sky, of which a view with `option_for_scenery` sees the world alone."""
+    spec = mujoco.MjSpec.from_file(str(robot.model))
+    if all(texture.type != mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
+        spec.add_texture(
+            name="_sky",
+            type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+            builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+            rgb1=_SKY,
+            rgb2=_SKY,
+            width=64,
+            height=64,
+        )
+    model = spec.compile()
+    if not model.nlight:
+        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.5, 0.5
+    model.geom_group[_moving(model)] = _HIDDEN_GROUP
+    return model
+
+
+def option_for_scenery(option: mujoco.MjvOption) -> None:
+    """Let a view of `load_scenery` leave out what belongs to the robot."""
+    option.geomgroup[_HIDDEN_GROUP] = 0
     option.sitegroup[:] = 0
     option.flags[mujoco.mjtVisFlag.mjVIS_TENDON] = 0
 
 
-def force_at(take: StoredRollout, state: int) -> Float[np.ndarray, " 3"] | None:
-    """The residual force (N, world) that acts from a state on; in the last state, the one that led there."""
-    return None if take.force is None else take.force[min(state, len(take.force) - 1)]
+def force_at(rollout: StoredRollout, state: int) -> Float[np.ndarray, " 3"] | None:
+    """Return the residual force (N, world) that acts from a state on; in the last state, the one that led there."""
+    return None if rollout.force is None else rollout.force[min(state, len(rollout.force) - 1)]
 
 
-def pushed(take: StoredRollout) -> str | None:
-    """The robot of a take on which the residual force acts."""
-    if take.force is None:
-        return None
-    return next((name for name in take.qpos if name != "recording" and not name.startswith("vanilla")), None)
+def pushed_robot(rollout: StoredRollout) -> str | None:
+    """Return the robot of a rollout on which the residual force acts; None where no force is known."""
+    return None if rollout.force is None else list(rollout.qpos)[-1]
 
 
-def _mesh(kind: int, size: Float[np.ndarray, " 3"]) -> trimesh.Trimesh:
-    types = mujoco.mjtGeom
+def _moving(model: mujoco.MjModel) -> np.ndarray:
+    """Return which geoms are of bodies that move."""
+    return model.body_weldid[model.geom_bodyid] != 0
+
+
+def _shown_geoms(model: mujoco.MjModel) -> list[int]:
+    moving = _moving(model) & (model.geom_type != int(mujoco.mjtGeom.mjGEOM_PLANE))
+    moving &= np.array([_alpha(model, geom) > 0 for geom in range(model.ngeom)], bool)
+    visible = moving & (model.geom_group < _SHOWN_GROUPS)
+    return np.flatnonzero(visible if visible.any() else moving).tolist()
+
+
+def _mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
+    """Return a geom's surface in its own frame; None for kinds that have none, such as height fields."""
+    kind, size, types = int(model.geom_type[geom]), model.geom_size[geom], mujoco.mjtGeom
     match kind:
         case types.mjGEOM_BOX:
             return trimesh.creation.box(extents=2 * size)
@@ -160,11 +243,23 @@ def _mesh(kind: int, size: Float[np.ndarray, " 3"]) -> trimesh.Trimesh:
             ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
             ball.apply_scale(size)
             return ball
+        case types.mjGEOM_MESH | types.mjGEOM_SDF:
+            number = model.geom_dataid[geom]
+            vertices, faces = model.mesh_vertadr[number], model.mesh_faceadr[number]
+            mesh = trimesh.Trimesh(
+                model.mesh_vert[vertices : vertices + model.mesh_vertnum[number]].astype(float),
+                model.mesh_face[faces : faces + model.mesh_facenum[number]],
+                process=False,
+            )
+            return mesh if len(mesh.faces) <= _MOST_FACES else mesh.convex_hull
         case _:
-            raise ValueError(f"Geoms of type {types(kind).name} cannot be drawn.")
+            return None
 
 
 def _opacity(model: mujoco.MjModel, geom: int) -> float:
+    return TRANSLUCENT_OPACITY if _alpha(model, geom) < 1 else OPACITY
+
+
+def _alpha(model: mujoco.MjModel, geom: int) -> float:
     material = model.geom_matid[geom]
-    alpha = model.mat_rgba[material, 3] if material >= 0 else model.geom_rgba[geom, 3]
-    return BALLOON_OPACITY if alpha < 1 else OPACITY
+    return float(model.mat_rgba[material, 3] if material >= 0 else model.geom_rgba[geom, 3])

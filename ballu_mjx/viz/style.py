@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,6 +11,8 @@ from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+
+from ballu_mjx.policies.variants import SimulatorVariant
 
 COLOURS: Mapping[str, str] = {
     "recording": "black",
@@ -27,7 +30,8 @@ COLOURS: Mapping[str, str] = {
     "envmimic-near": "#88ccee",
     "envmimic-wrench": "#44aa99",
 }
-"""One colour for each simulator in all figures (Okabe and Ito's, six of Tol's: the colour-blind tell them apart)."""
+"""Colours of simulators in all figures (Okabe and Ito's, six of Tol's: the colour-blind tell them apart). Read them by
+`colour_of`, which knows every name."""
 
 LABELS: Mapping[str, str] = {
     "recording": "recording",
@@ -48,29 +52,42 @@ LABELS: Mapping[str, str] = {
 
 
 def colour_of(simulator: str) -> tuple[float, float, float]:
-    """Of a simulator (a key of `COLOURS`), paler in each later round (`envmimic-2`); grey for a name unknown."""
-    name, number = round_of(simulator)
-    own = np.array(to_rgb(COLOURS.get(name, "grey")))
-    red, green, blue = 1 - (1 - own) * _PALER ** (number - 1)
-    return red, green, blue
+    """Return the colour of a simulator, always the same one, whatever its name (red, green, blue; 0 to 1).
+
+    A sum of residuals (`aerodynamic+supervised`) without an entry in `COLOURS` is a dark mixture of its parts, mostly
+    of the last. A later round (`envmimic-2`) is paler than the one before. Other names get one of `_OTHERS`.
+    """
+    variant = SimulatorVariant.parse(simulator)
+    red, green, blue = 1 - (1 - _first_round(variant.residual or variant.name)) * _PALER ** (variant.round - 1)
+    return float(red), float(green), float(blue)
 
 
 def label_of(simulator: str) -> str:
-    """A simulator's name in figures; one unknown is its own."""
-    name, number = round_of(simulator)
-    return LABELS.get(name, name) + (f", round {number}" if number > 1 else "")
+    """Return what a simulator is called in figures; one that `LABELS` lacks by its own name, a sum by its parts'."""
+    variant = SimulatorVariant.parse(simulator)
+    name = variant.residual or variant.name
+    label = LABELS.get(name) or "+".join(LABELS.get(part, part) for part in name.split("+"))
+    return label + (f", round {variant.round}" if variant.round > 1 else "")
 
 
-def round_of(simulator: str) -> tuple[str, int]:
-    """Its name in the first round, and which round it is."""
-    name, _, number = simulator.rpartition("-")
-    return (name, int(number)) if name in COLOURS and number.isdecimal() else (simulator, 1)
+def _first_round(name: str) -> Float[np.ndarray, " 3"]:
+    if name in COLOURS:
+        return np.array(to_rgb(COLOURS[name]))
+    *before, last = name.split("+")
+    if before and all(part in COLOURS for part in (*before, last)):
+        mixed = _first_round("+".join(before)) * (1 - _SHARE_OF_LAST) + _first_round(last) * _SHARE_OF_LAST
+        return mixed * _DARKER
+    return np.array(to_rgb(_OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)]))
 
 
 _PALER = 0.55
+_DARKER = 0.75
+_SHARE_OF_LAST = 0.65
+_OTHERS = ("#8c564b", "#7f7f7f", "#bcbd22", "#17becf", "#e377c2", "#6b6ecf", "#b5cf6b", "#ad494a")
+"""Colours of names that are none of `COLOURS`."""
 _DOTS_PER_INCH = 120
-SIDE_COLOURS = ("#1f77b4", "#d64d1f")
-"""Left and right, as in the model."""
+COMMAND_COLOURS = ("#1f77b4", "#d64d1f", "#2ca02c", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
+"""Colours of a robot's commands, in order; after the last, the first one comes again."""
 
 
 def unwrapped(runs: Float[np.ndarray, "runs T 3"], start: float) -> Float[np.ndarray, "runs T 3"]:

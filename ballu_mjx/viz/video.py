@@ -1,4 +1,4 @@
-"""A take as MP4, drawn by MuJoCo's renderer. Needs OpenGL, and the extra `video` for the encoder."""
+"""A rollout as MP4, drawn by MuJoCo's renderer. Needs OpenGL, and the extra `video` for the encoder."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def choose_renderer() -> None:
 
 
 def write(path: Path, take: StoredRollout) -> None:
-    """Draw a take at the control rate, the camera beside the robots.
+    """Draw a rollout at the control rate, the camera beside the robots.
 
     **Raises** `InputError` where there is no OpenGL or no encoder.
     """
@@ -43,22 +43,24 @@ def write(path: Path, take: StoredRollout) -> None:
         ) from None
     import mujoco
 
-    from ballu_mjx.ballu.model import load_model
     from ballu_mjx.viz import robot_meshes
 
-    model = load_model()
+    shapes = robot_meshes.RobotShapes(take.description)
+    model = robot_meshes.load_scenery(shapes.robot)
     model.vis.global_.offwidth, model.vis.global_.offheight = WIDTH, HEIGHT
     try:
-        renderer = mujoco.Renderer(model, HEIGHT, WIDTH, max_geom=200 * (1 + len(take.qpos)))
+        most = (200 + 2 * model.ngeom) * (1 + len(take.qpos))
+        renderer = mujoco.Renderer(model, HEIGHT, WIDTH, max_geom=most)
     except Exception as error:  # each OpenGL library has errors of its own
         raise InputError(_NO_OPENGL.format(str(error).strip().split("\n")[0] or type(error).__name__)) from None
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     option, camera = mujoco.MjvOption(), mujoco.MjvCamera()
-    robot_meshes.hide_robot(option)
+    robot_meshes.option_for_scenery(option)
     camera.azimuth, camera.elevation = 75.0, -12.0
-    ways = np.stack([robot_meshes.poses(model, qpos).balloon for qpos in take.qpos.values()])
+    ways = np.stack([shapes.poses(qpos).tracked for qpos in take.qpos.values()])
     middle = ways.mean(axis=0)
+    height = float(middle[:, 2].mean()) + shapes.above
     apart = np.linalg.norm(ways - middle, axis=-1).max(axis=0)
     rate = round(1.0 / float(np.median(np.diff(take.time))))
     frames = imageio_ffmpeg.write_frames(
@@ -67,12 +69,12 @@ def write(path: Path, take: StoredRollout) -> None:
     try:
         frames.send(None)
         for state in range(len(take.time)):
-            camera.lookat[:] = (*middle[state, :2], 0.7)
-            camera.distance = 2.4 + 1.2 * apart[state]
+            camera.lookat[:] = (*middle[state, :2], height)
+            camera.distance = 1.65 * shapes.extent + 1.2 * apart[state]
             renderer.update_scene(data, camera, option)
             robots = {name: qpos[state] for name, qpos in take.qpos.items()}
-            force = robot_meshes.force_at(take, state) if robot_meshes.pushed(take) else None
-            robot_meshes.draw(renderer.scene, model, data, robots, force)
+            arrow = shapes.arrow(take, state)
+            robot_meshes.draw(renderer.scene, shapes.model, data, shapes.robot, robots, arrow)
             # Where there is no GPU, shadows and mirrors would take two thirds of the time.
             renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
             renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False

@@ -1,4 +1,4 @@
-"""Robots of a take in a viser scene: live, or recorded into a page that plays without a server.
+"""Robots of a rollout in a viser scene: live, or recorded into a page that plays without a server.
 
 Needs the extra `report`.
 """
@@ -14,7 +14,6 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from ballu_mjx.ballu.model import load_model
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.runs.rollout_file import StoredRollout
 from ballu_mjx.viz import robot_meshes
@@ -28,15 +27,15 @@ _FIELD_OF_VIEW = np.deg2rad(40.0)
 
 
 class RobotScene:
-    """The robots of one take, their ways over the floor, and the residual force."""
+    """The robots of one rollout, their ways over the floor, and the residual force."""
 
     def __init__(self, server: viser.ViserServer, take: StoredRollout) -> None:
         scene = server.scene
-        model = load_model()
-        parts = robot_meshes.parts(model)
+        self.shapes = robot_meshes.RobotShapes(take.description)
+        model = self.shapes.model
         self.take = take
         self.states = len(take.time)
-        self.poses = {name: robot_meshes.poses(model, qpos) for name, qpos in take.qpos.items()}
+        self.poses = {name: self.shapes.poses(qpos) for name, qpos in take.qpos.items()}
         self._handles: dict[str, list[Any]] = {}
         self.world = scene.add_frame("/world", show_axes=False)
         scene.add_grid(
@@ -50,9 +49,10 @@ class RobotScene:
             self.robots[name] = scene.add_frame(top, show_axes=False)
             paths, self._handles[name] = [top], []
             for body in range(1, model.nbody):
-                paths.append(f"{paths[model.body_parentid[body]]}/{model.body(body).name}")
+                own = model.body(body).name.replace("/", "_") or f"body-{body}"
+                paths.append(f"{paths[model.body_parentid[body]]}/{own}")
                 self._handles[name].append(scene.add_frame(paths[body], show_axes=False))
-            for index, part in enumerate(parts):
+            for index, part in enumerate(self.shapes.parts):
                 scene.add_mesh_simple(
                     f"{paths[part.body]}/shape-{index}",
                     part.vertices,
@@ -62,20 +62,20 @@ class RobotScene:
                     cast_shadow=False,
                     receive_shadow=False,
                 )
-            way = _rounded(np.column_stack([poses.balloon[:, :2], np.full(self.states, 2e-3)]))
+            way = _rounded(np.column_stack([poses.tracked[:, :2], np.full(self.states, 2e-3)]))
             lines = np.stack([way[:-1], way[1:]], axis=1)
             scene.add_line_segments(f"{top}/way", lines, colour, thickness=2.0, thickness_units="screen")
-        pushed = robot_meshes.pushed(take)
+        pushed = robot_meshes.pushed_robot(take)
         self._pushed = None if pushed is None else self.poses[pushed]
         self._arrow: viser.ArrowsHandle | None = None
         if pushed is not None:
             self._arrow = scene.add_arrows(
-                f"/world/{label_of(pushed)}/force",
+                f"/world/{label_of(pushed).replace('/', '_')}/force",
                 np.zeros((1, 2, 3)),
                 robot_meshes.ARROW_COLOUR,
-                shaft_radius=0.008,
-                head_radius=0.022,
-                head_length=0.05,
+                shaft_radius=0.0055 * self.shapes.extent,
+                head_radius=0.015 * self.shapes.extent,
+                head_length=0.035 * self.shapes.extent,
                 visible=False,
             )
         position, target = self._camera()
@@ -84,28 +84,28 @@ class RobotScene:
         self.show(0)
 
     def show(self, state: int) -> None:
-        """Put all robots into a state of the take."""
+        """Put all robots into a state of the rollout."""
         for name, poses in self.poses.items():
             for body, handle in enumerate(self._handles[name], start=1):
                 handle.position = _rounded(poses.position[state, body])
                 handle.wxyz = _rounded(poses.quaternion[state, body])
         if self._arrow is not None and self._pushed is not None:
-            force = robot_meshes.force_at(self.take, state)
-            self._arrow.visible = force is not None and float(np.linalg.norm(force)) > robot_meshes.SMALLEST_FORCE
-            if force is not None and self._arrow.visible:
-                start = self._pushed.balloon[state]
-                self._arrow.points = _rounded(np.stack([start, start + robot_meshes.ARROW_LENGTH * force])[None])
+            arrow = self.shapes.arrow(self.take, state)
+            self._arrow.visible = arrow is not None
+            if arrow is not None:
+                start = self._pushed.pushed[state]
+                self._arrow.points = _rounded(np.stack([start, start + arrow])[None])
 
     def centre(self, state: int) -> Float[np.ndarray, " 3"]:
-        """The middle (m, world) of all balloons."""
-        return np.mean([poses.balloon[state] for poses in self.poses.values()], axis=0)
+        """Return the middle (m, world) of all robots."""
+        return np.mean([p.tracked[state] for p in self.poses.values()], axis=0) + [0.0, 0.0, self.shapes.above]
 
     def _camera(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
         """Place of a camera that sees the whole way, across it, and what it looks at."""
-        ways = np.concatenate([poses.balloon for poses in self.poses.values()])
+        ways = np.concatenate([poses.tracked for poses in self.poses.values()])
         low, high = ways.min(axis=0), ways.max(axis=0)
-        target = np.array([*((low + high)[:2] / 2), 0.62])
-        distance = 0.5 * float(np.linalg.norm((high - low)[:2])) + 2.0
+        target = np.array([*((low + high)[:2] / 2), self.centre(0)[2]])
+        distance = 0.5 * float(np.linalg.norm((high - low)[:2])) + 1.4 * self.shapes.extent
         along_y = high[1] - low[1] > high[0] - low[0]
         direction = np.array([1.0, -0.2, 0.3]) if along_y else np.array([-0.2, -1.0, 0.3])
         return target + distance * direction / np.linalg.norm(direction), target
@@ -140,7 +140,7 @@ def serve(port: int) -> LocalServer:
 
 
 def page(take: StoredRollout) -> str:
-    """A page (HTML) that plays a take in the browser by itself, from its own text alone."""
+    """Return a page (HTML) that plays a rollout in the browser by itself, from its own text alone."""
     server = serve(0)
     try:
         stage = RobotScene(server, take)

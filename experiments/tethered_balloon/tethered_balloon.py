@@ -43,7 +43,7 @@ from ballu_mjx.recordings.csv_format import write_recording
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.runs.checkpoints import list_checkpoints
-from ballu_mjx.viz.style import COLOURS, LABELS
+from ballu_mjx.viz.style import colour_of, label_of
 
 FOLDER = Path("experiments/tethered_balloon") if "ipykernel" in sys.modules else Path(__file__).parent
 DESCRIPTION = FOLDER / "balloon.robot.json"
@@ -107,10 +107,8 @@ def record(description: RobotDescription, name: str, seconds: float, seed: int) 
         notes=f"Simulated; wind {WIND.tolist()} m/s.",
         time=np.arange(steps) / RATE,
         command=sent[before:],
-        balloon_position=seen[:, 0],
-        balloon_quaternion=turn.as_quat(scalar_first=True),
-        base_position=None,
-        foot_position=None,
+        tracked_position=seen[:, 0],
+        tracked_quaternion=turn.as_quat(scalar_first=True),
         points={point: seen[:, 1 + number] for number, point in enumerate(description.points)},
     )
 
@@ -142,7 +140,7 @@ def learn(recordings: Path, run: Path, seed: int, quick: bool) -> Evaluation:
             command += ["--resume", str(run)]
         else:
             shutil.rmtree(run, ignore_errors=True)
-            command += ["--robot-description", str(DESCRIPTION), "--seed", str(seed), "--output", str(run)]
+            command += ["--robot", str(DESCRIPTION), "--seed", str(seed), "--output", str(run)]
             for option, use in (("recordings", "training"), ("validation", "validation"), ("test", "test")):
                 command += [f"--{option}", str(recordings / use)]
             command += QUICK if quick else []
@@ -200,8 +198,8 @@ def main() -> None:
     axis = figure.subplots()
     for name, values in curves.items():
         mean, low, high = (reduce(np.array(values), axis=1) for reduce in (np.mean, np.min, np.max))
-        axis.plot(horizons, mean, color=COLOURS[name], marker="o", label=LABELS[name])
-        axis.fill_between(horizons, low, high, color=COLOURS[name], alpha=0.2, linewidth=0)
+        axis.plot(horizons, mean, color=colour_of(name), marker="o", label=label_of(name))
+        axis.fill_between(horizons, low, high, color=colour_of(name), alpha=0.2, linewidth=0)
     axis.set(xlabel="horizon (s)", ylabel="position RMSE (m)", xscale="log", ylim=(0, None))
     axis.set_xticks(horizons, [f"{horizon:g}" for horizon in horizons])
     axis.minorticks_off()

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import mujoco
 import numpy as np
 import pytest
@@ -10,17 +9,13 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model, standing_qpos
-from ballu_mjx.ballu.reconstruct import (
-    _differentiate,
-    _fit_chunk,
-    _forward_kinematics,
-    _servo_chunk,
-    _Skeleton,
-    reconstruct_ballu,
-)
+from ballu_mjx.ballu.reconstruct import BASE_PITCH, _servo_chunk
+from ballu_mjx.ballu.recordings import make_recording
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion, ReconstructionParameters, add_capture_noise
-from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.recordings.reconstruct import differentiate, reconstruct
+from ballu_mjx.recordings.recording import Recording, cut
+from ballu_mjx.robots.registry import load_robot
 
 DURATION = 10.0
 STEP = 0.01
@@ -79,7 +74,7 @@ def capture(
         return seen * np.concatenate([[1.0], np.cumprod(np.where(flips, -1.0, 1.0))])[:, None]
 
     held = np.clip(np.searchsorted(truth.time, time + 1e-9, side="right") - 1, 0, len(truth.time) - 1)
-    return Recording(
+    return make_recording(
         name="made",
         kind="free",
         robot="nominal",
@@ -93,28 +88,22 @@ def capture(
     )
 
 
-def head(recording: Recording, count: int) -> Recording:
-    """The first `count` samples."""
-    arrays = {name: value[:count] for name, value in vars(recording).items() if isinstance(value, np.ndarray)}
-    return dataclasses.replace(recording, **arrays)
-
-
 @pytest.fixture(scope="module")
 def seen_with_base(truth: Truth) -> Motion:
-    return reconstruct_ballu(capture(truth), MODEL)
+    return reconstruct(capture(truth), load_robot(), MODEL)
 
 
 @pytest.fixture(scope="module")
 def seen_without_base(truth: Truth) -> Motion:
-    return reconstruct_ballu(capture(truth, base=False), MODEL)
+    return reconstruct(capture(truth, base=False), load_robot(), MODEL)
 
 
 def test_as_much_noise_again_errs_as_much_again(truth: Truth):
     """What `noisier` recordings are reconstructed to is off from the original's states by as much as these from the
     truth: a simulator's error by its starting states can be had without the truth."""
     seen = capture(truth)
-    once = reconstruct_ballu(seen, MODEL).qpos
-    again = [reconstruct_ballu(add_capture_noise(seen, seed=seed), MODEL).qpos for seed in (1, 2)]
+    once = reconstruct(seen, load_robot(), MODEL).qpos
+    again = [reconstruct(add_capture_noise(seen, seed=seed), load_robot(), MODEL).qpos for seed in (1, 2)]
     own = once[2:-2] - truth.qpos[::5][: len(once)][2:-2]
     for twin in again:
         places = [*range(3), *HIPS]  # what no stop clips
@@ -165,22 +154,6 @@ def leg_angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def test_kinematics_are_mujocos():
-    data = mujoco.MjData(MODEL)
-    rng = np.random.default_rng(0)
-    qpos = rng.normal(size=(10, MODEL.nq))
-    qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
-    skeleton = _Skeleton.of(MODEL)
-    with jax.enable_x64(True):
-        found = [np.asarray(x) for x in jax.vmap(lambda q: _forward_kinematics(skeleton, q))(qpos)]
-    for i, row in enumerate(qpos):
-        data.qpos[:] = row
-        mujoco.mj_kinematics(MODEL, data)
-        np.testing.assert_allclose(found[0][i], data.site("balloon").xpos, atol=1e-12)
-        np.testing.assert_allclose(found[1][i], data.body("balloon").xquat, atol=1e-12)
-        np.testing.assert_allclose(found[2][i], [data.site(f"foot_{s}").xpos for s in SIDES], atol=1e-12)
-
-
 @pytest.mark.parametrize("motion_name", ["seen_with_base", "seen_without_base"])
 def test_positions(truth, motion_name, request):
     motion = request.getfixturevalue(motion_name)
@@ -198,30 +171,28 @@ def test_positions(truth, motion_name, request):
 def test_hips_and_pitch(truth, seen_with_base, seen_without_base):
     errors = position_errors(truth, seen_with_base)
     assert np.median(errors["hips"]) < 0.3
-    assert np.rad2deg(seen_with_base.pitch_deviation) < 0.3
+    assert np.rad2deg(seen_with_base.uncertainty[BASE_PITCH]) < 0.3
     # A sample's markers alone leave 7 deg; the torque balance, here exact, brings it down to the tenths.
     errors = position_errors(truth, seen_without_base)
     assert np.median(errors["hips"]) < 1.0
     assert np.median(errors["pitch"]) < 1.0
-    assert 0.5 < np.rad2deg(seen_without_base.pitch_deviation) < 2.0
-    assert np.sqrt(np.mean(errors["pitch"] ** 2)) < 2 * np.rad2deg(seen_without_base.pitch_deviation)
+    assert 0.5 < np.rad2deg(seen_without_base.uncertainty[BASE_PITCH]) < 2.0
+    assert np.sqrt(np.mean(errors["pitch"] ** 2)) < 2 * np.rad2deg(seen_without_base.uncertainty[BASE_PITCH])
 
 
 def test_pitch_follows_the_measured_base_against_the_torque_balance(truth):
     """What is measured is believed: a base held 10 deg off its equilibrium is found there."""
     recording = capture(truth, noise=0.0)
-    assert recording.base_quaternion is not None
     tilt = Rotation.from_rotvec([0.0, np.deg2rad(10.0), 0.0])
-    base = Rotation.from_quat(recording.base_quaternion, scalar_first=True) * tilt
+    base = Rotation.from_quat(recording.orientations["base"], scalar_first=True) * tilt
     neck = Rotation.from_quat(truth.qpos[:, 3:7], scalar_first=True).apply(MODEL.body("balloon").pos)
     moved = neck - base.apply(MODEL.body("balloon").pos)
     recording = dataclasses.replace(
         recording,
-        base_quaternion=base.as_quat(scalar_first=True),
-        base_position=recording.base_position + moved,
-        foot_position=recording.foot_position + moved[:, None],
+        orientations={"base": base.as_quat(scalar_first=True)},
+        points={site: place + moved for site, place in recording.points.items()},
     )
-    motion = reconstruct_ballu(recording, MODEL)
+    motion = reconstruct(recording, load_robot(), MODEL)
     change = np.rad2deg(motion.qpos - truth.qpos[::5])
     assert np.median(np.abs(change[:, HIPS] + 10.0)) < 0.2
     assert np.median(np.abs(change[:, 7] + 10.0)) < 0.2
@@ -246,8 +217,7 @@ def test_velocities_have_no_lag(truth, seen_with_base, seen_without_base):
 def test_velocities_are_mujocos(truth):
     """In a world turned by 130 deg, only the linear velocity turns; integrating qvel leads to the next qpos."""
     plain = capture(truth, noise=0.0)
-    assert plain.balloon_quaternion is not None and plain.base_quaternion is not None
-    assert plain.foot_position is not None
+    assert plain.tracked_position is not None and plain.tracked_quaternion is not None
     turn = Rotation.from_euler("z", 130.0, degrees=True)
 
     def turned(quaternion: np.ndarray) -> np.ndarray:
@@ -255,13 +225,12 @@ def test_velocities_are_mujocos(truth):
 
     recording = dataclasses.replace(
         plain,
-        balloon_position=turn.apply(plain.balloon_position),
-        base_position=turn.apply(plain.base_position),
-        foot_position=turn.apply(plain.foot_position.reshape(-1, 3)).reshape(-1, 2, 3),
-        balloon_quaternion=turned(plain.balloon_quaternion),
-        base_quaternion=turned(plain.base_quaternion),
+        tracked_position=turn.apply(plain.tracked_position),
+        tracked_quaternion=turned(plain.tracked_quaternion),
+        points={site: turn.apply(place) for site, place in plain.points.items()},
+        orientations={site: turned(quaternion) for site, quaternion in plain.orientations.items()},
     )
-    motion, reference = reconstruct_ballu(recording, MODEL), reconstruct_ballu(plain, MODEL)
+    motion, reference = reconstruct(recording, load_robot(), MODEL), reconstruct(plain, load_robot(), MODEL)
     np.testing.assert_allclose(motion.qvel[:, :3], turn.apply(reference.qvel[:, :3]), atol=1e-6)
     np.testing.assert_allclose(motion.qvel[:, 3:], reference.qvel[:, 3:], atol=1e-5)
 
@@ -283,7 +252,7 @@ def test_turning_quickly(truth):
     spin = (tilt * Rotation.from_rotvec(np.outer(time, rate))).as_quat(scalar_first=True)
     qpos = np.tile(standing_qpos(MODEL), (len(time), 1))
     qpos[:, 3:7] = spin
-    found, velocity = _differentiate(qpos, STEP, ReconstructionParameters())
+    found, velocity = differentiate(qpos, MODEL, load_robot(), STEP, ReconstructionParameters())
     np.testing.assert_allclose(velocity[:, 3:6], np.tile(rate, (len(time), 1)), atol=0.05)
     np.testing.assert_allclose(np.abs(np.sum(found[:, 3:7] * spin, axis=1)), 1.0, atol=1e-5)
     assert np.all(np.sum(found[1:, 3:7] * found[:-1, 3:7], axis=1) > 0.9)
@@ -291,7 +260,7 @@ def test_turning_quickly(truth):
 
 def test_residuals_are_the_noise(seen_with_base, seen_without_base):
     for motion in (seen_with_base, seen_without_base):
-        assert set(motion.residual_mm) == {"balloon", "base", "feet"}
+        assert set(motion.residual_mm) == {"balloon", "base", "foot_left", "foot_right"}
         # Three axes of 0.5 mm are 0.87 mm; eleven unknowns take part of it.
         assert all(0.1 < value < 0.87 for value in motion.residual_mm.values())
 
@@ -299,7 +268,7 @@ def test_residuals_are_the_noise(seen_with_base, seen_without_base):
 def test_residuals_show_a_wrong_skeleton(truth):
     longer = load_model()
     longer.body_pos[longer.body("balloon").id, 2] += 0.02
-    motion = reconstruct_ballu(capture(truth, noise=0.0), longer)
+    motion = reconstruct(capture(truth, noise=0.0), load_robot(), longer)
     assert motion.residual_mm["balloon"] > 3.0
 
 
@@ -336,7 +305,7 @@ def test_jitter_and_rates(truth, rate):
     time = np.arange(0.0, DURATION - 0.02, 1.0 / rate)
     time = 7.0 + time + np.concatenate([[0.0], rng.uniform(-0.3, 0.3, len(time) - 1) / rate])
     recording = dataclasses.replace(capture(truth, time=time - 7.0), time=time)
-    motion = reconstruct_ballu(recording, MODEL)
+    motion = reconstruct(recording, load_robot(), MODEL)
     np.testing.assert_allclose(motion.time, np.arange(len(motion.time)) * CONTROL_TIMESTEP)
     errors = position_errors(truth, motion)
     assert np.median(errors["knees"]) < 0.5
@@ -349,12 +318,12 @@ def test_jitter_and_rates(truth, rate):
 
 def test_hidden_markers(truth, tmp_path):
     recording = capture(truth, base=False)
-    assert recording.balloon_position is not None and recording.foot_position is not None
-    balloon, feet = recording.balloon_position.copy(), recording.foot_position.copy()
-    balloon[200:205], feet[400:403, 1], feet[700:705, 0] = np.nan, np.nan, np.nan
-    recording = dataclasses.replace(recording, balloon_position=balloon, foot_position=feet)
-    write_recording(recording, tmp_path / "walk.csv")
-    motion = reconstruct_ballu(read_recording(tmp_path / "walk.csv"), MODEL)
+    balloon = np.array(recording.tracked_position)
+    points = {site: place.copy() for site, place in recording.points.items()}
+    balloon[200:205], points["foot_right"][400:403], points["foot_left"][700:705] = np.nan, np.nan, np.nan
+    recording = dataclasses.replace(recording, tracked_position=balloon, points=points)
+    write_recording(recording, tmp_path / "walk.csv", load_robot())
+    motion = reconstruct(read_recording(tmp_path / "walk.csv", load_robot()), load_robot(), MODEL)
     assert motion.interpolated["balloon_x"] == 5 and motion.interpolated["foot_left_z"] == 5
     errors = position_errors(truth, motion)
     assert np.median(errors["knees"]) < 0.3
@@ -363,9 +332,11 @@ def test_hidden_markers(truth, tmp_path):
 
 def test_measured_joints_are_taken(truth):
     recording = capture(truth)
-    recording = dataclasses.replace(recording, motor=truth.qpos[:, MOTORS] + 0.1, knee=truth.qpos[:, KNEES])
+    joints = {"motor_left": MOTORS[0], "motor_right": MOTORS[1], "knee_left": KNEES[0], "knee_right": KNEES[1]}
+    angles = {joint: truth.qpos[:, place] + 0.1 * joint.startswith("motor") for joint, place in joints.items()}
+    recording = dataclasses.replace(recording, joint_angles=angles)
     precise = ReconstructionParameters(joint_noise=1e-4)
-    motion = reconstruct_ballu(recording, MODEL, precise)
+    motion = reconstruct(recording, load_robot(), MODEL, precise)
     change = np.median(np.abs(motion.qpos[:, MOTORS] - truth.qpos[::5, MOTORS]))
     assert abs(change - 0.1) < 0.01
     assert np.median(position_errors(truth, motion)["knees"]) < 0.03
@@ -375,28 +346,24 @@ def test_commands_are_means_over_control_steps(truth):
     recording = capture(truth, noise=0.0)
     command = np.zeros_like(recording.command)
     command[12:27, 0] = 1.0  # from 0.12 s to 0.27 s
-    motion = reconstruct_ballu(dataclasses.replace(recording, command=command), MODEL)
+    motion = reconstruct(dataclasses.replace(recording, command=command), load_robot(), MODEL)
     np.testing.assert_allclose(motion.command[:7, 0], [0.0, 0.0, 0.6, 1.0, 1.0, 0.4, 0.0], atol=1e-9)
     np.testing.assert_array_equal(motion.command[:, 1], 0.0)
     assert len(motion.command) == len(motion.qpos) - 1 == len(motion.time) - 1
 
 
 def test_lengths_share_a_program(truth, seen_without_base):
-    def programs() -> list[int]:
-        compiled = (_fit_chunk, _servo_chunk)
-        return [function._cache_size() for function in compiled]  # pyright: ignore[reportAttributeAccessIssue]
-
-    before = programs()
+    before = _servo_chunk._cache_size()  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
     recording = capture(truth, base=False)
-    motion = reconstruct_ballu(head(recording, 333), MODEL)
+    motion = reconstruct(cut(recording, slice(333)), load_robot(), MODEL)
     assert len(motion.qpos) == 67
-    assert programs() == before
+    assert _servo_chunk._cache_size() == before  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
     np.testing.assert_allclose(motion.qpos[5:50, 7:], seen_without_base.qpos[5:50, 7:], atol=np.deg2rad(1.0))
 
 
 def test_suspended_and_short_recordings_are_refused(truth):
     recording = capture(truth)
     with pytest.raises(ValueError, match="suspended"):
-        reconstruct_ballu(dataclasses.replace(recording, kind="suspended"), MODEL)
+        reconstruct(dataclasses.replace(recording, kind="suspended"), load_robot(), MODEL)
     with pytest.raises(ValueError, match="too short"):
-        reconstruct_ballu(head(recording, 8), MODEL)
+        reconstruct(cut(recording, slice(8)), load_robot(), MODEL)

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ballu_mjx.ballu.recordings import make_recording
 from ballu_mjx.ballu.sweep import read_sweep
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.robots.registry import load_robot
 
 PATH = Path("sweep.csv")
 
@@ -26,9 +28,8 @@ def made(
     since = np.tile(np.arange(count) / rate, len(levels))[:, None]
     before = np.repeat(np.concatenate([levels[:1], levels[:-1]]), count, axis=0)
     angle = 0.5 + command + (before - command) * np.exp(-since / settle)
-    return Recording(
-        name="sweep", kind="suspended", robot=robot, time=time, command=command, balloon_position=None,
-        balloon_quaternion=None, base_position=None, foot_position=None, motor=angle, knee=angle + 0.1,
+    return make_recording(
+        name="sweep", kind="suspended", robot=robot, time=time, command=command, motor=angle, knee=angle + 0.1,
     )  # fmt: skip
 
 
@@ -54,8 +55,9 @@ def test_a_jittered_clock_from_any_origin_changes_nothing() -> None:
     steady = made(both(), rate=200.0)
     rng = np.random.default_rng(0)
     kept = np.sort(rng.choice(len(steady.time), round(0.7 * len(steady.time)), replace=False))
-    values = {name: getattr(steady, name)[kept] for name in ("time", "command", "motor", "knee")}
-    jittered = dataclasses.replace(steady, **{**values, "time": values["time"] + 1234.5})
+    angles = {joint: angle[kept] for joint, angle in steady.joint_angles.items()}
+    time, command = steady.time[kept] + 1234.5, steady.command[kept]
+    jittered = dataclasses.replace(steady, time=time, command=command, joint_angles=angles)
     expected, sweep = read_sweep({PATH: steady}), read_sweep({PATH: jittered})
     assert sweep.settled == pytest.approx(expected.settled, abs=1e-3)
     length = min(len(sweep.motion), len(expected.motion))
@@ -116,6 +118,6 @@ def test_recordings_of_two_robots_are_refused() -> None:
 
 
 def test_the_bundled_sweep_holds_twenty_commands_for_both_legs() -> None:
-    sweep = read_sweep({path: read_recording(path) for path in list_bundled("suspended")})
+    sweep = read_sweep({path: read_recording(path, load_robot()) for path in list_bundled("suspended")})
     assert sweep.command == pytest.approx(both(), abs=1e-4)
     assert np.all(np.diff(sweep.settled[:, 0], axis=0) > 0), "motors follow the command"

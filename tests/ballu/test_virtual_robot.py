@@ -5,6 +5,7 @@ import dataclasses
 import gzip
 import importlib.util
 import json
+import subprocess
 import sys
 from pathlib import Path
 
@@ -15,10 +16,12 @@ import pytest
 import ballu_mjx
 from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE
 from ballu_mjx.ballu.model import load_model, standing_qpos
+from ballu_mjx.ballu.recordings import base_position, foot_position, knee, motor
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.robots.model import assets
+from ballu_mjx.robots.registry import load_robot
 
 ROOT = Path(__file__).parents[2]
 
@@ -112,10 +115,11 @@ def test_capture_is_as_noisy_and_as_patchy_as_stated(virtual: virtual_robot.Virt
     trial = virtual_robot.draw_trial(7)
     seen = virtual_robot.record(virtual, trial, virtual_robot.open_loop(commands), 20.0, "standing")
     qpos, _ = virtual_robot.record_truth(virtual, trial, virtual_robot.open_loop(commands), 20.0)
-    assert seen.base_position is not None and seen.foot_position is not None
-    noise = seen.base_position - qpos[:, :3]
+    base, feet = base_position(seen), foot_position(seen)
+    assert base is not None and feet is not None
+    noise = base - qpos[:, :3]
     assert np.nanstd(noise, axis=0) == pytest.approx(np.full(3, 5e-4), rel=0.1)
-    hidden = np.isnan(np.concatenate([seen.base_position, seen.foot_position.reshape(-1, 6)], axis=1))
+    hidden = np.isnan(np.concatenate([base, feet.reshape(-1, 6)], axis=1))
     assert 0.0 < hidden.mean() < 0.05
 
 
@@ -125,7 +129,7 @@ def test_a_controller_sees_only_what_was_captured_before(virtual: virtual_robot.
 
     def controller(capture: Capture) -> np.ndarray:
         lengths.append(len(capture.time))
-        assert len(capture.balloon_position) == len(capture.time) == len(capture.command) + 1
+        assert len(capture.position) == len(capture.time) == len(capture.command) + 1
         return np.array([0.1, 0.2]) * (len(lengths) % 2)
 
     seen = virtual_robot.record(virtual, virtual_robot.draw_trial(1), controller, 1.0, "closed")
@@ -171,15 +175,16 @@ def test_a_bundled_recording_is_made_again_bit_for_bit(tmp_path: Path, monkeypat
 
 def test_the_sweep_holds_twenty_levels_until_the_joints_settle():
     (path,) = list_bundled("suspended")
-    sweep = read_recording(path)
-    assert sweep.kind == "suspended" and sweep.motor is not None and sweep.knee is not None
+    sweep = read_recording(path, load_robot())
+    knees = knee(sweep)
+    assert sweep.kind == "suspended" and motor(sweep) is not None and knees is not None
     levels, first = np.unique(sweep.command[:, 0], return_index=True)
     assert len(levels) == 20 and (levels[0], levels[-1]) == (0.0, 1.0)
     for start, end in zip(first, [*first[1:], len(sweep.time)], strict=True):
         # In deg/s; noise alone gives 0.6.
-        settled = np.rad2deg(sweep.knee[end - (end - start) // 3 : end])
+        settled = np.rad2deg(knees[end - (end - start) // 3 : end])
         assert np.abs(np.polyfit(np.arange(len(settled)) * 0.01, settled, 1)[0]).max() < 1.0
-    lifted = np.rad2deg(sweep.knee[-1] - sweep.knee[0])
+    lifted = np.rad2deg(knees[-1] - knees[0])
     assert lifted.min() > 15 and lifted.max() < 44  # weak servos: the nominal robot's knees gain 45 deg
 
 
@@ -196,8 +201,8 @@ def test_bundled_actuators_are_the_robots(virtual: virtual_robot.VirtualRobot):
 def test_bundled_free_recordings_show_no_motors_and_weigh_two_megabytes_at_most():
     for split in ("training", "validation", "test"):
         for path in list_bundled(split):
-            seen = read_recording(path)
-            assert seen.motor is None and seen.knee is None
+            seen = read_recording(path, load_robot())
+            assert not seen.joint_angles
             assert seen.time[-1] - seen.time[0] >= 19.9
     assert sum(path.stat().st_size for path in (assets() / "recordings").rglob("*.*")) < 2 * 2**20
 
@@ -225,6 +230,46 @@ def test_nothing_that_trains_knows_the_virtual_robot():
     for path in package.rglob("*.py"):
         if not path.relative_to(package).as_posix().startswith(USERS):
             assert not [name for name in imported(path) if "virtual" in name.split(".")], path
+
+
+FITTED = (
+    "identification/*.py",
+    "ballu/*identification*.py",
+    "ballu/leg_parameters.py",
+    "ballu/suspended_leg.py",
+    "residuals/*.py",
+)
+"""Modules that find out about the robot from recordings."""
+
+
+def numbers(node: ast.AST) -> set[float]:
+    found = (each.value for each in ast.walk(node) if isinstance(each, ast.Constant))
+    return {abs(value) for value in found if isinstance(value, int | float) and not isinstance(value, bool)}
+
+
+def test_no_number_of_the_virtual_robot_s_ranges_stands_where_it_is_identified():
+    """Ends of the ranges that robots are drawn from, of two digits or more: 0.01 and 0.1 are everybody's numbers."""
+    package = Path(ballu_mjx.__file__).parent
+    (draw,) = (
+        node
+        for node in ast.parse((package / "ballu/virtual/robot.py").read_text()).body
+        if isinstance(node, ast.FunctionDef) and node.name == "draw_robot"
+    )
+    calls = [node for node in ast.walk(draw) if isinstance(node, ast.Call)]
+    ranges = {x for call in calls for x in numbers(call) if len(f"{x:.9e}".split("e")[0].rstrip("0")) > 2}
+    assert {0.0125, 0.021, 0.28, 0.55, 0.14} < ranges, "the ranges are not found"
+    paths = {path for pattern in FITTED for path in package.glob(pattern)}
+    assert len(paths) > 10
+    for path in paths:
+        assert not numbers(ast.parse(path.read_text())) & ranges, path
+
+
+def test_identification_does_not_load_the_virtual_robot():
+    """Not by way of others either."""
+    modules = "ballu_mjx.ballu.identification, ballu_mjx.residuals.aerodynamics_fit, ballu_mjx.residuals.envmimic"
+    code = f"import sys, {modules}; print([name for name in sys.modules if 'ballu_mjx.ballu.virtual' in name])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
 
 
 def test_the_commands_that_record_look_at_no_parameter_of_the_robot():

@@ -1,6 +1,8 @@
 """The commands as a whole: `python -m ballu_mjx` lists them, and all tell of errors in the same way."""
 
+import dataclasses
 import importlib.util
+import json
 import pkgutil
 import shutil
 import subprocess
@@ -13,8 +15,16 @@ from ballu_mjx import __main__ as package
 from ballu_mjx import cli
 from ballu_mjx.__main__ import COMMANDS, NAMES
 from ballu_mjx.cli import completion
+from ballu_mjx.cli._command import TrainCommand, run_command
 from ballu_mjx.common import runtime
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.residuals.dataset import RecordingsData
+from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.runs.layout import RUN_FORMAT
 
+TRAININGS = (
+    "sysid", "envmimic", "supervised", "analytic", "aerodynamic", "walk", "turn", "turn-right", "walk-backward", "all",
+)  # fmt: skip
 SUBCOMMANDS = [
     "compare",
     "evaluate",
@@ -22,7 +32,7 @@ SUBCOMMANDS = [
     "report",
     "view",
     *(f"record {name}" for name in ("import", "check", "simulate", "example-mapping")),
-    *(f"train {name}" for name in ("sysid", "envmimic", "walk", "turn", "turn-right", "walk-backward", "all")),
+    *(f"train {name}" for name in TRAININGS),
 ]
 
 
@@ -67,7 +77,8 @@ def test_every_help_tells_of_debug(line: str, capsys: pytest.CaptureFixture[str]
         "view nowhere",
         "record check nowhere",
         "train sysid --recordings nowhere",
-        "train envmimic --resume nowhere",  # refused before the options are parsed
+        "train envmimic --resume nowhere",
+        "train walk --resume=nowhere",
     ],
 )
 def test_the_traceback_of_bad_input_is_shown_on_demand(line: str, capsys: pytest.CaptureFixture[str]):
@@ -77,6 +88,86 @@ def test_the_traceback_of_bad_input_is_shown_on_demand(line: str, capsys: pytest
     assert main(f"{line} --debug") == 2
     shown = capsys.readouterr().err
     assert shown.startswith("Traceback") and shown.endswith(f"InputError: {sentence}")
+
+
+@pytest.mark.parametrize(
+    ("line", "options"),
+    [
+        ("train supervised", ("--force-scales", "--forces", "--robot", "--actuators")),
+        ("train analytic", ("--relinearizations", "--forces", "--robot")),
+        ("train aerodynamic", ("--fixed-from", "--free", "--robot")),
+        ("train walk", ("--keep-every", "--robot", "--residual", "--domain-randomization")),
+        ("train sysid", ("--levels", "--robot", "--objective")),
+    ],
+)
+def test_every_option_of_a_training_is_in_its_help(line: str, options: tuple, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        main(f"{line} --help")
+    told = capsys.readouterr().out
+    assert all(option in told for option in options)
+
+
+@pytest.mark.parametrize(
+    ("line", "sizes"),
+    [
+        ("train envmimic", "--num-timesteps 120000 --num-envs 256 --batch-size 128"),
+        ("train walk", "--num-timesteps 60000"),
+        ("train sysid", "--no-motion --starts 4"),
+    ],
+)
+def test_help_tells_the_defaults_without_and_with_quick(line: str, sizes: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        main(f"{line} --help")
+    told = " ".join(capsys.readouterr().out.split())
+    assert f"Defaults under --quick: {sizes}" in told
+    assert "(default: 3000000)" in told or "sysid" in line
+
+
+@dataclasses.dataclass(frozen=True)
+class Data(RecordingsData):
+    resume: Path | None = None
+    validate_every: int = 400
+
+
+def given(arguments: str) -> tuple[Data, PPOConfig]:
+    """What a training's options come to."""
+    found = []
+
+    def keep(data: Data, ppo: PPOConfig) -> int:
+        found.append((data, ppo))
+        return 3
+
+    quick = {"ppo": {"num_envs": 256, "normalize_observations": False}}
+    commands = {"learn": TrainCommand("Learns.", {"data": Data(), "ppo": PPOConfig()}, keep, quick)}
+    assert run_command(commands, arguments.split(), "") == 3
+    return found[0]
+
+
+def test_quick_changes_defaults_wherever_it_stands_and_no_option_that_is_given():
+    assert given("learn") == (Data(), PPOConfig())
+    small = PPOConfig(num_envs=256, normalize_observations=False)
+    assert given("learn --quick") == (Data(quick=True), small)
+    _, ppo = given("learn --num-envs 1024 --quick --normalize-observations --seed 3")
+    assert ppo == dataclasses.replace(PPOConfig(), seed=3)  # given, though equal to the defaults without --quick
+
+
+def test_a_run_that_goes_on_keeps_its_options_but_for_those_given(tmp_path: Path):
+    stored = {"data": {"validate_every": 7, "output": "elsewhere"}, "ppo": {"num_envs": 64, "seed": 5}}
+    content = {"format": RUN_FORMAT, "task": "learn", **stored}
+    (tmp_path / "config.json").write_text(json.dumps(content))
+    data, ppo = given(f"learn --seed 6 --resume={tmp_path}")
+    assert (data.validate_every, data.output, data.resume) == (7, None, tmp_path)
+    assert (ppo.num_envs, ppo.seed) == (64, 6)
+    with pytest.raises(InputError, match="there is no run"):
+        given(f"learn --resume {tmp_path / 'other'}")
+
+
+@pytest.mark.parametrize("line", ["train residual", "train envmimic --method envmimic", "train sysid --num-envs 3"])
+def test_what_is_no_option_is_refused(line: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as left:
+        main(line)
+    assert left.value.code == 2
+    capsys.readouterr()
 
 
 def test_an_unexpected_error_is_called_a_fault_of_the_package(capsys: pytest.CaptureFixture[str]):
@@ -140,7 +231,7 @@ def bash_script(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("", {"record", "train", "evaluate", "report", "view", "compare", "export"}),
         ("tr", {"train"}),
         ("record ", {"import", "check", "simulate", "example-mapping"}),
-        ("train ", {"sysid", "envmimic", "residual", "walk", "turn", "turn-right", "walk-backward", "all"}),
+        ("train ", set(TRAININGS)),
         ("train envmimic --num-t", {"--num-timesteps"}),
         ("record import --format ", {"auto", "vicon", "c3d", "table"}),
         ("view --po", {"--port"}),

@@ -9,6 +9,7 @@ from scipy import stats
 
 from ballu_mjx.cli import compare
 from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, quotient
+from ballu_mjx.evaluation.statistics import t_interval
 from ballu_mjx.runs.folder import Run
 from ballu_mjx.runs.layout import RUN_FORMAT
 
@@ -56,9 +57,9 @@ def test_seeds_are_one_row_and_its_interval_is_students(folders: list[Path]):
     figures = [compare.figures(folder) for folder in found[0].folders]
     values = [each["reward at the end"] for each in figures]
     assert values == pytest.approx([1.0, 1.2, 1.1])
-    mean, half = compare.interval(values)
+    found_interval = t_interval(values)
     expected = stats.t.interval(0.95, 2, loc=np.mean(values), scale=stats.sem(values))
-    assert (mean - half, mean + half) == pytest.approx(expected)
+    assert (found_interval.low, found_interval.high) == pytest.approx(expected)
     assert figures[0]["near position, 5 s (ratio)"] == pytest.approx(0.5)
     assert figures[0]["far yaw, 10 s (ratio)"] == pytest.approx(1.0)
 
@@ -68,6 +69,7 @@ def test_the_command_writes_table_and_plot(folders: list[Path], tmp_path: Path, 
     text = (tmp_path / "out" / "compare.md").read_text()
     assert text.strip() in capsys.readouterr().out
     assert "| force_scale 0.05 | 3 | 1.100 ± 0.248 |" in text
+    assert "± is half the 95% confidence interval" in text
     assert (tmp_path / "out" / "compare.png").stat().st_size > 10_000
 
 

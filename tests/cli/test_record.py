@@ -17,8 +17,9 @@ from ballu_mjx.ballu.gaits import GAITS
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.cli import record
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_recording
-from ballu_mjx.recordings.importers.mapping import EXAMPLE
-from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.recordings.importers.mapping import example_mapping
+from ballu_mjx.recordings.recording import Recording, cut
+from ballu_mjx.robots.registry import load_robot
 
 ROLES = ("balloon", "base", "foot_left", "foot_right")
 
@@ -27,24 +28,20 @@ ROLES = ("balloon", "base", "foot_left", "foot_right")
 def recorded() -> Recording:
     """Random jumps, told from each other everywhere."""
     (path,) = [path for path in list_bundled("test") if path.name.startswith("far-1")]
-    return first(read_recording(path), 15.0)
+    return first(read_recording(path, load_robot()), 15.0)
 
 
 def first(recording: Recording, seconds: float) -> Recording:
-    fields = {field.name: getattr(recording, field.name) for field in dataclasses.fields(recording)}
-    rows = recording.time <= seconds
-    return dataclasses.replace(recording, **{n: v[rows] for n, v in fields.items() if isinstance(v, np.ndarray)})
+    return cut(recording, slice(int((recording.time <= seconds).sum())))
 
 
 def vicon_file(recording: Recording, path: Path) -> None:
     """A Tracker file of objects, quaternions, in another corner of a room."""
     there = Rotation.from_euler("z", -70, degrees=True)
-    assert recording.balloon_position is not None and recording.balloon_quaternion is not None
-    assert recording.base_position is not None and recording.foot_position is not None
-    balloon = Rotation.from_quat(recording.balloon_quaternion, scalar_first=True)
-    feet = recording.foot_position
+    assert recording.tracked_position is not None and recording.tracked_quaternion is not None
+    balloon = Rotation.from_quat(recording.tracked_quaternion, scalar_first=True)
     columns = []
-    for position in (recording.balloon_position, recording.base_position, feet[:, 0], feet[:, 1]):
+    for position in (recording.tracked_position, *(recording.points[role] for role in ROLES[1:])):
         columns += [(there * balloon).as_quat(), 1e3 * (there.apply(position) + [2.0, 1.0, 0.0])]
     names = [f"Global Angle ballu:{role}" + "," * 6 for role in ROLES]
     rows = [
@@ -82,12 +79,11 @@ LINE = "import walk.csv --mapping room.toml --commands log.csv --output out/walk
 
 def test_import_by_hand_gives_the_recording_back(room: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]):
     assert record.main([*LINE, "--offset", "-512.25"]) == 0
-    read = read_recording(room / "out" / "walk.csv.gz")
+    read = read_recording(room / "out" / "walk.csv.gz", load_robot())
     assert (read.robot, read.kind, len(read.time)) == ("mine", "free", len(recorded.time))
     np.testing.assert_allclose(read.command, recorded.command, atol=1e-4)
     # Turned and shifted to the start, it is the same walk: distances and heights are.
-    assert read.base_position is not None and recorded.base_position is not None
-    steps, expected = (np.linalg.norm(p - p[0], axis=1) for p in (read.base_position, recorded.base_position))
+    steps, expected = (np.linalg.norm(p - p[0], axis=1) for p in (read.points["base"], recorded.points["base"]))
     np.testing.assert_allclose(steps, expected, atol=3e-5)
     assert "15.00 s" in capsys.readouterr().out
 
@@ -102,7 +98,7 @@ def test_import_finds_the_offset_and_says_how_sure_it_is(room: Path, capsys: pyt
 
 def test_a_periodic_log_is_told(room: Path, capsys: pytest.CaptureFixture[str]):
     (path,) = [path for path in list_bundled("test") if path.name.startswith("near-1")]
-    walk = first(read_recording(path), 15.0)
+    walk = first(read_recording(path, load_robot()), 15.0)
     vicon_file(walk, room / "walk.csv")
     log_file(walk, room / "log.csv", 0.0)
     assert record.main(LINE) == 2
@@ -116,7 +112,7 @@ def test_a_periodic_log_is_told(room: Path, capsys: pytest.CaptureFixture[str]):
 @pytest.mark.parametrize(
     "change, line, said",
     [
-        (lambda text: text.replace("[0, 90]", "[90, 0]"), [], "legs move against the commands"),
+        (lambda text: text.replace("[0, 90]", "[90, 0]"), [], "the robot moves against the commands"),
         (lambda text: text, ["--offset", "3"], "log.csv: its commands, from 515.25"),
         (lambda text: text, ["--offset", "1", "--offset-range", "0", "1"], "give one of them"),
         (lambda text: text.replace('"foot_left"', '"foot_middle"'), [], "no body or marker 'foot_middle'"),
@@ -150,10 +146,9 @@ def test_import_overwrites_nothing(room: Path, capsys: pytest.CaptureFixture[str
 def test_a_sweep_comes_from_a_table_with_its_commands(tmp_path: Path):
     """Degrees, a knee that counts the other way round, and milliseconds of an absolute clock."""
     (path,) = list_bundled("suspended")
-    sweep = read_recording(path)
-    assert sweep.motor is not None and sweep.knee is not None
-    columns = [1e3 * sweep.time + 1e9, *sweep.command.T, *np.rad2deg(sweep.motor).T, 90 - np.rad2deg(sweep.knee).T[0]]
-    columns.append(np.rad2deg(sweep.knee).T[1])
+    sweep = read_recording(path, load_robot())
+    angles = [np.rad2deg(sweep.joint_angles[j]) for j in ("motor_left", "motor_right", "knee_left", "knee_right")]
+    columns = [1e3 * sweep.time + 1e9, *sweep.command.T, *angles[:2], 90 - angles[2], angles[3]]
     rows = [",".join(f"{x:.11g}" for x in row) for row in zip(*columns, strict=True)]
     (tmp_path / "bench.csv").write_text("\n".join(["ms,cl,cr,ml,mr,kl,kr", *rows]) + "\n")
     joints = {"motor_left": "ml", "motor_right": "mr", "knee_left": "kl", "knee_right": "kr"}
@@ -164,9 +159,10 @@ def test_a_sweep_comes_from_a_table_with_its_commands(tmp_path: Path):
     (tmp_path / "room.toml").write_text(room)
     line = ["import", tmp_path / "bench.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "sweep.csv"]
     assert record.main(list(map(str, line))) == 0
-    read = read_recording(tmp_path / "sweep.csv")
-    np.testing.assert_allclose(np.asarray(read.knee), sweep.knee, atol=2e-5)
-    np.testing.assert_allclose(np.asarray(read.motor), sweep.motor, atol=2e-5)
+    read = read_recording(tmp_path / "sweep.csv", load_robot())
+    assert set(read.joint_angles) == set(sweep.joint_angles) == set(joints)
+    for joint, angle in sweep.joint_angles.items():
+        np.testing.assert_allclose(read.joint_angles[joint], angle, atol=2e-5)
     np.testing.assert_allclose(read.command, sweep.command, atol=1e-4)
     assert read.kind == "suspended" and read.time[0] == 0
 
@@ -175,9 +171,10 @@ def test_a_sweep_comes_from_a_table_with_its_commands(tmp_path: Path):
 
 
 def test_check_counts_what_is_missing(tmp_path: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]):
-    base = np.array(recorded.base_position)
+    base = np.array(recorded.points["base"])
     base[100:112] = base[500:503] = np.nan
-    write_recording(dataclasses.replace(recorded, base_position=base), tmp_path / "walk.csv")
+    hidden = dataclasses.replace(recorded, points={**recorded.points, "base": base})
+    write_recording(hidden, tmp_path / "walk.csv", load_robot())
     gaps = record.missing(tmp_path / "walk.csv")
     assert gaps == {f"base_{axis}": [(1.0, 1.11), (5.0, 5.02)] for axis in "xyz"}
     assert record.main(["check", str(tmp_path), "--output", str(tmp_path / "figures")]) == 0
@@ -191,7 +188,7 @@ def test_check_counts_what_is_missing(tmp_path: Path, recorded: Recording, capsy
 
 def test_check_goes_on_after_a_broken_one(tmp_path: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]):
     for name in ("a", "b"):
-        write_recording(recorded, tmp_path / f"{name}.csv")
+        write_recording(recorded, tmp_path / f"{name}.csv", load_robot())
     text = (tmp_path / "a.csv").read_text().split("\n")
     (tmp_path / "a.csv").write_text("\n".join([*text[:10], "x" + text[10], *text[11:]]))
     assert record.main(["check", str(tmp_path)]) == 2
@@ -208,7 +205,7 @@ def test_simulate_plays_a_log_of_commands(tmp_path: Path):
     path = tmp_path / "walk.csv"
     line = ["simulate", "--commands", log, "--output", path, "--robot-seed", 3, "--trial-seed", 4]
     assert record.main(list(map(str, line))) == 0
-    read = read_recording(path)
+    read = read_recording(path, load_robot())
     assert read.robot == virtual_robot.draw_robot(3).name
     assert read.time[-1] == pytest.approx(2.05)
     at = [read.command[round(100 * t)].tolist() for t in (0.0, 0.48, 0.5, 1.98, 2.0)]
@@ -226,7 +223,7 @@ def test_simulate_repeats_itself_by_its_seeds(tmp_path: Path):
 def test_simulate_sweeps(tmp_path: Path):
     line = ["simulate", "--suspended", "--levels", 5, "--hold", 0.5, "--output", tmp_path / "sweep.csv"]
     assert record.main(list(map(str, line))) == 0
-    read = read_recording(tmp_path / "sweep.csv")
+    read = read_recording(tmp_path / "sweep.csv", load_robot())
     assert read.kind == "suspended" and np.unique(read.command[:, 0]).tolist() == [0.0, 0.25, 0.5, 0.75, 1.0]
 
 
@@ -247,6 +244,6 @@ def test_every_named_gait_can_be_asked_for():
 def test_the_example_mapping_is_printed_and_documented(tmp_path: Path):
     line = [sys.executable, "-m", "ballu_mjx", "record", "example-mapping"]
     done = subprocess.run(line, capture_output=True, text=True, timeout=120, cwd=tmp_path)
-    assert done.returncode == 0 and done.stdout == EXAMPLE
+    assert done.returncode == 0 and done.stdout == example_mapping(load_robot())
     page = (Path(__file__).parents[2] / "docs" / "data.md").read_text()
-    assert EXAMPLE in page
+    assert example_mapping(load_robot()) in page

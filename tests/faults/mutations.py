@@ -261,19 +261,22 @@ def recording_fault(recording: Any) -> str | None:
         return "time"
     if not (finite(recording.command) and (recording.command >= 0).all() and (recording.command <= 1).all()):
         return "command"
-    for name in ("balloon_position", "base_position", "foot_position", "motor", "knee"):
-        value = getattr(recording, name)
+    named = {"tracked_position": recording.tracked_position, **recording.points, **recording.joint_angles}
+    for name, value in named.items():
         if value is not None and not (finite(value) and np.abs(value).max() <= 100 and len(value) == len(time)):
             return name
-    for value in (recording.balloon_quaternion, recording.base_quaternion):
+    for value in (recording.tracked_quaternion, *recording.orientations.values()):
         if value is None:
             continue
         if not (finite(value) and np.abs(np.linalg.norm(value, axis=1) - 1).max() < 1e-6):
             return "length of a quaternion"
         if ((value[1:] * value[:-1]).sum(axis=1) < 0).any():
             return "sign of a quaternion"
-    needed = ("motor", "knee") if recording.kind == "suspended" else ("balloon_position", "base_position")
-    if recording.kind not in ("free", "suspended") or any(getattr(recording, name) is None for name in needed):
+    from ballu_mjx.robots.registry import load_robot
+
+    robot = load_robot()
+    needed = robot.joints if recording.kind == "suspended" else ("tracked_position", *robot.points)
+    if recording.kind not in ("free", "suspended") or any(named.get(name) is None for name in needed):
         return "kind"
     return None if recording.robot.strip() and printable(recording.robot, recording.notes) else "text"
 
@@ -350,7 +353,8 @@ def evaluation_fault(found: Any) -> str | None:
     each = [*found.vanilla, *found.residual]
     numbers = [x for errors in each for table in (errors.position, errors.yaw) for pair in table.values() for x in pair]
     numbers += [x for e in each for x in (e.mean_com_error, e.final_yaw_error, e.mean_force)]
-    return None if finite(*numbers) and finite(found.score) and printable(*(e.recording for e in each)) else "numbers"
+    numbers = [x for x in [*numbers, found.score] if x != math.inf]  # of simulations that diverged
+    return None if finite(*numbers) and printable(*(e.recording for e in each)) else "numbers"
 
 
 def replay_fault(takes: Any) -> str | None:
@@ -386,16 +390,16 @@ def formats(work: Path) -> list[Format]:
     from ballu_mjx.cli.cached_stages import read_mark, write_mark
     from ballu_mjx.evaluation import transfer
     from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_recording
-    from ballu_mjx.recordings.importers.mapping import EXAMPLE, ROLES, read_mapping
+    from ballu_mjx.recordings.importers.mapping import example_mapping, read_mapping
+    from ballu_mjx.recordings.recording import cut
     from ballu_mjx.residuals.aerodynamics import AERODYNAMICS_FILE, AERODYNAMICS_FORMAT, read_air_parameters
     from ballu_mjx.residuals.trained import _read_observed
     from ballu_mjx.robots.description import read_description
     from ballu_mjx.robots.model import assets
+    from ballu_mjx.robots.registry import load_robot
 
-    whole = read_recording(list_bundled("test")[0])
-    fields = {field.name: getattr(whole, field.name) for field in dataclasses.fields(whole)}
-    cut = {name: value[:130] for name, value in fields.items() if isinstance(value, np.ndarray)}
-    short = dataclasses.replace(whole, **cut)
+    robot = load_robot()
+    short = cut(read_recording(list_bundled("test")[0], robot), slice(130))
 
     def place() -> Path:  # its name must not be that of the file, which messages are to name
         return Path(tempfile.mkdtemp(dir=work))
@@ -412,15 +416,19 @@ def formats(work: Path) -> list[Format]:
     ):
         folder = place()
         path = folder / f"walk{ending}"
-        write_recording(short, path)
-        add(name, folder / damaged, damages, lambda path=path: read_recording(path), recording_fault, share=share)
+        write_recording(short, path, robot)
+        add(
+            name,
+            folder / damaged,
+            damages,
+            lambda path=path: read_recording(path, robot),
+            recording_fault,
+            share=share,
+        )
     folder = place()
-    sweep = read_recording(list_bundled("suspended")[0])
-    fields = {field.name: getattr(sweep, field.name) for field in dataclasses.fields(sweep)}
-    cut = {name: value[:130] for name, value in fields.items() if isinstance(value, np.ndarray)}
-    write_recording(dataclasses.replace(sweep, **cut), folder / "sweep.csv")
-    add("suspended recording, .csv", folder / "sweep.csv", CSV, lambda p=folder / "sweep.csv": read_recording(p),
-        recording_fault)  # fmt: skip
+    sweep = folder / "sweep.csv"
+    write_recording(cut(read_recording(list_bundled("suspended")[0], robot), slice(130)), sweep, robot)
+    add("suspended recording, .csv", sweep, CSV, lambda p=sweep: read_recording(p, robot), recording_fault)
 
     folder = place()
     path = folder / ACTUATORS_FILE
@@ -431,12 +439,18 @@ def formats(work: Path) -> list[Format]:
     path.write_bytes((assets() / "ballu.robot.json").read_bytes())
     shutil.copy(assets() / "ballu.xml", folder)
     add("robot description", path, JSON, lambda path=path: read_description(path), description_fault)
-    folder = place()
+    folder, ballu = place(), read_description(assets() / "ballu.robot.json")
     path = folder / AERODYNAMICS_FILE
     values = dict.fromkeys(("centre", "linear_drag", "quadratic_drag", "turning_drag"), [0.01, 0.02, 0.03])
     values |= {"added_mass": 0.1, "added_inertia": 0.003, "lift": -0.004, "delay": 0.05}
     path.write_text(json.dumps({"format": AERODYNAMICS_FORMAT, "parameters": values, "windows": 3}))
-    add("air.json", path, JSON, lambda path=path: read_air_parameters(path), air_fault)
+    add(
+        "air.json",
+        path,
+        JSON,
+        lambda path=path: read_air_parameters(path, ballu),
+        air_fault,
+    )
     folder = place()
     path = folder / "observed.json"
     path.write_text(json.dumps({"low": [-0.5] * 87, "high": [0.5] * 87}))
@@ -456,17 +470,17 @@ def formats(work: Path) -> list[Format]:
 
     folder = place()
     path = folder / "room.toml"
-    path.write_text(EXAMPLE)
-    add("mapping, TOML", path, TEXT, lambda path=path: read_mapping(path), mapping_fault)
+    path.write_text(example_mapping(robot))
+    add("mapping, TOML", path, TEXT, lambda path=path: read_mapping(path, robot), mapping_fault)
     folder = place()
     path = folder / "room.json"
     offset = {"offset": [0.1, 0, 0], "turn": [0, 0, 90]}
     tables = {"balloon": {"markers": ["a", "b", "c"], "geometry": [[0.1, 0, 0], [0, 1, 0], [0, 0, 1]], **offset}}
-    tables |= {role: {"body": f"ballu:{role}"} for role in ROLES[1:]}
+    tables |= {point: {"body": f"ballu:{point}"} for point in robot.points}
     tables |= {"knee_left": {"column": "kl", "sign": -1, "zero": 3.5}, "commands": {"range_left": [0, 90]}}
     content = {"robot": ROBOT, "axes": {"forward": "x"}, "origin": {"floor": 0.1}, "units": {"length": "mm"}, **tables}
     path.write_text(json.dumps(content))
-    add("mapping, JSON", path, JSON, lambda path=path: read_mapping(path), mapping_fault)
+    add("mapping, JSON", path, JSON, lambda path=path: read_mapping(path, robot), mapping_fault)
 
     found += _import_formats(place, short)
     folder = place()
@@ -513,6 +527,7 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
             StoredRollout(
                 name=name,
                 robot=robot_name,
+                description=load_robot(),
                 time=0.05 * np.arange(12),
                 qpos={"recording": qpos(), "vanilla": qpos()},
                 command=np.full((11, 2), 0.5),
@@ -532,7 +547,7 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
         """As the commands that show, compare, evaluate or go on with a run do, but for its checkpoints."""
         config = read_config(folder, "envmimic")
         found = [
-            typed_config(EnvMimicConfig, config, "env", folder, check_envmimic_config),
+            typed_config(EnvMimicConfig, config, "env", folder, lambda read: check_envmimic_config(read, 0.05)),
             typed_config(PPOConfig, config, "ppo", folder, ppo.check_values),
         ]
         run_actuators(config, folder, load_robot())
@@ -591,37 +606,37 @@ def _import_formats(place: Callable[[], Path], short: Any) -> list[Format]:
 
     from ballu_mjx.cli import record
     from ballu_mjx.recordings.csv_format import read_recording, sidecar_path
-    from ballu_mjx.recordings.importers.mapping import ROLES
+    from ballu_mjx.robots.registry import load_robot
 
-    feet, count = short.foot_position, len(short.time)
-    positions = dict(zip(ROLES, (short.balloon_position, short.base_position, feet[:, 0], feet[:, 1]), strict=True))
-    turn = Rotation.from_quat(short.balloon_quaternion, scalar_first=True)
+    count, positions = len(short.time), {"balloon": short.tracked_position, **short.points}
+    roles = tuple(positions)
+    turn = Rotation.from_quat(short.tracked_quaternion, scalar_first=True)
 
     def rows(header: Sequence[str], *columns: np.ndarray) -> str:
         table = np.column_stack(columns)
         return "\n".join([*header, *(",".join(f"{x:.7g}" for x in row) for row in table)]) + "\n"
 
     log = rows(["time,command_left,command_right"], short.time, short.command)
-    bodies = "\n".join(f'[{role}]\nbody = "ballu:{role}"' for role in ROLES)
-    names = ",".join(f"ballu:{role},,,,," for role in ROLES)
+    bodies = "\n".join(f'[{role}]\nbody = "ballu:{role}"' for role in roles)
+    names = ",".join(f"ballu:{role},,,,," for role in roles)
     units = ",".join(["deg,deg,deg,mm,mm,mm"] * 4)
     vicon = rows(
         ["Segments", "100", f",,{names}", "Frame,Sub Frame," + ",".join(["RX,RY,RZ,TX,TY,TZ"] * 4), f",,{units}"],
         np.arange(1, count + 1),
         np.zeros(count),
-        *(np.column_stack([np.rad2deg(turn.as_rotvec()), 1e3 * positions[role]]) for role in ROLES),
+        *(np.column_stack([np.rad2deg(turn.as_rotvec()), 1e3 * positions[role]]) for role in roles),
     )
     table = rows(
         ["time,bx,by,bz,bw,bi,bj,bk,px,py,pz,lx,ly,lz,rx,ry,rz,command_left,command_right"],
         short.time,
         positions["balloon"],
-        short.balloon_quaternion,
-        *(positions[role] for role in ROLES[1:]),
+        short.tracked_quaternion,
+        *(positions[role] for role in roles[1:]),
         short.command,
     )
     columns = '[balloon]\nposition = ["bx", "by", "bz"]\norientation = ["bw", "bi", "bj", "bk"]\n'
     columns += 'rotation = "quaternion"\n' + "\n".join(
-        f'[{role}]\nposition = ["{x}x", "{x}y", "{x}z"]' for role, x in zip(ROLES[1:], "plr", strict=True)
+        f'[{role}]\nposition = ["{x}x", "{x}y", "{x}z"]' for role, x in zip(roles[1:], "plr", strict=True)
     )
     top = f'robot = "{ROBOT}"\n'
 
@@ -654,7 +669,7 @@ def _import_formats(place: Callable[[], Path], short: Any) -> list[Format]:
             for path in (output, sidecar_path(output)):
                 path.unlink(missing_ok=True)
             record._import(options)
-            return read_recording(output)
+            return read_recording(output, load_robot())
 
         written = (output, sidecar_path(output))
         found.append(Format(name, folder / damaged, damages, read, recording_fault, share, written))
@@ -671,7 +686,7 @@ def _import_formats(place: Callable[[], Path], short: Any) -> list[Format]:
         return found
     cluster = np.array([[0.1, 0, 0], [0, 0.1, 0], [-0.1, 0, 0], [0, 0, 0.1]])
     markers = {f"B{i}": positions["balloon"] + turn.apply(corner) for i, corner in enumerate(cluster)}
-    markers |= {f"ballu:{role}": positions[role] for role in ROLES[1:]}
+    markers |= {f"ballu:{role}": positions[role] for role in roles[1:]}
     points = np.stack([1e3 * value.T for value in markers.values()], axis=1)
     content = ezc3d.c3d()
     for key, value in (("RATE", [100.0]), ("LABELS", list(markers)), ("UNITS", ["mm"])):
@@ -692,7 +707,14 @@ def _write_weights(folder: Path) -> Path:
     arrays: dict[str, np.ndarray] = {"mean": np.zeros(28), "std": np.ones(28), "observation_clip": np.array(10.0)}
     for i, (rows, columns) in enumerate(zip(sizes, sizes[1:], strict=False)):
         arrays |= {f"kernel_{i}": random.normal(size=(rows, columns)), f"bias_{i}": np.zeros(columns)}
-    arrays = {name: value.astype(np.float32) for name, value in arrays.items()} | {"activation": np.array("swish")}
+    levels = {"command_low": np.zeros(2), "command_high": np.ones(2), "command_rest": np.zeros(2)}
+    arrays |= levels | {"control_timestep": np.array(0.05), "full_travel": np.array(0.2)}
+    arrays = {name: value.astype(np.float32) for name, value in arrays.items()} | {
+        "activation": np.array("swish"),
+        "anchored": np.array(False),
+        "names": np.array(["balloon", "base", "foot_left", "foot_right"]),
+        "commands": np.array(["left", "right"]),
+    }
     np.savez(folder / "weights.npz", **arrays)  # pyright: ignore[reportArgumentType]
     return folder / "weights.npz"
 

@@ -105,6 +105,7 @@ def main() -> int:
     from ballu_mjx.cli import train_envmimic
     from ballu_mjx.residuals.envmimic import EnvMimicConfig
     from ballu_mjx.rl.ppo import PPOConfig
+    from ballu_mjx.rl.training_loop import TrainingInterrupted
 
     sizes = dict(train_envmimic.QUICK) if options.quick else {}
     steps = round(60 * options.minutes * options.rate)
@@ -116,7 +117,10 @@ def main() -> int:
         data = train_envmimic.Data(output=output, quick=options.quick)
         # Shells start what runs in the background with this signal ignored.
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        status = train_envmimic.train(data, EnvMimicConfig(), config)
+        try:
+            status = train_envmimic.train(data, EnvMimicConfig(), config)
+        except TrainingInterrupted as stopped:
+            status = stopped.status
     if len(sampler.samples) < 3:
         print(f"The training ended before there was anything to see, with {status}.", file=sys.stderr)
         return 1

@@ -32,10 +32,14 @@ def undisturbed(at: Trainer) -> Path:
 
 
 def test_a_killed_training_ends_as_if_nothing_had_happened(at: Trainer, undisturbed: Path):
-    folder, random = at.work / "often", np.random.default_rng()
+    random = np.random.default_rng(0)
     moments = [(int(random.integers(first, 20)), random.uniform(0.0, 0.2)) for first in (campaign.EVERY + 1, 1, 1)]
-    assert all([at.kill(folder, *moment) for moment in moments[:2]]), "the training was over before it was killed"
-    at.kill(folder, *moments[2])
+    for attempt in range(10):  # a busy machine may let a training end before it is killed: then anew
+        folder = at.work / f"often-{attempt}"
+        if all([at.kill(folder, *moment) for moment in moments]):
+            break
+    else:
+        pytest.fail("ten trainings were over before they were killed")
     at.finish(folder)
     rows, _ = campaign.outcome(folder)
     steps = [row["step"] for row in rows if "total_loss" in row]
@@ -70,7 +74,7 @@ def test_a_second_process_is_refused_until_the_first_is_killed(at: Trainer):
 def test_no_damage_to_the_last_checkpoint_passes_for_its_content(undisturbed: Path, tmp_path: Path, capsys):
     """Every file of it, cut off or with a bit turned: what is read is what was written, or the checkpoint before."""
     last, before = (_read(undisturbed, step, training=True) for step in reversed(list_checkpoints(undisturbed)[-2:]))
-    random, fallen = np.random.default_rng(), 0
+    random, fallen = np.random.default_rng(0), 0
     for file in campaign.checkpoint_files(undisturbed):
         folder = tmp_path / "copy"
         shutil.copytree(undisturbed / "checkpoints", folder / "checkpoints")

@@ -18,6 +18,7 @@ import pytest
 from ballu_mjx.cli import compare, record
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.checkpoints import file_checksums, last_checkpoint, record_checksum, restore_checkpoint
 from ballu_mjx.runs.folder import Run
 from ballu_mjx.runs.layout import RUN_FORMAT
@@ -156,6 +157,6 @@ def test_no_recording_runs_code(tmp_path: Path, found_classes: list[str]):
         (tmp_path / name).write_bytes(pickle.dumps(Bomb(mark)))
         path = tmp_path / ("walk.csv" if name == "walk.csv" else "walk.csv.gz")
         with pytest.raises(InputError):
-            read_recording(path)
+            read_recording(path, load_robot())
         assert record.main(["check", str(path)]) == 2
     assert not mark.exists() and not found_classes

@@ -1,7 +1,9 @@
 """The exported controller: alone on NumPy it is the policy, and nothing it is given gets past its limits."""
 
 import ast
+import dataclasses
 import importlib.util
+import json
 import math
 import re
 import subprocess
@@ -11,23 +13,39 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from rover import write_rover
 
 from ballu_mjx.cli import export as export_command
 from ballu_mjx.cli import train_policy
 from ballu_mjx.cli.export import Options
 from ballu_mjx.policies.deploy import controller, estimator, export
-from ballu_mjx.policies.deploy.controller import CONTROL_PERIOD, FULL_TRAVEL, TIMEOUT, Controller
+from ballu_mjx.policies.deploy.controller import TIMEOUT, Controller, observation_names
 from ballu_mjx.policies.deploy.estimator import Capture
-from ballu_mjx.policies.locomotion_env import OBSERVATIONS, LocomotionConfig, locomotion_observation
-from ballu_mjx.policies.policy import ACTIONS, Policy
+from ballu_mjx.policies.locomotion_env import LocomotionConfig, locomotion_observation, num_observations
+from ballu_mjx.policies.policy import Policy
+from ballu_mjx.residuals.aerodynamics import (
+    AERODYNAMICS_FILE,
+    AERODYNAMICS_FORMAT,
+    Aerodynamics,
+    AirParameters,
+    air_parameters_to_json,
+)
+from ballu_mjx.residuals.aerodynamics_fit import AirConfig
 from ballu_mjx.residuals.run_config import describe_run
+from ballu_mjx.residuals.trained import write_observed
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Normalizer, Params, PPOConfig
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.folder import Run
 
-LIMIT = CONTROL_PERIOD / FULL_TRAVEL
+BALLU = load_robot()
+NAMES = ("balloon", "base", "foot_left", "foot_right")
+FULL_TRAVEL = 0.2
+LIMIT = BALLU.control_timestep / FULL_TRAVEL
 CLEAN = """
 import sys
 
@@ -48,18 +66,22 @@ np.save(sys.argv[3], [controller.act(row) for row in features])
 """Runs an exported policy where there is nothing but NumPy."""
 
 
-def write_run(folder: Path, task: str = "walk", **settings: Any) -> Path:
-    """A run whose policy is drawn at random, with commands all over [0, 1]."""
+def write_run(
+    folder: Path, task: str = "walk", robot: RobotDescription = BALLU, residual: Path | None = None, **settings: Any
+) -> Path:
+    """A run whose policy is drawn at random, with commands all over their ranges."""
     config = PPOConfig(policy_layers=(16, 12), value_layers=(4,), **settings)
-    networks = ppo.make_networks(OBSERVATIONS, ACTIONS, config)
+    observations = num_observations(robot)
+    networks = ppo.make_networks(observations, len(robot.commands), config)
     tree: Any = jax.device_get(networks.policy_network.init(jax.random.key(1)))
     tree["params"]["Dense_0"]["kernel"] = 100.0 * tree["params"]["Dense_0"]["kernel"]
     rng = np.random.default_rng(2)
-    moments = ({"state": rng.uniform(0.1, 0.5, OBSERVATIONS).astype(np.float32)} for _ in range(3))
+    moments = ({"state": rng.uniform(0.1, 0.5, observations).astype(np.float32)} for _ in range(3))
     normalizer = Normalizer(np.float32(100.0), *moments)  # pyright: ignore[reportArgumentType]
     value = jax.device_get(networks.value_network.init(jax.random.key(3)))
     sections = {"env": LocomotionConfig(), "ppo": config, "data": train_policy.Data()}
-    content = describe_run(task, sections, {}, []) | {"residual": None}
+    content = describe_run(task, sections, {}, [], description=robot)
+    content["residual"] = None if residual is None else str(residual)
     with Run(folder, content) as run:
         run.save(7, ppo.as_tree(Params(normalizer, tree, value)), -1.0)
     return folder
@@ -89,7 +111,8 @@ def frame_at(time: float) -> dict[str, np.ndarray]:
         "balloon_position": np.array([0.1, 0.0, 1.1]) + 0.2 * sway,
         "balloon_quaternion": np.array([np.cos(sway[0]), 0.0, 0.0, np.sin(sway[0])]),
         "base_position": np.array([0.1, 0.0, 0.75]) + 0.1 * sway,
-        "foot_position": np.array([sway, -sway]),
+        "foot_left_position": sway,
+        "foot_right_position": -sway,
     }
 
 
@@ -155,18 +178,19 @@ def test_observation_is_named_and_that_of_training():
         np.testing.assert_allclose(
             controller.observation(row), locomotion_observation(jax.numpy.asarray(row)), atol=1e-5
         )
-    assert len(controller.OBSERVATION) == len(set(controller.OBSERVATION)) == OBSERVATIONS
+    names = observation_names(NAMES)
+    assert len(names) == len(set(names)) == num_observations(BALLU)
     row = np.zeros(27)
     row[[2, 13, 7]] = 1.1, 0.3, 0.2
-    seen = dict(zip(controller.OBSERVATION, controller.observation(row), strict=True))
-    names = ("balloon position z, m", "base velocity y, m/s", "balloon pitch, rad", "cosine of balloon yaw")
-    assert [seen[name] for name in names] == [1.1, 0.3, 0.2, 1.0]
+    seen = dict(zip(names, controller.observation(row), strict=True))
+    some = ("balloon position z, m", "base velocity y, m/s", "balloon pitch, rad", "cosine of balloon yaw")
+    assert [seen[name] for name in some] == [1.1, 0.3, 0.2, 1.0]
 
 
-def test_steps_are_those_of_the_policy_controller(exported: Path):
+def test_steps_are_those_of_the_policy_on_estimates(exported: Path):
     """Frame by frame at 100 Hz, some hidden: the policy on `estimator.estimate`'s features every 50 ms."""
     robot = Controller(exported, full_travel=1e-3)  # in effect without the limit
-    capture = Capture([], [], [], [], [], [], [])
+    capture = Capture(NAMES)
     start, rng = 1.7e9, np.random.default_rng(5)
     for number in range(300):
         frame = frame_at(number * 0.01)
@@ -174,8 +198,8 @@ def test_steps_are_those_of_the_policy_controller(exported: Path):
             if number > 3 and rng.uniform() < 0.2:
                 values[...] = np.nan
         capture.time.append(number * 0.01)
-        for name, values in frame.items():
-            getattr(capture, name).append(values)
+        capture.position.append(np.stack([frame[f"{name}_position"] for name in NAMES]))
+        capture.quaternion.append(frame["balloon_quaternion"])
         command = robot.step(start + number * 0.01, frame)
         if number % 5 == 0:
             assert robot.status == "running"
@@ -217,8 +241,8 @@ def without(name: str, value: Any) -> Callable[[float], Any]:
         without("base_position", [np.inf, 0, 0]),
         without("base_position", [1e9, 0, 0]),
         without("base_position", None),
-        without("foot_position", np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])),
-        without("foot_position", np.zeros(3)),
+        without("foot_right_position", np.array([np.nan, 0.0, 0.0])),
+        without("foot_left_position", np.zeros((2, 3))),
         without("balloon_quaternion", np.zeros(4)),
         without("balloon_quaternion", ["w", "x", "y", "z"]),
     ],
@@ -308,11 +332,11 @@ def test_command_refuses_what_it_cannot_use(run: Path, tmp_path: Path, capsys: p
     (tmp_path / "other" / "config.json").write_text('{"format": "ballu-run/1", "task": "envmimic"}')
     for arguments, words in (
         ([tmp_path / "nothing"], "there is no run"),
-        ([tmp_path / "other"], "is of a run of 'envmimic'"),
+        ([tmp_path / "other"], "is a residual (envmimic)"),
         ([run, "--output", tmp_path / "full", "--no-open-loop"], "not empty"),
         ([run, "--seconds", "0"], "--seconds"),
         ([run, "--pulse-low", "-1"], "--pulse-low"),
-        ([run, "--pulse-low", "1500", "--pulse-high", "1500"], "would not move"),
+        ([run, "--pulse-low", "1500", "--pulse-high", "1500"], "nothing would move"),
     ):
         assert export_command.main(list(map(str, arguments))) == 2
         error = capsys.readouterr().err
@@ -322,7 +346,9 @@ def test_command_refuses_what_it_cannot_use(run: Path, tmp_path: Path, capsys: p
 
 def test_commands_are_written_as_pulses(tmp_path: Path):
     commands = np.array([[0.0, 1.0], [0.5, 0.25]])
-    export._write_commands(tmp_path / "commands.csv", commands, Options(tmp_path, pulse_low=900, pulse_high=2100))
+    export._write_commands(
+        tmp_path / "commands.csv", commands, BALLU, Options(tmp_path, pulse_low=900, pulse_high=2100)
+    )
     assert (tmp_path / "commands.csv").read_text().splitlines() == [
         "time,command_left,command_right,pulse_left_us,pulse_right_us",
         "0.00,0.0000,1.0000,900.0,2100.0",
@@ -334,6 +360,81 @@ def test_readme_tells_of_the_run(exported: Path):
     text = (exported / "README.txt").read_text()
     assert "task 'walk'" in text and "step 7" in text and "27: sine of balloon yaw" in text
     assert max(map(len, text.splitlines())) <= 120
+
+
+def test_readme_tells_the_delay_of_training(tmp_path: Path):
+    """With the air's delay, which training has in its commands, the README said that there was none."""
+    text = (export.export_policy(Options(write_run(tmp_path / "plain"), open_loop=False)) / "README.txt").read_text()
+    assert "trained without delay" in text
+    air = dataclasses.replace(AirParameters.none(), delay=jnp.asarray(0.045))
+    with Run(tmp_path / "air", describe_run("aerodynamic", {"fit": AirConfig()}, {}, [])) as made:
+        content = {"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(air)}
+        made.write(AERODYNAMICS_FILE, json.dumps(content))
+        size = Aerodynamics(BALLU, BALLU.load_model()).inputs(jnp.zeros((3, 27)), jnp.zeros((3, 2))).shape[0]
+        write_observed(made, np.zeros((2, size)))
+    delayed = write_run(tmp_path / "delayed", residual=tmp_path / "air")
+    text = (export.export_policy(Options(delayed, open_loop=False)) / "README.txt").read_text()
+    assert "trained with a delay of 45 ms" in text and "without delay" not in text
+    assert "simulator 'aerodynamic'" in text
+
+
+@pytest.mark.parametrize("stuck", ["balloon_position", "balloon_quaternion", "foot_right_position"])
+def test_a_pose_that_does_not_change_relaxes(exported: Path, monkeypatch: pytest.MonkeyPatch, stuck: str):
+    """A stream that repeats its last frame, of one marker too, is no measurement."""
+    robot = Controller(exported)
+    monkeypatch.setattr(robot, "act", lambda features: np.ones(2))
+    frames = [frame_at(number * 0.01) for number in range(101)]
+    for number, frame in enumerate(frames):
+        robot.step(number * 0.01, frame)
+    assert robot.command.tolist() == [1.0, 1.0]
+    for number in range(101, 170):
+        command = robot.step(number * 0.01, frame_at(number * 0.01) | {stuck: frames[-1][stuck]})
+        assert command == (1.0, 1.0) or number * 0.01 > 1.0 + TIMEOUT - 0.001
+    assert command == (0.0, 0.0)
+    assert robot.status.startswith("relaxed: ") and "unchanged" in robot.status
+    for number in range(170, 200):
+        command = robot.step(number * 0.01, frame_at(number * 0.01))
+    assert command == (1.0, 1.0) and robot.status == "running"
+
+
+def test_a_policy_of_another_robot_is_exported(tmp_path: Path):
+    """Names, ranges, control rate and resting commands are those of its description, in files and controller."""
+    rover = write_rover(tmp_path)
+    folder = export.export_policy(Options(write_run(tmp_path / "run", robot=rover), open_loop=False))
+    done = subprocess.run([sys.executable, "controller.py"], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0 and "Passed." in done.stdout, done.stdout + done.stderr
+    robot = Controller(folder)
+    assert (robot.names, robot.commands, robot.period) == (("hull", "tip"), ("arm", "push"), 0.04)
+    assert robot.step(0.0, None) == (0.3, 1.0)  # the keyframe's
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(200, rover.features))
+    commands = np.array([robot.act(row) for row in features])
+    act = Policy.load(tmp_path / "run").act()
+    np.testing.assert_allclose(commands, [act(row) for row in features], atol=1e-4)
+    assert commands.min(axis=0) == pytest.approx([-0.4, 0.0]) and commands.max(axis=0) == pytest.approx([0.6, 10.0])
+    for number in range(50):
+        frame = {"hull_position": rng.normal(size=3), "tip_position": rng.normal(size=3)}
+        frame["hull_quaternion"] = np.array([1.0, *rng.normal(0, 0.1, 3)])
+        robot.step(number * 0.04, frame)
+    assert robot.steps == 50 and robot.status == "running"
+    text = (folder / "README.txt").read_text()
+    for words in (
+        "policy for rover",
+        "arm from -0.4 to 0.6",
+        "push from 0 to 10, at rest 1",
+        "every 0.04 s",
+        "hull yaw",
+    ):
+        assert words in text, words
+    assert not re.search("balloon|servo|knee|foot", text)
+    assert max(map(len, text.splitlines())) <= 120
+
+
+def test_a_policy_of_an_anchored_robot_sees_the_world():
+    features = jnp.asarray(np.random.default_rng(0).normal(size=15), jnp.float32)
+    seen = controller.observation(np.asarray(features), anchored=True)
+    np.testing.assert_allclose(seen, locomotion_observation(features, anchored=True), atol=1e-6)
+    np.testing.assert_allclose(seen[:3], features[:3], atol=1e-6)
 
 
 def test_export_can_be_imported_from_anywhere(exported: Path, monkeypatch: pytest.MonkeyPatch):

@@ -1,7 +1,6 @@
 """Locomotion tasks: what they reward, what their simulators are made of, and the residual's place in them."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +9,16 @@ import numpy as np
 import pytest
 
 from ballu_mjx.ballu.features import foot_positions
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP, KNEES, MOTORS, ActuatorParameters, load_model, standing_qpos
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, KNEES, MOTORS, ActuatorParameters, standing_qpos
 from ballu_mjx.policies.closed_loop import ClosedLoop
-from ballu_mjx.policies.locomotion_env import LocomotionConfig, LocomotionEnv, locomotion_observation, setting_of
+from ballu_mjx.policies.locomotion_env import (
+    LocomotionConfig,
+    LocomotionEnv,
+    LocomotionState,
+    locomotion_observation,
+    locomotion_state,
+    make_setting,
+)
 from ballu_mjx.policies.tasks import TASKS, Step
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.network import NetworkForces
@@ -20,10 +26,12 @@ from ballu_mjx.residuals.trained import MARGIN, TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.learner import Learner
 from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, heading_rotation
 from ballu_mjx.sim.step import state_at
 
-MODEL = load_model()
+BALLU = load_robot()
+MODEL = BALLU.load_model()
 INPUTS = 87
 """Of the residual: three steps of 27 features, and three commands."""
 
@@ -33,6 +41,7 @@ def make_residual(action: np.ndarray, width: float = 1e6) -> TrainedResidual:
     bound = np.full(INPUTS, width, np.float32)
     forces = NetworkForces(
         EnvMimicConfig(),
+        load_robot(),
         infer=lambda params, seen: jnp.asarray(action, jnp.float32),
         sample=lambda params, seen, key: jnp.asarray(action, jnp.float32) + jax.random.normal(key, (3,)),
     )
@@ -45,11 +54,11 @@ def make_residual(action: np.ndarray, width: float = 1e6) -> TrainedResidual:
     )
 
 
-def inner(state) -> Any:
-    return state.pipeline_state
+def inner(state) -> LocomotionState:
+    return locomotion_state(state)
 
 
-PLAIN = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig())
+PLAIN = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig())
 RESET, STEP = jax.jit(lambda setting, key: PLAIN._start(setting, key)), jax.jit(PLAIN.step)
 """Compiled once: what tells one simulator from another travels in the state."""
 
@@ -65,7 +74,7 @@ def test_reward_is_the_mean_velocity_of_the_robot_in_c_mujoco():
     data = mujoco.MjData(MODEL)
     for number in range(20):
         # From the same state every time: over a second a foot's contact may come a step earlier in one of the two.
-        physics = inner(state)["physics"]
+        physics = inner(state).rollout.physics
         data.qpos[:], data.qvel[:] = physics.qpos, physics.qvel
         mujoco.mj_forward(MODEL, data)
         before = data.subtree_com[1].copy()
@@ -96,16 +105,16 @@ def test_randomization_draws_friction_and_start_and_is_off_by_default():
     keys = jax.random.split(jax.random.key(1), 200)
     draw = jax.jit(jax.vmap(PLAIN._start, in_axes=(None, 0)))
     plain = inner(draw(PLAIN.setting, keys))
-    assert np.unique(plain["friction"]).tolist() == pytest.approx([0.9])
-    assert np.ptp(plain["physics"].qpos, axis=0).max() == 0 and np.abs(plain["physics"].qvel).max() == 0
+    assert np.unique(plain.friction).tolist() == pytest.approx([0.9])
+    assert np.ptp(plain.rollout.physics.qpos, axis=0).max() == 0 and np.abs(plain.rollout.physics.qvel).max() == 0
 
     config = LocomotionConfig(domain_randomization=True)
-    drawn = inner(draw(setting_of(MODEL, config, None), keys))
+    drawn = inner(draw(make_setting(BALLU, MODEL, config, None), keys))
     low, high = config.friction
-    assert low <= drawn["friction"].min() < low + 0.05 and high - 0.05 < drawn["friction"].max() <= high
-    yaw = np.rad2deg(np.asarray(drawn["history"])[:, -1, 8])
+    assert low <= drawn.friction.min() < low + 0.05 and high - 0.05 < drawn.friction.max() <= high
+    yaw = np.rad2deg(np.asarray(drawn.rollout.history)[:, -1, 8])
     assert config.start_yaw * 0.9 < yaw.max() <= config.start_yaw + 1 and yaw.min() < -config.start_yaw * 0.9
-    knees = np.asarray(drawn["physics"].qpos)[:, 7:][:, KNEES]
+    knees = np.asarray(drawn.rollout.physics.qpos)[:, 7:][:, KNEES]
     assert (knees >= standing_qpos(MODEL)[7:][KNEES] - 1e-6).all()
 
 
@@ -114,13 +123,14 @@ def test_friction_drawn_is_friction_felt():
     state = RESET(PLAIN.setting, jax.random.key(0))
     way = []
     for friction in (0.2, 1.0):
-        thrown = inner(state)["physics"]
+        thrown = inner(state).rollout.physics
         thrown = thrown._replace(qvel=thrown.qvel.at[0].set(1.0))
-        pushed = inner(state) | {"friction": jnp.float32(friction), "physics": thrown}
+        rollout = inner(state).rollout._replace(physics=thrown)
+        pushed = inner(state)._replace(friction=jnp.full_like(inner(state).friction, friction), rollout=rollout)
         now = dataclasses.replace(state, pipeline_state=pushed)
         for _ in range(10):
             now = STEP(now, -jnp.ones(2))
-        way.append(float(inner(now)["history"][-1, 15]))
+        way.append(float(inner(now).rollout.history[-1, 15]))
     assert way[0] > way[1] + 0.02
 
 
@@ -128,20 +138,20 @@ def test_identified_actuators_are_in_the_simulator_and_pass_from_episode_to_epis
     nominal = ActuatorParameters.nominal(MODEL)
     weak = dataclasses.replace(nominal, torque_limit=nominal.torque_limit * jnp.array([0.1, 1.0]))
     reached = []
-    for setting in (PLAIN.setting, setting_of(MODEL, LocomotionConfig(), weak)):
+    for setting in (PLAIN.setting, make_setting(BALLU, MODEL, LocomotionConfig(), weak)):
         state = STEP(RESET(setting, jax.random.key(0)), jnp.ones(2))
-        state = RESET(inner(state)["setting"], jax.random.key(1))
+        state = RESET(inner(state).setting, jax.random.key(1))
         for _ in range(20):
             state = STEP(state, jnp.ones(2))
-        reached.append(np.asarray(inner(state)["physics"].qpos)[7:][MOTORS])
+        reached.append(np.asarray(inner(state).rollout.physics.qpos)[7:][MOTORS])
     left, right = np.rad2deg(reached[0] - reached[1])
     assert left > 15 and abs(right) < left / 3
 
 
 def test_residual_pushes_in_the_balloon_s_heading_and_only_so_hard():
     action, yaw = np.array([0.5, 0.2, -0.1]), 2.0
-    env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(), residual=make_residual(action))
-    simulator, zeros = env.simulator, jnp.zeros(MODEL.nv)
+    env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(), residual=make_residual(action))
+    simulator, zeros = env.simulator.simulator, jnp.zeros(MODEL.nv)
     qpos = standing_qpos(MODEL)
     qpos[3:7] = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
     qpos = jnp.asarray(qpos, jnp.float32)
@@ -151,7 +161,7 @@ def test_residual_pushes_in_the_balloon_s_heading_and_only_so_hard():
     force = turn @ (EnvMimicConfig().force_scale * action)
     pushed = jax.jit(lambda wrench: simulator.step(state_at(qpos, zeros), jnp.zeros(2), wrench))
     expected = pushed(jnp.asarray([[*force, 0, 0, 0]], jnp.float32))
-    np.testing.assert_allclose(inner(state)["physics"].qvel, expected.qvel, atol=1e-5)
+    np.testing.assert_allclose(inner(state).rollout.physics.qvel, expected.qvel, atol=1e-5)
     assert np.abs(np.asarray(expected.qvel - pushed(jnp.zeros((1, 6))).qvel)).max() > 1e-3
     assert float(state.metrics["force"]) == pytest.approx(np.linalg.norm(force), rel=1e-5)
 
@@ -163,16 +173,19 @@ def test_force_fades_outside_of_what_the_residual_has_seen():
     width = 1.0
     residual = make_residual(np.array([1.0, 0.0, 0.0]), width)
     expected = (2.0 - width) / (2 * width) - MARGIN
-    assert float(residual.excess(history, commands)) == pytest.approx(expected, rel=1e-5)
-    assert float(residual.excess(jnp.zeros((HISTORY, 27)), commands)) == 0.0
+    assert float(residual.out_of_range(history, commands)) == pytest.approx(expected, rel=1e-5)
+    assert float(residual.out_of_range(jnp.zeros((HISTORY, 27)), commands)) == 0.0
 
-    far, key = history, jax.random.key(0)
     forces = []
     for decay in (0.0, 3.0):
-        env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(residual_decay=decay), residual=residual)
-        wrench, excess = env._wrench(far, commands, key)
-        assert float(excess) == pytest.approx(expected, rel=1e-5)
-        forces.append(float(jnp.linalg.norm(wrench)))
+        env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(residual_decay=decay), residual=residual)
+        state = PLAIN.reset(jax.random.key(0))
+        rollout = inner(state).rollout._replace(history=history)
+        state = jax.jit(env.step)(
+            dataclasses.replace(state, pipeline_state=inner(state)._replace(rollout=rollout)), -jnp.ones(2)
+        )
+        assert float(state.metrics["excess"]) == pytest.approx(expected, rel=1e-5)
+        forces.append(float(state.metrics["force"]))
     assert forces[0] == pytest.approx(EnvMimicConfig().force_scale, rel=1e-5)
     assert forces[1] == pytest.approx(forces[0] * np.exp(-3.0 * expected), rel=1e-5)
 
@@ -194,8 +207,8 @@ def test_one_program_serves_all_residuals_of_a_kind():
         inputs = np.random.default_rng(seed).normal(size=(50, INPUTS)).astype(np.float32)
         params = ppo.initial_policy(inputs, action, dataclasses.replace(network, seed=seed))
         seen = inputs.min(axis=0), inputs.max(axis=0)
-        learned = TrainedResidual(NetworkForces(EnvMimicConfig(), infer), params, seen, 0, actuators)
-        env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(), actuators=actuators, residual=learned)
+        learned = TrainedResidual(NetworkForces(EnvMimicConfig(), load_robot(), infer), params, seen, 0, actuators)
+        env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(), actuators=actuators, residual=learned)
         learner = Learner(env, sizes)
         state = jax.eval_shape(learner._first, jax.random.PRNGKey(0), learner._contents)
         training.append(learner._step.lower(state, learner._contents).as_text())
@@ -208,9 +221,9 @@ def test_one_program_serves_all_residuals_of_a_kind():
 
 def test_closed_loop_is_the_environment_step_by_step():
     infer = lambda params, seen: params.value * jnp.sin(10 * seen[:2])  # noqa: E731
-    env = LocomotionEnv(MODEL, TASKS["walk"], LocomotionConfig(domain_randomization=True))
+    env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(domain_randomization=True))
     loop = ClosedLoop(env, infer)
-    still, start = (inner(RESET(x.setting, jax.random.key(k)))["physics"] for x, k in ((PLAIN, 0), (env, 3)))
+    still, start = (inner(RESET(x.setting, jax.random.key(k))).rollout.physics for x, k in ((PLAIN, 0), (env, 3)))
     qpos, qvel = (np.stack([x] * 8 + [y]) for x, y in ((still.qpos, start.qpos), (still.qvel, start.qvel)))
     rollout = loop(GAIN, qpos, qvel, 5)  # the last one is of a batch of its own
     state = jax.jit(env.at)(jnp.asarray(qpos[-1]), jnp.asarray(qvel[-1]), jax.random.key(0))
@@ -218,7 +231,7 @@ def test_closed_loop_is_the_environment_step_by_step():
         action = 0.8 * jnp.sin(10 * jnp.asarray(state.obs)[:2])
         np.testing.assert_allclose(rollout.command[-1, number], (action + 1) / 2, atol=1e-5)
         state = STEP(state, action)
-        np.testing.assert_allclose(rollout.com[-1, number + 1], inner(state)["com"], atol=1e-4)
+        np.testing.assert_allclose(rollout.com[-1, number + 1], inner(state).com, atol=1e-4)
         assert rollout.reward[-1, number] == pytest.approx(float(state.reward), abs=1e-3)
     assert rollout.qpos.shape == (9, 6, MODEL.nq) and rollout.reward.shape == (9, 5)
     data = mujoco.MjData(MODEL)

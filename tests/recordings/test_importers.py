@@ -16,16 +16,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from ballu_mjx.ballu.recordings import FOOT_RADIUS
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.importers.c3d import read_c3d
-from ballu_mjx.recordings.importers.mapping import EXAMPLE, Commands, RoomMapping, Source, read_mapping
-from ballu_mjx.recordings.importers.placement import FOOT_RADIUS, place, with_commands
+from ballu_mjx.recordings.importers.mapping import Commands, RoomMapping, Source, example_mapping, read_mapping
+from ballu_mjx.recordings.importers.placement import place, with_commands
 from ballu_mjx.recordings.importers.table import Table, commands_in, read_commands, read_table
 from ballu_mjx.recordings.importers.trajectories import rigid_body
 from ballu_mjx.recordings.importers.vicon import read_vicon
-from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.recordings.recording import Recording, cut
+from ballu_mjx.robots.registry import load_robot
 
+ROBOT = load_robot()
 ROLES = ("balloon", "base", "foot_left", "foot_right")
 BODIES = "\n".join(f'[{role}]\nbody = "ballu:{role}"' for role in ROLES)
 KEPT = "[origin]\nstart = false\n"
@@ -38,26 +41,20 @@ Y_UP = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 @functools.cache
 def source() -> Recording:
     """Three seconds of a bundled recording."""
-    recording = read_recording(list_bundled("test")[0])
-    fields = {field.name: getattr(recording, field.name) for field in dataclasses.fields(recording)}
-    return dataclasses.replace(
-        recording, **{name: value[:300] for name, value in fields.items() if isinstance(value, np.ndarray)}
-    )
+    return cut(read_recording(list_bundled("test")[0], ROBOT), slice(300))
 
 
 def poses(recording: Recording) -> dict[str, tuple[np.ndarray, Rotation]]:
     """Positions (m) and rotations of all roles; the feet are given some turn of their own."""
-    assert recording.balloon_position is not None and recording.base_position is not None
-    assert recording.foot_position is not None
-    assert recording.balloon_quaternion is not None and recording.base_quaternion is not None
-    balloon = Rotation.from_quat(recording.balloon_quaternion, scalar_first=True)
-    base = Rotation.from_quat(recording.base_quaternion, scalar_first=True)
-    feet = recording.foot_position
+    assert recording.tracked_position is not None and recording.tracked_quaternion is not None
+    balloon = Rotation.from_quat(recording.tracked_quaternion, scalar_first=True)
+    base = Rotation.from_quat(recording.orientations["base"], scalar_first=True)
+    points = recording.points
     return {
-        "balloon": (recording.balloon_position, balloon),
-        "base": (recording.base_position, base),
-        "foot_left": (feet[:, 0], balloon * Rotation.from_rotvec([0.1, 0.2, 0.3])),
-        "foot_right": (feet[:, 1], base * Rotation.from_rotvec([-0.3, 0.2, 0.1])),
+        "balloon": (recording.tracked_position, balloon),
+        "base": (points["base"], base),
+        "foot_left": (points["foot_left"], balloon * Rotation.from_rotvec([0.1, 0.2, 0.3])),
+        "foot_right": (points["foot_right"], base * Rotation.from_rotvec([-0.3, 0.2, 0.1])),
     }
 
 
@@ -131,31 +128,26 @@ DEVICES = (
 def read(folder: Path, text: str, rooms: str, name: str = "walk.csv") -> Recording:
     (folder / name).write_text(text)
     (folder / "room.toml").write_text(rooms)
-    room = read_mapping(folder / "room.toml")
-    return place(read_vicon(folder / name, room), room, "walk")
+    room = read_mapping(folder / "room.toml", ROBOT)
+    return place(read_vicon(folder / name, room), room, ROBOT, "walk")
 
 
 def same(actual: Recording) -> None:
     expected = poses(source())
-    assert actual.balloon_quaternion is not None and actual.foot_position is not None
-    assert actual.balloon_position is not None and actual.base_position is not None
+    assert actual.tracked_position is not None and actual.tracked_quaternion is not None
     np.testing.assert_allclose(actual.time, source().time, atol=1e-9)
     shown = np.ones(len(actual.time), bool)
     shown[HIDDEN] = False
-    for value, role in (
-        (actual.balloon_position, "balloon"),
-        (actual.base_position, "base"),
-        (actual.foot_position[:, 0], "foot_left"),
-        (actual.foot_position[:, 1], "foot_right"),
-    ):
+    for role, value in {"balloon": actual.tracked_position, **actual.points}.items():
         hidden = ~shown & (role in ("balloon", "foot_left"))
         assert np.isnan(value[hidden]).all()
         np.testing.assert_allclose(value[~hidden], expected[role][0][~hidden], atol=2e-6)
-    turned = Rotation.from_quat(actual.balloon_quaternion[shown], scalar_first=True)
+    turned = Rotation.from_quat(actual.tracked_quaternion[shown], scalar_first=True)
     balloon = Rotation.from_quat(expected["balloon"][1].as_quat()[shown])
     assert (balloon.inv() * turned).magnitude().max() < 2e-6
-    if actual.base_quaternion is not None:
-        base = Rotation.from_quat(actual.base_quaternion, scalar_first=True)
+    assert set(actual.points) == set(ROLES[1:])
+    if "base" in actual.orientations:
+        base = Rotation.from_quat(actual.orientations["base"], scalar_first=True)
         assert (expected["base"][1].inv() * base).magnitude().max() < 2e-6
 
 
@@ -220,18 +212,18 @@ def test_start_brings_any_place_in_the_room_to_the_origin(tmp_path: Path):
     rooms = 'robot = "r"\n[origin]\nfloor = FLOOR\n' + BODIES
     first = read(tmp_path, section("Segments", captured(np.eye(3))), rooms.replace("FLOOR", "0"))
     second = read(tmp_path, section("Segments", moved), rooms.replace("FLOOR", "0.2"))
-    assert first.base_position is not None and first.foot_position is not None and second.foot_position is not None
-    np.testing.assert_allclose(first.base_position[0, :2], 0, atol=1e-9)
-    np.testing.assert_allclose(second.foot_position, first.foot_position, atol=5e-6)
-    forward = Rotation.from_quat(np.asarray(second.balloon_quaternion)[0], scalar_first=True).as_matrix()[:, 0]
+    np.testing.assert_allclose(first.points["base"][0, :2], 0, atol=1e-9)
+    for foot in ("foot_left", "foot_right"):
+        np.testing.assert_allclose(second.points[foot], first.points[foot], atol=5e-6)
+    forward = Rotation.from_quat(np.asarray(second.tracked_quaternion)[0], scalar_first=True).as_matrix()[:, 0]
     assert forward[1] == pytest.approx(0, abs=1e-9) and forward[0] > 0.9
 
 
 def test_feet_find_the_floor(tmp_path: Path):
     lifted = {role: (p + [0, 0, 0.7], r) for role, (p, r) in captured(np.eye(3)).items()}
     actual = read(tmp_path, section("Segments", lifted), f'robot = "r"\n[origin]\nfloor = "feet"\n{BODIES}')
-    assert actual.foot_position is not None
-    assert abs(np.nanmin(actual.foot_position[:, :, 2]) - FOOT_RADIUS) < 3e-3
+    lowest = min(np.nanmin(actual.points[foot][:, 2]) for foot in ("foot_left", "foot_right"))
+    assert abs(lowest - FOOT_RADIUS) < 3e-3
 
 
 def test_turn_start_makes_any_tracked_frame_upright(tmp_path: Path):
@@ -241,7 +233,7 @@ def test_turn_start_makes_any_tracked_frame_upright(tmp_path: Path):
     bodies = BODIES.replace('body = "ballu:balloon"', 'body = "ballu:balloon"\nturn = "start"')
     actual = read(tmp_path, text, 'robot = "r"\n' + KEPT + bodies)
     shown = np.r_[0 : HIDDEN.start, HIDDEN.stop : 300]
-    turned = Rotation.from_quat(np.asarray(actual.balloon_quaternion)[shown], scalar_first=True)
+    turned = Rotation.from_quat(np.asarray(actual.tracked_quaternion)[shown], scalar_first=True)
     expected = poses(source())["balloon"][1][shown]
     # What is left is how far it really stands from upright and forward at the start.
     left = (expected.inv() * turned).magnitude()
@@ -368,23 +360,22 @@ def test_mutated_files_are_refused_or_hold_what_they_held(
         path.write_bytes(text.encode("utf-8", "surrogatepass"))
         room.write_text('robot = "r"\n' + KEPT + BODIES)
         try:
-            checked = read_mapping(room)
-            recording = place(read_vicon(path, checked), checked, "walk")
+            checked = read_mapping(room, ROBOT)
+            recording = place(read_vicon(path, checked), checked, ROBOT, "walk")
         except InputError as error:
             assert folder in str(error) and len(str(error)) < 600
             return
     assert (np.diff(recording.time) > 0).all()
     header = any(row < 5 for row, _, _ in edits) or (swapped is not None and min(swapped) < 5)
     clean = poses(source())["base"][0]
-    assert recording.base_position is not None
-    for field in (recording.base_position, recording.balloon_position, recording.foot_position):
+    for field in (recording.tracked_position, *recording.points.values()):
         assert not np.isinf(np.asarray(field)).any()
     if not header and len(recording.time) > 1:
         frames = np.round(recording.time * 100).astype(int)
         touched = {row - 5 for row, _, _ in edits}
         kept = [i for i, frame in enumerate(frames) if frame not in touched and frame < len(clean)]
         if 0 not in touched and not any("\n" in t or "\r" in t or "," in t for _, _, t in edits) and cut is None:
-            np.testing.assert_allclose(recording.base_position[kept], clean[frames[kept]], atol=2e-6)
+            np.testing.assert_allclose(recording.points["base"][kept], clean[frames[kept]], atol=2e-6)
 
 
 # ---- markers ----
@@ -448,13 +439,13 @@ def c3d_room(folder: Path, more: str = "") -> RoomMapping:
     markers = ", ".join(f'"B{i}"' for i in range(5))
     balloon = f"[balloon]\nmarkers = [{markers}]\ngeometry = {cluster().tolist()}\n"
     (folder / "room.toml").write_text('robot = "r"\n' + KEPT + more + balloon + BODIES.split("\n", 2)[2])
-    return read_mapping(folder / "room.toml")
+    return read_mapping(folder / "room.toml", ROBOT)
 
 
 def test_c3d_comes_back(c3d_file: Path):
     """Single precision in the file: a tenth of a micrometre."""
     room = c3d_room(c3d_file.parent)
-    same(place(read_c3d(c3d_file, room), room, "walk"))
+    same(place(read_c3d(c3d_file, room), room, ROBOT, "walk"))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.05, 0.3, 0.9, 0.98])
@@ -469,14 +460,14 @@ def test_c3d_without_what_is_asked_for_is_refused(c3d_file: Path):
     room = c3d_room(c3d_file.parent)
     (c3d_file.parent / "room.toml").write_text((c3d_file.parent / "room.toml").read_text().replace("B4", "B9"))
     with pytest.raises(InputError, match=r"walk.c3d: there is no marker 'B9'; mend .*room\.toml"):
-        read_c3d(c3d_file, read_mapping(c3d_file.parent / "room.toml"))
+        read_c3d(c3d_file, read_mapping(c3d_file.parent / "room.toml", ROBOT))
     content = bytearray(c3d_file.read_bytes())
     units = content.index(b"UNITS")
     content[content.index(b"mm", units) : content.index(b"mm", units) + 2] = b"xy"
     c3d_file.write_bytes(content)
     with pytest.raises(InputError, match=r"POINT:UNITS: the unit 'xy' is no length"):
         read_c3d(c3d_file, room)
-    same(place(read_c3d(c3d_file, c3d_room(c3d_file.parent, '[units]\nlength = "mm"\n')), room, "walk"))
+    same(place(read_c3d(c3d_file, c3d_room(c3d_file.parent, '[units]\nlength = "mm"\n')), room, ROBOT, "walk"))
 
 
 @pytest.mark.parametrize("seed", [2, 6, 93, 184])
@@ -554,23 +545,23 @@ def table_text() -> str:
 def read_columns(folder: Path, text: str, rooms: str = COLUMNS) -> tuple[Recording, np.ndarray]:
     (folder / "walk.csv").write_text(text)
     (folder / "room.toml").write_text(rooms)
-    room = read_mapping(folder / "room.toml")
+    room = read_mapping(folder / "room.toml", ROBOT)
     table = Table(folder / "walk.csv")
-    return place(read_table(table, room), room, "walk"), commands_in(table, room.commands)
+    return place(read_table(table, room), room, ROBOT, "walk"), commands_in(table, room.commands)
 
 
 def test_tables_come_back(tmp_path: Path):
     actual, command = read_columns(tmp_path, table_text())
     same(actual)
     np.testing.assert_allclose(command, source().command, atol=1e-7)
-    assert actual.knee is not None
-    np.testing.assert_allclose(actual.knee, np.deg2rad(30 * np.sin(source().time))[:, None] * [1, 1], atol=1e-8)
+    for knee in ("knee_left", "knee_right"):
+        np.testing.assert_allclose(actual.joint_angles[knee], np.deg2rad(30 * np.sin(source().time)), atol=1e-8)
 
 
 @pytest.mark.parametrize(
     "damage, said",
     [
-        (lambda t, m: (t.replace("lx", "mx"), m), ["walk.csv: there is no column 'lx'", "mend the mapping"]),
+        (lambda t, m: (t.replace("lx", "mx"), m), ["walk.csv: there is no column 'lx'", "fix the mapping"]),
         (lambda t, m: (t.replace("bx,by", "by,by"), m), ["walk.csv"]),
         (lambda t, m: ("\n".join(t.split("\n")[:50]) + "\n1,2,3\n", m), ["line 51", "3 cells, the header 21"]),
         (lambda t, m: (t.replace("\n10,", "\nten,"), m), ["line 3, column clock", "'ten' is not a number"]),
@@ -593,12 +584,12 @@ def test_damaged_tables_are_refused(tmp_path: Path, damage: Callable[[str, str],
 def test_logs_hold_commands_until_the_next(tmp_path: Path):
     log = tmp_path / "log.csv"
     log.write_text("time,command_left,command_right\n5,0.2,0\n5.5,,1\n6.25,0.7,\n")
-    time, command = read_commands(Table(log), Commands())
+    time, command = read_commands(Table(log), Commands.of(ROBOT))
     assert time.tolist() == [5.0, 5.5, 6.25]
     assert command.tolist() == [[0.2, 0.0], [0.2, 1.0], [0.7, 1.0]]
-    with_log, cut = with_commands(log, source(), time - 5.0, command)
+    with_log, lost = with_commands(log, source(), time - 5.0, command)
     # From 0 s on, and the last is held for 0.75 s, as long as the longest before.
-    assert cut == pytest.approx((0.0, 0.99)) and with_log.time[-1] == pytest.approx(2.0)
+    assert lost == pytest.approx((0.0, 0.99)) and with_log.time[-1] == pytest.approx(2.0)
     assert with_log.command[[0, 49, 50, 124, 125, 200]].tolist() == [
         [0.2, 0],
         [0.2, 0],
@@ -613,10 +604,10 @@ def test_logs_hold_commands_until_the_next(tmp_path: Path):
 
 
 def test_the_example_is_a_mapping_and_shows_the_defaults(tmp_path: Path):
-    (tmp_path / "example.toml").write_text(EXAMPLE)
+    (tmp_path / "example.toml").write_text(example_mapping(ROBOT))
     bare = "\n".join(f'[{role}]\nbody = "ballu:{role}"' for role in ROLES)
-    (tmp_path / "bare.toml").write_text('robot = "ballu-room-3"\n' + bare)
-    example, bare = (read_mapping(tmp_path / f"{name}.toml") for name in ("example", "bare"))
+    (tmp_path / "bare.toml").write_text('robot = "ballu-1"\n' + bare)
+    example, bare = (read_mapping(tmp_path / f"{name}.toml", ROBOT) for name in ("example", "bare"))
     for field in dataclasses.fields(RoomMapping):
         if field.name not in ("path", "axes"):
             assert getattr(example, field.name) == getattr(bare, field.name), field.name
@@ -627,7 +618,7 @@ def test_json_is_read_alike(tmp_path: Path):
     (tmp_path / "room.json").write_text(
         '{"robot": "r", ' + ", ".join(f'"{role}": {{"body": "{role}"}}' for role in ROLES) + "}"
     )
-    assert read_mapping(tmp_path / "room.json").sources["base"].body == "base"
+    assert read_mapping(tmp_path / "room.json", ROBOT).sources["base"].body == "base"
 
 
 @pytest.mark.parametrize(
@@ -662,7 +653,7 @@ def test_broken_mappings_are_refused(tmp_path: Path, old: str, new: str, said: l
     assert old in text
     (tmp_path / "room.toml").write_text(text.replace(old, new))
     with pytest.raises(InputError) as refusal:
-        read_mapping(tmp_path / "room.toml")
+        read_mapping(tmp_path / "room.toml", ROBOT)
     assert str(refusal.value).startswith(str(tmp_path / "room.toml"))
     for part in said:
         assert part in str(refusal.value)
@@ -675,7 +666,7 @@ VALUES = st.recursive(
 )
 KEYS = [("", field.name) for field in dataclasses.fields(RoomMapping)]
 KEYS += [("balloon", field.name) for field in dataclasses.fields(Source)]
-KEYS += [("commands", field.name) for field in dataclasses.fields(Commands)]
+KEYS += [("commands", key) for key in ("time", "time_unit", "left", "right", "range_left", "range_right")]
 KEYS += [("axes", "up"), ("origin", "start"), ("origin", "floor"), ("units", "angle"), ("knee_left", "column")]
 
 
@@ -691,7 +682,7 @@ def test_whatever_stands_in_a_mapping_is_read_or_refused(changes: list[tuple[tup
         path = Path(folder) / "room.json"
         path.write_text(json.dumps(content))
         try:
-            checked = read_mapping(path)
+            checked = read_mapping(path, ROBOT)
         except InputError as error:
             assert str(error).startswith(str(path))
         else:

@@ -27,9 +27,12 @@ from ballu_mjx.residuals.aerodynamics import (
 )
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, Optimum, at_whole_delay, identify_air
 from ballu_mjx.robots.model import set_fields
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, heading_rotation
+from ballu_mjx.sim.simulator import Simulator
 
-MODEL = load_model()
+SIMULATOR = Simulator(load_robot())
+MODEL = SIMULATOR.mj_model
 AIR = AirParameters(
     added_mass=jnp.array(0.12),
     added_inertia=jnp.array(3e-3),
@@ -54,6 +57,7 @@ def windy_model() -> mujoco.MjModel:
     model.body_inertia[body] += 3e-3
     model.body_ipos[body] += [0.004, 0.013, 0.0]
     model.body_gravcomp[body] = lift / (model.body_mass[body] * 9.81)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
 
@@ -101,7 +105,7 @@ def history(euler: np.ndarray, velocity: np.ndarray, turning: np.ndarray) -> jnp
 
 
 def test_no_air_is_the_nominal_model():
-    air, none = Aerodynamics(MODEL), AirParameters.none()
+    air, none = Aerodynamics(load_robot(), MODEL), AirParameters.none()
     for name, value in air.fields(none).items():
         np.testing.assert_allclose(value, getattr(MODEL, name), rtol=1e-6, atol=1e-8)
     seen = history(np.array([0.1, 0.2, 0.3]), np.array([0.3, -0.2, 0.1]), np.array([0.1, 0.2, 0.3]))
@@ -110,7 +114,7 @@ def test_no_air_is_the_nominal_model():
 
 def test_added_mass_weighs_nothing_and_lift_lifts():
     model = load_model()
-    set_fields(model, Aerodynamics(MODEL).fields(AIR))
+    set_fields(model, Aerodynamics(load_robot(), MODEL).fields(AIR))
     for name in ("body_mass", "body_inertia", "body_ipos", "body_gravcomp"):
         np.testing.assert_allclose(getattr(model, name), getattr(windy_model(), name), rtol=1e-5, atol=1e-7)
 
@@ -125,7 +129,7 @@ def test_added_mass_weighs_nothing_and_lift_lifts():
 
 
 def test_late_commands_arrive_physics_step_by_physics_step():
-    air, sent = Aerodynamics(MODEL), jnp.array([[0.0, 0.2], [1.0, 0.4], [0.0, 1.0]])
+    air, sent = Aerodynamics(load_robot(), MODEL), jnp.array([[0.0, 0.2], [1.0, 0.4], [0.0, 1.0]])
     for delay, ages in ((0.0, [0] * 5), (0.05, [1] * 5), (0.02, [1, 1, 0, 0, 0]), (0.08, [2, 2, 2, 1, 1])):
         late = dataclasses.replace(AIR, delay=jnp.array(delay))
         np.testing.assert_array_equal(air.command(late, sent), sent[2 - np.array(ages)])
@@ -149,7 +153,7 @@ def test_rounding_a_delay_moves_what_passes_for_it():
 
 
 def test_drag_opposes_the_motion_whatever_the_heading():
-    air = Aerodynamics(MODEL)
+    air = Aerodynamics(load_robot(), MODEL)
     velocity, turning = np.array([0.4, -0.3, 0.2]), np.array([0.3, -0.5, 0.7])
     level = np.asarray(air.wrench(AIR, history(np.zeros(3), velocity, turning), COMMANDS))[0]
     speed = np.linalg.norm(velocity)
@@ -172,7 +176,7 @@ def motions() -> list[Motion]:
 
 @pytest.fixture(scope="module")
 def found(motions: list[Motion]) -> AirFit:
-    return identify_air(MODEL, motions, CONFIG)
+    return identify_air(SIMULATOR, motions, CONFIG)
 
 
 def test_known_air_is_found_again_in_another_simulator_s_motion(found: AirFit):
@@ -193,7 +197,7 @@ def test_known_air_is_found_again_in_another_simulator_s_motion(found: AirFit):
 def test_a_search_begun_elsewhere_ends_at_the_same_air(motions: list[Motion], found: AirFit):
     """A delay and an added mass explain much the same motion: a search may walk from one to the other, or stop."""
     began = dataclasses.replace(jax.tree.map(lambda x: x / 2, AIR), delay=jnp.array(0.1))
-    again = identify_air(MODEL, motions, CONFIG, known=began).parameters
+    again = identify_air(SIMULATOR, motions, CONFIG, fixed_from=began).parameters
     assert float(again.delay) == pytest.approx(float(found.parameters.delay))
     little = 0.25 * float(found.standard_errors.added_mass)
     assert float(again.added_mass) == pytest.approx(float(found.parameters.added_mass), abs=little)
@@ -203,7 +207,7 @@ def test_lost_lift_is_found_with_the_rest_kept(motions: list[Motion]):
     """A balloon that loses gas: one number. With the old lift feet come down at other times, and the robot is elsewhere
     within 2 s: no derivative there points to the right one."""
     known = dataclasses.replace(AIR, lift=jnp.array(1e-4))
-    fit = identify_air(MODEL, motions, AirConfig(), known=known, free=("lift",))
+    fit = identify_air(SIMULATOR, motions, AirConfig(), fixed_from=known, free=("lift",))
     assert float(fit.parameters.lift) == pytest.approx(-0.12, abs=0.002)
     np.testing.assert_array_equal(fit.parameters.turning_drag, AIR.turning_drag)
     assert float(fit.standard_errors.turning_drag[0]) == 0.0
@@ -211,20 +215,20 @@ def test_lost_lift_is_found_with_the_rest_kept(motions: list[Motion]):
 
 def test_what_is_not_free_stays_nominal(motions: list[Motion]):
     """Lift that was weighed; what nothing is known of is no air."""
-    fit = identify_air(MODEL, motions, CONFIG, free=("added_mass",))
+    fit = identify_air(SIMULATOR, motions, CONFIG, free=("added_mass",))
     assert float(fit.parameters.added_mass) > 0
     assert not any(np.any(getattr(fit.parameters, name)) for name in AIR_PARAMETERS if name != "added_mass")
 
 
 def test_recordings_shorter_than_a_window_are_refused(motions: list[Motion]):
     with pytest.raises(InputError, match="--window-seconds"):
-        identify_air(MODEL, motions[:1], AirConfig(window_seconds=30.0))
+        identify_air(SIMULATOR, motions[:1], AirConfig(window_seconds=30.0))
 
 
 def test_file_says_what_was_found(tmp_path: Path):
     path = tmp_path / AERODYNAMICS_FILE
     path.write_text(json.dumps({"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(AIR)}))
-    read = read_air_parameters(path)
+    read = read_air_parameters(path, load_robot())
     for name in AIR_PARAMETERS:
         np.testing.assert_allclose(getattr(read, name), getattr(AIR, name), rtol=1e-6)
 
@@ -243,5 +247,5 @@ def test_damaged_file_is_refused(tmp_path: Path, change: dict, says: str):
     path = tmp_path / AERODYNAMICS_FILE
     path.write_text(json.dumps({"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(AIR) | change}))
     with pytest.raises(InputError, match=says) as caught:
-        read_air_parameters(path)
+        read_air_parameters(path, load_robot())
     assert str(path) in str(caught.value)

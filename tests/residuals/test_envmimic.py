@@ -1,6 +1,7 @@
 """The residual-force task: its equations, its frames, its resets."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +15,13 @@ from ballu_mjx.evaluation.errors_table import Errors, Evaluation, mean_by_group
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, reward_terms
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, reward_terms, tracking_state
 from ballu_mjx.residuals.network import NetworkForces, world_loads
 from ballu_mjx.rl.learner import Learner
 from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, euler_angles, heading_observation, heading_rotation
-from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 from ballu_mjx.viz import artifacts, robot_meshes
 
@@ -49,11 +51,8 @@ def make_motion(force: np.ndarray, name: str = "made", steps: int = STEPS) -> Mo
         command=command,
         qpos=np.array(qpos),
         qvel=np.array(qvel),
-        **{f.name: _EMPTY[f.name] for f in dataclasses.fields(Motion) if f.name in _EMPTY},
+        residual_mm={},
     )
-
-
-_EMPTY = {"residual_mm": {}, "pitch_deviation": 0.0, "interpolated": {}}
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +89,7 @@ def test_euler_angles_are_intrinsic_zyx():
 def test_features_agree_with_c_mujoco(still: Motion):
     model = load_model()
     data = mujoco.MjData(model)
-    simulator = Simulator(model)
+    simulator = Simulator(load_robot(), model=model)
     rng = np.random.default_rng(0)
     data.qpos[:] = still.qpos[17]
     data.qvel[:] = rng.normal(0, 1.0, model.nv)
@@ -111,7 +110,7 @@ def test_features_agree_with_c_mujoco(still: Motion):
 def test_observation_and_force_turn_with_the_robot(still: Motion, seed: int):
     """The same motion elsewhere in the room, in another direction: same observation, force turned along."""
     rng = np.random.default_rng(seed)
-    simulator = Simulator(load_model())
+    simulator = Simulator(load_robot())
     reference, _ = stack_motions(simulator, [still])
     turn = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi))
     moved_qpos, moved_qvel = still.qpos.copy(), still.qvel.copy()
@@ -124,61 +123,62 @@ def test_observation_and_force_turn_with_the_robot(still: Motion, seed: int):
     np.testing.assert_allclose(heading_observation(here), heading_observation(there), atol=2e-4)
     config, action = EnvMimicConfig(), jnp.array([1.0, -0.5, 0.3])
     np.testing.assert_allclose(
-        turn.apply(world_loads(action, here[-1, 8], config)),
-        world_loads(action, there[-1, 8], config),
+        turn.apply(world_loads(action, here[-1, 8], config, load_robot())),
+        world_loads(action, there[-1, 8], config, load_robot()),
         atol=1e-5,
     )
 
 
 def test_force_stays_within_its_limit():
     config = EnvMimicConfig()
-    force = world_loads(jnp.array([1e6, -1e6, 0.0]), jnp.zeros(()), config)
+    force = world_loads(jnp.array([1e6, -1e6, 0.0]), jnp.zeros(()), config, load_robot())
     np.testing.assert_allclose(force, [1.0, -1.0, 0.0])
 
 
 def test_reset_starts_at_recorded_states_with_their_history(still: Motion, pushed: Motion):
-    env = EnvMimicEnv(load_model(), [still, pushed], EnvMimicConfig(start_noise=0.0))
+    env = EnvMimicEnv(Simulator(load_robot()), [still, pushed], EnvMimicConfig(start_noise=0.0))
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 256))
-    s = states.pipeline_state
-    recording, time = np.asarray(s["recording"]), np.asarray(s["time"])
+    s = tracking_state(states)
+    recording, time = np.asarray(s.recording), np.asarray(s.time)
     assert set(recording) == {0, 1}
     assert set(time) == set(range(HISTORY - 1, STEPS))
     motions = [still, pushed]
     for run in range(0, 256, 16):
-        np.testing.assert_allclose(s["physics"].qpos[run], motions[recording[run]].qpos[time[run]], atol=1e-6)
+        np.testing.assert_allclose(s.rollout.physics.qpos[run], motions[recording[run]].qpos[time[run]], atol=1e-6)
         expected = env.reference.features[recording[run], time[run] - 2 : time[run] + 1]
-        np.testing.assert_array_equal(s["history"][run], expected)
+        np.testing.assert_array_equal(s.rollout.history[run], expected)
 
 
 def test_start_noise_stays_small_and_keeps_the_quaternion_a_unit(still: Motion):
-    env = EnvMimicEnv(load_model(), [still], EnvMimicConfig(start_noise=1.0))
-    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 256)).pipeline_state
-    recorded = np.asarray(env.reference.qpos)[0, np.asarray(states["time"])]
-    np.testing.assert_allclose(np.linalg.norm(states["physics"].qpos[:, 3:7], axis=1), 1.0, atol=1e-5)
-    angle = 2 * np.arccos(np.clip(np.abs(np.sum(states["physics"].qpos[:, 3:7] * recorded[:, 3:7], axis=1)), 0, 1))
+    env = EnvMimicEnv(Simulator(load_robot()), [still], EnvMimicConfig(start_noise=1.0))
+    states = tracking_state(jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), 256)))
+    recorded = np.asarray(env.reference.qpos)[0, np.asarray(states.time)]
+    qpos = np.asarray(states.rollout.physics.qpos)
+    np.testing.assert_allclose(np.linalg.norm(qpos[:, 3:7], axis=1), 1.0, atol=1e-5)
+    angle = 2 * np.arccos(np.clip(np.abs(np.sum(qpos[:, 3:7] * recorded[:, 3:7], axis=1)), 0, 1))
     assert 0.3 < np.rad2deg(angle).mean() < 1.5
-    hinges = np.rad2deg(np.asarray(states["physics"].qpos[:, 7:]) - recorded[:, 7:])
+    hinges = np.rad2deg(qpos[:, 7:] - recorded[:, 7:])
     assert 0.4 < hinges[:, 0].std() < 0.6
     assert np.abs(hinges[:, 3]).max() == 0.0  # motors stay
 
 
 def test_time_limits_truncate_and_divergence_terminates(still: Motion):
-    env = EnvMimicEnv(load_model(), [still], EnvMimicConfig(episode_seconds=0.4, start_noise=0.0))
+    env = EnvMimicEnv(Simulator(load_robot()), [still], EnvMimicConfig(episode_seconds=0.4, start_noise=0.0))
     step = jax.jit(env.step)
     many = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 200))
-    lengths = many.pipeline_state["remaining"]  # pyright: ignore
+    lengths = tracking_state(many).remaining
     assert (lengths.min(), lengths.max()) == (4, 12)
     state = jax.jit(env.reset)(jax.random.key(3))
-    time, remaining = (int(state.pipeline_state[name]) for name in ("time", "remaining"))
+    time, remaining = int(tracking_state(state).time), int(tracking_state(state).remaining)
     for elapsed in range(1, min(remaining, STEPS - time) + 1):
         state = step(state, jnp.zeros(3))
         over = float(elapsed == remaining or time + elapsed == STEPS)
         assert (float(state.done), float(state.info["truncation"])) == (over, over)
 
     state = jax.jit(env.reset)(jax.random.key(3))
-    s = state.pipeline_state
-    physics = s["physics"]._replace(qvel=s["physics"].qvel.at[3].set(jnp.nan))
-    broken = state.replace(pipeline_state=s | {"physics": physics})
+    s = tracking_state(state)
+    physics = s.rollout.physics._replace(qvel=s.rollout.physics.qvel.at[3].set(jnp.nan))
+    broken = state.replace(pipeline_state=s._replace(rollout=s.rollout._replace(physics=physics)))
     state = step(broken, jnp.zeros(3))
     assert (float(state.done), float(state.info["truncation"])) == (1.0, 0.0)
     assert float(state.metrics["diverged"]) == 1.0
@@ -188,24 +188,24 @@ def test_time_limits_truncate_and_divergence_terminates(still: Motion):
 def test_the_missing_force_earns_more_than_none_and_its_opposite_less(pushed: Motion):
     """A constant force on the reference robot: would catch a sign or frame error. Of forces at balloon, base and feet,
     only the first is not zero."""
-    env = EnvMimicEnv(load_model(), [pushed], EnvMimicConfig(start_noise=0.0, force_cost=0.0, forces="multi"))
-    state = jax.jit(env.reset)(jax.random.key(5))
-    s = state.pipeline_state
-    start = 2
-    state = state.replace(
-        pipeline_state=s
-        | {
-            "physics": state_at(env.reference.qpos[0, start], env.reference.qvel[0, start]),
-            "history": env.reference.features[0, start - 2 : start + 1],
-            "time": jnp.asarray(start, s["time"].dtype),
-        }
+    env = EnvMimicEnv(
+        Simulator(load_robot()), [pushed], EnvMimicConfig(start_noise=0.0, force_cost=0.0, forces="multi")
     )
+    state = jax.jit(env.reset)(jax.random.key(5))
+    s = tracking_state(state)
+    start = 2
+    rollout = RolloutState(
+        state_at(env.reference.qpos[0, start], env.reference.qvel[0, start]),
+        env.reference.features[0, start - 2 : start + 1],
+        env.reference.command[0, start - 2 : start],
+    )
+    state = state.replace(pipeline_state=s._replace(rollout=rollout, time=jnp.asarray(start, s.time.dtype)))
     step = jax.jit(env.step)
 
     def total(force: np.ndarray) -> float:
         run, reward = state, 0.0
         for _ in range(20):
-            heading = np.asarray(heading_rotation(run.pipeline_state["history"][-1, 8]))
+            heading = np.asarray(heading_rotation(tracking_state(run).rollout.features[8]))
             action = jnp.zeros(env.action_size).at[:3].set(heading.T @ force / env.config.force_scale)
             run = step(run, action)
             reward += float(run.reward)
@@ -226,8 +226,8 @@ def evaluator() -> OpenLoopEvaluator:
     """Of a recording without and a shorter one with `FORCE`; the policy's parameters are the force it gives."""
     config = EnvMimicConfig()
     motions = [make_motion(np.zeros(3), "near-own", 60), make_motion(FORCE, "far-pushed", 50)]
-    constant = NetworkForces(config, lambda params, _: params / config.force_scale)
-    return OpenLoopEvaluator(load_model(), motions, constant)
+    constant = NetworkForces(config, load_robot(), lambda params, _: params / config.force_scale)
+    return OpenLoopEvaluator(Simulator(load_robot()), motions, constant)
 
 
 def test_evaluator_finds_no_error_in_its_own_physics_and_some_in_pushed_ones(evaluator: OpenLoopEvaluator):
@@ -239,6 +239,27 @@ def test_evaluator_finds_no_error_in_its_own_physics_and_some_in_pushed_ones(eva
     # The force that made the recording explains it; on the other recording it does harm, and the bound says so.
     assert result.ratio("far", "position", 2.0) < 0.1
     assert result.excess()[0] > 0 and "near-own" in result.excess()[1]
+
+
+def test_a_residual_that_breaks_the_simulation_down_is_counted_and_never_averaged(evaluator: OpenLoopEvaluator):
+    result = evaluator(jnp.full(3, jnp.nan))
+    for errors in result.residual:
+        some, starts = errors.diverged[1.0]
+        assert some == starts > 0 and errors.position[1.0] == (np.inf, 0.0) and errors.mean_com_error == np.inf
+    assert not any(errors.num_diverged(1.0) for errors in result.vanilla)
+    assert result.excess()[0] == result.score == np.inf
+    assert "diverged" in result.table() and "nan" not in result.table() + json.dumps(result.to_json()).lower()
+
+
+def test_the_nominal_robot_stands_beside_the_one_with_identified_actuators(evaluator: OpenLoopEvaluator):
+    """The first recording is the nominal robot's own: only without the identified actuators is there no error."""
+    assert evaluator(jnp.array(FORCE)).nominal == ()
+    nominal = ActuatorParameters.nominal(load_model())
+    stiffer = dataclasses.replace(nominal, knee_spring_stiffness=1.5 * nominal.knee_spring_stiffness)
+    identified = Simulator(load_robot(), stiffer)
+    result = OpenLoopEvaluator(identified, evaluator.motions, evaluator._residual, "vanilla+sysid")(jnp.array(FORCE))
+    assert list(result.simulators) == ["vanilla", "vanilla+sysid", "envmimic"]
+    assert result.nominal[0].position[1.0][0] < 1e-3 < 5e-3 < result.vanilla[0].position[1.0][0]
 
 
 def test_errors_of_starts_are_how_far_the_starts_lie_apart(evaluator: OpenLoopEvaluator):
@@ -277,10 +298,14 @@ def test_one_program_serves_all_recordings_and_actuators(still: Motion, pushed: 
     sizes = PPOConfig(num_envs=8, batch_size=8, num_minibatches=1, unroll_length=2, num_updates_per_batch=1)
     training, replaying = [], []
     for model, motions in cases:
-        learner = Learner(EnvMimicEnv(model, motions, EnvMimicConfig()), sizes)
+        learner = Learner(EnvMimicEnv(Simulator(load_robot(), model=model), motions, EnvMimicConfig()), sizes)
         state = jax.eval_shape(learner._first, jax.random.PRNGKey(0), learner._contents)
         training.append(learner._step.lower(state, learner._contents).as_text())
-        evaluator = OpenLoopEvaluator(model, motions, NetworkForces(EnvMimicConfig(), lambda params, _: params))
+        evaluator = OpenLoopEvaluator(
+            Simulator(load_robot(), model=model),
+            motions,
+            NetworkForces(EnvMimicConfig(), load_robot(), lambda params, _: params),
+        )
         places = np.tile(np.array([0, 2], np.int32), (evaluator._size, 1))
         carry = evaluator._begin(places)
         replaying.append(evaluator._chunk.lower(np.zeros(3), 1.0, *evaluator._fixed, carry, places).as_text())
@@ -298,8 +323,8 @@ def test_replays_kept_to_be_looked_at_are_those_evaluated(evaluator: OpenLoopEva
         assert take.time[0] == pytest.approx(first * CONTROL_TIMESTEP)
         for name, replay in replays.items():
             states = len(take.time)
-            seen = robot_meshes.poses(load_model(), take.qpos[name])
-            np.testing.assert_allclose(seen.balloon, replay.position[run, :states], atol=1e-4)
+            seen = robot_meshes.poses(load_model(), load_robot(), take.qpos[name])
+            np.testing.assert_allclose(seen.tracked, replay.position[run, :states], atol=1e-4)
             np.testing.assert_allclose(seen.yaw, replay.yaw[run, :states], atol=1e-3)
         assert take.force is not None
         np.testing.assert_allclose(take.force, np.tile(FORCE, (len(take.time) - 1, 1)), atol=0.02)

@@ -29,10 +29,11 @@ from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.linearize import ControlSteps, Linearizer
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.simulator import Simulator
-from ballu_mjx.sim.step import balloon_id, count_substeps
+from ballu_mjx.sim.step import count_substeps
 
-MODEL = load_model()
 BALLU = load_robot()
+SIMULATOR = Simulator(BALLU)
+MODEL = SIMULATOR.mj_model
 PUSH = np.array([0.02, -0.03, 0.015])
 """N, world."""
 TWIST = np.array([1e-3, -1.5e-3, 2e-3])
@@ -44,7 +45,7 @@ INPUTS = num_inputs(EnvMimicConfig(), load_robot())
 NETWORK = PPOConfig(policy_layers=(16,), value_layers=(4,))
 WRENCH = EnvMimicConfig(forces="wrench")
 ACTIONS = num_loads(WRENCH, BALLU)
-FORCES = NetworkForces(WRENCH, ppo.make_inference({ppo.STATE: (INPUTS,)}, ACTIONS, NETWORK), name="analytic")
+FORCES = NetworkForces(WRENCH, BALLU, ppo.make_inference({ppo.STATE: (INPUTS,)}, ACTIONS, NETWORK), name="analytic")
 
 
 def pushed(name: str, height: float, model: mujoco.MjModel = MODEL, twist: float = 0.0, steps: int = 60) -> Motion:
@@ -54,13 +55,13 @@ def pushed(name: str, height: float, model: mujoco.MjModel = MODEL, twist: float
     data.qpos[:] = standing_qpos(model)
     mujoco.mj_step(model, data, 100)
     data.qpos[2] += height
-    data.xfrc_applied[balloon_id(model)] = np.r_[PUSH, twist * TWIST]
+    data.xfrc_applied[model.body("balloon").id] = np.r_[PUSH, twist * TWIST]
     time = np.arange(steps) * CONTROL_TIMESTEP
     command = np.where((time[:, None] / 1.2 + np.array([0.0, 0.5])) % 1.0 < 0.4, 0.7, 0.0)
     states = [(data.qpos.copy(), data.qvel.copy())]
     for row in command:
         data.ctrl[:] = row
-        mujoco.mj_step(model, data, count_substeps(model))
+        mujoco.mj_step(model, data, count_substeps(model, CONTROL_TIMESTEP))
         states.append((data.qpos.copy(), data.qvel.copy()))
     qpos, qvel = (np.array(x) for x in zip(*states, strict=True))
     times = np.arange(steps + 1) * CONTROL_TIMESTEP
@@ -74,19 +75,19 @@ def motions() -> list[Motion]:
 
 @pytest.fixture(scope="module")
 def recorded(motions: list[Motion]) -> Segments:
-    return cut_segments(Simulator(MODEL), motions, SECONDS, SECONDS)
+    return cut_segments(SIMULATOR, motions, SECONDS, SECONDS)
 
 
 @pytest.fixture(scope="module")
 def linearize() -> Linearizer:
-    return Linearizer(MODEL, joints=BALLU.joints, forces="wrench")
+    return Linearizer(SIMULATOR, joints=BALLU.joints, forces="wrench")
 
 
 @pytest.fixture(scope="module")
 def inputs(motions: list[Motion], recorded: Segments) -> np.ndarray:
     """What networks see of the states in the windows."""
-    reference, _ = stack_motions(Simulator(MODEL), motions)
-    seen = np.asarray(recorded_inputs(reference, EnvMimicConfig())).reshape(len(motions), -1, INPUTS)
+    reference, _ = stack_motions(SIMULATOR, motions)
+    seen = np.asarray(recorded_inputs(reference, EnvMimicConfig(), BALLU)).reshape(len(motions), -1, INPUTS)
     states = recorded.features.shape[0] * recorded.features.shape[1] // len(motions)
     return seen[:, :states].reshape(-1, INPUTS)
 
@@ -99,7 +100,7 @@ def start(inputs: np.ndarray) -> ppo.Params:
 @pytest.fixture(scope="module")
 def unforced(recorded: Segments, start: ppo.Params) -> ControlSteps:
     still = start._replace(policy=jax.tree.map(np.zeros_like, jax.device_get(start.policy)))
-    return analytic.simulator(MODEL, FORCES)(still, recorded)[0]
+    return analytic.compile_rollout(SIMULATOR.with_residual(None), FORCES)(still, recorded)[0]
 
 
 def test_derivatives_are_those_of_c_mujoco(unforced: ControlSteps, linearize: Linearizer):
@@ -107,19 +108,19 @@ def test_derivatives_are_those_of_c_mujoco(unforced: ControlSteps, linearize: Li
     so most steps must agree, not all."""
     few = jax.tree.map(lambda x: x[::4], unforced)
     linear = linearize(few._replace(loads=np.zeros((len(few.loads), linearize.loads))))
-    data, body, nv = mujoco.MjData(MODEL), balloon_id(MODEL), MODEL.nv
+    data, body, nv = mujoco.MjData(MODEL), MODEL.body("balloon").id, MODEL.nv
     joints = [MODEL.joint(name).dofadr[0] for name in BALLU.joints]
     sizes = np.r_[np.full(nv, 1e-5), np.full(nv, 1e-4), np.full(3, 1e-3), np.full(3 + len(joints), 1e-5)]
     rng = np.random.default_rng(0)
 
     def after(place: int, change: np.ndarray) -> np.ndarray:
         mujoco.mj_resetData(MODEL, data)
-        data.qpos[:], data.qvel[:] = few.physics.qpos[place], few.physics.qvel[place] + change[nv : 2 * nv]
-        data.qacc_warmstart[:] = few.physics.warmstart[place]
+        data.qpos[:], data.qvel[:] = few.state.physics.qpos[place], few.state.physics.qvel[place] + change[nv : 2 * nv]
+        data.qacc_warmstart[:] = few.state.physics.warmstart[place]
         mujoco.mj_integratePos(MODEL, data.qpos, change[:nv], 1.0)
-        data.ctrl[:], data.xfrc_applied[body] = few.commands[place, -1], change[2 * nv :][:6]
+        data.ctrl[:], data.xfrc_applied[body] = few.command[place], change[2 * nv :][:6]
         data.qfrc_applied[joints] = change[2 * nv + 6 :]
-        mujoco.mj_step(MODEL, data, count_substeps(MODEL))
+        mujoco.mj_step(MODEL, data, count_substeps(MODEL, CONTROL_TIMESTEP))
         return np.concatenate([data.qpos, data.qvel])
 
     wrong = []
@@ -147,7 +148,7 @@ def test_labels_are_the_push(linearize: Linearizer):
         joint_noise=1.0,
         torque_spread=1e-4,
     )
-    label = supervised.ForceLabeller(MODEL, BALLU, linearize, config, WRENCH)
+    label = supervised.ForceLabeller(linearize, config, WRENCH)
     motions = [pushed("stepping", 0.0, twist=1.0), pushed("falling", 10.0, twist=1.0)]
     stepping, falling = (label(motion).mean(axis=0) for motion in motions)
     np.testing.assert_allclose(falling[:3], PUSH, atol=CLOSE)
@@ -163,7 +164,7 @@ def test_legs_that_differ_are_not_taken_for_forces(linearize: Linearizer):
     motion = pushed("stiff knees", 0.0, load_model(stiffer))
 
     def wrong(config: SupervisedConfig) -> float:
-        labels = supervised.ForceLabeller(MODEL, BALLU, linearize, config, WRENCH)(motion)
+        labels = supervised.ForceLabeller(linearize, config, WRENCH)(motion)
         return float(np.median(np.linalg.norm(labels[:, :3] - PUSH, axis=1)))
 
     assert wrong(SupervisedConfig()) < 0.5 * wrong(SupervisedConfig(torque_spread=1e-5))
@@ -171,7 +172,7 @@ def test_legs_that_differ_are_not_taken_for_forces(linearize: Linearizer):
 
 def test_examples_are_in_the_balloon_s_heading(motions: list[Motion]):
     """Seen by a robot that has turned, a force keeps its side."""
-    simulator = Simulator(MODEL)
+    simulator = SIMULATOR
     loads = [np.tile(np.r_[PUSH, TWIST], (len(motion.command), 1)) for motion in motions]
     seen, actions = supervised.examples(simulator, motions, loads, WRENCH)
     features, _ = simulator.observe_all(jnp.asarray(motions[0].qpos[40:41]), jnp.asarray(motions[0].qvel[40:41]))
@@ -187,11 +188,15 @@ def test_examples_are_in_the_balloon_s_heading(motions: list[Motion]):
 
 def test_gradients_find_the_push(recorded: Segments, inputs: np.ndarray, start: ppo.Params, linearize: Linearizer):
     config = AnalyticConfig(
-        window_seconds=SECONDS, rounds=4, updates=150, validate_every=150, learning_rate=1e-3, observation_noise=0.0
+        window_seconds=SECONDS,
+        relinearizations=4,
+        updates=150,
+        validate_every=150,
+        learning_rate=1e-3,
+        observation_noise=0.0,
     )
     found: list[tuple[object, dict[str, float]]] = []
     analytic.train(
-        MODEL,
         FORCES,
         lambda policy: start._replace(policy=policy),
         start.policy,
@@ -214,18 +219,18 @@ def test_gradients_find_the_push(recorded: Segments, inputs: np.ndarray, start: 
 @pytest.mark.parametrize(
     ("config", "says"),
     [
-        (AnalyticConfig(rounds=0), "--rounds is 0"),
+        (AnalyticConfig(relinearizations=0), "--relinearizations is 0"),
         (AnalyticConfig(window_seconds=0.01), "--window-seconds"),
         (SupervisedConfig(force_change=-1.0), "--force-change is -1"),
-        (SupervisedConfig(shares=(0.5, 1.5)), "--shares is 0.5 1.5"),
-        (SupervisedConfig(shares=()), "--shares"),
+        (SupervisedConfig(force_scales=(0.5, 1.5)), "--force-scales is 0.5 1.5"),
+        (SupervisedConfig(force_scales=()), "--force-scales"),
         (AnalyticConfig(interval_seconds=float("inf")), "--interval-seconds"),
     ],
 )
 def test_options_out_of_range_are_refused(config: AnalyticConfig | SupervisedConfig, says: str):
     with pytest.raises(InputError, match=says):
         if isinstance(config, AnalyticConfig):
-            check_analytic_config(config)
+            check_analytic_config(config, 0.05)
         else:
             check_supervised_config(config)
 
@@ -247,7 +252,7 @@ def test_a_run_is_read_as_its_kind(tmp_path: Path, start: ppo.Params):
     with Run(tmp_path, describe_run("supervised", sections, {}, []) | {"residual": None}) as run:
         write_observed(run, np.zeros((2, INPUTS)))
         run.save(5, ppo.as_tree(start), 0.5)
-    loaded = TrainedResidual.load(tmp_path)
+    loaded = TrainedResidual.load(tmp_path, BALLU)
     assert (loaded.model.name, loaded.step) == ("supervised", 5)
     assert json.loads((tmp_path / "config.json").read_text())["task"] == "supervised"
     wrench = loaded.wrench(jnp.zeros((HISTORY, 27)), jnp.zeros((HISTORY, 2)))

@@ -39,7 +39,7 @@ if distributed.is_first():
     with Run(folder, content) as run:
         TrainingLoop(run, None, 320, Validation(weight)).train(Follower(), config, ResumePoint(), content)
 else:
-    sys.exit(TrainingLoop(None, None, 320, Validation(weight)).follow(Follower(), config, ResumePoint(), content))
+    TrainingLoop(None, None, 320, Validation(weight)).train(Follower(), config, ResumePoint(), content)
 """
 
 

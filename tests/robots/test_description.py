@@ -1,6 +1,7 @@
 """Robots other than BALLU: what is refused of a description, whether the second robot is simulated and recovered."""
 
 import dataclasses
+import gzip
 import json
 import shutil
 from collections.abc import Callable
@@ -20,13 +21,16 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
-from ballu_mjx.recordings.recording import COLUMNS, Recording
-from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
+from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, tracking_state
 from ballu_mjx.residuals.network import world_loads
+from ballu_mjx.residuals.run_config import describe_recording, find_recordings, run_robot
 from ballu_mjx.robots.description import read_description
+from ballu_mjx.robots.model import assets
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, heading_observation
-from ballu_mjx.sim.step import PhysicsState, count_substeps
+from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.step import count_substeps
 
 BALLOON = Path(__file__).parents[2] / "experiments" / "tethered_balloon"
 DESCRIPTION = read_description(BALLOON / "balloon.robot.json")
@@ -52,7 +56,7 @@ def fly(seconds: float = SECONDS) -> tuple[Recording, np.ndarray, np.ndarray]:
     seen = np.array(places)
     flight = Recording(
         name="flight", kind="free", robot="balloon-0", time=np.arange(len(sent)) / 100, command=sent,
-        balloon_position=seen[:, 0], balloon_quaternion=np.array(turns), base_position=None, foot_position=None,
+        tracked_position=seen[:, 0], tracked_quaternion=np.array(turns),
         points={"knot": seen[:, 1]},
     )  # fmt: skip
     return flight, np.array(qpos), np.array(qvel)
@@ -65,7 +69,7 @@ def flight() -> tuple[Recording, np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def motion(flight: tuple[Recording, np.ndarray, np.ndarray]) -> Motion:
-    return reconstruct(flight[0], DESCRIPTION.load_model(), DESCRIPTION)
+    return reconstruct(flight[0], DESCRIPTION)
 
 
 @pytest.fixture
@@ -77,8 +81,11 @@ def copy(tmp_path: Path) -> Path:
 
 def test_ballu_s_description_says_what_its_recordings_hold():
     description = load_robot()
-    assert set(description.columns) == {name for names in COLUMNS.values() for name in names}
-    assert description.is_ballu and not description.anchored
+    header = (assets() / "recordings" / "training" / "gait-00-take-1.csv.gz").open("rb")
+    with header, gzip.open(header) as stream:
+        first = stream.readline().decode().strip().split(",")
+    assert set(description.columns) == {*first, *description.joints}
+    assert not description.anchored
 
 
 def in_json(**changes: Any) -> Callable[[Path], None]:
@@ -153,23 +160,88 @@ def test_a_damaged_description_is_refused_by_file_key_and_mend(
     assert said in str(refused.value) and copy.name in str(refused.value) and "\n" not in str(refused.value)
 
 
-def test_commands_for_ballu_alone_refuse_another_robot(capsys: pytest.CaptureFixture[str]):
-    given = ["--robot-description", str(DESCRIPTION.file)]
-    for command in ("sysid", "walk", "residual"):
-        assert train.main([command, *given]) == 2
-        assert f"`train {command}` is for BALLU alone" in capsys.readouterr().err
-    assert train.main(["envmimic", *given]) == 2
-    assert "--recordings" in capsys.readouterr().err
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+HULL = """<mujoco>
+  <asset><mesh name="hull" file="hull.obj"/></asset>
+  <worldbody><body name="hull" pos="0 0 1">
+    <freejoint/> <inertial pos="0 0 0" mass="0.15" diaginertia="2e-3 2e-3 2e-3"/>
+    <geom type="mesh" mesh="hull"/> <site name="imu"/> <site name="thruster"/>
+  </body></worldbody>
+  <include file="thruster.xml"/>
+</mujoco>"""
+THRUSTER = '<mujoco><actuator><general site="thruster" name="thruster" ctrlrange="0 1"/></actuator></mujoco>'
+
+
+@pytest.fixture
+def split_model(tmp_path: Path) -> Path:
+    """A description whose model includes a file that includes another, and has meshes in two places."""
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "robot.xml").write_text(
+        '<mujoco><option timestep="0.01"/><compiler meshdir="meshes"/><include file="parts/hull.xml"/>'
+        '<asset><mesh name="fin" file="fin.obj"/></asset></mujoco>'
+    )
+    (tmp_path / "parts" / "hull.xml").write_text(HULL)
+    (tmp_path / "parts" / "thruster.xml").write_text(THRUSTER)
+    (tmp_path / "parts" / "hull.obj").write_text(TETRAHEDRON)  # MuJoCo finds it beside what names it
+    (tmp_path / "meshes" / "fin.obj").write_text(TETRAHEDRON)
+    content = {"format": "ballu-robot/1", "name": "blimp", "model": "robot.xml", "tracked": "imu"}
+    content |= {"points": [], "commands": {"up": "thruster"}}
+    (tmp_path / "blimp.robot.json").write_text(json.dumps(content))
+    return tmp_path / "blimp.robot.json"
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("robot.xml", 'timestep="0.01"', 'timestep="0.005"'),
+        ("parts/hull.xml", "0.15", "0.30"),
+        ("parts/thruster.xml", "0 1", "0 2"),
+        ("parts/hull.obj", "v 1 0 0", "v 2 0 0"),
+        ("meshes/fin.obj", "v 1 0 0", "v 2 0 0"),
+    ],
+)
+def test_a_change_of_any_file_of_the_model_is_noticed(split_model: Path, name: str, old: str, new: str) -> None:
+    stored = {"robot_description": {"path": str(split_model), "sha256": read_description(split_model).sha256}}
+    run_robot(stored, split_model.parent)
+    changed = split_model.parent / name
+    text = changed.read_text()
+    assert old in text
+    changed.write_text(text.replace(old, new))
+    with pytest.raises(InputError, match="the robot description, or its model, has changed since the run began"):
+        run_robot(stored, split_model.parent)
+    changed.write_text(text)
+    run_robot(stored, split_model.parent)
+
+
+def test_a_change_of_a_recording_or_of_its_description_is_noticed(
+    flight: tuple[Recording, np.ndarray, np.ndarray], tmp_path: Path
+) -> None:
+    path = tmp_path / "flight.csv"
+    write_recording(flight[0], path, DESCRIPTION)
+    before = describe_recording(path)
+    content = json.loads((tmp_path / "flight.json").read_text())
+    (tmp_path / "flight.json").write_text(json.dumps(content | {"robot": "another"}))
+    assert describe_recording(path)["sha256"] != before["sha256"]
+    with pytest.raises(InputError, match="the recording has changed"):
+        find_recordings({"recordings": {"test": [before]}}, "test", tmp_path)
+
+
+def test_another_robot_needs_recordings_of_its_own(capsys: pytest.CaptureFixture[str]):
+    for command in ("sysid", "envmimic", "supervised", "analytic", "aerodynamic"):
+        assert train.main([command, "--robot", str(DESCRIPTION.file)]) == 2
+        told = capsys.readouterr().err
+        assert "--recordings" in told and DESCRIPTION.name in told and told.count("\n") == 1
 
 
 def test_recordings_go_through_files(flight: tuple[Recording, np.ndarray, np.ndarray], tmp_path: Path):
     write_recording(flight[0], tmp_path / "flight.csv", DESCRIPTION)
     found = read_recording(tmp_path / "flight.csv", DESCRIPTION)
     np.testing.assert_allclose(found.points["knot"], flight[0].points["knot"], atol=6e-6)
-    assert found.balloon_position is not None and flight[0].balloon_position is not None
-    np.testing.assert_allclose(found.balloon_position, flight[0].balloon_position, atol=6e-6)
+    assert found.tracked_position is not None and flight[0].tracked_position is not None
+    np.testing.assert_allclose(found.tracked_position, flight[0].tracked_position, atol=6e-6)
     with pytest.raises(InputError, match="unknown column"):
-        read_recording(tmp_path / "flight.csv")
+        read_recording(tmp_path / "flight.csv", load_robot())
     header, rest = (tmp_path / "flight.csv").read_text().split("\n", 1)
     (tmp_path / "flight.csv").write_text(header.replace("knot_y", "knot_w") + "\n" + rest)
     with pytest.raises(InputError, match="knot_w"):
@@ -211,16 +283,16 @@ def test_a_free_robot_is_recovered_wherever_it_is(tmp_path: Path):
     seen = np.array(places)
     made = Recording(
         name="loose", kind="free", robot="loose", time=time, command=np.zeros((len(time), 2)),
-        balloon_position=seen[:, 0], balloon_quaternion=np.array(turns), base_position=None, foot_position=None,
+        tracked_position=seen[:, 0], tracked_quaternion=np.array(turns),
         points={"knot": seen[:, 1]},
-        angles={"bend_x": 0.2 * np.sin(3 * time), "bend_y": np.full(len(time), 0.1), "swivel": 0.3 * time},
+        joint_angles={"bend_x": 0.2 * np.sin(3 * time), "bend_y": np.full(len(time), 0.1), "swivel": 0.3 * time},
     )  # fmt: skip
-    motion = reconstruct(made, model, found)
+    motion = reconstruct(made, found, model)
     np.testing.assert_allclose(motion.qvel[10, :3], [0.3, 0, 0], atol=0.02)
     np.testing.assert_allclose(motion.qvel[10, -1], 0.3, atol=0.02)
     np.testing.assert_allclose(motion.qpos[10, :3], [1.15, -2, 0.5], atol=0.005)
     with pytest.raises(InputError, match="nothing that is measured shows the joint"):
-        reconstruct(dataclasses.replace(made, angles={}), model, open_ended)
+        reconstruct(dataclasses.replace(made, joint_angles={}), open_ended, model)
 
 
 def test_a_joint_that_nothing_shows_is_named(flight: tuple[Recording, np.ndarray, np.ndarray], copy: Path):
@@ -229,46 +301,46 @@ def test_a_joint_that_nothing_shows_is_named(flight: tuple[Recording, np.ndarray
     in_model(site, f'<body><joint name="fan"/>{inertia}</body>{site}')(copy)
     hidden = read_description(copy)
     with pytest.raises(InputError, match="joint fan"):
-        reconstruct(flight[0], hidden.load_model(), hidden)
+        reconstruct(flight[0], hidden)
 
 
 def test_places_that_are_not_the_model_s_are_refused(flight: tuple[Recording, np.ndarray, np.ndarray]):
     moved = {"knot": flight[0].points["knot"] + [0.0, 0.0, 0.4]}
     with pytest.raises(InputError, match="from where the model can have it"):
-        reconstruct(dataclasses.replace(flight[0], points=moved), DESCRIPTION.load_model(), DESCRIPTION)
+        reconstruct(dataclasses.replace(flight[0], points=moved), DESCRIPTION)
 
 
 @pytest.fixture(scope="module")
 def env(motion: Motion) -> EnvMimicEnv:
     config = EnvMimicConfig(start_noise=0.0, observation_noise=0.0)
-    return EnvMimicEnv(DESCRIPTION.load_model(), [motion], config, robot=DESCRIPTION)
+    return EnvMimicEnv(Simulator(DESCRIPTION), [motion], config)
 
 
 def test_the_environment_steps_as_c_mujoco_does(env: EnvMimicEnv):
     """The push that is in the recording, found again: with it as the action the simulation stays on it, and without it
     drifts off."""
     state = jax.jit(env.reset)(jax.random.key(3))
-    s: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
+    start = tracking_state(state)
     model = DESCRIPTION.load_model()
     data = mujoco.MjData(model)
-    physics: PhysicsState = s["physics"]
+    physics = start.rollout.physics
     data.qpos[:], data.qvel[:] = np.asarray(physics.qpos), np.asarray(physics.qvel)
     data.xfrc_applied[model.body("balloon").id, :3] = PUSH
     step = jax.jit(env.step)
     for number in range(10):
-        data.ctrl[:] = np.asarray(env.reference.command[0, int(s["time"]) + number])
-        mujoco.mj_step(model, data, count_substeps(model))
+        data.ctrl[:] = np.asarray(env.reference.command[0, int(start.time) + number])
+        mujoco.mj_step(model, data, count_substeps(model, CONTROL_TIMESTEP))
         state = step(state, jnp.asarray(PUSH / env.config.force_scale, jnp.float32))
-    after: dict[str, Any] = state.pipeline_state  # pyright: ignore[reportAssignmentType]
-    np.testing.assert_allclose(after["physics"].qpos, data.qpos, atol=2e-4)
+    after = tracking_state(state)
+    np.testing.assert_allclose(after.rollout.physics.qpos, data.qpos, atol=2e-4)
     mujoco.mj_forward(model, data)
     velocity = np.zeros(6)
     mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, model.site("knot").id, velocity, 0)
-    features = after["history"][-1]
+    features = after.rollout.features
     assert features.shape == (DESCRIPTION.features,)
     np.testing.assert_allclose(features[9:12], data.site("knot").xpos, atol=2e-4)
     np.testing.assert_allclose(features[12:15], velocity[3:], atol=1e-3)
-    target = env.reference.features[0, int(after["time"])]
+    target = env.reference.features[0, int(after.time)]
     assert float(jnp.linalg.norm(features[:3] - target[:3])) < 0.01
 
 
@@ -280,7 +352,7 @@ def test_an_anchored_robot_sees_the_world(motion: Motion, env: EnvMimicEnv):
     changed = np.flatnonzero(np.abs(seen - other) > 1e-6)
     assert len(changed) == HISTORY, "the yaw alone"
     np.testing.assert_allclose(np.sort(np.asarray(seen)[:3]), np.sort(np.asarray(history[0, :3])), atol=1e-6)
-    force = world_loads(jnp.array([1.0, 2.0, 3.0]), turned[-1, 8], EnvMimicConfig(), anchored=True)
+    force = world_loads(jnp.array([1.0, 2.0, 3.0]), turned[-1, 8], EnvMimicConfig(), DESCRIPTION)
     np.testing.assert_allclose(force, [0.05, 0.1, 0.15], atol=1e-6)
 
 
@@ -290,7 +362,7 @@ def test_envmimic_runs_from_files_to_an_evaluation(tmp_path: Path, capsys: pytes
 
     write_recording(fly(7.0)[0], tmp_path / "flight.csv", DESCRIPTION)
     arguments = [
-        "envmimic", "--robot-description", str(DESCRIPTION.file), "--recordings", str(tmp_path / "flight.csv"),
+        "envmimic", "--robot", str(DESCRIPTION.file), "--recordings", str(tmp_path / "flight.csv"),
         "--output", str(tmp_path / "run"), "--num-timesteps", "160", "--num-envs", "8", "--batch-size", "8",
         "--num-minibatches", "2", "--unroll-length", "5", "--num-updates-per-batch", "1", "--validate-every", "160",
         "--policy-layers", "16", "--value-layers", "16",

@@ -11,9 +11,12 @@ import mujoco
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
+from mujoco import mjx
+from mujoco.mjx._src.solver import Context
 
 from ballu_mjx.ballu.model import (
     CABLE_SLACK,
+    CONTROL_TIMESTEP,
     KNEES,
     MOTORS,
     SIDES,
@@ -27,7 +30,16 @@ from ballu_mjx.ballu.model import (
 )
 from ballu_mjx.robots.model import set_fields, with_fields
 from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.sim.step import balloon_id, control_step, count_substeps, make_data, put_model, state_at
+from ballu_mjx.sim.step import (
+    _newton_step,
+    _solve,
+    control_step,
+    count_substeps,
+    load_state,
+    make_data,
+    put_model,
+    state_at,
+)
 
 CABLES = [f"cable_{side}" for side in SIDES]
 FIELDS = [field.name for field in dataclasses.fields(ActuatorParameters)]
@@ -82,7 +94,7 @@ class Samples:
 @functools.cache
 def samples() -> Samples:
     model = tight_model()
-    balloon, rng = balloon_id(model), np.random.default_rng(0)
+    balloon, rng = model.body("balloon").id, np.random.default_rng(0)
     rows = []
     for _ in range(8):
         data = mujoco.MjData(model)
@@ -116,7 +128,7 @@ def test_samples_visit_every_regime() -> None:
 def test_mjx_follows_c_mujoco_over_a_control_step() -> None:
     """The same step in float32 and in double precision, under a wrench on the balloon and forces at base and feet."""
     s, model = samples(), load_model()
-    count, balloon = count_substeps(model), balloon_id(model)
+    count, balloon = count_substeps(model, CONTROL_TIMESTEP), model.body("balloon").id
     points = tuple(model.site(name).id for name in load_robot().points)
     bodies = (balloon, *model.site_bodyid[list(points)].tolist())
     mjx_model, template = put_model(model), make_data(model)
@@ -303,7 +315,7 @@ def settled_in_mjx() -> tuple[np.ndarray, np.ndarray]:
 
     def knees(parameters: ActuatorParameters, command: Float[Array, " 2"]) -> Array:
         moved = with_fields(mjx_model, actuator_fields(model, parameters))
-        bodies, no_force = (balloon_id(model),), jnp.zeros((1, 6))
+        bodies, no_force = (model.body("balloon").id,), jnp.zeros((1, 6))
         state = control_step(moved, template, start, command, no_force, bodies=bodies, count=SETTLING_STEPS)
         return state.qpos[7:][KNEES]
 
@@ -392,3 +404,31 @@ def test_each_parameter_moves_its_own_side_as_described() -> None:
         assert np.abs(taut[f][other]).max() < 0.1 * np.abs(taut[f][own]).min(), name
     np.testing.assert_allclose(at_stop[FIELDS.index("default_knee_angle")][own], 1, atol=0.05)
     np.testing.assert_allclose(at_stop[FIELDS.index("motor_gain")], 0, atol=1e-3)  # single precision leaves 4e-4
+
+
+# ---- the solver's derivative ----
+
+
+def test_the_step_that_tells_whether_the_solver_has_arrived_is_newtons() -> None:
+    """Beside MJX's own search direction, from where too few iterations leave the solver."""
+    s, model = samples(), load_model()
+    model.opt.iterations = 1
+    mjx_model, template = put_model(model), make_data(model)
+
+    @jax.jit
+    @jax.vmap
+    def steps(qpos: Array, qvel: Array, command: Array) -> tuple[Array, Array]:
+        held = template.replace(ctrl=command)  # pyright: ignore
+        data = mjx.fwd_position(mjx_model, load_state(held, state_at(qpos, qvel)))
+        for stage in (mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration):
+            data = stage(mjx_model, data)
+        found = _solve(mjx_model, data)
+        here = Context.create(mjx_model, data.replace(qacc=found.qacc))  # pyright: ignore
+        return _newton_step(found, mjx_model, data)[1], here.search
+
+    found, expected = steps(*(jnp.asarray(x, jnp.float32) for x in (s.qpos, s.qvel, s.command)))
+    size = np.linalg.norm(expected, axis=1)
+    assert np.mean(size > 1.0) > 0.2, "the solver has arrived everywhere"
+    np.testing.assert_allclose(np.linalg.norm(found - expected, axis=1), 0.0, atol=1e-2 * size.max())
+    far = size > 1.0
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1)[far] / size[far], 1.0, atol=1e-2)

@@ -14,7 +14,7 @@ from mujoco import mjx
 
 from ballu_mjx.ballu.model import load_model, standing_qpos
 from ballu_mjx.sim import vmap_last
-from ballu_mjx.sim.step import PhysicsState, balloon_id, control_step, make_data, put_model, state_at
+from ballu_mjx.sim.step import PhysicsState, control_step, make_data, put_model, state_at
 from ballu_mjx.sim.vmap_last import nested_vmap, vmap, vmap_with_trailing_batch
 
 SIZE = 5
@@ -155,7 +155,7 @@ def robots() -> tuple[mjx.Model, mjx.Data, PhysicsState, Any, int]:
     qpos[:, 2] += rng.uniform(-0.002, 0.01, 8)
     state = state_at(jnp.asarray(qpos), jnp.asarray(0.3 * rng.normal(size=(8, model.nv))))
     command = jnp.asarray(rng.uniform(size=(8, 2)))
-    return put_model(model), make_data(model), state, command, balloon_id(model)
+    return put_model(model), make_data(model), state, command, model.body("balloon").id
 
 
 def test_a_batch_of_robots_moves_as_each_alone(robots: tuple[mjx.Model, mjx.Data, PhysicsState, Any, int]):

@@ -24,15 +24,19 @@ import pytest
 from PIL import Image
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
-from ballu_mjx.cli import pipeline, train_envmimic, train_policy, view
+from ballu_mjx.cli import train_envmimic, train_policy, view
 from ballu_mjx.cli.report import main
+from ballu_mjx.evaluation import story_layout
 from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation
 from ballu_mjx.evaluation.transfer import Transfer, walking_table
 from ballu_mjx.policies.locomotion_env import LocomotionConfig
+from ballu_mjx.policies.training import locomotion_ppo
 from ballu_mjx.recordings.csv_format import list_bundled
+from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.folder import Run
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, read_rollouts, write_rollouts
 from ballu_mjx.viz import report, robot_meshes, video, viser_scene
@@ -60,6 +64,7 @@ def take(name: str, states: int, seed: int = 0, robot_name: str = "") -> StoredR
     rng = np.random.default_rng(seed)
     return StoredRollout(
         name=name,
+        description=load_robot(),
         robot=robot_name,
         time=0.1 + np.arange(states) * CONTROL_TIMESTEP,
         qpos={
@@ -78,7 +83,7 @@ def errors(name: str, seed: int) -> Errors:
     def horizons() -> dict[float, tuple[float, float]]:
         return {horizon: tuple(rng.uniform(0.01, 1, 2)) for horizon in HORIZONS}  # pyright: ignore[reportReturnType]
 
-    return Errors(name, "near", horizons(), horizons(), *rng.uniform(0.1, 10, 3))
+    return Errors(name, group_of(name), horizons(), horizons(), *rng.uniform(0.1, 10, 3))
 
 
 def write_run(folder: Path, takes: list[StoredRollout]) -> Path:
@@ -206,7 +211,7 @@ class Bomb:
         (lambda arrays, path: arrays | {"0/qpos/vanilla": np.full((21, 14), np.nan)}, "0/qpos/vanilla is not"),
         (lambda arrays, path: arrays | {"0/time": np.array(["x"] * 21)}, "0/time is not an array"),
         (lambda arrays, path: {k: v for k, v in arrays.items() if "qpos" not in k}, "has no robot"),
-        (lambda arrays, path: arrays | {"format": np.array("other/1")}, "is not of the format ballu-replay/1"),
+        (lambda arrays, path: arrays | {"format": np.array("other/1")}, "is not of the format ballu-replay/2"),
     ],
 )
 def test_damaged_replay_is_refused(short: Path, tmp_path: Path, capsys, damage: Callable, says: str):
@@ -270,14 +275,17 @@ def test_damaged_evaluation_is_refused(short: Path, tmp_path: Path, capsys):
 def test_story_shows_its_tables_and_policies_over_each_other(tmp_path: Path):
     transfer = Transfer(*np.arange(1.0, 12.0))
     results = {"vanilla+dr": [[transfer]], "envmimic": [[transfer]], HOSTILE: [[transfer]]}
-    pipeline.table_file(tmp_path, "walk").write_text(walking_table(results))
+    story_layout.table_file(tmp_path, "walk").write_text(walking_table(results))
     for setting, states in (("vanilla+dr", 30), ("envmimic", 25), ("envmimic-2", 28)):
         folder = tmp_path / "seed-0" / f"walk-{setting}"
-        sections = {"env": LocomotionConfig(), "ppo": train_policy.defaults(), "data": train_policy.Data()}
+        sections = {"env": LocomotionConfig(), "ppo": locomotion_ppo(), "data": train_policy.Data()}
         with Run(folder, describe_run("walk", sections, {}, [])) as run:
             run.log(100, {"reward": 0.1})
         episode = StoredRollout(
-            name="walk", time=np.arange(states) * 0.05, qpos={setting.removesuffix("-2"): walk(states, 0.2, 0.0, 1)}
+            name="walk",
+            description=load_robot(),
+            time=np.arange(states) * 0.05,
+            qpos={setting.removesuffix("-2"): walk(states, 0.2, 0.0, 1)},
         )
         write_rollouts(folder / ROLLOUT_FILE, [episode])
     write_run(tmp_path / "seed-0" / "envmimic-walk", [take("actions-1", 21)])
@@ -303,7 +311,7 @@ def test_story_shows_its_tables_and_policies_over_each_other(tmp_path: Path):
 def test_shape_stands_on_the_floor_as_high_as_the_model():
     model = load_model()
     qpos = standing_qpos(model)
-    poses = robot_meshes.poses(model, qpos[None])
+    poses = robot_meshes.poses(model, load_robot(), qpos[None])
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
@@ -330,7 +338,7 @@ def test_mujoco_scene_holds_every_robot_in_its_colour_and_the_force():
     scene = mujoco.MjvScene(model, 500)
     shown = take("near-1", 3)
     robots = {name: qpos[1] for name, qpos in shown.qpos.items()}
-    robot_meshes.draw(scene, model, data, robots, np.array([0.0, 0.1, 0.0]))
+    robot_meshes.draw(scene, model, data, load_robot(), robots, np.array([0.0, 0.8, 0.0]))
     geoms = scene.geoms[: scene.ngeom]
     for name in robots:
         own = [geom for geom in geoms if np.allclose(geom.rgba[:3], colour_of(name), atol=1e-3)]

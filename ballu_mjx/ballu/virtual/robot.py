@@ -12,6 +12,7 @@ Nothing that trains may import this module's robots: they are known by their rec
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import jax.numpy as jnp
 import mujoco
@@ -30,10 +31,15 @@ from ballu_mjx.ballu.model import (
     standing_qpos,
     suspend,
 )
-from ballu_mjx.policies.deploy.estimator import Capture, Controller
+from ballu_mjx.ballu.recordings import make_recording
+from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.model import assets, set_fields
 
+CaptureController = Callable[[Capture], Float[np.ndarray, " 2"]]
+"""Sees all frames so far, returns the next commands (left, right)."""
+NAMES = ("balloon", "base", "foot_left", "foot_right")
+"""What motion capture sees; each is hidden independently of the others."""
 PHYSICS_TIMESTEP = 5e-4
 CAPTURE_TIMESTEP = 0.01
 _TICK = 1e-3
@@ -218,34 +224,41 @@ class _Servos:
         return np.clip(self.target, 0.0, 1.0)
 
 
-def open_loop(commands: Float[np.ndarray, "steps 2"]) -> Controller:
+def open_loop(commands: Float[np.ndarray, "steps 2"]) -> CaptureController:
     """A controller that plays `commands`, one a control step, and looks at nothing."""
     frames = round(CONTROL_TIMESTEP / CAPTURE_TIMESTEP)
     return lambda capture: commands[(len(capture.time) - 1) // frames]
 
 
 def record(
-    virtual: VirtualRobot, trial: TrialConditions, controller: Controller, duration: float, name: str, notes: str = ""
+    virtual: VirtualRobot,
+    trial: TrialConditions,
+    controller: CaptureController,
+    duration: float,
+    name: str,
+    notes: str = "",
 ) -> Recording:
     """Run one trial of `duration` seconds and return what motion capture saw.
 
     The robot stands still for two seconds before time 0. Commands change at the control rate (20 Hz); the last
     command is repeated in the last frame.
     """
-    return _finish(_simulate(virtual, trial, controller, duration)[0], virtual, name, notes)
+    capture, base_quaternion, _, _ = _simulate(virtual, trial, controller, duration)
+    return _finish(capture, base_quaternion, virtual, name, notes)
 
 
 def record_truth(
-    virtual: VirtualRobot, trial: TrialConditions, controller: Controller, duration: float
+    virtual: VirtualRobot, trial: TrialConditions, controller: CaptureController, duration: float
 ) -> tuple[Float[np.ndarray, "frames nq"], Float[np.ndarray, "frames nv"]]:
     """The same trial's true generalized positions and velocities, for checking what is made from the recording."""
-    _, qpos, qvel = _simulate(virtual, trial, controller, duration)
+    _, _, qpos, qvel = _simulate(virtual, trial, controller, duration)
     return qpos, qvel
 
 
 def _simulate(
-    virtual: VirtualRobot, trial: TrialConditions, controller: Controller, duration: float
-) -> tuple[Capture, np.ndarray, np.ndarray]:
+    virtual: VirtualRobot, trial: TrialConditions, controller: CaptureController, duration: float
+) -> tuple[Capture, np.ndarray, np.ndarray, np.ndarray]:
+    """Return what motion capture saw, the base's orientation that it saw beside, and the true states."""
     model = build(virtual)
     data = mujoco.MjData(model)
     data.qpos[:] = standing_qpos(model)
@@ -254,7 +267,7 @@ def _simulate(
     _place(model, data, trial)
 
     rng = np.random.default_rng(trial.capture_seed)
-    capture = Capture([], [], [], [], [], [], [])
+    capture, turns = Capture(NAMES), []
     hidden = _hidden(rng, round(duration / CAPTURE_TIMESTEP) + 1)
     frames_per_control = round(CONTROL_TIMESTEP / CAPTURE_TIMESTEP)
     command = np.zeros(2)
@@ -263,7 +276,7 @@ def _simulate(
         time = frame * CAPTURE_TIMESTEP
         mujoco.mj_forward(model, data)
         truth.append((data.qpos.copy(), data.qvel.copy()))
-        _capture_frame(data, rng, hidden[frame], time, capture)
+        turns.append(_capture_frame(data, rng, hidden[frame], time, capture))
         if frame % frames_per_control == 0 and frame < len(hidden) - 1:
             command = np.clip(np.asarray(controller(capture), float), 0.0, 1.0)
             servos.send(time, command)
@@ -272,7 +285,7 @@ def _simulate(
             break
         _advance(model, data, servos, trial, time)
     qpos, qvel = (np.array(x) for x in zip(*truth, strict=True))
-    return capture, qpos, qvel
+    return capture, np.array(turns), qpos, qvel
 
 
 def _advance(model: mujoco.MjModel, data: mujoco.MjData, servos: _Servos, trial: TrialConditions, time: float) -> None:
@@ -341,21 +354,15 @@ def record_sweep(virtual: VirtualRobot, seed: int, name: str, *, commands: int =
                 data.ctrl[:] = servos.at(time + tick * _TICK)
                 mujoco.mj_step(model, data, round(_TICK / PHYSICS_TIMESTEP))
     table = np.array(rows)
-    return Recording(
+    return make_recording(
         name=name,
         kind="suspended",
         robot=virtual.name,
         notes="Actuator sweep, feet off the ground.",
         time=table[:, 0],
         command=np.repeat(table[:, 1:2], 2, axis=1),
-        balloon_position=None,
-        balloon_quaternion=None,
-        base_position=None,
-        base_quaternion=None,
-        foot_position=None,
         motor=table[:, 2:4],
         knee=table[:, 4:6],
-        interpolated={},
     )
 
 
@@ -375,14 +382,10 @@ def _wind(trial: TrialConditions, time: float) -> np.ndarray:
     return np.array(trial.draught) + amplitude * np.array([np.sin(phase), np.cos(phase), 0.0])
 
 
-_MARKERS = 4
-"""Balloon, base and two feet are hidden independently of each other."""
-
-
 def _hidden(rng: np.random.Generator, frames: int) -> np.ndarray:
     """Which of the marker groups is hidden in which frame: about once in 10 s, for up to 0.15 s."""
-    hidden = np.zeros((frames, _MARKERS), bool)
-    for marker in range(_MARKERS):
+    hidden = np.zeros((frames, len(NAMES)), bool)
+    for marker in range(len(NAMES)):
         for _ in range(rng.poisson(frames * CAPTURE_TIMESTEP / 10.0)):
             start, length = rng.integers(5, max(frames - 20, 6)), rng.integers(2, 16)
             hidden[start : start + length, marker] = True
@@ -391,7 +394,9 @@ def _hidden(rng: np.random.Generator, frames: int) -> np.ndarray:
 
 def _capture_frame(
     data: mujoco.MjData, rng: np.random.Generator, hidden: np.ndarray, time: float, capture: Capture
-) -> None:
+) -> Float[np.ndarray, " 4"]:
+    """Add what motion capture sees now; return the base's orientation (w, x, y, z), which no policy sees."""
+
     def position(site: str, is_hidden: np.bool) -> np.ndarray:
         noisy = data.site(site).xpos + rng.normal(0, POSITION_NOISE, 3)
         return np.full(3, np.nan) if is_hidden else noisy
@@ -401,28 +406,29 @@ def _capture_frame(
         noisy = noise * Rotation.from_quat(data.body(body).xquat, scalar_first=True)
         return np.full(4, np.nan) if is_hidden else noisy.as_quat(scalar_first=True, canonical=True)
 
+    balloon, turn = position("balloon", hidden[0]), quaternion("balloon", hidden[0])
+    base, base_turn = position("base", hidden[1]), quaternion("base", hidden[1])
+    feet = [position(f"foot_{side}", hidden[2 + i]) for i, side in enumerate(SIDES)]
     capture.time.append(time)
-    capture.balloon_position.append(position("balloon", hidden[0]))
-    capture.balloon_quaternion.append(quaternion("balloon", hidden[0]))
-    capture.base_position.append(position("base", hidden[1]))
-    capture.base_quaternion.append(quaternion("base", hidden[1]))
-    capture.foot_position.append(np.stack([position(f"foot_{side}", hidden[2 + i]) for i, side in enumerate(SIDES)]))
+    capture.position.append(np.stack([balloon, base, *feet]))
+    capture.quaternion.append(turn)
+    return base_turn
 
 
-def _finish(capture: Capture, virtual: VirtualRobot, name: str, notes: str) -> Recording:
-    return Recording(
+def _finish(
+    capture: Capture, base_quaternion: Float[np.ndarray, "T 4"], virtual: VirtualRobot, name: str, notes: str
+) -> Recording:
+    position = np.array(capture.position)
+    return make_recording(
         name=name,
         kind="free",
         robot=virtual.name,
         notes=notes,
         time=np.array(capture.time),
         command=np.array(capture.command),
-        balloon_position=np.array(capture.balloon_position),
-        balloon_quaternion=np.array(capture.balloon_quaternion),
-        base_position=np.array(capture.base_position),
-        base_quaternion=np.array(capture.base_quaternion),
-        foot_position=np.array(capture.foot_position),
-        motor=None,
-        knee=None,
-        interpolated={},
+        balloon_position=position[:, 0],
+        balloon_quaternion=np.array(capture.quaternion),
+        base_position=position[:, 1],
+        base_quaternion=base_quaternion,
+        foot_position=position[:, 2:],
     )

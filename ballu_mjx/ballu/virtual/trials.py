@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,17 +10,42 @@ from jaxtyping import Float
 
 from ballu_mjx.ballu import plots as ballu_plots
 from ballu_mjx.ballu.features import foot_positions
+from ballu_mjx.ballu.gait import count_steps
 from ballu_mjx.ballu.model import load_model
-from ballu_mjx.ballu.reconstruct import reconstruct_ballu
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import TrialConditions, VirtualRobot
 from ballu_mjx.evaluation.transfer import Trajectory, Transfer, compare_trajectories
 from ballu_mjx.policies.closed_loop import ClosedLoop
-from ballu_mjx.policies.deploy.estimator import PolicyController
+from ballu_mjx.policies.deploy.controller import Controller
+from ballu_mjx.policies.deploy.estimator import Capture
+from ballu_mjx.policies.deploy.export import weights
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.reference import stack_motions
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.simulator import Simulator
+
+
+class ExportedPolicy:
+    """A policy as `python -m ballu_mjx export` ships it, rate limit and time-out included, fed from captures."""
+
+    def __init__(self, stored: Mapping[str, np.ndarray]) -> None:
+        """`stored` is what `export.weights` returns."""
+        self.controller = Controller(stored)
+        self._fed = 0
+
+    def __call__(self, capture: Capture) -> Float[np.ndarray, " 2"]:
+        """Return the commands after the frames that came since the last call; a trial needs a new controller."""
+        commands = self.controller.command
+        for frame in range(self._fed, len(capture.time)):
+            seen = {
+                f"{name}_position": place for name, place in zip(capture.names, capture.position[frame], strict=True)
+            }
+            seen[f"{capture.names[0]}_quaternion"] = capture.quaternion[frame]
+            commands = np.array(self.controller.step(capture.time[frame], seen))
+        self._fed = len(capture.time)
+        return commands
 
 
 def run_trials(
@@ -30,32 +55,33 @@ def run_trials(
     folder: Path,
     loop: ClosedLoop | None = None,
 ) -> list[Transfer]:
-    """Run each trial in closed loop from motion capture alone, and compare it with the policy's own simulator (`loop`,
-    where that is at hand already) from the same state.
+    """Run each trial in closed loop from motion capture alone, under the controller that `export` ships, and compare it
+    with the policy's own simulator (`loop`, where that is at hand already) from the same state.
 
     Leaves in `folder` a recording a trial, and `trials.png`: the ways from above, on the robot and in simulation.
     """
-    act, seconds = policy.act(), policy.task.trial_seconds
+    stored = weights(policy)
+    seconds, setting = policy.task.trial_seconds, policy.variant.name
     recordings = []
     for number, draw in enumerate(draws):
         name = f"trial-{number + 1}"
-        notes = f"{policy.task.name}, trained in {policy.setting}, closed loop."
-        recording = virtual_robot.record(hardware, draw, PolicyController(act), seconds, name, notes)
+        notes = f"{policy.task.name}, trained in {setting}, closed loop."
+        recording = virtual_robot.record(hardware, draw, ExportedPolicy(stored), seconds, name, notes)
         path = folder / f"{name}.csv.gz"
-        write_recording(recording, path, decimals=4)
-        recordings.append(read_recording(path))  # reading fills the gaps
-        print(f"{policy.task.name}, {policy.setting}: {name} of {len(draws)} done", flush=True)
+        write_recording(recording, path, load_robot(), decimals=4)
+        recordings.append(read_recording(path, load_robot()))  # reading fills the gaps
+        print(f"{policy.task.name}, {setting}: {name} of {len(draws)} done", flush=True)
 
     model = load_model(policy.actuators)
-    motions = [reconstruct_ballu(recording, model) for recording in recordings]
-    reference, com = stack_motions(Simulator(model), motions)
+    motions = [reconstruct(recording, load_robot(), model) for recording in recordings]
+    reference, com = stack_motions(Simulator(load_robot(), model=model), motions)
     starts = [np.stack([getattr(motion, name)[0] for motion in motions]) for name in ("qpos", "qvel")]
     rollout = (loop or policy.closed_loop())(policy.params, starts[0], starts[1], len(motions[0].command))
     recorded = np.asarray(com), np.asarray(reference.features)
     hardware_ways = [_way(*(x[i, : len(motion.qpos)] for x in recorded)) for i, motion in enumerate(motions)]
     simulated = [_way(*states) for states in zip(rollout.com, rollout.features, strict=True)]
     ballu_plots.draw_trajectories(
-        folder / "trials.png", [way.com for way in hardware_ways], [way.com for way in simulated], policy.setting
+        folder / "trials.png", [way.com for way in hardware_ways], [way.com for way in simulated], setting
     )
     ballu_plots.gait(folder / "gait.png", motions[0].qpos, motions[0].command)
     return [compare_trajectories(sim, real) for sim, real in zip(simulated, hardware_ways, strict=True)]
@@ -63,4 +89,4 @@ def run_trials(
 
 def _way(com: Float[np.ndarray, "T 3"], features: Float[np.ndarray, "T 27"]) -> Trajectory:
     """Of states as `observation.observe_features` sees them."""
-    return Trajectory(com, features[:, 8], foot_positions(features))
+    return Trajectory(com, features[:, 8], count_steps(foot_positions(features)))

@@ -14,7 +14,7 @@ from jaxtyping import Float
 POSITION_WINDOW = 0.04
 """Seconds of frames behind a position and velocity. Longer ones lag at footfalls, shorter ones pass on more noise."""
 ORIENTATION_WINDOW = 0.1
-"""Seconds of frames behind the balloon's orientation, which is noisier and turns slowly."""
+"""Seconds of frames behind the tracked body's orientation, which is noisier and turns slowly."""
 FEWEST_FRAMES = 3
 """Where fewer are visible in a window, as at the end of a drop-out, older ones are taken."""
 EXTRAPOLATION_LIMIT = 0.2
@@ -23,49 +23,33 @@ EXTRAPOLATION_LIMIT = 0.2
 
 @dataclasses.dataclass
 class Capture:
-    """Motion capture frames as they come: time (s), noisy poses (m; w, x, y, z) in the world frame; NaN where a marker
-    is hidden. One list entry a frame; the newest frame has no command (left, right) yet."""
+    """Motion capture frames as they come, in the world frame; NaN where something is hidden.
 
-    time: list[float]
-    command: list[np.ndarray]
-    balloon_position: list[np.ndarray]
-    balloon_quaternion: list[np.ndarray]
-    base_position: list[np.ndarray]
-    base_quaternion: list[np.ndarray]
-    foot_position: list[np.ndarray]
+    The newest frame has no command yet.
 
+    **Fields**
 
-Controller = Callable[[Capture], Float[np.ndarray, " 2"]]
-"""Sees all frames so far, returns the next commands (left, right)."""
-
-
-class PolicyController:
-    """A `Controller` that asks a policy.
-
-    **Arguments**
-
-    - `act`: the policy, from features (see `estimate`) to commands (left, right), which are clipped to [0, 1].
+    - `names`: of what is seen, the tracked body first, then the robot's points.
+    - `time`: s, one entry a frame.
+    - `command`: in the actuators' units, one entry a frame.
+    - `position`: places (m) of what `names` names, one entry a frame.
+    - `quaternion`: orientation of the tracked body (w, x, y, z), one entry a frame.
     """
 
-    def __init__(self, act: Callable[[Float[np.ndarray, " 27"]], Float[np.ndarray, " 2"]]) -> None:
-        self.act = act
-        self.features: list[Float[np.ndarray, " 27"]] = []
-        """The estimates acted on so far, one a call."""
-
-    def __call__(self, capture: Capture) -> Float[np.ndarray, " 2"]:
-        """The next commands. Raises `ValueError` as `estimate` does."""
-        features = estimate(capture)
-        self.features.append(features)
-        return np.clip(np.asarray(self.act(features), float), 0.0, 1.0)
+    names: tuple[str, ...]
+    time: list[float] = dataclasses.field(default_factory=list)
+    command: list[Float[np.ndarray, " commands"]] = dataclasses.field(default_factory=list)
+    position: list[Float[np.ndarray, "names 3"]] = dataclasses.field(default_factory=list)
+    quaternion: list[Float[np.ndarray, " 4"]] = dataclasses.field(default_factory=list)
 
 
 def estimate(
     capture: Capture, window: float = POSITION_WINDOW, orientation_window: float = ORIENTATION_WINDOW
-) -> Float[np.ndarray, " 27"]:
-    """The features of `observation.observe_features` at the newest frame, from this and earlier frames only.
+) -> Float[np.ndarray, " features"]:
+    """Return the features of `observation.observe_features` at the newest frame, from this and earlier frames only.
 
-    Each position, and the balloon's Euler angles, are a least-squares line over the visible frames of a window that
-    ends with the last visible frame, read off now; the line's slope is the velocity. Of a marker seen once, the
+    Each position, and the tracked body's Euler angles, are a least-squares line over the visible frames of a window
+    that ends with the last visible frame, read off now; the line's slope is the velocity. Of a marker seen once, the
     velocity is 0. One hidden for longer than `EXTRAPOLATION_LIMIT` is taken to have come to rest there.
 
     **Arguments**
@@ -75,27 +59,28 @@ def estimate(
 
     **Returns**
 
-    World frame; m, m/s, rad: balloon position, velocity and Euler angles (roll, pitch, yaw; intrinsic z-y-x; yaw and
-    roll in [-pi, pi]), base position and velocity, position and velocity of the left and of the right foot.
+    World frame; m, m/s, rad: position, velocity and Euler angles (roll, pitch, yaw; intrinsic z-y-x; yaw and roll in
+    [-pi, pi]) of the tracked body, then position and velocity of each point.
 
-    Raises `ValueError` if a marker has been hidden from the first frame on.
+    **Raises** `ValueError` if a marker has been hidden from the first frame on.
     """
-
-    def kinematics(name: str, position: Callable[[int], np.ndarray]) -> np.ndarray:
-        time, visible = _visible(capture.time, position, name, window)
-        return np.concatenate(_line(time, visible, capture.time[-1]))
+    kinematics = []
+    for place, name in enumerate(capture.names):
+        time, visible = _visible(capture.time, lambda frame, at=place: capture.position[frame][at], name, window)
+        kinematics.append(np.concatenate(_line(time, visible, capture.time[-1])))
 
     def angles(frame: int) -> np.ndarray:
-        return euler_angles(capture.balloon_quaternion[frame])
+        return euler_angles(capture.quaternion[frame])
 
-    balloon = kinematics("balloon", lambda frame: capture.balloon_position[frame])
-    base = kinematics("base", lambda frame: capture.base_position[frame])
-    left = kinematics("left foot", lambda frame: capture.foot_position[frame][0])
-    right = kinematics("right foot", lambda frame: capture.foot_position[frame][1])
-    time, visible = _visible(capture.time, angles, "balloon's orientation", orientation_window)
+    time, visible = _visible(capture.time, angles, orientation_of(capture.names[0]), orientation_window)
     euler, _ = _line(time, np.unwrap(visible, axis=0), capture.time[-1])
     euler = np.arctan2(np.sin(euler), np.cos(euler))
-    return np.concatenate([balloon, euler, base, left, right])
+    return np.concatenate([kinematics[0], euler, *kinematics[1:]])
+
+
+def orientation_of(tracked: str) -> str:
+    """Return what the orientation of the tracked body is called."""
+    return f"{tracked}'s orientation"
 
 
 def euler_angles(quaternion: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " 3"]:

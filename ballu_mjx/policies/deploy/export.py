@@ -26,7 +26,7 @@ from ballu_mjx.policies.deploy import controller, estimator
 
 if TYPE_CHECKING:
     from ballu_mjx.policies.policy import Policy
-    from ballu_mjx.rl.ppo import PPOConfig
+    from ballu_mjx.robots.description import RobotDescription
 
 _CHECKS = 20
 """Features and commands that go with the weights, for the robot to check its own arithmetic."""
@@ -48,9 +48,9 @@ class ExportOptions:
     """Write policy.onnx too, for other runtimes: from observation to commands, without estimator, rate limit and
     time-out. Needs the extra onnx."""
     pulse_low: float = 1000.0
-    """Pulse width, microseconds, at which the servo stands at command 0."""
+    """Pulse width, microseconds, that stands for the smallest value of a command."""
     pulse_high: float = 2000.0
-    """Pulse width, microseconds, at which the servo stands at command 1."""
+    """Pulse width, microseconds, that stands for the largest value of a command."""
 
 
 def export_policy(options: ExportOptions) -> Path:
@@ -60,20 +60,23 @@ def export_policy(options: ExportOptions) -> Path:
     """
     from ballu_mjx.policies.policy import Policy
     from ballu_mjx.policies.tasks import TASKS
-    from ballu_mjx.rl.ppo import PPOConfig
-    from ballu_mjx.robots.model import CONTROL_TIMESTEP
-    from ballu_mjx.runs.folder import new_folder, read_config, typed_config
+    from ballu_mjx.residuals.trained import RESIDUAL_TASKS
+    from ballu_mjx.runs.folder import new_folder, read_config
 
     _check(options)
-    ppo_config = typed_config(PPOConfig, read_config(options.run, *TASKS), "ppo", options.run)
+    if (task := read_config(options.run, *TASKS, *RESIDUAL_TASKS)["task"]) in RESIDUAL_TASKS:
+        raise InputError(
+            f"{options.run}: is a residual ({task}), which acts in simulation only; train a policy in its simulator "
+            f"(ballu_mjx train walk --residual {options.run}) and export that."
+        )
     folder = new_folder(options.output or options.run / "export", "export")
     policy = Policy.load(options.run)
-    stored = weights(policy, ppo_config)
+    stored = weights(policy)
     commands = None
     if options.open_loop:
         seconds = policy.task.trial_seconds if options.seconds is None else options.seconds
         print("Compiling: about a minute the first time ...", flush=True)
-        commands = open_loop(policy, max(round(seconds / CONTROL_TIMESTEP), 1))
+        commands = open_loop(policy, max(round(seconds / policy.robot.control_timestep), 1))
 
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in sources().items():
@@ -82,31 +85,45 @@ def export_policy(options: ExportOptions) -> Path:
     if options.onnx:
         (folder / "policy.onnx").write_bytes(onnx_model(stored))
     if commands is not None:
-        _write_commands(folder / "commands.csv", commands, options)
-        print(_rate(commands))
-    (folder / "README.txt").write_text(_readme(options, policy, commands), encoding="utf-8")
+        _write_commands(folder / "commands.csv", commands, policy.robot, options)
+        if (said := _rate(commands, stored)) is not None:
+            print(said)
+    (folder / "README.txt").write_text(_readme(options, policy, stored, commands), encoding="utf-8")
     print(f"Written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}.")
     return folder
 
 
-def weights(policy: Policy, ppo_config: PPOConfig) -> dict[str, np.ndarray]:
-    """What `controller.Controller` reads: normalizer, layers of the mean's network, and a few features and commands.
+def weights(policy: Policy) -> dict[str, np.ndarray]:
+    """Return what `controller.Controller` reads: normalizer, layers of the mean's network, what the robot is seen and
+    driven by, and a few features and commands.
 
     The policy's most likely action is the mean of its Gaussian: the network's output before the deviation, which is a
     parameter of its own and is left out.
     """
+    robot, network = policy.robot, policy.network
     layers = _layers(policy.params.policy["params"])
     mean, std = (np.asarray(m["state"]) for m in (policy.params.normalizer.mean, policy.params.normalizer.std))
-    clip = ppo_config.observation_clip
-    if not ppo_config.normalize_observations:
+    clip = network.observation_clip
+    if not network.normalize_observations:
         mean, std, clip = np.zeros_like(mean), np.ones_like(std), math.inf
-    features = _plausible(np.random.default_rng(0), _CHECKS)
+    features = _plausible(np.random.default_rng(0), _CHECKS, robot.features)
     act = policy.act()
+    low, high = np.array(robot.command_ranges, float).T
     return {
+        "robot": np.array(robot.name),
+        "names": np.array((robot.tracked, *robot.points)),
+        "anchored": np.array(robot.anchored),
+        "commands": np.array(robot.commands),
+        "command_low": low,
+        "command_high": high,
+        "command_rest": robot.adapter.rest_command(robot, robot.load_model()),
+        "control_timestep": np.array(robot.control_timestep),
+        "full_travel": np.array(robot.adapter.full_travel(robot)),
+        "observation": np.array(controller.observation_names((robot.tracked, *robot.points))),
         "mean": mean,
         "std": std,
         "observation_clip": np.array(clip),
-        "activation": np.array(ppo_config.activation),
+        "activation": np.array(network.activation),
         **{f"kernel_{i}": kernel for i, (kernel, _) in enumerate(layers)},
         **{f"bias_{i}": bias for i, (_, bias) in enumerate(layers)},
         "check_features": features,
@@ -117,8 +134,8 @@ def weights(policy: Policy, ppo_config: PPOConfig) -> dict[str, np.ndarray]:
 def onnx_model(stored: Mapping[str, np.ndarray]) -> bytes:
     """`weights` as an ONNX graph.
 
-    Input `observation`, float32 [batch, 28], in the order and units of `controller.OBSERVATION`; output `command`,
-    float32 [batch, 2], left and right, in [0, 1].
+    Input `observation`, float32 [batch, observations], in the order and units of `controller.observation_names`; output
+    `command`, float32 [batch, commands], in the actuators' units.
     """
     from onnx import TensorProto, checker, helper, numpy_helper
 
@@ -146,7 +163,9 @@ def onnx_model(stored: Mapping[str, np.ndarray]) -> bytes:
         elif i < last:
             x = node("Tanh", [x], f"active_{i}")
     x = node("Mul", [node("Add", [x, constant("one", 1.0)], "raised"), constant("half", 0.5)], "halved")
-    node("Clip", [x, constant("relaxed", 0.0), "one"], "command")
+    x = node("Clip", [x, constant("zero", 0.0), "one"], "share")
+    x = node("Mul", [x, constant("range", stored["command_high"] - stored["command_low"])], "scaled")
+    node("Add", [x, constant("low", stored["command_low"])], "command")
     sizes = {"observation": len(stored["mean"]), "command": len(stored[f"bias_{last}"])}
     ends = [helper.make_tensor_value_info(n, TensorProto.FLOAT, ["batch", size]) for n, size in sizes.items()]
     graph = helper.make_graph(nodes, "policy", ends[:1], ends[1:], constants)
@@ -163,8 +182,8 @@ def sources() -> dict[str, str]:
     }
 
 
-def open_loop(policy: Policy, steps: int) -> Float[np.ndarray, "steps 2"]:
-    """The policy's commands in its own simulator, from standing."""
+def open_loop(policy: Policy, steps: int) -> Float[np.ndarray, "steps commands"]:
+    """Return the policy's commands in its own simulator, from the initial pose."""
     loop = policy.closed_loop()
     return np.asarray(loop(policy.params, *loop.standing(), steps).command[0], float)
 
@@ -205,7 +224,7 @@ def _check(options: ExportOptions) -> None:
     if options.onnx and importlib.util.find_spec("onnx") is None:
         raise InputError('--onnx: the package onnx is not installed; `pip install "ballu-mjx[onnx]"` brings it.')
     if options.pulse_low == options.pulse_high:
-        raise InputError(f"--pulse-low and --pulse-high are both {options.pulse_low:g}: the servos would not move.")
+        raise InputError(f"--pulse-low and --pulse-high are both {options.pulse_low:g}: nothing would move.")
 
 
 def _layers(tree: dict) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -217,44 +236,84 @@ def _layers(tree: dict) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(np.asarray(layer["kernel"]), np.asarray(layer["bias"])) for layer in layers]
 
 
-def _plausible(rng: np.random.Generator, count: int) -> Float[np.ndarray, "count 27"]:
-    """Features of the order of a walking robot's."""
-    features = rng.normal(0.0, 0.2, (count, 27))
-    features[:, [2, 11]] += 1.1, 0.75
+def _plausible(rng: np.random.Generator, count: int, size: int) -> Float[np.ndarray, "count size"]:
+    """Return features of the order of a moving robot's."""
+    features = rng.normal(0.0, 0.2, (count, size))
     features[:, 8] = rng.uniform(-np.pi, np.pi, count)
     return features
 
 
-def _write_commands(path: Path, commands: Float[np.ndarray, "steps 2"], options: ExportOptions) -> None:
-    pulses = options.pulse_low + commands * (options.pulse_high - options.pulse_low)
+def _write_commands(
+    path: Path, commands: Float[np.ndarray, "steps commands"], robot: RobotDescription, options: ExportOptions
+) -> None:
+    low, high = np.array(robot.command_ranges, float).T
+    pulses = options.pulse_low + (commands - low) / (high - low) * (options.pulse_high - options.pulse_low)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["time", "command_left", "command_right", "pulse_left_us", "pulse_right_us"])
+        names = (*(f"command_{name}" for name in robot.commands), *(f"pulse_{name}_us" for name in robot.commands))
+        writer.writerow(["time", *names])
         for step, (command, pulse) in enumerate(zip(commands, pulses, strict=True)):
-            time = f"{step * controller.CONTROL_PERIOD:.2f}"
+            time = f"{step * robot.control_timestep:.{_decimals(robot.control_timestep)}f}"
             writer.writerow([time, *(f"{x:.4f}" for x in command), *(f"{x:.1f}" for x in pulse)])
 
 
-def _rate(commands: Float[np.ndarray, "steps 2"]) -> str:
-    """How much of the policy's commands the controller's rate limit would change."""
-    largest = controller.CONTROL_PERIOD / controller.FULL_TRAVEL
-    beyond = np.abs(np.diff(commands, axis=0, prepend=np.zeros((1, 2)))).max(axis=1) > largest + 1e-6
+def _decimals(step: float) -> int:
+    """Return how many decimals multiples of a step need, two at least."""
+    return max(2, len(f"{step:.6f}".rstrip("0").partition(".")[2]))
+
+
+def _rate(commands: Float[np.ndarray, "steps commands"], stored: Mapping[str, np.ndarray]) -> str | None:
+    """Return how much of the policy's commands the controller's rate limit would change; None: there is no limit."""
+    if not stored["full_travel"] > 0:
+        return None
+    largest = stored["control_timestep"] / stored["full_travel"]
+    shares = np.diff(commands, axis=0, prepend=stored["command_rest"][None])
+    beyond = (np.abs(shares) / (stored["command_high"] - stored["command_low"])).max(axis=1) > largest + 1e-6
     return (
         f"In its own simulator the policy changes a command by more than the controller's rate limit allows "
-        f"({largest:g} a control step) in {beyond.mean():.0%} of the control steps."
+        f"({largest:g} of its range a control step) in {beyond.mean():.0%} of the control steps."
     )
 
 
-def _readme(options: ExportOptions, policy: Policy, commands: Float[np.ndarray, "steps 2"] | None) -> str:
-    indented = textwrap.TextWrapper(width=112, initial_indent="    ", subsequent_indent="    ").fill
+def _readme(
+    options: ExportOptions,
+    policy: Policy,
+    stored: Mapping[str, np.ndarray],
+    commands: Float[np.ndarray, "steps commands"] | None,
+) -> str:
+    robot = policy.robot
+    notes, names = robot.adapter.deployment_notes(robot), (robot.tracked, *robot.points)
+    step, travel, simulator = robot.control_timestep, float(stored["full_travel"]), policy.variant.name
     low, high = options.pulse_low, options.pulse_high
-    observed = "; ".join(f"{i}: {name}" for i, name in enumerate(controller.OBSERVATION))
-    commanded = (
-        f"0 is the servo relaxed (knee at its stop, cable just taut), 1 is 90 deg. Pulses: {low:g} us at 0, {high:g} "
-        f"us at 1. Commands change at 20 Hz, by {controller.CONTROL_PERIOD / controller.FULL_TRAVEL:g} a control step "
-        f"at most: full travel in {controller.FULL_TRAVEL:g} s, for the servo's own no-load speed is 60 deg in 0.14 s "
-        "(90 deg in 0.21 s); Controller's full_travel sets it. If a marker has not been seen for "
-        f"{controller.TIMEOUT:g} s, commands go to 0 at that rate until all have been seen again."
+
+    def indented(text: str, hang: int = 4) -> str:
+        return textwrap.fill(text, 112, initial_indent="    ", subsequent_indent=" " * hang)
+
+    observed = "; ".join(f"{i}: {name}" for i, name in enumerate(stored["observation"].tolist()))
+    frame = "World frame: floor at z = 0, z up; x forward and y left as the robot stands at the start."
+    seen = "x and y axes are turned about z into the heading (the yaw) of {0}; x and y of positions are relative to {0}"
+    seen = seen.format(robot.tracked) + " (so entries 0 and 1 are 0); z is above the floor; m, m/s, rad."
+    if robot.anchored:
+        frame = "World frame of the robot's model, z up."
+        seen = "Everything is in the world frame; m, m/s, rad."
+    markers = [
+        f"{name}_position: x, y, z of the site {name!r}" + (f", {notes.markers[name]}" if name in notes.markers else "")
+        for name in names
+    ]
+    markers.insert(
+        1,
+        f"{robot.tracked}_quaternion: w, x, y, z from the axes of {robot.tracked} to the world's; 1, 0, 0, 0 in the "
+        "model's reference pose",
+    )
+    ranges = "; ".join(
+        f"{name} from {bounds[0]:g} to {bounds[1]:g}, at rest {rest:g}"
+        for name, bounds, rest in zip(robot.commands, robot.command_ranges, stored["command_rest"], strict=True)
+    )
+    commanded = [f"In the actuators' own units: {ranges}.", notes.commands]
+    commanded += [f"Pulses: {low:g} us at the smallest value, {high:g} us at the largest.", _limit(step, travel)]
+    commanded.append(
+        f"If a marker has not been seen for {controller.TIMEOUT:g} s, or its pose has not changed for as long, "
+        "commands go to those at rest until all have been seen again."
     )
     estimation = (
         f"Each position is a straight line through the frames of the last {estimator.POSITION_WINDOW:g} s "
@@ -264,68 +323,82 @@ def _readme(options: ExportOptions, policy: Policy, commands: Float[np.ndarray, 
     open_loop = "Not written (--no-open-loop)."
     if commands is not None:
         open_loop = (
-            f"{len(commands) * controller.CONTROL_PERIOD:g} s of the policy's commands in its own simulator, from\n"
-            "standing, without the rate limit. Each row holds until the next (0.05 s).\n"
-            + textwrap.fill(_rate(commands))
+            f"{len(commands) * step:g} s of the policy's commands in its own simulator, from its initial pose, without "
+            f"the rate limit. Each row holds until the next ({step:g} s). {_rate(commands, stored) or ''}"
         )
+    measure = [
+        *notes.measure,
+        "Motion capture: sign and zero of the yaw (turn the robot left: it must grow), heights, which marker is which.",
+        f"Time from the camera to the actuator. {_latency(policy.latency)}",
+        "Control step's time on the robot (python3 controller.py).",
+        "First runs with the robot held, at a fraction of the speed (Controller(folder, full_travel=1.0)).",
+    ]
     return f"""\
-A policy for BALLU: task '{policy.task.name}', trained in the simulator '{policy.setting}', step {policy.step}.
+A policy for {robot.name}: task '{policy.task.name}', trained in the simulator '{simulator}', step {policy.step}.
 
 Files
-    controller.py    the controller: Controller(folder).step(time, frame) -> (left, right)
+    controller.py    the controller: Controller(folder).step(time, frame) -> {", ".join(robot.commands)}
     estimator.py     its estimator: positions and velocities from motion capture frames so far
-    weights.npz      the policy's network and the normalization of its observation
+    weights.npz      the policy's network, the normalization of its observation, and names and units of what it
+                     sees and commands
     commands.csv     see 'Open loop' below
     policy.onnx      with --onnx: the network alone, from 'observation' (as below) to 'command', for other runtimes
 
 Running it
     Needs Python 3.9 or newer and NumPy, nothing else. Copy this folder to the robot and there:
 
-        python3 controller.py        # must print 'Passed.'; tells the time of a control step (50 ms there are)
+        python3 controller.py        # must print 'Passed.'; tells the time of a control step
 
     In the robot's loop, with every frame of motion capture (best at 100 Hz, 50 Hz or more; or once every
-    0.05 s, where velocities lag more):
+    {step:g} s, where velocities lag more):
 
         import time
         from controller import Controller
         controller = Controller(folder)
         while True:
             frame = newest_frame()                     # or None where nothing came
-            left, right = controller.step(time.monotonic(), frame)
-            send_pulses({low:g} + left * {high - low:g}, {low:g} + right * {high - low:g})  # microseconds
+            commands = controller.step(time.monotonic(), frame)
+            send(commands)                             # {", ".join(robot.commands)}
 
-    Call it with None when no frame came for 0.05 s: the time-out is counted inside step. If the program
-    itself stops, the servo driver must cut the pulses; nothing here can. controller.status says what is missing.
+    Call it with None when no frame came for {step:g} s: the time-out is counted inside step. If the program
+    itself stops, the actuators' driver must stop them; nothing here can. controller.status says what is missing.
 
 A frame
-    A dict, or an object with attributes, of arrays; NaN where a marker is hidden.
-    World frame: floor at z = 0, z up; x forward and y left as the robot stands at the start.
-        balloon_position     x, y, z of the balloon cluster's centre of mass, m (the model's site 'balloon':
-                             0.38 m above the neck's hinge, on the robot's middle)
-        balloon_quaternion   w, x, y, z from the balloon's axes to the world's; 1, 0, 0, 0 upright, facing x
-        base_position        x, y, z of the middle of the hip axis, m (site 'base')
-        foot_position        2 x 3: centres of the left and of the right foot's sphere, m
+    A dict, or an object with attributes, of arrays (m); NaN where a marker is hidden.
+{indented(frame)}
+{chr(10).join(indented(f"    {marker}", 12) for marker in markers)}
 
 Commands
-{indented(commanded)}
+{indented(" ".join(filter(None, commanded)))}
 
 Estimator
 {indented(estimation)}
 
 What the policy sees
-    x and y axes are turned about z into the balloon's heading; x and y of positions are relative to the
-    balloon's (so entries 0 and 1 are 0); z is above the floor; m, m/s, rad.
+{indented(seen)}
 {indented(observed)}
 
 Open loop
 {indented(open_loop)}
 
 Measure first
-    1. Pulse widths at command 0 (cable just taut, knee at its stop) and at 90 deg, of each servo; whether one runs
-       the other way round. Give them by --pulse-low and --pulse-high, or in send_pulses for each servo.
-    2. Motion capture: z of the feet standing (the foot sphere's radius, not 0), sign and zero of the yaw (turn the
-       robot left: it must grow), which foot is left, base and balloon height.
-    3. Time from the camera to the servo. The policy was trained without delay.
-    4. Control step's time on the robot (python3 controller.py).
-    5. First runs with the robot held, at a fraction of the speed (Controller(folder, full_travel=1.0)).
+{chr(10).join(indented(f"{number}. {text}", 7) for number, text in enumerate(measure, start=1))}
 """
+
+
+def _limit(step: float, travel: float) -> str:
+    """Return what the README says of the rate limit."""
+    changing = f"Commands change every {step:g} s"
+    if travel == 0:
+        return f"{changing}, without a limit of their rate; Controller's full_travel sets one."
+    return (
+        f"{changing}, by {step / travel:g} of their range at most: full travel in {travel:g} s; Controller's "
+        "full_travel sets it."
+    )
+
+
+def _latency(seconds: float) -> str:
+    """Return what the README says of the latency in training."""
+    if seconds == 0:
+        return "The policy was trained without delay."
+    return f"The policy was trained with a delay of {1000 * seconds:.0f} ms from its command to the actuator."

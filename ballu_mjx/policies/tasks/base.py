@@ -14,10 +14,10 @@ class Step(NamedTuple):
 
     velocity: Float[Array, " 3"]
     """Of the centre of mass, mean over the control step (m/s)."""
-    features: Float[Array, " 27"]
+    features: Float[Array, " features"]
     """`observation.observe_features` at the step's end."""
-    command: Float[Array, " 2"]
-    """Servo commands (left, right) in [0, 1]."""
+    command: Float[Array, " commands"]
+    """Commands, in the actuators' units."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -55,7 +55,7 @@ def read_c3d(path: Path, mapping: RoomMapping) -> Trajectories:
         return points[:, labels.index(full)].T
 
     if not mapping.sources:
-        refuse(mapping.path, "", "it asks for no marker of a C3D file", "say what the balloon is, or give a table")
+        refuse(mapping.path, "", "it asks for no marker of a C3D file", "say what its sites are, or give a table")
     bodies = {}
     for role, source in mapping.sources.items():
         if source.position:

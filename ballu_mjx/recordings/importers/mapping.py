@@ -10,79 +10,23 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NoReturn, cast
 
+import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.ballu.model import SIDES
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import is_number
+from ballu_mjx.recordings.hooks import hooks_of
 from ballu_mjx.recordings.importers.trajectories import ANGLES, LENGTHS, TIMES, refuse, shorten, suggest
-from ballu_mjx.recordings.recording import COLUMNS, Kind
+from ballu_mjx.recordings.recording import Kind
+from ballu_mjx.robots.description import RobotDescription
 
-ROLES = ("balloon", "base", *(f"foot_{side}" for side in SIDES))
-JOINTS = (*COLUMNS["motor"], *COLUMNS["knee"])
 MARKER_TOLERANCE = 0.01
 """m, see `trajectories.rigid_body`."""
-
-EXAMPLE = """\
-# What is what in the files of one capture room, for `python -m ballu_mjx record import`.
-# Only robot, balloon, base and the feet must stand here; everything else shows its default unless it says otherwise.
-
-robot = "ballu-room-3"   # the name that all recordings of this robot carry
-kind = "free"            # "suspended": a sweep with the feet off the ground
-notes = ""
-# rate = 100.0           # Hz; only for tables without a time column, or where the file's own is wrong
-
-[axes]                   # the capture's axes that point along the format's; all of "x", "-x" ... "-z"
-forward = "x"
-left = "y"
-up = "z"
-
-[origin]
-start = true             # turn and shift so that the robot starts at the origin, looking along x; false: as captured
-floor = 0.0              # m, height of the floor in the capture; "feet": where the lowest foot stands
-
-[units]                  # only where the file does not say, or says something wrong
-# length = "mm"          # m, cm, mm
-# angle = "deg"          # rad, deg
-# time = "s"             # s, ms, us, ns; tables only
-
-[balloon]                # needs an orientation: a Vicon object or segment, three markers or more, or columns
-body = "ballu:balloon"   # "subject:segment", an object, or the name behind the colon where only one subject has it
-# section = "Segments"   # where the name stands in several sections of a Vicon file
-# rotation = "helical"   # RX, RY, RZ are a rotation vector. Euler angles: "XYZ" about the body's own axes in turn
-                         # (Vicon's "Euler XYZ"), "xyz" about the capture's. Default: helical in "Segments"; others must
-                         # say it
-# markers = ["B1", "B2", "B3", "B4"]                        # instead of body
-# geometry = [[0.1, 0, 0], [0, 0.1, 0], [-0.1, 0, 0], [0, 0, 0.1]]  # where they sit, m; default: as at the start
-# position = ["bx", "by", "bz"]                             # instead of body, in tables: names of columns
-# orientation = ["qw", "qx", "qy", "qz"]                    # with rotation = "quaternion" (w, x, y, z), or three angles
-offset = [0.0, 0.0, 0.0] # m: the model's site `balloon` in the tracked body's frame
-turn = [0.0, 0.0, 0.0]   # deg, a rotation vector: the model's balloon frame in the tracked body's frame.
-                         # "start": at the start the robot stands upright and looks along `forward`
-
-[base]                   # the model's site `base`: the middle of the hip axle
-body = "ballu:base"
-
-[foot_left]              # the centre of the foot's sphere
-body = "ballu:foot_left"
-
-[foot_right]
-body = "ballu:foot_right"
-
-# [knee_left]            # tables only: motor_left, motor_right, knee_left, knee_right
-# column = "kl"
-# sign = 1               # -1 turns it round
-# zero = 0.0             # in the column's unit: what it shows where the model's angle is 0
-
-[commands]               # columns of the command log (--commands), or of the table itself
-time = "time"
-time_unit = "s"
-left = "command_left"
-right = "command_right"
-range_left = [0.0, 1.0]  # what the columns show at command 0 and at command 1; servo angles: [0, 90]
-range_right = [0.0, 1.0] # a servo mounted the other way round: [90, 0]
-"""
+_TABLES = ("axes", "origin", "units", "commands")
+_RESERVED = ("robot", "kind", "notes", "rate", *_TABLES)
+"""Names that no site or joint of a mapping file can have."""
+_RESERVED_COMMANDS = ("time", "time_unit")
 
 _AXIS = re.compile(r"([+-]?)([xyz])")
 _EULER = re.compile(r"[XYZ]{3}|[xyz]{3}")
@@ -114,18 +58,28 @@ class Joint:
     column: str
     sign: float
     zero: float
+    slides: bool = False
+    """Whether it is a length."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Commands:
     """Columns of a command log."""
 
+    columns: Mapping[str, str]
+    """By the robot's commands, in their order."""
+    limits: tuple[tuple[float, float], ...]
+    """Smallest and largest value of each command, in its actuator's units."""
+    ranges: tuple[tuple[float, float], ...]
+    """What the columns show at these."""
     time: str = "time"
     time_unit: str = "s"
-    left: str = "command_left"
-    right: str = "command_right"
-    range_left: tuple[float, ...] = (0.0, 1.0)
-    range_right: tuple[float, ...] = (0.0, 1.0)
+
+    @staticmethod
+    def of(robot: RobotDescription) -> Commands:
+        """Return the columns that a log without a mapping has."""
+        columns = {name: f"command_{name}" for name in robot.commands}
+        return Commands(columns, robot.command_ranges, robot.command_ranges)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,6 +88,7 @@ class RoomMapping:
 
     path: Path
     robot: str
+    """Which specimen was captured."""
     kind: Kind
     notes: str
     rate: float | None
@@ -141,8 +96,8 @@ class RoomMapping:
     axes: Float[np.ndarray, "3 3"]
     """Turns the capture's coordinates into (forward, left, up)."""
     start: bool
-    floor: float | Literal["feet"]
-    """m."""
+    floor: float | str
+    """m, or a name among the robot's `RecordingHooks.floors`."""
     length: str | None
     angle: str | None
     time: str
@@ -153,50 +108,66 @@ class RoomMapping:
     commands: Commands
 
 
-def read_mapping(path: Path) -> RoomMapping:
-    """Read and check the mapping at `path`: JSON where it ends in .json, TOML else.
+def read_mapping(path: Path, robot: RobotDescription) -> RoomMapping:
+    """Read and check the mapping at `path` for captures of `robot`: JSON where it ends in .json, TOML else.
 
-    **Raises** `InputError` naming file, key and mend.
+    **Raises** `InputError` naming file, key and fix.
     """
-    mend = "mend it there; `python -m ballu_mjx record example-mapping` prints one that works"
+    fix = "correct it there; `python -m ballu_mjx record example-mapping` prints one that works"
     if path.suffix == ".json":
-        content = files.read_json(path, mend)
+        content = files.read_json(path, fix)
     else:
         try:
             content = tomllib.loads(files.read_text(path))
         except (ValueError, RecursionError) as error:
-            refuse(path, "", f"not TOML ({shorten(str(error))})", mend)
+            refuse(path, "", f"not TOML ({shorten(str(error))})", fix)
+    roles = (robot.tracked, *robot.points)
+    _check_names(path, roles, robot)
     top = _Keys(path, "", content)
-    robot = top.text("robot")
+    specimen = top.text("robot")
     kind = cast(Kind, top.choice("kind", ("free", "suspended"), "free"))
     notes, rate = top.text("notes", "", empty=True), top.number("rate", None, positive=True)
     axes = _axes(top.keys("axes"))
     origin = top.keys("origin")
-    start = origin.flag("start", True)
-    floor = "feet" if origin.values.get("floor") == "feet" else origin.number("floor", 0.0)
-    origin.taken.add("floor")
+    start = origin.flag("start", not robot.anchored)
+    floors = hooks_of(robot).floors
+    floor = origin.get("floor")
+    if not (isinstance(floor, str) and floor in floors):
+        floor = origin.number("floor", 0.0)
     origin.finish()
     units = top.keys("units")
     length = units.choice("length", LENGTHS, None)
     angle = units.choice("angle", ANGLES, None)
     time = units.choice("time", TIMES, "s")
     units.finish()
-    sources = {role: _source(top.keys(role), role) for role in ROLES if role in content}
-    for role in ROLES:
+    sources = {role: _source(top.keys(role), role) for role in roles if role in content}
+    for role in roles:
         if role not in sources and kind == "free":
-            refuse(path, f"[{role}]", "the table is missing", f'say what the {role} is, such as body = "ballu:{role}"')
-    if kind == "free" and not (sources["balloon"].body or sources["balloon"].markers or sources["balloon"].orientation):
-        mend = 'give it by body = "...", by markers = [...] or by orientation = [...]'
-        refuse(path, "[balloon]", "its orientation is missing", mend)
-    joints = {name: _joint(top.keys(name)) for name in JOINTS if name in content}
-    commands = _commands(top.keys("commands"))
-    top.taken |= {*ROLES, *JOINTS}
+            refuse(path, f"[{role}]", "the table is missing", f'say what the {role} is, such as body = "name:{role}"')
+    tracked = sources.get(robot.tracked)
+    if kind == "free" and tracked is not None and not (tracked.body or tracked.markers or tracked.orientation):
+        fix = 'give it by body = "...", by markers = [...] or by orientation = [...]'
+        refuse(path, f"[{robot.tracked}]", "its orientation is missing", fix)
+    given = [name for name in robot.joints if name in content]
+    model = robot.load_model()
+    joints = {name: _joint(top.keys(name), slides=_slides(model, name)) for name in given}
+    commands = _commands(top.keys("commands"), robot)
+    top.taken |= {*roles, *robot.joints}
     top.finish()
-    assert time is not None
+    assert time is not None and floor is not None
     return RoomMapping(
-        path, robot, kind, notes, rate, axes, start, cast(Any, floor), length, angle, time, commands.time, sources,
-        joints, commands,
+        path, specimen, kind, notes, rate, axes, start, floor, length, angle, time, commands.time, sources, joints,
+        commands,
     )  # fmt: skip
+
+
+def _check_names(path: Path, roles: Sequence[str], robot: RobotDescription) -> None:
+    for name, reserved in [
+        *((name, _RESERVED) for name in (*roles, *robot.joints)),
+        *((name, _RESERVED_COMMANDS) for name in robot.commands),
+    ]:
+        if name in reserved:
+            refuse(robot.file, shorten(name), f"the mapping {path} has another meaning for this name", "rename it")
 
 
 class _Keys:
@@ -206,10 +177,10 @@ class _Keys:
         self.path, self.name, self.values = path, name, values
         self.taken: set[str] = set()
 
-    def bad(self, key: str, mend: str) -> NoReturn:
+    def bad(self, key: str, fix: str) -> NoReturn:
         value = shorten(_json(self.values[key])) if key in self.values else "missing"
         place = f"[{self.name}] {key}" if self.name else f"key {key}"
-        refuse(self.path, place, "it is missing" if value == "missing" else f"it is {value}", mend)
+        refuse(self.path, place, "it is missing" if value == "missing" else f"it is {value}", fix)
 
     def get(self, key: str) -> Any:
         self.taken.add(key)
@@ -260,13 +231,13 @@ class _Keys:
             self.bad(key, f"write {count} numbers, [{', '.join(['0.0'] * count)}]")
         return tuple(map(float, value))
 
-    def names(self, key: str, counts: Sequence[int] | None, mend: str) -> tuple[str, ...]:
+    def names(self, key: str, counts: Sequence[int] | None, fix: str) -> tuple[str, ...]:
         value = self.get(key)
         if value is None:
             return ()
         fits = isinstance(value, list) and all(isinstance(name, str) and name for name in value)
         if not fits or (counts is not None and len(value) not in counts) or len(set(value)) < len(value):
-            self.bad(key, mend)
+            self.bad(key, fix)
         return tuple(value)
 
     def finish(self) -> None:
@@ -342,7 +313,11 @@ def _source(keys: _Keys, role: str) -> Source:
     return Source(role, body, section, rotation, markers, geometry, position, orientation, offset, turn)
 
 
-def _joint(keys: _Keys) -> Joint:
+def _slides(model: mujoco.MjModel, joint: str) -> bool:
+    return bool(model.joint(joint).type[0] == mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def _joint(keys: _Keys, *, slides: bool) -> Joint:
     column = keys.text("column")
     sign = keys.number("sign", 1.0)
     if sign not in (1.0, -1.0):
@@ -350,16 +325,91 @@ def _joint(keys: _Keys) -> Joint:
     zero = keys.number("zero", 0.0)
     keys.finish()
     assert sign is not None and zero is not None
-    return Joint(column, sign, zero)
+    return Joint(column, sign, zero, slides)
 
 
-def _commands(keys: _Keys) -> Commands:
-    default = Commands()
-    texts = {name: keys.text(name, getattr(default, name)) for name in ("time", "left", "right")}
+def _commands(keys: _Keys, robot: RobotDescription) -> Commands:
+    default = Commands.of(robot)
+    time = keys.text("time", default.time)
     unit = keys.choice("time_unit", TIMES, default.time_unit)
-    ranges = {name: keys.numbers(name, 2, (0.0, 1.0)) for name in ("range_left", "range_right")}
-    for name, (low, high) in ranges.items():
+    columns = {command: keys.text(command, column) for command, column in default.columns.items()}
+    ranges = []
+    for command, limits in zip(robot.commands, default.limits, strict=True):
+        key = f"range_{command}"
+        low, high = keys.numbers(key, 2, limits)
         if low == high:
-            keys.bad(name, "write what the column shows at command 0 and at command 1")
+            keys.bad(key, f"write what the column shows at command {limits[0]:g} and at command {limits[1]:g}")
+        ranges.append((low, high))
     keys.finish()
-    return dataclasses.replace(default, time_unit=unit or "s", **texts, **ranges)
+    return Commands(columns, default.limits, tuple(ranges), time, unit or "s")
+
+
+# ---- example ----
+
+
+def example_mapping(robot: RobotDescription) -> str:
+    """Return a mapping file for `robot` with every key and its default."""
+    tracked, name = robot.tracked, robot.name.lower().replace(" ", "_")
+    start = str(not robot.anchored).lower()
+    pads = {"pad": " " * max(1, 25 - len(f'robot = "{name}-1"')), "pad_tracked": " " * max(1, 23 - len(tracked))}
+    floors = "".join(f'; "{floor}": where the lowest of these stands' for floor in hooks_of(robot).floors)
+    lines = [_EXAMPLE.format(tracked=tracked, name=name, floors=floors, start=start, **pads)]
+    lines += [f'[{point}]\nbody = "{name}:{point}"\n' for point in robot.points]
+    if robot.joints:
+        lines.append(
+            f"# [{robot.joints[0]}]{' ' * max(1, 22 - len(robot.joints[0]))}# tables only: {', '.join(robot.joints)}\n"
+            '# column = "angle"\n'
+            "# sign = 1               # -1 turns it round\n"
+            "# zero = 0.0             # in the column's unit: what it shows where the model's angle is 0\n"
+        )
+    lines.append(
+        "[commands]               # columns of the command log (--commands), or of the table itself\n"
+        'time = "time"\ntime_unit = "s"\n'
+        + "".join(f'{command} = "command_{command}"\n' for command in robot.commands)
+        + "# What the columns show at the actuator's smallest and largest command. Servo angles: [0, 90]; a servo\n"
+        "# mounted the other way round: [90, 0].\n"
+        + "".join(
+            f"range_{command} = [{low:g}, {high:g}]\n"
+            for command, (low, high) in zip(robot.commands, robot.command_ranges, strict=True)
+        )
+    )
+    return "\n".join(lines)
+
+
+_EXAMPLE = """\
+# What is what in the files of one capture room, for `python -m ballu_mjx record import`.
+# Only robot and the sites of a free robot must stand here; all else shows its default unless it says otherwise.
+
+robot = "{name}-1"{pad}# the name that all recordings of this robot carry
+kind = "free"            # "suspended": the root is held
+notes = ""
+# rate = 100.0           # Hz; only for tables without a time column, or where the file's own is wrong
+
+[axes]                   # the capture's axes that point along the format's; all of "x", "-x" ... "-z"
+forward = "x"
+left = "y"
+up = "z"
+
+[origin]
+start = {start}             # turn and shift so that the robot starts at the origin, looking along x; false: as captured
+floor = 0.0              # m, height of the floor in the capture{floors}
+
+[units]                  # only where the file does not say, or says something wrong
+# length = "mm"          # m, cm, mm
+# angle = "deg"          # rad, deg
+# time = "s"             # s, ms, us, ns; tables only
+
+[{tracked}]{pad_tracked}# needs an orientation: a Vicon object or segment, three markers or more, or columns
+body = "{name}:{tracked}"   # "subject:segment", an object, or the name behind the colon where only one subject has it
+# section = "Segments"   # where the name stands in several sections of a Vicon file
+# rotation = "helical"   # RX, RY, RZ are a rotation vector. Euler angles: "XYZ" about the body's own axes in turn
+                         # (Vicon's "Euler XYZ"), "xyz" about the capture's. Default: helical in "Segments"; others must
+                         # say it
+# markers = ["M1", "M2", "M3", "M4"]                        # instead of body
+# geometry = [[0.1, 0, 0], [0, 0.1, 0], [-0.1, 0, 0], [0, 0, 0.1]]  # where they sit, m; default: as at the start
+# position = ["x", "y", "z"]                                # instead of body, in tables: names of columns
+# orientation = ["qw", "qx", "qy", "qz"]                    # with rotation = "quaternion" (w, x, y, z), or three angles
+offset = [0.0, 0.0, 0.0] # m: the model's site `{tracked}` in the tracked body's frame
+turn = [0.0, 0.0, 0.0]   # deg, a rotation vector: the model's frame of this body in the tracked body's frame.
+                         # "start": at the start the robot stands upright and looks along `forward`
+"""

@@ -9,78 +9,74 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu.model import SIDES
-from ballu_mjx.recordings.importers.mapping import JOINTS, RoomMapping
+from ballu_mjx.recordings.hooks import hooks_of
+from ballu_mjx.recordings.importers.mapping import RoomMapping
 from ballu_mjx.recordings.importers.trajectories import Body, Trajectories, refuse
-from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.recordings.recording import Recording, cut
+from ballu_mjx.robots.description import RobotDescription
 
-FOOT_RADIUS = 0.004
-"""m, of the model's foot spheres: what their centres come down to."""
 _START_SAMPLES = 20
 """Samples at the start over which `turn = "start"` takes the mean."""
-_FEET_PERCENTILE = 1.0
-"""Of the heights of both feet: the lowest without outliers."""
+_LOWEST_PERCENTILE = 1.0
+"""Of the heights of what stands on the floor: the lowest without outliers."""
 
 
-def place(trajectories: Trajectories, mapping: RoomMapping, name: str) -> Recording:
-    """The recording that `trajectories` hold, without commands yet (NaN): sites of the model, x forward, y left, z up.
+def place(trajectories: Trajectories, mapping: RoomMapping, robot: RobotDescription, name: str) -> Recording:
+    """The recording of `robot` that `trajectories` hold, without commands yet (NaN): sites of the model, x forward, y
+    left, z up.
 
     A body's orientation is renamed with the axes: one that stands like the capture's axes stands like the new ones.
 
     **Raises** `InputError` where an orientation is needed and not there, or nothing was seen at all.
     """
-    mapped = {role: _site(trajectories, mapping, role, body) for role, body in trajectories.bodies.items()}
-    for role, source in mapping.sources.items():
+    mapped = {
+        site: _site(trajectories, mapping, site, body, needs_orientation=site == robot.tracked)
+        for site, body in trajectories.bodies.items()
+    }
+    for site, source in mapping.sources.items():
         if source.turn == "start":
-            mapped[role] = _standing(mapped[role])
+            mapped[site] = _standing(mapped[site])
     if mapping.kind == "free":
-        _to_floor(mapping, mapped)
+        _to_floor(mapping, mapped, robot)
         if mapping.start:
-            _to_start(mapped)
-    time = trajectories.time
-    balloon, base = mapped.get("balloon"), mapped.get("base")
-    feet = [mapped[f"foot_{side}"].position for side in SIDES if f"foot_{side}" in mapped]
-    joints = [trajectories.columns.get(name) for name in JOINTS]
-    motor, knee = (_pair(pair) for pair in (joints[:2], joints[2:]))
+            _to_start(mapped, robot)
+    tracked = mapped.get(robot.tracked)
     return Recording(
         name=name,
         kind=mapping.kind,
         robot=mapping.robot,
         notes=mapping.notes,
-        time=time,
-        command=np.full((len(time), 2), np.nan),
-        balloon_position=None if balloon is None else balloon.position,
-        balloon_quaternion=None if balloon is None else balloon.quaternion,
-        base_position=None if base is None else base.position,
-        base_quaternion=None if base is None else base.quaternion,
-        foot_position=np.stack(feet, axis=1) if len(feet) == 2 else None,
-        motor=motor,
-        knee=knee,
+        time=trajectories.time,
+        command=np.full((len(trajectories.time), len(robot.commands)), np.nan),
+        tracked_position=None if tracked is None else tracked.position,
+        tracked_quaternion=None if tracked is None else tracked.quaternion,
+        points={site: mapped[site].position for site in robot.points if site in mapped},
+        orientations={
+            site: quaternion
+            for site in robot.oriented_points
+            if site in mapped and (quaternion := mapped[site].quaternion) is not None
+        },
+        joint_angles={joint: trajectories.columns[joint] for joint in robot.joints if joint in trajectories.columns},
     )
 
 
-def _pair(columns: list[Float[np.ndarray, " T"] | None]) -> Float[np.ndarray, "T 2"] | None:
-    left, right = columns
-    return None if left is None or right is None else np.stack([left, right], axis=1)
-
-
-def _site(trajectories: Trajectories, mapping: RoomMapping, role: str, body: Body) -> Body:
+def _site(trajectories: Trajectories, mapping: RoomMapping, role: str, body: Body, *, needs_orientation: bool) -> Body:
     """The model's site on a tracked body, with the axes renamed."""
     source = mapping.sources[role]
     axes = mapping.axes
     if np.isnan(body.position).all():
-        refuse(trajectories.path, "", f"[{role}] was never seen", "mend the mapping or the labels")
+        refuse(trajectories.path, "", f"[{role}] was never seen", "fix the mapping or the labels")
     if body.quaternion is None:
-        if role == "balloon":
-            mend = "name an object or a segment, or three markers or more, or columns, for it"
-            refuse(mapping.path, f"[{role}]", "what it names has no orientation", mend)
+        if needs_orientation:
+            fix = "name an object or a segment, or three markers or more, or columns, for it"
+            refuse(mapping.path, f"[{role}]", "what it names has no orientation", fix)
         if source.turn == "start" or any(source.turn) or any(source.offset):
-            mend = "leave turn and offset out, or name what has one"
-            refuse(mapping.path, f"[{role}]", "what it names has no orientation to turn or shift along", mend)
+            fix = "leave turn and offset out, or name what has one"
+            refuse(mapping.path, f"[{role}]", "what it names has no orientation to turn or shift along", fix)
         return Body(body.position @ axes.T)
     seen = ~np.isnan(body.quaternion).any(axis=1)
     if not seen.any():
-        refuse(trajectories.path, "", f"the orientation of [{role}] was never seen", "mend the mapping or the labels")
+        refuse(trajectories.path, "", f"the orientation of [{role}] was never seen", "fix the mapping or the labels")
     turned = Rotation.from_quat(body.quaternion[seen], scalar_first=True)
     position = body.position.copy()
     if any(source.offset):
@@ -103,26 +99,27 @@ def _standing(body: Body) -> Body:
     return Body(body.position, quaternion)
 
 
-def _to_floor(mapping: RoomMapping, mapped: dict[str, Body]) -> None:
+def _to_floor(mapping: RoomMapping, mapped: dict[str, Body], robot: RobotDescription) -> None:
     """Shift everything up or down, in place, until the floor is at 0."""
-    if mapping.floor == "feet":
-        heights = np.concatenate([mapped[f"foot_{side}"].position[:, 2] for side in SIDES])
-        floor = float(np.nanpercentile(heights, _FEET_PERCENTILE)) - FOOT_RADIUS
+    if isinstance(mapping.floor, str):
+        standing = hooks_of(robot).floors[mapping.floor]
+        heights = np.concatenate([mapped[site].position[:, 2] - above for site, above in standing.items()])
+        floor = float(np.nanpercentile(heights, _LOWEST_PERCENTILE))
     else:
         floor = mapping.floor
     for role, body in mapped.items():
         mapped[role] = Body(body.position - [0.0, 0.0, floor], body.quaternion)
 
 
-def _to_start(mapped: dict[str, Body]) -> None:
-    """Turn about the vertical and shift along the floor, in place: the base starts at the origin, the balloon looks
-    along x. Both are taken from the first sample that shows them."""
-    balloon, base = mapped["balloon"], mapped["base"]
-    assert balloon.quaternion is not None
-    seen = ~np.isnan(balloon.quaternion).any(axis=1)
-    forward = Rotation.from_quat(balloon.quaternion[int(seen.argmax())], scalar_first=True).as_matrix()[:, 0]
+def _to_start(mapped: dict[str, Body], robot: RobotDescription) -> None:
+    """Turn about the vertical and shift along the floor, in place: the robot starts at the origin, and its tracked body
+    looks along x. Both are taken from the first sample that shows them."""
+    tracked, over = mapped[robot.tracked], mapped[hooks_of(robot).origin or robot.tracked]
+    assert tracked.quaternion is not None
+    seen = ~np.isnan(tracked.quaternion).any(axis=1)
+    forward = Rotation.from_quat(tracked.quaternion[int(seen.argmax())], scalar_first=True).as_matrix()[:, 0]
     turn = Rotation.from_euler("z", -np.arctan2(forward[1], forward[0]))
-    origin = base.position[int((~np.isnan(base.position).any(axis=1)).argmax())] * [1.0, 1.0, 0.0]
+    origin = over.position[int((~np.isnan(over.position).any(axis=1)).argmax())] * [1.0, 1.0, 0.0]
     for role, body in mapped.items():
         position = turn.apply(body.position - origin)  # NaN stays NaN
         quaternion = body.quaternion
@@ -139,7 +136,7 @@ def with_commands(
     path: Path,
     recording: Recording,
     time: Float[np.ndarray, " N"],
-    command: Float[np.ndarray, "N 2"],
+    command: Float[np.ndarray, "N commands"],
 ) -> tuple[Recording, tuple[float, float]]:
     """`recording` with `command` sent at `time` (s, the recording's clock), each held until the next.
 
@@ -160,12 +157,10 @@ def with_commands(
     kept = np.flatnonzero((clock >= time[0] - 1e-9) & (clock <= last + 1e-9))
     if len(kept) < 2 or clock[kept[-1]] - clock[kept[0]] < 1.0:
         problem = f"its commands, from {time[0]:.2f} to {last:.2f} s of the capture's clock, do not overlap it"
-        mend = f"the capture is from {clock[0]:.2f} to {clock[-1]:.2f} s; mend --offset, or give this trial's log"
-        refuse(path, "", problem, mend)
+        fix = f"the capture is from {clock[0]:.2f} to {clock[-1]:.2f} s; fix --offset, or give this trial's log"
+        refuse(path, "", problem, fix)
     rows = slice(int(kept[0]), int(kept[-1]) + 1)
     lost = float(clock[rows.start] - clock[0]), float(clock[-1] - clock[rows.stop - 1])
     held = np.searchsorted(time, clock[rows] + 1e-9, side="right") - 1
-    fields = {field.name: getattr(recording, field.name) for field in dataclasses.fields(recording)}
-    cut = {name: value[rows] for name, value in fields.items() if isinstance(value, np.ndarray)}
-    fresh = {"time": cut["time"] - cut["time"][0], "command": command[held]}
-    return dataclasses.replace(recording, **(cut | fresh)), lost
+    kept = cut(recording, rows)
+    return dataclasses.replace(kept, time=kept.time - kept.time[0], command=command[held]), lost

@@ -26,7 +26,7 @@ from ballu_mjx.recordings.importers.trajectories import (
 )
 
 _COMMAND_TOLERANCE = 0.005
-"""Commands so far outside of [0, 1] are noise of a servo's own measurement, and are clipped."""
+"""Of a command's range: so far outside of it is noise of a servo's own measurement, and is clipped."""
 
 
 class Table:
@@ -56,8 +56,8 @@ class Table:
                 if len(cells) != len(header):
                     few = len(cells) < len(header)
                     problem = f"the row has {len(cells)} cells, the header {len(header)}"
-                    mend = "the file was cut off, copy it again" if few else "write points in numbers, not commas"
-                    refuse(path, f"line {reader.line_num}", problem, mend)
+                    fix = "the file was cut off, copy it again" if few else "write points in numbers, not commas"
+                    refuse(path, f"line {reader.line_num}", problem, fix)
                 self.rows.append(cells)
                 self.lines.append(reader.line_num)
         except csv.Error as error:
@@ -67,10 +67,10 @@ class Table:
         self.header = header
 
     def column(self, name: str) -> Float[np.ndarray, " T"]:
-        """The numbers of a column, NaN where a cell is empty. Raises `InputError` naming line, column and mend."""
+        """The numbers of a column, NaN where a cell is empty. Raises `InputError` naming line, column and fix."""
         if name not in self.header:
             hint = suggest(name, self.header).rstrip("?")
-            refuse(self.path, "", f"there is no column {shorten(name)!r}", f"mend {self._mapping}, {hint}")
+            refuse(self.path, "", f"there is no column {shorten(name)!r}", f"fix {self._mapping}, {hint}")
         if self.header.count(name) > 1:
             refuse(self.path, "", f"the column {shorten(name)!r} stands there twice", "rename one")
         place = self.header.index(name)
@@ -82,9 +82,9 @@ class Table:
                 if math.isinf(values[i]) or "_" in cell:
                     raise ValueError
             except ValueError:
-                mend = "write a number, or leave the cell empty if the sample is missing"
+                fix = "write a number, or leave the cell empty if the sample is missing"
                 where = f"line {self.lines[i]}, column {shorten(name)}"
-                refuse(self.path, where, f"{shorten(cell)!r} is not a number", mend)
+                refuse(self.path, where, f"{shorten(cell)!r} is not a number", fix)
         return values
 
     def columns(self, names: Iterable[str]) -> Float[np.ndarray, "T n"]:
@@ -102,15 +102,15 @@ class Table:
         if back.any():
             row = int(back.argmax()) + 1
             problem = f"time runs back or stands still, from {time[row - 1]:g} to {time[row]:g} s"
-            mend = "sort the lines by time, and delete repeated ones"
-            refuse(self.path, f"line {self.lines[row]}, column {shorten(name)}", problem, mend)
+            fix = "sort the lines by time, and delete repeated ones"
+            refuse(self.path, f"line {self.lines[row]}, column {shorten(name)}", problem, fix)
         return time
 
 
 def read_table(table: Table, mapping: RoomMapping) -> Trajectories:
     """The columns that `mapping` names.
 
-    **Raises** `InputError` naming file, line, column and mend.
+    **Raises** `InputError` naming file, line, column and fix.
     """
     path = table.path
     if mapping.time_column in table.header:
@@ -119,27 +119,30 @@ def read_table(table: Table, mapping: RoomMapping) -> Trajectories:
         time = np.arange(len(table.rows)) / mapping.rate
     else:
         problem = f"there is no column {shorten(mapping.time_column)!r} of times"
-        mend = f'write time = "..." under [commands], {suggest(mapping.time_column, table.header)}'.rstrip("?")
-        refuse(path, "", problem, f"{mend}; or rate = ... (Hz)")
+        fix = f'write time = "..." under [commands], {suggest(mapping.time_column, table.header)}'.rstrip("?")
+        refuse(path, "", problem, f"{fix}; or rate = ... (Hz)")
     positions = [name for source in mapping.sources.values() for name in source.position]
     length = _unit(mapping, mapping.length, LENGTHS, "length") if positions else 1.0
     bodies = {}
     for role, source in mapping.sources.items():
         if not source.position:
-            mend = 'a table has columns, write position = ["x", "y", "z"] there'
-            refuse(mapping.path, f"[{role}]", f"it is given by name, and {path.name} is a table", mend)
+            fix = 'a table has columns, write position = ["x", "y", "z"] there'
+            refuse(mapping.path, f"[{role}]", f"it is given by name, and {path.name} is a table", fix)
         bodies[role] = _body(table, mapping, source, length)
     joints = {}
     for name, joint in mapping.joints.items():
-        angle = _unit(mapping, mapping.angle, ANGLES, "angle")
-        joints[name] = (table.column(joint.column) - joint.zero) * joint.sign * angle
+        if joint.slides:
+            unit = _unit(mapping, mapping.length, LENGTHS, "length")
+        else:
+            unit = _unit(mapping, mapping.angle, ANGLES, "angle")
+        joints[name] = (table.column(joint.column) - joint.zero) * joint.sign * unit
     return Trajectories(path, time, bodies, joints)
 
 
 def _unit(mapping: RoomMapping, unit: str | None, known: Mapping[str, float], name: str) -> float:
     if unit is None:
-        mend = f'write {name} = "{next(iter(known))}" or another there'
-        refuse(mapping.path, "[units]", f"the {name} of a table's columns is not said", mend)
+        fix = f'write {name} = "{next(iter(known))}" or another there'
+        refuse(mapping.path, "[units]", f"the {name} of a table's columns is not said", fix)
     return known[unit]
 
 
@@ -154,35 +157,41 @@ def _body(table: Table, mapping: RoomMapping, source: Source, length: float) -> 
     return Body(position, to_quaternion(table.path, place, columns, source.rotation, unit))
 
 
-def read_commands(table: Table, columns: Commands) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N 2"]]:
-    """Times (s, the log's own clock) and commands (left, right) in [0, 1] of a log.
+def read_commands(table: Table, columns: Commands) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N commands"]]:
+    """Times (s, the log's own clock) and commands of a log, in the actuators' units.
 
-    **Raises** `InputError` naming file, line, column and mend.
+    **Raises** `InputError` naming file, line, column and fix.
     """
     time = table.clock(columns.time, columns.time_unit)
     return time, commands_in(table, columns)
 
 
-def commands_in(table: Table, columns: Commands) -> Float[np.ndarray, "N 2"]:
-    """Commands (left, right) in [0, 1]; an empty cell goes on with the command before."""
-    pairs = [(columns.left, columns.range_left), (columns.right, columns.range_right)]
-    return np.stack([_command(table, name, low, high) for name, (low, high) in pairs], axis=1)
+def commands_in(table: Table, columns: Commands) -> Float[np.ndarray, "N commands"]:
+    """Commands in the actuators' units; an empty cell goes on with the command before.
+
+    **Raises** `InputError` naming file, line, column and fix.
+    """
+    each = zip(columns.columns.items(), columns.ranges, columns.limits, strict=True)
+    return np.stack([_command(table, *names, shown, limits) for names, shown, limits in each], axis=1)
 
 
-def _command(table: Table, name: str, low: float, high: float) -> Float[np.ndarray, " N"]:
+def _command(
+    table: Table, command: str, name: str, shown: tuple[float, float], limits: tuple[float, float]
+) -> Float[np.ndarray, " N"]:
     raw = table.column(name)
     held = np.maximum.accumulate(np.where(np.isnan(raw), -1, np.arange(len(raw))))
     if held[0] < 0:
-        mend = "write what was being sent, or delete the lines before the first command"
-        refuse(table.path, f"line {table.lines[0]}, column {shorten(name)}", "the first command is missing", mend)
+        fix = "write what was being sent, or delete the lines before the first command"
+        refuse(table.path, f"line {table.lines[0]}, column {shorten(name)}", "the first command is missing", fix)
     with np.errstate(over="ignore"):
-        value = (raw[held] - low) / (high - low)
-    outside = (value < -_COMMAND_TOLERANCE) | (value > 1 + _COMMAND_TOLERANCE)
+        share = (raw[held] - shown[0]) / (shown[1] - shown[0])
+    outside = (share < -_COMMAND_TOLERANCE) | (share > 1 + _COMMAND_TOLERANCE)
     if outside.any():
         row = int(outside.argmax())
-        problem = f"{raw[held][row]:g} is outside of {low:g} to {high:g}"
-        mend = (
-            "write under [commands] in the mapping what the column shows at command 0 and 1, as range_left, range_right"
+        problem = f"{raw[held][row]:g} is outside of {shown[0]:g} to {shown[1]:g}"
+        fix = (
+            "write under [commands] in the mapping what the column shows at the smallest and the largest command, as "
+            f"range_{command}"
         )
-        refuse(table.path, f"line {table.lines[row]}, column {shorten(name)}", problem, mend)
-    return np.clip(value, 0.0, 1.0)
+        refuse(table.path, f"line {table.lines[row]}, column {shorten(name)}", problem, fix)
+    return limits[0] + np.clip(share, 0.0, 1.0) * (limits[1] - limits[0])

@@ -43,9 +43,9 @@ class Trajectories:
     time: Float[np.ndarray, " T"]
     """s, strictly increasing."""
     bodies: Mapping[str, Body]
-    """By role ("balloon", "foot_left", ...)."""
+    """By the robot's site."""
     columns: Mapping[str, Float[np.ndarray, " T"]] = dataclasses.field(default_factory=dict)
-    """Motor and knee angles (rad) by the format's column name."""
+    """Joint angles (rad; of slides, m) by joint."""
 
 
 def refuse(path: Path, place: str, problem: str, mend: str) -> NoReturn:

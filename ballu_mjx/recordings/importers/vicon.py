@@ -101,7 +101,7 @@ def read_vicon(path: Path, mapping: RoomMapping) -> Trajectories:
     groups = _groups(path, _sections(path, lines, delimiter), mapping)
     wanted = {role: _wanted(path, mapping.path, source, groups) for role, source in mapping.sources.items()}
     if not wanted:
-        refuse(mapping.path, "", "it asks for no body of a Vicon file", "say what the balloon is, or give a table")
+        refuse(mapping.path, "", "it asks for no body of a Vicon file", "say what its sites are, or give a table")
     used = list({id(g.section): g.section for gs in wanted.values() for g in gs}.values())
     rates = {section.rate for section in used}
     if len(rates) > 1:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 
 _HEIGHT, _SPEED = 0.012, 0.1
 """A planted foot's greatest height (m) and horizontal speed (m/s)."""
@@ -20,11 +20,13 @@ def planted_feet(feet: Float[np.ndarray, "T 2 3"]) -> Bool[np.ndarray, "T 2"]:
     return (feet[..., 2] < _HEIGHT) & (speed < _SPEED)
 
 
-def count_steps(feet: Float[np.ndarray, "T 2 3"]) -> int:
-    """How often a foot stands alone after the other one did: 0 of a robot that rests, slides, hops or flies.
+def count_steps(feet: Float[np.ndarray, "T 2 3"]) -> Int[np.ndarray, " T"]:
+    """Return how often a foot has stood alone after the other one did, by each state.
 
-    **Arguments** as of `planted`.
+    0 of a robot that rests, slides, hops or flies. Arguments as of `planted_feet`.
     """
     down = planted_feet(feet)
     alone = np.flatnonzero(down[:, 0] != down[:, 1])
-    return int(np.count_nonzero(np.diff(down[alone, 1].astype(int))))
+    steps = np.zeros(len(feet), int)
+    steps[alone[1:]] = np.diff(down[alone, 1].astype(int)) != 0
+    return np.cumsum(steps)

@@ -1,0 +1,173 @@
+"""What the training commands share: their table, the options that --quick and --resume imply, and what they say."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.residuals.run_config import run_robot
+from ballu_mjx.rl.training_loop import TrainingInterrupted
+from ballu_mjx.robots.description import RobotDescription, check_simulates
+from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
+from ballu_mjx.runs.folder import Run, read_config, typed_config
+from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
+
+PROGRAM = "python -m ballu_mjx.train"
+_KEPT = ("validate_every", "keep_every", "wandb")
+"""Options of a command's data that a run keeps."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainCommand:
+    """A subcommand of `train`.
+
+    **Fields**
+
+    - `summary`: what its help says.
+    - `sections`: its options, as instances of dataclasses that hold the defaults, by the section's name.
+    - `run`: takes the sections by name, and returns the exit status.
+    - `quick`: other defaults under --quick, by section and option.
+    """
+
+    summary: str
+    sections: Mapping[str, Any]
+    run: Callable[..., int]
+    quick: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+
+    @property
+    def help(self) -> str:
+        """The summary, and what --quick makes of the options."""
+        changed = [
+            f"--{name.replace('_', '-')} {value}" if not isinstance(value, bool) else _flag(name, value)
+            for values in self.quick.values()
+            for name, value in values.items()
+        ]
+        return self.summary + (f" Defaults under --quick: {' '.join(changed)}." if changed else "")
+
+    def implied(self, name: str, data: Any) -> Mapping[str, Any] | None:
+        """Return the sections with the defaults that the options in `data` imply; None: those that they have anyway.
+
+        **Raises** `InputError` where the run of --resume is none of the command called `name`.
+        """
+        folder: Path | None = getattr(data, "resume", None)
+        if folder is not None:
+            config = read_config(folder, name)
+            kept = {option: config["data"][option] for option in _KEPT if option in config.get("data", {})}
+            stored = {
+                section: typed_config(type(default), config, section, folder)
+                for section, default in self.sections.items()
+                if section != "data"
+            }
+            return {"data": dataclasses.replace(self.sections["data"], **kept), **stored}
+        if getattr(data, "quick", False) and self.quick:
+            return {
+                section: dataclasses.replace(default, **self.quick.get(section, {}))
+                for section, default in self.sections.items()
+            }
+        return None
+
+
+def _flag(name: str, value: bool) -> str:
+    return f"--{'' if value else 'no-'}{name.replace('_', '-')}"
+
+
+def parsers(commands: Mapping[str, TrainCommand], sections: Mapping[str, Mapping[str, Any]] | None = None) -> dict:
+    """Return what tyro makes the parsers of `commands` from, by name; `sections` holds other defaults than theirs."""
+    return {name: _parser(name, each, (sections or {}).get(name)) for name, each in commands.items()}
+
+
+def _parser(name: str, command: TrainCommand, sections: Mapping[str, Any] | None) -> type:
+    fields = [(n, type(default), default) for n, default in (sections or command.sections).items()]
+    made = dataclasses.make_dataclass(name.replace("-", "_"), fields, frozen=True)
+    made.__doc__ = command.help
+    made.command = name  # pyright: ignore[reportAttributeAccessIssue]
+    return made
+
+
+def run_command(commands: Mapping[str, TrainCommand], arguments: Sequence[str] | None, description: str) -> int:
+    """Parse the arguments (None: the process's own), and run the command that they name; returns its exit status.
+
+    Defaults that depend on other options, --resume and --quick, are settled by a second parse.
+
+    **Raises** `InputError` for options that cannot be used.
+    """
+
+    def parse(sections: Mapping[str, Mapping[str, Any]] | None = None) -> Any:
+        return tyro.extras.subcommand_cli_from_dict(
+            parsers(commands, sections),
+            args=arguments,
+            prog=PROGRAM,
+            description=description,
+            config=(tyro.conf.OmitArgPrefixes,),
+        )
+
+    given = parse()
+    name, command = given.command, commands[given.command]
+    implied = command.implied(name, getattr(given, "data", None))
+    if implied is not None:
+        given = parse({name: implied})
+    try:
+        return command.run(**{section: getattr(given, section) for section in command.sections})
+    except TrainingInterrupted as stopped:
+        return stopped.status
+
+
+def load_chosen_robot(robot: str | None, resume: Path | None = None, task: str | None = None) -> RobotDescription:
+    """Return the robot of the option --robot (None: the default one), or that of the run of a `task` that goes on.
+
+    **Raises** `InputError` where there is no such robot, or both are given.
+    """
+    if resume is not None and task is not None:
+        if robot is not None:
+            raise InputError("--robot does not go with --resume, which keeps the robot; leave one out.")
+        return run_robot(read_config(resume, task), resume)
+    found = load_robot(DEFAULT_ROBOT if robot is None else robot)
+    check_simulates(found)
+    return found
+
+
+@dataclasses.dataclass
+class Written:
+    """Where a command writes to."""
+
+    folder: Path | None = None
+
+
+@contextlib.contextmanager
+def written_to(*, first: bool = True) -> Iterator[Written]:
+    """Say at the end where everything lies, and how long it took; `first` is whether this process writes.
+
+    The command sets `folder` of what it gets.
+    """
+    started, written = time.perf_counter(), Written()
+    yield written
+    if first:
+        print(f"\nWritten to {written.folder}. {time.perf_counter() - started:.0f} s in all.")
+
+
+@contextlib.contextmanager
+def open_run(
+    folder: Path, content: Mapping[str, Any], resumed_at: int | None, wandb: str | None, *, first: bool = True
+) -> Iterator[TrainingRecord]:
+    """Open the run's folder for a training: in memory alone where another process writes; see `Run`.
+
+    A training that is interrupted is told how to go on.
+    """
+    if not first:
+        yield MemoryRecord(content)
+        return
+    with Run(folder, content, resumed_at=resumed_at, wandb=wandb) as run:
+        print("Compiling: about a minute the first time ...", flush=True)
+        try:
+            yield run
+        except TrainingInterrupted:
+            print(f"To go on: {PROGRAM} {content['task']} --resume {folder}", file=sys.stderr)
+            raise

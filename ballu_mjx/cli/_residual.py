@@ -1,0 +1,97 @@
+"""What the commands that learn a residual share: reading and checking, announcing, and the evaluation at the end."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from ballu_mjx.cli._command import load_chosen_robot
+from ballu_mjx.evaluation.open_loop import Evaluators
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.residuals.dataset import USES, RecordingsData, ResidualDataset
+from ballu_mjx.residuals.run_config import describe_run
+from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.runs.folder import new_folder
+from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
+from ballu_mjx.viz import artifacts
+
+
+@dataclasses.dataclass(frozen=True)
+class Prepared:
+    """Recordings and simulator, ready to learn from.
+
+    **Fields**
+
+    - `motions`: by use.
+    - `base`: residual that the simulator has already, and `where` its run; None: none.
+    - `simulator`: without it.
+    - `evaluators`: of `simulator`.
+    """
+
+    task: str
+    folder: Path
+    dataset: ResidualDataset
+    motions: Mapping[str, list[Motion]]
+    simulator: Simulator
+    base: TrainedResidual | None
+    where: Path | None
+    evaluators: Evaluators
+
+    @property
+    def improved(self) -> AugmentedSimulator:
+        """The simulator with its base residual."""
+        return self.simulator.with_residual(None if self.base is None else self.base.bound)
+
+    def describe(self, sections: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what `config.json` holds."""
+        devices = [str(device) for device in jax.devices()]
+        identified, robot = self.dataset.identified, self.dataset.robot
+        content = describe_run(self.task, sections, self.dataset.files, devices, identified, robot)
+        return content | {"residual": None if self.where is None else str(self.where.resolve())}
+
+    def show_evaluation(self, residual: TrainedResidual, *, quick: bool) -> None:
+        """Write and print how the simulator with the residual replays the test recordings."""
+        print(f"{self.dataset.replayed}:\n")
+        test = self.evaluators.of(residual.model, self.motions["test"])
+        print(artifacts.write_evaluation(test, residual.params, self.folder).table())
+        if quick:
+            print("\nThese numbers mean little: --quick trains for seconds.")
+
+
+def prepare(
+    task: str, data: RecordingsData, base: Path | None = None, resume: Path | None = None, *, first: bool = True
+) -> Prepared:
+    """Read and check everything that a residual is learned from, and tell the user what is used for what.
+
+    `base` is the run of the residual that the simulator has already, `resume` the run that goes on, `first` whether
+    this process writes.
+
+    **Raises** `InputError` for recordings, actuators or a base residual that cannot be used, naming them.
+    """
+    robot = load_chosen_robot(data.robot, resume, task)
+    residual = None if base is None else TrainedResidual.load(base, robot)
+    dataset = ResidualDataset.read(data, robot, resume)
+    if residual is not None:
+        dataset.check_base_residual(residual.actuators, base)
+    folder = resume or new_folder(data.output if first else None, task)
+    if first:
+        _announce(dataset, folder, data.quick)
+    simulator = Simulator(robot, dataset.identified)
+    motions = dataset.reconstruct(simulator.mj_model)
+    return Prepared(task, folder, dataset, motions, simulator, residual, base, Evaluators(simulator))
+
+
+def _announce(dataset: ResidualDataset, folder: Path, quick: bool) -> None:
+    print(f"Run folder: {folder}")
+    for use in USES:
+        print(f"  {use}: {', '.join(recording.name for recording in dataset.recordings[use])}")
+    print(f"  actuators: {dataset.where}")
+    for sentence in dataset.reused:
+        print(f"  {sentence}")
+    if quick:
+        print("  --quick: sizes so small that the numbers mean little.")
+    print("Reconstructing the recorded states ...", flush=True)

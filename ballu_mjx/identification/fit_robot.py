@@ -1,0 +1,442 @@
+"""Identification of declared parameters from recordings, for any robot.
+
+Levenberg-Marquardt over windows of recordings (`identification.residuals`), from several starts, with exact derivatives
+taken forwards through the simulation. Each window's starting state is an unknown of its own. It is eliminated window by
+window (variable projection), so that the search sees the parameters alone, however many windows there are.
+
+What comes out is always compared with the nominal parameters on held-out windows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Float, Int
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.identification.batched_solver import BatchedSolver
+from ballu_mjx.identification.parameters import IdentifiedParameters, ParameterSet
+from ballu_mjx.identification.residuals import MeasuredMotion, Simulated, Windows, WindowSimulator, cut_windows
+
+
+@dataclasses.dataclass(frozen=True)
+class FitConfig:
+    """How parameters are identified."""
+
+    window_seconds: float = 1.0
+    """Length of a window, s."""
+    interval_seconds: float | None = None
+    """Time between the starts of two windows, s; None: a window's length."""
+    starts: int = 4
+    """Searches: one from the nominal values, the others from draws from the priors."""
+    steps: int = 20
+    """Most iterations of a search."""
+    outlying: float = 3.0
+    """Differences beyond so many times their scatter count less (pseudo-Huber loss)."""
+    start_spread: float = 1.0
+    """How uncertain starting states are, in units of the measurements' noise."""
+    seed: int = 0
+    """Seeds the draws."""
+
+
+def check_fit_config(config: FitConfig) -> None:
+    """Refuse sizes that make no sense.
+
+    **Raises** `InputError` naming the option.
+    """
+    for name in ("window_seconds", "starts", "steps", "outlying", "start_spread"):
+        if getattr(config, name) <= 0:
+            raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name)}: it must be above 0.")
+    if config.seed < 0:
+        raise InputError(f"--seed is {config.seed}: it must be 0 or more; 0 is the nearest.")
+
+
+class Direction(NamedTuple):
+    """A combination of parameters, each in units of its prior spread."""
+
+    weights: Float[np.ndarray, " parameters"]
+    """Unit vector."""
+    standard_error: float
+    """Of the combination, by the data alone: above 1 they say less than is known without them."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Errors on held-out windows, from measured starting states."""
+
+    motion: Int[np.ndarray, " windows"]
+    """Number of the motion that each is of."""
+    errors: Float[np.ndarray, "windows samples channels"]
+    """Simulated less recorded: positions, then velocities, along the velocities' directions (SI units)."""
+    noise: Float[np.ndarray, " channels"]
+    """What they are weighed by."""
+
+    @property
+    def score(self) -> float:
+        """Return the median over windows of the root mean square error in units of noise; inf where most diverge."""
+        squares = np.mean((self.errors / self.noise) ** 2, axis=(1, 2))
+        return float(np.sqrt(np.median(np.where(np.isfinite(squares), squares, np.inf))))
+
+    @property
+    def final_median(self) -> Float[np.ndarray, " channels"]:
+        """Return the median absolute error at the windows' end."""
+        last = np.abs(self.errors[:, -1])
+        return np.median(np.where(np.isfinite(last), last, np.inf), axis=0)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RobotFit:
+    """What was identified, how well it is known, and whether it helps."""
+
+    parameters: ParameterSet
+    values: Float[np.ndarray, " parameters"]
+    standard_errors: Float[np.ndarray, " parameters"]
+    """Sandwich: windows err independently, in whatever way (cluster-robust by window)."""
+    white_noise_errors: Float[np.ndarray, " parameters"]
+    """Standard errors if what is left were white noise."""
+    correlations: Float[np.ndarray, "parameters parameters"]
+    directions: tuple[Direction, ...]
+    """From the best to the least determined."""
+    unseen: tuple[str, ...]
+    """Parameters that the data check says these recordings cannot show."""
+    at_bounds: tuple[str, ...]
+    scatter: Float[np.ndarray, " channels"]
+    """Robust standard deviation of what is left, in units of the measurements' noise; positions, then velocities."""
+    losses: Float[np.ndarray, " starts"]
+    """Where the searches ended, in ascending order."""
+    nominal: HeldOut
+    identified: HeldOut
+
+    @property
+    def improves(self) -> bool:
+        """Return whether the identified values replay held-out windows better than the nominal ones."""
+        return self.identified.score < self.nominal.score
+
+    @property
+    def best(self) -> IdentifiedParameters:
+        """Return the identified values, or the nominal ones where those replay held-out windows better."""
+        values = self.values if self.improves else self.parameters.nominal
+        return IdentifiedParameters(jnp.asarray(values), self.parameters)
+
+    @property
+    def unidentified(self) -> tuple[str, ...]:
+        """Return the directions that the data leave open, in words."""
+        return tuple(self._words(d) for d in self.directions if d.standard_error > 1)
+
+    @property
+    def strong_correlations(self) -> tuple[tuple[str, str, float], ...]:
+        """Return pairs of parameters with a correlation beyond 0.9 in size."""
+        names, found = self.parameters.names, self.correlations
+        pairs = zip(*np.triu_indices(len(names), 1), strict=True)
+        return tuple((names[i], names[j], float(found[i, j])) for i, j in pairs if abs(found[i, j]) > _STRONG)
+
+    def _words(self, direction: Direction) -> str:
+        order = np.argsort(-np.abs(direction.weights))
+        named = [i for i in order if abs(direction.weights[i]) > _NAMED]
+        return " ".join(f"{direction.weights[i]:+.2f} {self.parameters.names[i]}" for i in named)
+
+
+_STRONG = 0.9
+_NAMED = 0.3
+Report = Callable[[str, int, int, float], None]
+"""(stage, iteration, most iterations, the lowest loss among the searches)."""
+
+
+class Visibility(NamedTuple):
+    """What the data check finds."""
+
+    names: tuple[str, ...]
+    signal: Float[np.ndarray, " parameters"]
+    """How much a change by the prior spread changes the data, in standard deviations of their noise, the best change of
+    starting states taken off."""
+
+    @property
+    def unseen(self) -> tuple[str, ...]:
+        """Return the parameters whose prior spread hides in the noise."""
+        return tuple(name for name, signal in zip(self.names, self.signal, strict=True) if signal < 1)
+
+
+def check_data(
+    parameters: ParameterSet, motions: Sequence[MeasuredMotion], config: FitConfig | None = None
+) -> Visibility:
+    """Say which parameters these recordings can show, from the nominal values and two draws; the best of them counts.
+
+    **Raises** `InputError` where no recording is as long as a window.
+    """
+    config = config or FitConfig()
+    check_fit_config(config)
+    with jax.enable_x64(True):
+        windows = cut_windows(motions, config.window_seconds, config.interval_seconds)
+        return _visibility(_Objective(WindowSimulator(parameters, motions, windows), config), config)
+
+
+def fit_robot(
+    parameters: ParameterSet,
+    training: Sequence[MeasuredMotion],
+    validation: Sequence[MeasuredMotion] | None = None,
+    config: FitConfig | None = None,
+    report: Report | None = None,
+) -> RobotFit:
+    """Fit parameters to recorded motions.
+
+    1. Check which parameters the data can show; the others stay near their priors.
+    2. Search from several starts, side by side.
+    3. Weigh each channel by the scatter that the best one leaves, and search on from there.
+    4. Replay held-out windows with nominal and with identified values.
+
+    **Arguments**
+
+    - `validation`: motions that the fit does not see; None: every fourth window is held out.
+
+    **Raises** `InputError` for options out of range, and where no recording is as long as a window.
+    """
+    config = config or FitConfig()
+    check_fit_config(config)
+    report = report or (lambda stage, iteration, steps, value: None)
+    with jax.enable_x64(True):
+        windows = cut_windows(training, config.window_seconds, config.interval_seconds)
+        if validation is None:
+            if len(windows.first) < _EVERY:
+                problem = f"{len(windows.first)} windows of {config.window_seconds:g} s are too few to hold some out"
+                raise InputError(f"{training[0].name}: {problem}; give validation recordings, or shorter windows.")
+            held = np.arange(len(windows.first)) % _EVERY == _EVERY - 1
+            held_out = Windows(windows.motion[held], windows.first[held], windows.samples)
+            windows = Windows(windows.motion[~held], windows.first[~held], windows.samples)
+            simulator = WindowSimulator(parameters, training, held_out)
+        else:
+            held_out = cut_windows(validation, config.window_seconds, config.interval_seconds)
+            simulator = WindowSimulator(parameters, validation, held_out)
+        objective = _Objective(WindowSimulator(parameters, training, windows), config)
+        report("data check", 0, 1, float("nan"))
+        unseen = _visibility(objective, config).unseen
+        objective.rescale(objective.simulator.differences(parameters.nominal))
+        solver = BatchedSolver(optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6))
+        search = _Search(objective, config.starts)
+        found, losses = solver(
+            search,
+            parameters.draw(config.seed, config.starts),
+            config.steps,
+            partial(report, "search"),
+            _PATIENCE,
+        )
+        best = int(np.argmin(losses))
+        objective.rescale(search.residuals[best])
+        again = _Search(objective, 1, search.start[best])
+        found, _ = solver(again, found[best][None], config.steps, partial(report, "refinement"), _PATIENCE)
+        objective.rescale(again.residuals[0])
+        values = np.asarray(parameters.vector(found[0]), float)
+        analysis = _analyse(objective, values, again.start[0])
+        pair = [_held_out(simulator, point) for point in (parameters.nominal, values)]
+    return RobotFit(
+        parameters=parameters,
+        values=values,
+        standard_errors=analysis.robust,
+        white_noise_errors=analysis.white,
+        correlations=analysis.correlations,
+        directions=analysis.directions,
+        unseen=unseen,
+        at_bounds=parameters.at_bounds(values),
+        scatter=objective.scale,
+        losses=np.sort(losses),
+        nominal=pair[0],
+        identified=pair[1],
+    )
+
+
+_EVERY = 4
+_PATIENCE = 6
+
+
+def replay(
+    parameters: ParameterSet,
+    motions: Sequence[MeasuredMotion],
+    points: Sequence[Float[np.ndarray, " parameters"]],
+    seconds: float,
+    interval: float | None = None,
+) -> tuple[HeldOut, ...]:
+    """Replay motions with several values of the parameters, in windows of `seconds`, one every `interval` (s; None: end
+    to end), from measured starting states.
+
+    **Raises** `InputError` where no motion is as long.
+    """
+    with jax.enable_x64(True):
+        simulator = WindowSimulator(parameters, motions, cut_windows(motions, seconds, interval))
+        return tuple(_held_out(simulator, np.asarray(values, float)) for values in points)
+
+
+class _Reduced(NamedTuple):
+    """Residuals, and how they change by the parameters while starting states move along to their best."""
+
+    values: Float[np.ndarray, "windows rows"]
+    slopes: Float[np.ndarray, "windows rows parameters"]
+    """In the parameters' units; at right angles to all that starting states can change."""
+    start: Float[np.ndarray, "windows start"]
+    """The best starting states, to first order."""
+    start_slopes: Float[np.ndarray, "windows start parameters"]
+
+    @property
+    def loss(self) -> float:
+        return float(np.sum(self.values**2))
+
+
+class _Objective:
+    """Softened residuals of all windows."""
+
+    def __init__(self, simulator: WindowSimulator, config: FitConfig) -> None:
+        self.simulator, self.config = simulator, config
+        self.parameters = simulator.parameters
+        self.scale = np.ones(simulator.channels)
+        """Of each channel's scatter, in units of its noise."""
+
+    def rescale(self, differences: Float[np.ndarray, "windows samples channels"]) -> None:
+        """Weigh channels by their robust scatter, and none by less than its noise."""
+        self.scale = np.maximum(1.0, _NORMAL * np.median(np.abs(differences), axis=(0, 1)))
+
+    def __call__(
+        self, values: Float[np.ndarray, " parameters"], start: Float[np.ndarray, "windows start"]
+    ) -> tuple[_Reduced, Simulated]:
+        simulated = self.simulator.linearize(values, start)
+        soft, steepness = soften(simulated.values / self.scale, self.config.outlying)
+        weight = (steepness / self.scale)[..., None]
+        windows = len(soft)
+        flat = lambda x: x.reshape(windows, -1, *x.shape[3:])  # noqa: E731
+        channels = self.simulator.channels
+        own = np.tile(np.eye(channels) / self.config.start_spread, (windows, 1, 1))
+        by_start = np.concatenate([flat(weight * simulated.by_start), own], axis=1)
+        slopes = flat(weight * simulated.by_parameters)
+        slopes = np.concatenate([slopes, np.zeros((windows, channels, slopes.shape[-1]))], axis=1)
+        residuals = np.concatenate([flat(soft), start / self.config.start_spread], axis=1)
+        q, r = np.linalg.qr(by_start)
+        turned = np.swapaxes(q, 1, 2)
+        along, along_slopes = turned @ residuals[..., None], turned @ slopes
+        reduced = _Reduced(
+            values=residuals,
+            slopes=slopes - q @ along_slopes,
+            start=start - np.linalg.solve(r, along)[..., 0],
+            start_slopes=-np.linalg.solve(r, along_slopes),
+        )
+        return reduced, simulated
+
+
+_NORMAL = 1.4826
+"""Standard deviation over median absolute deviation of a normal distribution."""
+
+
+def soften(values: Float[np.ndarray, "*shape"], outlying: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return what has the pseudo-Huber loss of `values` for its square, with their signs; and its slopes."""
+    root = np.sqrt(1 + (values / outlying) ** 2)
+    soft = values * np.sqrt(2 / (root + 1))
+    return soft, np.sqrt((root + 1) / 2) / root
+
+
+class _Search:
+    """What a `BatchedSolver` evaluates: residuals and Jacobians at several points, compressed to as many rows as there
+    are parameters (and one), which keep all sums of squares. Starting states are remembered from the best point so far
+    of each search, and moved along with its parameters."""
+
+    def __init__(
+        self, objective: _Objective, searches: int, start: Float[np.ndarray, "windows start"] | None = None
+    ) -> None:
+        simulator = objective.simulator
+        self.objective = objective
+        begin = np.zeros((simulator.count, simulator.channels)) if start is None else start
+        self.start = [begin] * searches
+        self.residuals = [np.zeros((0, 0, 0))] * searches
+        """Differences at the best point so far, in units of noise."""
+        self._best: list[tuple[float, np.ndarray, _Reduced] | None] = [None] * searches
+        self._refused = [0] * searches
+
+    def __call__(self, coordinates: Float[np.ndarray, "searches _"]) -> tuple[np.ndarray, np.ndarray]:
+        rows = [self._one(number, y) for number, y in enumerate(coordinates)]
+        values, slopes = zip(*rows, strict=True)
+        return np.stack(values), np.stack(slopes)
+
+    def _one(self, number: int, coordinates: Float[np.ndarray, " _"]) -> tuple[np.ndarray, np.ndarray]:
+        parameters = self.objective.parameters
+        values = np.asarray(parameters.vector(coordinates), float)
+        by_coordinates = np.asarray(jax.jacfwd(parameters.vector)(jnp.asarray(coordinates)))
+        start, best = self.start[number], self._best[number]
+        if best is not None:
+            _, at, reduced = best
+            step = reduced.start + reduced.start_slopes @ (values - at) - start
+            start = start + np.clip(step / 2.0 ** self._refused[number], -_FAR, _FAR)
+        reduced, simulated = self.objective(values, start)
+        prior = (values - parameters.nominal) / parameters.prior
+        loss = reduced.loss + float(prior @ prior)
+        if best is None or loss < best[0]:
+            self._best[number], self._refused[number] = (loss, values, reduced), 0
+            self.start[number], self.residuals[number] = start, simulated.values
+        else:  # starting states may be what went too far
+            self._refused[number] += 1
+        slopes = np.concatenate([reduced.slopes.reshape(-1, len(values)), np.diag(1 / parameters.prior)])
+        table = np.concatenate(
+            [slopes @ by_coordinates, np.concatenate([reduced.values.ravel(), prior])[:, None]], axis=1
+        )
+        triangle = np.asarray(np.linalg.qr(table, mode="r"))
+        return triangle[:, -1], triangle[:, :-1]
+
+
+_FAR = 3.0
+"""Longest step of a starting state, in units of its uncertainty: the linearization holds no farther."""
+
+
+class _Analysis(NamedTuple):
+    white: np.ndarray
+    robust: np.ndarray
+    correlations: np.ndarray
+    directions: tuple[Direction, ...]
+
+
+def _analyse(objective: _Objective, values: Float[np.ndarray, " parameters"], start: np.ndarray) -> _Analysis:
+    """Standard errors in the parameters' units."""
+    parameters = objective.parameters
+    reduced, _ = objective(values, start)
+    size, windows = len(values), len(reduced.values)
+    # As many rows say where starting states begin as there are starting states.
+    variance = reduced.loss / max(reduced.values.size - reduced.start.size - size, 1)
+    # In units of what bounds or priors leave open, so that all are of a size.
+    unit = np.where(np.isfinite(parameters.prior), parameters.prior, (parameters.upper - parameters.lower) / 2)
+    slopes = reduced.slopes * unit
+    flat = slopes.reshape(-1, size)
+    known = np.diag(np.where(np.isfinite(parameters.prior), 1.0, 0.0) + _SLIGHT)
+    bread = np.linalg.inv(flat.T @ flat / variance + known)
+    scores = np.einsum("wr,wrp->wp", reduced.values, slopes) / variance
+    meat = scores.T @ scores * windows / max(windows - 1, 1)
+    sandwich = bread @ (meat + known) @ bread
+    deviations = [np.sqrt(np.diag(covariance)) for covariance in (bread, sandwich)]
+    correlations = sandwich / np.outer(deviations[1], deviations[1])
+    _, singular, right = np.linalg.svd(flat / np.sqrt(variance), full_matrices=False)
+    signed = [row * np.sign(row[np.argmax(np.abs(row))]) for row in right]
+    directions = [Direction(row, float(1 / max(s, 1e-12))) for row, s in zip(signed, singular, strict=True)]
+    return _Analysis(deviations[0] * unit, deviations[1] * unit, correlations, tuple(directions))
+
+
+_SLIGHT = 1e-9
+
+
+def _visibility(objective: _Objective, config: FitConfig) -> Visibility:
+    parameters, simulator = objective.parameters, objective.simulator
+    unit = np.where(np.isfinite(parameters.prior), parameters.prior, (parameters.upper - parameters.lower) / 2)
+    start = np.zeros((simulator.count, simulator.channels))
+    signal = np.zeros(len(parameters))
+    for coordinates in parameters.draw(config.seed, _DRAWS):
+        reduced, _ = objective(np.asarray(parameters.vector(coordinates), float), start)
+        signal = np.maximum(signal, np.sqrt(np.sum((reduced.slopes * unit) ** 2, axis=(0, 1))))
+    return Visibility(parameters.names, signal)
+
+
+_DRAWS = 3
+
+
+def _held_out(simulator: WindowSimulator, values: Float[np.ndarray, " parameters"]) -> HeldOut:
+    motions = simulator.motions
+    noise = np.array([np.concatenate([m.position_noise, m.velocity_noise]) for m in motions])
+    errors = simulator.differences(values) * noise[simulator.windows.motion][:, None]
+    return HeldOut(simulator.windows.motion, errors, noise.mean(axis=0))

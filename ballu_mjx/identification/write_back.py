@@ -1,0 +1,152 @@
+"""Identified values in files: JSON that this package reads, and the user's MJCF with the values in place."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ballu_mjx.common import files
+from ballu_mjx.common.errors import InputError, is_number
+from ballu_mjx.identification.parameters import (
+    BodyTarget,
+    FieldTarget,
+    IdentifiedParameters,
+    declared_parameters,
+)
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.model import set_fields
+
+IDENTIFIED_FORMAT = "ballu-identified/1"
+
+
+def identified_to_json(
+    robot: RobotDescription,
+    identified: IdentifiedParameters,
+    standard_errors: Float[np.ndarray, " parameters"] | None = None,
+) -> str:
+    """Return identified values, by the names of a description's `identify`, as `read_identified` takes them."""
+    values = np.asarray(identified.values, float)
+    errors = np.full(len(values), np.nan) if standard_errors is None else standard_errors
+    rows = {}
+    for parameter, value, error in zip(identified.declared.parameters, values, errors, strict=True):
+        rows[parameter.name] = {"value": float(value), "unit": parameter.unit}
+        if np.isfinite(error):
+            rows[parameter.name]["standard_error"] = float(error)
+    return json.dumps({"format": IDENTIFIED_FORMAT, "robot": robot.name, "parameters": rows}, indent=2) + "\n"
+
+
+def read_identified(path: Path | str, robot: RobotDescription) -> IdentifiedParameters:
+    """Return the values in a file of `identified_to_json`; parameters that it leaves out are nominal.
+
+    **Raises** `InputError` naming the file, the parameter and the fix.
+    """
+    path = Path(path)
+    content = files.read_json(path, "restore it or identify again")
+    rows = content.get("parameters")
+    if content.get("format") != IDENTIFIED_FORMAT or not isinstance(rows, dict):
+        raise InputError(f'{path}: is not of the format "{IDENTIFIED_FORMAT}"; give one that identification wrote.')
+    parameters = declared_parameters(robot, robot.load_model())
+    values = parameters.nominal.copy()
+    for name, row in rows.items():
+        if name not in parameters.names:
+            known = ", ".join(parameters.names)
+            raise InputError(f"{path}: {robot.file.name} identifies no {name}; it identifies {known}.")
+        value = row.get("value") if isinstance(row, dict) else None
+        place = parameters.names.index(name)
+        low, high = parameters.parameters[place].bounds
+        if value is None or not is_number(value) or not low <= value <= high:
+            raise InputError(f"{path}: {name} is {value!r}; write a number from {low:g} to {high:g}.")
+        values[place] = value
+    return IdentifiedParameters(jnp.asarray(values), parameters)
+
+
+def identified_xml(robot: RobotDescription, identified: IdentifiedParameters) -> str:
+    """Return the robot's MJCF with the identified values, for plain MuJoCo.
+
+    What MJCF cannot hold, the drivetrain, stands in a comment at the top. Paths of meshes and textures stay relative to
+    the robot's MJCF file. Numbers have six digits, as MuJoCo writes them.
+
+    **Raises** `InputError` for a field that MuJoCo's specification of a model does not have.
+    """
+    model = robot.load_model()
+    with jax.enable_x64(True):
+        fields = {k: np.asarray(v) for k, v in identified.declared.fields(model, identified.values).items()}
+    set_fields(model, fields)
+    spec = mujoco.MjSpec.from_file(str(robot.model))
+    targets = [target for parameter in identified.declared.parameters for target in parameter.targets]
+    for target in targets:
+        if isinstance(target, FieldTarget):
+            _write(spec, model, target)
+        elif isinstance(target, BodyTarget):
+            body = spec.body(model.body(target.body).name)
+            body.explicitinertial = True
+            body.mass, body.ipos = model.body_mass[target.body], model.body_ipos[target.body]
+            body.iquat, body.inertia = model.body_iquat[target.body], model.body_inertia[target.body]
+            body.fullinertia = [np.nan, 0, 0, 0, 0, 0]
+    compiled = spec.compile()
+    for target in targets:
+        if isinstance(target, FieldTarget):
+            got, wanted = (getattr(m, target.field)[target.index] for m in (compiled, model))
+            if not np.isclose(got, wanted, rtol=1e-5, atol=1e-8):
+                raise InputError(f"{robot.file}: {target.field} cannot be written as MJCF; keep it in the JSON file.")
+    head, _, rest = spec.to_xml().partition("\n")
+    return f"{head}\n  <!-- {_drivetrain_words(robot, identified)} -->\n{rest}"
+
+
+_SPEC_FIELDS: Mapping[str, str] = {
+    "dof_damping": "damping",
+    "dof_armature": "armature",
+    "dof_frictionloss": "frictionloss",
+    "jnt_stiffness": "stiffness",
+    "qpos_spring": "springref",
+    "jnt_range": "range",
+    "tendon_stiffness": "stiffness",
+    "tendon_damping": "damping",
+    "tendon_frictionloss": "frictionloss",
+    "tendon_lengthspring": "springlength",
+    "tendon_range": "range",
+    "geom_friction": "friction",
+    "actuator_gainprm": "gainprm",
+    "actuator_biasprm": "biasprm",
+    "actuator_forcerange": "forcerange",
+    "body_gravcomp": "gravcomp",
+}
+
+
+def _write(spec: mujoco.MjSpec, model: mujoco.MjModel, target: FieldTarget) -> None:
+    """Set what makes a field of the compiled model; others are left, and found out by comparing."""
+    own = _SPEC_FIELDS.get(target.field)
+    if own is None:
+        return
+    kind, index = target.field.split("_")[0], target.index[0]
+    if kind == "dof":
+        index = int(model.dof_jntid[index])
+    elif kind == "qpos":
+        index = int(np.flatnonzero(model.jnt_qposadr == index)[0])
+    element = "joint" if kind in ("dof", "qpos", "jnt") else kind
+    part: Any = getattr(spec, element)(getattr(model, element)(index).name)
+    value = float(getattr(model, target.field)[target.index])
+    if isinstance(getattr(part, own), np.ndarray):
+        getattr(part, own)[target.index[1] if len(target.index) > 1 else 0] = value
+    else:
+        setattr(part, own, value)
+
+
+def _drivetrain_words(robot: RobotDescription, identified: IdentifiedParameters) -> str:
+    found = identified.drivetrain()
+    nominal = {"scale": 1.0, "rate_limit": np.inf}
+    words = []
+    for number, command in enumerate(robot.commands):
+        own = {name: float(value[number]) for name, value in zip(found._fields, found, strict=True)}
+        changed = [f"{name} {value:.6g}" for name, value in own.items() if value != nominal.get(name, 0.0)]
+        if changed:
+            words.append(f"{command}: {', '.join(changed)}")
+    return f"Drivetrain, which MJCF cannot hold: {'; '.join(words) or 'none'}"

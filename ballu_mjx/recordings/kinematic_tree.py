@@ -1,0 +1,165 @@
+"""Forward kinematics and Jacobians of many poses at once, in NumPy and double precision: as MuJoCo has them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+_JOINT = mujoco.mjtJoint
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Poses:
+    """Places of a tree's points, orientations of its bodies and lines of its joints, in N poses; world frame."""
+
+    points: tuple[Float[np.ndarray, "N 3"], ...]
+    """m."""
+    rotations: tuple[Float[np.ndarray, "N 3 3"], ...]
+    """Bodies' axes in the columns."""
+    axes: Float[np.ndarray, "N nv 3"]
+    """Unit vectors along slides and about hinges."""
+    anchors: Float[np.ndarray, "N nv 3"]
+    """m, points on these lines."""
+
+
+class KinematicTree:
+    """The part of a model that moves some points and bodies: one free joint at the root or none, hinges and slides."""
+
+    def __init__(
+        self, model: mujoco.MjModel, points: Sequence[tuple[int, Float[np.ndarray, " 3"]]], bodies: Sequence[int]
+    ) -> None:
+        """Take bodies with the places (m) of points in their frames, and bodies whose orientation is asked for."""
+        self.model = model
+        self.points = [(body, np.array(place, float)) for body, place in points]
+        self.bodies = list(bodies)
+        lineages = {body: self._lineage(body) for body in {*bodies, *(body for body, _ in points)}}
+        self._order = sorted({each for lineage in lineages.values() for each in lineage})
+        self.point_dofs = [self._dofs(lineages[body]) for body, _ in points]
+        """Degrees of freedom that move each point."""
+        self.body_dofs = [self._dofs(lineages[body]) for body in bodies]
+        """Degrees of freedom that turn or shift each body."""
+        self.rotates = np.ones(model.nv, bool)
+        """Degrees of freedom in radians; the others are in metres."""
+        for joint, kind in enumerate(model.jnt_type):
+            first = model.jnt_dofadr[joint]
+            if kind == _JOINT.mjJNT_FREE:
+                self.rotates[first : first + 3] = False
+            elif kind == _JOINT.mjJNT_SLIDE:
+                self.rotates[first] = False
+
+    def _lineage(self, body: int) -> list[int]:
+        """`body` and its ancestors, without the world."""
+        found = []
+        while body:
+            found.append(int(body))
+            body = int(self.model.body_parentid[body])
+        return found
+
+    def _dofs(self, bodies: Sequence[int]) -> np.ndarray:
+        first, count = self.model.body_dofadr, self.model.body_dofnum
+        return np.array(sorted(d for body in bodies for d in range(first[body], first[body] + count[body])), int)
+
+    def pose(self, qpos: Float[np.ndarray, "N nq"]) -> Poses:
+        """Return places, orientations and joint lines; quaternions in `qpos` have unit length."""
+        model, count = self.model, len(qpos)
+        positions = {0: np.zeros((count, 3))}
+        rotations = {0: np.broadcast_to(np.eye(3), (count, 3, 3))}
+        axes, anchors = np.zeros((count, model.nv, 3)), np.zeros((count, model.nv, 3))
+        for body in self._order:
+            parent = int(model.body_parentid[body])
+            joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
+            if len(joints) and model.jnt_type[joints[0]] == _JOINT.mjJNT_FREE:
+                address, dof = model.jnt_qposadr[joints[0]], model.jnt_dofadr[joints[0]]
+                position = qpos[:, address : address + 3]
+                rotation = to_matrices(qpos[:, address + 3 : address + 7])
+                axes[:, dof : dof + 3] = np.eye(3)
+                axes[:, dof + 3 : dof + 6] = rotation.transpose(0, 2, 1)
+                anchors[:, dof + 3 : dof + 6] = position[:, None]
+            else:
+                position = positions[parent] + rotations[parent] @ model.body_pos[body]
+                rotation = rotations[parent] @ to_matrices(model.body_quat[body][None])[0]
+                for joint in joints:
+                    moved = qpos[:, model.jnt_qposadr[joint]] - model.qpos0[model.jnt_qposadr[joint]]
+                    dof, place = model.jnt_dofadr[joint], model.jnt_pos[joint]
+                    anchor, axis = position + rotation @ place, rotation @ model.jnt_axis[joint]
+                    axes[:, dof], anchors[:, dof] = axis, anchor
+                    if model.jnt_type[joint] == _JOINT.mjJNT_SLIDE:
+                        position = position + axis * moved[:, None]
+                    else:
+                        rotation = rotation @ _about(model.jnt_axis[joint], moved)
+                        position = anchor - rotation @ place
+            positions[body], rotations[body] = position, rotation
+        points = tuple(positions[body] + rotations[body] @ place for body, place in self.points)
+        return Poses(points, tuple(rotations[body] for body in self.bodies), axes, anchors)
+
+    def point_jacobian(self, poses: Poses, point: int) -> Float[np.ndarray, "N 3 nv"]:
+        """Return how a point moves with each degree of freedom."""
+        dofs = self.point_dofs[point]
+        axes = poses.axes[:, dofs]
+        arms = poses.points[point][:, None] - poses.anchors[:, dofs]
+        x, y, z = np.moveaxis(axes, -1, 0)
+        u, v, w = np.moveaxis(arms, -1, 0)
+        turned = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
+        jacobian = np.zeros((len(axes), 3, self.model.nv))
+        jacobian[:, :, dofs] = np.where(self.rotates[dofs], turned, axes.transpose(0, 2, 1))
+        return jacobian
+
+    def turn_jacobian(self, poses: Poses, number: int) -> Float[np.ndarray, "N 3 nv"]:
+        """Return how the body of that number turns (rotation vectors in the world) with each degree of freedom."""
+        dofs = self.body_dofs[number]
+        dofs = dofs[self.rotates[dofs]]
+        jacobian = np.zeros((len(poses.axes), 3, self.model.nv))
+        jacobian[:, :, dofs] = poses.axes[:, dofs].transpose(0, 2, 1)
+        return jacobian
+
+    def move(self, qpos: Float[np.ndarray, "N nq"], step: Float[np.ndarray, "N nv"]) -> Float[np.ndarray, "N nq"]:
+        """Return `qpos` moved along generalized velocities, as `mj_integratePos` does."""
+        if self.model.jnt_type[0] != _JOINT.mjJNT_FREE:
+            return qpos + step
+        moved = np.concatenate([qpos[:, :3] + step[:, :3], qpos[:, 3:7], qpos[:, 7:] + step[:, 6:]], axis=1)
+        angle = np.linalg.norm(step[:, 3:6], axis=1, keepdims=True)
+        turn = np.concatenate([np.cos(angle / 2), step[:, 3:6] * np.sinc(angle / (2 * np.pi)) / 2], axis=1)
+        quaternion = multiply(qpos[:, 3:7], turn)
+        moved[:, 3:7] = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+        return moved
+
+
+# ---- rotations ----
+
+
+def multiply(a: Float[np.ndarray, "N 4"], b: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
+    """Return products of quaternions (w, x, y, z)."""
+    w, x, y, z = a.T
+    p, q, r, s = b.T
+    return np.stack(
+        [
+            w * p - x * q - y * r - z * s,
+            w * q + x * p + y * s - z * r,
+            w * r - x * s + y * p + z * q,
+            w * s + x * r - y * q + z * p,
+        ],
+        axis=1,
+    )
+
+
+def to_matrices(quaternion: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 3 3"]:
+    """Return rotation matrices of unit quaternions (w, x, y, z)."""
+    w, x, y, z = quaternion.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+def _about(axis: Float[np.ndarray, " 3"], angle: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 3 3"]:
+    """Rotations about one axis, by Rodrigues' formula."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    sine, versine = np.sin(angle)[:, None, None], 1 - np.cos(angle)[:, None, None]
+    return np.eye(3) + sine * cross + versine * (cross @ cross)

@@ -1,0 +1,132 @@
+"""Identification of the air: from a simulator and recorded motions to a residual."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reference import stack_motions
+from ballu_mjx.residuals.aerodynamics import (
+    AERODYNAMICS_FILE,
+    AERODYNAMICS_FORMAT,
+    AIR_PARAMETERS,
+    Aerodynamics,
+    air_parameters_to_json,
+)
+from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, check_air_config, identify_air
+from ballu_mjx.residuals.network import ForceNetworkConfig, recorded_inputs
+from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
+from ballu_mjx.robots.model import same_parameters
+from ballu_mjx.runs.progress import PhaseProgress
+from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
+from ballu_mjx.sim.simulator import Simulator
+
+_BESIDE = 9
+"""Most evaluations beside those of the first fit: one without air, and a fit at each whole delay beside the best."""
+
+
+def fit_aerodynamics(
+    simulator: Simulator,
+    motions: Sequence[Motion],
+    config: AirConfig | None = None,
+    *,
+    fixed_from: TrainedResidual | None = None,
+    free: Sequence[str] = AIR_PARAMETERS,
+    run: TrainingRecord | None = None,
+    progress: PhaseProgress | None = None,
+) -> TrainedResidual:
+    """Identify the air around the robot; the result's report has the parameters with their standard errors.
+
+    **Arguments**
+
+    - `motions`: what the simulator is to follow.
+    - `config`: how to identify; None: the defaults.
+    - `fixed_from`: an earlier result, whose parameters are kept but for those that are `free`; None: none are kept.
+    - `free`: names of the parameters to identify.
+    - `run`: takes measurements and files, in a folder say; None: memory.
+    - `progress`: is told of every evaluation.
+
+    **Raises** `InputError` for options out of range, where `fixed_from` is no such result or belongs to another
+    simulator, and where no motion is as long as a window.
+    """
+    config = config or AirConfig()
+    check_air_config(config, simulator.control_timestep)
+    if not free:
+        raise InputError(f"--free names no parameter; there are {', '.join(AIR_PARAMETERS)}.")
+    if fixed_from is not None and not same_parameters(fixed_from.actuators, simulator.actuators):
+        raise InputError("The earlier residual belongs to other actuators than the simulator's; take the same.")
+    if fixed_from is not None and not isinstance(fixed_from.model, Aerodynamics):
+        raise InputError(f"The earlier residual is of kind {fixed_from.model.name}, not aerodynamic; give another.")
+    record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run
+    began, done = time.perf_counter(), 0
+
+    def report(evaluation: int, cost: float) -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress.update("air", evaluation, _BESIDE + config.evaluations, cost)
+        record.log(done, {"cost": cost, "seconds": time.perf_counter() - began})
+
+    values = None if fixed_from is None else fixed_from.params
+    found = identify_air(simulator, motions, config, report, fixed_from=values, free=free)
+    if progress is not None:
+        progress.close()
+    record.log(done, {"control_steps": found.control_steps})
+    record.write(AERODYNAMICS_FILE, json.dumps(air_details(found), indent=2) + "\n")
+    reference, _ = stack_motions(simulator, motions)
+    inputs = np.asarray(recorded_inputs(reference, ForceNetworkConfig(), simulator.robot))
+    write_observed(record, inputs)
+    return TrainedResidual(
+        Aerodynamics(simulator.robot, simulator.mj_model),
+        found.parameters,
+        observed_range(inputs),
+        0,
+        simulator.actuators,
+        air_table(found),
+    )
+
+
+def air_details(found: AirFit) -> dict[str, Any]:
+    """Return what the file `AERODYNAMICS_FILE` holds."""
+    return {
+        "format": AERODYNAMICS_FORMAT,
+        "parameters": air_parameters_to_json(found.parameters),
+        "standard_errors": air_parameters_to_json(found.standard_errors),
+        "windows": found.windows,
+        "cost": {"without": found.cost[0], "with": found.cost[1]},
+    }
+
+
+_UNITS = {
+    "added_mass": "kg",
+    "added_inertia": "kg m^2",
+    "lift": "N",
+    "centre": "m",
+    "linear_drag": "N s/m",
+    "quadratic_drag": "N s^2/m^2",
+    "turning_drag": "N m s",
+    "delay": "s",
+}
+
+
+def air_table(found: AirFit) -> str:
+    """Return the parameters with their standard errors, as text."""
+    lines = [f"{'':18}{'':4}{'value':>12}{'std. error':>12}"]
+    values, errors = (air_parameters_to_json(each) for each in (found.parameters, found.standard_errors))
+    for name, unit in _UNITS.items():
+        single = not isinstance(values[name], list)
+        rows = [(values[name], errors[name])] if single else zip(values[name], errors[name], strict=True)
+        for axis, (value, error) in zip("xyz", rows, strict=False):
+            lines.append(f"{name:18}{'' if single else axis:4}{value:>12.5f}{error:>12.5f}  {unit}")
+    lines.append(
+        f"{found.windows} windows; robust cost {found.cost[0]:.1f} without, {found.cost[1]:.1f} with. Axes are the "
+        "buoyant body's."
+    )
+    return "\n".join(lines)

@@ -1,0 +1,95 @@
+"""Training of EnvMimic's forces: from a simulator and recorded motions to a residual."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.evaluation.open_loop import Evaluators
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, check_envmimic_config
+from ballu_mjx.residuals.network import NetworkForces, num_inputs
+from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
+from ballu_mjx.rl import ppo
+from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.rl.training_loop import ResumePoint, TrainingLoop, Validation
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.runs.progress import Progress
+from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
+from ballu_mjx.sim.force_model import add_to_base
+from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
+
+VALIDATE_EVERY = 400_000
+"""Control steps between two validations, each of which leaves a checkpoint."""
+
+
+def train_envmimic(
+    simulator: Simulator | AugmentedSimulator,
+    motions: Sequence[Motion],
+    config: EnvMimicConfig | None = None,
+    ppo_config: PPOConfig | None = None,
+    *,
+    validation: Sequence[Motion] | None = None,
+    validate_every: int = VALIDATE_EVERY,
+    run: TrainingRecord | None = None,
+    progress: Progress | None = None,
+    start: ResumePoint | None = None,
+    evaluators: Evaluators | None = None,
+) -> TrainedResidual:
+    """Learn residual forces by reinforcement learning, and return those that validate best.
+
+    **Arguments**
+
+    - `simulator`: what is to follow the motions. Where it has a residual already, the forces learn what that leaves,
+      and the result is both together.
+    - `motions`: recorded ones.
+    - `config`, `ppo_config`: the task, and how it is learned; None: their defaults. The seed is `ppo_config.seed`.
+    - `validation`: motions that choose the best; None: `motions`.
+    - `run`: takes measurements and checkpoints, in a folder say; None: memory.
+    - `progress`: is told of every training step.
+    - `start`: where to go on; None: from the beginning.
+    - `evaluators`: of this simulator without residual, where they are needed further; they share compiled programs.
+
+    **Raises** `InputError` for options that do not fit, and where learning breaks down; `TrainingInterrupted` after
+    SIGINT or SIGTERM, the last state saved.
+    """
+    config, ppo_config, start = config or EnvMimicConfig(), ppo_config or PPOConfig(), start or ResumePoint()
+    augmented = simulator.with_residual(None)
+    plain, robot = augmented.without_residual(), augmented.robot
+    check_envmimic_options(config, ppo_config, validate_every, robot.control_timestep)
+    sections = {"env": dataclasses.asdict(config), "ppo": dataclasses.asdict(ppo_config)}
+    record = MemoryRecord(sections) if run is None else run
+    check_resumes(start, config, robot)
+    env = EnvMimicEnv(augmented, motions, config)
+    sizes = env.observation_size, env.action_size, ppo_config
+    infer = ppo.make_inference(*sizes)
+    forces = NetworkForces(config, robot, infer, ppo.make_sampler(*sizes))
+    model, all_params = add_to_base(augmented.residual, forces)
+    measure = (evaluators or Evaluators(plain)).of(model, motions if validation is None else validation)
+    tells_best = Validation(lambda params: measure(all_params(params)).score)
+    write_observed(record, env.recorded_inputs)
+    TrainingLoop(record, progress, validate_every, tells_best).train(env, ppo_config, start, record.config)
+    step, tree = record.best()
+    observed = observed_range(env.recorded_inputs)
+    return TrainedResidual(model, all_params(ppo.from_tree(tree)), observed, step, plain.actuators)
+
+
+def check_envmimic_options(
+    config: EnvMimicConfig, ppo_config: PPOConfig, validate_every: int, control_timestep: float
+) -> None:
+    """**Raises** `InputError` for options of `train_envmimic` that are out of range, or do not fit the devices."""
+    check_envmimic_config(config, control_timestep)
+    ppo.check(ppo_config, len(jax.devices()))
+    if validate_every < 1:
+        raise InputError(f"--validate-every is {validate_every}: it must be 1 or more.")
+
+
+def check_resumes(start: ResumePoint, config: EnvMimicConfig, robot: RobotDescription) -> None:
+    """**Raises** `InputError` where the policy that goes on was trained on other observations than these."""
+    if start.params is not None and start.params.normalizer.mean["state"].shape != (num_inputs(config, robot),):
+        raise InputError(
+            f"{start.folder}: its policy was trained on other observations; leave the options of env as they were."
+        )

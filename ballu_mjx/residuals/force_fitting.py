@@ -1,0 +1,264 @@
+"""Residual forces without reinforcement learning: from a simulator and recorded motions to a residual."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from ballu_mjx.evaluation.open_loop import Evaluators
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reference import stack_motions
+from ballu_mjx.recordings.segments import cut_segments
+from ballu_mjx.residuals import analytic, supervised
+from ballu_mjx.residuals.analytic import AnalyticConfig
+from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.network import NetworkForces, num_loads, recorded_inputs
+from ballu_mjx.residuals.supervised import SupervisedConfig
+from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
+from ballu_mjx.rl import ppo
+from ballu_mjx.rl.ppo import Params, PPOConfig
+from ballu_mjx.runs.progress import PhaseProgress
+from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
+from ballu_mjx.sim.force_model import ForceSet, add_to_base
+from ballu_mjx.sim.linearize import Linearizer
+from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
+
+
+def fit_supervised(
+    simulator: Simulator | AugmentedSimulator,
+    motions: Sequence[Motion],
+    config: SupervisedConfig | None = None,
+    *,
+    forces: ForceSet = "force",
+    validation: Sequence[Motion] | None = None,
+    run: TrainingRecord | None = None,
+    progress: PhaseProgress | None = None,
+    evaluators: Evaluators | None = None,
+) -> TrainedResidual:
+    """Learn residual forces by regression on the forces that explain the recordings (the paper's baseline).
+
+    **Arguments**
+
+    - `simulator`: what is to follow the motions. Where it has a residual already, the forces learn what that leaves,
+      and the result is both together.
+    - `motions`: recorded ones.
+    - `config`: how to label and regress; None: the defaults.
+    - `forces`: what the network pushes with.
+    - `validation`: motions that choose the best; None: `motions`.
+    - `run`: takes measurements and checkpoints, in a folder say; None: memory.
+    - `progress`: is told of every step.
+    - `evaluators`: of this simulator without residual, where they are needed further; they share compiled programs.
+
+    **Raises** `InputError` for options out of range.
+    """
+    config = config or SupervisedConfig()
+    supervised.check_supervised_config(config)
+    uses = _Uses(motions, motions if validation is None else validation)
+    return _fit(_Supervised, "supervised", simulator, uses, config, forces, run, progress, evaluators)
+
+
+def fit_analytic(
+    simulator: Simulator | AugmentedSimulator,
+    motions: Sequence[Motion],
+    config: AnalyticConfig | None = None,
+    *,
+    forces: ForceSet = "force",
+    validation: Sequence[Motion] | None = None,
+    run: TrainingRecord | None = None,
+    progress: PhaseProgress | None = None,
+    evaluators: Evaluators | None = None,
+) -> TrainedResidual:
+    """Learn residual forces by gradients of the tracking error through the simulation.
+
+    Arguments and errors are those of `fit_supervised`.
+    """
+    config = config or AnalyticConfig()
+    analytic.check_analytic_config(config, simulator.robot.control_timestep)
+    uses = _Uses(motions, motions if validation is None else validation)
+    return _fit(_Analytic, "analytic", simulator, uses, config, forces, run, progress, evaluators)
+
+
+def network_sections(forces: ForceSet, seed: int) -> tuple[EnvMimicConfig, PPOConfig]:
+    """Return what the network sees and means, and its sizes: both methods learn EnvMimic's."""
+    return EnvMimicConfig(forces=forces), PPOConfig(seed=seed)
+
+
+class _Uses(NamedTuple):
+    """Motions by their use."""
+
+    training: Sequence[Motion]
+    validation: Sequence[Motion]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Setup:
+    """What both methods learn with."""
+
+    simulator: AugmentedSimulator
+    motions: _Uses
+    forces: NetworkForces
+    start: Params
+    inputs: Float[np.ndarray, "states inputs"]
+
+    def with_policy(self, policy: Any) -> Params:
+        """Return parameters of `forces`."""
+        return self.start._replace(policy=policy)
+
+
+class _Fit:
+    """A method at work, which logs and saves what it learns."""
+
+    def __init__(
+        self,
+        setup: _Setup,
+        config: SupervisedConfig | AnalyticConfig,
+        record: TrainingRecord,
+        validate: Callable[[Params], float],
+        progress: PhaseProgress | None,
+    ) -> None:
+        self.setup, self.config, self.record, self.validate = setup, config, record, validate
+        self.progress, self.began = progress, time.perf_counter()
+        self.notes: list[str] = []
+        """Sentences of the report."""
+
+    def learn(self) -> None:
+        """From beginning to end."""
+        raise NotImplementedError
+
+    @property
+    def still(self) -> Any:
+        """A policy without force, which whatever is learned has to beat."""
+        return jax.tree.map(np.zeros_like, jax.device_get(self.setup.start.policy))
+
+    def show(self, stage: str, iteration: int, steps: int, loss: float) -> None:
+        """Tell the progress, where there is one."""
+        if self.progress is not None:
+            self.progress.update(stage, iteration, steps, loss)
+
+    def log(self, step: int, metrics: Mapping[str, float]) -> None:
+        """With the time so far."""
+        self.record.log(step, {**metrics, "seconds": time.perf_counter() - self.began})
+
+    def save(self, step: int, policy: Any, error: float) -> None:
+        """Keep what was learned; `error` is the validation's, open loop."""
+        self.record.save(step, ppo.as_tree(self.setup.with_policy(jax.device_get(policy))), error)
+
+
+class _Supervised(_Fit):
+    def learn(self) -> None:
+        """Labels for training and validation, the regression, and which share of its forces to take."""
+        setup, config = self.setup, self.config
+        assert isinstance(config, SupervisedConfig)
+        robot, env = setup.simulator.robot, setup.forces.config
+        linearize = Linearizer(setup.simulator, robot.joints, env.forces)
+        label = supervised.ForceLabeller(linearize, config, env)
+        uses = {"training": setup.motions.training}
+        if setup.motions.validation is not setup.motions.training:
+            uses["validation"] = setup.motions.validation
+        found = {}
+        for use, motions in uses.items():
+            loads = []
+            for motion in motions:
+                loads.append(label(motion))
+                self.show(f"labels, {use}", len(loads), len(motions), math.nan)
+            found[use] = supervised.examples(setup.simulator.simulator, motions, loads, env)
+            force = _rms(np.concatenate(loads)[:, :3])
+            self.notes.append(f"Labels, {use}: {force * 1e3:.1f} mN on the {robot.tracked} (RMS of an axis).")
+        infer = jax.jit(lambda policy, seen: setup.forces.infer(setup.with_policy(policy), seen))
+        seen, actions = found.get("validation", found["training"])
+        best = math.inf, 0, self.still
+
+        def validate(step: int, policy: Any, loss: float) -> None:
+            nonlocal best
+            error = _rms(np.asarray(infer(policy, seen)) - actions) / _rms(actions)
+            best = min(best, (error, step, jax.device_get(policy)), key=lambda found: found[0])
+            self.log(step, {"loss": loss, "force_error": error})
+            self.show("learning", step, config.updates, error)
+
+        validate(0, self.still, float(np.mean(found["training"][1] ** 2)))
+        supervised.regress(infer, setup.start.policy, found["training"], config, validate)
+        _, step, policy = best
+        parts = {share: ppo.with_share(policy, share) for share in config.force_scales}
+        errors = {share: self.validate(setup.with_policy(part)) for share, part in parts.items()}
+        told = ", ".join(f"{share:.0%}: {error:.2f}" for share, error in errors.items())
+        self.notes.append(f"Validation error by the share of the forces that acts (ratio): {told}.")
+        share = min(errors, key=lambda share: errors[share])
+        if share == 0.0:
+            self.notes.append("No share of them is better than none: the residual is without force.")
+        labelled = sum(len(motion.command) for motions in uses.values() for motion in motions)
+        simulated = labelled * (1 + linearize.directions)
+        self.log(config.updates + 1, {"share": share, "validation_error": errors[share], "control_steps": simulated})
+        self.save(step, parts[share], errors[share])
+
+
+class _Analytic(_Fit):
+    def learn(self) -> None:
+        """Gradients through the simulation; the validation is open loop."""
+        setup, config = self.setup, self.config
+        assert isinstance(config, AnalyticConfig)
+        cut = cut_segments(
+            setup.simulator.simulator, setup.motions.training, config.window_seconds, config.interval_seconds
+        )
+        total = config.relinearizations * config.updates
+
+        def report(step: int, policy: Any, metrics: dict[str, float]) -> None:
+            error = self.validate(setup.with_policy(policy))
+            self.log(step, {**metrics, "validation_error": error})
+            self.save(step, policy, error)
+            self.show("learning", step, total, error)
+
+        report(0, self.still, {})
+        analytic.train(
+            setup.forces,
+            setup.with_policy,
+            setup.start.policy,
+            cut,
+            np.std(setup.inputs, axis=0),
+            config,
+            report,
+            Linearizer(setup.simulator, forces=setup.forces.config.forces),
+        )
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _fit(
+    method: type[_Fit],
+    name: str,
+    simulator: Simulator | AugmentedSimulator,
+    motions: _Uses,
+    config: SupervisedConfig | AnalyticConfig,
+    forces: ForceSet,
+    run: TrainingRecord | None,
+    progress: PhaseProgress | None,
+    evaluators: Evaluators | None,
+) -> TrainedResidual:
+    augmented = simulator.with_residual(None)
+    plain, robot = augmented.without_residual(), augmented.robot
+    record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run
+    env, network = network_sections(forces, config.seed)
+    reference, _ = stack_motions(plain, motions.training)
+    inputs = np.asarray(recorded_inputs(reference, env, robot))
+    sizes = {ppo.STATE: (inputs.shape[1],)}, num_loads(env, robot), network
+    network_forces = NetworkForces(env, robot, ppo.make_inference(*sizes), None, name)
+    start = ppo.initial_policy(inputs, sizes[1], network)
+    model, all_params = add_to_base(augmented.residual, network_forces)
+    measure = (evaluators or Evaluators(plain)).of(model, motions.validation)
+    write_observed(record, inputs)
+    setup = _Setup(augmented, motions, network_forces, start, inputs)
+    work = method(setup, config, record, lambda params: measure(all_params(params)).score, progress)
+    work.learn()
+    if progress is not None:
+        progress.close()
+    step, tree = record.best()
+    params, report = all_params(ppo.from_tree(tree)), "\n".join(work.notes)
+    return TrainedResidual(model, params, observed_range(inputs), step, plain.actuators, report)

@@ -1,0 +1,107 @@
+"""The kinds of residual, each said once: what a run of it leaves, and how that is read.
+
+A new kind is a class with the interface `sim.force_model.ForceModel`, a function that loads it from a run's folder, and
+an entry in `KINDS`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.model import ModelParameters
+
+if TYPE_CHECKING:
+    from ballu_mjx.sim.force_model import ForceModel
+
+
+class StoredRun(NamedTuple):
+    """A run's folder, and what it says of itself."""
+
+    folder: Path
+    config: Mapping[str, Any]
+    """Content of `config.json`."""
+    robot: RobotDescription
+    actuators: ModelParameters | None
+    """Identified actuators of its simulator; None: the nominal ones."""
+    which: Literal["best", "last"]
+    """The checkpoint to read, where there are any."""
+
+
+class LoadedResidual(NamedTuple):
+    """What a run has learned, without its base residual."""
+
+    model: ForceModel
+    params: Any
+    inputs: int
+    """Size of the model's inputs."""
+    step: int
+    """Control steps or gradient steps of training behind it; 0 where there are no checkpoints."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ResidualKind:
+    """A kind of residual."""
+
+    name: str
+    """The task of its runs, and the name of the simulator that it improves."""
+    label: str
+    """In figures and tables."""
+    network: bool
+    """Whether it is a network of forces, with checkpoints and perhaps a base residual, or a white box."""
+    load: Callable[[StoredRun], LoadedResidual]
+    """**Raises** `InputError` where the run's files are damaged."""
+
+
+def _load_network(run: StoredRun) -> LoadedResidual:
+    from ballu_mjx.residuals.envmimic import EnvMimicConfig, check_envmimic_config
+    from ballu_mjx.residuals.network import NetworkForces, num_inputs, num_loads
+    from ballu_mjx.rl import ppo
+    from ballu_mjx.runs.checkpoints import restore_checkpoint
+    from ballu_mjx.runs.folder import typed_config
+
+    folder, robot, task = run.folder, run.robot, run.config["task"]
+    step, tree = restore_checkpoint(folder, run.which)
+    params = ppo.from_tree(tree)
+    inputs = params.normalizer.mean["state"].shape[0]
+    check = functools.partial(check_envmimic_config, control_timestep=robot.control_timestep)
+    config = typed_config(EnvMimicConfig, run.config, "env", folder, check)
+    network = typed_config(ppo.PPOConfig, run.config, "ppo", folder, ppo.check_values)
+    sizes = inputs, num_loads(config, robot), network
+    infer = ppo.make_inference(*sizes)
+    if not (inputs == num_inputs(config, robot) and ppo.fits(infer, params, inputs)):
+        raise InputError(
+            f"{folder}: the stored parameters do not fit the networks in its config.json; restore one of them."
+        )
+    sample = ppo.make_sampler(*sizes) if task == "envmimic" else None
+    return LoadedResidual(NetworkForces(config, robot, infer, sample, task), params, inputs, step)
+
+
+def _load_aerodynamics(run: StoredRun) -> LoadedResidual:
+    from ballu_mjx.residuals.aerodynamics import AERODYNAMICS_FILE, Aerodynamics, read_air_parameters
+    from ballu_mjx.residuals.network import ForceNetworkConfig, num_inputs
+
+    model = Aerodynamics(run.robot, run.robot.load_model(run.actuators))
+    params = read_air_parameters(run.folder / AERODYNAMICS_FILE, run.robot)
+    return LoadedResidual(model, params, num_inputs(ForceNetworkConfig(), run.robot), 0)
+
+
+KINDS: Mapping[str, ResidualKind] = {
+    kind.name: kind
+    for kind in (
+        ResidualKind("envmimic", "EnvMimic", True, _load_network),
+        ResidualKind("supervised", "supervised", True, _load_network),
+        ResidualKind("analytic", "analytic", True, _load_network),
+        ResidualKind("aerodynamic", "aerodynamic", False, _load_aerodynamics),
+    )
+}
+"""By name."""
+RESIDUAL_TASKS = tuple(KINDS)
+"""Runs that leave a residual."""
+NETWORK_TASKS = tuple(name for name, kind in KINDS.items() if kind.network)
+"""Runs that leave a network of forces."""

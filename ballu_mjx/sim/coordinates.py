@@ -1,0 +1,54 @@
+"""Generalized coordinates of a robot: one free joint at the root or none, then hinges and slides.
+
+Directions are those of `mjx.Data.qvel`: of a free joint, the translation along the world's axes and the rotation about
+the body's own; then the joints.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+_KINDS = mujoco.mjtJoint
+_TRANSLATIONS = {
+    int(_KINDS.mjJNT_FREE): [True] * 3 + [False] * 3,
+    int(_KINDS.mjJNT_SLIDE): [True],
+    int(_KINDS.mjJNT_HINGE): [False],
+}
+
+
+def translations(model: mujoco.MjModel) -> Bool[np.ndarray, " nv"]:
+    """Return which directions are translations (m), not rotations (rad)."""
+    return np.concatenate([_TRANSLATIONS[int(kind)] for kind in model.jnt_type])
+
+
+def has_free_joint(model: mujoco.MjModel) -> bool:
+    """Return whether the root is free."""
+    return bool(model.jnt_type[0] == _KINDS.mjJNT_FREE)
+
+
+def expand(qpos: Float[Array, " nq"], change: Float[Array, " nv"], free: bool) -> Float[Array, " nq"]:
+    """Return the rates of generalized positions at velocities `change`: of a quaternion q, q (0, omega) / 2.
+
+    `free` says whether the first joint is free.
+    """
+    if not free:
+        return change
+    turn = product(qpos[3:7], jnp.concatenate([jnp.zeros(1), change[3:6]])) / 2
+    return jnp.concatenate([change[:3], turn, change[6:]])
+
+
+def compress(qpos: Float[Array, " nq"], change: Float[Array, " nq"], free: bool) -> Float[Array, " nv"]:
+    """Return the inverse of `expand`."""
+    if not free:
+        return change
+    conjugate = qpos[3:7] * jnp.array([1.0, -1.0, -1.0, -1.0])
+    return jnp.concatenate([change[:3], 2 * product(conjugate, change[3:7])[1:], change[7:]])
+
+
+def product(a: Float[Array, " 4"], b: Float[Array, " 4"]) -> Float[Array, " 4"]:
+    """Return the product of two quaternions (w, x, y, z)."""
+    v, w = a[1:], b[1:]
+    return jnp.concatenate([(a[0] * b[0] - v @ w)[None], a[0] * w + b[0] * v + jnp.cross(v, w)])

@@ -1,0 +1,121 @@
+"""Draw the seeds of the final tier: `python experiments/draw_final.py --tag TAG`.
+
+The seeds follow from the hash of the tagged commit. Whoever writes that commit cannot choose them, and whoever checks
+the table can draw them again. See experiments/protocol.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ballu_mjx.common import files
+from ballu_mjx.common.errors import InputError
+
+FORMAT = "ballu-final/1"
+COUNTS: Mapping[str, int] = {"robots": 3, "robots_outside": 2, "recordings": 1, "trials": 1, "trainings": 5}
+"""How many seeds are drawn for what: robots of the virtual robot's family, robots outside of the white box's class,
+sets of recordings, sets of trials, trainings of each method."""
+FIRST_SEED, SEEDS = 10_000, 2**31
+"""Drawn seeds are from the first to below the second: development used small ones and a year's number."""
+_PACKAGES = (
+    "ballu-mjx",
+    "jax",
+    "jaxlib",
+    "mujoco",
+    "mujoco-mjx",
+    "brax",
+    "flax",
+    "optax",
+    "optimistix",
+    "numpy",
+    "scipy",
+)
+_ROOT = Path(__file__).parents[1]
+
+
+def draw_seeds(commit: str) -> dict[str, list[int]]:
+    """Return the seeds, by use, that follow from the full hash of a commit."""
+    return {use: [_seed(f"{commit} {use} {number}") for number in range(count)] for use, count in COUNTS.items()}
+
+
+def _seed(text: str) -> int:
+    number = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+    return FIRST_SEED + number % (SEEDS - FIRST_SEED)
+
+
+def draw_final(tag: str, output: Path, repository: Path) -> dict[str, Any]:
+    """Draw the seeds for a tag of `repository`, write them to `output`, and return what was written.
+
+    **Raises** `InputError` where `output` is there, the tag is missing or is not checked out, or the working tree has
+    changes.
+    """
+    if output.exists():
+        raise InputError(f"{output}: seeds were drawn already, and a final run is made once; keep the file.")
+    commit = _git(repository, "rev-parse", "--verify", "--quiet", f"refs/tags/{tag}^{{commit}}")
+    if not commit:
+        raise InputError(f"--tag {tag}: there is no such tag; commit everything, then `git tag {tag}`.")
+    if _git(repository, "rev-parse", "HEAD") != commit:
+        raise InputError(f"--tag {tag}: is not the commit that is checked out; `git checkout {tag}` first.")
+    if changed := _git(repository, "status", "--porcelain"):
+        raise InputError(f"{repository}: has changes ({changed.splitlines()[0].strip()}); commit them, and tag that.")
+    found = {
+        "format": FORMAT,
+        "tag": tag,
+        "commit": commit,
+        "drawn": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
+        "seeds": draw_seeds(commit),
+        "machine": {
+            "system": platform.system(),
+            "processor": platform.processor() or platform.machine(),
+            "cores": os.cpu_count(),
+        },
+        "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
+        "results": {},
+    }
+    output.parent.mkdir(parents=True, exist_ok=True)
+    files.write(output, json.dumps(found, indent=2) + "\n")
+    return found
+
+
+def _git(repository: Path, *arguments: str) -> str:
+    """Return what git says; nothing where it fails."""
+    done = subprocess.run(["git", "-C", str(repository), *arguments], capture_output=True, text=True)
+    return done.stdout.strip() if done.returncode == 0 else ""
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Draw the seeds of the final tier from a tagged commit.")
+    parser.add_argument("--tag", required=True, help="tag of the commit that is checked out")
+    parser.add_argument("--output", type=Path, default=_ROOT / "results" / "final.json", help="file to write")
+    options = parser.parse_args()
+    try:
+        found = draw_final(options.tag, options.output, _ROOT)
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    for use, seeds in found["seeds"].items():
+        print(f"{use}: {', '.join(map(str, seeds))}")
+    print(f"Written to {options.output}. Commit it before anything is measured.")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

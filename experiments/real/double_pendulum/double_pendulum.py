@@ -1,0 +1,133 @@
+# %% [markdown]
+# # A real double pendulum: friction, motors and delay from recordings
+#
+# The data are public: `dfki-ric-underactuated-lab/double_pendulum` on GitHub, commit `1e8544e`, BSD-3-Clause; Wiebe et
+# al., open-source dual-purpose acrobot and pendubot platform, IEEE RAM 2023. We use the ten recordings of design C.1 in
+# `data/experiment_records/design_C.1/sys_id/20230629`. `--data` is a folder with these as recordings of the project's
+# format (`docs/data.md`), named `sysid-20230629-HHMMSS.csv.gz`. Columns `shoulder`, `elbow` are `pos_meas1`,
+# `pos_meas2` (rad); `command_shoulder`, `command_elbow` are `tau_con / 20 + 0.5`. Places of `middle` and `tip` follow
+# by forward kinematics.
+#
+# Masses, lengths and inertias of the model are the published ones. Six recordings train, two choose nothing but show
+# whether identification helps (validation), two are the test. The published friction is replayed beside.
+#
+# `python experiments/real/double_pendulum/double_pendulum.py --data FOLDER`; `--quick` shows that it works.
+
+# %%
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from ballu_mjx.common import runtime
+
+runtime.prepare()
+
+import numpy as np
+
+from ballu_mjx.identification.fit_robot import FitConfig, HeldOut, RobotFit, fit_robot, replay
+from ballu_mjx.identification.parameters import declared_parameters
+from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, cut_windows, measure
+from ballu_mjx.recordings.csv_format import read_recording
+from ballu_mjx.robots.description import read_description
+
+FOLDER = Path("experiments/real/double_pendulum") if "ipykernel" in sys.modules else Path(__file__).parent
+TRAINING = ("143339", "143524", "143601", "143704", "144115", "154220")
+VALIDATION = ("143747", "143906")
+TEST = ("144003", "154548")
+SAMPLING = SamplingConfig(sample_timestep=0.02, angle_noise=np.deg2rad(0.1), position_window=0.03, rate_window=0.05)
+"""Encoders see far less than 0.1 deg of noise; what the gears hide is more."""
+PUBLISHED = {
+    "shoulder_frictionloss": 0.16 * np.pi / 2,
+    "elbow_frictionloss": 0.12 * np.pi / 2,
+    "shoulder_damping": 0.001,
+    "elbow_damping": 0.001,
+}
+"""Of the data's authors, whose Coulomb friction is cf atan(100 v)."""
+
+
+def load(data: Path, names: tuple[str, ...]) -> list[MeasuredMotion]:
+    """Read recordings by the time in their names."""
+    return read([data / f"sysid-20230629-{name}.csv.gz" for name in names])
+
+
+def load_swing_ups(data: Path) -> list[MeasuredMotion]:
+    """Read the swing-ups of the acrobot under the controller `ilqr_tvlqr_lqr`, if they are there."""
+    return read(sorted(data.glob("acrobot-ilqr_tvlqr_lqr-experiment*.csv.gz")))
+
+
+def read(paths: list[Path]) -> list[MeasuredMotion]:
+    robot = read_description(FOLDER / "double_pendulum.robot.json")
+    return [measure(read_recording(path, robot), robot, robot.load_model(), SAMPLING) for path in paths]
+
+
+def identify(data: Path, *, quick: bool) -> RobotFit:
+    """Fit the declared parameters."""
+    robot = read_description(FOLDER / "double_pendulum.robot.json")
+    parameters = declared_parameters(robot, robot.load_model())
+    training = load(data, TRAINING[:1] if quick else TRAINING)
+    config = FitConfig(
+        window_seconds=0.4 if quick else 1.0,
+        interval_seconds=2.0 if quick else 1.0,
+        starts=1 if quick else 2,
+        steps=2 if quick else 15,
+    )
+    return fit_robot(parameters, training, load(data, VALIDATION), config, report)
+
+
+def report(stage: str, iteration: int, steps: int, value: float) -> None:
+    print(f"{stage} {iteration}/{steps}: {value:.6g}", file=sys.stderr, flush=True)
+
+
+def row(name: str, found: HeldOut, motions: int) -> str:
+    """Median absolute errors of both joints at the windows' end, and of each recording."""
+    each = [np.median(np.abs(found.errors[found.motion == number, -1, :2]), axis=0) for number in range(motions)]
+    cells = [np.rad2deg(found.final_median[:2]), *map(np.rad2deg, each)]
+    return f"| {name} | " + " | ".join(f"{q1:.2f} / {q2:.2f}" for q1, q2 in cells) + " |"
+
+
+def tip_errors(found: HeldOut, motions: list[MeasuredMotion], seconds: float, interval: float) -> np.ndarray:
+    """Distances (m) between simulated and recorded tip at the windows' end; inf where a simulation diverged."""
+    windows = cut_windows(motions, seconds, interval)
+    ends = zip(windows.motion, windows.first + windows.samples - 1, strict=True)
+    recorded = np.array([motions[motion].qpos[sample] for motion, sample in ends])
+    distance = np.linalg.norm(tip(recorded + found.errors[:, -1, :2]) - tip(recorded), axis=1)
+    return np.where(np.isfinite(distance), distance, np.inf)
+
+
+def tip(angles: np.ndarray) -> np.ndarray:
+    """Place of the tip (m) in the plane of motion; angles (..., 2) in rad."""
+    upper, lower = angles[..., 0], angles.sum(axis=-1)
+    return np.stack([0.2 * np.sin(upper) + 0.3 * np.sin(lower), -0.2 * np.cos(upper) - 0.3 * np.cos(lower)], axis=-1)
+
+
+# %%
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--quick", action="store_true")
+    options = parser.parse_args()
+    fit = identify(options.data, quick=options.quick)
+    print("| parameter | nominal | identified | standard error | unit |\n| --- | --- | --- | --- | --- |")
+    for parameter, value, error in zip(fit.parameters.parameters, fit.values, fit.standard_errors, strict=True):
+        print(f"| {parameter.name} | {parameter.nominal:.4g} | {value:.4g} | {error:.2g} | {parameter.unit} |")
+    print(f"at bounds: {fit.at_bounds}; not shown by the data: {fit.unseen}; open: {fit.unidentified}")
+    print(f"strong correlations: {fit.strong_correlations}; scatter over noise: {fit.scatter.round(1)}")
+    print(f"validation, score: nominal {fit.nominal.score:.3g}, identified {fit.identified.score:.3g}")
+    published = fit.parameters.nominal.copy()
+    for name, value in PUBLISHED.items():
+        published[fit.parameters.names.index(name)] = value
+    points = {"nominal": fit.parameters.nominal, "published friction": published, "identified": fit.values}
+    for seconds in (0.4,) if options.quick else (0.4, 1.0):
+        print(f"\nMedian |error| after {seconds:g} s, deg, shoulder / elbow: all, validation, test\n")
+        motions = load(options.data, (*VALIDATION, *TEST))
+        found = replay(fit.parameters, motions, list(points.values()), seconds, 0.2)
+        for name, errors in zip(points, found, strict=True):
+            print(row(name, errors, len(motions)))
+    if swing_ups := [] if options.quick else load_swing_ups(options.data):
+        print("\nSwing-ups of the acrobot (other motions, another controller): tip after 0.4 s, m, median and 90 %\n")
+        found = replay(fit.parameters, swing_ups, list(points.values()), 0.4, 0.2)
+        for name, errors in zip(points, found, strict=True):
+            middle, most = np.percentile(tip_errors(errors, swing_ups, 0.4, 0.2), [50, 90])
+            print(f"| {name} | {middle:.4f} | {most:.4f} |")

@@ -1,0 +1,94 @@
+# %% [markdown]
+# # A real motor: identified with three loads, tested with a fourth
+#
+# A Unitree Go1 motor swings a pendulum with 0, 1, 2 or 3 kg at 0.15 m. The data are public: `rimim/bam` on GitHub,
+# commit `38071b1`, `example_data/data_raw_go1`, a fork of `Rhoban/bam` (Apache-2.0); method and friction models:
+# Duclusaud et al., ICRA 2025 (arXiv 2410.08650). `--data` is a folder with `go1_0/recordings` to `go1_3/recordings`,
+# three recordings each in the project's format (`docs/data.md`), `sin_sin`, `sin_time_square` and `up_and_down`: column
+# `motor` is `position` (rad), `command_goal` is `goal_position / (2 pi) + 0.5`. `lift_and_drop` switches the motor off,
+# which no command says, and is left out.
+#
+# The fit sees 0, 1 and 2 kg. Each load is a model of its own; the parameters are common.
+#
+# `python experiments/real/go1/go1.py --data FOLDER`; `--quick` shows that it works.
+
+# %%
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from ballu_mjx.common import runtime
+
+runtime.prepare()
+
+import mujoco
+import numpy as np
+
+from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, fit_robot, replay
+from ballu_mjx.identification.parameters import declared_parameters
+from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, measure
+from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+from ballu_mjx.robots.description import read_description
+
+FOLDER = Path("experiments/real/go1") if "ipykernel" in sys.modules else Path(__file__).parent
+LOADS = (0, 1, 2, 3)
+"""kg; the last is the test."""
+SAMPLING = SamplingConfig(sample_timestep=0.016, angle_noise=np.deg2rad(0.1), position_window=0.08, rate_window=0.1)
+LIGHTEST = 0.001
+"""kg: a body needs some mass."""
+PUBLISHED = {"motor_frictionloss": 0.0914, "motor_damping": 0.047}
+"""Of the data's authors (Coulomb and viscous)."""
+SECONDS = 5.9
+
+
+def load(data: Path, kilograms: int) -> list[MeasuredMotion]:
+    """Read the recordings of a load, each with the model of that load."""
+    robot = read_description(FOLDER / "go1.robot.json")
+    spec = mujoco.MjSpec.from_file(str(robot.model))
+    spec.body("load").mass = max(kilograms, LIGHTEST)
+    model = spec.compile()
+    paths = list_recordings([data / f"go1_{kilograms}" / "recordings"])
+    return [measure(read_recording(path, robot), robot, model, SAMPLING) for path in paths]
+
+
+def identify(data: Path, *, quick: bool) -> RobotFit:
+    """Fit the declared parameters to all loads but the last."""
+    robot = read_description(FOLDER / "go1.robot.json")
+    parameters = declared_parameters(robot, robot.load_model())
+    training = [motion for kilograms in LOADS[:-1] for motion in load(data, kilograms)]
+    config = FitConfig(window_seconds=2.0, starts=1 if quick else 2, steps=4 if quick else 15)
+    return fit_robot(parameters, training[1:5:3] if quick else training, load(data, LOADS[-1]), config, report)
+
+
+def mean_errors(fit: RobotFit, motions: list[MeasuredMotion], points: list[np.ndarray]) -> np.ndarray:
+    """Mean absolute angle errors (deg) of whole recordings, (points, recordings)."""
+    found = replay(fit.parameters, motions, points, SECONDS, 2 * SECONDS)
+    return np.array([np.rad2deg(np.abs(errors.errors[..., 0]).mean(axis=1)) for errors in found])
+
+
+def report(stage: str, iteration: int, steps: int, value: float) -> None:
+    print(f"{stage} {iteration}/{steps}: {value:.6g}", file=sys.stderr, flush=True)
+
+
+# %%
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--quick", action="store_true")
+    options = parser.parse_args()
+    fit = identify(options.data, quick=options.quick)
+    print("| parameter | nominal | identified | standard error | unit |\n| --- | --- | --- | --- | --- |")
+    for parameter, value, error in zip(fit.parameters.parameters, fit.values, fit.standard_errors, strict=True):
+        print(f"| {parameter.name} | {parameter.nominal:.4g} | {value:.4g} | {error:.2g} | {parameter.unit} |")
+    print(f"at bounds: {fit.at_bounds}; not shown by the data: {fit.unseen}; open: {fit.unidentified}")
+    print(f"strong correlations: {fit.strong_correlations}; scatter over noise: {fit.scatter.round(1)}")
+    published = fit.parameters.nominal.copy()
+    for name, value in PUBLISHED.items():
+        published[fit.parameters.names.index(name)] = value
+    print(f"\nMean |error| over {SECONDS:g} s, deg\n")
+    print("| load (kg) | nominal | published friction | identified |\n| --- | --- | --- | --- |")
+    for kilograms in LOADS[-1:] if options.quick else LOADS:
+        errors = mean_errors(fit, load(options.data, kilograms), [fit.parameters.nominal, published, fit.values])
+        print(f"| {kilograms} | " + " | ".join(f"{x:.2f}" for x in errors.mean(axis=1)) + " |")

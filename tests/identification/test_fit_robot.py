@@ -1,0 +1,205 @@
+"""Known parameters of a servo arm, simulated by C MuJoCo with noise, are found again; and what the data cannot show is
+said."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, check_data, fit_robot, replay, soften
+from ballu_mjx.identification.parameters import ParameterSet, declared_parameters
+from ballu_mjx.identification.residuals import (
+    MeasuredMotion,
+    SamplingConfig,
+    WindowSimulator,
+    cut_windows,
+    measure,
+)
+from ballu_mjx.recordings.csv_format import read_recording
+from ballu_mjx.robots.description import RobotDescription, read_description
+
+MODEL = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.005" integrator="implicitfast" iterations="4" ls_iterations="10"/>
+  <worldbody>
+    <body name="arm" pos="0 0 1">
+      <joint name="elbow" axis="0 1 0" damping="0.05" armature="0.01" frictionloss="0.02"/>
+      <inertial pos="0 0 -0.15" mass="0.3" diaginertia="0.002 0.002 0.0003"/>
+      <site name="tip" pos="0 0 -0.3"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="servo" joint="elbow" kp="4" kv="0.1" ctrlrange="0 1" forcerange="-20 20"/>
+  </actuator>
+</mujoco>
+"""
+IDENTIFY = [
+    {"joint": "elbow", "field": "damping", "bounds": [0.005, 0.5], "prior": 0.05},
+    {"joint": "elbow", "field": "frictionloss", "bounds": [0.001, 0.5], "prior": 0.1},
+    {"actuator": "servo", "field": "kp"},
+    {"body": "arm", "field": "mass", "name": "mass"},
+    {"command": "elbow", "field": "delay"},
+    {"actuator": "servo", "field": "forcerange", "bounds": [5, 40], "prior": 5},
+]
+TRUTH = {"elbow_damping": 0.12, "elbow_frictionloss": 0.08, "servo_kp": 3.2, "mass": 0.36, "elbow_delay": 0.033}
+NOISE = np.deg2rad(0.2)
+
+
+def robot(folder: Path) -> tuple[RobotDescription, ParameterSet, mujoco.MjModel]:
+    (folder / "arm.xml").write_text(MODEL)
+    content = {
+        "format": "ballu-robot/1",
+        "name": "arm",
+        "model": "arm.xml",
+        "tracked": "tip",
+        "points": [],
+        "commands": {"elbow": "servo"},
+        "joints": ["elbow"],
+        "identify": IDENTIFY,
+    }
+    (folder / "arm.robot.json").write_text(json.dumps(content))
+    description = read_description(folder / "arm.robot.json")
+    model = description.load_model()
+    return description, declared_parameters(description, model), model
+
+
+def record(folder: Path, name: str, seed: int, seconds: float = 6.0) -> Path:
+    """A recording of the true arm at 100 Hz, by C MuJoCo at the model's time step."""
+    spec = mujoco.MjSpec.from_string(MODEL)
+    spec.joint("elbow").damping[0] = TRUTH["elbow_damping"]
+    spec.joint("elbow").frictionloss = TRUTH["elbow_frictionloss"]
+    spec.actuator("servo").gainprm[0] = TRUTH["servo_kp"]
+    spec.actuator("servo").biasprm[1] = -TRUTH["servo_kp"]
+    spec.body("arm").mass = TRUTH["mass"]
+    spec.body("arm").inertia = np.array([0.002, 0.002, 0.0003]) * TRUTH["mass"] / 0.3
+    model = spec.compile()
+    model.opt.iterations, model.opt.tolerance = 50, 0
+    data, rng = mujoco.MjData(model), np.random.default_rng(seed)
+    steps, dt = round(seconds / model.opt.timestep), model.opt.timestep
+    command = np.repeat(rng.uniform(0, 1, steps // 80 + 1), 80)[:steps].round(4)
+    rows = ["time,command_elbow,tip_x,tip_y,tip_z,tip_qw,tip_qx,tip_qy,tip_qz,elbow"]
+    late = np.interp(np.arange(steps) - TRUTH["elbow_delay"] / dt, np.arange(steps), command)
+    for step in range(steps):
+        if step % 2 == 0:
+            mujoco.mj_kinematics(model, data)
+            place = np.concatenate([data.site("tip").xpos, data.body("arm").xquat])
+            angle = data.qpos[0] + NOISE * rng.normal()
+            cells = [step * dt, command[step], *place, angle]
+            rows.append(",".join(f"{cell:.6f}" for cell in cells))
+        data.ctrl[:] = late[step]
+        mujoco.mj_step(model, data)
+    path = folder / f"{name}.csv"
+    path.write_text("\n".join(rows) + "\n")
+    keys = {"format": "ballu-recording/1", "kind": "free", "robot": "arm", "notes": ""}
+    path.with_suffix(".json").write_text(json.dumps(keys))
+    return path
+
+
+@pytest.fixture(scope="module")
+def motions(tmp_path_factory: pytest.TempPathFactory) -> list[MeasuredMotion]:
+    folder = tmp_path_factory.mktemp("arm")
+    description, _, model = robot(folder)
+    config = SamplingConfig(angle_noise=NOISE, rate_window=0.07)
+    return [
+        measure(read_recording(record(folder, f"motion-{seed}", seed), description), description, model, config)
+        for seed in range(3)
+    ]
+
+
+@pytest.fixture(scope="module")
+def parameters(tmp_path_factory: pytest.TempPathFactory) -> ParameterSet:
+    return robot(tmp_path_factory.mktemp("arm"))[1]
+
+
+CONFIG = FitConfig(window_seconds=1.0, starts=2)
+
+
+@pytest.fixture(scope="module")
+def fit(motions: list[MeasuredMotion], parameters: ParameterSet) -> RobotFit:
+    return fit_robot(parameters, motions[:2], motions[2:], CONFIG)
+
+
+def test_known_parameters_are_found_within_two_standard_errors(fit: RobotFit):
+    for name, value, error in zip(fit.parameters.names, fit.values, fit.standard_errors, strict=True):
+        if name in TRUTH:
+            assert abs(value - TRUTH[name]) < 2 * error, (name, value, error)
+            assert error < 0.1 * TRUTH[name], (name, value, error)
+
+
+def test_held_out_windows_say_that_it_helps(fit: RobotFit):
+    assert fit.improves
+    assert fit.identified.score < 0.2 * fit.nominal.score
+    np.testing.assert_allclose(fit.best.values, fit.values)
+    # What is left is the noise of the angles.
+    np.testing.assert_allclose(fit.scatter[0], 1.0, atol=0.15)
+
+
+def test_worse_than_nominal_is_said_and_not_taken(fit: RobotFit):
+    swapped = dataclasses.replace(fit, nominal=fit.identified, identified=fit.nominal)
+    assert not swapped.improves
+    np.testing.assert_allclose(swapped.best.values, fit.parameters.nominal)
+
+
+def test_the_data_check_names_a_limit_that_no_recording_reaches(parameters: ParameterSet, fit: RobotFit):
+    assert fit.unseen == ("servo_forcerange",)
+    assert len(fit.unidentified) == 1 and fit.unidentified[0] == "+1.00 servo_forcerange"
+    # It stays where it is believed to be, with the error of that belief.
+    place = parameters.names.index("servo_forcerange")
+    np.testing.assert_allclose(fit.values[place], 20.0, rtol=0.02)
+    np.testing.assert_allclose(fit.standard_errors[place], 5.0, rtol=0.02)
+
+
+def test_derivatives_are_those_of_differences(motions: list[MeasuredMotion], parameters: ParameterSet):
+    values = np.array([0.12, 0.08, 3.2, 0.36, 0.0333, 20.0])
+    with jax.enable_x64(True):
+        simulator = WindowSimulator(parameters, motions[:2], cut_windows(motions[:2], CONFIG.window_seconds))
+        start = 0.3 * np.random.default_rng(0).normal(size=(simulator.count, simulator.channels))
+        found = simulator.linearize(values, start)
+        np.testing.assert_allclose(found.values, simulator.differences(values, start), atol=1e-9)
+        for place in range(len(values) - 1):
+            step = 1e-5 * values * np.eye(len(values))[place]
+            change = simulator.differences(values + step, start) - simulator.differences(values - step, start)
+            slope, true = found.by_parameters[..., place], change / (2 * step[place])
+            # Where a joint sticks or slips at another step, neither says much; nearly nowhere.
+            off = np.abs(slope - true) > 0.01 * np.abs(true).max()
+            assert off.mean() < 0.02, (place, off.mean())
+        step = np.array([1e-4, 0.0])
+        change = simulator.differences(values, start + step) - simulator.differences(values, start - step)
+        np.testing.assert_allclose(found.by_start[..., 0], change / 2e-4, atol=0.02)
+
+
+def test_a_motion_of_another_load_is_simulated_with_its_own(motions: list[MeasuredMotion], parameters: ParameterSet):
+    spec = mujoco.MjSpec.from_string(MODEL)
+    spec.body("arm").mass = 0.9
+    loaded = dataclasses.replace(motions[1], model=spec.compile())
+    pair = [motions[0], loaded]
+    both, alone = (replay(parameters, each, [parameters.nominal], 1.0)[0] for each in (pair, [loaded]))
+    np.testing.assert_allclose(both.errors[both.motion == 1], alone.errors, atol=1e-9)
+    assert not np.allclose(both.errors[both.motion == 1], both.errors[both.motion == 0], atol=1e-3)
+
+
+def test_softening_keeps_small_differences_and_flattens_large_ones():
+    values = np.array([-100.0, -0.1, 0.0, 0.1, 100.0])
+    soft, slopes = soften(values, 3.0)
+    np.testing.assert_allclose(soft**2, 2 * 9 * (np.sqrt(1 + values**2 / 9) - 1), atol=1e-12)
+    change = (soften(values + 1e-6, 3.0)[0] - soften(values - 1e-6, 3.0)[0]) / 2e-6
+    np.testing.assert_allclose(slopes, change, atol=1e-6)
+
+
+def test_what_cannot_be_fitted_is_refused(motions: list[MeasuredMotion], parameters: ParameterSet, tmp_path: Path):
+    with pytest.raises(InputError, match="No recording lasts 60 s"):
+        fit_robot(parameters, motions, None, FitConfig(window_seconds=60.0))
+    with pytest.raises(InputError, match="--starts is 0"):
+        check_data(parameters, motions, FitConfig(starts=0))
+    description, _, model = robot(tmp_path)
+    path = record(tmp_path, "short", 0, 1.5)
+    rows = [line.rpartition(",")[0] for line in path.read_text().splitlines()]
+    path.write_text("\n".join(rows) + "\n")
+    with pytest.raises(InputError, match="joint elbow was not recorded"):
+        measure(read_recording(path, description), description, model)

@@ -1,0 +1,247 @@
+"""Declared parameters: what they set, their coordinates, and what is refused."""
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.identification.parameters import (
+    BODY_QUANTITIES,
+    IdentifiedParameters,
+    ParameterSet,
+    declared_parameters,
+    deform_body,
+)
+from ballu_mjx.robots.description import read_description
+from ballu_mjx.robots.model import ModelParameters, set_fields
+from ballu_mjx.sim.drivetrain import identity_drivetrain
+
+MODEL = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.01" integrator="implicitfast"/>
+  <worldbody>
+    <body name="arm">
+      <joint name="left" axis="0 1 0" damping="0.1" stiffness="2"/>
+      <geom name="rod" type="capsule" fromto="0 0 0 0.2 0.02 -0.3" size="0.02" mass="0.4"/>
+      <body name="hand" pos="0 0 -0.3">
+        <joint name="right" axis="0 1 0" damping="0.1" stiffness="3"/>
+        <geom name="palm" type="box" pos="0.05 0 0" size="0.03 0.04 0.05" mass="0.2"/>
+        <site name="tip" pos="0 0 -0.1"/>
+      </body>
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="cable" springlength="0 0.1" stiffness="10"><joint joint="left" coef="1"/></fixed>
+  </tendon>
+  <actuator>
+    <position name="servo_left" joint="left" kp="5" kv="0.2" ctrlrange="-1 1" forcerange="-2 2"/>
+    <motor name="servo_right" joint="right" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>
+"""
+
+
+def arm(folder: Path, *entries: dict[str, Any]) -> tuple[ParameterSet, mujoco.MjModel]:
+    (folder / "arm.xml").write_text(MODEL)
+    content = {
+        "format": "ballu-robot/1",
+        "name": "arm",
+        "model": "arm.xml",
+        "tracked": "tip",
+        "points": [],
+        "commands": {"left": "servo_left", "right": "servo_right"},
+        "identify": list(entries),
+    }
+    (folder / "arm.robot.json").write_text(json.dumps(content))
+    robot = read_description(folder / "arm.robot.json")
+    model = robot.load_model()
+    return declared_parameters(robot, model), model
+
+
+EVERYTHING = (
+    {"joint": ["left", "right"], "field": "damping"},
+    {"joint": "left", "field": "frictionloss", "bounds": [0, 1]},
+    {"actuator": "servo_left", "field": "kp"},
+    {"actuator": "servo_left", "field": "kd"},
+    {"actuator": "servo_left", "field": "forcerange"},
+    {"actuator": "servo_right", "field": "strength"},
+    {"tendon": "cable", "field": "springlength"},
+    {"body": "hand", "field": "mass_properties"},
+    {"command": "left", "field": "delay"},
+    {"command": "right", "field": "rate_limit"},
+)
+
+
+def test_nominal_values_change_nothing(tmp_path: Path):
+    parameters, model = arm(tmp_path, *EVERYTHING)
+    with jax.enable_x64(True):
+        fields = parameters.fields(model, parameters.nominal)
+    same = copy.copy(model)
+    set_fields(same, {name: value for name, value in fields.items() if name not in ("body_inertia", "body_iquat")})
+    for name in fields:
+        if name not in ("body_inertia", "body_iquat"):
+            np.testing.assert_allclose(getattr(same, name), getattr(model, name), rtol=1e-12, atol=1e-8)
+    np.testing.assert_allclose(
+        np.sort(fields["body_inertia"]), np.sort(model.body_inertia), rtol=1e-5
+    )  # axes may change their order, and orientation with them
+    drivetrain = parameters.drivetrain(parameters.nominal)
+    for own, same in zip(drivetrain, identity_drivetrain(2), strict=True):
+        ours = jnp.minimum(own, 2 / model.opt.timestep)  # so fast a rate limit holds nothing back
+        np.testing.assert_allclose(ours, jnp.minimum(same, 2 / model.opt.timestep))
+
+
+def test_ties_set_all_their_targets(tmp_path: Path):
+    parameters, model = arm(
+        tmp_path,
+        {"joint": ["left", "right"], "field": "damping"},
+        {"actuator": "servo_left", "field": "kp"},
+        {"actuator": "servo_left", "field": "forcerange"},
+        {
+            "name": "springs",
+            "targets": [
+                {"joint": "left", "field": "stiffness"},
+                {"joint": "right", "field": "stiffness", "factor": 1.5},
+            ],
+        },
+    )
+    assert parameters.names == ("left_and_right_damping", "servo_left_kp", "servo_left_forcerange", "springs")
+    np.testing.assert_allclose(parameters.nominal, [0.1, 5.0, 2.0, 2.0])
+    fields = parameters.fields(model, np.array([0.3, 7.0, 1.5, 4.0]))
+    np.testing.assert_allclose(fields["dof_damping"], [0.3, 0.3], rtol=1e-6)
+    np.testing.assert_allclose(fields["actuator_gainprm"][0, 0], 7.0, rtol=1e-6)
+    np.testing.assert_allclose(fields["actuator_biasprm"][0, :3], [0.0, -7.0, -0.2], rtol=1e-6)
+    np.testing.assert_allclose(fields["actuator_forcerange"][0], [-1.5, 1.5], rtol=1e-6)
+    np.testing.assert_allclose(fields["jnt_stiffness"], [4.0, 6.0], rtol=1e-6)
+
+
+def test_a_coordinate_runs_from_bound_to_bound(tmp_path: Path):
+    parameters, _ = arm(tmp_path, *EVERYTHING)
+    with jax.enable_x64(True):
+        low, high = (parameters.vector(np.full(len(parameters), far)) for far in (-40.0, 40.0))
+        np.testing.assert_allclose(low, parameters.lower, atol=1e-12)
+        np.testing.assert_allclose(high, parameters.upper, rtol=1e-12)
+        drawn = parameters.draw(0, 20)
+        values = np.array([parameters.vector(y) for y in drawn])
+        np.testing.assert_allclose(parameters.coordinates(values), drawn, atol=1e-6)
+    assert (values > parameters.lower).all() and (values < parameters.upper).all()
+    # The first is nominal, but for what would begin on a bound.
+    inside = (parameters.nominal > parameters.lower) & (parameters.nominal < parameters.upper)
+    np.testing.assert_allclose(values[0, inside], parameters.nominal[inside], rtol=1e-9)
+    assert parameters.at_bounds(np.where(np.arange(len(parameters)) == 2, parameters.upper, values[1])) == (
+        "servo_left_kp",
+    )
+
+
+def test_any_deformation_is_of_a_rigid_body_and_none_is_the_identity():
+    mass, ipos, inertia = 0.4, np.array([0.1, 0.2, 0.3]), np.array([2e-3, 2e-3, 5e-4])
+    iquat = np.array([0.5, -0.5, 0.5, 0.5])
+    rng = np.random.default_rng(0)
+    with jax.enable_x64(True):
+        for draw in range(50):
+            numbers = np.concatenate([np.exp(rng.normal(size=1)), rng.normal(size=3), np.exp(rng.normal(size=3))])
+            numbers = np.concatenate([numbers, rng.normal(size=3)])
+            if draw == 0:
+                numbers = np.array([1.0, 0, 0, 0, 1, 1, 1, 0, 0, 0])
+            own_mass, centre, quaternion, own = map(
+                np.asarray, deform_body(*map(jnp.asarray, (mass, ipos, iquat, inertia, numbers)))
+            )
+            assert own_mass > 0 and (own > 0).all()
+            assert 2 * own.max() < own.sum()
+            np.testing.assert_allclose(np.linalg.norm(quaternion), 1)
+            # The same, by sums over point masses of that distribution.
+            axes, turned = np.zeros(9), np.zeros(9)
+            mujoco.mju_quat2Mat(axes, iquat)
+            mujoco.mju_quat2Mat(turned, quaternion)
+            axes, turned = axes.reshape(3, 3), turned.reshape(3, 3)
+            stretch = np.diag(numbers[4:7])
+            stretch[[0, 0, 1], [1, 2, 2]] = numbers[7:]
+            points = np.sqrt(3 * (inertia.sum() / 2 - inertia) / mass) * np.concatenate([np.eye(3), -np.eye(3)])
+            points = points @ stretch.T @ axes.T
+            weight = numbers[0] * mass / 6
+            whole = weight * sum(np.dot(p, p) * np.eye(3) - np.outer(p, p) for p in points)
+            np.testing.assert_allclose(turned @ np.diag(own) @ turned.T, whole, rtol=1e-4, atol=1e-5 * own.max())
+            np.testing.assert_allclose(centre, ipos + axes @ numbers[1:4])
+
+
+def test_derivatives_by_inertia_hold_where_principal_moments_are_equal():
+    """A rod's two moments are equal, and its axes then have no derivative of their own."""
+    mass, ipos, inertia, iquat = 0.4, np.zeros(3), np.array([2e-3, 2e-3, 5e-4]), np.array([1.0, 0, 0, 0])
+
+    def whole(numbers: jax.Array) -> jax.Array:
+        nominal = jnp.asarray(mass), jnp.asarray(ipos), jnp.asarray(iquat), jnp.asarray(inertia)
+        _, _, quaternion, own = deform_body(*nominal, numbers)
+        w, v = quaternion[0], quaternion[1:]
+        cross = jnp.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+        turned = jnp.eye(3) + 2 * w * cross + 2 * cross @ cross
+        return turned @ jnp.diag(own) @ turned.T
+
+    with jax.enable_x64(True):
+        nominal = jnp.array([1.0, 0, 0, 0, 1, 1, 1, 0, 0, 0])
+        slopes = np.asarray(jax.jacfwd(whole)(nominal))
+        for place in range(len(BODY_QUANTITIES)):
+            step = np.eye(10)[place] * 1e-4
+            change = (whole(nominal + step) - whole(nominal - step)) / 2e-4
+            np.testing.assert_allclose(slopes[..., place], change, atol=2e-8)
+
+
+def test_identified_values_are_model_parameters(tmp_path: Path):
+    parameters, model = arm(tmp_path, {"joint": "left", "field": "damping"}, {"command": "left", "field": "delay"})
+    identified = IdentifiedParameters(jnp.array([0.2, 0.05]), parameters)
+    assert isinstance(identified, ModelParameters)
+    set_fields(model, identified.fields(model))
+    np.testing.assert_allclose(model.dof_damping, [0.2, 0.1], rtol=1e-6)
+    np.testing.assert_allclose(identified.drivetrain().delay, [0.05, 0.0])
+    assert parameters.slots(0.01) == 12
+
+
+FAULTS = {
+    "no such joint": ({"joint": "knee", "field": "damping"}, "entry 1 names 'knee', no joint of the model"),
+    "no such field": ({"joint": "left", "field": "colour"}, 'entry 1 has the field "colour"'),
+    "no such key": ({"joint": "left", "field": "damping", "bound": [0, 1]}, 'has the key "bound"'),
+    "no bounds": ({"joint": "left", "field": "frictionloss"}, 'has no "bounds"'),
+    "bounds without nominal": ({"joint": "left", "field": "damping", "bounds": [1, 2]}, "without the nominal 0.1"),
+    "bounds the wrong way": ({"joint": "left", "field": "damping", "bounds": [2, 1]}, "the smaller first"),
+    "negative": ({"joint": "left", "field": "damping", "bounds": [-1, 1]}, "damping is 0 or more"),
+    "unequal ties": ({"joint": ["left", "right"], "field": "stiffness"}, r"values differ \(2, 3\)"),
+    "two kinds": ({"joint": "left", "body": "arm", "field": "damping"}, "names 2 kinds of elements"),
+    "no feedback": ({"actuator": "servo_right", "field": "kp"}, "feeds back no such thing"),
+    "no forcerange": ({"actuator": "servo_right", "field": "forcerange"}, "give the actuator a forcerange"),
+    "no bias": ({"actuator": "servo_right", "field": "bias", "bounds": [-1, 1]}, "has the bias of servo_right"),
+    "no such command": ({"command": "middle", "field": "delay"}, "names 'middle', no command"),
+    "a mass by its field": ({"body": "arm", "field": "body_mass"}, "there are mass, com, inertia, mass_properties"),
+    "prior": ({"joint": "left", "field": "damping", "prior": 0}, "write a number above 0"),
+    "bounds of ten": ({"body": "arm", "field": "mass_properties", "bounds": [0, 1]}, "leave it out"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_named_with_file_and_entry(tmp_path: Path, fault: str):
+    entry, message = FAULTS[fault]
+    with pytest.raises(InputError, match=rf'arm\.robot\.json: "identify" .*{message}'):
+        arm(tmp_path, entry)
+
+
+def test_what_is_identified_twice_or_not_at_all_is_refused(tmp_path: Path):
+    damping = {"joint": "left", "field": "damping"}
+    with pytest.raises(InputError, match="two parameters left_damping"):
+        arm(tmp_path, damping, damping)
+    with pytest.raises(InputError, match="sets the same number by left_damping and again"):
+        arm(tmp_path, damping, {**damping, "name": "again"})
+    with pytest.raises(InputError, match='"identify" is missing'):
+        arm(tmp_path)
+
+
+def test_any_field_goes_by_its_own_name(tmp_path: Path):
+    parameters, model = arm(
+        tmp_path, {"joint": "left", "field": "jnt_range", "index": 1, "bounds": [0, 1], "name": "stop"}
+    )
+    fields = parameters.fields(model, np.array([0.5]))
+    np.testing.assert_allclose(fields["jnt_range"], [[0, 0.5], [0, 0]])

@@ -1,0 +1,60 @@
+"""Which recordings serve for what: what is refused, and what the user is told."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import pytest
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.csv_format import list_bundled, read_recording
+from ballu_mjx.residuals.dataset import USES, RecordingsData, ResidualDataset, check_overlap
+from ballu_mjx.robots.registry import load_robot
+
+ONE, TWO, THREE, FOUR = list_bundled("training")[:2] + list_bundled("test")[:2]
+
+
+def prepared(training: list[Path], validation: list[Path], test: list[Path]) -> ResidualDataset:
+    data = RecordingsData(recordings=tuple(training), validation=tuple(validation), test=tuple(test))
+    return ResidualDataset.read(data, load_robot())
+
+
+@pytest.mark.parametrize(
+    ("validation", "test", "told", "replayed"),
+    [
+        ([THREE], [FOUR], [], "of the test recordings"),
+        ([THREE, FOUR], [FOUR, THREE], ["test is on the validation"], "of the validation recordings (they chose the"),
+        ([ONE], [FOUR], ["Validation is on the training"], "of the test recordings"),
+        ([THREE], [ONE], ["test is on the training"], "of the training recordings"),
+        ([ONE], [ONE], ["Validation is on the training", "test is on the training"], "of the training recordings"),
+    ],
+)
+def test_recordings_that_serve_twice_are_told_where_it_matters(
+    validation: list[Path], test: list[Path], told: list[str], replayed: str
+) -> None:
+    found = prepared([ONE], validation, test)
+    assert len(found.reused) == len(told) and all(part in line for part, line in zip(told, found.reused, strict=True))
+    assert replayed in found.replayed
+
+
+@pytest.mark.parametrize(("one", "other"), list(itertools.combinations(USES, 2)))
+def test_two_uses_that_share_some_recordings_are_refused(one: str, other: str) -> None:
+    files = {use: [path] for use, path in zip(USES, (ONE, THREE, FOUR), strict=True)}
+    check_overlap(files)
+    files[other] = [*files[one], TWO]
+    with pytest.raises(InputError, match=f"among the {one} and the {other} recordings; take it out of one"):
+        check_overlap(files)
+    files[other] = files[one]
+    check_overlap(files)
+
+
+def test_bundled_recordings_of_different_uses_do_not_overlap() -> None:
+    """Neither a file nor the commands of one serve two uses: no take of a training gait is tested on."""
+    files = {use: list_bundled(use) for use in USES}
+    commands = {
+        use: {read_recording(path, load_robot()).command.tobytes() for path in paths} for use, paths in files.items()
+    }
+    assert sum(map(len, commands.values())) >= 12
+    for one, other in itertools.combinations(USES, 2):
+        assert not commands[one] & commands[other], f"{one} and {other}"

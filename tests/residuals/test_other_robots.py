@@ -1,0 +1,178 @@
+"""The residual methods on a robot that is no BALLU: a tethered balloon, anchored, in commands of any unit."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reference import stack_motions
+from ballu_mjx.recordings.segments import cut_segments
+from ballu_mjx.residuals import analytic, supervised
+from ballu_mjx.residuals.aerodynamics import Aerodynamics, AirParameters
+from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
+from ballu_mjx.residuals.analytic import AnalyticConfig
+from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.network import NetworkForces, load_units, num_inputs, num_loads, recorded_inputs
+from ballu_mjx.residuals.supervised import SupervisedConfig
+from ballu_mjx.rl import ppo
+from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.robots.description import RobotDescription, read_description
+from ballu_mjx.sim.linearize import Linearizer
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout
+from ballu_mjx.sim.simulator import Simulator
+
+FOLDER = Path(__file__).parents[2] / "experiments" / "tethered_balloon"
+ROBOT = read_description(FOLDER / "balloon.robot.json")
+SIMULATOR = Simulator(ROBOT)
+PUSH = np.array([0.02, -0.03, 0.015])
+"""N, world."""
+CONFIG = EnvMimicConfig()
+NETWORK = PPOConfig(policy_layers=(16,), value_layers=(4,))
+STEPS = 60
+
+
+def flight(robot: RobotDescription = ROBOT, push: np.ndarray = PUSH, added_mass: float = 0.0, seed: int = 0) -> Motion:
+    """The balloon in C MuJoCo under random commands, with `push` on it, or with so much air that moves along."""
+    model, rng = robot.load_model(), np.random.default_rng(seed)
+    body = model.body("balloon").id
+    lift = model.body_gravcomp[body] * model.body_mass[body] + added_mass
+    model.body_mass[body] += added_mass
+    model.body_gravcomp[body] = lift / model.body_mass[body]
+    data = mujoco.MjData(model)
+    data.xfrc_applied[body, :3] = push
+    low, high = np.array(robot.command_ranges).T
+    command = low + (high - low) * np.repeat(rng.uniform(size=(STEPS // 5, 2)), 5, axis=0)
+    qpos, qvel = [data.qpos.copy()], [data.qvel.copy()]
+    for now in command:
+        data.ctrl[:] = now
+        mujoco.mj_step(model, data, round(robot.control_timestep / model.opt.timestep))
+        qpos.append(data.qpos.copy())
+        qvel.append(data.qvel.copy())
+    time = np.arange(STEPS + 1) * robot.control_timestep
+    return Motion(f"flight-{seed}", time, command, np.array(qpos), np.array(qvel), {})
+
+
+@pytest.fixture(scope="module")
+def motions() -> list[Motion]:
+    return [flight(seed=seed) for seed in range(2)]
+
+
+@pytest.fixture(scope="module")
+def linearize() -> Linearizer:
+    return Linearizer(SIMULATOR)
+
+
+def test_labels_are_the_push(motions: list[Motion], linearize: Linearizer):
+    """In the world's frame, whichever way the balloon faces."""
+    labels = supervised.ForceLabeller(linearize, SupervisedConfig())(motions[0])
+    np.testing.assert_allclose(np.median(labels, axis=0), PUSH, atol=0.1 * float(np.linalg.norm(PUSH)))
+    _, actions = supervised.examples(SIMULATOR, motions[:1], [np.tile(PUSH, (STEPS, 1))], CONFIG)
+    np.testing.assert_allclose(load_units(CONFIG, 3) * actions, np.tile(PUSH, (len(actions), 1)), atol=1e-6)
+    yaw = stack_motions(SIMULATOR, motions)[0].features[0, :, ObservationLayout.yaw]
+    assert np.ptp(np.asarray(yaw)) > 0.1  # in a heading frame these would be other actions
+
+
+def test_gradients_through_the_simulation_find_the_push(motions: list[Motion], linearize: Linearizer):
+    reference, _ = stack_motions(SIMULATOR, motions)
+    inputs = np.asarray(recorded_inputs(reference, CONFIG, ROBOT))
+    sizes = {ppo.STATE: (num_inputs(CONFIG, ROBOT),)}, num_loads(CONFIG, ROBOT), NETWORK
+    forces = NetworkForces(CONFIG, ROBOT, ppo.make_inference(*sizes), name="analytic")
+    start = ppo.initial_policy(inputs, num_loads(CONFIG, ROBOT), NETWORK)
+    settings = AnalyticConfig(
+        window_seconds=0.5, interval_seconds=0.5, relinearizations=2, updates=150, validate_every=150,
+        observation_noise=0.0, start_noise=0.0,
+    )  # fmt: skip
+    windows = cut_segments(SIMULATOR, motions, settings.window_seconds, settings.interval_seconds)
+    found = []
+    analytic.train(
+        forces,
+        lambda policy: start._replace(policy=policy),
+        start.policy,
+        windows,
+        np.std(inputs, axis=0),
+        settings,
+        lambda step, policy, metrics: found.append((policy, metrics)),
+        linearize,
+    )
+    policy, metrics = found[-1]
+    actions = np.asarray(forces.infer(start._replace(policy=policy), jnp.asarray(inputs)))
+    found_push = (load_units(CONFIG, 3) * actions).mean(axis=0)
+    # A force along the taut tether moves the balloon no more than another one: only the horizontal part shows.
+    np.testing.assert_allclose(found_push[:2], PUSH[:2], atol=0.05 * float(np.linalg.norm(PUSH)))
+    assert metrics["loss"] < 0.1 * found[0][1]["loss"]
+
+
+def test_added_mass_is_found():
+    windy = [flight(push=np.zeros(3), added_mass=0.03, seed=seed) for seed in range(2)]
+    config = AirConfig(window_seconds=1.0, interval_seconds=1.0)
+    fit = identify_air(SIMULATOR, windy, config, free=("added_mass",))
+    assert float(fit.parameters.added_mass) == pytest.approx(0.03, rel=0.05)
+    assert fit.cost[1] < 0.05 * fit.cost[0]
+
+
+def test_a_robot_without_buoyancy_has_no_aerodynamics(tmp_path: Path):
+    robot = altered(tmp_path, ' gravcomp="1.631"', "")
+    with pytest.raises(InputError, match=r"balloon\.xml: the body balloon has no buoyancy.*gravcomp"):
+        Aerodynamics(robot, robot.load_model())
+
+
+def altered(folder: Path, *texts: str) -> RobotDescription:
+    """The robot with an altered model: pairs of texts, the old and the new."""
+    shutil.copy(ROBOT.file, folder)
+    text = ROBOT.model.read_text()
+    for old, new in zip(texts[::2], texts[1::2], strict=True):
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "balloon.xml").write_text(text)
+    return read_description(folder / ROBOT.file.name)
+
+
+def test_commands_in_other_units_are_the_same_robot(tmp_path: Path):
+    """Propellers that take -2 to 2 for what the others take 0 to 1 for: motion, inputs and what is learned agree."""
+    twin = altered(
+        tmp_path, 'gainprm="0.04" ctrlrange="0 1"', 'gainprm="0.01" biastype="affine" biasprm="0.02" ctrlrange="-2 2"'
+    )
+    assert twin.command_ranges == ((-2.0, 2.0), (-2.0, 2.0))
+    learned = []
+    for robot, simulator in ((ROBOT, SIMULATOR), (twin, Simulator(twin))):
+        motion = flight(robot, push=np.zeros(3))
+        reference, _ = stack_motions(simulator, [motion])
+        inputs = np.asarray(recorded_inputs(reference, CONFIG, robot))
+        assert inputs[:, -2 * HISTORY :].min() >= 0 and inputs[:, -2 * HISTORY :].max() <= 1
+        actions = np.random.default_rng(0).normal(size=(len(inputs), 3)).astype(np.float32)
+        sizes = {ppo.STATE: (inputs.shape[1],)}, 3, NETWORK
+        infer, start = ppo.make_inference(*sizes), ppo.initial_policy(inputs, 3, NETWORK)
+        forces = jax.jit(lambda policy, seen, infer=infer, start=start: infer(start._replace(policy=policy), seen))
+        policies = []
+        supervised.regress(
+            forces, start.policy, (inputs, actions), SupervisedConfig(updates=20, validate_every=20),
+            lambda step, policy, error, policies=policies: policies.append(policy),
+        )  # fmt: skip
+        windows = cut_segments(simulator, [motion], 1.0, 1.0)
+        network = NetworkForces(CONFIG, robot, infer)
+        rollout = analytic.compile_rollout(simulator.with_residual(None), network)
+        _, features = rollout(start._replace(policy=policies[-1]), windows)
+        learned.append((motion.qpos, inputs, np.asarray(features)))
+    for one, other, tolerance in zip(*learned, (1e-9, 1e-4, 1e-3), strict=True):
+        np.testing.assert_allclose(one, other, atol=tolerance)
+
+
+def test_the_air_s_delay_is_counted_in_the_robot_s_control_steps(tmp_path: Path):
+    """A robot commanded every 0.02 s: a delay of 0.03 s brings the command of two steps ago first, then the last."""
+    description = json.loads(ROBOT.file.read_text()) | {"control_timestep": 0.02, "model": str(ROBOT.model)}
+    (tmp_path / "fast.robot.json").write_text(json.dumps(description))
+    fast = read_description(tmp_path / "fast.robot.json")
+    air = dataclasses.replace(AirParameters.none(), delay=jnp.array(0.03))
+    sent = jnp.array([[0.0, 0.0], [0.5, 0.5], [1.0, 1.0]])
+    arrived = np.asarray(Aerodynamics(fast, fast.load_model()).command(air, sent))
+    np.testing.assert_array_equal(arrived[:, 0], [0.0, 0.5])

@@ -1,0 +1,157 @@
+"""The improved simulator's step, against the sequence written out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+
+from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.force_model import BoundForces, Fields
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout
+from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
+from ballu_mjx.sim.step import PhysicsState, state_at
+
+ROBOT = load_robot()
+SIMULATOR = Simulator(ROBOT)
+LAYOUT = ObservationLayout.of(ROBOT)
+BODY = SIMULATOR.mj_model.body("balloon").id
+
+
+class Springs:
+    """A residual that changes everything a residual can: heavier, late by a step, pulled towards its last places."""
+
+    name = "springs"
+
+    def inputs(self, history: Array, commands: Array) -> Array:
+        return jnp.concatenate([history.ravel(), commands.ravel()])
+
+    def fields(self, params: Array) -> Fields:
+        mass = jnp.asarray(SIMULATOR.mj_model.body_mass)
+        return {"body_mass": mass.at[BODY].add(0.05 * params)}
+
+    def command(self, params: Array, commands: Array) -> Array:
+        return commands[-2:-1]
+
+    def wrench(self, params: Array, history: Array, commands: Array, key: Array | None = None) -> Array:
+        pull = params * (history[0, LAYOUT.position] - history[-1, LAYOUT.position]) + 0.01 * commands.sum()
+        return jnp.concatenate([pull, jnp.zeros(3)])[None]
+
+
+@pytest.fixture(scope="module")
+def start() -> RolloutState:
+    model = SIMULATOR.mj_model
+    qpos = jnp.asarray(ROBOT.adapter.initial_qpos(ROBOT, model), jnp.float32)
+    physics = state_at(qpos, jnp.zeros(model.nv))
+    features, _ = jax.jit(SIMULATOR.observe)(physics)
+    history = jnp.stack([features.at[0].add(-0.01 * age) for age in (2, 1, 0)])
+    return RolloutState(physics, history, jnp.array([[0.2, 0.9], [0.6, 0.1]]))
+
+
+COMMAND = jnp.array([0.3, 0.8])
+PARAMS = jnp.float32(1.5)
+
+
+@jax.jit
+def by_hand(start: RolloutState, scale: Float[Array, ""]) -> tuple[PhysicsState, Array, Array, Array]:
+    kind, commands = Springs(), jnp.concatenate([start.commands, COMMAND[None]])
+    mass = jnp.asarray(SIMULATOR.mj_model.body_mass, jnp.float32)
+    altered = SIMULATOR.with_fields({"body_mass": (1 - scale) * mass + scale * kind.fields(PARAMS)["body_mass"]})
+    wrench = scale * kind.wrench(PARAMS, start.history, commands)
+    command = (1 - scale) * COMMAND + scale * kind.command(PARAMS, commands)
+    physics = altered.step(start.physics, command, wrench)
+    features, com = altered.observe(physics)
+    return physics, features, com, wrench
+
+
+@jax.jit
+def stepped(start: RolloutState, scale: Float[Array, ""]) -> Any:
+    return SIMULATOR.with_residual(BoundForces(Springs(), PARAMS), scale).step(start, COMMAND)
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.4, 0.0])
+def test_a_step_is_ask_step_observe_and_shift(start: RolloutState, scale: float):
+    physics, features, com, wrench = by_hand(start, jnp.float32(scale))
+    after = stepped(start, jnp.float32(scale))
+    for found, expected in zip(after.state.physics, physics, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+    np.testing.assert_allclose(after.state.history[:-1], start.history[1:])
+    np.testing.assert_allclose(after.state.features, features, atol=1e-5)
+    np.testing.assert_allclose(after.com, com, atol=1e-6)
+    np.testing.assert_allclose(after.wrench, wrench, atol=1e-6)
+    np.testing.assert_array_equal(after.state.commands, jnp.stack([start.commands[1], COMMAND]))
+    if scale == 1.0:
+        whole = jax.jit(lambda state: SIMULATOR.with_residual(BoundForces(Springs(), PARAMS)).step(state, COMMAND))
+        np.testing.assert_allclose(whole(start).state.physics.qvel, physics.qvel, atol=1e-4)  # another program
+        plain = jax.jit(lambda state: SIMULATOR.with_residual(None).step(state, COMMAND))
+        assert np.abs(plain(start).state.physics.qvel - physics.qvel).max() > 1e-3
+
+
+def test_further_wrenches_and_residuals_add_up(start: RolloutState):
+    """Two residuals in a row, a scaled wrench and another one on the base: their sum pushes."""
+
+    class Push(Springs):
+        name = "push"
+
+        def fields(self, params: Array) -> Fields:
+            return {}
+
+        def command(self, params: Array, commands: Array) -> Array:
+            return commands[-1:]
+
+        def wrench(self, params: Array, history: Array, commands: Array, key: Array | None = None) -> Array:
+            return params * jnp.eye(1, 6)
+
+    def both(simulator: Simulator | AugmentedSimulator) -> AugmentedSimulator:
+        return simulator.with_residual(BoundForces(Springs(), PARAMS)).with_residual(BoundForces(Push(), 0.02))
+
+    more = jnp.zeros((2, 6)).at[1, 2].set(0.1)
+    after = jax.jit(lambda state: both(SIMULATOR).step(state, COMMAND, wrench=more, wrench_scale=0.5))(start)
+    own = Springs().wrench(PARAMS, start.history, start.with_command(COMMAND))
+    expected = more.at[0].add(0.5 * (own[0] + 0.02 * jnp.eye(1, 6)[0]))
+    np.testing.assert_allclose(after.wrench, expected, atol=1e-6)
+    altered = both(SIMULATOR)
+    np.testing.assert_allclose(
+        altered.simulator.model.body_mass[BODY], SIMULATOR.mj_model.body_mass[BODY] + 0.05 * PARAMS, rtol=1e-6
+    )
+    assert altered.residual is not None and altered.residual.model.name == "springs+push"
+    with pytest.raises(ValueError, match="Both residuals change body_mass"):
+        altered.with_residual(BoundForces(Springs(), PARAMS))
+
+
+def test_numbers_that_are_not_finite_keep_the_earlier_state(start: RolloutState):
+    broken = start._replace(physics=start.physics._replace(qvel=start.physics.qvel.at[0].set(jnp.nan)))
+    instead = start.features + 1.0
+    kept, finite = broken.keep_finite(start, instead)
+    assert not finite
+    np.testing.assert_array_equal(kept.physics.qvel, start.physics.qvel)
+    np.testing.assert_array_equal(kept.features, instead)
+    same, finite = start.keep_finite(broken, instead)
+    assert finite
+    np.testing.assert_array_equal(same.features, start.features)
+
+
+def test_names_say_where_features_stand():
+    model = SIMULATOR.mj_model
+    rng = np.random.default_rng(0)
+    qpos = ROBOT.adapter.initial_qpos(ROBOT, model)
+    qvel = rng.normal(0, 0.3, model.nv)
+    features, _ = SIMULATOR.observe_all(jnp.asarray(qpos[None], jnp.float32), jnp.asarray(qvel[None], jnp.float32))
+    assert features.shape[-1] == LAYOUT.size and HISTORY == 3
+
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    mujoco.mj_forward(model, data)
+    for site, place, speed in (
+        (ROBOT.tracked, LAYOUT.position, LAYOUT.velocity),
+        *((point, LAYOUT.point_position(point), LAYOUT.point_velocity(point)) for point in ROBOT.points),
+    ):
+        velocity = np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, model.site(site).id, velocity, 0)
+        np.testing.assert_allclose(features[0, place], data.site(site).xpos, atol=1e-5)
+        np.testing.assert_allclose(features[0, speed], velocity[3:], atol=1e-4)

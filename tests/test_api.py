@@ -1,0 +1,148 @@
+"""The package's root: what a notebook imports, and that it does so lazily."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import subprocess
+import sys
+import typing
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import ballu_mjx as bm
+from ballu_mjx.ballu.leg_parameters import IdentificationConfig
+from ballu_mjx.recordings.recording import cut
+from ballu_mjx.runs.layout import RUN_FORMAT
+from ballu_mjx.runs.record import MemoryRecord
+
+SIZES = bm.PPOConfig(
+    num_timesteps=320, num_envs=16, batch_size=16, num_minibatches=2, unroll_length=5, num_updates_per_batch=1,
+    policy_layers=(16,), value_layers=(16,),
+)  # fmt: skip
+
+
+def test_importing_the_package_imports_no_jax():
+    code = "import sys, ballu_mjx; assert 'jax' not in sys.modules; ballu_mjx.load_robot; assert 'jax' in sys.modules"
+    code += "; import os; assert '--xla_force_host_platform_device_count' in os.environ['XLA_FLAGS']"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == done.stderr == ""
+
+
+def test_every_name_of_the_root_is_there():
+    for name in bm.__all__:
+        assert getattr(bm, name).__name__ == name
+    assert set(bm.__all__) <= set(dir(bm))
+    assert set(bm._MODULES) == set(bm.__all__)
+    with pytest.raises(AttributeError, match="fit_everything"):
+        bm.fit_everything  # noqa: B018
+
+
+@pytest.fixture(scope="module")
+def robot() -> bm.RobotDescription:
+    return bm.load_robot("ballu")
+
+
+@pytest.fixture(scope="module")
+def motions(robot: bm.RobotDescription) -> list[bm.Motion]:
+    """Two short ones."""
+    recordings = [
+        cut(each, slice(int(np.searchsorted(each.time, each.time[0] + 6.0))))
+        for each in bm.load_recordings("validation", robot)[1:3]
+    ]
+    return [bm.reconstruct(each, robot) for each in recordings]
+
+
+@pytest.fixture(scope="module")
+def actuators(robot: bm.RobotDescription) -> bm.IdentifiedActuators:
+    config = IdentificationConfig(motion=False, starts=4)
+    return bm.identify_actuators(bm.load_recordings("suspended", robot), robot, config)
+
+
+@pytest.fixture(scope="module")
+def simulator(robot: bm.RobotDescription, actuators: bm.IdentifiedActuators) -> bm.Simulator:
+    return bm.Simulator(robot, actuators=actuators)
+
+
+@pytest.fixture(scope="module")
+def air(simulator: bm.Simulator, motions: list[bm.Motion]) -> bm.TrainedResidual:
+    config = bm.AirConfig(window_seconds=0.5, evaluations=2)
+    return bm.fit_aerodynamics(simulator, motions, config, free=("added_mass", "lift"))
+
+
+def test_the_example_of_the_readme_prints_a_table_and_nothing_else(
+    simulator: bm.Simulator, actuators: bm.IdentifiedActuators, air: bm.TrainedResidual, motions: list[bm.Motion]
+):
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        found = bm.evaluate(simulator.with_residual(air), motions)
+        policy = bm.train_policy(simulator.with_residual(air), task="walk", ppo_config=SIZES)
+    assert said.getvalue() == ""
+    assert "vanilla+sysid" in found.table() and "aerodynamic" in found.table()
+    assert "motor gain, left" in actuators.report and "std. error" in air.report
+    assert policy.variant.name == "aerodynamic" and policy.step % 160 == 0
+    command = policy.act()(np.zeros(simulator.robot.features))
+    assert command.shape == (2,) and np.all((command >= 0) & (command <= 1))
+
+
+def test_evaluating_twice_gives_the_same(simulator: bm.Simulator, air: bm.TrainedResidual, motions: list[bm.Motion]):
+    one, other = (bm.evaluate(simulator.with_residual(air), motions) for _ in range(2))
+    assert one == other
+    assert one.residual != one.vanilla
+
+
+def test_forces_learned_beside_the_air_are_evaluated_with_it(
+    simulator: bm.Simulator, air: bm.TrainedResidual, motions: list[bm.Motion]
+):
+    """A residual learned in an improved simulator is the sum of both."""
+    learned = bm.train_envmimic(simulator.with_residual(air), motions, ppo_config=SIZES)
+    found = bm.evaluate(simulator.with_residual(learned), motions)
+    assert found.name == "aerodynamic+envmimic"
+    alone = bm.evaluate(simulator.with_residual(air), motions)
+    assert found.vanilla == alone.vanilla
+    if not learned.step:  # no forces: what the air alone makes
+        np.testing.assert_allclose(found.score, alone.score, rtol=0.2)
+
+
+def test_a_training_in_memory_is_that_in_a_folder(
+    simulator: bm.Simulator, motions: list[bm.Motion], tmp_path: Path, robot: bm.RobotDescription
+):
+    content = {"format": RUN_FORMAT, "task": "envmimic", "starts": [], "ppo": dataclasses.asdict(SIZES)}
+    memory = MemoryRecord(content)
+    kept = bm.train_envmimic(simulator, motions, ppo_config=SIZES, run=memory, validate_every=160)
+    with bm.Run(tmp_path / "run", content) as run:
+        written = bm.train_envmimic(simulator, motions, ppo_config=SIZES, run=run, validate_every=160)
+    assert kept.step == written.step
+    jax.tree.map(np.testing.assert_array_equal, kept.params, written.params)
+    assert [row["step"] for row in memory.metrics if "validation_error" in row] == [0, 160, 320]
+
+
+def test_regression_returns_a_residual(simulator: bm.Simulator, motions: list[bm.Motion]):
+    learned = bm.fit_supervised(simulator, motions, bm.SupervisedConfig(updates=20, force_scales=(1.0,)))
+    assert np.isfinite(bm.evaluate(simulator.with_residual(learned), motions).score)
+    assert "Labels, training" in learned.report
+
+
+def test_gradients_return_a_residual(simulator: bm.Simulator, motions: list[bm.Motion]):
+    config = bm.AnalyticConfig(window_seconds=0.5, relinearizations=1, updates=2, validate_every=2)
+    learned = bm.fit_analytic(simulator, motions, config)
+    assert np.isfinite(bm.evaluate(simulator.with_residual(learned), motions).score)
+
+
+def test_recordings_of_another_robot_are_not_the_bundled_ones(robot: bm.RobotDescription, tmp_path: Path):
+    folder = Path(__file__).parents[1] / "experiments" / "tethered_balloon"
+    other = bm.load_robot(folder / "balloon.robot.json")
+    with pytest.raises(bm.InputError, match="bundled recordings are of BALLU"):
+        bm.load_recordings("training", other)
+    with pytest.raises(bm.InputError, match="actuators of tethered balloon cannot be identified"):
+        bm.identify_actuators(bm.load_recordings("suspended", robot), other)
+    with pytest.raises(bm.InputError, match="no such file or folder"):
+        bm.load_recordings(tmp_path / "nowhere", robot)
+    with pytest.raises(bm.InputError, match="There are no suspended recordings"):
+        bm.identify_actuators([], robot)
+    assert typing.get_type_hints(bm.evaluate)["return"] is bm.Evaluation

@@ -1,0 +1,85 @@
+"""The arrangement of the package: imports run one way, and general code knows no robot."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import ballu_mjx
+
+PACKAGE = Path(ballu_mjx.__file__).parent
+LAYERS = (
+    "cli",
+    "ballu",
+    "viz",
+    "policies",
+    "residuals",
+    "evaluation",
+    "identification",
+    "recordings",
+    "rl",
+    "sim",
+    "runs",
+    "robots",
+    "common",
+)
+"""Each folder may import itself and those after it."""
+ROBOT_WORDS = re.compile(
+    r"\b(balloons?|knees?|servos?|foot|feet|legs?)\b|_(balloon|knee|servo|foot|feet|leg)s?\b", re.I
+)
+"""Parts that BALLU has, and that no general code may name."""
+
+
+def modules() -> Iterator[tuple[str, Path]]:
+    """Yield folder and path of each module of a layer."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        folder, *rest = path.relative_to(PACKAGE).parts
+        if rest:
+            yield folder, path
+
+
+def imported_folders(path: Path) -> Iterator[tuple[str, int]]:
+    """Yield the folder and the line of each import from this package."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "ballu_mjx":
+            parts = node.module.split(".")
+            for name in [parts[1]] if len(parts) > 1 else [alias.name for alias in node.names]:
+                yield name, node.lineno
+        elif isinstance(node, ast.Import):
+            for alias in node.names:
+                parts = alias.name.split(".")
+                if parts[0] == "ballu_mjx" and len(parts) > 1:
+                    yield parts[1], node.lineno
+
+
+def test_every_folder_is_a_layer():
+    assert {folder for folder, _ in modules()} == set(LAYERS)
+
+
+def test_imports_run_one_way():
+    wrong = [
+        f"{path.relative_to(PACKAGE)}:{line} imports {other}"
+        for folder, path in modules()
+        for other, line in imported_folders(path)
+        if other in LAYERS and LAYERS.index(other) < LAYERS.index(folder)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("folder", [layer for layer in LAYERS if layer not in ("ballu", "cli")])
+def test_general_code_names_no_part_of_one_robot(folder: str):
+    found = []
+    for path in sorted((PACKAGE / folder).rglob("*.py")):
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            if ROBOT_WORDS.search(line):
+                found.append(f"{path.relative_to(PACKAGE)}:{number}: {line.strip()}")
+    assert not found, "\n".join(found)
+
+
+def test_general_code_asks_no_robot_who_it_is():
+    pattern = re.compile(r"is_ballu|== *[\"']ballu[\"']|== *[\"']BALLU[\"']|isinstance\([^)]*Ballu\b")
+    for folder, path in modules():
+        if folder != "ballu":
+            assert not pattern.search(path.read_text(encoding="utf-8")), path
