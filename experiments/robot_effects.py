@@ -28,8 +28,8 @@ from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.ballu.virtual.trials import run_trials
 from ballu_mjx.cli import pipeline
-from ballu_mjx.evaluation import story_layout
 from ballu_mjx.evaluation.transfer import Transfer
+from ballu_mjx.policies import pipeline_layout
 from ballu_mjx.policies.policy import Policy
 
 # %% [markdown]
@@ -133,7 +133,9 @@ def main() -> None:
     parser.add_argument("--robot-seed", type=int, default=0, help="the robot that `train all` ran on")
     parser.add_argument("--seed", type=int, default=0, help="whose policies")
     parser.add_argument("--task", default="walk", choices=("walk", "turn"))
-    parser.add_argument("--settings", nargs="+", default=list(story_layout.SETTINGS), choices=story_layout.SETTINGS)
+    parser.add_argument(
+        "--settings", nargs="+", default=list(pipeline_layout.SETTINGS), choices=pipeline_layout.SETTINGS
+    )
     parser.add_argument("--trials", type=int, default=3, help="trials of each policy on each robot")
     arguments = parser.parse_args()
     story = pipeline.Story(pipeline.Options(output=arguments.output, robot_seed=arguments.robot_seed), arguments.seed)

@@ -47,7 +47,7 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.evaluation import story_layout
+from ballu_mjx.policies import pipeline_layout
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.robots.registry import load_robot
@@ -263,7 +263,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--settings",
         nargs="+",
-        choices=story_layout.SETTINGS,
+        choices=pipeline_layout.SETTINGS,
         default=list(SETTINGS),
         help="a row each (the paper's two)",
     )

@@ -40,7 +40,7 @@ import transfer_figure
 
 from ballu_mjx.cli import pipeline
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.evaluation import story_layout
+from ballu_mjx.policies import pipeline_layout
 
 # %% [markdown]
 # ## The table
@@ -53,7 +53,7 @@ from ballu_mjx.evaluation import story_layout
 def table(options: pipeline.Options) -> Path:
     """Run what is missing, print the table; the file that holds it."""
     pipeline.run(options)
-    return story_layout.table_file(options.output, "walk")
+    return pipeline_layout.table_file(options.output, "walk")
 
 
 # %% [markdown]

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from ballu_mjx.ballu.recordings import base_position
 from ballu_mjx.cli import pipeline
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.evaluation import story_layout
+from ballu_mjx.policies import pipeline_layout
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.viz.style import colour_of, label_of
@@ -41,7 +41,7 @@ def options(description: str, task: str) -> tuple[pipeline.Options, bool]:
     parser.add_argument(
         "--also",
         nargs="+",
-        choices=story_layout.MORE_SETTINGS,
+        choices=pipeline_layout.MORE_SETTINGS,
         default=[],
         help="further simulators; see `train all --help` (none)",
     )
@@ -67,7 +67,7 @@ def read_ways(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[l
     **Raises** `InputError` where `folder` holds no such trials.
     """
     found = {}
-    for setting in (*story_layout.SETTINGS, *story_layout.settings_beyond(folder / f"seed-{seeds[0]}", task)):
+    for setting in (*pipeline_layout.SETTINGS, *pipeline_layout.settings_beyond(folder / f"seed-{seeds[0]}", task)):
         trials = [folder / f"seed-{seed}" / f"trials-{task}-{setting}" for seed in seeds]
         if all(_finished(trial) for trial in trials):
             found[setting] = [[_way(path) for path in sorted(trial.glob("trial-*.csv.gz"))] for trial in trials]

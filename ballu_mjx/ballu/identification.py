@@ -24,6 +24,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from ballu_mjx.ballu.curves import curve_distances
 from ballu_mjx.ballu.leg_parameters import (
     DEGREE,
     FIRST_DRIVETRAIN,
@@ -39,7 +40,6 @@ from ballu_mjx.ballu.model import SIDES, ActuatorParameters
 from ballu_mjx.ballu.suspended_leg import SuspendedLeg
 from ballu_mjx.ballu.sweep import SAMPLE_TIMESTEP, Sweep
 from ballu_mjx.identification.batched_solver import BatchedSolver, along_directions
-from ballu_mjx.identification.curves import curve_distances
 
 
 class LegData(NamedTuple):

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from ballu_mjx.ballu.curves import curve_distances
 from ballu_mjx.ballu.identification import Direction, Identification
 from ballu_mjx.ballu.leg_parameters import (
     DEGREE,
@@ -19,7 +20,6 @@ from ballu_mjx.ballu.leg_parameters import (
 )
 from ballu_mjx.ballu.model import SIDES
 from ballu_mjx.ballu.sweep import Sweep
-from ballu_mjx.identification.curves import curve_distances
 
 _STRONG = 0.9
 """Correlations beyond this are named."""

@@ -29,7 +29,10 @@ from ballu_mjx.cli.cached_stages import cached_stage
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation import transfer
-from ballu_mjx.evaluation.story_layout import (
+from ballu_mjx.evaluation.transfer import Transfer
+from ballu_mjx.policies.deploy.export import weights
+from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_locomotion_config
+from ballu_mjx.policies.pipeline_layout import (
     NEAR,
     ROUNDS,
     SETTINGS,
@@ -39,9 +42,6 @@ from ballu_mjx.evaluation.story_layout import (
     residual_folder,
     table_file,
 )
-from ballu_mjx.evaluation.transfer import Transfer
-from ballu_mjx.policies.deploy.export import weights
-from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_locomotion_config
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.policies.tasks import TASKS
 from ballu_mjx.policies.training import locomotion_ppo

@@ -2,18 +2,18 @@
 
 A description's key `identify` lists them. An entry names an element of the model and what of it is identified:
 
-- `{"joint": "knee", "field": "damping"}`; fields are damping, armature, frictionloss, stiffness, springref;
-- `{"actuator": "servo", "field": "kp"}`; kp and kd (position and velocity feedback; kp scales gain and bias together),
+- `{"joint": "hinge", "field": "damping"}`; fields are damping, armature, frictionloss, stiffness, springref;
+- `{"actuator": "motor", "field": "kp"}`; kp and kd (position and velocity feedback; kp scales gain and bias together),
   strength (scales gain and bias), gain, bias, forcerange (symmetric);
 - `{"tendon": "cable", "field": "springlength"}`; stiffness, damping, frictionloss, springlength (upper end);
-- `{"geom": "foot", "field": "friction"}` (sliding);
+- `{"geom": "tip", "field": "friction"}` (sliding);
 - `{"body": "arm", "field": "mass"}`; mass (inertia grows along), com (3 parameters), inertia (6), or all 10 by
   mass_properties;
 - `{"command": "left", "field": "delay"}`; scale, offset, delay, backlash, rate_limit, lag (`sim.drivetrain`);
-- any other numeric field of an element by MuJoCo's name for it: `{"joint": "knee", "field": "jnt_range", "index": 0}`.
+- any other numeric field of an element by MuJoCo's name for it: `{"joint": "hinge", "field": "jnt_range", "index": 0}`.
 
-Several elements in a list, `{"joint": ["knee_left", "knee_right"], ...}`, share one value. `"targets"`, a list of such
-element-field pairs, each with an optional `"factor"`, ties anything to anything. Optional keys: `name`, `unit`,
+Several elements in a list, `{"joint": ["hinge_left", "hinge_right"], ...}`, share one value. `"targets"`, a list of
+such element-field pairs, each with an optional `"factor"`, ties anything to anything. Optional keys: `name`, `unit`,
 `bounds`, `prior` (standard deviation among robots), `nominal`.
 
 Values of `mass` and of what a factor multiplies are those of the first element. A body's inertia is written as the
@@ -512,7 +512,7 @@ class _Declaration:
             return nominal, (CommandTarget(command, field, 1.0),)
         index = self._id(kind, element)
         if kind == "actuator" and field in _SERVO_FIELDS:
-            return self._servo(index, element, field)
+            return self._position_control(index, element, field)
         if field in _FIELDS[kind]:
             own = _FIELDS[kind][field]
             rest = (_FIXED_INDEX[own],) if own in _FIXED_INDEX else ()
@@ -549,7 +549,7 @@ class _Declaration:
             self.refuse(f"has the index {number} in {name}, of shape {shape}", "give one that is there")
         return name, (int(number),)
 
-    def _servo(self, index: int, element: str, field: str) -> tuple[float, tuple[Target, ...]]:
+    def _position_control(self, index: int, element: str, field: str) -> tuple[float, tuple[Target, ...]]:
         model = self.model
         gain, bias = model.actuator_gainprm[index], model.actuator_biasprm[index]
         affine = model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_AFFINE
@@ -567,7 +567,7 @@ class _Declaration:
             return 1.0, tuple(of(n, i, float(x)) for n, prm in prms for i, x in enumerate(prm[:3]) if x)
         place = {"kp": 1, "kd": 2}[field]
         if not affine or (field == "kp" and bias[place] == 0):
-            self.refuse(f"has {field} of {element}, which feeds back no such thing", "give a position servo")
+            self.refuse(f"has {field} of {element}, which feeds back no such thing", "give a position actuator")
         value = float(-bias[place])
         if field == "kd":
             return value, (of("biasprm", 2, -1.0),)

@@ -39,7 +39,7 @@ class LocomotionConfig:
     """Draw friction and starting state anew for every episode, as the paper does (not masses, not buoyancy: gaits
     depend on these too finely)."""
     friction: tuple[float, float] = (0.5, 1.1)
-    """Range of the coefficient of sliding friction, one for all geoms that collide (BALLU's feet: 0.9 nominally)."""
+    """Range of the coefficient of sliding friction, one for all geoms that collide."""
     start_yaw: float = 20.0
     """Starting headings are drawn from plus or minus this, deg."""
     start_tilt: float = 2.0

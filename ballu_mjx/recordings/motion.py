@@ -30,8 +30,8 @@ class ReconstructionParameters:
     position_window: float = 0.09
     """Width (s) of the Savitzky-Golay filter for the root's place and all joints."""
     rate_window: float = 0.19
-    """The same for their velocities. One width for root and legs, so that a standing foot's velocity comes out as 0.
-    Wider than what follows a knee's sudden stops best: noise in a velocity does the simulator more harm."""
+    """The same for their velocities. One width for the root and all joints, so that a point in contact with the ground
+    has a velocity of 0. A narrower filter follows sudden stops better, but noise in a velocity does more harm."""
     rotation_window: float = 0.31
     """The same for the tracked body's orientation and its rate."""
     order: int = 3

@@ -27,7 +27,7 @@ POSITION = (0.002, 0.01)
 ANGLE = (np.deg2rad(0.3), np.deg2rad(0.6))
 """Likewise of its orientation (rad)."""
 OUTLYING = 3.0
-"""Expected errors beyond which a window counts less: a foot slipped there, say."""
+"""Expected errors beyond which a window counts less: a contact point slipped there, for example."""
 
 
 class Segments(NamedTuple):

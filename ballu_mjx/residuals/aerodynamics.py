@@ -1,6 +1,6 @@
 """The white-box residual: what the air does to a buoyant body, in sixteen numbers.
 
-The body is the tracked one of the robot, and has `gravcomp` in its model: a balloon. It drags half its displaced air
+The body is the tracked one of the robot, and has `gravcomp` in its model. It drags half its displaced air
 along, is slowed by it, and is lifted at a point that need not be where the model has it. Each of these is a textbook's
 formula with a constant or two to find; none needs a network.
 """

@@ -2,9 +2,9 @@
 
 The recordings are cut into short windows. Each is simulated from its recorded first state under its recorded commands;
 what the place and orientation of the simulated tracked body differ by from the recorded ones is made small, by
-nonlinear least squares with a loss that single bad windows, such as one where a foot slipped, do not rule.
+nonlinear least squares with a loss that single bad windows, such as one with a slipping contact, do not dominate.
 
-Slopes are taken over a parameter's order of magnitude, not at a point. Where feet come down at other times than in the
+Slopes are taken over a parameter's order of magnitude, not at a point. Where contacts begin at other times than in the
 recording, derivatives hold for less than a millinewton of lift and point nowhere beyond, while errors over thirty
 change smoothly (`docs/white_box.md`, "Why not derivatives").
 """

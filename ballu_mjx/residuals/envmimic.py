@@ -1,6 +1,6 @@
 """EnvMimic: the residual-force policy's Markov decision process (paper, section "Residual Dynamics Learning").
 
-The actuators replay a recording's commands; the policy pushes on the tracked body (BALLU's balloon); the reward is high
+The actuators replay a recording's commands; the policy pushes on the tracked body; the reward is high
 while the simulated body follows the recorded one. What the policy learns is the part of the physics that the simulator
 lacks.
 """

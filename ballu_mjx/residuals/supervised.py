@@ -3,7 +3,7 @@ for it.
 
 One control step alone says little: half a millimetre of motion capture's noise over 0.05 s looks like a tenth of a
 newton. And not all that a recorded step differs in from the simulated one is a matter of the force: actuators are late,
-feet slip, air turns the tracked body. A label is therefore the most likely force given the whole recording, where
+contacts slip, air turns the tracked body. A label is therefore the most likely force given the whole recording, where
 capture, joints' torques and the motion itself err as well: a smoothing problem, linear along the recorded motion.
 """
 
@@ -41,8 +41,8 @@ class SupervisedConfig:
     """Standard deviation of the prior on the force along each axis, N. That on a torque is, in units of the network's
     output, as wide."""
     force_change: float = 0.1
-    """Standard deviation of the prior on how it changes from one control step to the next, N. Air that a balloon
-    drags along pushes back at every footfall: a prior that smooths more takes most of that away."""
+    """Standard deviation of the prior on how it changes from one control step to the next, N. A buoyant body's
+    added mass pushes back at every contact: a smoother prior removes most of that force."""
     torque_spread: float = 0.05
     """Standard deviation of what the robot's joints pull beyond the model, N m."""
     position_noise: float = 0.0005

@@ -60,7 +60,8 @@ def find_robot(described: Mapping[str, str], named_in: Path) -> RobotDescription
         raise InputError(f"{shown}: the robot description is gone; {fix}.")
     found = read_description(path)
     if found.sha256 != described["sha256"]:
-        raise InputError(f"{path}: the robot description, or its model, has changed since; {fix}.")
+        problem = f"the robot description, or its model, has changed since {named_in} was written"
+        raise InputError(f"{path}: {problem}; restore it.")
     return found
 
 

@@ -105,7 +105,7 @@ def _constants(pose: ReferencePose, model: mjx.Model, fields: Mapping[str, Array
         matrix += jnp.einsum("bi,bij,bik->jk", inertia, turned, turned)
         matrix += jnp.einsum("t,ti,tj->ij", model.tendon_armature, pose.tendons, pose.tendons)
         matrix += jnp.diag(model.dof_armature)
-        # A chain's inertia matrix is badly scaled: metres beside radians, a whole robot beside a foot.
+        # A chain's inertia matrix is badly scaled: metres beside radians, the heaviest body beside the lightest.
         scale = 1 / jnp.sqrt(jnp.diag(matrix))
         factor = jax.scipy.linalg.cho_factor(scale[:, None] * matrix * scale)
         inverse = scale[:, None] * jax.scipy.linalg.cho_solve(factor, jnp.eye(len(scale), dtype=scale.dtype)) * scale

@@ -91,9 +91,9 @@ def collect(folder: Path) -> Content:
 
     **Raises** `InputError` where `folder` is neither, or a file in it is damaged.
     """
-    from ballu_mjx.evaluation import story_layout
+    from ballu_mjx.policies import pipeline_layout
 
-    tables = [(task, story_layout.table_file(folder, task)) for task in story_layout.TABLES]
+    tables = [(task, pipeline_layout.table_file(folder, task)) for task in pipeline_layout.TABLES]
     if not (folder / "config.json").is_file() and any(path.is_file() for _, path in tables):
         return _story(folder, {task: files.read_text(path) for task, path in tables if path.is_file()})
     return _run(folder)
@@ -128,7 +128,7 @@ def _run(folder: Path) -> Content:
 
 def _story(folder: Path, tables: Mapping[str, str]) -> Content:
     """A folder of `train all`: its tables, and of each seed and task the policies over each other."""
-    from ballu_mjx.evaluation import story_layout
+    from ballu_mjx.policies import pipeline_layout
     from ballu_mjx.viz.style import label_of
 
     content = Content(f"train all: {folder.resolve().name}", facts=[("folder", str(folder.resolve()))])
@@ -136,7 +136,7 @@ def _story(folder: Path, tables: Mapping[str, str]) -> Content:
     for seed in sorted(path for path in folder.glob("seed-*") if path.is_dir()):
         for task in tables:
             where = f"{task}, {seed.name}"
-            settings = ("vanilla", *story_layout.SETTINGS, *story_layout.settings_beyond(seed, task))
+            settings = ("vanilla", *pipeline_layout.SETTINGS, *pipeline_layout.settings_beyond(seed, task))
             policies = {setting: seed / f"{task}-{setting}" for setting in settings}
             policies = {setting: path for setting, path in policies.items() if (path / "config.json").is_file()}
             content.curves += [dataclasses.replace(c, title=f"{c.title} ({where})") for c in _curves(policies)]
@@ -148,8 +148,8 @@ def _story(folder: Path, tables: Mapping[str, str]) -> Content:
                 if image.is_file():
                     content.images.append((f"Trials on the robot: {where}, {setting}", image.read_bytes()))
             residuals: dict[Path, str] = {}  # two settings may have one
-            for setting in (story_layout.ROUNDS, *story_layout.settings_beyond(seed, task)):
-                residuals.setdefault(story_layout.residual_folder(seed, task, setting), setting)
+            for setting in (pipeline_layout.ROUNDS, *pipeline_layout.settings_beyond(seed, task)):
+                residuals.setdefault(pipeline_layout.residual_folder(seed, task, setting), setting)
             for learned, setting in residuals.items():
                 name = f"{label_of(setting)}: {where}"
                 if (learned / "config.json").is_file():

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import directed_hausdorff as scipy_directed_hausdorff
 
+from ballu_mjx.ballu.curves import curve_distances, directed_hausdorff, polynomial_curve
 from ballu_mjx.ballu.identification import CompiledLeg, Identifier, leg_data
 from ballu_mjx.ballu.leg_parameters import (
     LEG_PARAMETERS,
@@ -23,7 +24,6 @@ from ballu_mjx.ballu.leg_parameters import (
 )
 from ballu_mjx.ballu.model import SIDES, ActuatorParameters, actuator_fields, suspend
 from ballu_mjx.ballu.sweep import Sweep
-from ballu_mjx.identification.curves import curve_distances, directed_hausdorff, polynomial_curve
 from ballu_mjx.robots.model import assets, set_fields
 
 COMMANDS = np.linspace(0, 1, 20)

@@ -371,7 +371,7 @@ def replay_fault(takes: Any) -> str | None:
 
 def mapping_fault(found: Any) -> str | None:
     numbers = [x for source in found.sources.values() for x in (*source.offset, *(source.geometry or ()))]
-    numbers += [found.axes, *found.commands.range_left, *found.commands.range_right]
+    numbers += [found.axes, *found.commands.ranges]
     numbers += [x for joint in found.joints.values() for x in (joint.sign, joint.zero)]
     fits = round(float(np.linalg.det(found.axes))) == 1 and (found.rate is None or found.rate > 0)
     return None if fits and all(finite(x) for x in numbers) and found.robot.strip() else "numbers"

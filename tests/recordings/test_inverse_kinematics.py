@@ -81,7 +81,7 @@ def test_bent_arms_are_found_within_their_ranges(tmp_path: Path, links: int):
     data = mujoco.MjData(model)
     for _ in range(40):
         qpos = rng.uniform(-2.2, 2.2, links) + 0.05 * np.sin(np.pi * np.arange(120) / RATE)[:, None]
-        motion = reconstruct(capture(robot, qpos), model, robot)
+        motion = reconstruct(capture(robot, qpos), robot)
         assert np.abs(motion.qpos).max() < 3.01
         assert motion.residual_mm["tip"] < 1.0
         assert np.abs(np.diff(motion.qpos, axis=0)).max() < 0.3, "one posture throughout"
@@ -98,7 +98,7 @@ def test_a_keyframe_says_which_posture_is_meant(tmp_path: Path):
         home = f'<keyframe><key name="home" qpos="{-sign} {2 * sign} {-sign}"/></keyframe></mujoco>'
         robot = describe(tmp_path, arm(3).replace("</mujoco>", home), tracked="tip", keyframe="home")
         qpos = sign * np.array([-0.9, 1.7, -0.9]) + 0.05 * np.sin(np.pi * np.arange(120) / RATE)[:, None]
-        motion = reconstruct(capture(robot, qpos), robot.load_model(), robot)
+        motion = reconstruct(capture(robot, qpos), robot)
         np.testing.assert_allclose(motion.qpos[5], qpos[25], atol=0.02)
 
 
@@ -118,14 +118,14 @@ def test_a_closed_loop_shows_the_joint_behind_it(tmp_path: Path):
     robot = describe(tmp_path, FOURBAR.replace("LOOP", LOOP), tracked="mid")
     angle = 0.5 * np.sin(2 * np.pi * 0.5 * np.arange(150) / RATE)
     qpos = np.stack([angle, -angle, angle], axis=1)  # a parallelogram
-    motion = reconstruct(capture(robot, qpos), robot.load_model(), robot)
+    motion = reconstruct(capture(robot, qpos), robot)
     np.testing.assert_allclose(motion.qpos[3:-3], qpos[::5][: len(motion.qpos)][3:-3], atol=0.02)
     read_description(describe(tmp_path, FOURBAR.replace("LOOP", LOOP), tracked="mid", points=["far"]).file)
     with pytest.raises(InputError, match="of another robot than mid"):
         describe(tmp_path, FOURBAR.replace("LOOP", ""), tracked="mid", points=["far"])
     open_chain = describe(tmp_path, FOURBAR.replace("LOOP", ""), tracked="mid")
     with pytest.raises(InputError, match="nothing that is measured shows the joint jc"):
-        reconstruct(capture(robot, qpos), open_chain.load_model(), open_chain)
+        reconstruct(capture(robot, qpos), open_chain)
 
 
 def test_coupled_joints_move_together(tmp_path: Path):
@@ -134,7 +134,7 @@ def test_coupled_joints_move_together(tmp_path: Path):
     robot = describe(tmp_path, FOURBAR.replace("LOOP", coupled), tracked="mid")
     angle = 0.5 * np.sin(2 * np.pi * 0.5 * np.arange(150) / RATE)
     qpos = np.stack([angle, -angle, 0.1 + 0.5 * angle], axis=1)
-    motion = reconstruct(capture(robot, qpos), robot.load_model(), robot)
+    motion = reconstruct(capture(robot, qpos), robot)
     np.testing.assert_allclose(motion.qpos[3:-3, 2], qpos[::5][: len(motion.qpos)][3:-3, 2], atol=0.02)
 
 
@@ -162,7 +162,7 @@ def test_a_wheel_turns_on_and_on(tmp_path: Path, seen: str):
     if seen == "wrapped":
         recording = dataclasses.replace(recording, joint_angles={"wheel": qpos[:, 7] % (2 * np.pi)})
     write_recording(recording, tmp_path / "drive.csv", robot)
-    motion = reconstruct(read_recording(tmp_path / "drive.csv", robot), robot.load_model(), robot)
+    motion = reconstruct(read_recording(tmp_path / "drive.csv", robot), robot)
     np.testing.assert_allclose(motion.qvel[3:-3, 6], 5.0, atol=0.3)
     np.testing.assert_allclose(motion.qpos[3:-3, 7] - motion.qpos[3, 7], 5.0 * (motion.time[3:-3] - 0.15), atol=0.03)
 

@@ -26,9 +26,9 @@ from PIL import Image
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.cli import train_envmimic, train_policy, view
 from ballu_mjx.cli.report import main
-from ballu_mjx.evaluation import story_layout
 from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation
 from ballu_mjx.evaluation.transfer import Transfer, walking_table
+from ballu_mjx.policies import pipeline_layout
 from ballu_mjx.policies.locomotion_env import LocomotionConfig
 from ballu_mjx.policies.training import locomotion_ppo
 from ballu_mjx.recordings.csv_format import list_bundled
@@ -275,7 +275,7 @@ def test_damaged_evaluation_is_refused(short: Path, tmp_path: Path, capsys):
 def test_story_shows_its_tables_and_policies_over_each_other(tmp_path: Path):
     transfer = Transfer(*np.arange(1.0, 12.0))
     results = {"vanilla+dr": [[transfer]], "envmimic": [[transfer]], HOSTILE: [[transfer]]}
-    story_layout.table_file(tmp_path, "walk").write_text(walking_table(results))
+    pipeline_layout.table_file(tmp_path, "walk").write_text(walking_table(results))
     for setting, states in (("vanilla+dr", 30), ("envmimic", 25), ("envmimic-2", 28)):
         folder = tmp_path / "seed-0" / f"walk-{setting}"
         sections = {"env": LocomotionConfig(), "ppo": locomotion_ppo(), "data": train_policy.Data()}

@@ -366,7 +366,7 @@ def example_mapping(robot: RobotDescription) -> str:
         "[commands]               # columns of the command log (--commands), or of the table itself\n"
         'time = "time"\ntime_unit = "s"\n'
         + "".join(f'{command} = "command_{command}"\n' for command in robot.commands)
-        + "# What the columns show at the actuator's smallest and largest command. Servo angles: [0, 90]; a servo\n"
+        + "# What the columns show at the actuator's smallest and largest command. Angles: [0, 90]; an actuator\n"
         "# mounted the other way round: [90, 0].\n"
         + "".join(
             f"range_{command} = [{low:g}, {high:g}]\n"

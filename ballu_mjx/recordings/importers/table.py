@@ -26,7 +26,7 @@ from ballu_mjx.recordings.importers.trajectories import (
 )
 
 _COMMAND_TOLERANCE = 0.005
-"""Of a command's range: so far outside of it is noise of a servo's own measurement, and is clipped."""
+"""Of a command's range: values that exceed it by at most this share are measurement noise and are clipped."""
 
 
 class Table:

@@ -4,7 +4,7 @@ A file holds one or more sections, each after blank lines or none:
 
     Segments                                    title: Objects, Segments, Trajectories, Joints, Model Outputs, ...
     100                                         rate (Hz)
-    ,,ballu:base,,,,,,ballu:balloon,,,,,        names, each above its first column; Tracker: "Global Angle ballu"
+    ,,robot:base,,,,,,robot:body,,,,,           names, each above its first column; Tracker: "Global Angle robot"
     Frame,Sub Frame,RX,RY,RZ,TX,TY,TZ,RX,...    components; RX, RY, RZ, RW is a quaternion; markers have X, Y, Z
     ,,deg,deg,deg,mm,mm,mm,deg,...              units
     1,0,0.1,...                                 an empty cell is a sample not seen

@@ -1,0 +1,56 @@
+"""Trials on the virtual robot: it is driven by what `export` ships, not by the bare policy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.ballu.virtual.trials import ExportedPolicy
+from ballu_mjx.policies.deploy.controller import observation_names
+from ballu_mjx.policies.deploy.estimator import Capture
+
+
+def stored(command: float) -> dict[str, np.ndarray]:
+    """The arrays of a policy that always asks for one command."""
+    size = len(observation_names(virtual_robot.NAMES))
+    return {
+        "names": np.array(virtual_robot.NAMES),
+        "commands": np.array(["left", "right"]),
+        "anchored": np.array(False),
+        "command_low": np.zeros(2),
+        "command_high": np.ones(2),
+        "command_rest": np.zeros(2),
+        "control_timestep": np.array(0.05),
+        "full_travel": np.array(0.2),
+        "mean": np.zeros(size),
+        "std": np.ones(size),
+        "observation_clip": np.array(5.0),
+        "activation": np.array("tanh"),
+        "kernel_0": np.zeros((size, 2)),
+        "bias_0": np.full(2, 2 * command - 1),
+    }
+
+
+def test_trials_are_limited_in_rate_as_the_exported_controller():
+    robot, trial = virtual_robot.draw_robot(0), virtual_robot.draw_trial(3)
+    controller = ExportedPolicy(stored(0.9))
+    seen = virtual_robot.record(robot, trial, controller, 1.0, "trial")
+    np.testing.assert_allclose(seen.command[:40:5, 0], [0.25, 0.5, 0.75, 0.9, 0.9, 0.9, 0.9, 0.9], atol=1e-9)
+    assert controller.controller.steps == 20 and controller.controller.status == "running"
+
+
+@pytest.mark.parametrize("place", range(len(virtual_robot.NAMES)))
+def test_trials_relax_where_a_marker_is_lost(place: int):
+    """Every frame reaches the controller, also those between two commands."""
+    controller, rng = ExportedPolicy(stored(1.0)), np.random.default_rng(0)
+    capture, commands = Capture(virtual_robot.NAMES), []
+    for frame in range(121):
+        position = rng.normal(size=(4, 3))
+        position[place] = np.nan if frame > 50 else position[place]
+        capture.time.append(frame * 0.01)
+        capture.position.append(position)
+        capture.quaternion.append(np.array([1.0, *rng.normal(0, 0.1, 3)]))
+        if frame % 5 == 0:
+            commands.append(controller(capture))
+    assert commands[10].tolist() == [1.0, 1.0] and commands[-1].tolist() == [0.0, 0.0]
