@@ -18,7 +18,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import CaptureController
@@ -40,6 +39,7 @@ from ballu_mjx.evaluation.story_layout import (
     table_file,
 )
 from ballu_mjx.evaluation.transfer import Transfer
+from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.policies.deploy.export import weights
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_locomotion_config
 from ballu_mjx.policies.policy import Policy
