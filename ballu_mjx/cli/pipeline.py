@@ -156,7 +156,7 @@ class Story:
 
         def make(folder: Path) -> None:
             recordings = (sweep / "sweep.csv.gz",)
-            data = train_sysid.SweepData(recordings=recordings, output=folder, wandb=self.options.wandb)
+            data = train_sysid.SysidData(recordings=recordings, output=folder, wandb=self.options.wandb)
             train_sysid.train(data, config)
 
         return cached_stage(self._shared / "sysid", config, [sweep], make)

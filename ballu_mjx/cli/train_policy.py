@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, open_run, written_to
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.identification.actuators import AUTO, NOMINAL, read_actuators
+from ballu_mjx.identification.actuators import AUTO, NOMINAL, read_actuators, validation_ratio
 from ballu_mjx.policies.closed_loop import Rollout
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_task, variant_of
 from ballu_mjx.policies.policy import check_belongs
@@ -90,6 +90,8 @@ def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
         if first:
             print(f"Run folder: {folder}")
             print(f"  task: {task.name}; simulator: {setting}" + (f", residual {where}" if where is not None else ""))
+            if data.actuators not in (AUTO, NOMINAL):
+                print(f"  actuators: {data.actuators}{_verdict(data.actuators)}")
             if data.quick:
                 print("  --quick: sizes so small that the policy will not walk.")
         devices = [str(device) for device in jax.devices()]
@@ -118,6 +120,15 @@ def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
             write_rollouts(folder / ROLLOUT_FILE, [episode])
             print(summary(task, rollout, robot, residual is not None))
     return 0
+
+
+def _verdict(path: Path) -> str:
+    """Return what the file says of identified beside nominal actuators, in words."""
+    ratio = validation_ratio(path)
+    if ratio is None:
+        return ""
+    better = "better" if ratio < 1 else "WORSE"
+    return f" (replayed validation recordings {better} than nominal ones, with {ratio:.2f} times the error)"
 
 
 def summary(task: Task, rollout: Rollout, robot: RobotDescription, with_residual: bool) -> str:

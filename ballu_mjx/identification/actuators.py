@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ballu_mjx.common import files
-from ballu_mjx.common.errors import InputError
+from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.identification.parameters import IdentifiedParameters
 from ballu_mjx.identification.write_back import IDENTIFIED_FORMAT, identified_from_json, identified_to_json
 from ballu_mjx.recordings.recording import Recording
@@ -35,12 +35,14 @@ def identify_actuators(
     levels: int | None = None,
     progress: IdentificationProgress | None = None,
 ) -> IdentifiedActuators:
-    """Identify the actuators of `robot` by its adapter's method.
+    """Identify the actuators of `robot`: by its adapter's method, or the parameters that its description declares.
 
     **Arguments**
 
-    - `recordings`: suspended recordings of one robot; by file, where errors shall name these.
-    - `config`: of the method (for BALLU `ballu.leg_parameters.IdentificationConfig`); None: its defaults.
+    - `recordings`: recordings of one robot, suspended ones for an adapter's method; by file, where errors shall name
+      these.
+    - `config`: of the method (of declared parameters `fit_robot.FitConfig`, for BALLU
+      `ballu.leg_parameters.IdentificationConfig`); None: its defaults.
     - `levels`: fewest command levels of each actuator; None: the method's own.
     - `progress`: is told of every iteration.
 
@@ -49,6 +51,10 @@ def identify_actuators(
     by_file = recordings if isinstance(recordings, Mapping) else {Path(each.name): each for each in recordings}
     if not by_file:
         raise InputError("There are no suspended recordings to identify actuators from; give some.")
+    if declares_parameters(robot):
+        from ballu_mjx.identification.declared import identify_declared  # Optimistix: slow to import
+
+        return identify_declared(by_file, robot, config, progress=progress)
     return robot.adapter.identify_actuators(robot, by_file, config, levels, progress)
 
 
@@ -75,6 +81,14 @@ def read_actuators(robot: RobotDescription, path: Path) -> tuple[str, ModelParam
         if content.get("format") == IDENTIFIED_FORMAT or not has_own_method(robot):
             return str(content.get("robot")), identified_from_json(content, path, robot)
     return robot.adapter.read_actuators(robot, path)
+
+
+def validation_ratio(path: Path) -> float | None:
+    """Return how many times nominal's error on validation recordings the actuators in a file had when they were
+    identified; None: the file does not say."""
+    found = files.read_json(path, "restore it or identify again").get("validation")
+    ratio = found.get("ratio") if isinstance(found, dict) else None
+    return float(ratio) if ratio is not None and is_number(ratio) else None
 
 
 def find_actuators(robot: RobotDescription, recordings: Iterable[Path], specimen: str) -> Path | None:

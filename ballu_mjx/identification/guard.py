@@ -228,7 +228,7 @@ def _simulate(
         mujoco.mj_getState(model, data, row, kind)
     place = np.minimum(starts[:, None] * substeps + np.arange(steps * substeps), len(ctrl) - 1)
     state, _ = mujoco.rollout.rollout(model, data, initial, ctrl[place])
-    after = state[:, substeps - 1 :: substeps]
+    after = np.asarray(state, float)[:, substeps - 1 :: substeps]
     # MuJoCo begins anew where a simulation breaks down, and its clock with it.
     expected = np.arange(1, steps + 1) * substeps * model.opt.timestep
     intact = np.isfinite(after).all(axis=2) & (np.abs(after[..., 0] - expected) < 1e-6 * expected)

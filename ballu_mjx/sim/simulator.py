@@ -133,14 +133,11 @@ class Simulator:
         """Return the drivetrain's state before each of the control steps under `commands`, from rest under the first;
         all arrays have an axis of control steps in front. None where there is no drivetrain."""
 
-        def step(state: DrivetrainState, command: Array) -> tuple[DrivetrainState, DrivetrainState]:
-            after, _ = self.drive(state, command)
-            assert after is not None
-            return after, state
+        def step(state: DrivetrainState, command: Array) -> tuple[Any, DrivetrainState]:
+            return self.drive(state, command)[0], state
 
-        return (
-            None if self.drivetrain is None else jax.lax.scan(step, self.drivetrain_at_rest(commands[0]), commands)[1]
-        )
+        start = self.drivetrain_at_rest(commands[0])
+        return None if start is None else jax.lax.scan(step, start, commands)[1]
 
     def drive(
         self, state: DrivetrainState | None, command: Float[Array, "*parts commands"]

@@ -105,7 +105,9 @@ def test_without_a_drivetrain_nothing_is_carried_or_changed(robot: RobotDescript
 class Scaled(ForceModel):
     """Commands times a parameter, and no forces."""
 
-    name = "scaled"
+    @property
+    def name(self) -> str:
+        return "scaled"
 
     def fields(self, params: Array) -> Fields:
         return {}
