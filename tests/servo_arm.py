@@ -103,21 +103,23 @@ def true_path(
     return np.array(qpos), np.array(qvel)
 
 
-def record_arm(folder: Path, robot: RobotDescription, name: str, seed: int, seconds: float = 6.0) -> Path:
-    """Write a recording of the true arm at 100 Hz, with 0.2 deg of noise."""
+def record_arm(folder: Path, robot: RobotDescription, name: str, seed: int, kind: str = "free") -> Path:
+    """Write a recording of 6 s of the true arm at 100 Hz, with 0.2 deg of noise; suspended ones hold joints alone."""
+    seconds, free = 6.0, kind == "free"
     commands = wandering(seed, round(seconds / 0.05), hold=8)
     qpos, _ = true_path(robot, identified(robot, **TRUTH), commands)
     qpos = np.concatenate([np.zeros((1, 2)), qpos[:-1]])[::2]
     rng = np.random.default_rng(seed)
-    rows = ["time,command_shoulder,command_elbow,tip_x,tip_y,tip_z,tip_qw,tip_qx,tip_qy,tip_qz,shoulder,elbow"]
+    places = "tip_x,tip_y,tip_z,tip_qw,tip_qx,tip_qy,tip_qz," if free else ""
+    rows = [f"time,command_shoulder,command_elbow,{places}shoulder,elbow"]
     for sample, angles in enumerate(qpos):
         half, turn = angles[0] / 2, angles[0]
         tip = (-0.2 * np.sin(turn), 0, 1 - 0.2 * np.cos(turn), np.cos(half), 0, np.sin(half), 0)
         measured = angles + np.deg2rad(0.2) * rng.normal(size=2)
-        cells = (sample * 0.01, *commands[sample // 5], *tip, *measured)
+        cells = (sample * 0.01, *commands[sample // 5], *(tip if free else ()), *measured)
         rows.append(",".join(f"{cell:.6f}" for cell in cells))
     path = folder / f"{name}.csv"
     path.write_text("\n".join(rows) + "\n")
-    keys = {"format": "ballu-recording/1", "kind": "free", "robot": "arm", "notes": ""}
+    keys = {"format": "ballu-recording/1", "kind": kind, "robot": "arm", "notes": ""}
     path.with_suffix(".json").write_text(json.dumps(keys))
     return path

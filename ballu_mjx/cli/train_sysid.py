@@ -140,7 +140,7 @@ def _train_declared(
     if both:
         raise InputError(f"{min(both)}: is among --recordings and --validation; take it out of one of them.")
     recordings, validation = ({path: read_recording(path, robot) for path in each} for each in (paths, held))
-    specimen = check_recordings(robot, {**recordings, **validation})
+    specimen = check_recordings(robot, {**recordings, **validation}, config.window_seconds)
     folder = new_folder(data.output, "sysid")
     sections = {"fit": config, "sampling": sampling, "data": data}
     content = describe_run("sysid", sections, {"training": paths, "validation": held}, [], description=robot)
@@ -150,6 +150,10 @@ def _train_declared(
         count = stages.update(stage, iteration, steps, loss)
         if np.isfinite(loss):
             run.log(count, {stage: loss})
+
+    def checked(seen: Visibility) -> None:
+        stages.close()
+        print(data_check(seen), flush=True)
 
     with written_to() as written, Run(folder, content, wandb=data.wandb) as run:
         written.folder = folder
@@ -164,7 +168,7 @@ def _train_declared(
             sampling,
             validation,
             progress=report,
-            on_data_check=lambda seen: print(data_check(seen), flush=True),
+            on_data_check=checked,
         )
         stages.close()
         run.write("identification.txt", found.report + "\n")

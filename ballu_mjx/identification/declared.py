@@ -46,8 +46,8 @@ class IdentifiedByFit(IdentifiedActuators):
     choice: Choice | None
 
 
-def check_recordings(robot: RobotDescription, recordings: Mapping[Path, Recording]) -> str:
-    """Check that recordings can be measured, and are of one specimen, whose name is returned.
+def check_recordings(robot: RobotDescription, recordings: Mapping[Path, Recording], window_seconds: float) -> str:
+    """Check that recordings can be measured, some as long as a window, and are of one specimen, whose name is returned.
 
     **Raises** `InputError` naming the file and the fix.
     """
@@ -60,6 +60,9 @@ def check_recordings(robot: RobotDescription, recordings: Mapping[Path, Recordin
                 f"{path}: is a suspended recording, and {robot.model.name} has a free joint; give free ones, or a "
                 "model whose root is held."
             )
+    if all(recording.time[-1] - recording.time[0] < window_seconds for recording in recordings.values()):
+        first = next(iter(recordings))
+        raise InputError(f"{first}: no recording lasts {window_seconds:g} s; give longer ones, or --window-seconds.")
     return next(iter(specimens))
 
 
@@ -108,7 +111,7 @@ def identify_declared(
     config, sampling, validation = config or FitConfig(), sampling or SamplingConfig(), validation or {}
     check_fit_config(config)
     check_sampling_config(sampling)
-    specimen = check_recordings(robot, {**recordings, **validation})
+    specimen = check_recordings(robot, {**recordings, **validation}, config.window_seconds)
     model = robot.load_model()
     parameters = declared_parameters(robot, model)
     training, held = (

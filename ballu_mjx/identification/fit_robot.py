@@ -226,6 +226,7 @@ def fit_robot(
         objective = _Objective(WindowSimulator(parameters, training, windows), config)
         report("data check", 0, 1, float("nan"))
         visibility = _visibility(objective, config)
+        report("data check", 1, 1, float("nan"))
         if on_data_check is not None:
             on_data_check(visibility)
         objective.rescale(objective.simulator.differences(parameters.nominal))

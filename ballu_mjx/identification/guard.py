@@ -7,7 +7,7 @@ test uses: the validation recordings.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -62,6 +62,8 @@ class ReplayRow(NamedTuple):
 
 
 _LEAST = 1e-6
+_SCALES: Mapping[Quantity, float] = {"position": 1.0, "joints": 180 / np.pi}
+_WORDS: Mapping[Quantity, str] = {"position": "position", "joints": "joint angles"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -91,11 +93,10 @@ class Choice:
     @property
     def worse(self) -> tuple[str, ...]:
         """Return where identified actuators are worse, in words: one entry for each group, horizon and quantity."""
-        quantities: tuple[tuple[Quantity, str], ...] = (("position", "position"), ("joints", "joint angles"))
         return tuple(
             f"{words} of {row.group} recordings over {row.horizon:g} s ({row.ratio(quantity):.2f} times the error)"
             for row in self.rows
-            for quantity, words in quantities
+            for quantity, words in _WORDS.items()
             if row.ratio(quantity) > 1
         )
 
@@ -107,7 +108,7 @@ class Choice:
         ]
         for row in self.rows:
             cells = []
-            for quantity, scale in (("position", 1.0), ("joints", 180 / np.pi)):
+            for quantity, scale in _SCALES.items():
                 pair = [getattr(errors, quantity) * scale for errors in (row.nominal, row.identified)]
                 given = not np.isnan(pair[0])
                 digits = 4 if quantity == "position" else 2

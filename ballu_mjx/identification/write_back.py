@@ -39,10 +39,12 @@ def identified_to_json(
 
     `specimen` is the name that the robot's recordings carry (None: the description's), `more` further keys.
     """
-    values = np.asarray(identified.values, float)
+    declared = identified.declared
+    # Single precision may be a little beyond a bound.
+    values = np.clip(np.asarray(identified.values, float), declared.lower, declared.upper)
     errors = np.full(len(values), np.nan) if standard_errors is None else standard_errors
     rows = {}
-    for parameter, value, error in zip(identified.declared.parameters, values, errors, strict=True):
+    for parameter, value, error in zip(declared.parameters, values, errors, strict=True):
         rows[parameter.name] = {"value": float(value), "unit": parameter.unit}
         if np.isfinite(error):
             rows[parameter.name]["standard_error"] = float(error)

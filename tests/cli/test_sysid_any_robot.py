@@ -31,6 +31,8 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
     for use, seed in (("training", 0), ("validation", 1)):
         (folder / use).mkdir()
         record_arm(folder / use, robot, f"motion-{seed}", seed)
+    (folder / "sweep").mkdir()
+    record_arm(folder / "sweep", robot, "sweep", 0, "suspended")
     return robot
 
 
@@ -38,7 +40,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
 def run(robot: RobotDescription) -> tuple[Path, str]:
     """A run of sysid, and what it printed."""
     folder, printed = robot.file.parent, io.StringIO()
-    arguments = ["sysid", "--robot", robot.file, "--recordings", folder / "training", "--output", folder / "run"]
+    arguments = ["sysid", "--robot", robot.file, "--recordings", folder / "sweep", "--output", folder / "run"]
     arguments += ["--validation", folder / "validation", "--starts", "2", "--steps", "12"]
     with contextlib.redirect_stdout(printed):
         assert train.main(list(map(str, arguments))) == 0
@@ -110,7 +112,7 @@ def test_auto_takes_identified_actuators_where_they_replay_better(
         (["--window-seconds", "0"], "--window-seconds is 0.0: it must be above 0"),
         (["--angle-noise", "-1"], "--angle-noise is -1.0: it must be above 0"),
         (["--validation", "{training}"], "is among --recordings and --validation"),
-        (["--window-seconds", "60"], "No recording lasts 60 s"),
+        (["--window-seconds", "60"], "no recording lasts 60 s"),
     ],
 )
 def test_what_does_not_fit_is_refused(
@@ -121,6 +123,7 @@ def test_what_does_not_fit_is_refused(
     line += ["--output", str(folder / "refused")]
     assert train.main([*line, *(a.format(training=folder / "training") for a in arguments)]) == 2
     assert says in capsys.readouterr().err
+    assert not (folder / "refused").exists()
 
 
 def test_options_of_declared_parameters_do_not_go_with_a_method_of_its_own(capsys: pytest.CaptureFixture):
