@@ -69,8 +69,9 @@ def check_recordings(robot: RobotDescription, recordings: Mapping[Path, Recordin
 def recorded_motion(
     recording: Recording, robot: RobotDescription, model: mujoco.MjModel, sampling: SamplingConfig | None = None
 ) -> Motion:
-    """Return a recording's states at the control rate: reconstructed, or of a robot whose root is held as measured."""
-    if robot.anchored:
+    """Return a recording's states at the control rate: as measured where all joints of a robot whose root is held are,
+    else reconstructed."""
+    if _is_measured(recording, model):
         return held_motion(recording, robot, model, sampling)
     return reconstruct(recording, robot, model)
 
@@ -78,13 +79,20 @@ def recorded_motion(
 def measure_recording(
     recording: Recording, robot: RobotDescription, model: mujoco.MjModel, sampling: SamplingConfig | None = None
 ) -> MeasuredMotion:
-    """Return a recording as identification takes it: measured, or of a robot with a free joint reconstructed.
+    """Return a recording as identification takes it: as measured where all joints of a robot whose root is held are,
+    else reconstructed.
 
     **Raises** `InputError` naming the joint that was not recorded, or a recording that is too short.
     """
-    if robot.anchored:
+    if _is_measured(recording, model):
         return measure(recording, robot, model, sampling)
     return measured_from_motion(reconstruct(recording, robot, model), model)
+
+
+def _is_measured(recording: Recording, model: mujoco.MjModel) -> bool:
+    """Return whether the joints of a recording are its states, or else must be."""
+    joints = {model.joint(number).name for number in range(model.njnt)}
+    return joints <= set(recording.joint_angles) or recording.kind == "suspended"
 
 
 def identify_declared(

@@ -24,6 +24,7 @@ from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, tracking_s
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.sim.drivetrain import DrivetrainParameters
 from ballu_mjx.sim.force_model import BoundForces, Fields, ForceModel
+from ballu_mjx.sim.linearize import ControlSteps, Linearizer
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
@@ -79,10 +80,11 @@ def test_derivatives_by_the_drivetrain_are_those_of_differences(robot: RobotDesc
             driven = simulator.with_drivetrain(DrivetrainParameters(*whole.at[places].set(values).reshape(6, 2)))
             return run(driven.with_residual(None), begin(driven, commands[0]), commands)[0][-1]
 
-        slopes, at = np.asarray(jax.jit(jax.jacfwd(angles))(whole[places])), jax.jit(angles)
+        both = jax.jit(lambda values: (jax.jacfwd(angles)(values), angles(values)))
+        slopes = np.asarray(both(whole[places])[0])
         for place in range(len(places)):
             step = jnp.zeros(len(places)).at[place].set(1e-6)
-            change = np.asarray(at(whole[places] + step) - at(whole[places] - step)) / 2e-6
+            change = np.asarray(both(whole[places] + step)[1] - both(whole[places] - step)[1]) / 2e-6
             np.testing.assert_allclose(slopes[:, place], change, atol=0.01, rtol=0.02)
             assert np.abs(slopes[:, place]).max() > 0.03
 
@@ -163,6 +165,14 @@ def test_windows_and_episodes_begin_in_the_drivetrains_recorded_state(simulator:
     reached = tracking_state(jax.jit(env.step)(state, jnp.zeros(env.action_size)))
     np.testing.assert_allclose(reached.rollout.physics.qpos, motion.qpos[int(begun.time) + 1], atol=1e-3)
     assert np.asarray(stack_motions(simulator, [motion])[0].steps) == [80]
+
+
+def test_control_steps_are_linearized_about_the_drivetrains_state(simulator: Simulator, motion: Motion):
+    states, commands = jax.vmap(start_segment)(cut_segments(simulator, [motion], 0.1, 0.5))
+    linear = Linearizer(simulator)(ControlSteps(states, commands[:, 0], np.zeros((len(commands), 3))))
+    first = HISTORY - 1 + 10 * np.arange(len(commands))
+    np.testing.assert_allclose(linear.qpos, motion.qpos[first + 1], atol=1e-3)
+    assert np.isfinite(linear.state).all() and np.abs(linear.state).max() > 0.1
 
 
 def test_policies_are_trained_under_late_commands(tmp_path: Path):
