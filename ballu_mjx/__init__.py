@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ballu_mjx.evaluation.errors_table import Evaluation
     from ballu_mjx.evaluation.open_loop import evaluate
     from ballu_mjx.identification.actuators import identify_actuators
+    from ballu_mjx.identification.guard import choose_actuators
     from ballu_mjx.policies.locomotion_env import LocomotionConfig
     from ballu_mjx.policies.policy import Policy
     from ballu_mjx.policies.training import locomotion_ppo, train_policy
@@ -63,6 +64,7 @@ _MODULES = {
     "Simulator": "sim.simulator",
     "SupervisedConfig": "residuals.supervised",
     "TrainedResidual": "residuals.trained",
+    "choose_actuators": "identification.guard",
     "evaluate": "evaluation.open_loop",
     "fit_aerodynamics": "residuals.aerodynamics_training",
     "fit_analytic": "residuals.force_fitting",
@@ -97,6 +99,7 @@ __all__ = [
     "Simulator",
     "SupervisedConfig",
     "TrainedResidual",
+    "choose_actuators",
     "evaluate",
     "fit_aerodynamics",
     "fit_analytic",

@@ -27,9 +27,10 @@ import bundled_recordings
 import jax
 import numpy as np
 
-from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
+from ballu_mjx.ballu.actuators_file import read_actuators
 from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
+from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct

@@ -35,10 +35,11 @@ runtime.prepare()
 import bundled_recordings
 import deflation
 
-from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
+from ballu_mjx.ballu.actuators_file import read_actuators
 from ballu_mjx.ballu.model import buoyancy_ratio, load_model
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.cli import train_aerodynamics
+from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.robots.model import assets

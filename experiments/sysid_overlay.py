@@ -36,8 +36,9 @@ from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
+from ballu_mjx.ballu.actuators_file import read_actuators
 from ballu_mjx.ballu.model import KNEES, MOTORS, SIDES, load_model, standing_qpos
+from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.robots.model import assets
 from ballu_mjx.viz.style import colour_of, label_of
 

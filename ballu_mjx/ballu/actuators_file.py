@@ -12,7 +12,7 @@ import dataclasses
 import json
 import math
 import reprlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,6 @@ from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 
 ACTUATORS_FORMAT = "ballu-actuators/1"
-ACTUATORS_FILE = "actuators.json"
-"""The name under which a robot's file is found beside its recordings."""
 _FIELDS = tuple(field.name for field in dataclasses.fields(ActuatorParameters))
 _POSITIVE = ("knee_spring_stiffness", "motor_gain", "torque_limit")
 _LARGEST_ANGLE = math.pi
@@ -56,16 +54,6 @@ def read_actuators(path: Path) -> tuple[str, ActuatorParameters]:
     if not isinstance(content.get("parameters"), dict):
         raise InputError(f'{path}: "parameters" is missing; give a file that `train sysid` wrote.')
     return content["robot"], actuators_from_json(content["parameters"], path)
-
-
-def find_actuators(recordings: Iterable[Path], robot: str) -> Path | None:
-    """The robot's file beside its recordings: in their folder or the one above."""
-    folders = dict.fromkeys(folder for path in recordings for folder in (path.parent, path.parent.parent))
-    for folder in folders:
-        path = folder / ACTUATORS_FILE
-        if path.is_file() and read_actuators(path)[0] == robot:
-            return path
-    return None
 
 
 def actuators_to_json(parameters: ActuatorParameters) -> dict[str, list[float]]:

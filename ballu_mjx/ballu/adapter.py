@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -116,10 +116,6 @@ class Ballu(RobotAdapter, RecordingHooks):
         """Return what `actuators_file.read_actuators` returns."""
         del robot
         return actuators_file.read_actuators(path)
-
-    def find_actuators(self, recordings: Iterable[Path], name: str) -> Path | None:
-        """Return what `actuators_file.find_actuators` returns."""
-        return actuators_file.find_actuators(recordings, name)
 
     def write_actuators(self, path: Path, found: IdentifiedActuators, more: Mapping[str, Any]) -> None:
         """Write what `actuators_file.write_actuators` writes."""

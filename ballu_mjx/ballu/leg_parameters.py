@@ -38,7 +38,8 @@ class IdentificationConfig:
     draws: int = 128
     """Parameters drawn at random for each leg, beside the nominal ones, to find good starts."""
     starts: int = 8
-    """Searches for each leg, from the best draws."""
+    """Searches for each leg, from the best draws. Of declared parameters: from the nominal values, then from draws from
+    the priors."""
     steps: int = 25
     """Most iterations of a search."""
     seed: int = 0

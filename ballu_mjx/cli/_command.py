@@ -35,12 +35,15 @@ class TrainCommand:
     - `sections`: its options, as instances of dataclasses that hold the defaults, by the section's name.
     - `run`: takes the sections by name, and returns the exit status.
     - `quick`: other defaults under --quick, by section and option.
+    - `defaults`: takes the data section, and returns other defaults that follow from it, by section and option; None:
+      those under --quick.
     """
 
     summary: str
     sections: Mapping[str, Any]
     run: Callable[..., int]
     quick: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    defaults: Callable[[Any], Mapping[str, Mapping[str, Any]]] | None = None
 
     @property
     def help(self) -> str:
@@ -67,12 +70,16 @@ class TrainCommand:
                 if section != "data"
             }
             return {"data": dataclasses.replace(self.sections["data"], **kept), **stored}
-        if getattr(data, "quick", False) and self.quick:
-            return {
-                section: dataclasses.replace(default, **self.quick.get(section, {}))
-                for section, default in self.sections.items()
-            }
-        return None
+        if self.defaults is not None:
+            changed = self.defaults(data)
+        else:
+            changed = self.quick if getattr(data, "quick", False) else {}
+        if not changed:
+            return None
+        return {
+            section: dataclasses.replace(default, **changed.get(section, {}))
+            for section, default in self.sections.items()
+        }
 
 
 def _flag(name: str, value: bool) -> str:

@@ -11,6 +11,7 @@ import jax
 
 from ballu_mjx.cli._command import load_chosen_robot
 from ballu_mjx.evaluation.open_loop import Evaluators
+from ballu_mjx.identification.guard import choose_actuators
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.dataset import USES, RecordingsData, ResidualDataset
 from ballu_mjx.residuals.run_config import describe_run
@@ -76,12 +77,23 @@ def prepare(
     residual = None if base is None else TrainedResidual.load(base, robot)
     dataset = ResidualDataset.read(data, robot, resume)
     if residual is not None:
+        if dataset.undecided:
+            dataset = dataset.with_actuators(residual.actuators, f"those of {base}")
         dataset.check_base_residual(residual.actuators, base)
     folder = resume or new_folder(data.output if first else None, task)
     if first:
         _announce(dataset, folder, data.quick)
     simulator = Simulator(robot, dataset.identified)
     motions = dataset.reconstruct(simulator.mj_model)
+    if dataset.identified is not None and resume is None:
+        choice = choose_actuators(robot, dataset.identified, motions["validation"])
+        if first:
+            print(f"Open-loop replay of the validation recordings by actuators:\n\n{choice.table()}\n", flush=True)
+        if dataset.undecided and not choice.improves:
+            if first:
+                print("Nominal actuators are taken; --actuators FILE takes the identified ones.", flush=True)
+            dataset, simulator = dataset.with_actuators(None, "nominal"), Simulator(robot)
+            motions = dataset.reconstruct(simulator.mj_model)
     return Prepared(task, folder, dataset, motions, simulator, residual, base, Evaluators(simulator))
 
 

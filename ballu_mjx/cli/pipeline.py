@@ -18,7 +18,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import CaptureController
@@ -30,6 +29,7 @@ from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation import transfer
 from ballu_mjx.evaluation.transfer import Transfer
+from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.policies.deploy.export import weights
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_locomotion_config
 from ballu_mjx.policies.pipeline_layout import (
@@ -156,7 +156,7 @@ class Story:
 
         def make(folder: Path) -> None:
             recordings = (sweep / "sweep.csv.gz",)
-            data = train_sysid.SweepData(recordings=recordings, output=folder, wandb=self.options.wandb)
+            data = train_sysid.SysidData(recordings=recordings, output=folder, wandb=self.options.wandb)
             train_sysid.train(data, config)
 
         return cached_stage(self._shared / "sysid", config, [sweep], make)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, open_run, written_to
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.identification.actuators import AUTO, NOMINAL, read_actuators, validation_ratio
 from ballu_mjx.policies.closed_loop import Rollout
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_task, variant_of
 from ballu_mjx.policies.policy import check_belongs
@@ -43,8 +44,6 @@ from ballu_mjx.viz import plots
 
 QUICK: Mapping[str, Any] = {"num_timesteps": 60_000, "num_envs": 256, "batch_size": 128}
 """Defaults of `PPOConfig` under `--quick`."""
-NOMINAL = Path("nominal")
-"""What `--actuators` takes beside a file."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,9 +53,9 @@ class Data(loggers.LoggingOptions, distributed.DistributedOptions):
     robot: str | None = None
     """Whose policy this is: the name of a robot that comes with the package, or the file of a description
     (docs/own_robot.md). Without this option: ballu; with --resume: the run's."""
-    actuators: Path | None = None
-    """File of identified actuators (`train sysid` writes it), or the word nominal. Without this option: the residual's
-    if there is one, else nominal."""
+    actuators: Path = AUTO
+    """File of identified actuators (`train sysid` writes it), or the word nominal, or auto: the residual's if there is
+    one, else nominal."""
     residual: Path | None = None
     """Folder of a run of `train envmimic`, supervised, analytic or aerodynamic, whose residual acts in every control
     step. Without this option: none."""
@@ -91,6 +90,8 @@ def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
         if first:
             print(f"Run folder: {folder}")
             print(f"  task: {task.name}; simulator: {setting}" + (f", residual {where}" if where is not None else ""))
+            if data.actuators not in (AUTO, NOMINAL):
+                print(f"  actuators: {data.actuators}{_verdict(data.actuators)}")
             if data.quick:
                 print("  --quick: sizes so small that the policy will not walk.")
         devices = [str(device) for device in jax.devices()]
@@ -121,6 +122,15 @@ def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
     return 0
 
 
+def _verdict(path: Path) -> str:
+    """Return what the file says of identified beside nominal actuators, in words."""
+    ratio = validation_ratio(path)
+    if ratio is None:
+        return ""
+    better = "better" if ratio < 1 else "WORSE"
+    return f" (replayed validation recordings {better} than nominal ones, with {ratio:.2f} times the error)"
+
+
 def summary(task: Task, rollout: Rollout, robot: RobotDescription, with_residual: bool) -> str:
     """Return what some runs did, in words: means and ranges."""
     way = rollout.com[:, -1] - rollout.com[:, 0]
@@ -148,15 +158,16 @@ def summary(task: Task, rollout: Rollout, robot: RobotDescription, with_residual
 def _parts(task: Task, data: Data, robot: RobotDescription) -> tuple[ModelParameters | None, Path | None]:
     """Return actuators (None: nominal), and the run of the residual (None: none)."""
     if data.resume is not None:
-        for option, given in (("--actuators", data.actuators), ("--residual", data.residual)):
+        chosen = None if data.actuators == AUTO else data.actuators
+        for option, given in (("--actuators", chosen), ("--residual", data.residual)):
             if given is not None:
                 raise InputError(f"{option} does not go with --resume, which keeps the simulator; leave one out.")
         stored = read_config(data.resume, task.name)
         return run_actuators(stored, data.resume, robot), run_residual(stored, data.resume)
     if data.actuators == NOMINAL:
         return None, data.residual
-    if data.actuators is not None:
-        return robot.adapter.read_actuators(robot, data.actuators)[1], data.residual
+    if data.actuators != AUTO:
+        return read_actuators(robot, data.actuators)[1], data.residual
     return None if data.residual is None else TrainedResidual.load(data.residual, robot).actuators, data.residual
 
 

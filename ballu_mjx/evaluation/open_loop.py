@@ -20,6 +20,7 @@ from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, base
 from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, pad_to_bucket, stack_motions
+from ballu_mjx.sim.drivetrain import DrivetrainParameters, identity_drivetrain
 from ballu_mjx.sim.force_model import BoundForces, ForceModel
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
@@ -105,9 +106,9 @@ class OpenLoopEvaluator:
         self._split = jax.sharding.NamedSharding(mesh, spec("batch"))
         # XLA splits the batch over the devices: one core a device.
         split = jax.shard_map(
-            jax.vmap(self._advance, in_axes=(None, None, None, None, 0, 0)),
+            jax.vmap(self._advance, in_axes=(None, None, None, None, None, 0, 0)),
             mesh=mesh,
-            in_specs=(spec(), spec(), spec(), spec(), spec("batch"), spec("batch")),
+            in_specs=(*[spec()] * 5, spec("batch"), spec("batch")),
             out_specs=spec("batch"),
             check_vma=False,
         )
@@ -125,7 +126,8 @@ class OpenLoopEvaluator:
         reference, com = stack_motions(self._simulator, motions)
         self._recorded, self._recorded_com = np.asarray(reference.features), np.asarray(com)
         self._reference = jax.device_get(pad_to_bucket(reference))
-        self._fixed = jax.device_put((jax.device_get(self._simulator.model), self._reference), self._everywhere)
+        own = self._simulator.model, self._simulator.drivetrain
+        self._fixed = jax.device_put((*jax.device_get(own), self._reference), self._everywhere)
         interval = round(START_INTERVAL / self.robot.control_timestep)
         self.starts = [
             (index, start)
@@ -148,7 +150,8 @@ class OpenLoopEvaluator:
         fixed = self._fixed
         if nominal:
             model = jax.device_get(Simulator(self.robot).model)
-            fixed = jax.device_put((model, self._reference), self._everywhere)
+            unchanged = None if self._simulator.drivetrain is None else identity_drivetrain(len(self.robot.commands))
+            fixed = jax.device_put((model, jax.device_get(unchanged), self._reference), self._everywhere)
         params = jax.device_get(params)  # they may live on one device; the batch is spread over all
         starts = np.array(self.starts, np.int32)
         steps = np.array([len(self.motions[recording].command) - start for recording, start in self.starts])
@@ -191,7 +194,9 @@ class OpenLoopEvaluator:
             for x, when in ((self._reference.features, earlier), (self._reference.command, earlier[:, :-1]))
         )
         physics = PhysicsState(qpos, qvel, np.zeros_like(qvel))  # pyright: ignore
-        return jax.device_put(RolloutState(physics, features, command), self._split)  # pyright: ignore
+        # Nominal actuators, which pass commands on, read nothing of the drivetrain's state.
+        drivetrain = self._reference.drivetrain_at(recording, first)
+        return jax.device_put(RolloutState(physics, features, command, drivetrain), self._split)  # pyright: ignore
 
     def recorded(self, run: int) -> tuple[Float[np.ndarray, "states 3"], Float[np.ndarray, " states"]]:
         """Return the tracked body's recorded position (m) and yaw (rad), from the start of `run` to the end."""
@@ -218,6 +223,7 @@ class OpenLoopEvaluator:
         params: Any,
         scale: Array,
         model: mjx.Model,
+        drivetrain: DrivetrainParameters | None,
         reference: ReferenceMotions,
         rollout: RolloutState,
         place: Int[Array, " 2"],
@@ -225,7 +231,8 @@ class OpenLoopEvaluator:
         """One run, on by `_CHUNK` control steps: what the next ones start from, and features, centre of mass, force and
         generalized positions after each."""
         recording, start = place
-        simulator = self._simulator.with_model(model).with_residual(BoundForces(self._residual, params), scale)
+        own = self._simulator.with_model(model).with_drivetrain(drivetrain)
+        simulator = own.with_residual(BoundForces(self._residual, params), scale)
 
         def step(rollout: RolloutState, time: Array) -> tuple[RolloutState, tuple]:
             after = simulator.step(rollout, reference.command[recording, time])

@@ -1,15 +1,30 @@
-"""Identification of a robot's actuators from suspended recordings, by whatever method its adapter has."""
+"""Identified actuators of any robot: by its adapter's method or by declared parameters, and the files they are in.
+
+A robot whose adapter has a method and a format of its own uses these. Every robot whose description declares `identify`
+has the format `ballu-identified/1` (`identification.write_back`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ballu_mjx.common.errors import InputError
+from ballu_mjx.common import files
+from ballu_mjx.common.errors import InputError, is_number
+from ballu_mjx.identification.parameters import IdentifiedParameters
+from ballu_mjx.identification.write_back import IDENTIFIED_FORMAT, identified_from_json, identified_to_json
 from ballu_mjx.recordings.recording import Recording
-from ballu_mjx.robots.adapter import IdentificationProgress, IdentifiedActuators
+from ballu_mjx.robots.adapter import IdentificationProgress, IdentifiedActuators, RobotAdapter
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.model import ModelParameters
+
+ACTUATORS_FILE = "actuators.json"
+"""The name under which a robot's identified actuators are found beside its recordings."""
+
+AUTO, NOMINAL = Path("auto"), Path("nominal")
+"""What options that take a file of identified actuators take beside it."""
 
 
 def identify_actuators(
@@ -20,12 +35,14 @@ def identify_actuators(
     levels: int | None = None,
     progress: IdentificationProgress | None = None,
 ) -> IdentifiedActuators:
-    """Identify the actuators of `robot`.
+    """Identify the actuators of `robot`: by its adapter's method, or the parameters that its description declares.
 
     **Arguments**
 
-    - `recordings`: suspended recordings of one robot; by file, where errors shall name these.
-    - `config`: of the method (for BALLU `ballu.leg_parameters.IdentificationConfig`); None: its defaults.
+    - `recordings`: recordings of one robot, suspended ones for an adapter's method; by file, where errors shall name
+      these.
+    - `config`: of the method (of declared parameters `fit_robot.FitConfig`, for BALLU
+      `ballu.leg_parameters.IdentificationConfig`); None: its defaults.
     - `levels`: fewest command levels of each actuator; None: the method's own.
     - `progress`: is told of every iteration.
 
@@ -34,4 +51,73 @@ def identify_actuators(
     by_file = recordings if isinstance(recordings, Mapping) else {Path(each.name): each for each in recordings}
     if not by_file:
         raise InputError("There are no suspended recordings to identify actuators from; give some.")
+    if declares_parameters(robot):
+        from ballu_mjx.identification.declared import identify_declared  # Optimistix: slow to import
+
+        return identify_declared(by_file, robot, config, progress=progress)
     return robot.adapter.identify_actuators(robot, by_file, config, levels, progress)
+
+
+def has_own_method(robot: RobotDescription) -> bool:
+    """Return whether the robot's adapter identifies its actuators by a method of its own."""
+    return type(robot.adapter).identify_actuators is not RobotAdapter.identify_actuators
+
+
+def declares_parameters(robot: RobotDescription) -> bool:
+    """Return whether the robot's actuators are the parameters that its description declares."""
+    return bool(robot.identify) and not has_own_method(robot)
+
+
+def read_actuators(robot: RobotDescription, path: Path) -> tuple[str, ModelParameters]:
+    """Return the specimen's name and the parameters in a file of identified actuators.
+
+    **Raises** `InputError` where this robot's actuators cannot be identified, or the file is damaged; names file,
+    parameter and fix.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; `python -m ballu_mjx.train sysid` writes one.")
+    if robot.identify:
+        content = files.read_json(path, "restore it or identify again")
+        if content.get("format") == IDENTIFIED_FORMAT or not has_own_method(robot):
+            return str(content.get("robot")), identified_from_json(content, path, robot)
+    return robot.adapter.read_actuators(robot, path)
+
+
+def validation_ratio(path: Path) -> float | None:
+    """Return how many times nominal's error on validation recordings the actuators in a file had when they were
+    identified; None: the file does not say."""
+    found = files.read_json(path, "restore it or identify again").get("validation")
+    ratio = found.get("ratio") if isinstance(found, dict) else None
+    return float(ratio) if ratio is not None and is_number(ratio) else None
+
+
+def find_actuators(robot: RobotDescription, recordings: Iterable[Path], specimen: str) -> Path | None:
+    """Return the file of identified actuators of a specimen beside its recordings, in their folder or the one above;
+    None: there is none, or this robot's actuators cannot be identified.
+
+    **Raises** `InputError` where a file there is damaged.
+    """
+    if not (robot.identify or has_own_method(robot)):
+        return None
+    for folder in dict.fromkeys(folder for path in recordings for folder in (path.parent, path.parent.parent)):
+        path = folder / ACTUATORS_FILE
+        if path.is_file() and read_actuators(robot, path)[0] == specimen:
+            return path
+    return None
+
+
+def actuators_to_json(robot: RobotDescription, parameters: ModelParameters) -> dict[str, Any]:
+    """Return identified parameters as JSON's types, for `actuators_from_json`."""
+    if isinstance(parameters, IdentifiedParameters):
+        return json.loads(identified_to_json(robot, parameters))
+    return robot.adapter.actuators_to_json(parameters)
+
+
+def actuators_from_json(robot: RobotDescription, values: Mapping[str, Any], path: Path) -> ModelParameters:
+    """Return the inverse of `actuators_to_json`; `path` is the file that the values stand in.
+
+    **Raises** `InputError` naming file, parameter and fix.
+    """
+    if values.get("format") == IDENTIFIED_FORMAT:
+        return identified_from_json(values, path, robot)
+    return robot.adapter.actuators_from_json(robot, values, path)

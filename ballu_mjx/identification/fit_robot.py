@@ -27,21 +27,27 @@ from ballu_mjx.identification.residuals import MeasuredMotion, Simulated, Window
 
 
 @dataclasses.dataclass(frozen=True)
-class FitConfig:
-    """How parameters are identified."""
+class WindowConfig:
+    """What recordings are cut into, and how they count."""
 
     window_seconds: float = 1.0
     """Length of a window, s."""
     interval_seconds: float | None = None
-    """Time between the starts of two windows, s; None: a window's length."""
-    starts: int = 4
-    """Searches: one from the nominal values, the others from draws from the priors."""
-    steps: int = 20
-    """Most iterations of a search."""
+    """Time between the starts of two windows, s. Without this option: a window's length."""
     outlying: float = 3.0
     """Differences beyond so many times their scatter count less (pseudo-Huber loss)."""
     start_spread: float = 1.0
     """How uncertain starting states are, in units of the measurements' noise."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FitConfig(WindowConfig):
+    """How parameters are identified."""
+
+    starts: int = 4
+    """Searches: one from the nominal values, the others from draws from the priors."""
+    steps: int = 20
+    """Most iterations of a search."""
     seed: int = 0
     """Seeds the draws."""
 
@@ -51,8 +57,8 @@ def check_fit_config(config: FitConfig) -> None:
 
     **Raises** `InputError` naming the option.
     """
-    for name in ("window_seconds", "starts", "steps", "outlying", "start_spread"):
-        if getattr(config, name) <= 0:
+    for name in ("window_seconds", "interval_seconds", "starts", "steps", "outlying", "start_spread"):
+        if getattr(config, name) is not None and getattr(config, name) <= 0:
             raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name)}: it must be above 0.")
     if config.seed < 0:
         raise InputError(f"--seed is {config.seed}: it must be 0 or more; 0 is the nearest.")
@@ -73,6 +79,8 @@ class HeldOut:
 
     motion: Int[np.ndarray, " windows"]
     """Number of the motion that each is of."""
+    first: Int[np.ndarray, " windows"]
+    """Sample of the motion that each starts in."""
     errors: Float[np.ndarray, "windows samples channels"]
     """Simulated less recorded: positions, then velocities, along the velocities' directions (SI units)."""
     noise: Float[np.ndarray, " channels"]
@@ -183,6 +191,7 @@ def fit_robot(
     validation: Sequence[MeasuredMotion] | None = None,
     config: FitConfig | None = None,
     report: Report | None = None,
+    on_data_check: Callable[[Visibility], None] | None = None,
 ) -> RobotFit:
     """Fit parameters to recorded motions.
 
@@ -194,6 +203,7 @@ def fit_robot(
     **Arguments**
 
     - `validation`: motions that the fit does not see; None: every fourth window is held out.
+    - `report`: is told of every iteration, `on_data_check` of what the first step finds.
 
     **Raises** `InputError` for options out of range, and where no recording is as long as a window.
     """
@@ -215,7 +225,10 @@ def fit_robot(
             simulator = WindowSimulator(parameters, validation, held_out)
         objective = _Objective(WindowSimulator(parameters, training, windows), config)
         report("data check", 0, 1, float("nan"))
-        unseen = _visibility(objective, config).unseen
+        visibility = _visibility(objective, config)
+        report("data check", 1, 1, float("nan"))
+        if on_data_check is not None:
+            on_data_check(visibility)
         objective.rescale(objective.simulator.differences(parameters.nominal))
         solver = BatchedSolver(optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6))
         search = _Search(objective, config.starts)
@@ -241,7 +254,7 @@ def fit_robot(
         white_noise_errors=analysis.white,
         correlations=analysis.correlations,
         directions=analysis.directions,
-        unseen=unseen,
+        unseen=visibility.unseen,
         at_bounds=parameters.at_bounds(values),
         scatter=objective.scale,
         losses=np.sort(losses),
@@ -439,4 +452,4 @@ def _held_out(simulator: WindowSimulator, values: Float[np.ndarray, " parameters
     motions = simulator.motions
     noise = np.array([np.concatenate([m.position_noise, m.velocity_noise]) for m in motions])
     errors = simulator.differences(values) * noise[simulator.windows.motion][:, None]
-    return HeldOut(simulator.windows.motion, errors, noise.mean(axis=0))
+    return HeldOut(simulator.windows.motion, simulator.windows.first, errors, noise.mean(axis=0))

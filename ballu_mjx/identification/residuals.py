@@ -36,6 +36,17 @@ from ballu_mjx.sim.step import PhysicsState, make_data, physics_step, put_model,
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 
 
+def check_sampling_config(config: SamplingConfig) -> None:
+    """Refuse sizes that make no sense.
+
+    **Raises** `InputError` naming the option.
+    """
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if not 0 < value < np.inf:
+            raise InputError(f"--{field.name.replace('_', '-')} is {value}: it must be above 0.")
+
+
 @dataclasses.dataclass(frozen=True)
 class SamplingConfig:
     """How recordings are sampled, and what is known of their noise."""
@@ -122,6 +133,29 @@ def measure(
         qvel=rates[here],
         position_noise=np.full(model.nv, config.angle_noise),
         velocity_noise=uncertainty,
+    )
+
+
+def held_motion(
+    recording: Recording, robot: RobotDescription, model: mujoco.MjModel, config: SamplingConfig | None = None
+) -> Motion:
+    """Return states at the control rate of a recording that has every joint of a model whose root is held: of what
+    `reconstruct` gives for free recordings, all but distances to measured places.
+
+    **Raises** `InputError` as `measure` does.
+    """
+    config = dataclasses.replace(config or SamplingConfig(), sample_timestep=robot.control_timestep)
+    measured = measure(recording, robot, model, config)
+    edges = np.arange(len(measured.qpos)) * robot.control_timestep
+    return Motion(
+        name=recording.name,
+        time=edges,
+        command=mean_command(recording, edges),
+        qpos=measured.start_qpos,
+        qvel=measured.qvel,
+        residual_mm={},
+        interpolated=dict(recording.interpolated),
+        robot=recording.robot,
     )
 
 

@@ -31,16 +31,25 @@ def identified_to_json(
     robot: RobotDescription,
     identified: IdentifiedParameters,
     standard_errors: Float[np.ndarray, " parameters"] | None = None,
+    *,
+    specimen: str | None = None,
+    more: Mapping[str, Any] | None = None,
 ) -> str:
-    """Return identified values, by the names of a description's `identify`, as `read_identified` takes them."""
-    values = np.asarray(identified.values, float)
+    """Return identified values, by the names of a description's `identify`, as `read_identified` takes them.
+
+    `specimen` is the name that the robot's recordings carry (None: the description's), `more` further keys.
+    """
+    declared = identified.declared
+    # Single precision may be a little beyond a bound.
+    values = np.clip(np.asarray(identified.values, float), declared.lower, declared.upper)
     errors = np.full(len(values), np.nan) if standard_errors is None else standard_errors
     rows = {}
-    for parameter, value, error in zip(identified.declared.parameters, values, errors, strict=True):
+    for parameter, value, error in zip(declared.parameters, values, errors, strict=True):
         rows[parameter.name] = {"value": float(value), "unit": parameter.unit}
         if np.isfinite(error):
             rows[parameter.name]["standard_error"] = float(error)
-    return json.dumps({"format": IDENTIFIED_FORMAT, "robot": robot.name, "parameters": rows}, indent=2) + "\n"
+    head = {"format": IDENTIFIED_FORMAT, "robot": specimen or robot.name, "parameters": rows}
+    return json.dumps({**head, **(more or {})}, indent=2) + "\n"
 
 
 def read_identified(path: Path | str, robot: RobotDescription) -> IdentifiedParameters:
@@ -49,7 +58,14 @@ def read_identified(path: Path | str, robot: RobotDescription) -> IdentifiedPara
     **Raises** `InputError` naming the file, the parameter and the fix.
     """
     path = Path(path)
-    content = files.read_json(path, "restore it or identify again")
+    return identified_from_json(files.read_json(path, "restore it or identify again"), path, robot)
+
+
+def identified_from_json(content: Mapping[str, Any], path: Path, robot: RobotDescription) -> IdentifiedParameters:
+    """Return the values in what `identified_to_json` makes, which stands in the file `path`; see `read_identified`.
+
+    **Raises** `InputError` naming the file, the parameter and the fix.
+    """
     rows = content.get("parameters")
     if content.get("format") != IDENTIFIED_FORMAT or not isinstance(rows, dict):
         raise InputError(f'{path}: is not of the format "{IDENTIFIED_FORMAT}"; give one that identification wrote.')

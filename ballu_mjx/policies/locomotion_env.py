@@ -25,7 +25,8 @@ from ballu_mjx.policies.tasks import Step, Task
 from ballu_mjx.policies.variants import SimulatorVariant
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.robots.model import ModelParameters
+from ballu_mjx.robots.model import ModelParameters, bare_parameters
+from ballu_mjx.sim.drivetrain import DrivetrainParameters, drivetrain_of
 from ballu_mjx.sim.observation import HISTORY, heading_observation
 from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
@@ -114,6 +115,8 @@ class Setting(NamedTuple):
 
     fields: dict[str, Array]
     """Fields of the MJX model that identified actuators change."""
+    drivetrain: DrivetrainParameters | None
+    """What commands meet on their way to the actuators; None: nothing."""
     initial: Float[Array, " nq"]
     """Pose that episodes start from."""
     joint_range: Float[Array, "joints 2"]
@@ -198,10 +201,10 @@ class LocomotionEnv(Env):
         """
         check_task(task, robot)
         self.robot, self.task, self.config, self.residual = robot, task, config, residual
-        simulator = Simulator(robot)
+        simulator = Simulator(robot, actuators)
         self.simulator = simulator.with_residual(None if residual is None else residual.bound)
         model = simulator.mj_model
-        self.setting = make_setting(robot, model, config, actuators)
+        self.setting = make_setting(robot, robot.load_model(), config, actuators)
         self._colliding = colliding_geoms(model)
         self._friction = jnp.asarray(model.geom_friction)
         self._rest = jnp.asarray(robot.adapter.rest_command(robot, model), jnp.float32)
@@ -250,6 +253,7 @@ class LocomotionEnv(Env):
         friction = {"geom_friction": self._friction.at[self._colliding, 0].set(before.friction)}
         drawn = key_force if self.config.sampled_residual else None
         simulator = self.simulator.with_fields(before.setting.fields | friction)
+        simulator = simulator.with_drivetrain(before.setting.drivetrain)
         after = simulator.step(before.rollout, command, wrench_scale=decay, key=drawn)
 
         rollout, finite = after.state.keep_finite(before.rollout, before.rollout.features)
@@ -314,7 +318,9 @@ class LocomotionEnv(Env):
         mean = max(round(self.config.episode_seconds / self.robot.control_timestep), 2)
         physics = state_at(qpos, qvel)
         features, com = self.simulator.simulator.observe(physics)
-        rollout = RolloutState(physics, jnp.tile(features, (HISTORY, 1)), jnp.tile(self._rest, (HISTORY - 1, 1)))
+        drivetrain = self.simulator.simulator.with_drivetrain(setting.drivetrain).drivetrain_at_rest(self._rest)
+        history, commands = jnp.tile(features, (HISTORY, 1)), jnp.tile(self._rest, (HISTORY - 1, 1))
+        rollout = RolloutState(physics, history, commands, drivetrain)
         remaining = jax.random.randint(key_length, (), mean // 2, mean + mean // 2 + 1)
         now = LocomotionState(setting, friction, rollout, com, remaining, key)
         zero = jnp.zeros(())
@@ -357,10 +363,11 @@ def make_setting(
     limited = improved.jnt_limited[first:, None].astype(bool)
     along = np.concatenate([[True] * 3 + [False] * 3] * first + [~hinges])
     turn = np.array([config.start_tilt, config.start_tilt, config.start_yaw])
-    own = model.geom_friction[colliding_geoms(model), 0]
+    own = improved.geom_friction[colliding_geoms(model), 0]
     drawn = np.tile(config.friction, (len(own), 1))
     return Setting(
         fields=jax.tree.map(jnp.float32, fields),
+        drivetrain=drivetrain_of(bare_parameters(actuators)),
         initial=jnp.asarray(robot.adapter.initial_qpos(robot, improved), jnp.float32),
         joint_range=jnp.asarray(np.where(limited, improved.jnt_range[first:], [-np.inf, np.inf]), jnp.float32),
         friction=jnp.asarray(drawn if config.domain_randomization else np.stack([own, own], axis=1), jnp.float32),

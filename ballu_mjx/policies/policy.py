@@ -30,9 +30,10 @@ from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Inference, Params, PPOConfig
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.robots.model import ModelParameters, same_parameters
+from ballu_mjx.robots.model import ModelParameters, bare_parameters, same_parameters
 from ballu_mjx.runs.checkpoints import Which, restore_checkpoint
 from ballu_mjx.runs.folder import read_config, typed_config
+from ballu_mjx.sim.drivetrain import drivetrain_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,8 +118,11 @@ class Policy:
 
     @property
     def latency(self) -> float:
-        """Seconds from a command to the actuators in the simulator that the policy was trained in."""
-        return 0.0 if self.trained_residual is None else self.trained_residual.latency
+        """Seconds from a command to the actuators in the simulator that the policy was trained in; the longest of the
+        commands'."""
+        drivetrain = drivetrain_of(bare_parameters(self.actuators))
+        own = 0.0 if drivetrain is None else float(np.max(drivetrain.delay))
+        return own if self.trained_residual is None else own + self.trained_residual.latency
 
     def environment(self) -> LocomotionEnv:
         """Return the simulator that the policy was trained in."""

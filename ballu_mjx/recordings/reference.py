@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.sim.drivetrain import DrivetrainState
 from ballu_mjx.sim.simulator import Simulator
 
 
@@ -22,6 +24,15 @@ class ReferenceMotions(NamedTuple):
     command: Float[Array, "recordings steps commands"]
     steps: Int[Array, " recordings"]
     """Control steps of each recording."""
+    drivetrain: DrivetrainState | None = None
+    """Of the simulator's drivetrain before each control step, axes of recordings and control steps in front; None where
+    it has none."""
+
+    def drivetrain_at(
+        self, recording: Int[Array, "*batch"] | np.ndarray, step: Int[Array, "*batch"] | np.ndarray
+    ) -> DrivetrainState | None:
+        """Return the drivetrain's state before control steps of recordings; None where there is no drivetrain."""
+        return jax.tree.map(lambda x: x[recording, step], self.drivetrain)
 
 
 def stack_motions(
@@ -41,7 +52,8 @@ def stack_motions(
     steps = jnp.array([len(motion.command) for motion in motions])
 
     feature, com = simulator.observe_all(qpos, qvel)
-    return ReferenceMotions(qpos, qvel, feature, command, steps), com
+    drivetrain = None if simulator.drivetrain is None else jax.jit(jax.vmap(simulator.drivetrain_along))(command)
+    return ReferenceMotions(qpos, qvel, feature, command, steps, drivetrain), com
 
 
 def pad_to_bucket(reference: ReferenceMotions) -> ReferenceMotions:
@@ -54,10 +66,10 @@ def pad_to_bucket(reference: ReferenceMotions) -> ReferenceMotions:
     )
 
     def filled(x: Array) -> Array:
-        return jnp.pad(x, [(0, more[0]), (0, more[1]), (0, 0)], mode="edge")
+        return jnp.pad(x, [(0, more[0]), (0, more[1]), *[(0, 0)] * (x.ndim - 2)], mode="edge")
 
-    motion = ReferenceMotions(*map(filled, reference[:-1]), steps=reference.steps)  # pyright: ignore[reportCallIssue]
-    return motion._replace(steps=jnp.pad(reference.steps, (0, more[0])))
+    steps = jnp.pad(reference.steps, (0, more[0]))
+    return jax.tree.map(filled, reference._replace(steps=None))._replace(steps=steps)
 
 
 _ROOM = (16, 512)

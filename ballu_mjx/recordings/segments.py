@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -18,6 +19,7 @@ from jaxtyping import Array, Float
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
+from ballu_mjx.sim.drivetrain import DrivetrainState
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout, wrap_angle
 from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
@@ -42,6 +44,8 @@ class Segments(NamedTuple):
     """From two control steps before the first on."""
     features: Float[Array | np.ndarray, "windows windowsteps features"]
     """Recorded, after each control step."""
+    drivetrain: DrivetrainState | None = None
+    """In the first states; None where the simulator has no drivetrain."""
 
 
 def check_segments(window_seconds: float, interval_seconds: float, control_timestep: float) -> None:
@@ -82,6 +86,7 @@ def cut_segments(
         of(features, 1 - history, history),
         of(command, 1 - history, steps + history - 1),
         of(features, 1, steps),
+        jax.tree.map(np.asarray, reference.drivetrain_at(*np.array(places).T)),
     )
 
 
@@ -90,7 +95,8 @@ def start_segment(window: Segments) -> tuple[RolloutState, Float[Array, "windows
     physics = state_at(jnp.asarray(window.qpos), jnp.asarray(window.qvel))
     past = HISTORY - 1
     history, commands = jnp.asarray(window.history), jnp.asarray(window.commands)
-    return RolloutState(physics, history, commands[:past]), commands[past:]
+    drivetrain = jax.tree.map(jnp.asarray, window.drivetrain)
+    return RolloutState(physics, history, commands[:past], drivetrain), commands[past:]
 
 
 def segment_errors(

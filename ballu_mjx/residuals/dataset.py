@@ -11,6 +11,7 @@ import mujoco
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS
+from ballu_mjx.identification.actuators import AUTO, NOMINAL, find_actuators, read_actuators
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.load import bundled_recordings
@@ -42,9 +43,10 @@ class RecordingsData(loggers.LoggingOptions):
     robot: str | None = None
     """Whose recordings these are: the name of a robot that comes with the package, or the file of a description
     (docs/own_robot.md). Without this option: ballu; with --resume, where there is that: the run's."""
-    actuators: Path | None = None
-    """File of identified actuators (`train sysid` writes it), or the word nominal. Without this option: actuators.json
-    beside the recordings or in the folder above, if it names their robot; else nominal."""
+    actuators: Path = AUTO
+    """File of identified actuators (`train sysid` writes it), or the word nominal, or auto: of actuators.json beside
+    the recordings or in the folder above, if it names their robot, and nominal ones, those that replay the validation
+    recordings better. With --resume, auto: the run's."""
     output: Path | None = None
     """Folder of the run, new or empty. Without this option: one under runs/, named after the time."""
     quick: bool = False
@@ -68,6 +70,12 @@ class ResidualDataset:
     where: str
     """Where the actuators come from, for the user to read."""
     robot: RobotDescription
+    undecided: bool = False
+    """Whether the better ones of the identified and the nominal actuators are to be taken."""
+
+    def with_actuators(self, identified: ModelParameters | None, where: str) -> ResidualDataset:
+        """Return the same with actuators that are decided on (None: nominal), and where they come from."""
+        return dataclasses.replace(self, identified=identified, where=where, undecided=False)
 
     @staticmethod
     def read(data: RecordingsData, robot: RobotDescription, earlier: Path | None = None) -> ResidualDataset:
@@ -78,7 +86,8 @@ class ResidualDataset:
         files = _choose(data, robot, earlier)
         recordings = _read(files, robot)
         found = _actuators(data, earlier, files["training"], recordings["training"], robot)
-        return ResidualDataset(files, recordings, *found, robot)
+        undecided = data.actuators == AUTO and earlier is None and found[0] is not None
+        return ResidualDataset(files, recordings, *found, robot, undecided)
 
     def check_base_residual(self, learned_with: ModelParameters | None, run: Path | None) -> None:
         """**Raises** `InputError` where the base residual, of `run`, was learned with other actuators than these."""
@@ -155,18 +164,18 @@ def _actuators(
     description: RobotDescription,
 ) -> tuple[ModelParameters | None, str]:
     """The simulator's actuators (None: nominal), and where they come from, for the user to read."""
-    if data.actuators is None and earlier is not None:
+    if data.actuators == AUTO and earlier is not None:
         identified = run_actuators(read_config(earlier, "envmimic"), earlier, description)
         return identified, f"{'nominal' if identified is None else 'identified'}, as before"
-    if data.actuators == Path("nominal"):
+    if data.actuators == NOMINAL:
         return None, "nominal"
     robots = {recording.robot for recording in recordings}
-    path = data.actuators
-    if path is None and len(robots) == 1:
-        path = description.adapter.find_actuators(files, next(iter(robots)))
+    path: Path | None = data.actuators
+    if path == AUTO:
+        path = find_actuators(description, files, next(iter(robots))) if len(robots) == 1 else None
     if path is None:
         return None, "nominal (the recordings' robot has no actuators.json; `train sysid` identifies one from a sweep)"
-    robot, identified = description.adapter.read_actuators(description, path)
+    robot, identified = read_actuators(description, path)
     if robots != {robot}:
         raise InputError(
             f"{path}: these are the actuators of {robot!r}, the recordings are of {', '.join(sorted(robots))}; give "

@@ -171,6 +171,7 @@ class EnvMimicEnv(Env):
         `learner.wrap_for_training`) serve them all."""
         return {
             "model": self.simulator.simulator.model,
+            "drivetrain": self.simulator.simulator.drivetrain,
             "reference": self.reference,
             "spread": self._spread,
             "spread of starts": self._spread_of_starts,
@@ -180,7 +181,8 @@ class EnvMimicEnv(Env):
     def with_contents(self, contents: Mapping[str, Any]) -> EnvMimicEnv:
         """The same with other contents, which may be traced."""
         other = copy.copy(self)
-        other.simulator = self.simulator.with_model(contents["model"], contents["base residual"])
+        simulator = self.simulator.with_model(contents["model"], contents["base residual"])
+        other.simulator = simulator.with_drivetrain(contents["drivetrain"])
         other.reference = contents["reference"]
         other._spread, other._spread_of_starts = contents["spread"], contents["spread of starts"]
         return other
@@ -198,7 +200,8 @@ class EnvMimicEnv(Env):
         remaining = jax.random.randint(
             key_length, (), max(self.episode_length // 2, 1), self.episode_length + self.episode_length // 2 + 1
         )
-        rollout = RolloutState(state_at(qpos, qvel), history, commands)
+        drivetrain = reference.drivetrain_at(recording, time)
+        rollout = RolloutState(state_at(qpos, qvel), history, commands, drivetrain)
         tracking = TrackingState(rollout, recording, time, remaining, key_sensor)
         zero = jnp.zeros(())
         metrics = {"reward_position": zero, "reward_orientation": zero, "force": zero, "diverged": zero}

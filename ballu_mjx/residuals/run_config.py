@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.identification.actuators import actuators_from_json, actuators_to_json
 from ballu_mjx.recordings.csv_format import sidecar_path
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, assets
@@ -30,7 +31,7 @@ def run_actuators(config: Mapping[str, Any], folder: Path, robot: RobotDescripti
     **Raises** `InputError` where they are damaged.
     """
     stored = config_section(config, "actuators", folder)
-    return None if stored is None else robot.adapter.actuators_from_json(robot, stored, folder / CONFIG_FILE)
+    return None if stored is None else actuators_from_json(robot, stored, folder / CONFIG_FILE)
 
 
 def run_robot(config: Mapping[str, Any], folder: Path) -> RobotDescription:
@@ -67,7 +68,7 @@ def describe_run(
         "format": RUN_FORMAT,
         "task": task,
         **{name: dataclasses.asdict(section) for name, section in sections.items()},
-        "actuators": None if identified is None else description.adapter.actuators_to_json(identified),
+        "actuators": None if identified is None else actuators_to_json(description, identified),
         "recordings": {use: [describe_recording(path) for path in paths] for use, paths in recordings.items()},
         "robot_description": describe_robot(description),
         "starts": [

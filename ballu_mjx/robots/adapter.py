@@ -7,7 +7,7 @@ are the general answers.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -132,8 +132,8 @@ class RobotAdapter:
         """
         del recordings, levels
         raise InputError(
-            f"{robot.file}: the actuators of {robot.name} cannot be identified; give it an adapter with "
-            "`identify_actuators` (docs/own_robot.md)."
+            f"{robot.file}: the actuators of {robot.name} cannot be identified; declare what to identify under "
+            '"identify" (docs/identify.md), or give it an adapter with `identify_actuators`.'
         )
 
     def read_actuators(self, robot: RobotDescription, path: Path) -> tuple[str, ModelParameters]:
@@ -142,13 +142,9 @@ class RobotAdapter:
         **Raises** `InputError` where this robot's actuators cannot be identified, or the file is damaged.
         """
         raise InputError(
-            f"{path}: the actuators of {robot.name} cannot be identified yet ({robot.file.name} names no adapter that "
-            "does it); leave --actuators out."
+            f"{path}: the actuators of {robot.name} cannot be identified yet ({robot.file.name} declares no "
+            '"identify"); leave --actuators out.'
         )
-
-    def find_actuators(self, recordings: Iterable[Path], name: str) -> Path | None:
-        """Return the file of identified actuators of the robot called `name` beside its recordings; None: none."""
-        del recordings, name
 
     def write_actuators(self, path: Path, found: IdentifiedActuators, more: Mapping[str, Any]) -> None:
         """Write a file that `read_actuators` reads, with the details, and `more` keys beside them."""

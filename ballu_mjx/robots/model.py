@@ -37,10 +37,12 @@ def assets() -> Path:
 
 
 def load_model(file: Path, parameters: ModelParameters | None = None) -> mujoco.MjModel:
-    """Return the model in an MJCF file, nominal or with identified parameters."""
+    """Return the model in an MJCF file, nominal or with identified parameters and the constants that follow."""
     model = mujoco.MjModel.from_xml_path(str(file))
     if parameters is not None:
         set_fields(model, parameters.fields(model))
+        # Contacts, limits and friction are as soft as the inertia matrix at the reference pose says.
+        mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
 

@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from mujoco import mjx
 
-INERTIAL_FIELDS = ("body_mass", "body_inertia", "body_ipos")
-"""Fields that the constants are derived from, and that residuals alter."""
+INERTIAL_FIELDS = ("body_mass", "body_inertia", "body_ipos", "dof_armature")
+"""Fields that the constants are derived from, and that residuals or identified parameters alter."""
 
 
 _TRIPLES = {int(mujoco.mjtJoint.mjJNT_FREE): (0, 3), int(mujoco.mjtJoint.mjJNT_BALL): (0,)}
@@ -96,7 +96,7 @@ def with_derived_constants(pose: ReferencePose, model: mjx.Model, fields: Mappin
 
 def _constants(pose: ReferencePose, model: mjx.Model, fields: Mapping[str, Array]) -> dict[str, Array]:
     """Return the constants by their definition, in the precision of `model`."""
-    mass, inertia, centre = (jnp.asarray(fields.get(name, getattr(model, name))) for name in INERTIAL_FIELDS)
+    mass, inertia, centre, armature = (jnp.asarray(fields.get(name, getattr(model, name))) for name in INERTIAL_FIELDS)
     with jax.default_matmul_precision("highest"):
         arm = jnp.einsum("bij,bj->bi", pose.frame, centre)
         moved = pose.translation + jnp.cross(pose.rotation, arm[:, :, None], axis=1)
@@ -104,7 +104,7 @@ def _constants(pose: ReferencePose, model: mjx.Model, fields: Mapping[str, Array
         matrix = jnp.einsum("b,bij,bik->jk", mass, moved, moved)
         matrix += jnp.einsum("bi,bij,bik->jk", inertia, turned, turned)
         matrix += jnp.einsum("t,ti,tj->ij", model.tendon_armature, pose.tendons, pose.tendons)
-        matrix += jnp.diag(model.dof_armature)
+        matrix += jnp.diag(armature)
         # A chain's inertia matrix is badly scaled: metres beside radians, the heaviest body beside the lightest.
         scale = 1 / jnp.sqrt(jnp.diag(matrix))
         factor = jax.scipy.linalg.cho_factor(scale[:, None] * matrix * scale)

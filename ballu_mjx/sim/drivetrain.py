@@ -8,10 +8,11 @@ function of arrays: differentiable forwards, batched by `jax.vmap`, and stepped 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 
@@ -55,6 +56,25 @@ def identity_drivetrain(commands: int) -> DrivetrainParameters:
     return DrivetrainParameters(one, zero, zero, zero, jnp.full(commands, jnp.inf), zero)
 
 
+@runtime_checkable
+class HasDrivetrain(Protocol):
+    """Model parameters that also say what commands meet on their way."""
+
+    def drivetrain(self) -> DrivetrainParameters:
+        """Return the drivetrain of all commands."""
+        ...
+
+
+def drivetrain_of(parameters: object) -> DrivetrainParameters | None:
+    """Return the drivetrain that a simulator's parameters have; None where commands arrive unchanged."""
+    if not isinstance(parameters, HasDrivetrain):
+        return None
+    found = DrivetrainParameters(*(jnp.asarray(value, jnp.float32) for value in parameters.drivetrain()))
+    unchanged = identity_drivetrain(len(found.scale))
+    same = all(np.array_equal(one, other) for one, other in zip(found, unchanged, strict=True))
+    return None if same else found
+
+
 def count_slots(longest_delay: float, timestep: float) -> int:
     """Return how many commands a state must remember for delays up to `longest_delay` (s)."""
     return math.ceil(longest_delay / timestep - 1e-9) + 2
@@ -92,15 +112,25 @@ def step_drivetrain(
     return DrivetrainState(sent, limited, lagged, played), played
 
 
-def filter_commands(
-    parameters: DrivetrainParameters, commands: Float[Array, "steps commands"], timestep: float, slots: int
-) -> Float[Array, "steps commands"]:
-    """Return the actuators' `ctrl` of each physics step, from rest under the first command."""
+def scan_drivetrain(
+    parameters: DrivetrainParameters,
+    state: DrivetrainState,
+    commands: Float[Array, "steps commands"],
+    timestep: float,
+) -> tuple[DrivetrainState, Float[Array, "steps commands"]]:
+    """Advance by one physics step for each of `commands`; see `step_drivetrain`."""
 
     def step(state: DrivetrainState, command: Array) -> tuple[DrivetrainState, Array]:
         return step_drivetrain(parameters, state, command, timestep)
 
-    return jax.lax.scan(step, init_drivetrain(parameters, commands[0], slots), commands)[1]
+    return jax.lax.scan(step, state, commands)
+
+
+def filter_commands(
+    parameters: DrivetrainParameters, commands: Float[Array, "steps commands"], timestep: float, slots: int
+) -> Float[Array, "steps commands"]:
+    """Return the actuators' `ctrl` of each physics step, from rest under the first command."""
+    return scan_drivetrain(parameters, init_drivetrain(parameters, commands[0], slots), commands, timestep)[1]
 
 
 def _delayed(sent: Float[Array, "slots commands"], late: Float[Array, " commands"]) -> Float[Array, " commands"]:

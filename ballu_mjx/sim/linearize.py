@@ -108,7 +108,7 @@ class Linearizer:
             history = jnp.asarray(step.state.history)
             if self.simulator.residual is not None:  # which sees the moved state
                 history = history.at[-1].set(self.simulator.simulator.observe(moved)[0])
-            state = RolloutState(moved, history, jnp.asarray(step.state.commands))
+            state = jax.tree.map(jnp.asarray, step.state._replace(physics=moved, history=history))
             simulator = self.simulator.with_generalized_force(torques)
             done = simulator.step(state, jnp.asarray(step.command), wrench=wrench).state
             return done.physics, done.features

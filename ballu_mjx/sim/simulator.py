@@ -19,6 +19,14 @@ from mujoco import mjx
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, bare_parameters, with_fields
 from ballu_mjx.sim.derived_constants import ReferencePose, with_derived_constants
+from ballu_mjx.sim.drivetrain import (
+    DrivetrainParameters,
+    DrivetrainState,
+    count_slots,
+    drivetrain_of,
+    init_drivetrain,
+    scan_drivetrain,
+)
 from ballu_mjx.sim.force_model import BoundForces, HasForces, add_wrenches
 from ballu_mjx.sim.observation import observe_features
 from ballu_mjx.sim.step import PhysicsState, control_step, count_substeps, load_state, make_data, put_model, state_at
@@ -28,7 +36,8 @@ from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 class Simulator:
     """The MJX robot between control steps: states in, states and features out.
 
-    Commands are in the actuators' own units. `model` is the MJX model, `mj_model` the C model that it was made from.
+    Commands are in the actuators' own units. `model` is the MJX model, `mj_model` the C model that it was made from,
+    `drivetrain` what commands meet on their way to the actuators; None: nothing.
     """
 
     def __init__(
@@ -42,7 +51,8 @@ class Simulator:
 
         **Arguments**
 
-        - `actuators`: identified actuators; None: the nominal ones.
+        - `actuators`: identified actuators, with a drivetrain (`drivetrain.HasDrivetrain`) or without; None: the
+          nominal ones.
         - `model`: a model of this robot to simulate instead of `robot.load_model(actuators)`.
 
         **Raises** `ValueError` where the model's time step does not divide the robot's control time step.
@@ -54,6 +64,8 @@ class Simulator:
         self.nv = self.mj_model.nv
         self.substeps = count_substeps(self.mj_model, robot.control_timestep)
         """Physics steps in a control step."""
+        self.drivetrain = drivetrain_of(self.actuators)
+        self._slots = 0 if self.drivetrain is None else self._count_slots(self.drivetrain)
         self.model = put_model(self.mj_model)
         self._template = make_data(self.mj_model)
         self._reference_pose = ReferencePose.of(self.mj_model)
@@ -76,6 +88,18 @@ class Simulator:
         """Return the same simulator of another MJX model of this structure, which may be traced."""
         other = copy.copy(self)
         other.model = model
+        return other
+
+    def with_drivetrain(self, drivetrain: DrivetrainParameters | None) -> Simulator:
+        """Return the same simulator with another drivetrain, which may be traced.
+
+        Its delays may be as long as those of the drivetrain that it takes the place of, rounded up to whole control
+        steps; a simulator without a drivetrain takes none.
+        """
+        if (drivetrain is None) != (self.drivetrain is None):
+            raise ValueError("One simulator has a drivetrain, the other has none; make both with actuators alike.")
+        other = copy.copy(self)
+        other.drivetrain = drivetrain
         return other
 
     def with_generalized_force(self, force: Float[Array, " nv"]) -> Simulator:
@@ -101,17 +125,57 @@ class Simulator:
         features, com = (jnp.concatenate(parts)[:count] for parts in zip(*pieces, strict=True))
         return features.reshape(*shape, -1), com.reshape(*shape, -1)
 
+    def drivetrain_at_rest(self, command: Float[Array, " commands"]) -> DrivetrainState | None:
+        """Return the drivetrain's state long after the same command; None where there is no drivetrain."""
+        return None if self.drivetrain is None else init_drivetrain(self.drivetrain, command, self._slots)
+
+    def drivetrain_along(self, commands: Float[Array, "steps commands"]) -> DrivetrainState | None:
+        """Return the drivetrain's state before each of the control steps under `commands`, from rest under the first;
+        all arrays have an axis of control steps in front. None where there is no drivetrain."""
+
+        def step(state: DrivetrainState, command: Array) -> tuple[Any, DrivetrainState]:
+            return self.drive(state, command)[0], state
+
+        start = self.drivetrain_at_rest(commands[0])
+        return None if start is None else jax.lax.scan(step, start, commands)[1]
+
+    def drive(
+        self, state: DrivetrainState | None, command: Float[Array, "*parts commands"]
+    ) -> tuple[DrivetrainState | None, Float[Array, "*substeps commands"]]:
+        """Return the drivetrain's state after a control step under a command, or one for each of equal parts of it; and
+        the actuators' `ctrl` in each physics step. Without a drivetrain: None, and the command itself.
+
+        **Raises** `ValueError` where one of drivetrain and state is there without the other.
+        """
+        if (state is None) != (self.drivetrain is None):
+            raise ValueError("The simulator has a drivetrain and the state has none, or the other way round.")
+        if state is None or self.drivetrain is None:
+            return None, command
+        return scan_drivetrain(self.drivetrain, state, self._in_substeps(command), self._timestep)
+
     def step(
-        self, state: PhysicsState, command: Float[Array, "*parts commands"], wrench: Float[Array, "loaded 6"]
+        self, state: PhysicsState, ctrl: Float[Array, "*parts commands"], wrench: Float[Array, "loaded 6"]
     ) -> PhysicsState:
-        """One control step under a command, or one for each of equal parts of it; wrenches are on the tracked body
-        and, if more, at the robot's points. See `step.control_step`."""
-        parts = command.reshape(-1, command.shape[-1])
-        commands = jnp.repeat(parts, self.substeps // len(parts), axis=0)
+        """One control step under the actuators' `ctrl`, or one for each of equal parts of it; wrenches are on the
+        tracked body and, if more, at the robot's points. See `step.control_step`."""
+        commands = self._in_substeps(ctrl)
         sites, bodies = zip(*self._sites[: len(wrench)], strict=True)
         return control_step(
             self.model, self._template, state, commands, wrench, bodies=bodies, points=sites[1:], count=self.substeps
         )
+
+    @property
+    def _timestep(self) -> float:
+        return float(self.mj_model.opt.timestep)
+
+    def _count_slots(self, drivetrain: DrivetrainParameters) -> int:
+        # Whole control steps: robots of nearly the same delay share a compiled program.
+        steps = math.ceil(float(np.max(drivetrain.delay)) / self.control_timestep - 1e-6)
+        return count_slots(steps * self.control_timestep, self._timestep)
+
+    def _in_substeps(self, command: Float[Array, "*parts commands"]) -> Float[Array, "substeps commands"]:
+        parts = command.reshape(-1, command.shape[-1])
+        return jnp.repeat(parts, self.substeps // len(parts), axis=0)
 
     def with_residual(
         self, residual: HasForces | None, scale: Float[Array, ""] | float | None = None
@@ -132,7 +196,7 @@ class Simulator:
 
 
 class RolloutState(NamedTuple):
-    """A simulation between two control steps: the physics, and what a residual remembers.
+    """A simulation between two control steps: the physics, and what a residual and the drivetrain remember.
 
     With B leading batch axes it is a batch of simulations.
     """
@@ -142,6 +206,8 @@ class RolloutState(NamedTuple):
     """`observe_features` of the last `HISTORY` control steps, the current one last."""
     commands: Float[Array, "earlier commands"]
     """Commands of the `HISTORY` - 1 control steps before the coming one, the latest last."""
+    drivetrain: DrivetrainState | None = None
+    """Of the simulator's drivetrain; None where it has none."""
 
     @property
     def features(self) -> Float[Array, "*batch features"]:
@@ -157,13 +223,15 @@ class RolloutState(NamedTuple):
     ) -> tuple[RolloutState, Bool[Array, ""]]:
         """Return this state, the successor of `before`, and whether all its numbers are finite.
 
-        Where they are not, the physics is that of `before`, and `features` stand for the current observation.
+        Where they are not, physics and drivetrain are those of `before`, and `features` stand for the current
+        observation.
         """
         finite = jnp.all(jnp.isfinite(self.features)) & jnp.all(jnp.isfinite(self.physics.qvel))
         seen = jnp.where(finite, self.features, features)
-        physics = jax.tree.map(lambda new, old: jnp.where(finite, new, old), self.physics, before.physics)
+        own, earlier = ((state.physics, state.drivetrain) for state in (self, before))
+        physics, drivetrain = jax.tree.map(lambda new, old: jnp.where(finite, new, old), own, earlier)
         history = jnp.concatenate([self.history[:-1], seen[None]])
-        return RolloutState(physics, history, self.commands), finite
+        return RolloutState(physics, history, self.commands, drivetrain), finite
 
 
 class RolloutStep(NamedTuple):
@@ -233,6 +301,10 @@ class AugmentedSimulator:
         residual = None if self.residual is None else self.residual._replace(params=params)
         return dataclasses.replace(self, simulator=self.simulator.with_model(model), residual=residual)
 
+    def with_drivetrain(self, drivetrain: DrivetrainParameters | None) -> AugmentedSimulator:
+        """Return the same with another drivetrain; see `Simulator.with_drivetrain`."""
+        return dataclasses.replace(self, simulator=self.simulator.with_drivetrain(drivetrain))
+
     def with_generalized_force(self, force: Float[Array, " nv"]) -> AugmentedSimulator:
         """Return the same under generalized forces; see `Simulator.with_generalized_force`."""
         return dataclasses.replace(self, simulator=self.simulator.with_generalized_force(force))
@@ -246,7 +318,9 @@ class AugmentedSimulator:
         wrench_scale: Float[Array, ""] | float | None = None,
         key: Array | None = None,
     ) -> RolloutStep:
-        """Advance by one control step: ask the residual, step the physics, observe, shift the history.
+        """Advance by one control step: ask the residual, step drivetrain and physics, observe, shift the history.
+
+        The residual's commands are what the drivetrain takes.
 
         **Arguments**
 
@@ -263,10 +337,11 @@ class AugmentedSimulator:
             sent, total = self._ask(state.history, commands, key)
             total = total if wrench_scale is None else wrench_scale * total
             total = total if wrench is None else add_wrenches(wrench, total)
-        physics = self.simulator.step(state.physics, sent, total)
+        drivetrain, ctrl = self.simulator.drive(state.drivetrain, sent)
+        physics = self.simulator.step(state.physics, ctrl, total)
         features, com = self.simulator.observe(physics)
         history = jnp.concatenate([state.history[1:], features[None]])
-        return RolloutStep(RolloutState(physics, history, commands[1:]), com, total)
+        return RolloutStep(RolloutState(physics, history, commands[1:], drivetrain), com, total)
 
     def _ask(
         self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"], key: Array | None

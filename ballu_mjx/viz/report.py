@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 
 REPORT_FILE = "report.html"
+IDENTIFICATION_FILE = "identification.json"
+"""What `train sysid` leaves of declared parameters: `identification.fit_report.fit_details`."""
 _TEMPLATE = "report.html"
 _INTERACTIVE = ("tracking.png", "learning_curve.png")
 """Figures of a run's folder that the page has an interactive twin of."""
@@ -112,6 +114,7 @@ def _run(folder: Path) -> Content:
     for use, used in config.get("recordings", {}).items():
         content.facts.append((f"{use} recordings", ", ".join(str(file["path"]) for file in used)))
     _add_evaluation(content, folder)
+    _add_identification(content, folder)
     if (folder / "identification.txt").is_file():
         content.texts.append(("Identification", files.read_text(folder / "identification.txt")))
     content.curves = _curves({config["task"]: folder})
@@ -193,6 +196,33 @@ def _add_evaluation(content: Content, folder: Path, prefix: str = "") -> None:
     content.tables.append(Table(f"{prefix}whole recordings", header, rows))
     if (folder / "evaluation.txt").is_file():
         content.texts.append((f"{prefix}by group", files.read_text(folder / "evaluation.txt")))
+
+
+def _add_identification(content: Content, folder: Path) -> None:
+    """Tables from `identification.json`: parameters with intervals, and errors on held-out windows."""
+    path = folder / IDENTIFICATION_FILE
+    if not path.is_file():
+        return
+    found = files.read_json(path, "identify again")
+    try:
+        rows = []
+        for each in found["parameters"]:
+            low, high = each["interval"]
+            notes = ["not shown"] * (not each["seen"]) + ["at a bound"] * bool(each["at_bound"])
+            numbers = [each[key] for key in ("nominal", "value", "standard_error", "white_noise_error")]
+            cells = [Cell(f"{x:.4g}", repr(x)) for x in (*numbers, low, high)]
+            rows.append([Cell(str(each["name"])), *cells, Cell(str(each["unit"])), Cell(", ".join(notes))])
+        header = ["", "nominal", "identified", "standard error", "of white noise", "95 % from", "to", "unit", ""]
+        content.tables.append(Table("parameters", header, rows))
+        pair = [found["held_out"][name] for name in ("nominal", "identified")]
+        rows = [[Cell("all, in units of noise"), *(Cell(f"{each['score']:.3g}", repr(each["score"])) for each in pair)]]
+        for name in pair[0]["final_median"]:
+            values = [each["final_median"][name] for each in pair]
+            rows.append([Cell(f"{name}, median at the end (rad or m)"), *(Cell(f"{x:.4g}", repr(x)) for x in values)])
+        title = f"errors on {pair[0]['windows']} held-out windows"
+        content.tables.append(Table(title, ["", "nominal", "identified"], rows))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: is damaged ({error!r}); identify again.") from None
 
 
 def _horizons(title: str, names: tuple[str, str], without: Errors, mimic: Errors) -> Table:

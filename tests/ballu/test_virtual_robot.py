@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 import ballu_mjx
-from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE
 from ballu_mjx.ballu.model import load_model, standing_qpos
 from ballu_mjx.ballu.recordings import base_position, foot_position, knee, motor
 from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.robots.model import assets

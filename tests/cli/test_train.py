@@ -18,10 +18,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
+from ballu_mjx.ballu.actuators_file import read_actuators
 from ballu_mjx.ballu.model import CABLE_SLACK, ActuatorParameters
 from ballu_mjx.ballu.sweep import read_sweep
 from ballu_mjx.cli import evaluate, train, train_envmimic
+from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_recording
 from ballu_mjx.recordings.recording import Recording, cut
 from ballu_mjx.residuals.dataset import _choose, _read

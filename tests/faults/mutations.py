@@ -386,9 +386,10 @@ def transfers_fault(found: Any) -> str | None:
 
 def formats(work: Path) -> list[Format]:
     """Every format that is read, with a valid example of it in a folder of its own below `work`."""
-    from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE, read_actuators
+    from ballu_mjx.ballu.actuators_file import read_actuators
     from ballu_mjx.cli.cached_stages import read_mark, write_mark
     from ballu_mjx.evaluation import transfer
+    from ballu_mjx.identification.actuators import ACTUATORS_FILE
     from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_recording
     from ballu_mjx.recordings.importers.mapping import example_mapping, read_mapping
     from ballu_mjx.recordings.recording import cut

@@ -42,6 +42,14 @@ def test_plain_mujoco_loads_the_identified_model_and_moves_alike(tmp_path: Path)
     assert np.abs(ends[2] - ends[0]).max() > 0.01
 
 
+def test_values_on_a_bound_come_back(tmp_path: Path):
+    robot, found = identified(tmp_path, {"command": "left", "field": "delay", "bounds": [0, 0.1]})
+    assert float(np.float32(0.1)) > 0.1
+    path = tmp_path / "identified.json"
+    path.write_text(identified_to_json(robot, IdentifiedParameters(jnp.array([0.1], jnp.float32), found.declared)))
+    np.testing.assert_allclose(read_identified(path, robot).values, 0.1)
+
+
 def test_a_field_that_mjcf_has_not_is_refused(tmp_path: Path):
     robot, found = identified(tmp_path, {"joint": "left", "field": "dof_invweight0"})
     with pytest.raises(InputError, match="dof_invweight0 cannot be written as MJCF"):

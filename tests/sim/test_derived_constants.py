@@ -53,6 +53,17 @@ def test_constants_are_those_of_mj_setconst(robot: RobotDescription) -> None:
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-3, atol=1e-6, err_msg=name)
 
 
+def test_constants_follow_from_armature_alone() -> None:
+    robot = read_description(BALLOON)
+    model = robot.load_model()
+    armature = model.dof_armature + 1e-3
+    found = Simulator(robot).with_fields({"dof_armature": jnp.asarray(armature)}).model
+    expected = compiled(robot, {"dof_armature": armature})
+    for name in DERIVED:
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-3, atol=1e-6, err_msg=name)
+    assert np.abs(expected.dof_invweight0 / model.dof_invweight0 - 1).max() > 0.01
+
+
 def test_constants_of_unaltered_masses_are_the_models_own() -> None:
     robot = load_robot()
     model = robot.load_model()

@@ -1,0 +1,145 @@
+"""Identification of the parameters that a robot's description declares, from recordings to a report."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import jax.numpy as jnp
+import mujoco
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.identification.fit_report import fit_details, fit_table
+from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, Visibility, check_fit_config, fit_robot
+from ballu_mjx.identification.guard import HORIZONS, Choice, choose_actuators
+from ballu_mjx.identification.parameters import IdentifiedParameters, declared_parameters
+from ballu_mjx.identification.residuals import (
+    MeasuredMotion,
+    SamplingConfig,
+    check_sampling_config,
+    held_motion,
+    measure,
+    measured_from_motion,
+)
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.robots.adapter import IdentificationProgress, IdentifiedActuators
+from ballu_mjx.robots.description import RobotDescription
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class IdentifiedByFit(IdentifiedActuators):
+    """Identified values of declared parameters, with the whole fit.
+
+    **Fields**
+
+    - `fit`: values, errors, held-out windows.
+    - `held_out`: motions that the held-out windows are of.
+    - `choice`: replay of the validation recordings with nominal and with identified values; None: there were none, or
+      none as long as a second.
+    """
+
+    fit: RobotFit
+    held_out: tuple[MeasuredMotion, ...]
+    choice: Choice | None
+
+
+def check_recordings(robot: RobotDescription, recordings: Mapping[Path, Recording], window_seconds: float) -> str:
+    """Check that recordings can be measured, some as long as a window, and are of one specimen, whose name is returned.
+
+    **Raises** `InputError` naming the file and the fix.
+    """
+    specimens = {recording.robot: path for path, recording in recordings.items()}
+    if len(specimens) != 1:
+        raise InputError(f"The recordings are of several robots ({', '.join(sorted(specimens))}); give those of one.")
+    for path, recording in recordings.items():
+        if recording.kind != "free" and not robot.anchored:
+            raise InputError(
+                f"{path}: is a suspended recording, and {robot.model.name} has a free joint; give free ones, or a "
+                "model whose root is held."
+            )
+    if all(recording.time[-1] - recording.time[0] < window_seconds for recording in recordings.values()):
+        first = next(iter(recordings))
+        raise InputError(f"{first}: no recording lasts {window_seconds:g} s; give longer ones, or --window-seconds.")
+    return next(iter(specimens))
+
+
+def recorded_motion(
+    recording: Recording, robot: RobotDescription, model: mujoco.MjModel, sampling: SamplingConfig | None = None
+) -> Motion:
+    """Return a recording's states at the control rate: as measured where all joints of a robot whose root is held are,
+    else reconstructed."""
+    if _is_measured(recording, model):
+        return held_motion(recording, robot, model, sampling)
+    return reconstruct(recording, robot, model)
+
+
+def measure_recording(
+    recording: Recording, robot: RobotDescription, model: mujoco.MjModel, sampling: SamplingConfig | None = None
+) -> MeasuredMotion:
+    """Return a recording as identification takes it: as measured where all joints of a robot whose root is held are,
+    else reconstructed.
+
+    **Raises** `InputError` naming the joint that was not recorded, or a recording that is too short.
+    """
+    if _is_measured(recording, model):
+        return measure(recording, robot, model, sampling)
+    return measured_from_motion(reconstruct(recording, robot, model), model)
+
+
+def _is_measured(recording: Recording, model: mujoco.MjModel) -> bool:
+    """Return whether the joints of a recording are its states, or else must be."""
+    joints = {model.joint(number).name for number in range(model.njnt)}
+    return joints <= set(recording.joint_angles) or recording.kind == "suspended"
+
+
+def identify_declared(
+    recordings: Mapping[Path, Recording],
+    robot: RobotDescription,
+    config: FitConfig | None = None,
+    sampling: SamplingConfig | None = None,
+    validation: Mapping[Path, Recording] | None = None,
+    progress: IdentificationProgress | None = None,
+    on_data_check: Callable[[Visibility], None] | None = None,
+) -> IdentifiedByFit:
+    """Identify the parameters that `robot` declares.
+
+    **Arguments**
+
+    - `recordings`, `validation`: by file. Validation recordings have no part in the fit; without any, every fourth
+      window is held out.
+    - `sampling`: of recordings of a robot whose root is held.
+    - `progress`: is told of every iteration, `on_data_check` before the search of which parameters the data show.
+
+    **Raises** `InputError` for options out of range, recordings that cannot be used, and declarations that do not fit
+    the model.
+    """
+    config, sampling, validation = config or FitConfig(), sampling or SamplingConfig(), validation or {}
+    check_fit_config(config)
+    check_sampling_config(sampling)
+    specimen = check_recordings(robot, {**recordings, **validation}, config.window_seconds)
+    model = robot.load_model()
+    parameters = declared_parameters(robot, model)
+    training, held = (
+        [measure_recording(each, robot, model, sampling) for each in group.values()]
+        for group in (recordings, validation)
+    )
+    fit = fit_robot(parameters, training, held or None, config, progress, on_data_check)
+    identified = IdentifiedParameters(jnp.asarray(fit.values), parameters)
+    motions = [recorded_motion(each, robot, model, sampling) for each in validation.values()]
+    long_enough = [motion for motion in motions if motion.time[-1] >= min(HORIZONS)]
+    choice = choose_actuators(robot, identified, long_enough) if long_enough else None
+    report = fit_table(fit, model, config.window_seconds, "validation recordings" if held else "the same recordings")
+    if choice is not None:
+        report += f"\n\nOpen-loop replay of the validation recordings:\n{choice.table()}"
+    return IdentifiedByFit(
+        robot=specimen,
+        parameters=identified,
+        report=report,
+        details=fit_details(fit, model),
+        fit=fit,
+        held_out=tuple(held or training),
+        choice=choice,
+    )

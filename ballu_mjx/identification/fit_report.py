@@ -1,0 +1,145 @@
+"""What came out of a fit of declared parameters: as text, as JSON's types, and as arrays for figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ballu_mjx.identification.fit_robot import HeldOut, RobotFit
+
+_NORMAL_95 = 1.96
+"""Standard errors to either side of a 95 % interval."""
+
+
+def intervals(fit: RobotFit) -> Float[np.ndarray, "parameters 2"]:
+    """Return 95 % intervals by the robust standard errors, cut at the bounds."""
+    half = _NORMAL_95 * fit.standard_errors
+    both = np.stack([fit.values - half, fit.values + half], axis=1)
+    return np.clip(both, fit.parameters.lower[:, None], fit.parameters.upper[:, None])
+
+
+def channel_names(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Return what the channels of a motion are called: one name for each direction of `qvel`."""
+    names = []
+    for number in range(model.njnt):
+        joint = model.joint(number)
+        if model.jnt_type[number] == mujoco.mjtJoint.mjJNT_FREE:
+            names += [f"root {axis}" for axis in ("x", "y", "z", "rotation x", "rotation y", "rotation z")]
+        else:
+            names.append(joint.name)
+    return tuple(names)
+
+
+def angular_channels(model: mujoco.MjModel) -> np.ndarray:
+    """Return which channels are in rad; the others are in m."""
+    kinds = []
+    for kind in model.jnt_type:
+        free = kind == mujoco.mjtJoint.mjJNT_FREE
+        kinds += [False] * 3 + [True] * 3 if free else [kind == mujoco.mjtJoint.mjJNT_HINGE]
+    return np.array(kinds, bool)
+
+
+def channel_scales(model: mujoco.MjModel) -> tuple[Float[np.ndarray, " channels"], tuple[str, ...]]:
+    """Return what turns channels of positions into degrees and millimetres, and these units."""
+    angular = angular_channels(model)
+    return np.where(angular, 180 / np.pi, 1e3), tuple("deg" if each else "mm" for each in angular)
+
+
+def autocorrelation(errors: Float[np.ndarray, "windows samples channels"]) -> Float[np.ndarray, "lags channels"]:
+    """Return the correlation of errors with those so many samples later in the same window, from lag 0 to half a
+    window; the errors' mean is not taken off, so that a constant error correlates fully. Windows that diverged are left
+    out."""
+    kept = errors[np.isfinite(errors).all(axis=(1, 2))]
+    samples = errors.shape[1]
+    power = np.mean(kept**2, axis=(0, 1)) + np.finfo(float).tiny
+    lags = range(samples // 2 + 1)
+    return np.stack([np.mean(kept[:, : samples - lag] * kept[:, lag:], axis=(0, 1)) / power for lag in lags])
+
+
+def fit_table(fit: RobotFit, model: mujoco.MjModel, window_seconds: float, held_out: str) -> str:
+    """Return values, standard errors, what the data leave open, and errors on held-out windows, in words.
+
+    `held_out` says which recordings the windows are of.
+    """
+    parameters = fit.parameters
+    width = max(map(len, (*parameters.names, "parameter"))) + 2
+    lines = [f"{'parameter':{width}}{'nominal':>10}{'identified':>12}{'standard error':>16}{'95 % interval':>24}  unit"]
+    for place, (one, (low, high)) in enumerate(zip(parameters.parameters, intervals(fit), strict=True)):
+        notes = [
+            note
+            for note, names in (("not shown by the data", fit.unseen), ("at a bound", fit.at_bounds))
+            if one.name in names
+        ]
+        cells = f"{one.nominal:>10.4g}{fit.values[place]:>12.4g}{fit.standard_errors[place]:>16.2g}"
+        interval = f"{low:.4g} to {high:.4g}"
+        lines.append(f"{one.name:{width}}{cells}{interval:>24}  {one.unit or '1'} {'; '.join(notes)}".rstrip())
+    lines.append("")
+    lines += [f"Not determined: {direction}." for direction in fit.unidentified]
+    lines += [
+        f"{one} and {other} pass for each other (correlation {r:.2f})." for one, other, r in fit.strong_correlations
+    ]
+    median = float(np.median(fit.scatter))
+    lines.append(f"What is left on training windows is {median:.1f} times the assumed noise (median over channels).")
+    if median > _MUCH:
+        lines.append("The model leaves something out, or the assumed noise is too small.")
+    lines += ["", *_held_out_table(fit, model, window_seconds, held_out)]
+    return "\n".join(lines)
+
+
+_MUCH = 2.0
+
+
+def _held_out_table(fit: RobotFit, model: mujoco.MjModel, window_seconds: float, held_out: str) -> list[str]:
+    scales, units = channel_scales(model)
+    lines = [
+        f"Median error after {window_seconds:g} s on {len(fit.nominal.motion)} held-out windows of {held_out}:",
+        f"{'':24}{'nominal':>10}{'identified':>12}",
+    ]
+    pair = [each.final_median[: model.nv] * scales for each in (fit.nominal, fit.identified)]
+    for name, unit, one, other in zip(channel_names(model), units, *pair, strict=True):
+        lines.append(f"{name:24}{one:>10.3g}{other:>12.3g} {unit}")
+    verdict = "better" if fit.improves else "WORSE"
+    scores = f"{fit.identified.score:.3g} and {fit.nominal.score:.3g} times the noise"
+    lines.append(f"Identified values replay them {verdict} than nominal ones: errors are {scores}.")
+    return lines
+
+
+def fit_details(fit: RobotFit, model: mujoco.MjModel) -> dict[str, Any]:
+    """Return a fit as JSON's types: parameters with intervals, what is not determined, errors on held-out windows."""
+    rows = []
+    for place, (one, (low, high)) in enumerate(zip(fit.parameters.parameters, intervals(fit), strict=True)):
+        rows.append(
+            {
+                "name": one.name,
+                "unit": one.unit,
+                "nominal": one.nominal,
+                "value": float(fit.values[place]),
+                "standard_error": float(fit.standard_errors[place]),
+                "white_noise_error": float(fit.white_noise_errors[place]),
+                "interval": [float(low), float(high)],
+                "bounds": list(one.bounds),
+                "seen": one.name not in fit.unseen,
+                "at_bound": one.name in fit.at_bounds,
+            }
+        )
+    return {
+        "parameters": rows,
+        "not_determined": list(fit.unidentified),
+        "correlations": [list(pair) for pair in fit.strong_correlations],
+        "scatter": [float(x) for x in fit.scatter],
+        "held_out": {name: _held_out(each, model) for name, each in _pair(fit).items()},
+        "improves": fit.improves,
+    }
+
+
+def _pair(fit: RobotFit) -> Mapping[str, HeldOut]:
+    return {"nominal": fit.nominal, "identified": fit.identified}
+
+
+def _held_out(found: HeldOut, model: mujoco.MjModel) -> dict[str, Any]:
+    final = dict(zip(channel_names(model), map(float, found.final_median[: model.nv]), strict=True))
+    return {"score": found.score, "windows": len(found.motion), "final_median": final}

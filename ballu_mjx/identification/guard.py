@@ -1,0 +1,251 @@
+"""Whether identified actuators help: recordings replayed open loop with nominal and with identified ones.
+
+Replays are C MuJoCo's, which need no compiling. Recordings must be ones that neither the identification nor a final
+test uses: the validation recordings.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import jax.numpy as jnp
+import mujoco
+import mujoco.rollout
+import numpy as np
+from jaxtyping import Float, Int
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.groups import group_of
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.model import ModelParameters, bare_parameters
+from ballu_mjx.sim.drivetrain import count_slots, drivetrain_of, filter_commands
+from ballu_mjx.sim.step import count_substeps
+
+HORIZONS = (1.0, 5.0)
+"""Seconds over which errors are taken, where recordings are as long."""
+START_INTERVAL = 1.0
+"""Seconds between two starts in the same recording."""
+
+Quantity = Literal["position", "joints"]
+
+
+class ReplayErrors(NamedTuple):
+    """Root mean square errors over a horizon: means over the starts that did not diverge, inf where all did."""
+
+    position: float
+    """Of the tracked site (m)."""
+    joints: float
+    """Of the robot's recorded hinges (rad); not a number where it has none."""
+    diverged: int
+    """Starts."""
+
+
+class ReplayRow(NamedTuple):
+    """A group of recordings over a horizon."""
+
+    group: str
+    horizon: float
+    """s."""
+    starts: int
+    nominal: ReplayErrors
+    identified: ReplayErrors
+
+    def ratio(self, quantity: Quantity) -> float:
+        """Return identified over nominal error; inf where more starts diverge."""
+        if self.identified.diverged > self.nominal.diverged:
+            return np.inf
+        one, other = getattr(self.identified, quantity), getattr(self.nominal, quantity)
+        return float(max(one, _LEAST) / max(other, _LEAST)) if np.isfinite(other) else 1.0
+
+
+_LEAST = 1e-6
+_SCALES: Mapping[Quantity, float] = {"position": 1.0, "joints": 180 / np.pi}
+_WORDS: Mapping[Quantity, str] = {"position": "position", "joints": "joint angles"}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Choice:
+    """Which of nominal and identified actuators replay recordings better."""
+
+    identified: ModelParameters
+    rows: tuple[ReplayRow, ...]
+    decides: Quantity
+    """What the choice is made by: the tracked site's position; of a robot without a free joint, the joints."""
+
+    @property
+    def ratio(self) -> float:
+        """Return the geometric mean over groups and horizons of identified over nominal error."""
+        return float(np.exp(np.mean(np.log([row.ratio(self.decides) for row in self.rows]))))
+
+    @property
+    def improves(self) -> bool:
+        """Return whether the identified actuators replay the recordings better."""
+        return self.ratio < 1
+
+    @property
+    def actuators(self) -> ModelParameters | None:
+        """Return the better actuators; None: the nominal ones."""
+        return self.identified if self.improves else None
+
+    @property
+    def worse(self) -> tuple[str, ...]:
+        """Return where identified actuators are worse, in words: one entry for each group, horizon and quantity."""
+        return tuple(
+            f"{words} of {row.group} recordings over {row.horizon:g} s ({row.ratio(quantity):.2f} times the error)"
+            for row in self.rows
+            for quantity, words in _WORDS.items()
+            if row.ratio(quantity) > 1
+        )
+
+    def table(self) -> str:
+        """Return errors and verdict as text."""
+        lines = [
+            f"{'':8}{'horizon':>8}{'':8} | {'position RMSE (m)':^30} | {'joint RMSE (deg)':^30}",
+            f"{'group':8}{'(s)':>8}{'starts':>8}" + f" | {'nominal':>10}{'identified':>12}{'ratio':>8}" * 2,
+        ]
+        for row in self.rows:
+            cells = []
+            for quantity, scale in _SCALES.items():
+                pair = [getattr(errors, quantity) * scale for errors in (row.nominal, row.identified)]
+                given = not np.isnan(pair[0])
+                digits = 4 if quantity == "position" else 2
+                cell = f"{pair[0]:>10.{digits}f}{pair[1]:>12.{digits}f}{row.ratio(quantity):>8.2f}"
+                cells.append(cell if given else f"{'none':>10}{'none':>12}{'':>8}")
+            lines.append(f"{row.group:8}{row.horizon:>8g}{row.starts:>8} | {' | '.join(cells)}")
+            if row.nominal.diverged or row.identified.diverged:
+                lost = f"{row.nominal.diverged} nominal, {row.identified.diverged} identified"
+                lines.append(f"{'':24} | diverged: {lost}")
+        better = "better" if self.improves else "WORSE"
+        what = {"position": "position", "joints": "joint"}[self.decides]
+        lines.append(
+            f"Identified actuators are {better} than nominal: {self.ratio:.2f} times the {what} error on average."
+        )
+        lines += [f"Identification is worse in: {place}." for place in self.worse]
+        return "\n".join(lines)
+
+
+def choose_actuators(
+    robot: RobotDescription,
+    actuators: ModelParameters,
+    motions: Sequence[Motion],
+    horizons: Sequence[float] = HORIZONS,
+) -> Choice:
+    """Replay recorded motions with nominal and with identified actuators, and say which are better.
+
+    Each motion is started afresh every second from its recorded states. Both replays start from the same states; of
+    joints that nothing measures, these may hold what one of the models says.
+
+    **Raises** `InputError` where no motion is as long as the shortest horizon (s).
+    """
+    identified = bare_parameters(actuators)
+    assert identified is not None, "There are no actuators to choose."
+    lasting = [h for h in horizons if any(len(_starts(motion, h, robot)) for motion in motions)]
+    if not lasting:
+        names = ", ".join(motion.name for motion in motions)
+        raise InputError(f"{names}: no validation recording lasts {min(horizons):g} s; give longer ones.")
+    both = [_replay(robot, parameters, motions, lasting) for parameters in (None, identified)]
+    rows = []
+    for group in dict.fromkeys(group_of(motion.name) for motion in motions):
+        for horizon in lasting:
+            pair = [found.get((group, horizon)) for found in both]
+            if pair[0] is not None and pair[1] is not None:
+                rows.append(ReplayRow(group, horizon, len(pair[0]), _summary(pair[0]), _summary(pair[1])))
+    by_joints = robot.anchored and not np.isnan(rows[0].nominal.joints)
+    return Choice(identified, tuple(rows), "joints" if by_joints else "position")
+
+
+def _starts(motion: Motion, horizon: float, robot: RobotDescription) -> Int[np.ndarray, " starts"]:
+    """Return the control steps that a motion is started in to be followed over a horizon (s)."""
+    steps, every = (round(seconds / robot.control_timestep) for seconds in (horizon, START_INTERVAL))
+    return np.arange(0, len(motion.command) - steps + 1, max(every, 1))
+
+
+def _summary(errors: Float[np.ndarray, "starts 2"]) -> ReplayErrors:
+    kept = errors[np.isfinite(errors[:, 0])]
+    position, joints = kept.mean(axis=0) if len(kept) else (np.inf, np.inf)
+    return ReplayErrors(float(position), float(joints), len(errors) - len(kept))
+
+
+def _replay(
+    robot: RobotDescription, parameters: ModelParameters | None, motions: Sequence[Motion], horizons: Sequence[float]
+) -> dict[tuple[str, float], Float[np.ndarray, "starts 2"]]:
+    """Return position and joint error of every start, by group and horizon; inf where it diverged."""
+    model = robot.load_model(parameters)
+    substeps = count_substeps(model, robot.control_timestep)
+    found: dict[tuple[str, float], list[np.ndarray]] = {}
+    for motion in motions:
+        starts = _starts(motion, min(horizons), robot)
+        if not len(starts):
+            continue
+        steps = min(round(max(horizons) / robot.control_timestep), len(motion.command))
+        ctrl = _ctrl(parameters, motion.command, substeps, float(model.opt.timestep))
+        qpos, intact = _simulate(model, motion, starts, ctrl, steps, substeps)
+        ways = [_look(model, robot, each) for each in (motion.qpos, qpos.reshape(-1, model.nq))]
+        (recorded, angles), (position, joints) = ways
+        position, joints = position.reshape(len(starts), steps, 3), joints.reshape(len(starts), steps, -1)
+        for horizon in horizons:
+            count = round(horizon / robot.control_timestep)
+            errors = []
+            for run, start in enumerate(starts):
+                if start + count > len(motion.command):
+                    continue
+                later = slice(start + 1, start + count + 1)
+                far = np.sqrt(np.mean(np.sum((position[run, :count] - recorded[later]) ** 2, axis=1)))
+                turned = joints[run, :count] - angles[later]
+                turn = np.sqrt(np.mean(turned**2)) if turned.size else np.nan
+                errors.append([far, turn] if intact[run, :count].all() else [np.inf, np.inf])
+            if errors:
+                found.setdefault((group_of(motion.name), horizon), []).extend(map(np.array, errors))
+    return {key: np.array(errors) for key, errors in found.items()}
+
+
+def _ctrl(
+    parameters: ModelParameters | None, commands: Float[np.ndarray, "steps commands"], substeps: int, timestep: float
+) -> Float[np.ndarray, "physics commands"]:
+    """Return what the actuators get in each physics step, the drivetrain at rest before the first."""
+    fine, drivetrain = np.repeat(commands, substeps, axis=0), drivetrain_of(parameters)
+    if drivetrain is None:
+        return fine
+    slots = count_slots(float(np.max(drivetrain.delay)), timestep)
+    return np.asarray(filter_commands(drivetrain, jnp.asarray(fine, jnp.float32), timestep, slots), np.float64)
+
+
+def _simulate(
+    model: mujoco.MjModel,
+    motion: Motion,
+    starts: Int[np.ndarray, " starts"],
+    ctrl: Float[np.ndarray, "physics commands"],
+    steps: int,
+    substeps: int,
+) -> tuple[Float[np.ndarray, "starts steps nq"], np.ndarray]:
+    """Return generalized positions after each control step, and whether the simulation was intact by then."""
+    data, kind = mujoco.MjData(model), mujoco.mjtState.mjSTATE_FULLPHYSICS
+    initial = np.zeros((len(starts), mujoco.mj_stateSize(model, kind)))
+    for row, start in zip(initial, starts, strict=True):
+        data.qpos[:], data.qvel[:] = motion.qpos[start], motion.qvel[start]
+        mujoco.mj_getState(model, data, row, kind)
+    place = np.minimum(starts[:, None] * substeps + np.arange(steps * substeps), len(ctrl) - 1)
+    state, _ = mujoco.rollout.rollout(model, data, initial, ctrl[place])
+    after = np.asarray(state, float)[:, substeps - 1 :: substeps]
+    # MuJoCo begins anew where a simulation breaks down, and its clock with it.
+    expected = np.arange(1, steps + 1) * substeps * model.opt.timestep
+    intact = np.isfinite(after).all(axis=2) & (np.abs(after[..., 0] - expected) < 1e-6 * expected)
+    return after[..., 1 : 1 + model.nq], intact
+
+
+def _look(
+    model: mujoco.MjModel, robot: RobotDescription, qpos: Float[np.ndarray, "states nq"]
+) -> tuple[Float[np.ndarray, "states 3"], Float[np.ndarray, "states hinges"]]:
+    """Return the tracked site's place (m), and the recorded hinges' angles (rad)."""
+    data, site = mujoco.MjData(model), model.site(robot.tracked).id
+    position = np.zeros((len(qpos), 3))
+    for number, row in enumerate(qpos):
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        position[number] = data.site_xpos[site]
+    joints = [model.joint(name) for name in robot.joints]
+    hinges = [int(j.qposadr[0]) for j in joints if j.type[0] == mujoco.mjtJoint.mjJNT_HINGE]
+    return position, qpos[:, hinges]

@@ -1,0 +1,147 @@
+"""`train sysid` for a robot that declares what to identify, and what other commands make of the result."""
+
+import contextlib
+import io
+import json
+import shutil
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from servo_arm import IDENTIFY, TRUTH, identified, record_arm, write_arm
+
+from ballu_mjx.cli import train
+from ballu_mjx.cli._residual import prepare
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.identification.actuators import ACTUATORS_FILE, read_actuators, validation_ratio
+from ballu_mjx.identification.parameters import IdentifiedParameters
+from ballu_mjx.identification.write_back import identified_to_json
+from ballu_mjx.residuals.dataset import RecordingsData
+from ballu_mjx.residuals.run_config import describe_run, run_actuators
+from ballu_mjx.robots.description import RobotDescription, read_description
+from ballu_mjx.robots.model import same_parameters
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
+    """The arm, with recordings beside it."""
+    folder = tmp_path_factory.mktemp("arm")
+    robot = write_arm(folder)
+    for use, seed in (("training", 0), ("validation", 1)):
+        (folder / use).mkdir()
+        record_arm(folder / use, robot, f"motion-{seed}", seed)
+    (folder / "sweep").mkdir()
+    record_arm(folder / "sweep", robot, "sweep", 0, "suspended")
+    return robot
+
+
+@pytest.fixture(scope="module")
+def run(robot: RobotDescription) -> tuple[Path, str]:
+    """A run of sysid, and what it printed."""
+    folder, printed = robot.file.parent, io.StringIO()
+    arguments = ["sysid", "--robot", robot.file, "--recordings", folder / "sweep", "--output", folder / "run"]
+    arguments += ["--validation", folder / "validation", "--starts", "2", "--steps", "12"]
+    with contextlib.redirect_stdout(printed):
+        assert train.main(list(map(str, arguments))) == 0
+    return folder / "run", printed.getvalue()
+
+
+def test_the_arm_is_identified_and_everything_is_written(robot: RobotDescription, run: tuple[Path, str]):
+    folder, printed = run
+    name, found = read_actuators(robot, folder / ACTUATORS_FILE)
+    assert name == "arm" and isinstance(found, IdentifiedParameters)
+    assert 0 < (validation_ratio(folder / ACTUATORS_FILE) or 0) < 0.2
+    for parameter, value in zip(found.declared.names, np.asarray(found.values), strict=True):
+        assert value == pytest.approx(TRUTH[parameter], rel=0.1), parameter
+    assert "these recordings show all 5 parameters" in printed
+    assert printed.count("better than nominal") == 2
+    assert (folder / "identification.txt").read_text().strip() in printed
+    details = json.loads((folder / "identification.json").read_text())
+    for row in details["parameters"]:
+        low, high = row["interval"]
+        assert low <= row["value"] <= high and row["seen"] and not row["at_bound"]
+    assert details["held_out"]["identified"]["score"] < 0.3 * details["held_out"]["nominal"]["score"]
+    model = mujoco.MjModel.from_xml_path(str(folder / "identified.xml"))
+    assert model.body("lower").mass[0] == pytest.approx(
+        float(found.values[found.declared.names.index("mass")]), rel=1e-4
+    )
+    for figure in ("held_out.png", "residual_autocorrelation.png", "parameters.png"):
+        assert (folder / figure).stat().st_size > 5000
+    page = (folder / "report.html").read_text()
+    assert "shoulder_backlash" in page and "95 % from" in page and "held_out.png" in page
+    assert any("search" in json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines())
+
+
+def dataset(robot: RobotDescription, **options: Path) -> RecordingsData:
+    folder = robot.file.parent
+    parts = {"recordings": (folder / "training",), "validation": (folder / "validation",), "robot": str(robot.file)}
+    return RecordingsData(**parts, output=folder / "out", **options)  # pyright: ignore[reportArgumentType]
+
+
+def test_auto_takes_identified_actuators_where_they_replay_better(
+    robot: RobotDescription, run: tuple[Path, str], capsys: pytest.CaptureFixture
+):
+    beside = robot.file.parent / ACTUATORS_FILE
+    shutil.copy(run[0] / ACTUATORS_FILE, beside)
+    try:
+        prepared = prepare("supervised", dataset(robot))
+        assert prepared.simulator.drivetrain is not None and "better than nominal" in capsys.readouterr().out
+        stored = describe_run("supervised", {}, {}, [], prepared.dataset.identified, robot)
+        again = run_actuators(json.loads(json.dumps(stored, default=str)), robot.file.parent, robot)
+        assert same_parameters(again, prepared.dataset.identified)
+
+        beside.write_text(identified_to_json(robot, identified(robot, shoulder_scale=1.4, mass=0.08)))
+        prepared = prepare("supervised", dataset(robot))
+        printed = capsys.readouterr().out
+        assert prepared.dataset.identified is None and prepared.simulator.drivetrain is None
+        assert "WORSE than nominal" in printed and "Nominal actuators are taken" in printed
+        prepared = prepare("supervised", dataset(robot, actuators=beside))  # what is asked for is done
+        assert prepared.dataset.identified is not None and "WORSE than nominal" in capsys.readouterr().out
+        prepared = prepare("supervised", dataset(robot, actuators=Path("nominal")))
+        assert prepared.dataset.identified is None and "than nominal" not in capsys.readouterr().out
+    finally:
+        beside.unlink()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--objective", "hausdorff"], "--objective is for BALLU's legs"),
+        (["--levels", "5"], "--levels is for BALLU's legs"),
+        (["--window-seconds", "0"], "--window-seconds is 0.0: it must be above 0"),
+        (["--angle-noise", "-1"], "--angle-noise is -1.0: it must be above 0"),
+        (["--validation", "{training}"], "is among --recordings and --validation"),
+        (["--window-seconds", "60"], "no recording lasts 60 s"),
+    ],
+)
+def test_what_does_not_fit_is_refused(
+    robot: RobotDescription, capsys: pytest.CaptureFixture, arguments: list[str], says: str
+):
+    folder = robot.file.parent
+    line = ["sysid", "--robot", str(robot.file), "--recordings", str(folder / "training")]
+    line += ["--output", str(folder / "refused")]
+    assert train.main([*line, *(a.format(training=folder / "training") for a in arguments)]) == 2
+    assert says in capsys.readouterr().err
+    assert not (folder / "refused").exists()
+
+
+def test_options_of_declared_parameters_do_not_go_with_a_method_of_its_own(capsys: pytest.CaptureFixture):
+    assert train.main(["sysid", "--window-seconds", "2"]) == 2
+    assert (
+        "--window-seconds is for declared parameters; ballu has a method of its own" in capsys.readouterr().err.lower()
+    )
+
+
+def test_a_file_of_another_declaration_is_refused(robot: RobotDescription, tmp_path: Path):
+    path = tmp_path / "actuators.json"
+    path.write_text(identified_to_json(robot, identified(robot, **TRUTH)))
+    content = json.loads(robot.file.read_text()) | {"identify": IDENTIFY[:2], "model": str(robot.model)}
+    other = tmp_path / "other.robot.json"
+    other.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"actuators.json: other.robot.json identifies no shoulder_delay"):
+        read_actuators(read_description(other), path)
+    del content["identify"]
+    other.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="the actuators of arm cannot be identified yet"):
+        read_actuators(read_description(other), path)

@@ -1,0 +1,63 @@
+"""Which of nominal and identified actuators is taken, and what the user is told."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from servo_arm import TRUTH, identified, true_path, wandering, write_arm
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.identification.guard import choose_actuators
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.robots.description import RobotDescription
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
+    return write_arm(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def motions(robot: RobotDescription) -> list[Motion]:
+    found = []
+    for name, seed, steps in (("near-1", 0, 60), ("far-1", 1, 110)):
+        commands = wandering(seed, steps)
+        qpos, qvel = true_path(robot, identified(robot, **TRUTH), commands)
+        states = (np.concatenate([np.zeros((1, 2)), x[9::10]]) for x in (qpos, qvel))
+        found.append(Motion(name, np.arange(steps + 1) * 0.05, commands, *states, residual_mm={}))
+    return found
+
+
+def test_what_replays_better_is_taken(robot: RobotDescription, motions: list[Motion]):
+    truth = identified(robot, **TRUTH)
+    choice = choose_actuators(robot, truth, motions)
+    assert choice.improves and choice.actuators is truth and choice.ratio < 0.1
+    assert choice.decides == "joints" and not choice.worse
+    assert [(row.group, row.horizon, row.starts) for row in choice.rows] == [
+        ("near", 1.0, 3),
+        ("far", 1.0, 5),
+        ("far", 5.0, 1),
+    ]
+    # From its own states, the true arm's motion comes back, but for the drivetrain's unknown state at later starts.
+    assert choice.rows[2].identified.joints < 0.01 * choice.rows[2].nominal.joints
+    assert "better than nominal" in choice.table() and "WORSE" not in choice.table()
+
+
+def test_identification_that_makes_it_worse_is_named_and_left(robot: RobotDescription, motions: list[Motion]):
+    choice = choose_actuators(robot, identified(robot, shoulder_scale=1.4, mass=0.08), motions)
+    assert not choice.improves and choice.actuators is None and choice.ratio > 1.2
+    assert any(text.startswith("joint angles of near recordings over 1 s") for text in choice.worse)
+    assert "WORSE than nominal" in choice.table()
+
+
+def test_more_divergence_is_never_better(robot: RobotDescription, motions: list[Motion]):
+    choice = choose_actuators(robot, identified(robot, **TRUTH), motions)
+    lost = [row._replace(identified=row.identified._replace(diverged=1)) for row in choice.rows]
+    assert not dataclasses.replace(choice, rows=tuple(lost)).improves
+
+
+def test_recordings_that_are_too_short_are_refused(robot: RobotDescription, motions: list[Motion]):
+    motion = motions[0]
+    short = dataclasses.replace(motion, command=motion.command[:10], qpos=motion.qpos[:11], qvel=motion.qvel[:11])
+    with pytest.raises(InputError, match=r"near-1: no validation recording lasts 1 s"):
+        choose_actuators(robot, identified(robot, **TRUTH), [short])

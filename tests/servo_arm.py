@@ -1,0 +1,125 @@
+"""A two-joint servo arm on a stand, and its true self in C MuJoCo: other numbers, and a drivetrain that a model of the
+arm does not have."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ballu_mjx.identification.parameters import IdentifiedParameters, declared_parameters
+from ballu_mjx.robots.description import RobotDescription, read_description
+from ballu_mjx.sim.drivetrain import count_slots, filter_commands
+
+_MODEL = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="0.005" integrator="implicitfast" iterations="6" ls_iterations="10"/>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <joint name="shoulder" axis="0 1 0" damping="0.2" armature="0.01" range="-2 2"/>
+      <inertial pos="0 0 -0.1" mass="0.3" diaginertia="0.002 0.002 0.0003"/>
+      <site name="tip" pos="0 0 -0.2"/>
+      <body name="lower" pos="0 0 -0.2">
+        <joint name="elbow" axis="0 1 0" damping="0.1" armature="0.005" range="-2 2"/>
+        <inertial pos="0 0 -0.08" mass="0.15" diaginertia="0.0006 0.0006 0.0001"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="one" joint="shoulder" kp="6" kv="0.1" ctrlrange="-1 1"/>
+    <position name="two" joint="elbow" kp="4" kv="0.1" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>
+"""
+IDENTIFY = [
+    {"joint": "elbow", "field": "damping", "bounds": [0.01, 1]},
+    {"body": "lower", "field": "mass", "name": "mass"},
+    *({"command": "shoulder", "field": field} for field in ("delay", "backlash", "scale")),
+]
+TRUTH = {
+    "elbow_damping": 0.18,
+    "mass": 0.2,
+    "shoulder_delay": 0.073,
+    "shoulder_backlash": 0.12,
+    "shoulder_scale": 0.8,
+}
+
+
+def write_arm(folder: Path, model: str = _MODEL) -> RobotDescription:
+    """Return the description, written to `folder` with its model."""
+    (folder / "arm.xml").write_text(model)
+    content = {
+        "format": "ballu-robot/1",
+        "name": "arm",
+        "model": "arm.xml",
+        "tracked": "tip",
+        "points": [],
+        "commands": {"shoulder": "one", "elbow": "two"},
+        "joints": ["shoulder", "elbow"],
+        "identify": IDENTIFY,
+    }
+    (folder / "arm.robot.json").write_text(json.dumps(content))
+    return read_description(folder / "arm.robot.json")
+
+
+def identified(robot: RobotDescription, **values: float) -> IdentifiedParameters:
+    """Return the nominal parameters, but for `values`."""
+    declared = declared_parameters(robot, robot.load_model())
+    vector = declared.nominal.copy()
+    for name, value in values.items():
+        vector[declared.names.index(name)] = value
+    return IdentifiedParameters(jnp.asarray(vector), declared)
+
+
+def wandering(seed: int, steps: int, hold: int = 5) -> Float[np.ndarray, "steps 2"]:
+    """Return commands at the control rate, each held for `hold` control steps, with four decimals."""
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.uniform(-1, 1, (steps // hold + 1, 2)), hold, axis=0)[:steps].round(4)
+
+
+def true_path(
+    robot: RobotDescription, parameters: IdentifiedParameters, commands: Float[np.ndarray, "steps 2"]
+) -> tuple[Float[np.ndarray, "physics 2"], Float[np.ndarray, "physics 2"]]:
+    """Return qpos and qvel after each physics step of C MuJoCo, from the rest pose, 10 physics steps to a command."""
+    model = robot.load_model(parameters)
+    model.opt.iterations, model.opt.tolerance = 50, 0
+    timestep = float(model.opt.timestep)
+    with jax.enable_x64(True):
+        fine = jnp.asarray(np.repeat(commands, 10, axis=0))
+        ctrl = np.asarray(filter_commands(parameters.drivetrain(), fine, timestep, count_slots(0.1, timestep)))
+    data = mujoco.MjData(model)
+    states = []
+    for now in ctrl:
+        data.ctrl[:] = now
+        mujoco.mj_step(model, data)
+        states.append((data.qpos.copy(), data.qvel.copy()))
+    qpos, qvel = zip(*states, strict=True)
+    return np.array(qpos), np.array(qvel)
+
+
+def record_arm(folder: Path, robot: RobotDescription, name: str, seed: int, kind: str = "free") -> Path:
+    """Write a recording of 6 s of the true arm at 100 Hz, with 0.2 deg of noise; suspended ones hold joints alone."""
+    seconds, free = 6.0, kind == "free"
+    commands = wandering(seed, round(seconds / 0.05), hold=8)
+    qpos, _ = true_path(robot, identified(robot, **TRUTH), commands)
+    qpos = np.concatenate([np.zeros((1, 2)), qpos[:-1]])[::2]
+    rng = np.random.default_rng(seed)
+    places = "tip_x,tip_y,tip_z,tip_qw,tip_qx,tip_qy,tip_qz," if free else ""
+    rows = [f"time,command_shoulder,command_elbow,{places}shoulder,elbow"]
+    for sample, angles in enumerate(qpos):
+        half, turn = angles[0] / 2, angles[0]
+        tip = (-0.2 * np.sin(turn), 0, 1 - 0.2 * np.cos(turn), np.cos(half), 0, np.sin(half), 0)
+        measured = angles + np.deg2rad(0.2) * rng.normal(size=2)
+        cells = (sample * 0.01, *commands[sample // 5], *(tip if free else ()), *measured)
+        rows.append(",".join(f"{cell:.6f}" for cell in cells))
+    path = folder / f"{name}.csv"
+    path.write_text("\n".join(rows) + "\n")
+    keys = {"format": "ballu-recording/1", "kind": kind, "robot": "arm", "notes": ""}
+    path.with_suffix(".json").write_text(json.dumps(keys))
+    return path
