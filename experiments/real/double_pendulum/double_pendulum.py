@@ -20,9 +20,12 @@ import argparse
 import sys
 from pathlib import Path
 
-from ballu_mjx.common import runtime
+FOLDER = Path("experiments/real/double_pendulum") if "ipykernel" in sys.modules else Path(__file__).parent
+sys.path.append(str(FOLDER.parents[1]))
 
-runtime.prepare()
+import _setup
+
+_setup.prepare()
 
 import numpy as np
 
@@ -32,7 +35,6 @@ from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, c
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.description import read_description
 
-FOLDER = Path("experiments/real/double_pendulum") if "ipykernel" in sys.modules else Path(__file__).parent
 TRAINING = ("143339", "143524", "143601", "143704", "144115", "154220")
 VALIDATION = ("143747", "143906")
 TEST = ("144003", "154548")
@@ -103,7 +105,7 @@ def tip(angles: np.ndarray) -> np.ndarray:
 
 
 # %%
-if __name__ == "__main__":
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--quick", action="store_true")
@@ -131,3 +133,7 @@ if __name__ == "__main__":
         for name, errors in zip(points, found, strict=True):
             middle, most = np.percentile(tip_errors(errors, swing_ups, 0.4, 0.2), [50, 90])
             print(f"| {name} | {middle:.4f} | {most:.4f} |")
+
+
+if __name__ == "__main__":
+    _setup.run(main)

@@ -19,9 +19,12 @@ import argparse
 import sys
 from pathlib import Path
 
-from ballu_mjx.common import runtime
+FOLDER = Path("experiments/real/go1") if "ipykernel" in sys.modules else Path(__file__).parent
+sys.path.append(str(FOLDER.parents[1]))
 
-runtime.prepare()
+import _setup
+
+_setup.prepare()
 
 import mujoco
 import numpy as np
@@ -32,7 +35,6 @@ from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, m
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.robots.description import read_description
 
-FOLDER = Path("experiments/real/go1") if "ipykernel" in sys.modules else Path(__file__).parent
 LOADS = (0, 1, 2, 3)
 """kg; the last is the test."""
 SAMPLING = SamplingConfig(sample_timestep=0.016, angle_noise=np.deg2rad(0.1), position_window=0.08, rate_window=0.1)
@@ -73,7 +75,7 @@ def report(stage: str, iteration: int, steps: int, value: float) -> None:
 
 
 # %%
-if __name__ == "__main__":
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--quick", action="store_true")
@@ -92,3 +94,7 @@ if __name__ == "__main__":
     for kilograms in LOADS[-1:] if options.quick else LOADS:
         errors = mean_errors(fit, load(options.data, kilograms), [fit.parameters.nominal, published, fit.values])
         print(f"| {kilograms} | " + " | ".join(f"{x:.2f}" for x in errors.mean(axis=1)) + " |")
+
+
+if __name__ == "__main__":
+    _setup.run(main)
