@@ -1,4 +1,4 @@
-"""Start-up and end of an experiment, as a script or as a notebook: call `prepare` before imports that bring in JAX."""
+"""What experiments share, as scripts or as notebooks: call `prepare` before imports that bring in JAX."""
 
 from __future__ import annotations
 
@@ -23,6 +23,13 @@ def prepare() -> None:
     from ballu_mjx.common import runtime
 
     runtime.prepare()
+
+
+def write_table(text: str, folder: Path) -> None:
+    """Print a Markdown table, and write it to `table.md` in a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "table.md").write_text(text + "\n")
+    print(text)
 
 
 def run(main: Callable[[], None]) -> None:

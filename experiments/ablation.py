@@ -188,8 +188,7 @@ def main() -> None:
                 print(f"{label}, seed {seed}: {history[-1]['score']:.2f} ({seconds:.0f} s)", flush=True)
             results.setdefault(label, []).append(json.loads(path.read_text())["validations"])
     text = table(results)
-    (options.output / "table.md").write_text(text + "\n")
-    print(text)
+    _setup.write_table(text, options.output)
 
 
 if __name__ == "__main__":

@@ -76,9 +76,7 @@ def main() -> None:
             f"{float(air.delay) * 1e3:.0f} ({float(error.delay) * 1e3:.0f}) | {fit.cost[1]:.0f} |"
         )
         print(lines[-1], flush=True)
-    text = "\n".join(lines)
-    (options.output / "table.md").write_text(text + "\n")
-    print(text)
+    _setup.write_table("\n".join(lines), options.output)
     print(f"\nIn brackets standard errors. Written to {options.output}.")
 
 

@@ -141,9 +141,8 @@ def main() -> None:
     text = "\n".join(lines)
     figure.savefig(options.output / "cost.png", dpi=150)
     plt.close(figure)
-    (options.output / "table.md").write_text(text + "\n")
     print("How far errors change as their derivative says: median cosine over windows, by the size of the step\n")
-    print(text)
+    _setup.write_table(text, options.output)
     print(f"\nWritten to {options.output}.")
 
 

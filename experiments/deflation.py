@@ -151,9 +151,7 @@ def main() -> None:
             f"(standard error {float(fit.standard_errors.lift) * 1e3:.1f}), in {seconds[1]:.0f} s beside compiling.",
         ]
     )
-    options.output.mkdir(parents=True, exist_ok=True)
-    (options.output / "table.md").write_text(text + "\n")
-    print(text)
+    _setup.write_table(text, options.output)
 
 
 if __name__ == "__main__":

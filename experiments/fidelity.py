@@ -478,9 +478,8 @@ def main() -> None:
         parts += [table(found[name], "vanilla+sysid", METHODS[name].label) for name in ("identified", AIR)]
     parts += ["### Progress", race(folders)]
     text = "\n\n".join(parts)
-    (options.output / "table.md").write_text(text + "\n")
     figure(folders, [*recorded.test, policy], options.output / "tracking.png")
-    print(text)
+    _setup.write_table(text, options.output)
     print(f"\nWritten to {options.output}.")
 
 

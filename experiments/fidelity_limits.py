@@ -162,10 +162,7 @@ def main() -> None:
     for place, variant in enumerate(VARIANTS):
         cells = [f"{1e3 * means[group][place, 0]:.0f} mm, {means[group][place, 1]:.1f} deg" for group in groups]
         lines.append(f"| {variant.label} | " + " | ".join(cells) + " |")
-    text = "\n".join(lines)
-    options.output.mkdir(parents=True, exist_ok=True)
-    (options.output / "table.md").write_text(text + "\n")
-    print(text)
+    _setup.write_table("\n".join(lines), options.output)
     print(f"\n{len(jobs)} recordings. Written to {options.output}.")
 
 

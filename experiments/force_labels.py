@@ -150,9 +150,7 @@ def main() -> None:
     shown = next(iter(true))
     series = {"true": true[shown], "label": labels[shown], "network": forces(simulator, first, twins[shown])}
     figure(series, f"{shown}: the force that explains each control step", arguments.output / "force_labels.png")
-    text = "\n".join(lines)
-    (arguments.output / "table.md").write_text(text + "\n")
-    print(text)
+    _setup.write_table("\n".join(lines), arguments.output)
     print(f"\nWritten to {arguments.output}.")
 
 

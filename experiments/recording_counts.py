@@ -127,9 +127,8 @@ def main() -> None:
         arguments.counts, arguments.seeds = arguments.counts[:2], arguments.seeds[:1]
     found = learn(arguments)
     text = table(found)
-    (arguments.output / "table.md").write_text(text + "\n")
     figure(found, arguments.output / "recording_counts.png")
-    print(text)
+    _setup.write_table(text, arguments.output)
     print(f"\nWritten to {arguments.output}.")
 
 

@@ -185,7 +185,6 @@ def main() -> None:
             f"| {horizon:g} | {place:.3f}, {yaw:.1f} | {place_with:.3f}, {yaw_with:.1f} | {' | '.join(left)} |"
         )
     text = "\n".join(lines)
-    (options.output / "table.md").write_text(text + "\n")
     figure = Figure(figsize=(6.0, 4.0), layout="constrained")
     axis = figure.subplots()
     for name, values in curves.items():
@@ -198,7 +197,7 @@ def main() -> None:
     axis.grid(alpha=0.3)
     axis.legend()
     figure.savefig(options.output / "errors.png", dpi=120)
-    print(text)
+    _setup.write_table(text, options.output)
 
 
 if __name__ == "__main__":

@@ -16,17 +16,17 @@
 # %%
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
 FOLDER = Path("experiments/real/double_pendulum") if "ipykernel" in sys.modules else Path(__file__).parent
-sys.path.append(str(FOLDER.parents[1]))
+sys.path[1:1] = [str(FOLDER.parent), str(FOLDER.parents[1])]
 
 import _setup
 
 _setup.prepare()
 
+import _fit
 import numpy as np
 
 from ballu_mjx.identification.fit_robot import FitConfig, HeldOut, RobotFit, fit_robot, replay
@@ -75,11 +75,7 @@ def identify(data: Path, *, quick: bool) -> RobotFit:
         starts=1 if quick else 2,
         steps=2 if quick else 15,
     )
-    return fit_robot(parameters, training, load(data, VALIDATION), config, report)
-
-
-def report(stage: str, iteration: int, steps: int, value: float) -> None:
-    print(f"{stage} {iteration}/{steps}: {value:.6g}", file=sys.stderr, flush=True)
+    return fit_robot(parameters, training, load(data, VALIDATION), config, _fit.report)
 
 
 def row(name: str, found: HeldOut, motions: int) -> str:
@@ -106,21 +102,11 @@ def tip(angles: np.ndarray) -> np.ndarray:
 
 # %%
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true")
-    options = parser.parse_args()
+    options = _fit.parse(__doc__)
     fit = identify(options.data, quick=options.quick)
-    print("| parameter | nominal | identified | standard error | unit |\n| --- | --- | --- | --- | --- |")
-    for parameter, value, error in zip(fit.parameters.parameters, fit.values, fit.standard_errors, strict=True):
-        print(f"| {parameter.name} | {parameter.nominal:.4g} | {value:.4g} | {error:.2g} | {parameter.unit} |")
-    print(f"at bounds: {fit.at_bounds}; not shown by the data: {fit.unseen}; open: {fit.unidentified}")
-    print(f"strong correlations: {fit.strong_correlations}; scatter over noise: {fit.scatter.round(1)}")
+    _fit.show(fit)
     print(f"validation, score: nominal {fit.nominal.score:.3g}, identified {fit.identified.score:.3g}")
-    published = fit.parameters.nominal.copy()
-    for name, value in PUBLISHED.items():
-        published[fit.parameters.names.index(name)] = value
-    points = {"nominal": fit.parameters.nominal, "published friction": published, "identified": fit.values}
+    points = _fit.candidates(fit, PUBLISHED)
     for seconds in (0.4,) if options.quick else (0.4, 1.0):
         print(f"\nMedian |error| after {seconds:g} s, deg, shoulder / elbow: all, validation, test\n")
         motions = load(options.data, (*VALIDATION, *TEST))
