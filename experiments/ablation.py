@@ -14,20 +14,23 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ballu_mjx.common import runtime
+sys.path.append("experiments")  # a notebook runs in the repository's root
 
-runtime.prepare()
+import _setup
 
-import bundled_recordings
+_setup.prepare()
+
 import jax
 import numpy as np
 
 from ballu_mjx.ballu.actuators_file import read_actuators
+from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
@@ -164,7 +167,7 @@ def main() -> None:
     if options.quick:
         rows, seeds, training = rows[:2], seeds[:1], training[:2]
         sizes = Sizes(20_000, 20_000, {"num_envs": 256, "batch_size": 128})
-    validation = bundled_recordings.fresh(options.fresh, options.output, 1 if options.quick else 6)
+    validation = dataset.record_fresh(options.fresh, options.output, 1 if options.quick else 6)
     _, identified = read_actuators(assets() / "recordings" / ACTUATORS_FILE)
     simulator = Simulator(load_robot(), identified)
     read = {"training": training, "validation": validation}
@@ -186,9 +189,8 @@ def main() -> None:
                 print(f"{label}, seed {seed}: {history[-1]['score']:.2f} ({seconds:.0f} s)", flush=True)
             results.setdefault(label, []).append(json.loads(path.read_text())["validations"])
     text = table(results)
-    (options.output / "table.md").write_text(text + "\n")
-    print(text)
+    _setup.write_table(text, options.output)
 
 
 if __name__ == "__main__":
-    main()
+    _setup.run(main)

@@ -17,26 +17,17 @@
 # %%
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
-if "google.colab" in sys.modules:  # install, from a checkout in the current folder
-    if not Path("constraints.txt").exists():
-        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
-    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
-if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
-    sys.argv[1:] = []
-    sys.path[:0] = [".", "experiments"]
-
-# %%
 import argparse
 import dataclasses
 import json
+import sys
+from pathlib import Path
 
-from ballu_mjx.common import runtime
+sys.path.append("experiments")  # a notebook runs in the repository's root
 
-runtime.prepare()
+import _setup
+
+_setup.prepare()
 
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
 from ballu_mjx.cli import train_sysid
@@ -93,8 +84,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    _setup.run(main)

@@ -10,39 +10,30 @@
 # %%
 from __future__ import annotations
 
-import subprocess
+import argparse
+import dataclasses
 import sys
 from pathlib import Path
 
-if "google.colab" in sys.modules:  # install, from a checkout in the current folder
-    if not Path("constraints.txt").exists():
-        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
-    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
-if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
-    sys.argv[1:] = []
-    sys.path[:0] = [".", "experiments"]
+sys.path.append("experiments")  # a notebook runs in the repository's root
 
-# %%
-import argparse
-import dataclasses
+import _setup
 
-from ballu_mjx.common import runtime
-from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.sim.simulator import Simulator
+_setup.prepare()
 
-runtime.prepare()
-
-import bundled_recordings
 import deflation
 
 from ballu_mjx.ballu.actuators_file import read_actuators
 from ballu_mjx.ballu.model import buoyancy_ratio, load_model
+from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.cli import train_aerodynamics
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.robots.model import assets
+from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.simulator import Simulator
 
 NONE = (0.0, 0.0)
 FRICTION = {"knee_friction": NONE, "motor_friction": NONE}
@@ -71,7 +62,7 @@ def main() -> None:
         f"| truth | {lift * 1e3:.0f} | {full.added_mass:.3f} | {full.added_inertia:.4f} | {full.latency * 1e3:.0f} | |",
     ]
     config = AirConfig(**train_aerodynamics.QUICK) if options.quick else AirConfig()
-    training = [job for job in bundled_recordings.jobs() if job.split == "training"][: 3 if options.quick else None]
+    training = [job for job in dataset.jobs() if job.split == "training"][: 3 if options.quick else None]
     for name, changes in list(ROBOTS.items())[: 2 if options.quick else None]:
         legs = dataclasses.replace(full, **changes)
         folder = options.output / name.replace(" ", "-")
@@ -86,11 +77,9 @@ def main() -> None:
             f"{float(air.delay) * 1e3:.0f} ({float(error.delay) * 1e3:.0f}) | {fit.cost[1]:.0f} |"
         )
         print(lines[-1], flush=True)
-    text = "\n".join(lines)
-    (options.output / "table.md").write_text(text + "\n")
-    print(text)
+    _setup.write_table("\n".join(lines), options.output)
     print(f"\nIn brackets standard errors. Written to {options.output}.")
 
 
 if __name__ == "__main__":
-    main()
+    _setup.run(main)

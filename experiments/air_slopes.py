@@ -12,28 +12,17 @@
 # %%
 from __future__ import annotations
 
-import subprocess
+import argparse
+import dataclasses
 import sys
 from pathlib import Path
 
-if "google.colab" in sys.modules:  # install, from a checkout in the current folder
-    if not Path("constraints.txt").exists():
-        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
-    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
-if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
-    sys.argv[1:] = []
-    sys.path[:0] = [".", "experiments"]
+sys.path.append("experiments")  # a notebook runs in the repository's root
 
-# %%
-import argparse
-import dataclasses
+import _setup
 
-from ballu_mjx.common import runtime
-from ballu_mjx.robots.registry import load_robot
+_setup.prepare()
 
-runtime.prepare()
-
-import bundled_recordings
 import deflation
 import jax
 import matplotlib.pyplot as plt
@@ -41,11 +30,13 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.segments import Segments, pseudo_huber
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirWindows
 from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.sharding import shard_over_devices
 from ballu_mjx.sim.simulator import Simulator
 
@@ -119,7 +110,7 @@ def main() -> None:
     full = virtual_robot.draw_robot(0)
     deflated = dataclasses.replace(full, buoyancy=full.buoyancy * (1 - LOSS))
     lost = deflation.lift(LOSS * full.buoyancy)
-    gait = next(job for job in bundled_recordings.jobs() if job.split == "training")
+    gait = next(job for job in dataset.jobs() if job.split == "training")
     recorded = deflation.recorded(gait, deflated, 2000, options.output / "recordings")
     motions = [reconstruct(recorded, load_robot(), model)]
     # At a whole delay, where errors can be differentiated.
@@ -150,11 +141,10 @@ def main() -> None:
     text = "\n".join(lines)
     figure.savefig(options.output / "cost.png", dpi=150)
     plt.close(figure)
-    (options.output / "table.md").write_text(text + "\n")
     print("How far errors change as their derivative says: median cosine over windows, by the size of the step\n")
-    print(text)
+    _setup.write_table(text, options.output)
     print(f"\nWritten to {options.output}.")
 
 
 if __name__ == "__main__":
-    main()
+    _setup.run(main)

@@ -1,169 +1,15 @@
 """Record the bundled data set on the virtual robot, bit for bit: `python experiments/bundled_recordings.py`.
 
-Training: ten gaits of 20 s by hand (bang-bang commands of differing period, phase, duty and asymmetry), two of them
-three times, in different draughts. Validation and test: two near recordings (the same family of gaits, parameters
-between those trained on) and two far ones (commands unlike any gait) each. And one suspended actuator sweep.
+What is recorded stands in `ballu_mjx.ballu.virtual.dataset`.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import multiprocessing
 from pathlib import Path
 
-import numpy as np
-from jaxtyping import Float
-
-from ballu_mjx.ballu.gaits import Gait, hopping, one_legged, telegraph, waves
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP
-from ballu_mjx.ballu.virtual import robot as virtual_robot
-from ballu_mjx.recordings.csv_format import write_recording
+from ballu_mjx.ballu.virtual.dataset import ROBOT_SEED, record_dataset
 from ballu_mjx.robots.model import assets
-from ballu_mjx.robots.registry import load_robot
-
-ROBOT_SEED = 0
-DECIMALS = 4
-"""Of positions (quaternions get one fewer): rounding by a tenth of the noise at most keeps the set at 2 MB."""
-SECONDS = {"training": 20.0, "validation": 25.0, "test": 25.0}
-"""Five seconds more for validation and test: five starts for a horizon of 20 s, where one alone is a matter of luck."""
-
-
-TRAINING = (
-    Gait(0.70, 0.50, (0.40, 0.40), (1.00, 1.00)),
-    Gait(0.90, 0.50, (0.35, 0.35), (0.90, 0.90)),
-    Gait(1.10, 0.20, (0.45, 0.45), (0.80, 0.80)),
-    Gait(1.30, 0.50, (0.40, 0.40), (1.00, 1.00)),
-    Gait(1.60, 0.30, (0.30, 0.30), (0.80, 0.80)),
-    Gait(1.90, 0.70, (0.45, 0.45), (0.70, 0.70)),
-    Gait(1.00, 0.40, (0.40, 0.60), (1.00, 0.50)),
-    Gait(1.20, 0.60, (0.60, 0.35), (0.50, 1.00)),
-    Gait(1.50, 0.45, (0.35, 0.45), (0.90, 0.80)),
-    Gait(0.80, 0.80, (0.45, 0.35), (0.80, 1.00)),
-)
-REPEATED = (1, 3)
-"""Gaits that are recorded three times."""
-NEAR = {
-    "validation": (
-        Gait(1.00, 0.50, (0.40, 0.40), (0.90, 0.90)),
-        Gait(1.40, 0.45, (0.40, 0.35), (0.85, 0.95)),
-    ),
-    "test": (
-        Gait(1.20, 0.50, (0.40, 0.40), (0.90, 0.90)),
-        Gait(0.95, 0.55, (0.40, 0.45), (0.95, 0.80)),
-    ),
-}
-
-
-FAR = {"validation": (hopping, one_legged), "test": (telegraph, waves)}
-
-
-@dataclasses.dataclass(frozen=True)
-class Job:
-    """One recording to make."""
-
-    split: str
-    name: str
-    commands: Float[np.ndarray, "steps 2"]
-    trial: int
-    notes: str
-
-
-def jobs() -> list[Job]:
-    """All free recordings of the data set, each in a draught of its own."""
-    found: list[tuple[str, str, Float[np.ndarray, "steps 2"], str]] = []
-    for index, gait in enumerate(TRAINING):
-        for take in range(3 if index in REPEATED else 1):
-            name = f"gait-{index:02d}-take-{take + 1}"
-            found.append(("training", name, gait.commands(SECONDS["training"]), str(gait)))
-    for split in ("validation", "test"):
-        for index, gait in enumerate(NEAR[split]):
-            found.append((split, f"near-{index + 1}", gait.commands(SECONDS[split]), str(gait)))
-        for index, make in enumerate(FAR[split]):
-            found.append((split, f"far-{index + 1}", make(SECONDS[split]), f"{make.__name__}: {make.__doc__}"))
-    return [Job(*entry[:3], trial=100 + number, notes=entry[3]) for number, entry in enumerate(found)]
-
-
-def fresh_jobs(seed: int, each: int = 6) -> list[Job]:
-    """A larger test set than the bundled one, drawn at random: `each` near and `each` far recordings.
-
-    Near: gaits with period, phase, duty and height drawn from the range of the training gaits. Far: random jumps, both
-    legs together, smooth waves (a phase apart, or of two periods) and one leg at a time, in turn.
-    """
-    rng = np.random.default_rng([seed, 4])
-    seconds = SECONDS["test"]
-    time = np.arange(round(seconds / CONTROL_TIMESTEP))[:, None] * CONTROL_TIMESTEP
-
-    def pair(low: float, high: float) -> tuple[float, float]:
-        left, right = np.round(rng.uniform(low, high, 2), 2)
-        return float(left), float(right)
-
-    def far(kind: int) -> Float[np.ndarray, "steps 2"]:
-        period, phase, high = rng.uniform(0.8, 1.6), rng.uniform(0.2, 0.8), rng.uniform(0.75, 1.0)
-        if kind == 0:
-            return telegraph(seconds, int(rng.integers(2**31)))
-        if kind == 1:
-            return Gait(period, 0.0, (0.4, 0.4), (high, high)).commands(seconds)
-        if kind == 2:
-            return 0.5 - 0.5 * np.cos(2 * np.pi * (time / period + np.array([0.0, phase])))
-        if kind == 3:
-            return 0.5 - 0.5 * np.cos(2 * np.pi * time / rng.uniform(0.8, 1.8, 2))
-        both = Gait(period, 0.0, (0.4, 0.4), (high, high)).commands(seconds)
-        return np.where(np.hstack([time % 6 < 3, time % 6 >= 3]), both, 0.0)
-
-    near = [
-        Gait(round(rng.uniform(0.8, 1.6), 2), round(rng.uniform(0.3, 0.7), 2), pair(0.35, 0.5), pair(0.75, 1.0))
-        for _ in range(each)
-    ]
-    found = [(f"near-{i + 1}", gait.commands(seconds), str(gait)) for i, gait in enumerate(near)]
-    found += [(f"far-{i + 1}", np.round(far(i % 5), 3), f"far, kind {i % 5}") for i in range(each)]
-    return [
-        Job("fresh", name, commands, trial=10_000 * (seed + 1) + number, notes=notes)
-        for number, (name, commands, notes) in enumerate(found)
-    ]
-
-
-def make(job: Job, robot_seed: int, output: Path) -> Path:
-    """Record one job and write it."""
-    robot = virtual_robot.draw_robot(robot_seed)
-    recording = virtual_robot.record(
-        robot,
-        virtual_robot.draw_trial(job.trial),
-        virtual_robot.open_loop(job.commands),
-        len(job.commands) * CONTROL_TIMESTEP,
-        job.name,
-        job.notes,
-    )
-    path = output / job.split / f"{job.name}.csv.gz"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_recording(recording, path, load_robot(), decimals=DECIMALS)
-    return path
-
-
-def fresh(seed: int, folder: Path, each: int = 6, robot_seed: int = ROBOT_SEED) -> list[Path]:
-    """Recordings of `fresh_jobs`, in a folder; made by all cores, unless they are there."""
-    jobs = fresh_jobs(seed, each)
-    paths = [folder / job.split / f"{job.name}.csv.gz" for job in jobs]
-    make_all([job for job, path in zip(jobs, paths, strict=True) if not path.exists()], robot_seed, folder)
-    return paths
-
-
-def data_set(robot_seed: int, folder: Path) -> list[Path]:
-    """Record the whole data set on a virtual robot into a folder; the sweep comes last."""
-    paths = make_all(jobs(), robot_seed, folder)
-    sweep = folder / "suspended" / "sweep.csv.gz"
-    sweep.parent.mkdir(parents=True, exist_ok=True)
-    suspended = virtual_robot.record_sweep(virtual_robot.draw_robot(robot_seed), seed=robot_seed, name="sweep")
-    write_recording(suspended, sweep, load_robot(), decimals=DECIMALS)
-    return [*paths, sweep]
-
-
-def make_all(jobs: list[Job], robot_seed: int, folder: Path) -> list[Path]:
-    """`make` on all cores."""
-    if not jobs:
-        return []
-    with multiprocessing.get_context("spawn").Pool() as pool:
-        return pool.starmap(make, [(job, robot_seed, folder) for job in jobs])
 
 
 def main() -> None:
@@ -171,7 +17,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=assets() / "recordings", help="folder to write to")
     parser.add_argument("--robot", type=int, default=ROBOT_SEED, help="seed of the virtual robot (bundled: 0)")
     arguments = parser.parse_args()
-    for path in data_set(arguments.robot, arguments.output):
+    for path in record_dataset(arguments.robot, arguments.output):
         print(path)
 
 

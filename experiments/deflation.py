@@ -13,35 +13,24 @@
 # %%
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
-if "google.colab" in sys.modules:  # install, from a checkout in the current folder
-    if not Path("constraints.txt").exists():
-        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
-    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
-if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
-    sys.argv[1:] = []
-    sys.path[:0] = [".", "experiments"]
-
-# %%
 import argparse
 import dataclasses
+import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
-from ballu_mjx.common import runtime
-from ballu_mjx.robots.registry import load_robot
+sys.path.append("experiments")  # a notebook runs in the repository's root
 
-runtime.prepare()
+import _setup
 
-import bundled_recordings
+_setup.prepare()
+
 import fidelity
 import numpy as np
-from bundled_recordings import Job
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.cli import train_aerodynamics
@@ -53,6 +42,7 @@ from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.simulator import Simulator
 
 # %% [markdown]
@@ -60,7 +50,7 @@ from ballu_mjx.sim.simulator import Simulator
 
 
 # %%
-def recorded(job: Job, virtual: VirtualRobot, trial: int, folder: Path) -> Recording:
+def recorded(job: dataset.Job, virtual: VirtualRobot, trial: int, folder: Path) -> Recording:
     """Some commands on a robot, in a draught of their own; recorded into `folder`."""
     taken = virtual_robot.record(
         virtual,
@@ -118,10 +108,10 @@ def main() -> None:
     model = simulator.mj_model
     full = virtual_robot.draw_robot(0)
     deflated = dataclasses.replace(full, buoyancy=full.buoyancy * (1 - options.loss))
-    bundled = bundled_recordings.jobs()
-    tests = [*(job for job in bundled if job.split == "test"), *bundled_recordings.fresh_jobs(options.fresh)]
+    bundled = dataset.jobs()
+    tests = [*(job for job in bundled if job.split == "test"), *dataset.fresh_jobs(options.fresh)]
 
-    def motions(virtual: VirtualRobot, jobs: Sequence[Job], first: int, name: str) -> list[Motion]:
+    def motions(virtual: VirtualRobot, jobs: Sequence[dataset.Job], first: int, name: str) -> list[Motion]:
         folder = options.output / name
         recordings = [recorded(job, virtual, first + number, folder) for number, job in enumerate(jobs)]
         return [reconstruct(each, load_robot(), model) for each in recordings]
@@ -161,10 +151,8 @@ def main() -> None:
             f"(standard error {float(fit.standard_errors.lift) * 1e3:.1f}), in {seconds[1]:.0f} s beside compiling.",
         ]
     )
-    options.output.mkdir(parents=True, exist_ok=True)
-    (options.output / "table.md").write_text(text + "\n")
-    print(text)
+    _setup.write_table(text, options.output)
 
 
 if __name__ == "__main__":
-    main()
+    _setup.run(main)

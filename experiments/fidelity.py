@@ -17,35 +17,25 @@
 # %%
 from __future__ import annotations
 
+import argparse
+import dataclasses
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-if "google.colab" in sys.modules:  # install, from a checkout in the current folder
-    if not Path("constraints.txt").exists():
-        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
-    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
-if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
-    sys.argv[1:] = []
-    sys.path[:0] = [".", "experiments"]
+sys.path.append("experiments")  # a notebook runs in the repository's root
 
-# %%
-import argparse
-import dataclasses
-from collections.abc import Mapping, Sequence
+import _setup
 
-from ballu_mjx.common import runtime
-from ballu_mjx.robots.registry import load_robot
+_setup.prepare()
 
-runtime.prepare()
-
-import bundled_recordings
 import numpy as np
-from bundled_recordings import Job
 from jaxtyping import Float
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP
+from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.evaluation.errors_table import (
     HORIZONS,
     SCORE_HORIZONS,
@@ -63,6 +53,7 @@ from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.robots.model import assets
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.checkpoints import list_checkpoints
 from ballu_mjx.runs.metrics import read_column
 from ballu_mjx.sim.simulator import Simulator
@@ -177,10 +168,10 @@ class Recorded:
 def record(robot_seed: int, folder: Path) -> Recorded:
     """The bundled recordings for robot 0; for another one they are made, and its actuators identified, in `folder`."""
     place = assets() / "recordings"
-    if robot_seed != bundled_recordings.ROBOT_SEED:
+    if robot_seed != dataset.ROBOT_SEED:
         place = folder / "recordings"
         if not (place / "suspended" / "sweep.csv.gz").exists():
-            bundled_recordings.data_set(robot_seed, place)
+            dataset.record_dataset(robot_seed, place)
         if not (place / "actuators.json").exists():
             train(folder / "sysid", "sysid", "--recordings", str(place / "suspended"), result="actuators.json")
             shutil.copy(folder / "sysid" / "actuators.json", place)
@@ -190,15 +181,17 @@ def record(robot_seed: int, folder: Path) -> Recorded:
 
 def replayed_policy(options: Options) -> Path:
     """The robot under the actions of a walking policy that was trained in vanilla, replayed open loop (paper)."""
-    source, seconds = options.output / "walk-vanilla", bundled_recordings.SECONDS["test"]
+    source, seconds = options.output / "walk-vanilla", dataset.SECONDS["test"]
     train(source, "walk", *(["--quick"] if options.quick else []), result="replay.npz")
     path = options.output / "policy" / "policy.csv.gz"
     if not path.exists():
         policy = Policy.load(source)
         loop = policy.closed_loop()
         actions = loop(policy.params, *loop.standing(), round(seconds / CONTROL_TIMESTEP)).command[0]
-        job = Job(path.parent.name, "policy", np.round(actions, 3).astype(float), 300, "Actions of a vanilla policy.")
-        bundled_recordings.make(job, options.robot, options.output)
+        job = dataset.Job(
+            path.parent.name, "policy", np.round(actions, 3).astype(float), 300, "Actions of a vanilla policy."
+        )
+        dataset.record_job(job, options.robot, options.output)
     return path
 
 
@@ -421,7 +414,7 @@ def parse() -> Options:
         help=f"beside {', '.join(always)}",
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="one training a seed")
-    parser.add_argument("--robot", type=int, default=bundled_recordings.ROBOT_SEED, help="seed of the virtual robot")
+    parser.add_argument("--robot", type=int, default=dataset.ROBOT_SEED, help="seed of the virtual robot")
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the larger test set")
     parser.add_argument("--output", type=Path, default=Path("runs/fidelity"), help="folder of the runs")
     parser.add_argument("--quick", action="store_true", help="train for seconds; the numbers mean nothing")
@@ -466,7 +459,7 @@ def main() -> None:
         for name, members in folders.items()
     }
     each = 1 if options.quick else 6
-    fresh = bundled_recordings.fresh(options.fresh, options.output, each, options.robot)
+    fresh = dataset.record_fresh(options.fresh, options.output, each, options.robot)
     policy = replayed_policy(options)
     sets = {
         "Bundled test recordings": recorded.test,
@@ -485,11 +478,10 @@ def main() -> None:
         parts += [table(found[name], "vanilla+sysid", METHODS[name].label) for name in ("identified", AIR)]
     parts += ["### Progress", race(folders)]
     text = "\n\n".join(parts)
-    (options.output / "table.md").write_text(text + "\n")
     figure(folders, [*recorded.test, policy], options.output / "tracking.png")
-    print(text)
+    _setup.write_table(text, options.output)
     print(f"\nWritten to {options.output}.")
 
 
 if __name__ == "__main__":
-    main()
+    _setup.run(main)

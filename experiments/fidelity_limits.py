@@ -13,37 +13,27 @@
 # %%
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
-if "google.colab" in sys.modules:  # install, from a checkout in the current folder
-    if not Path("constraints.txt").exists():
-        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
-    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
-if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
-    sys.argv[1:] = []
-    sys.path[:0] = [".", "experiments"]
-
-# %%
 import argparse
 import dataclasses
 import multiprocessing
+import sys
 import tempfile
+from pathlib import Path
 
-from ballu_mjx.common import runtime
+sys.path.append("experiments")  # a notebook runs in the repository's root
 
-runtime.prepare()
+import _setup
 
-import bundled_recordings
+_setup.prepare()
+
 import deflation
 import mujoco
 import numpy as np
-from bundled_recordings import Job
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.evaluation.open_loop import START_INTERVAL
@@ -123,7 +113,7 @@ def seen(model: mujoco.MjModel, qpos: Float[np.ndarray, "states nq"]) -> tuple[n
     return np.array(places), Rotation.from_quat(np.array(turns), scalar_first=True).as_euler("ZYX")[:, 0]
 
 
-def errors(virtual: VirtualRobot, job: Job) -> tuple[str, Float[np.ndarray, "variants 2"]]:
+def errors(virtual: VirtualRobot, job: dataset.Job) -> tuple[str, Float[np.ndarray, "variants 2"]]:
     """Group of a recording; RMSE of position (m) and yaw (deg) over the horizon, mean over starts, by variant."""
     trial = virtual_robot.draw_trial(job.trial)
     with tempfile.TemporaryDirectory() as folder:
@@ -156,14 +146,14 @@ def errors(virtual: VirtualRobot, job: Job) -> tuple[str, Float[np.ndarray, "var
 # %%
 def main() -> None:
     parser = argparse.ArgumentParser(description="What no simulator could do better, and what each shortcut costs.")
-    parser.add_argument("--robot", type=int, default=bundled_recordings.ROBOT_SEED, help="seed of the virtual robot")
+    parser.add_argument("--robot", type=int, default=dataset.ROBOT_SEED, help="seed of the virtual robot")
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the test set, that of fidelity.py")
     parser.add_argument("--output", type=Path, default=Path("runs/fidelity-limits"), help="folder of the table")
     parser.add_argument("--quick", action="store_true", help="two recordings; the numbers mean little")
     options = parser.parse_args()
 
     virtual = virtual_robot.draw_robot(options.robot)
-    jobs = bundled_recordings.fresh_jobs(options.fresh, 1 if options.quick else 6)
+    jobs = dataset.fresh_jobs(options.fresh, 1 if options.quick else 6)
     with multiprocessing.get_context("spawn").Pool() as pool:
         found = pool.starmap(errors, [(virtual, job) for job in jobs], chunksize=1)
     groups = sorted({group for group, _ in found}, reverse=True)  # near before far
@@ -172,12 +162,9 @@ def main() -> None:
     for place, variant in enumerate(VARIANTS):
         cells = [f"{1e3 * means[group][place, 0]:.0f} mm, {means[group][place, 1]:.1f} deg" for group in groups]
         lines.append(f"| {variant.label} | " + " | ".join(cells) + " |")
-    text = "\n".join(lines)
-    options.output.mkdir(parents=True, exist_ok=True)
-    (options.output / "table.md").write_text(text + "\n")
-    print(text)
+    _setup.write_table("\n".join(lines), options.output)
     print(f"\n{len(jobs)} recordings. Written to {options.output}.")
 
 
 if __name__ == "__main__":
-    main()
+    _setup.run(main)

@@ -12,33 +12,24 @@
 # %%
 from __future__ import annotations
 
-import subprocess
+import argparse
+import dataclasses
 import sys
 from pathlib import Path
 
-if "google.colab" in sys.modules:  # install, from a checkout in the current folder
-    if not Path("constraints.txt").exists():
-        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
-    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
-if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
-    sys.argv[1:] = []
-    sys.path[:0] = [".", "experiments"]
+sys.path.append("experiments")  # a notebook runs in the repository's root
 
-# %%
-import argparse
-import dataclasses
+import _setup
 
-from ballu_mjx.common import runtime
+_setup.prepare()
 
-runtime.prepare()
-
-import bundled_recordings
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP
+from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.motion import Motion
@@ -61,11 +52,11 @@ SEEN_WELL = {"position_noise": 2e-5, "angle_noise": 0.01, "held_angle_noise": 0.
 """Of `SupervisedConfig`: there is no motion capture between the robot and its twin."""
 
 
-def twin(job: bundled_recordings.Job) -> Motion:
+def twin(job: dataset.Job) -> Motion:
     """What the virtual robot really did, at the control rate."""
     steps = len(job.commands)
     qpos, qvel = virtual_robot.record_truth(
-        virtual_robot.draw_robot(bundled_recordings.ROBOT_SEED),
+        virtual_robot.draw_robot(dataset.ROBOT_SEED),
         virtual_robot.draw_trial(job.trial),
         virtual_robot.open_loop(job.commands),
         steps * CONTROL_TIMESTEP,
@@ -143,7 +134,7 @@ def main() -> None:
 
     recordings = {path.name: path for path in list_recordings([assets() / "recordings" / "validation"])}
     true, labels, twins = {}, {}, {}
-    for job in bundled_recordings.jobs():
+    for job in dataset.jobs():
         if job.split == "validation":
             twins[job.name] = twin(job)
             true[job.name] = label_well(twins[job.name])[HISTORY - 1 :]
@@ -159,11 +150,9 @@ def main() -> None:
     shown = next(iter(true))
     series = {"true": true[shown], "label": labels[shown], "network": forces(simulator, first, twins[shown])}
     figure(series, f"{shown}: the force that explains each control step", arguments.output / "force_labels.png")
-    text = "\n".join(lines)
-    (arguments.output / "table.md").write_text(text + "\n")
-    print(text)
+    _setup.write_table("\n".join(lines), arguments.output)
     print(f"\nWritten to {arguments.output}.")
 
 
 if __name__ == "__main__":
-    main()
+    _setup.run(main)

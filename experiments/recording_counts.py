@@ -12,31 +12,22 @@
 # %%
 from __future__ import annotations
 
-import subprocess
+import argparse
 import sys
 from pathlib import Path
 
-if "google.colab" in sys.modules:  # install, from a checkout in the current folder
-    if not Path("constraints.txt").exists():
-        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
-    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
-if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
-    sys.argv[1:] = []
-    sys.path[:0] = [".", "experiments"]
+sys.path.append("experiments")  # a notebook runs in the repository's root
 
-# %%
-import argparse
+import _setup
 
-from ballu_mjx.common import runtime
+_setup.prepare()
 
-runtime.prepare()
-
-import bundled_recordings
 import fidelity
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
 
+from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.viz.style import colour_of, label_of
 
 METHODS = {"identified": "envmimic", "regression": "supervised", "analytic": "analytic", "aerodynamic": "aerodynamic"}
@@ -53,7 +44,7 @@ QUANTITIES = {"position": "balloon position", "yaw": "yaw"}
 # %%
 def learn(arguments: argparse.Namespace) -> dict[str, dict[int, list[Path]]]:
     """Run folders by method and number of recordings, one a seed."""
-    recorded = fidelity.record(bundled_recordings.ROBOT_SEED, arguments.output)
+    recorded = fidelity.record(dataset.ROBOT_SEED, arguments.output)
     # Every gait once before any a second time.
     ordered = sorted(recorded.training, key=lambda path: path.name.partition("take-")[2])
     folders: dict[str, dict[int, list[Path]]] = {}
@@ -136,11 +127,10 @@ def main() -> None:
         arguments.counts, arguments.seeds = arguments.counts[:2], arguments.seeds[:1]
     found = learn(arguments)
     text = table(found)
-    (arguments.output / "table.md").write_text(text + "\n")
     figure(found, arguments.output / "recording_counts.png")
-    print(text)
+    _setup.write_table(text, arguments.output)
     print(f"\nWritten to {arguments.output}.")
 
 
 if __name__ == "__main__":
-    main()
+    _setup.run(main)

@@ -14,12 +14,15 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from ballu_mjx.common import runtime
+sys.path.append("experiments")  # a notebook runs in the repository's root
 
-runtime.prepare()
+import _setup
+
+_setup.prepare()
 
 import numpy as np
 
@@ -154,4 +157,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    _setup.run(main)

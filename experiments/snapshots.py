@@ -10,31 +10,22 @@
 # model is drawn from one fixed place, so that all pictures of a task have the same scale.
 #
 # `python experiments/snapshots.py` needs the trials of `python -m ballu_mjx.train all` (or of
-# `experiments/table_walking.py` and `experiments/table_turning.py`, which run it); drawing takes a minute.
+# `experiments/transfer_tables.py`, which runs it); drawing takes a minute.
 
 # %%
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
-if "google.colab" in sys.modules:  # install, from a checkout in the current folder
-    if not Path("constraints.txt").exists():
-        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
-    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
-if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
-    sys.argv[1:] = []
-    sys.path[:0] = [".", "experiments"]
-
-# %%
 import argparse
 import dataclasses
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 
-from ballu_mjx.common import runtime
+sys.path.append("experiments")  # a notebook runs in the repository's root
 
-runtime.prepare()
+import _setup
+
+_setup.prepare()
 
 import mujoco
 import numpy as np
@@ -291,8 +282,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except InputError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+    _setup.run(main)

@@ -11,24 +11,15 @@
 # %%
 from __future__ import annotations
 
-import subprocess
+import argparse
 import sys
 from pathlib import Path
 
-if "google.colab" in sys.modules:  # install, from a checkout in the current folder
-    if not Path("constraints.txt").exists():
-        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
-    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
-if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
-    sys.argv[1:] = []
-    sys.path[:0] = [".", "experiments"]
+sys.path.append("experiments")  # a notebook runs in the repository's root
 
-# %%
-import argparse
+import _setup
 
-from ballu_mjx.common import runtime
-
-runtime.prepare()
+_setup.prepare()
 
 import mujoco
 import numpy as np
@@ -137,4 +128,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    _setup.run(main)

@@ -24,6 +24,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.tasks import Step, Task
 from ballu_mjx.policies.variants import SimulatorVariant
 from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.rl.learner import initial_state
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, bare_parameters
 from ballu_mjx.sim.drivetrain import DrivetrainParameters, drivetrain_of
@@ -323,16 +324,7 @@ class LocomotionEnv(Env):
         rollout = RolloutState(physics, history, commands, drivetrain)
         remaining = jax.random.randint(key_length, (), mean // 2, mean + mean // 2 + 1)
         now = LocomotionState(setting, friction, rollout, com, remaining, key)
-        zero = jnp.zeros(())
-        metrics: dict[str, Array] = {name: zero for name in _METRICS}
-        return State(
-            pipeline_state=cast(Any, now),
-            obs=self._observe(rollout),
-            reward=zero,
-            done=zero,
-            metrics=metrics,
-            info={"truncation": zero},
-        )
+        return initial_state(now, self._observe(rollout), _METRICS)
 
     def _excess(self, rollout: RolloutState, command: Float[Array, " commands"]) -> Float[Array, ""]:
         """Return how far the residual's observation lies outside of its data."""

@@ -31,6 +31,7 @@ from ballu_mjx.residuals.network import (
     square_newtons,
     world_loads,
 )
+from ballu_mjx.rl.learner import initial_state
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.coordinates import translations
 from ballu_mjx.sim.force_model import to_wrenches
@@ -121,6 +122,9 @@ def reward_terms(
     return {"position": position, "orientation": orientation, "tracking": tracking}
 
 
+_METRICS = ("reward_position", "reward_orientation", "force", "diverged")
+
+
 class TrackingState(NamedTuple):
     """Where an episode stands."""
 
@@ -203,16 +207,7 @@ class EnvMimicEnv(Env):
         drivetrain = reference.drivetrain_at(recording, time)
         rollout = RolloutState(state_at(qpos, qvel), history, commands, drivetrain)
         tracking = TrackingState(rollout, recording, time, remaining, key_sensor)
-        zero = jnp.zeros(())
-        metrics = {"reward_position": zero, "reward_orientation": zero, "force": zero, "diverged": zero}
-        return State(
-            pipeline_state=cast(Any, tracking),
-            obs=self._observe(tracking),
-            reward=zero,
-            done=zero,
-            metrics=metrics,
-            info={"truncation": zero},
-        )
+        return initial_state(tracking, self._observe(tracking), _METRICS)
 
     def step(self, state: State, action: Array) -> State:
         """Advance one control step under the recording's command and the policy's force."""

@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -69,6 +69,19 @@ Stored = Mapping[str, np.ndarray]
 _AXIS = "devices"
 _MEASURED = "measured"
 _MAX_CALLS = 400
+
+
+def initial_state(inner: Any, observation: Any, metrics: Iterable[str]) -> State:
+    """Return an environment's state at the start of an episode: not done, reward and metrics (by name) 0."""
+    zero = jnp.zeros(())
+    return State(
+        pipeline_state=inner,
+        obs=observation,
+        reward=zero,
+        done=zero,
+        metrics={name: zero for name in metrics},
+        info={"truncation": zero},
+    )
 
 
 def wrap_for_training(env: Env) -> Wrapper:

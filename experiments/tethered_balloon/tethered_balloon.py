@@ -12,25 +12,18 @@
 # %%
 from __future__ import annotations
 
+import argparse
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
-if "google.colab" in sys.modules:  # install, from a checkout in the current folder
-    if not Path("constraints.txt").exists():
-        raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
-    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
-if "ipykernel" in sys.modules:  # a notebook: write the options here, as on a command line
-    sys.argv[1:] = []
-    sys.path[:0] = ["."]
+FOLDER = Path("experiments/tethered_balloon") if "ipykernel" in sys.modules else Path(__file__).parent
+sys.path.append(str(FOLDER.parent))
 
-# %%
-import argparse
-import shutil
+import _setup
 
-from ballu_mjx.common import runtime
-
-runtime.prepare()
+_setup.prepare()
 
 import mujoco
 import numpy as np
@@ -45,7 +38,6 @@ from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.runs.checkpoints import list_checkpoints
 from ballu_mjx.viz.style import colour_of, label_of
 
-FOLDER = Path("experiments/tethered_balloon") if "ipykernel" in sys.modules else Path(__file__).parent
 DESCRIPTION = FOLDER / "balloon.robot.json"
 
 # %% [markdown]
@@ -193,7 +185,6 @@ def main() -> None:
             f"| {horizon:g} | {place:.3f}, {yaw:.1f} | {place_with:.3f}, {yaw_with:.1f} | {' | '.join(left)} |"
         )
     text = "\n".join(lines)
-    (options.output / "table.md").write_text(text + "\n")
     figure = Figure(figsize=(6.0, 4.0), layout="constrained")
     axis = figure.subplots()
     for name, values in curves.items():
@@ -206,8 +197,8 @@ def main() -> None:
     axis.grid(alpha=0.3)
     axis.legend()
     figure.savefig(options.output / "errors.png", dpi=120)
-    print(text)
+    _setup.write_table(text, options.output)
 
 
 if __name__ == "__main__":
-    main()
+    _setup.run(main)

@@ -3,7 +3,6 @@
 import ast
 import dataclasses
 import gzip
-import importlib.util
 import json
 import subprocess
 import sys
@@ -16,14 +15,13 @@ import pytest
 import ballu_mjx
 from ballu_mjx.ballu.model import load_model, standing_qpos
 from ballu_mjx.ballu.recordings import base_position, foot_position, knee, motor
+from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.robots.model import assets
 from ballu_mjx.robots.registry import load_robot
-
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -160,14 +158,9 @@ def test_the_nominal_member_has_no_side():
     assert np.abs(left[-1, 0] - left[0, 0]) > 0.01
 
 
-def test_a_bundled_recording_is_made_again_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    spec = importlib.util.spec_from_file_location("bundle", ROOT / "experiments" / "bundled_recordings.py")
-    assert spec is not None and spec.loader is not None
-    bundle = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "bundle", bundle)
-    spec.loader.exec_module(bundle)
-    job = bundle.jobs()[0]
-    again = bundle.make(job, bundle.ROBOT_SEED, tmp_path)
+def test_a_bundled_recording_is_made_again_bit_for_bit(tmp_path: Path):
+    job = dataset.jobs()[0]
+    again = dataset.record_job(job, dataset.ROBOT_SEED, tmp_path)
     shipped = assets() / "recordings" / job.split / again.name
     # The text, not the compressed bytes: those depend on the zlib at hand.
     assert gzip.decompress(again.read_bytes()) == gzip.decompress(shipped.read_bytes())

@@ -16,14 +16,17 @@
 # %%
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
-from ballu_mjx.common import runtime
+FOLDER = Path("experiments/real/double_pendulum") if "ipykernel" in sys.modules else Path(__file__).parent
+sys.path[1:1] = [str(FOLDER.parent), str(FOLDER.parents[1])]
 
-runtime.prepare()
+import _setup
 
+_setup.prepare()
+
+import _fit
 import numpy as np
 
 from ballu_mjx.identification.fit_robot import FitConfig, HeldOut, RobotFit, fit_robot, replay
@@ -32,7 +35,6 @@ from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, c
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.description import read_description
 
-FOLDER = Path("experiments/real/double_pendulum") if "ipykernel" in sys.modules else Path(__file__).parent
 TRAINING = ("143339", "143524", "143601", "143704", "144115", "154220")
 VALIDATION = ("143747", "143906")
 TEST = ("144003", "154548")
@@ -73,11 +75,7 @@ def identify(data: Path, *, quick: bool) -> RobotFit:
         starts=1 if quick else 2,
         steps=2 if quick else 15,
     )
-    return fit_robot(parameters, training, load(data, VALIDATION), config, report)
-
-
-def report(stage: str, iteration: int, steps: int, value: float) -> None:
-    print(f"{stage} {iteration}/{steps}: {value:.6g}", file=sys.stderr, flush=True)
+    return fit_robot(parameters, training, load(data, VALIDATION), config, _fit.report)
 
 
 def row(name: str, found: HeldOut, motions: int) -> str:
@@ -103,22 +101,12 @@ def tip(angles: np.ndarray) -> np.ndarray:
 
 
 # %%
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true")
-    options = parser.parse_args()
+def main() -> None:
+    options = _fit.parse(__doc__)
     fit = identify(options.data, quick=options.quick)
-    print("| parameter | nominal | identified | standard error | unit |\n| --- | --- | --- | --- | --- |")
-    for parameter, value, error in zip(fit.parameters.parameters, fit.values, fit.standard_errors, strict=True):
-        print(f"| {parameter.name} | {parameter.nominal:.4g} | {value:.4g} | {error:.2g} | {parameter.unit} |")
-    print(f"at bounds: {fit.at_bounds}; not shown by the data: {fit.unseen}; open: {fit.unidentified}")
-    print(f"strong correlations: {fit.strong_correlations}; scatter over noise: {fit.scatter.round(1)}")
+    _fit.show(fit)
     print(f"validation, score: nominal {fit.nominal.score:.3g}, identified {fit.identified.score:.3g}")
-    published = fit.parameters.nominal.copy()
-    for name, value in PUBLISHED.items():
-        published[fit.parameters.names.index(name)] = value
-    points = {"nominal": fit.parameters.nominal, "published friction": published, "identified": fit.values}
+    points = _fit.candidates(fit, PUBLISHED)
     for seconds in (0.4,) if options.quick else (0.4, 1.0):
         print(f"\nMedian |error| after {seconds:g} s, deg, shoulder / elbow: all, validation, test\n")
         motions = load(options.data, (*VALIDATION, *TEST))
@@ -131,3 +119,7 @@ if __name__ == "__main__":
         for name, errors in zip(points, found, strict=True):
             middle, most = np.percentile(tip_errors(errors, swing_ups, 0.4, 0.2), [50, 90])
             print(f"| {name} | {middle:.4f} | {most:.4f} |")
+
+
+if __name__ == "__main__":
+    _setup.run(main)

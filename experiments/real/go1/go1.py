@@ -15,14 +15,17 @@
 # %%
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
-from ballu_mjx.common import runtime
+FOLDER = Path("experiments/real/go1") if "ipykernel" in sys.modules else Path(__file__).parent
+sys.path[1:1] = [str(FOLDER.parent), str(FOLDER.parents[1])]
 
-runtime.prepare()
+import _setup
 
+_setup.prepare()
+
+import _fit
 import mujoco
 import numpy as np
 
@@ -32,7 +35,6 @@ from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, m
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.robots.description import read_description
 
-FOLDER = Path("experiments/real/go1") if "ipykernel" in sys.modules else Path(__file__).parent
 LOADS = (0, 1, 2, 3)
 """kg; the last is the test."""
 SAMPLING = SamplingConfig(sample_timestep=0.016, angle_noise=np.deg2rad(0.1), position_window=0.08, rate_window=0.1)
@@ -59,7 +61,7 @@ def identify(data: Path, *, quick: bool) -> RobotFit:
     parameters = declared_parameters(robot, robot.load_model())
     training = [motion for kilograms in LOADS[:-1] for motion in load(data, kilograms)]
     config = FitConfig(window_seconds=2.0, starts=1 if quick else 2, steps=4 if quick else 15)
-    return fit_robot(parameters, training[1:5:3] if quick else training, load(data, LOADS[-1]), config, report)
+    return fit_robot(parameters, training[1:5:3] if quick else training, load(data, LOADS[-1]), config, _fit.report)
 
 
 def mean_errors(fit: RobotFit, motions: list[MeasuredMotion], points: list[np.ndarray]) -> np.ndarray:
@@ -68,27 +70,18 @@ def mean_errors(fit: RobotFit, motions: list[MeasuredMotion], points: list[np.nd
     return np.array([np.rad2deg(np.abs(errors.errors[..., 0]).mean(axis=1)) for errors in found])
 
 
-def report(stage: str, iteration: int, steps: int, value: float) -> None:
-    print(f"{stage} {iteration}/{steps}: {value:.6g}", file=sys.stderr, flush=True)
-
-
 # %%
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--quick", action="store_true")
-    options = parser.parse_args()
+def main() -> None:
+    options = _fit.parse(__doc__)
     fit = identify(options.data, quick=options.quick)
-    print("| parameter | nominal | identified | standard error | unit |\n| --- | --- | --- | --- | --- |")
-    for parameter, value, error in zip(fit.parameters.parameters, fit.values, fit.standard_errors, strict=True):
-        print(f"| {parameter.name} | {parameter.nominal:.4g} | {value:.4g} | {error:.2g} | {parameter.unit} |")
-    print(f"at bounds: {fit.at_bounds}; not shown by the data: {fit.unseen}; open: {fit.unidentified}")
-    print(f"strong correlations: {fit.strong_correlations}; scatter over noise: {fit.scatter.round(1)}")
-    published = fit.parameters.nominal.copy()
-    for name, value in PUBLISHED.items():
-        published[fit.parameters.names.index(name)] = value
+    _fit.show(fit)
+    points = list(_fit.candidates(fit, PUBLISHED).values())
     print(f"\nMean |error| over {SECONDS:g} s, deg\n")
     print("| load (kg) | nominal | published friction | identified |\n| --- | --- | --- | --- |")
     for kilograms in LOADS[-1:] if options.quick else LOADS:
-        errors = mean_errors(fit, load(options.data, kilograms), [fit.parameters.nominal, published, fit.values])
+        errors = mean_errors(fit, load(options.data, kilograms), points)
         print(f"| {kilograms} | " + " | ".join(f"{x:.2f}" for x in errors.mean(axis=1)) + " |")
+
+
+if __name__ == "__main__":
+    _setup.run(main)

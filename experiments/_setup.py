@@ -1,0 +1,46 @@
+"""What experiments share, as scripts or as notebooks: call `prepare` before imports that bring in JAX."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+
+def prepare() -> None:
+    """Install the package in Colab, drop a notebook's own arguments, and set JAX's start-up options.
+
+    In a notebook, write the options of the experiment into `sys.argv[1:]` after this call.
+    """
+    if "google.colab" in sys.modules:
+        if not Path("constraints.txt").exists():
+            raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
+        subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
+    if "ipykernel" in sys.modules:
+        sys.argv[1:] = []
+        sys.path.insert(0, ".")
+    from ballu_mjx.common import runtime
+
+    runtime.prepare()
+
+
+def write_table(text: str, folder: Path) -> None:
+    """Print a Markdown table, and write it to `table.md` in a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "table.md").write_text(text + "\n")
+    print(text)
+
+
+def run(main: Callable[[], None]) -> None:
+    """Call `main`; end after bad input with one sentence, and after an interrupt without a traceback."""
+    from ballu_mjx.common.errors import InputError
+
+    try:
+        main()
+    except InputError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        sys.exit(130)

@@ -1,0 +1,202 @@
+# %% [markdown]
+# # Tables I and II: from simulation to the robot
+#
+# Section "Improved Sim-to-real Transfer" of the paper. A policy is trained in four simulators: with identified
+# actuators (vanilla+sysid), with domain randomization (vanilla+DR), with both (vanilla+sysid+DR), and with EnvMimic's
+# forces besides both; and, beyond the paper, in a fifth with the identified air besides both (aerodynamic). Each then
+# runs on the robot.
+#
+# `--task walk` is Table I. The reward is the velocity along x, a trial takes 24 s. The table gives the mean distance
+# between the centres of mass of simulation and robot, and how far the robot came, along x and in all.
+#
+# `--task turn` is Table II. The reward is the velocity along y, to the left of the robot, which starts looking along x:
+# it must turn and walk. A trial takes 22 s. The table gives the difference in final yaw between simulation and robot,
+# and how far the robot came along y and how far it turned.
+#
+# The paper's robot is real, its numbers are one policy's each, and its yaw errors are signed. Here a virtual robot
+# stands in for it, every policy is trained with several seeds and tried five times, each time in another draught;
+# numbers are means (of the yaw error: of its absolute value, for errors to either side cancel) with the 95 % confidence
+# interval over seeds (Student's t), beside the paper's.
+#
+# `python experiments/transfer_tables.py --task walk` makes the stages of `python -m ballu_mjx.train all` that it needs;
+# those that are there are found again. This takes hours on two cores. Stages made with other options than the defaults
+# of `train all` are set aside and made again: for such a folder, `--figure-only` draws the figure and runs nothing.
+# `--quick` shows that it works.
+
+# %%
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+sys.path.append("experiments")  # a notebook runs in the repository's root
+
+import _setup
+
+_setup.prepare()
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from ballu_mjx.ballu.recordings import base_position
+from ballu_mjx.cli import pipeline
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.policies import pipeline_layout
+from ballu_mjx.recordings.csv_format import read_recording
+from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.viz.style import colour_of, label_of
+
+OUTPUT, QUICK_OUTPUT = Path("runs/all"), Path("runs/all-quick")
+"""Folders of the stages. Two, so that trying `--quick` sets no training of hours aside."""
+_SEED_STYLES = ("-", "--", ":", "-.")
+_SMALLEST_EXTENT = 0.4
+"""Least width and height (m) of a panel."""
+
+FIGURES = {"walk": "table_walking.png", "turn": "table_turning.png"}
+"""File of the figure, by the task."""
+
+Way = Float[np.ndarray, "samples 2"]
+
+# %% [markdown]
+# ## The figure: all ways from above
+# What the table's means are taken over. A perfect policy that walks goes straight to the right, one that turns ends as
+# far up as it can. The lines are the recorded base's; the table is about the centre of mass, up in the balloons, some
+# centimetres off.
+
+
+# %%
+def read_ways(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[list[Way]]]:
+    """Read the base's way from above (m), `[setting][seed][trial]`, from its start, of settings that all seeds have.
+
+    **Raises** `InputError` where `folder` holds no such trials.
+    """
+    found = {}
+    for setting in (*pipeline_layout.SETTINGS, *pipeline_layout.settings_beyond(folder / f"seed-{seeds[0]}", task)):
+        trials = [folder / f"seed-{seed}" / f"trials-{task}-{setting}" for seed in seeds]
+        if all(_finished(trial) for trial in trials):
+            found[setting] = [[_way(path) for path in sorted(trial.glob("trial-*.csv.gz"))] for trial in trials]
+    if not found:
+        numbers = " ".join(map(str, seeds))
+        raise InputError(
+            f"{folder}: no setting has finished trials of {task!r} for all of the seeds {numbers}; make them with "
+            f"`python -m ballu_mjx.train all --output {folder} --tasks {task} --seeds {numbers}`."
+        )
+    return found
+
+
+def _finished(trials: Path) -> bool:
+    """Whether `trials` is a stage that came to its end."""
+    mark = trials.with_name(trials.name + ".stage.json")
+    return mark.is_file() and bool(json.loads(mark.read_text())["done"])
+
+
+def _way(path: Path) -> Way:
+    base = base_position(read_recording(path, load_robot()))
+    if base is None:  # only in suspended recordings
+        raise InputError(f"{path}: has no base position; it is no recording of a trial, take it out of the folder.")
+    return base[:, :2] - base[0, :2]
+
+
+def draw(ways: dict[str, list[list[Way]]], seeds: Sequence[int], path: Path) -> None:
+    """Draw one panel a setting, all to one scale: a line a trial, a dash pattern a seed, a dot where the robot ends."""
+    low, high = _limits(np.concatenate([way for runs in ways.values() for trials in runs for way in trials]))
+    width, height = high - low
+    columns = len(ways)
+    if len(ways) > 2 and width > 1.3 * height:
+        columns = 2 if len(ways) <= 4 else 3
+    rows = -(-len(ways) // columns)
+    panel = 12.0 / max(columns, 3)
+    size = (panel * columns + 0.4, ((panel - 0.2) * height / width + 0.65) * rows + (0.75 if len(seeds) > 1 else 0.4))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    styles = [_SEED_STYLES[index % len(_SEED_STYLES)] for index in range(len(seeds))]
+    for axis in axes.flat[len(ways) :]:
+        axis.set_axis_off()
+    for axis, (setting, runs) in zip(axes.flat, ways.items(), strict=False):
+        axis.axhline(0.0, color="grey", linewidth=0.8)
+        axis.axvline(0.0, color="grey", linewidth=0.8)
+        for style, trials in zip(styles, runs, strict=True):
+            for way in trials:
+                axis.plot(*way.T, style, color=colour_of(setting), linewidth=1.2, alpha=0.85)
+                axis.plot(*way[-1], "o", color=colour_of(setting), markersize=4)
+        axis.plot(0.0, 0.0, "o", color="black", markersize=5)
+        axis.set(title=label_of(setting), xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        axis.set_aspect("equal")
+        axis.grid(alpha=0.3)
+    for axis in axes.flat[len(ways) - columns : len(ways)]:  # the lowest of each column
+        axis.set_xlabel("x (m)")
+        axis.tick_params(labelbottom=True)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("y (m)")
+    if len(seeds) > 1:
+        for seed, style in zip(seeds, styles, strict=True):
+            axes[0, 0].plot([], [], style, color="black", label=f"seed {seed}")
+        figure.legend(loc="outside lower center", ncols=len(seeds))
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=120)
+
+
+def _limits(points: Way) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
+    """Corners of what is shown: all points and a margin, no narrower or flatter than is good to look at."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = np.maximum(1.1 * (high - low), _SMALLEST_EXTENT)
+    size = np.maximum(size, 0.4 * size.max())
+    middle = (low + high) / 2
+    return middle - size / 2, middle + size / 2
+
+
+# %% [markdown]
+# ## Table and figure
+# Training, trials and table are the package's: `ballu_mjx.cli.pipeline` holds the stages,
+# `ballu_mjx.evaluation.transfer` the figures of a trial.
+
+
+# %%
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description="Tables I and II of the paper: tasks on the robot, by the simulator that the policy was trained in."
+    )
+    parser.add_argument("--task", choices=list(FIGURES), required=True, help="walk: Table I; turn (left): Table II")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="trainings of every policy (0 1 2)")
+    parser.add_argument("--robot-seed", type=int, default=0, help="which virtual robot stands in for the hardware (0)")
+    parser.add_argument(
+        "--output", type=Path, help=f"folder of `train all`'s stages ({OUTPUT}, or {QUICK_OUTPUT} under --quick)"
+    )
+    parser.add_argument("--rounds", type=int, default=1, help="how often EnvMimic learns; see `train all --help` (1)")
+    parser.add_argument(
+        "--also",
+        nargs="+",
+        choices=pipeline_layout.MORE_SETTINGS,
+        default=[],
+        help="further simulators; see `train all --help` (none)",
+    )
+    parser.add_argument("--quick", action="store_true", help="train for seconds; the numbers mean nothing")
+    parser.add_argument("--figure-only", action="store_true", help="draw from the trials that are there; run nothing")
+    given = parser.parse_args()
+    output = given.output or (QUICK_OUTPUT if given.quick else OUTPUT)
+    written = []
+    if not given.figure_only:
+        pipeline.run(
+            pipeline.Options(
+                output=output,
+                robot_seed=given.robot_seed,
+                seeds=tuple(given.seeds),
+                tasks=(given.task,),
+                quick=given.quick,
+                rounds=given.rounds,
+                also=tuple(given.also),
+            )
+        )
+        written.append(pipeline_layout.table_file(output, given.task))
+    written.append(output / FIGURES[given.task])
+    draw(read_ways(output, given.task, given.seeds), given.seeds, written[-1])
+    print(f"Written: {', '.join(map(str, written))}.")
+
+
+if __name__ == "__main__":
+    _setup.run(main)
