@@ -51,7 +51,7 @@ def identify(folder: Path, config: IdentificationConfig) -> None:
     **Raises** `InputError` where `folder` holds something else.
     """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-        train_sysid.train(train_sysid.SweepData(output=folder), config)
+        train_sysid.train(train_sysid.SysidData(output=folder), config)
         return
     found = read_config(folder, "sysid")["fit"]
     mend = "delete it, or give --output another folder"
