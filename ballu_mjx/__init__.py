@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from ballu_mjx.residuals.analytic import AnalyticConfig
     from ballu_mjx.residuals.envmimic import EnvMimicConfig
     from ballu_mjx.residuals.envmimic_training import train_envmimic
+    from ballu_mjx.residuals.fluid_fit import FluidConfig
+    from ballu_mjx.residuals.fluid_training import fit_fluid
     from ballu_mjx.residuals.force_fitting import fit_analytic, fit_supervised
     from ballu_mjx.residuals.supervised import SupervisedConfig
     from ballu_mjx.residuals.trained import TrainedResidual
@@ -67,6 +69,8 @@ _MODULES = {
     "choose_actuators": "identification.guard",
     "evaluate": "evaluation.open_loop",
     "fit_aerodynamics": "residuals.aerodynamics_training",
+    "FluidConfig": "residuals.fluid_fit",
+    "fit_fluid": "residuals.fluid_training",
     "fit_analytic": "residuals.force_fitting",
     "fit_supervised": "residuals.force_fitting",
     "identify_actuators": "identification.actuators",
@@ -102,6 +106,8 @@ __all__ = [
     "choose_actuators",
     "evaluate",
     "fit_aerodynamics",
+    "fit_fluid",
+    "FluidConfig",
     "fit_analytic",
     "fit_supervised",
     "identify_actuators",

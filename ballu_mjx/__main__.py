@@ -18,6 +18,7 @@ COMMANDS = (
     ("identification", "train sysid", "actuator parameters from a suspended sweep"),
     ("residual", "train envmimic", "forces that make simulation follow recordings"),
     ("", "train aerodynamic", "the air around the balloon, identified: no forces learned, but physics"),
+    ("", "train fluid", "lift, drag and moments of any body in air or water, as polynomials"),
     ("", "train supervised", "forces by regression on those that explain recordings; also analytic, by gradients"),
     ("", "evaluate RUN", "replay recordings without and with a residual"),
     ("policy", "train walk", "also turn, turn-right, walk-backward: policies in an improved simulator"),

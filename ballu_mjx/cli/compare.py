@@ -98,7 +98,8 @@ def figures(folder: Path) -> dict[str, float]:
 
     steps, reward = read_column(folder, "reward")
     path = folder / "evaluation.json"
-    identified = read_config(folder, *RESIDUAL_TASKS, *TASKS)["task"] == "aerodynamic"
+    task = read_config(folder, *RESIDUAL_TASKS, *TASKS)["task"]
+    identified = task in RESIDUAL_TASKS and task not in NETWORK_TASKS
     if not len(steps) and not identified:
         raise InputError(f"{folder}: has not trained yet (metrics.jsonl holds no reward); leave it out.")
     found = {"reward at the end": float(reward[steps > (1 - _LAST) * steps[-1]].mean())} if len(steps) else {}

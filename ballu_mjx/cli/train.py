@@ -45,7 +45,15 @@ def subcommands() -> Mapping[str, Any]:
 
 def _commands() -> Mapping[str, TrainCommand]:
     """Return the subcommands by name, in the order of the work."""
-    from ballu_mjx.cli import pipeline, train_aerodynamics, train_envmimic, train_forces, train_policy, train_sysid
+    from ballu_mjx.cli import (
+        pipeline,
+        train_aerodynamics,
+        train_envmimic,
+        train_fluid,
+        train_forces,
+        train_policy,
+        train_sysid,
+    )
     from ballu_mjx.policies.tasks import TASKS
 
     return {
@@ -54,6 +62,7 @@ def _commands() -> Mapping[str, TrainCommand]:
         "supervised": train_forces.SUPERVISED,
         "analytic": train_forces.ANALYTIC,
         "aerodynamic": train_aerodynamics.COMMAND,
+        "fluid": train_fluid.COMMAND,
         **{name: train_policy.command_for(task) for name, task in TASKS.items()},
         "all": pipeline.COMMAND,
     }

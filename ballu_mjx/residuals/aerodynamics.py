@@ -21,10 +21,11 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
+from ballu_mjx.residuals.body_motion import body_motion
 from ballu_mjx.residuals.network import ForceNetworkConfig, network_input
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.force_model import Fields
-from ballu_mjx.sim.observation import HISTORY, ObservationLayout, heading_rotation
+from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.step import count_substeps
 
 
@@ -136,13 +137,10 @@ class Aerodynamics:
     ) -> Float[Array, "1 6"]:
         """Drag in still air, by the velocities in the middle of the coming control step, extrapolated from the last."""
         del commands, key
-        layout = ObservationLayout
-        earlier, before, now = (rotation(seen[layout.euler_angles]) for seen in history[-3:])
-        velocity = now.T @ (1.5 * history[-1, layout.velocity] - 0.5 * history[-2, layout.velocity])
-        turned = 2 * turn(before.T @ now) - turn(earlier.T @ before)
+        now, velocity, rate = body_motion(history, self._control_timestep)
         speed = jnp.sqrt(jnp.sum(velocity**2) + _SLOW**2)
         force = -(params.linear_drag + params.quadratic_drag * speed) * velocity
-        torque = -params.turning_drag * turned / self._control_timestep
+        torque = -params.turning_drag * rate
         return jnp.concatenate([now @ force, now @ torque])[None]
 
 
@@ -150,19 +148,6 @@ _JUST = 1e-3
 """Of a control step: a delay of just so many physics steps is over when they are."""
 _SLOW = 1e-3
 """m/s; keeps the speed differentiable at rest."""
-
-
-def rotation(euler: Float[Array, " 3"]) -> Float[Array, "3 3"]:
-    """Rotation matrix, body to world, of roll, pitch and yaw (rad; intrinsic z-y-x)."""
-    roll, pitch, yaw = euler
-    cr, sr, cp, sp = jnp.cos(roll), jnp.sin(roll), jnp.cos(pitch), jnp.sin(pitch)
-    tilt = jnp.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
-    return heading_rotation(yaw) @ tilt
-
-
-def turn(matrix: Float[Array, "3 3"]) -> Float[Array, " 3"]:
-    """Rotation vector (rad) of a small rotation, to second order."""
-    return jnp.stack([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2
 
 
 def read_air_parameters(path: Path, robot: RobotDescription) -> AirParameters:

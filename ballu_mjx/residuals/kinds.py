@@ -91,6 +91,18 @@ def _load_aerodynamics(run: StoredRun) -> LoadedResidual:
     return LoadedResidual(model, params, num_inputs(ForceNetworkConfig(), run.robot), 0)
 
 
+def _load_fluid(run: StoredRun) -> LoadedResidual:
+    import jax.numpy as jnp
+
+    from ballu_mjx.residuals.fluid import FLUID_FILE, FluidForces, read_fluid
+    from ballu_mjx.residuals.network import ForceNetworkConfig, num_inputs
+
+    found = read_fluid(run.folder / FLUID_FILE)
+    model = FluidForces(run.robot, run.robot.load_model(run.actuators), found.term_set)
+    params = jnp.asarray(found.values, jnp.float32)
+    return LoadedResidual(model, params, num_inputs(ForceNetworkConfig(), run.robot), 0)
+
+
 KINDS: Mapping[str, ResidualKind] = {
     kind.name: kind
     for kind in (
@@ -98,6 +110,7 @@ KINDS: Mapping[str, ResidualKind] = {
         ResidualKind("supervised", "supervised", True, _load_network),
         ResidualKind("analytic", "analytic", True, _load_network),
         ResidualKind("aerodynamic", "aerodynamic", False, _load_aerodynamics),
+        ResidualKind("fluid", "fluid forces", False, _load_fluid),
     )
 }
 """By name."""

@@ -23,9 +23,9 @@ from ballu_mjx.residuals.aerodynamics import (
     AirParameters,
     air_parameters_to_json,
     read_air_parameters,
-    rotation,
 )
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, Optimum, at_whole_delay, identify_air
+from ballu_mjx.residuals.body_motion import rotation
 from ballu_mjx.robots.model import set_fields
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, heading_rotation

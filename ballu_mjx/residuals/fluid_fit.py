@@ -1,0 +1,300 @@
+"""Fit of fluid forces to recordings of free motion, by least squares through MJX.
+
+Recordings are cut into windows. Each is simulated from its recorded first state under its recorded commands. The fit
+minimizes how far the tracked body's position and orientation end up from the recorded ones. Derivatives are exact,
+taken forwards through the simulation. Windows grow from stage to stage: over a short window, errors are nearly linear
+in the coefficients; a long one shows what adds up.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float, Int
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.identification.batched_solver import BatchedSolver
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.segments import (
+    OUTLYING,
+    Segments,
+    check_segments,
+    cut_segments,
+    pseudo_huber,
+    segment_errors,
+    start_segment,
+)
+from ballu_mjx.residuals.fluid import TERM_SETS, FluidCoefficients, FluidForces, TermSet, mirrored, terms_of
+from ballu_mjx.sim.force_model import BoundForces
+from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.sharding import shard_over_devices
+from ballu_mjx.sim.simulator import RolloutState, Simulator
+
+
+@dataclasses.dataclass(frozen=True)
+class FluidConfig:
+    """How fluid forces are fitted."""
+
+    terms: Literal["auto", TermSet] = "auto"
+    """Which terms: linear (gravity's direction, velocities), drag (these times the speed), quadratic (products of two
+    velocities), cubic (of three, over the speed); each has those before it. auto fits all four, and takes the one with
+    the lowest error on the validation recordings."""
+    mirror: bool = True
+    """Whether the forces are symmetric about the body's xz plane where the robot's description declares `mirror`."""
+    window_seconds: tuple[float, ...] = (0.5, 1.0, 2.0)
+    """Lengths of the windows, s, one for each stage."""
+    windows: int = 200
+    """Most windows of a stage."""
+    steps: int = 6
+    """Most iterations of Levenberg-Marquardt in a stage."""
+    spread: float = 1.0
+    """Standard deviation of the prior on each term's typical effect, as an acceleration (m/s^2, rad/s^2)."""
+
+
+def check_fluid_config(config: FluidConfig, control_timestep: float) -> None:
+    """Check options.
+
+    **Raises** `InputError` naming the option that is out of range.
+    """
+    if not config.window_seconds:
+        raise InputError("--window-seconds names no length; give one or more, in seconds.")
+    for seconds in config.window_seconds:
+        check_segments(seconds, seconds, control_timestep)
+    for name in ("windows", "steps", "spread"):
+        if not getattr(config, name) > 0:
+            raise InputError(f"--{name} is {getattr(config, name)}: it must be above 0.")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FluidFit:
+    """What a fit found, and how good it is."""
+
+    coefficients: FluidCoefficients
+    scores: dict[str, float]
+    """Root mean square error on validation windows, in expected errors, by set of terms; `none`: without forces."""
+    symmetric: bool
+    """Whether the forces are symmetric about the xz plane."""
+    windows: int
+    control_steps: int
+    """Simulated for it."""
+
+
+Report = Callable[[str, int, int, float], None]
+"""(stage, iteration, most iterations, loss)."""
+
+
+def fit_fluid_forces(
+    simulator: Simulator,
+    training: Sequence[Motion],
+    validation: Sequence[Motion],
+    config: FluidConfig,
+    report: Report = lambda stage, iteration, steps, loss: None,
+) -> FluidFit:
+    """Fit coefficients to `training`; `validation` chooses the set of terms.
+
+    **Raises** `InputError` for options out of range, and where no recording is as long as a window.
+    """
+    check_fluid_config(config, simulator.control_timestep)
+    windows = _Windows(simulator, training, config)
+    held_out = _Windows(simulator, validation, config, program=windows.program)
+    symmetric = config.mirror and simulator.robot.mirror is not None
+    names: Sequence[TermSet] = TERM_SETS if config.terms == "auto" else (config.terms,)
+    prior = _priors(windows, config.spread)
+    scores = {"none": held_out.score(np.zeros_like(prior))}
+    best: tuple[float, FluidCoefficients] | None = None
+    for name in names:
+        search = _Search(windows, name, prior, symmetric=symmetric)
+        vector = search.run(config, lambda *told, name=name: report(f"{name}, {told[0]}", *told[1:]))
+        scores[name] = held_out.score(search.table(vector))
+        if best is None or scores[name] < best[0]:
+            shown = slice(len(terms_of(name)))
+            errors = search.table(search.standard_errors(vector))
+            best = scores[name], FluidCoefficients(name, search.table(vector)[shown], errors[shown])
+    assert best is not None
+    steps = windows.program.control_steps
+    return FluidFit(best[1], scores, symmetric, windows.count, steps)
+
+
+def _thin(windows: Segments, most: int) -> Segments:
+    """Return at most so many windows, evenly chosen."""
+    count = len(windows.qpos)
+    if count <= most:
+        return windows
+    chosen = np.linspace(0, count - 1, most).astype(int)
+    return jax.tree.map(lambda x: np.asarray(x)[chosen], windows)
+
+
+class _Program:
+    """Simulation of windows under all terms; compiles once for each length of windows, whatever the set of terms."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        self._simulator = simulator
+        self.forces = FluidForces(simulator.robot, simulator.mj_model, TERM_SETS[-1])
+        self.errors = shard_over_devices(self._errors, shared=1)
+        self.slopes = shard_over_devices(self._along, shared=1)
+        self.control_steps = 0
+        """Simulated so far."""
+
+    def _along(
+        self, params: Float[Array, "terms 6"], direction: Float[Array, "terms 6"], window: Segments
+    ) -> Float[Array, " entries"]:
+        return jax.jvp(lambda own: self._errors(own, window), (params,), (direction,))[1]
+
+    def _errors(self, params: Float[Array, "terms 6"], window: Segments) -> Float[Array, " entries"]:
+        """One window's errors, in expected errors."""
+        simulator = self._simulator.with_residual(BoundForces(self.forces, params))
+        state, commands = start_segment(window)
+
+        def step(state: RolloutState, command: Array) -> tuple[RolloutState, Array]:
+            after = simulator.step(state, command).state
+            return after, after.features
+
+        _, features = jax.lax.scan(step, state, commands)
+        return segment_errors(features, window.features, self._simulator.control_timestep).ravel()
+
+
+class _Windows:
+    """Windows of recorded motions, as long as the last stage's."""
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        motions: Sequence[Motion],
+        config: FluidConfig,
+        program: _Program | None = None,
+    ) -> None:
+        seconds = max(config.window_seconds)
+        self.simulator = simulator
+        self.segments = _thin(cut_segments(simulator, motions, seconds, seconds), config.windows)
+        self.program = _Program(simulator) if program is None else program
+        self.count, self.steps = np.shape(self.segments.features)[:2]
+
+    def errors(self, params: Float[np.ndarray, "terms 6"]) -> Float[np.ndarray, "windows entries"]:
+        """Return the errors of all windows, in expected errors; diverged ones count as `_LOST`."""
+        self.program.control_steps += self.count * self.steps
+        filled = np.arange(-(-self.count // _BATCH) * _BATCH) % self.count
+        parts = filled.reshape(-1, _BATCH)
+        found = [self.program.errors(np.float32(params), self._chosen(part)) for part in parts]
+        errors = np.concatenate(found).astype(np.float64)[: self.count]
+        lost = ~np.isfinite(errors).all(axis=1)
+        errors[lost] = _LOST / np.sqrt(errors.shape[1])
+        return errors
+
+    def slopes(
+        self, params: Float[np.ndarray, "terms 6"], directions: Float[np.ndarray, "size terms 6"]
+    ) -> Float[np.ndarray, "windows entries size"]:
+        """Return how errors change along directions; diverged windows do not."""
+        size = len(directions)
+        self.program.control_steps += self.count * self.steps * size
+        window, direction = np.divmod(np.arange(-(-self.count * size // _BATCH) * _BATCH) % (self.count * size), size)
+        found = []
+        for part in np.arange(len(window)).reshape(-1, _BATCH):
+            own = np.float32(directions[direction[part]])
+            found.append(self.program.slopes(np.float32(params), own, self._chosen(window[part])))
+        slopes = np.concatenate(found).astype(np.float64)[: self.count * size].reshape(self.count, size, -1)
+        slopes[~np.isfinite(slopes).all(axis=(1, 2))] = 0.0
+        return np.swapaxes(slopes, 1, 2)
+
+    def shortened(self, seconds: float) -> _Windows:
+        """Return the same windows, cut off after so many seconds."""
+        steps = round(seconds / self.simulator.control_timestep)
+        commands = self.segments.commands[:, : steps + HISTORY - 1]
+        other = copy.copy(self)
+        other.segments = self.segments._replace(commands=commands, features=self.segments.features[:, :steps])
+        other.steps = steps
+        return other
+
+    def score(self, params: Float[np.ndarray, "terms 6"]) -> float:
+        """Return the root of the mean robust loss of windows, in expected errors."""
+        return float(np.sqrt(np.mean(pseudo_huber(np.sum(self.errors(params) ** 2, axis=1))) / 6))
+
+    def _chosen(self, rows: Int[np.ndarray, " rows"]) -> Segments:
+        return jax.tree.map(lambda x: np.asarray(x)[rows], self.segments)
+
+
+class _Search:
+    """The fit of one set of terms. A vector holds the coefficients that may differ from 0, in units of their priors."""
+
+    def __init__(
+        self, windows: _Windows, name: TermSet, prior: Float[np.ndarray, "terms 6"], *, symmetric: bool
+    ) -> None:
+        self._windows, self._prior = windows, prior
+        terms = terms_of(TERM_SETS[-1])
+        self._free = mirrored(terms) if symmetric else np.ones(prior.shape, bool)
+        self._free[len(terms_of(name)) :] = False
+        self.size = int(self._free.sum())
+        self._directions = np.zeros((self.size, *prior.shape))
+        self._directions[np.arange(self.size), *np.argwhere(self._free).T] = prior[self._free]
+
+    def table(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, "terms 6"]:
+        """Return coefficients in SI units."""
+        return np.tensordot(vector, self._directions, 1)
+
+    def run(self, config: FluidConfig, report: Report) -> Float[np.ndarray, " size"]:
+        """Return the vector that fits best."""
+        vector = np.zeros(self.size)
+        solver = BatchedSolver(optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3))
+        for seconds in config.window_seconds:
+            windows = self._windows.shortened(seconds)
+            found, _ = solver(
+                lambda points, windows=windows: tuple(x[None] for x in self._rows(points[0], windows)),
+                vector[None],
+                config.steps,
+                lambda *told, seconds=seconds: report(f"windows of {seconds:g} s", *told),
+                patience=3,
+            )
+            vector = found[0]
+        return vector
+
+    def standard_errors(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, " size"]:
+        """Return standard errors that hold for windows that err independently, in whatever way (sandwich)."""
+        params = self.table(vector)
+        errors, slopes = self._windows.errors(params), self._windows.slopes(params, self._directions)
+        weight = 1 / np.sqrt(1 + np.sum(errors**2, axis=1) / OUTLYING**2)
+        scores = np.einsum("we,wes->ws", errors, slopes) * weight[:, None]
+        bread = np.linalg.inv(np.einsum("w,wes,wet->st", weight, slopes, slopes, optimize=True) + np.eye(self.size))
+        covariance = bread @ (scores.T @ scores + np.eye(self.size)) @ bread
+        return np.sqrt(np.diag(covariance))
+
+    def _rows(
+        self, vector: Float[np.ndarray, " size"], windows: _Windows
+    ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows size"]]:
+        """Return softened errors and the prior, and how they change."""
+        params = self.table(vector)
+        errors, slopes = windows.errors(params), windows.slopes(params, self._directions)
+        # Iteratively reweighted: the weight of a window is held where its slopes are taken.
+        weight = (1 + np.sum(errors**2, axis=1)[:, None] / OUTLYING**2) ** -0.25
+        values = np.concatenate([(weight * errors).ravel(), vector])
+        return values, np.concatenate([(weight[..., None] * slopes).reshape(-1, self.size), np.eye(self.size)])
+
+
+def _priors(windows: _Windows, spread: float) -> Float[np.ndarray, "terms 6"]:
+    """Return the coefficients whose terms accelerate the robot by `spread`, at the terms' size in the recordings."""
+    history = jnp.asarray(windows.segments.history)
+    _, terms = jax.jit(jax.vmap(windows.program.forces.values))(history)
+    typical = np.sqrt(np.mean(np.asarray(terms, np.float64) ** 2, axis=0))
+    mass, inertia = _whole_body(windows.simulator)
+    force = np.array([mass] * 3 + [inertia] * 3) * spread
+    return force / np.maximum(typical, _LEAST * typical.max())[:, None]
+
+
+_BATCH = 1024
+"""Simulations side by side."""
+_LEAST = 1e-3
+"""Of the largest typical term: smaller ones count as so large, so that no coefficient may grow without limit."""
+_LOST = 20.0
+"""What a window that diverged counts as, in expected errors."""
+
+
+def _whole_body(simulator: Simulator) -> tuple[float, float]:
+    """Return the robot's mass (kg) and the tracked body's mean moment of inertia about its centre (kg m^2)."""
+    model = simulator.mj_model
+    body = int(model.site_bodyid[model.site(simulator.robot.tracked).id])
+    return float(model.body_subtreemass[model.body_rootid[body]]), float(np.mean(model.body_inertia[body]))

@@ -1,0 +1,318 @@
+# %% [markdown]
+# # A real helium blimp: forces of the air from recorded flights
+#
+# RGBlimp (Peking University) has an envelope with wings, a gondola that moves fore and aft, and two propellers. The
+# data are public: `zhu-yj/ABNODE` on GitHub, commit `138a1de`, `data/data_1.csv` to `data_140.csv`, MIT. Papers: Zhu,
+# Cheng, Zhang, ABNODE, RA-L 9(12) 2024 (arXiv 2404.18580); Cheng et al., RGBlimp, RA-L 2023 (arXiv 2306.04079).
+#
+# `--data` is a folder with these files (`data_N.csv`, also `.csv.xz`), or with the recordings that an earlier run made
+# of them (`flight-NNN.csv.gz`). File N is flight (N - 1) mod 4 + 1 of input (N - 1) div 4. Commands are constant in a
+# flight. Spirals are files 1 to 120, straight flights 121 to 140.
+#
+# | use | files |
+# | --- | --- |
+# | training | flights 1 and 2 of inputs 0 to 19 |
+# | validation | flight 3 of the same inputs |
+# | test, near | flight 4 of inputs 0 to 9 |
+# | test, between | inputs 20 to 24: pairs of thrusts that training lacks |
+# | test, far | files 121 to 130: straight flights |
+#
+# These test flights have been reported before: they are development data. Other flights of the data set are left for a
+# final check, and this script does not read them.
+#
+# Rivals are the nominal model without air, the published aerodynamic model, and the mean motion of the nearest recorded
+# moments. Errors are those at the end of a horizon, root mean square over starts in every second.
+#
+# `python experiments/real/rgblimp/rgblimp.py --data FOLDER`; `--quick` shows that it works.
+
+# %%
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+FOLDER = Path("experiments/real/rgblimp") if "ipykernel" in sys.modules else Path(__file__).parent
+sys.path[1:1] = [str(FOLDER.parents[1])]
+
+import _setup
+
+_setup.prepare()
+
+import argparse
+import lzma
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
+from ballu_mjx.recordings.csv_format import read_recording, write_recording
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.residuals.body_motion import body_motion
+from ballu_mjx.residuals.fluid_fit import FluidConfig
+from ballu_mjx.residuals.fluid_training import fit_fluid
+from ballu_mjx.robots.description import RobotDescription, read_description
+from ballu_mjx.runs.progress import PhaseProgress
+from ballu_mjx.sim.force_model import Fields
+from ballu_mjx.sim.simulator import Simulator
+
+HORIZONS = (1.0, 2.0, 5.0)
+"""s."""
+TRAINING = tuple(4 * i + flight for i in range(20) for flight in (1, 2))
+VALIDATION = tuple(4 * i + 3 for i in range(20))
+TEST: Mapping[str, tuple[int, ...]] = {
+    "near": tuple(4 * i + 4 for i in range(10)),
+    "between": tuple(range(81, 101)),
+    "far": tuple(range(121, 131)),
+}
+FLIP = np.array([1.0, -1.0, -1.0])
+"""North, east, down to forward, left, up; its own inverse."""
+FULL_THRUST, FIRST_PLACE, TRAVEL = 0.07, 0.0647, 0.05
+"""Of the commands: N, m, m."""
+
+# %% [markdown]
+# ## Conversion
+
+
+# %%
+def convert(path: Path, name: str) -> Recording:
+    """Return a flight of the public data as a recording: 60 rows a second, world z up.
+
+    **Raises** `InputError` where the file lacks a column.
+    """
+    text = lzma.open(path, "rt").read() if path.suffix == ".xz" else path.read_text()
+    header, *rows = text.split("\n")
+    columns = header.strip().split(",")
+    table = np.array([row.split(",") for row in rows if row.strip()], float)
+    wanted = [*(f"{kind}_{k}" for kind in ("p", "e", "rb_series") for k in (1, 2, 3)), "Fl_series", "Fr_series"]
+    for column in wanted:
+        if column not in columns:
+            raise InputError(f"{path}: there is no column {column}; give a file of the public data set.")
+    place, angles, gondola = (table[:, [columns.index(c) for c in wanted[k : k + 3]]] for k in (0, 3, 6))
+    left, right = (table[:, columns.index(c)] for c in wanted[9:])
+    turns = Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix() * FLIP[:, None] * FLIP
+    mass = gondola[:, 0]
+    return Recording(
+        name=name,
+        kind="free",
+        robot="RGBlimp",
+        notes=f"zhu-yj/ABNODE 138a1de data/{path.name}, MIT",
+        time=np.arange(len(table)) / 60,
+        command=np.stack([left / FULL_THRUST, right / FULL_THRUST, (mass - FIRST_PLACE) / TRAVEL], axis=1),
+        tracked_position=place * FLIP,
+        tracked_quaternion=Rotation.from_matrix(turns).as_quat(scalar_first=True),
+        joint_angles={"mass_x": mass},
+    )
+
+
+def load(data: Path, numbers: Sequence[int], robot: RobotDescription, made: Path) -> list[Motion]:
+    """Return reconstructed flights by the numbers of their files; conversions are kept in the folder `made`."""
+    motions = []
+    for number in numbers:
+        name = f"flight-{number:03d}.csv.gz"
+        path = next((p for p in (data / name, made / name) if p.exists()), None)
+        if path is None:
+            raw = next((p for e in ("csv", "csv.xz") if (p := data / f"data_{number}.{e}").exists()), None)
+            if raw is None:
+                raise InputError(f"{data}: there is neither data_{number}.csv nor {name}; fetch the public data set.")
+            made.mkdir(parents=True, exist_ok=True)
+            path = made / name
+            write_recording(convert(raw, name.removesuffix(".csv.gz")), path, robot)
+        motions.append(reconstruct(read_recording(path, robot), robot))
+    return motions
+
+
+# %% [markdown]
+# ## The published aerodynamic model
+#
+# Lift, drag, side force and moments over angle of attack and sideslip, and rotary damping: `models/RGBlimp_dynamics.py`
+# and `utils/parameters.py` of the data's authors. Whether they were fitted to these same flights is not said there.
+
+
+# %%
+class PublishedAerodynamics:
+    """The published model as a residual; it has no parameters."""
+
+    name = "published"
+    pressure_area = 0.5 * 1.2187 * 0.25
+    damping = np.array([-0.0503, -0.0264, -0.0137])
+    centre = np.array([-0.0436, 0.0003, -0.008])
+    """Centre of mass of the hull (m), where wrenches act."""
+
+    def __init__(self, control_timestep: float) -> None:
+        self._control_timestep = control_timestep
+
+    def inputs(self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]) -> Array:
+        del commands
+        return history[-1]
+
+    def fields(self, params: Any) -> Fields:
+        del params
+        return {}
+
+    def command(self, params: Any, commands: Float[Array, "steps commands"]) -> Float[Array, "1 commands"]:
+        del params
+        return commands[-1:]
+
+    def wrench(
+        self,
+        params: Any,
+        history: Float[Array, "steps features"],
+        commands: Float[Array, "steps commands"],
+        key: Array | None = None,
+    ) -> Float[Array, "1 6"]:
+        del params, commands, key
+        frame, velocity, rate = body_motion(history, self._control_timestep)
+        v, w = FLIP * velocity, FLIP * rate
+        speed = jnp.sqrt(jnp.sum(v**2) + 1e-8)
+        a, b = jnp.arctan2(v[2], v[0]), jnp.arcsin(jnp.clip(v[1] / speed, -1.0, 1.0))
+        size = self.pressure_area * speed**2
+        drag = 0.2425 + 4.4195 * a**2 + 7.5080 * b**2
+        side = 0.0083 - 0.0744 * a**2 - 2.1140 * b
+        lift = 0.1594 + 2.9375 * a + 4.5537 * b**2
+        moments = jnp.stack(
+            [
+                0.0131 - 0.0301 * a - 0.5256 * b,
+                0.0568 + 0.0933 * a + 5.2357 * b**4,
+                0.0006 - 0.0012 * a - 0.0936 * b,
+            ]
+        )
+        ca, sa, cb, sb = jnp.cos(a), jnp.sin(a), jnp.cos(b), jnp.sin(b)
+        wind = jnp.array([[ca * cb, -ca * sb, -sa], [sb, cb, 0.0], [sa * cb, -sa * sb, ca]])
+        force = FLIP * (wind @ (size * jnp.stack([-drag, side, -lift])))
+        torque = FLIP * (wind @ (size * moments + self.damping * w))
+        torque = torque - jnp.cross(self.centre, force)
+        return jnp.concatenate([frame @ force, frame @ torque])[None]
+
+
+# %% [markdown]
+# ## Errors
+
+
+# %%
+def end_errors(evaluator: OpenLoopEvaluator, replay: Replay) -> dict[float, tuple[float, float, int, int]]:
+    """Return position (m) and yaw error (deg) at each horizon's end, root mean square, starts, and diverged ones."""
+    found = {}
+    for horizon in HORIZONS:
+        steps = round(horizon / evaluator.robot.control_timestep)
+        errors = []
+        for run in range(len(evaluator.starts)):
+            position, yaw = evaluator.recorded(run)
+            if len(position) > steps:
+                turn = replay.yaw[run, steps] - yaw[steps]
+                far = np.linalg.norm(replay.position[run, steps] - position[steps])
+                errors.append([far, np.rad2deg(np.arctan2(np.sin(turn), np.cos(turn)))])
+        table = np.array(errors).reshape(-1, 2)
+        kept = table[np.isfinite(table).all(axis=1)]
+        rms = np.sqrt(np.mean(kept**2, axis=0)) if len(kept) else np.full(2, np.inf)
+        found[horizon] = float(rms[0]), float(rms[1]), len(table), len(table) - len(kept)
+    return found
+
+
+def neighbour_errors(
+    training: Sequence[Motion], test: Sequence[Motion], control_timestep: float, neighbours: int = 20
+) -> dict[float, tuple[float, float, int, int]]:
+    """Return the errors of the mean displacement of the most similar recorded moments, in the heading frame.
+
+    Moments are compared by roll, pitch, velocity and angular velocity in the body, and commands.
+    """
+    found = {}
+    for horizon in HORIZONS:
+        steps = round(horizon / control_timestep)
+        known = [_moments(motion, steps, 1) for motion in training]
+        tree, moved = KDTree(np.concatenate([x for x, _ in known])), np.concatenate([y for _, y in known])
+        errors = []
+        for motion in test:
+            seen, truth = _moments(motion, steps, round(1 / control_timestep))
+            if len(seen):
+                guess = moved[tree.query(seen, neighbours)[1]].mean(axis=1)
+                errors += [[np.linalg.norm(e[:3]), np.rad2deg(e[3])] for e in guess - truth]
+        rms = np.sqrt(np.mean(np.array(errors) ** 2, axis=0))
+        found[horizon] = float(rms[0]), float(rms[1]), len(errors), 0
+    return found
+
+
+_LIKE = np.array([0.01] * 2 + [0.01] * 3 + [0.02] * 3 + [0.001] * 3)
+"""Differences that count alike: rad, m/s, rad/s, commands."""
+
+
+def _moments(motion: Motion, steps: int, every: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return what moments of a motion are compared by, and the displacement and turn that follow."""
+    count = max(len(motion.qpos) - steps, 0)
+    here = np.arange(2, count, every)
+    if not len(here):
+        return np.zeros((0, len(_LIKE))), np.zeros((0, 4))
+    turns = Rotation.from_quat(motion.qpos[:, 3:7], scalar_first=True)
+    yaw, pitch, roll = turns.as_euler("ZYX").T
+    velocity = turns.inv().apply(motion.qvel[:, :3])
+    state = np.column_stack([roll, pitch, velocity, motion.qvel[:, 3:6]])[here]
+    heading = Rotation.from_euler("z", -yaw[here, None])
+    moved = heading.apply(motion.qpos[here + steps, :3] - motion.qpos[here, :3])
+    turned = np.unwrap(yaw)[here + steps] - np.unwrap(yaw)[here]
+    return np.column_stack([state, motion.command[here]]) / _LIKE, np.column_stack([moved, turned])
+
+
+def table(rows: Mapping[str, Mapping[str, Mapping[float, tuple[float, float, int, int]]]]) -> str:
+    """Return all errors as Markdown; `rows` by method and group."""
+    heads = [f"{group}, {horizon:g} s" for group in TEST for horizon in HORIZONS]
+    lines = [f"| method | {' | '.join(heads)} |", f"| --- |{' --- |' * len(heads)}"]
+    for method, groups in rows.items():
+        cells = []
+        for group in TEST:
+            for horizon in HORIZONS:
+                far, turned, starts, lost = groups[group][horizon]
+                diverged = f" ({lost} of {starts} diverged)" if lost else ""
+                cells.append(f"{far:.3f} m, {turned:.1f} deg{diverged}")
+        lines.append(f"| {method} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+# %% [markdown]
+# ## All of it
+
+
+# %%
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Fit the air around a real blimp, and predict flights never seen.")
+    parser.add_argument("--data", type=Path, required=True, help="folder with the public files or recordings of them")
+    parser.add_argument("--output", type=Path, default=Path("runs/rgblimp"), help="folder for results (runs/rgblimp)")
+    parser.add_argument("--quick", action="store_true", help="few flights and steps; the numbers mean little")
+    options = parser.parse_args()
+    robot = read_description(FOLDER / "rgblimp.robot.json")
+    few = slice(0, 2) if options.quick else slice(None)
+    made = options.output / "recordings"
+    training, validation = (load(options.data, each[few], robot, made) for each in (TRAINING, VALIDATION))
+    test = {group: load(options.data, numbers[few], robot, made) for group, numbers in TEST.items()}
+    simulator = Simulator(robot)
+    quick = {"window_seconds": (0.5,), "windows": 10, "steps": 2}
+    full = {"window_seconds": (0.5, 2.0, 5.0), "windows": 150, "steps": 5}
+    residuals = {"published model": (PublishedAerodynamics(robot.control_timestep), jnp.zeros(0))}
+    for name, terms in (("linear terms", "linear"), ("fluid forces", "linear" if options.quick else "auto")):
+        config = FluidConfig(terms=terms, **(quick if options.quick else full))  # pyright: ignore[reportArgumentType]
+        found = fit_fluid(simulator, training, validation, config, progress=PhaseProgress())
+        print(f"\n{name}\n{found.report}\n", flush=True)
+        residuals[name] = found.model, found.params
+    rows: dict[str, dict[str, Any]] = {"no air": {}}
+    for name, (model, params) in residuals.items():
+        rows[name] = {}
+        evaluator = OpenLoopEvaluator(simulator, next(iter(test.values())), model)
+        for group, motions in test.items():
+            evaluator = evaluator.on(motions)
+            rows[name][group] = end_errors(evaluator, evaluator.replay(params))
+            if group not in rows["no air"]:
+                rows["no air"][group] = end_errors(evaluator, evaluator.replay(params, scale=0.0))
+    rows["nearest moments"] = {
+        group: neighbour_errors(training, motions, robot.control_timestep) for group, motions in test.items()
+    }
+    _setup.write_table(table(rows), options.output)
+
+
+if __name__ == "__main__":
+    _setup.run(main)
