@@ -105,7 +105,10 @@ def figures(folder: Path) -> dict[str, float]:
         raise InputError(
             f"{folder}: has no evaluation; `python -m ballu_mjx evaluate {folder} --output {folder}` writes it."
         )
-    found = {"reward at the end": float(reward[steps > (1 - _LAST) * steps[-1]].mean())} if len(steps) else {}
+    found = {}
+    if len(steps):
+        at_end = (steps > (1 - _LAST) * steps[-1]) | (steps == steps[-1])  # the second where that is step 0
+        found["reward at the end"] = float(reward[at_end].mean())
     if path.exists():
         evaluation = read_evaluation(path)
         for group in evaluation.groups:

@@ -1,7 +1,6 @@
 """From motion capture to the policy: features estimated now, from noisy and partly hidden frames so far."""
 
 import copy
-import dataclasses
 import subprocess
 import sys
 from typing import Any
