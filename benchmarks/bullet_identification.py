@@ -124,7 +124,7 @@ def hanging_hips(model: mujoco.MjModel, recording: Recording) -> dict[str, Float
     for side in SIDES:
         knees = np.linspace(0.2, 1.9, 60)
         angles = np.zeros(len(knees))
-        hip, knee = (model.joint(f"{kind}_{side}").qposadr[0] for kind in ("hip", "knee"))
+        knee = model.joint(f"knee_{side}").qposadr[0]
         body = model.body(f"femur_{side}").id
         for number, angle in enumerate(knees):
             data.qpos[:] = 0.0
@@ -133,7 +133,6 @@ def hanging_hips(model: mujoco.MjModel, recording: Recording) -> dict[str, Float
             mujoco.mj_comPos(model, data)
             x, _, z = data.subtree_com[body] - data.xanchor[model.joint(f"hip_{side}").id]
             angles[number] = -np.arctan2(-x, -z)
-        del hip
         found[f"hip_{side}"] = np.interp(recording.joint_angles[f"knee_{side}"], knees, angles)
     return found
 
@@ -287,7 +286,7 @@ def main() -> None:
             ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False
         ).stdout.strip()
         if arguments.output:
-            write(arguments.output, "bullet_identification", {"commit": commit, "robots": results})
+            write(arguments.output, "bullet_identification", {"commit": said.stdout.strip(), "robots": results})
     print(f"\n{described(machine())}; JAX {jax.__version__}, MuJoCo {mujoco.__version__}\n{table(results)}")
 
 

@@ -70,7 +70,8 @@ class Sweep:
         name = f"{('motor', 'knee')[joint]}_{SIDES[side]}"
         return (
             f"{creeping} of {len(drift)} holds end with a joint that still creeps, by up to "
-            f"{np.rad2deg(drift.max()):.1f} deg ({name}). Their settled angles count for less; the motion counts in full."
+            f"{np.rad2deg(drift.max()):.1f} deg ({name}). Their settled angles count for less; the motion "
+            "counts in full."
         )
 
     def settled_without(self, left_out: Sequence[int]) -> Sweep:
