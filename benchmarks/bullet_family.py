@@ -420,7 +420,7 @@ def _link(root: ElementTree.Element, name: str, mass: float, com: Any, inertia: 
     ElementTree.SubElement(inertial, "origin", xyz=_numbers(com), rpy="0 0 0")
     ElementTree.SubElement(inertial, "mass", value=repr(float(mass)))
     moments = {name: repr(float(value)) for name, value in zip(("ixx", "iyy", "izz"), inertia, strict=True)}
-    ElementTree.SubElement(inertial, "inertia", **moments, ixy="0", ixz="0", iyz="0")
+    ElementTree.SubElement(inertial, "inertia", moments, ixy="0", ixz="0", iyz="0")
     if foot:
         collision = ElementTree.SubElement(link, "collision")
         ElementTree.SubElement(collision, "origin", xyz=f"0 0 {FOOT_Z}", rpy="0 0 0")

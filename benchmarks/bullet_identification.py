@@ -282,9 +282,7 @@ def main() -> None:
     results = {}
     for seed in robots:
         results[seed] = examine(seed, quick=arguments.quick)
-        commit = subprocess.run(
-            ["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False
-        ).stdout.strip()
+        said = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
         if arguments.output:
             write(arguments.output, "bullet_identification", {"commit": said.stdout.strip(), "robots": results})
     print(f"\n{described(machine())}; JAX {jax.__version__}, MuJoCo {mujoco.__version__}\n{table(results)}")

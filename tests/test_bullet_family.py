@@ -16,7 +16,7 @@ from ballu_mjx.robots.registry import load_robot
 
 pytest.importorskip("pybullet")
 
-import bullet_family as family
+import bullet_family as family  # pyright: ignore[reportMissingImports]
 
 
 def test_robots_are_the_same_every_time_and_differ_from_each_other() -> None:
