@@ -65,6 +65,8 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
             lines.append(f"{label:33}{'':10}{value * scale:>12.4g}{'':16} {unit} (reported only)")
     before, after = (mean_error(angles, sweep) for angles in (result.nominal_settled, result.settled))
     lines += ["", f"Mean error of the settled angles: {before:.2f} deg before, {after:.2f} deg after."]
+    if (creep := sweep.creep) is not None:
+        lines.append(creep)
     if result.with_drivetrain is not None:
         scatter = ", ".join(
             f"{np.rad2deg(fit.residual):.2f} deg ({side})" for side, fit in zip(SIDES, result.fits, strict=True)

@@ -98,11 +98,17 @@ def figures(folder: Path) -> dict[str, float]:
 
     steps, reward = read_column(folder, "reward")
     path = folder / "evaluation.json"
-    task = read_config(folder, *RESIDUAL_TASKS, *TASKS)["task"]
-    identified = task in RESIDUAL_TASKS and task not in NETWORK_TASKS
-    if not len(steps) and not identified:
+    rewarded = read_config(folder, *RESIDUAL_TASKS, *TASKS)["task"] in ("envmimic", *TASKS)
+    if rewarded and not len(steps):
         raise InputError(f"{folder}: has not trained yet (metrics.jsonl holds no reward); leave it out.")
-    found = {"reward at the end": float(reward[steps > (1 - _LAST) * steps[-1]].mean())} if len(steps) else {}
+    if not rewarded and not path.exists():
+        raise InputError(
+            f"{folder}: has no evaluation; `python -m ballu_mjx evaluate {folder} --output {folder}` writes it."
+        )
+    found = {}
+    if len(steps):
+        at_end = (steps > (1 - _LAST) * steps[-1]) | (steps == steps[-1])  # the second where that is step 0
+        found["reward at the end"] = float(reward[at_end].mean())
     if path.exists():
         evaluation = read_evaluation(path)
         for group in evaluation.groups:

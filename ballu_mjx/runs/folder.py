@@ -75,7 +75,7 @@ def new_folder(output: Path | None, task: str) -> Path:
         raise InputError(f"{output}: is a file; give --output a folder that is new or empty.")
     if output.exists() and any(output.iterdir()):
         mend = "give --output a folder that is new or empty"
-        if (output / CHECKPOINTS_FOLDER).is_dir():
+        if any((output / CHECKPOINTS_FOLDER).glob(f"*/{TRAINING_FOLDER}")):  # others cannot go on
             mend = f"--resume {output} goes on with it, or give --output another folder"
         raise InputError(f"{output}: the folder is not empty; {mend}.")
     files.check_folder(output)

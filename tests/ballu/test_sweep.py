@@ -82,6 +82,19 @@ def test_a_joint_that_creeps_on_is_told_by_its_drift() -> None:
     assert sweep.drift[0] == pytest.approx(0, abs=1e-9)
 
 
+def test_a_knee_that_creeps_on_slowly_is_accepted_and_said_to() -> None:
+    assert read_sweep({PATH: made(both())}).creep is None
+    recording = made(both(), hold=2.0)
+    since = np.arange(len(recording.time)) % 200 / 100
+    creeping = np.where(recording.command[:, 0] > 0.99, np.deg2rad(3.2) * (since - 2.0), 0.0)
+    knee = recording.joint_angles["knee_right"] + creeping  # 0.8 deg from half to half of the last half second
+    angles = {**recording.joint_angles, "knee_right": knee}
+    sweep = read_sweep({PATH: dataclasses.replace(recording, joint_angles=angles)})
+    assert np.rad2deg(sweep.drift[-1, 1, 1]) == pytest.approx(0.8, abs=0.02)
+    assert sweep.creep is not None
+    assert sweep.creep.startswith("1 of 20 holds end with a joint that still creeps, by up to 0.8 deg (knee_right)")
+
+
 def test_leaving_out_a_hold_leaves_the_settled_angles_of_the_others() -> None:
     sweep = read_sweep({PATH: made(both())})
     shorter = sweep.settled_without([3])

@@ -64,11 +64,12 @@ def export_policy(options: ExportOptions) -> Path:
     from ballu_mjx.runs.folder import new_folder, read_config
 
     _check(options)
-    if (task := read_config(options.run, *TASKS, *RESIDUAL_TASKS)["task"]) in RESIDUAL_TASKS:
+    if (task := read_config(options.run, *TASKS, *RESIDUAL_TASKS, "sysid")["task"]) in RESIDUAL_TASKS:
         raise InputError(
             f"{options.run}: is a residual ({task}), which acts in simulation only; train a policy in its simulator "
             f"(ballu_mjx train walk --residual {options.run}) and export that."
         )
+    read_config(options.run, *TASKS)
     folder = new_folder(options.output or options.run / "export", "export")
     policy = Policy.load(options.run)
     stored = weights(policy)

@@ -1,0 +1,447 @@
+"""A second family of virtual BALLU robots, in PyBullet, to judge identification and residuals by.
+
+Masses, places and lengths are the real robot's, from its CAD export. The mechanism is another one than the package's:
+
+- An arm is moved by a position loop: a time constant, a top speed, and a travel below 90 deg. Play lies between the
+  loop and the arm. The load bends the arm a little.
+- A cable is a one-sided spring and damper between its tie points. Its tension saturates.
+- Knees are viscous.
+- Air: quadratic drag and added mass, both by forces on the balloons, and a torque against turning.
+- Contacts and joint stops are Bullet's.
+
+`draw(seed)` draws a robot from the ranges that stand in it. Seeds 0 to 4 are the family. Choices are made on robots 0
+and 1; results are reported for all five. The package does not import this module, and no start, prior or bound of any
+fit is taken from it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tempfile
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pybullet  # pyright: ignore[reportMissingImports]
+from jaxtyping import Float
+from pybullet_utils.bullet_client import BulletClient  # pyright: ignore[reportMissingImports]
+from scipy.spatial.transform import Rotation
+
+from ballu_mjx.ballu.gaits import Gait, telegraph, waves
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES
+from ballu_mjx.ballu.recordings import make_recording
+from ballu_mjx.recordings.recording import Recording
+
+ROBOTS = range(5)
+CHOSEN_ON = (0, 1)
+"""Robots that choices may look at."""
+TIMESTEP = 1e-3
+CAPTURE_TIMESTEP = 0.01
+POSITION_NOISE = 5e-4
+ANGLE_NOISE = float(np.deg2rad(0.3))
+GRAVITY = 9.81
+_DEGREE = np.pi / 180
+
+# ---- the robot's numbers (SI units; x forward, y left, z up) ----
+
+BASE_MASS, BASE_COM, BASE_INERTIA = 0.02127, (-0.00044, 0.00002, -0.0039), (2.3943e-5, 2.1653e-6, 2.3619e-5)
+FEMUR_MASS, FEMUR_COM, FEMUR_INERTIA = 0.00944, (-0.00005, 0.0, -0.17956), (1.7050e-4, 1.7049e-4, 1.0243e-7)
+TIBIA_MASS, TIBIA_COM, TIBIA_INERTIA = 0.04367, (0.0068, -0.00419, -0.22605), (1.5546e-4, 1.5892e-4, 5.6535e-6)
+ARM_MASS = 0.00016
+"""Of an arm; it is carried by the tibia."""
+BALLOON_MASS, BALLOON_COM, BALLOON_INERTIA = 0.15898, (-0.00006, 0.0, 0.37953), (1.4214e-2, 1.4208e-2, 1.0256e-2)
+TOTAL_MASS = BASE_MASS + BALLOON_MASS + 2 * (FEMUR_MASS + TIBIA_MASS + ARM_MASS)
+NECK, HIP_Y, FEMUR_LENGTH = (0.00444, 0.0, 0.015), 0.058025, 0.36501
+FOOT_Z, FOOT_RADIUS = -0.38485, 0.004
+TIE_ABOVE_KNEE, ARM_X, ARM_Z, ARM_LENGTH = 0.025, -0.008375, -0.32732, 0.016
+SPRING_STIFFNESS, SPRING_PRELOAD, KNEE_MOST = 2 * 0.00807, 72.35 * _DEGREE, 100 * _DEGREE
+ARM_RANGE = np.pi / 2
+PASSIVE_DAMPING, PASSIVE_ARMATURE = 1e-3, 1e-4
+STANDING_HIP = -14 * _DEGREE
+
+
+@dataclasses.dataclass(frozen=True)
+class BulletRobot:
+    """One robot of the family. Pairs are (left, right); SI units, radians."""
+
+    name: str
+    arm_travel: tuple[float, float]
+    """Share of 90 deg that a command of 1 asks for."""
+    arm_zero: tuple[float, float]
+    """Angle at command 0."""
+    arm_lag: tuple[float, float]
+    """Time constant of the position loop."""
+    arm_speed: tuple[float, float]
+    """Top speed."""
+    arm_yield: tuple[float, float]
+    """Bending under load, rad/(N m)."""
+    play: tuple[float, float]
+    """Width of the play between position loop and arm."""
+    delay: float
+    """From a command to the position loop."""
+    cable_stiffness: tuple[float, float]
+    cable_damping: tuple[float, float]
+    cable_limit: tuple[float, float]
+    """Tension (N) at which the cable gives way."""
+    cable_slack: tuple[float, float]
+    """With the arm at 0 and the knee at its stop."""
+    spring_stiffness: tuple[float, float]
+    knee_stop: tuple[float, float]
+    knee_damping: tuple[float, float]
+    foot_friction: tuple[float, float]
+    buoyancy: float
+    """Lift over weight."""
+    balloon_offset: tuple[float, float]
+    """Of the balloons' centre of mass and lift, in x and y."""
+    drag: float
+    """N/(m/s)^2."""
+    turning_drag: float
+    """N m/(rad/s)^2."""
+    added_mass: float
+
+
+def draw(seed: int) -> BulletRobot:
+    """Draw a robot."""
+    rng = np.random.default_rng([seed, 41])
+
+    def one(low: float, high: float) -> float:
+        return float(rng.uniform(low, high))
+
+    def pair(low: float, high: float) -> tuple[float, float]:
+        return one(low, high), one(low, high)
+
+    return BulletRobot(
+        name=f"bullet-ballu-{seed}",
+        arm_travel=pair(0.75, 0.97),
+        arm_zero=pair(-3 * _DEGREE, 4 * _DEGREE),
+        arm_lag=pair(0.02, 0.06),
+        arm_speed=pair(5.0, 8.0),
+        arm_yield=pair(0.1, 0.4),
+        play=pair(1 * _DEGREE, 4 * _DEGREE),
+        delay=one(0.02, 0.06),
+        cable_stiffness=pair(1000.0, 3000.0),
+        cable_damping=pair(1.0, 4.0),
+        cable_limit=pair(3.5, 7.0),
+        cable_slack=pair(1e-4, 1.2e-3),
+        spring_stiffness=pair(0.75 * SPRING_STIFFNESS, 1.2 * SPRING_STIFFNESS),
+        knee_stop=pair(26 * _DEGREE, 31 * _DEGREE),
+        knee_damping=pair(0.004, 0.016),
+        foot_friction=pair(0.7, 1.0),
+        buoyancy=one(0.82, 0.86),
+        balloon_offset=(one(-0.006, 0.006), one(-0.012, 0.012)),
+        drag=one(0.10, 0.30),
+        turning_drag=one(2e-3, 8e-3),
+        added_mass=one(0.08, 0.14),
+    )
+
+
+# ---- recordings ----
+
+SWEEP_HOLD = 2.0
+
+
+def sweep_commands(count: int = 20) -> Float[np.ndarray, "holds 2"]:
+    """Return levels spread over [0, 1], both legs, in rising order."""
+    return np.repeat(np.round(np.linspace(0.0, 1.0, count), 4)[:, None], 2, axis=1)
+
+
+def held_out_commands(seed: int, count: int = 16) -> Float[np.ndarray, "holds 2"]:
+    """Return random levels, each leg its own, in random order."""
+    return np.round(np.random.default_rng([seed, 42]).uniform(0.0, 1.0, (count, 2)), 4)
+
+
+def record_sweep(robot: BulletRobot, commands: Float[np.ndarray, "holds 2"], name: str, seed: int = 0) -> Recording:
+    """Hold the base and each pair of commands for `SWEEP_HOLD` seconds; the first has settled when recording begins."""
+    world = World(robot, held=True)
+    rng = np.random.default_rng([seed, 43])
+    world.run(commands[0], 2.0)
+    rows, sent = [], []
+    for level in commands:
+        for _ in range(round(SWEEP_HOLD / CAPTURE_TIMESTEP)):
+            rows.append([*world.arms, *world.knees])
+            sent.append(level)
+            world.run(level, CAPTURE_TIMESTEP)
+    world.close()
+    angles = np.array(rows) + rng.normal(0, ANGLE_NOISE, (len(rows), 4))
+    return make_recording(
+        name=name,
+        kind="suspended",
+        robot=robot.name,
+        notes="Commands held one after the other, feet off the ground.",
+        time=np.arange(len(rows)) * CAPTURE_TIMESTEP,
+        command=np.array(sent),
+        motor=angles[:, :2],
+        knee=angles[:, 2:],
+    )
+
+
+def walking_commands(seconds: float) -> dict[str, Float[np.ndarray, "steps 2"]]:
+    """Return hand-designed commands by recording: `near-*` are walking gaits, `far-*` are not."""
+    return {
+        "near-1": Gait(1.2, 0.5, (0.4, 0.4), (0.9, 0.9)).commands(seconds),
+        "near-2": Gait(1.4, 0.45, (0.45, 0.45), (0.8, 0.8)).commands(seconds),
+        "far-1": waves(seconds),
+        "far-2": telegraph(seconds),
+    }
+
+
+def record_walking(robot: BulletRobot, commands: Float[np.ndarray, "steps 2"], name: str, seed: int = 0) -> Recording:
+    """Play commands at 20 Hz, after standing still for two seconds; motion capture sees balloons, base and feet."""
+    world = World(robot)
+    rng = np.random.default_rng([seed, 44])
+    world.run(np.zeros(2), 2.0)
+    world.face_forward()
+    frames = round(CONTROL_TIMESTEP / CAPTURE_TIMESTEP)
+    positions, balloons, bases, sent = [], [], [], []
+    for number in range(len(commands) * frames + 1):
+        command = commands[min(number // frames, len(commands) - 1)]
+        places, balloon, base = world.look()
+        positions.append(places + rng.normal(0, POSITION_NOISE, places.shape))
+        noise = Rotation.from_rotvec(rng.normal(0, ANGLE_NOISE, (2, 3)))
+        balloons.append((noise[0] * balloon).as_quat(scalar_first=True, canonical=True))
+        bases.append((noise[1] * base).as_quat(scalar_first=True, canonical=True))
+        sent.append(command)
+        if number < len(commands) * frames:
+            world.run(command, CAPTURE_TIMESTEP)
+    world.close()
+    seen = np.array(positions)
+    return make_recording(
+        name=name,
+        kind="free",
+        robot=robot.name,
+        notes="Hand-designed commands, open loop.",
+        time=np.arange(len(seen)) * CAPTURE_TIMESTEP,
+        command=np.array(sent),
+        balloon_position=seen[:, 0],
+        balloon_quaternion=np.array(balloons),
+        base_position=seen[:, 1],
+        base_quaternion=np.array(bases),
+        foot_position=seen[:, 2:],
+    )
+
+
+# ---- the world ----
+
+
+class World:
+    """A robot in Bullet, on a floor; or held by its base."""
+
+    def __init__(self, robot: BulletRobot, *, held: bool = False) -> None:
+        self.robot = robot
+        self._world: Any = BulletClient(pybullet.DIRECT)
+        self._world.setGravity(0.0, 0.0, -GRAVITY)
+        self._world.setPhysicsEngineParameter(fixedTimeStep=TIMESTEP, numSubSteps=1)
+        floor = self._world.createMultiBody(0.0, self._world.createCollisionShape(pybullet.GEOM_PLANE))
+        self._world.changeDynamics(floor, -1, lateralFriction=1.0)  # Bullet multiplies both surfaces' coefficients
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "ballu.urdf"
+            path.write_text(urdf(robot))
+            self._body = self._world.loadURDF(str(path), useFixedBase=held, flags=pybullet.URDF_MAINTAIN_LINK_ORDER)
+        infos = [self._world.getJointInfo(self._body, index) for index in range(self._world.getNumJoints(self._body))]
+        self._links = {info[12].decode(): info[0] for info in infos}
+        self._knees = [self._links[f"tibia_{side}"] for side in SIDES]
+        inertia = _inertias()
+        for name, link in {"base": -1, **self._links}.items():
+            side = name.endswith("right")
+            self._world.changeDynamics(
+                self._body, link, linearDamping=0.0, angularDamping=0.0, restitution=0.0,
+                lateralFriction=robot.foot_friction[side], maxJointVelocity=1e3,
+            )  # fmt: skip
+            # No rigid body has the base's, with armature: a file may not ask for it, a call of its own may.
+            self._world.changeDynamics(self._body, link, localInertiaDiagonal=inertia[name])
+        for link in self._links.values():  # Bullet brakes every joint unless told not to
+            self._world.setJointMotorControl2(self._body, link, pybullet.VELOCITY_CONTROL, force=0.0)
+        self._legs = [_Leg(robot, side) for side in range(2)]
+        for side, knee in enumerate(self._knees):
+            self._world.resetJointState(self._body, knee, robot.knee_stop[side], 0.0)
+            hip = self._links[f"femur_{SIDES[side]}"]
+            self._world.resetJointState(self._body, hip, STANDING_HIP, 0.0)
+        self._world.resetBasePositionAndOrientation(self._body, [0.0, 0.0, 1.5 if held else 0.72], [0, 0, 0, 1])
+        self._queue: list[np.ndarray] = []
+        self._air = np.zeros(3), np.zeros(3)
+        """The balloons' last velocity, and their acceleration as the added mass feels it."""
+
+    def close(self) -> None:
+        """Give the world back."""
+        self._world.disconnect()
+
+    @property
+    def arms(self) -> list[float]:
+        """Return the arms' angles (rad)."""
+        return [leg.arm for leg in self._legs]
+
+    @property
+    def knees(self) -> list[float]:
+        """Return the knees' angles (rad)."""
+        return [state[0] for state in self._world.getJointStates(self._body, self._knees)]
+
+    def total_mass(self) -> float:
+        """Return the mass (kg) as Bullet has it."""
+        return sum(self._world.getDynamicsInfo(self._body, link)[0] for link in (-1, *self._links.values()))
+
+    def floor_force(self) -> float:
+        """Return the upward force (N) of the floor."""
+        return sum(contact[9] for contact in self._world.getContactPoints(self._body))
+
+    def run(self, command: Float[np.ndarray, " 2"], seconds: float) -> None:
+        """Advance under commands."""
+        late = round(self.robot.delay / TIMESTEP)
+        for _ in range(round(seconds / TIMESTEP)):
+            self._queue.append(command)
+            if len(self._queue) > late + 1:
+                self._queue.pop(0)
+            self._step(self._queue[0])
+
+    def _step(self, command: Float[np.ndarray, " 2"]) -> None:
+        states = self._world.getJointStates(self._body, self._knees)
+        torques = [leg.drive(float(command[i]), *states[i][:2]) for i, leg in enumerate(self._legs)]
+        self._world.setJointMotorControlArray(self._body, self._knees, pybullet.TORQUE_CONTROL, forces=torques)
+        robot, link = self.robot, self._links["balloon"]
+        state = self._world.getLinkState(self._body, link, computeLinkVelocity=1)
+        velocity, spin = np.array(state[6]), np.array(state[7])
+        last, felt = self._air
+        felt = felt + (TIMESTEP / _AIR_FILTER) * ((velocity - last) / TIMESTEP - felt)
+        self._air = velocity, felt
+        force = -robot.drag * math.sqrt(velocity @ velocity) * velocity - robot.added_mass * felt
+        force[2] += robot.buoyancy * TOTAL_MASS * GRAVITY
+        self._world.applyExternalForce(self._body, link, force.tolist(), state[0], pybullet.WORLD_FRAME)
+        torque = -robot.turning_drag * math.sqrt(spin @ spin) * spin
+        self._world.applyExternalTorque(self._body, link, torque.tolist(), pybullet.WORLD_FRAME)
+        self._world.stepSimulation()
+
+    def face_forward(self) -> None:
+        """Move the robot above the origin and turn its base to face x."""
+        place, quaternion = self._world.getBasePositionAndOrientation(self._body)
+        turn = Rotation.from_quat(quaternion)
+        back = Rotation.from_euler("z", -turn.as_euler("ZYX")[0])
+        linear, angular = self._world.getBaseVelocity(self._body)
+        self._world.resetBasePositionAndOrientation(self._body, [0.0, 0.0, place[2]], (back * turn).as_quat().tolist())
+        self._world.resetBaseVelocity(self._body, back.apply(linear).tolist(), back.apply(angular).tolist())
+        self._air = back.apply(self._air[0]), back.apply(self._air[1])
+
+    def look(self) -> tuple[Float[np.ndarray, "4 3"], Rotation, Rotation]:
+        """Return places (m) of balloons, base, left and right foot; orientations of balloons and base."""
+        centre, quaternion = self._world.getBasePositionAndOrientation(self._body)
+        base = Rotation.from_quat(quaternion)
+        names = ("balloon", *(f"tibia_{side}" for side in SIDES))
+        states = self._world.getLinkStates(
+            self._body, [self._links[name] for name in names], computeForwardKinematics=1
+        )
+        frames = [(np.array(state[4]), Rotation.from_quat(state[5])) for state in states]
+        sites = [BALLOON_COM, *[(0.0, 0.0, FOOT_Z)] * 2]
+        balloon, left, right = (p + turn.apply(site) for (p, turn), site in zip(frames, sites, strict=True))
+        return np.stack([balloon, np.array(centre) - base.apply(BASE_COM), left, right]), frames[0][1], base
+
+
+_AIR_FILTER = 0.01
+"""s; without it the added mass would answer its own force within a step."""
+
+
+class _Leg:
+    """What drives one knee: command, position loop, play, arm, cable, spring."""
+
+    def __init__(self, robot: BulletRobot, side: int) -> None:
+        self._travel, self._zero = robot.arm_travel[side] * ARM_RANGE, robot.arm_zero[side]
+        self._lag, self._speed = robot.arm_lag[side], robot.arm_speed[side]
+        self._yield, self._half = robot.arm_yield[side], robot.play[side] / 2
+        self._stiffness, self._damping = robot.cable_stiffness[side], robot.cable_damping[side]
+        self._most = robot.cable_limit[side]
+        self._spring, self._friction = robot.spring_stiffness[side], robot.knee_damping[side]
+        self._springref = robot.knee_stop[side] - SPRING_PRELOAD
+        self._rest = _cable(robot.knee_stop[side], 0.0)[0] + robot.cable_slack[side]
+        self._loop = self._played = self.arm = self._zero
+        self._last = 0.0
+        self._torque = 0.0
+
+    def drive(self, command: float, knee: float, velocity: float) -> float:
+        """Return the torque on the knee (N m) in this time step."""
+        target = self._zero + self._travel * command
+        rate = min(max((target - self._loop) / self._lag, -self._speed), self._speed)
+        self._loop += TIMESTEP * rate
+        self._played = min(max(self._played, self._loop - self._half), self._loop + self._half)
+        self.arm = self._played - self._yield * self._torque
+        length, by_knee, by_arm = _cable(knee, self.arm)
+        stretch = length - self._rest
+        tension = 0.0
+        if stretch > 0:
+            rate = by_knee * velocity + by_arm * (self.arm - self._last) / TIMESTEP
+            tension = min(max(self._stiffness * stretch + self._damping * rate, 0.0), self._most)
+        self._last = self.arm
+        self._torque += 0.05 * (tension * by_arm - self._torque)  # bends over 20 time steps
+        return -self._spring * (knee - self._springref) - self._friction * velocity - tension * by_knee
+
+
+def _cable(knee: float, arm: float) -> tuple[float, float, float]:
+    """Return the distance (m) between the tie points, and its derivatives by knee and arm."""
+    sin_k, cos_k = math.sin(knee), math.cos(knee)
+    x, z = ARM_X - ARM_LENGTH * math.sin(arm), ARM_Z + ARM_LENGTH * math.cos(arm)
+    along, up = cos_k * x + sin_k * z, -sin_k * x + cos_k * z
+    dx, dz = along, up - TIE_ABOVE_KNEE
+    length = math.hypot(dx, dz)
+    x_m, z_m = -ARM_LENGTH * math.cos(arm), -ARM_LENGTH * math.sin(arm)
+    by_arm = dx * (cos_k * x_m + sin_k * z_m) + dz * (-sin_k * x_m + cos_k * z_m)
+    return length, (dx * up - dz * along) / length, by_arm / length
+
+
+# ---- the file ----
+
+
+def _inertias() -> dict[str, list[float]]:
+    """Moments of inertia (kg m^2); the base's with the armature of neck and hips about y."""
+    base = np.array(BASE_INERTIA) + [0.0, 3 * PASSIVE_ARMATURE, 0.0]
+    own = {"base": base, "balloon": BALLOON_INERTIA}
+    for side in SIDES:
+        own |= {f"femur_{side}": FEMUR_INERTIA, f"tibia_{side}": TIBIA_INERTIA}
+    return {name: [float(value) for value in moments] for name, moments in own.items()}
+
+
+def urdf(robot: BulletRobot) -> str:
+    """Return the robot as a URDF; knees are at 0 where the leg is straight."""
+    root = ElementTree.Element("robot", name="ballu")
+    offset = np.array([*robot.balloon_offset, 0.0])
+    _link(root, "base", BASE_MASS, BASE_COM, BASE_INERTIA)
+    _link(root, "balloon", BALLOON_MASS, np.array(BALLOON_COM) + offset, BALLOON_INERTIA)
+    _joint(root, "neck", "base", "balloon", NECK)
+    for side, sign, stop in zip(SIDES, (1, -1), robot.knee_stop, strict=True):
+        _link(root, f"femur_{side}", FEMUR_MASS, FEMUR_COM, FEMUR_INERTIA)
+        com = np.array(TIBIA_COM) * [1, sign, 1]
+        _link(root, f"tibia_{side}", TIBIA_MASS + ARM_MASS, com, TIBIA_INERTIA, foot=True)
+        _joint(root, f"hip_{side}", "base", f"femur_{side}", (0.0, sign * HIP_Y, 0.0))
+        knee = (0.0, 0.0, -FEMUR_LENGTH)
+        _joint(root, f"knee_{side}", f"femur_{side}", f"tibia_{side}", knee, (stop, KNEE_MOST))
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _link(root: ElementTree.Element, name: str, mass: float, com: Any, inertia: Any, *, foot: bool = False) -> None:
+    link = ElementTree.SubElement(root, "link", name=name)
+    inertial = ElementTree.SubElement(link, "inertial")
+    ElementTree.SubElement(inertial, "origin", xyz=_numbers(com), rpy="0 0 0")
+    ElementTree.SubElement(inertial, "mass", value=repr(float(mass)))
+    moments = {name: repr(float(value)) for name, value in zip(("ixx", "iyy", "izz"), inertia, strict=True)}
+    ElementTree.SubElement(inertial, "inertia", moments, ixy="0", ixz="0", iyz="0")
+    if foot:
+        collision = ElementTree.SubElement(link, "collision")
+        ElementTree.SubElement(collision, "origin", xyz=f"0 0 {FOOT_Z}", rpy="0 0 0")
+        shape = ElementTree.SubElement(collision, "geometry")
+        ElementTree.SubElement(shape, "sphere", radius=repr(FOOT_RADIUS))
+
+
+def _joint(
+    root: ElementTree.Element, name: str, parent: str, child: str, place: Any, limits: tuple[float, float] | None = None
+) -> None:
+    joint = ElementTree.SubElement(root, "joint", name=name, type="revolute" if limits else "continuous")
+    ElementTree.SubElement(joint, "origin", xyz=_numbers(place), rpy="0 0 0")
+    ElementTree.SubElement(joint, "parent", link=parent)
+    ElementTree.SubElement(joint, "child", link=child)
+    ElementTree.SubElement(joint, "axis", xyz="0 1 0")
+    damping = 0.0 if limits else PASSIVE_DAMPING  # the knees' is a torque, with the cable's
+    ElementTree.SubElement(joint, "dynamics", damping=repr(damping), friction="0")
+    if limits:
+        low, high = (repr(float(value)) for value in limits)
+        ElementTree.SubElement(joint, "limit", lower=low, upper=high, effort="1000", velocity="1000")
+
+
+def _numbers(values: Any) -> str:
+    return " ".join(repr(float(value)) for value in values)

@@ -1,0 +1,152 @@
+"""Every command on every other command's run, and every residual on every other: it works, or one sentence says why."""
+
+from __future__ import annotations
+
+import importlib
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE
+from ballu_mjx.ballu.leg_parameters import IdentificationConfig
+from ballu_mjx.cli import train_policy, view
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation
+from ballu_mjx.policies.locomotion_env import LocomotionConfig, num_observations
+from ballu_mjx.recordings.csv_format import list_bundled
+from ballu_mjx.residuals.aerodynamics import (
+    AERODYNAMICS_FILE,
+    AERODYNAMICS_FORMAT,
+    AirParameters,
+    air_parameters_to_json,
+)
+from ballu_mjx.residuals.aerodynamics_fit import AirConfig
+from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
+from ballu_mjx.residuals.network import num_inputs, num_loads
+from ballu_mjx.residuals.run_config import describe_run
+from ballu_mjx.residuals.trained import TrainedResidual, write_observed
+from ballu_mjx.rl import ppo
+from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.runs.folder import Run
+
+BALLU = load_robot()
+NETWORK = PPOConfig(policy_layers=(8,), value_layers=(4,))
+ONE = list_bundled("test")[0]
+INPUTS = num_inputs(EnvMimicConfig(), BALLU)
+RUNS = (*RESIDUAL_TASKS, "walk", "sysid", "all")
+COMMANDS = (
+    "compare RUN OTHER",
+    "record check RUN",
+    *(f"train {task} --resume RUN --num-timesteps 0" for task in ("envmimic", "walk", "turn")),
+    *(f"train {task} --residual RUN --recordings nowhere" for task in ("envmimic", "supervised", "analytic")),
+    "train walk --residual RUN --num-envs 0",
+    "train aerodynamic --fixed-from RUN --recordings nowhere",
+    "train supervised --actuators RUN --recordings ONE",
+    "train supervised --output RUN --recordings ONE",
+)
+"""Each ends before any long work: where the run suits it, a wrong option behind stops it."""
+
+
+def write_run(folder: Path, task: str, base: Path | None = None) -> Path:
+    """A run as its command leaves it, of parameters that were never trained."""
+    config: dict[str, Any] = {"residual": None if base is None else str(base)}
+    if task == "all":
+        folder.mkdir()
+        (folder / "table-walk.md").write_text("| a |\n| --- |\n| 1 |\n")
+        return folder
+    sections: dict[str, Any] = {"env": EnvMimicConfig(), "ppo": NETWORK}
+    inputs, actions = INPUTS, num_loads(EnvMimicConfig(), BALLU)
+    if task == "aerodynamic":
+        sections = {"fit": AirConfig()}
+    elif task == "sysid":
+        sections = {"fit": IdentificationConfig()}
+    elif task == "walk":
+        sections = {"env": LocomotionConfig(), "ppo": NETWORK, "data": train_policy.Data()}
+        inputs, actions = num_observations(BALLU), len(BALLU.commands)
+    with Run(folder, describe_run(task, sections, {}, []) | config) as run:
+        if task in ("envmimic", "walk"):
+            run.log(0, {"reward": 1.0})
+        if task in RESIDUAL_TASKS:
+            write_observed(run, np.zeros((2, inputs)))
+        if task == "aerodynamic":
+            air = {"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(AirParameters.none())}
+            run.write(AERODYNAMICS_FILE, json.dumps(air))
+        elif task == "sysid":
+            run.write(ACTUATORS_FILE, "{}")
+        else:
+            start = ppo.initial_policy(np.random.default_rng(0).normal(size=(4, inputs)), actions, NETWORK)
+            run.save(0, ppo.as_tree(start), 1.0)
+    if task in RESIDUAL_TASKS:
+        each = {horizon: (1.0, 0.1) for horizon in HORIZONS}
+        found = (Errors("near-1", "near", each, each, 1.0, 1.0, 0.0),)
+        (folder / "evaluation.json").write_text(json.dumps(Evaluation(found, found, name=task).to_json()))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("runs")
+    return {task: write_run(folder / task, task) for task in RUNS}
+
+
+@pytest.mark.parametrize("line", COMMANDS)
+@pytest.mark.parametrize("task", RUNS)
+def test_every_command_ends_well_on_every_run(
+    task: str, line: str, runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    other = runs["envmimic" if task in RESIDUAL_TASKS else task]
+    places = {"RUN": str(runs[task]), "OTHER": str(other), "OUT": str(tmp_path), "ONE": str(ONE)}
+    command, *arguments = line.split()
+    for name, place in places.items():
+        arguments = [argument.replace(name, place) for argument in arguments]
+    status = importlib.import_module(f"ballu_mjx.cli.{command}").main(arguments)
+    said = capsys.readouterr().err
+    assert "fault of ballu_mjx" not in said
+    assert status == 0 or (status == 2 and said.count("\n") == 1 and said.endswith(".\n")), said
+
+
+@pytest.mark.parametrize(
+    ("line", "suits"),
+    [
+        ("report RUN --output OUT/page.html", RUNS),
+        ("compare RUN", (*RESIDUAL_TASKS, "walk")),
+        ("export RUN --output OUT/robot --no-open-loop", ("walk",)),
+    ],
+)
+def test_commands_work_on_the_runs_they_are_for(
+    line: str, suits: tuple[str, ...], runs: dict[str, Path], tmp_path: Path
+):
+    for task in RUNS:
+        out = tmp_path / task
+        out.mkdir()
+        command, *arguments = line.replace("RUN", str(runs[task])).replace("OUT", str(out)).split()
+        status = importlib.import_module(f"ballu_mjx.cli.{command}").main(arguments)
+        assert status == (0 if task in suits else 2), task
+
+
+@pytest.mark.parametrize("task", RUNS)
+def test_a_run_without_a_replay_says_so_when_it_is_viewed(task: str, runs: dict[str, Path]):
+    with pytest.raises(InputError, match=r"\.$"):
+        view.load(runs[task])
+
+
+def test_evaluate_refuses_what_is_no_residual(runs: dict[str, Path], capsys: pytest.CaptureFixture[str]):
+    evaluate = importlib.import_module("ballu_mjx.cli.evaluate")
+    for task in ("walk", "sysid", "all"):
+        assert evaluate.main([str(runs[task])]) == 2
+        assert "fault" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("base", "task"), [*itertools.product(RESIDUAL_TASKS, ("envmimic", "supervised", "analytic"))])
+def test_every_residual_acts_beside_every_other(base: str, task: str, runs: dict[str, Path], tmp_path: Path):
+    """Its name is that of both; a third on top of them is read too."""
+    both = write_run(tmp_path / "both", task, runs[base])
+    assert TrainedResidual.load(both, BALLU).model.name == f"{base}+{task}"
+    three = write_run(tmp_path / "three", "supervised", both)
+    assert TrainedResidual.load(three, BALLU).model.name == f"{base}+{task}+supervised"

@@ -1,0 +1,72 @@
+"""The second family of virtual robots: what it draws, and that a robot of it is one."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ballu_mjx
+from ballu_mjx.ballu.sweep import read_sweep
+from ballu_mjx.recordings.csv_format import read_recording, write_recording
+from ballu_mjx.robots.registry import load_robot
+
+pytest.importorskip("pybullet")
+
+import bullet_family as family  # pyright: ignore[reportMissingImports]
+
+
+def test_robots_are_the_same_every_time_and_differ_from_each_other() -> None:
+    robots = [family.draw(seed) for seed in family.ROBOTS]
+    assert robots == [family.draw(seed) for seed in family.ROBOTS]
+    assert len({dataclasses.astuple(robot)[1:] for robot in robots}) == len(robots)
+
+
+def test_recordings_are_the_same_every_time_and_can_be_read(tmp_path: Path) -> None:
+    robot, commands = family.draw(0), family.walking_commands(1.0)["near-1"]
+    for name in ("one", "other"):
+        recording = family.record_walking(robot, commands, name)
+        write_recording(recording, tmp_path / f"{name}.csv", load_robot())
+    assert (tmp_path / "one.csv").read_bytes() == (tmp_path / "other.csv").read_bytes()
+    assert read_recording(tmp_path / "one.csv", load_robot()).robot == robot.name
+
+
+@pytest.mark.parametrize("seed", family.ROBOTS)
+def test_a_robot_stands_on_its_weight_less_lift_and_moves(seed: int) -> None:
+    robot = family.draw(seed)
+    world = family.World(robot)
+    world.run(np.zeros(2), 4.0)
+    assert world.total_mass() == pytest.approx(0.28679, abs=1e-5)
+    forces = []
+    for _ in range(100):
+        world.run(np.zeros(2), 0.01)
+        forces.append(world.floor_force())
+    assert np.mean(forces) == pytest.approx((1 - robot.buoyancy) * 0.28679 * 9.81, rel=0.05)
+    before, balloon, _ = world.look()
+    assert balloon.as_matrix()[2, 2] > 0.98
+    assert before[1, 2] == pytest.approx(0.70, abs=0.05)
+    for command in family.walking_commands(5.0)["near-1"]:
+        world.run(command, 0.05)
+    after, balloon, _ = world.look()
+    world.close()
+    assert np.linalg.norm(after[0] - before[0]) > 0.2
+    assert balloon.as_matrix()[2, 2] > 0.9
+
+
+def test_settled_angles_rise_with_the_command() -> None:
+    recording = family.record_sweep(family.draw(1), family.sweep_commands(), "sweep")
+    settled = read_sweep({Path("sweep.csv"): recording}).settled
+    assert np.all(np.diff(settled[:, 0], axis=0) > 0), "arms"
+    assert np.all(np.diff(settled[:, 1], axis=0) > -np.deg2rad(0.3)), "knees, up to noise"
+    assert np.rad2deg(settled[-1, 1] - settled[0, 1]).min() > 15
+
+
+def test_the_package_knows_nothing_of_it() -> None:
+    for file in Path(ballu_mjx.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not any("bullet" in name for name in names), file
