@@ -46,8 +46,6 @@ def read_actuators(path: Path) -> tuple[str, ActuatorParameters]:
     """
     if not path.exists():
         raise InputError(f"{path}: there is no such file; `python -m ballu_mjx.train sysid` writes one.")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; give the file {ACTUATORS_FILE} of a run of `train sysid`.")
     content = files.read_json(path, "restore it or identify again")
     if content.get("format") != ACTUATORS_FORMAT:
         raise InputError(f'{path}: "format" is not "{ACTUATORS_FORMAT}"; give a file that `train sysid` wrote.')

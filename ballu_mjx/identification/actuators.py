@@ -74,6 +74,8 @@ def read_actuators(robot: RobotDescription, path: Path) -> tuple[str, ModelParam
     **Raises** `InputError` where this robot's actuators cannot be identified, or the file is damaged; names file,
     parameter and fix.
     """
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; give the file {ACTUATORS_FILE} of a run of `train sysid`.")
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; `python -m ballu_mjx.train sysid` writes one.")
     if robot.identify:

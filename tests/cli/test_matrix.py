@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ballu_mjx.ballu.actuators_file import ACTUATORS_FILE
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
 from ballu_mjx.cli import train_policy, view
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation
+from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, num_observations
 from ballu_mjx.recordings.csv_format import list_bundled
 from ballu_mjx.residuals.aerodynamics import (
