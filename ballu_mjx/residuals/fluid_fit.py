@@ -243,8 +243,13 @@ class _Search:
         solver = BatchedSolver(optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3))
         for seconds in config.window_seconds:
             windows = self._windows.shortened(seconds)
+
+            def evaluate(points: np.ndarray, windows: _Windows = windows) -> tuple[np.ndarray, np.ndarray]:
+                values, slopes = self._rows(points[0], windows)
+                return values[None], slopes[None]
+
             found, _ = solver(
-                lambda points, windows=windows: tuple(x[None] for x in self._rows(points[0], windows)),
+                evaluate,
                 vector[None],
                 config.steps,
                 lambda *told, seconds=seconds: report(f"windows of {seconds:g} s", *told),

@@ -23,7 +23,8 @@ from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.runs.layout import RUN_FORMAT
 
 TRAININGS = (
-    "sysid", "envmimic", "supervised", "analytic", "aerodynamic", "walk", "turn", "turn-right", "walk-backward", "all",
+    "sysid", "envmimic", "supervised", "analytic", "aerodynamic", "fluid",
+    "walk", "turn", "turn-right", "walk-backward", "all",
 )  # fmt: skip
 SUBCOMMANDS = [
     "compare",

@@ -26,6 +26,8 @@ from ballu_mjx.residuals.aerodynamics import (
 )
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.fluid import FLUID_FILE, FluidCoefficients, terms_of
+from ballu_mjx.residuals.fluid_fit import FluidConfig
 from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
 from ballu_mjx.residuals.network import num_inputs, num_loads
 from ballu_mjx.residuals.run_config import describe_run
@@ -64,6 +66,8 @@ def write_run(folder: Path, task: str, base: Path | None = None) -> Path:
     inputs, actions = INPUTS, num_loads(EnvMimicConfig(), BALLU)
     if task == "aerodynamic":
         sections = {"fit": AirConfig()}
+    elif task == "fluid":
+        sections = {"fit": FluidConfig()}
     elif task == "sysid":
         sections = {"fit": IdentificationConfig()}
     elif task == "walk":
@@ -77,6 +81,9 @@ def write_run(folder: Path, task: str, base: Path | None = None) -> Path:
         if task == "aerodynamic":
             air = {"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(AirParameters.none())}
             run.write(AERODYNAMICS_FILE, json.dumps(air))
+        elif task == "fluid":
+            nothing = np.zeros((len(terms_of("drag")), 6))
+            run.write(FLUID_FILE, FluidCoefficients("drag", nothing, nothing).to_json())
         elif task == "sysid":
             run.write(ACTUATORS_FILE, "{}")
         else:

@@ -60,7 +60,7 @@ from ballu_mjx.residuals.fluid_fit import FluidConfig
 from ballu_mjx.residuals.fluid_training import fit_fluid
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.runs.progress import PhaseProgress
-from ballu_mjx.sim.force_model import Fields
+from ballu_mjx.sim.force_model import Fields, ForceModel
 from ballu_mjx.sim.simulator import Simulator
 
 HORIZONS = (1.0, 2.0, 5.0)
@@ -293,7 +293,9 @@ def main() -> None:
     simulator = Simulator(robot)
     quick = {"window_seconds": (0.5,), "windows": 10, "steps": 2}
     full = {"window_seconds": (0.5, 2.0, 5.0), "windows": 150, "steps": 5}
-    residuals = {"published model": (PublishedAerodynamics(robot.control_timestep), jnp.zeros(0))}
+    residuals: dict[str, tuple[ForceModel, Any]] = {
+        "published model": (PublishedAerodynamics(robot.control_timestep), jnp.zeros(0))
+    }
     for name, terms in (("linear terms", "linear"), ("fluid forces", "linear" if options.quick else "auto")):
         config = FluidConfig(terms=terms, **(quick if options.quick else full))  # pyright: ignore[reportArgumentType]
         found = fit_fluid(simulator, training, validation, config, progress=PhaseProgress())
