@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,12 +17,7 @@ QUICK: Mapping[str, Any] = {"terms": "linear", "window_seconds": (0.5,), "window
 """Defaults of `FluidConfig` under `--quick`."""
 
 
-@dataclasses.dataclass(frozen=True)
-class FluidData(RecordingsData):
-    """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
-
-
-def train(data: FluidData, fit: FluidConfig) -> int:
+def train(data: RecordingsData, fit: FluidConfig) -> int:
     """Read and check everything, fit, evaluate; returns the exit status."""
     check_fluid_config(fit, load_chosen_robot(data.robot).control_timestep)
     loggers.check(data.wandb)
@@ -49,7 +43,7 @@ def train(data: FluidData, fit: FluidConfig) -> int:
 COMMAND = TrainCommand(
     "Fit force and torque on the tracked body as polynomials of its velocity: lift, drag, side force, moments and "
     "rotary damping, for any body in air or water.",
-    {"data": FluidData(), "fit": FluidConfig()},
+    {"data": RecordingsData(), "fit": FluidConfig()},
     train,
     {"fit": QUICK},
 )

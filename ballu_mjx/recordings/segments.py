@@ -21,7 +21,7 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.sim.drivetrain import DrivetrainState
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout, wrap_angle
-from ballu_mjx.sim.simulator import RolloutState, Simulator
+from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
 POSITION = (0.002, 0.01)
@@ -97,6 +97,18 @@ def start_segment(window: Segments) -> tuple[RolloutState, Float[Array, "windows
     history, commands = jnp.asarray(window.history), jnp.asarray(window.commands)
     drivetrain = jax.tree.map(jnp.asarray, window.drivetrain)
     return RolloutState(physics, history, commands[:past], drivetrain), commands[past:]
+
+
+def simulate_segment(simulator: AugmentedSimulator, window: Segments) -> Float[Array, "windowsteps 6"]:
+    """Return `segment_errors` of one window, simulated from its start; JAX's own transformations apply."""
+    state, commands = start_segment(window)
+
+    def step(state: RolloutState, command: Array) -> tuple[RolloutState, Array]:
+        after = simulator.step(state, command).state
+        return after, after.features
+
+    _, features = jax.lax.scan(step, state, commands)
+    return segment_errors(features, window.features, simulator.control_timestep)
 
 
 def segment_errors(

@@ -16,7 +16,6 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
@@ -31,8 +30,7 @@ from ballu_mjx.recordings.segments import (
     check_segments,
     cut_segments,
     pseudo_huber,
-    segment_errors,
-    start_segment,
+    simulate_segment,
 )
 from ballu_mjx.residuals.aerodynamics import (
     AIR_PARAMETERS,
@@ -43,7 +41,7 @@ from ballu_mjx.residuals.aerodynamics import (
 )
 from ballu_mjx.sim.force_model import BoundForces
 from ballu_mjx.sim.sharding import shard_over_devices
-from ballu_mjx.sim.simulator import RolloutState, Simulator
+from ballu_mjx.sim.simulator import Simulator
 
 
 @dataclasses.dataclass(frozen=True)
@@ -319,11 +317,4 @@ class AirWindows:
         """`errors` of one window, at a whole delay; JAX's own transformations apply."""
         air = self._unravel(vector)
         simulator = self._simulator.with_residual(BoundForces(self._air, air))
-        state, commands = start_segment(window)
-
-        def step(state: RolloutState, command: Array) -> tuple[RolloutState, Array]:
-            after = simulator.step(state, command).state
-            return after, after.features
-
-        _, features = jax.lax.scan(step, state, commands)
-        return segment_errors(features, window.features, self._simulator.robot.control_timestep).ravel()
+        return simulate_segment(simulator, window).ravel()

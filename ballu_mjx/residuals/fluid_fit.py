@@ -28,14 +28,13 @@ from ballu_mjx.recordings.segments import (
     check_segments,
     cut_segments,
     pseudo_huber,
-    segment_errors,
-    start_segment,
+    simulate_segment,
 )
 from ballu_mjx.residuals.fluid import TERM_SETS, FluidCoefficients, FluidForces, TermSet, mirrored, terms_of
 from ballu_mjx.sim.force_model import BoundForces
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.sharding import shard_over_devices
-from ballu_mjx.sim.simulator import RolloutState, Simulator
+from ballu_mjx.sim.simulator import Simulator
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,14 +149,7 @@ class _Program:
     def _errors(self, params: Float[Array, "terms 6"], window: Segments) -> Float[Array, " entries"]:
         """One window's errors, in expected errors."""
         simulator = self._simulator.with_residual(BoundForces(self.forces, params))
-        state, commands = start_segment(window)
-
-        def step(state: RolloutState, command: Array) -> tuple[RolloutState, Array]:
-            after = simulator.step(state, command).state
-            return after, after.features
-
-        _, features = jax.lax.scan(step, state, commands)
-        return segment_errors(features, window.features, self._simulator.control_timestep).ravel()
+        return simulate_segment(simulator, window).ravel()
 
 
 class _Windows:
