@@ -116,7 +116,7 @@ def train(
         ratios = {
             f"{group} {quantity} {horizon:g}": result.ratio(group, quantity, horizon)
             for group in result.groups
-            for quantity in ("position", "yaw")
+            for quantity in ("position", "orientation")
             for horizon in SCORE_HORIZONS
         }
         history.append({"step": step, "score": result.score, "reward": metrics["reward"], "ratios": ratios})

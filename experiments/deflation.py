@@ -83,7 +83,7 @@ def row(label: str, result: Evaluation) -> str:
     for group in result.groups:
         position, yaw = (
             np.mean([getattr(errors, quantity)[5.0][0] for errors in result.residual if errors.group == group])
-            for quantity in ("position", "yaw")
+            for quantity in ("position", "orientation")
         )
         cells.append(f"{position:.3f} m, {yaw:.1f} deg")
     return f"| {label} | " + " | ".join(cells) + " |"

@@ -253,7 +253,7 @@ def comparison(rows: Rows, effort: Mapping[str, str], horizon: float) -> str:
     """Markdown: what simulators leave of vanilla's RMSE over `horizon` s, the range of that over seeds, and `effort`,
     what learning took. In vanilla's row stand its errors themselves; the least of a column is bold, unless there is one
     seed alone, which ranks nothing."""
-    columns = [(group, quantity) for group in groups_of(rows) for quantity in ("position", "yaw")]
+    columns = [(group, quantity) for group in groups_of(rows) for quantity in ("position", "orientation")]
 
     def mean(run: Sequence[Errors], group: str, quantity: str) -> float:
         return float(np.mean([getattr(e, quantity)[horizon][0] for e in run if e.group == group]))
@@ -287,7 +287,9 @@ def final_yaw(rows: Rows) -> str:
     lines = ["| final yaw error (deg) | " + " | ".join(groups) + " |", "| --- " + "| ---: " * len(groups) + "|"]
     for row, found in rows.items():
         cells = [
-            spread([float(np.mean([abs(e.final_yaw_error) for e in run if e.group == group])) for run in found], 0)
+            spread(
+                [float(np.mean([abs(e.final_orientation_error) for e in run if e.group == group])) for run in found], 0
+            )
             for group in groups
         ]
         lines.append(f"| {row} | " + " | ".join(cells) + " |")
@@ -321,7 +323,7 @@ def table(runs: list[Evaluation], base: str, name: str) -> str:
     for group in runs[0].groups:
         for horizon in HORIZONS:
             cells = []
-            for quantity, digits in (("position", 3), ("yaw", 1)):
+            for quantity, digits in (("position", 3), ("orientation", 1)):
                 mean = [
                     [np.mean([getattr(e, quantity)[horizon][0] for e in side if e.group == group]) for side in pair]
                     for pair in ((run.vanilla, run.residual) for run in runs)
@@ -339,7 +341,7 @@ def table(runs: list[Evaluation], base: str, name: str) -> str:
         ours = [run.residual[index] for run in runs]
         lines.append(
             f"| {without.recording} | {without.mean_com_error:.2f} | {spread([e.mean_com_error for e in ours])} | "
-            f"{without.final_yaw_error:.0f} | {spread([e.final_yaw_error for e in ours], 0)} |"
+            f"{without.final_orientation_error:.0f} | {spread([e.final_orientation_error for e in ours], 0)} |"
         )
     return "\n".join(lines)
 

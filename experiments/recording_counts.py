@@ -35,7 +35,7 @@ METHODS = {"identified": "envmimic", "regression": "supervised", "analytic": "an
 GROUPS = ("near", "far")
 HORIZON = 5.0
 """s."""
-QUANTITIES = {"position": "balloon position", "yaw": "yaw"}
+QUANTITIES = {"position": "balloon position", "orientation": "yaw"}
 
 # %% [markdown]
 # ## Learn

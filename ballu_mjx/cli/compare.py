@@ -90,7 +90,7 @@ def figures(folder: Path) -> dict[str, float]:
 
     **Raises** `InputError` where the run has not trained yet, or its evaluation is damaged.
     """
-    from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS, read_evaluation
+    from ballu_mjx.evaluation.errors_table import read_evaluation
     from ballu_mjx.policies.tasks import TASKS
     from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
     from ballu_mjx.runs.folder import read_config
@@ -112,10 +112,11 @@ def figures(folder: Path) -> dict[str, float]:
     if path.exists():
         evaluation = read_evaluation(path)
         for group in evaluation.groups:
-            for quantity in ("position", "yaw"):
-                for horizon in SCORE_HORIZONS:
+            for quantity in ("position", "orientation"):
+                for horizon in evaluation.score_horizons(group):
                     if any(horizon in errors.position for errors in evaluation.vanilla if errors.group == group):
-                        name = f"{group} {quantity}, {horizon:g} s (ratio)"
+                        called = evaluation.angle if quantity == "orientation" else quantity
+                        name = f"{group} {called}, {horizon:g} s (ratio)"
                         found[name] = evaluation.ratio(group, quantity, horizon)
     return found
 

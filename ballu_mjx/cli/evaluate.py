@@ -67,7 +67,7 @@ def _evaluate(options: Options) -> None:
     paths = list_recordings(options.recordings) or find_recordings(config, "test", options.run)
     recordings = [read_recording(path, robot) for path in paths]
     for path, recording in zip(paths, recordings, strict=True):
-        check_recording(path, recording, long_enough=True)
+        check_recording(path, recording, robot, long_enough=True)
     if options.output is not None:
         files.check_folder(options.output)
         options.output.mkdir(parents=True, exist_ok=True)
@@ -102,6 +102,6 @@ def noise_floor(floor: Sequence[Errors], errors: Sequence[Errors]) -> str:
         for horizon, (position, _) in noise.position.items():
             lines.append(
                 f"{noise.group:7}{horizon:>8g} |{position:>14.3f} m of {ours.position[horizon][0]:.3f} m | "
-                f"{noise.yaw[horizon][0]:>6.1f} deg of {ours.yaw[horizon][0]:.1f} deg"
+                f"{noise.orientation[horizon][0]:>6.1f} deg of {ours.orientation[horizon][0]:.1f} deg"
             )
     return "\n".join(lines)

@@ -7,19 +7,30 @@ a whole recording small errors only compound. The paper's whole-recording figure
 from __future__ import annotations
 
 import copy
+import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
-from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, base_name, has_diverged, summarize_starts
+from ballu_mjx.evaluation.errors_table import (
+    Errors,
+    Evaluation,
+    base_name,
+    choose_horizons,
+    has_diverged,
+    median_of_starts,
+    summarize_starts,
+)
 from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, pad_to_bucket, stack_motions
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.drivetrain import DrivetrainParameters, identity_drivetrain
 from ballu_mjx.sim.force_model import BoundForces, ForceModel
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
@@ -27,7 +38,7 @@ from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState
 
 START_INTERVAL = 1.0
-"""Seconds between two starts in the same recording."""
+"""Seconds between two starts in the same recording, or the shortest horizon where that is shorter."""
 _RUNS = {True: 64, False: 1024}
 """Runs side by side on each device; on a CPU, and elsewhere. Fewer are filled up, more go batch after batch."""
 _CHUNK = 100
@@ -40,14 +51,62 @@ class Replay(NamedTuple):
 
     position: Float[np.ndarray, "runs states 3"]
     """Of the tracked body (m, world)."""
-    yaw: Float[np.ndarray, "runs states"]
-    """Of the tracked body (rad), not unwrapped."""
+    euler_angles: Float[np.ndarray, "runs states 3"]
+    """Roll, pitch and yaw of the tracked body (rad), not unwrapped."""
+    points: Float[np.ndarray, "runs states points 3"]
+    """Of the robot's points (m, world)."""
+    joints: Float[np.ndarray, "runs states hinges"]
+    """Angles (rad) of the hinges that are measured (`measured_hinges`)."""
     com: Float[np.ndarray, "runs states 3"]
     """Centre of mass (m, world)."""
     force: Float[np.ndarray, "runs steps 3"]
     """Residual force (N, world)."""
     qpos: Float[np.ndarray, "recordings states nq"]
     """Generalized positions from each recording's first start."""
+
+    @property
+    def yaw(self) -> Float[np.ndarray, "runs states"]:
+        """Yaw of the tracked body (rad), not unwrapped."""
+        return self.euler_angles[..., 2]
+
+
+def measured_hinges(robot: RobotDescription, model: mujoco.MjModel, motion: Motion) -> dict[str, int]:
+    """Return where `qpos` has the hinges whose angles a recording holds, by name; held ones are left out."""
+    found = {name: model.joint(name) for name in robot.joints if name in motion.joints and name not in robot.held}
+    return {
+        name: int(joint.qposadr[0]) for name, joint in found.items() if joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE
+    }
+
+
+def orientation_errors(
+    simulated: Float[np.ndarray, "*states 3"], recorded: Float[np.ndarray, "*states 3"], upright: bool
+) -> Float[np.ndarray, "*states"]:
+    """Return errors of orientation (deg) of roll, pitch and yaw (rad; intrinsic z-y-x).
+
+    Of an upright robot simulated less recorded yaw, wrapped to 180 deg. Else the angle of the rotation between both.
+    """
+    if upright:
+        turn = simulated[..., 2] - recorded[..., 2]
+        return np.rad2deg(np.arctan2(np.sin(turn), np.cos(turn)))
+    (w, x, y, z), (a, b, c, d) = map(_quaternion, (simulated, recorded))
+    scalar = w * a + x * b + y * c + z * d
+    vector = np.sqrt(
+        (w * b - x * a + y * d - z * c) ** 2
+        + (w * c - y * a + z * b - x * d) ** 2
+        + (w * d - z * a + x * c - y * b) ** 2
+    )
+    return np.rad2deg(2 * np.arctan2(vector, np.abs(scalar)))
+
+
+def _quaternion(euler: Float[np.ndarray, "*states 3"]) -> tuple[np.ndarray, ...]:
+    halves = np.moveaxis(np.asarray(euler, np.float64), -1, 0) / 2
+    (cr, cp, cy), (sr, sp, sy) = np.cos(halves), np.sin(halves)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
 
 
 def evaluate(simulator: AugmentedSimulator, motions: Sequence[Motion]) -> Evaluation:
@@ -128,7 +187,13 @@ class OpenLoopEvaluator:
         self._reference = jax.device_get(pad_to_bucket(reference))
         own = self._simulator.model, self._simulator.drivetrain
         self._fixed = jax.device_put((*jax.device_get(own), self._reference), self._everywhere)
-        interval = round(START_INTERVAL / self.robot.control_timestep)
+        longest = max(len(motion.command) for motion in self.motions) * self.robot.control_timestep
+        self.horizons = choose_horizons(self.robot.horizons, longest)
+        interval = round(min(START_INTERVAL, *self.horizons) / self.robot.control_timestep)
+        model = self._simulator.mj_model
+        self._hinges = [measured_hinges(self.robot, model, motion) for motion in self.motions]
+        names = dict.fromkeys(name for hinges in self._hinges for name in hinges)
+        self._joints = {name: int(model.joint(name).qposadr[0]) for name in names}
         self.starts = [
             (index, start)
             for index, motion in enumerate(self.motions)
@@ -178,7 +243,9 @@ class OpenLoopEvaluator:
                     array[batch, where] = values[: len(batch), : part.stop - part.start]
         return Replay(
             features[..., ObservationLayout.position],
-            features[..., ObservationLayout.yaw],
+            features[..., ObservationLayout.euler_angles],
+            self._points(features),
+            qpos[..., list(self._joints.values())],
             com,
             force,
             qpos[self.first_runs],
@@ -200,16 +267,30 @@ class OpenLoopEvaluator:
 
     def recorded(self, run: int) -> tuple[Float[np.ndarray, "states 3"], Float[np.ndarray, " states"]]:
         """Return the tracked body's recorded position (m) and yaw (rad), from the start of `run` to the end."""
-        recording, start = self.starts[run]
-        states = self._recorded[recording, start : len(self.motions[recording].qpos)]
+        states = self._recorded_features(run)
         return states[:, ObservationLayout.position], states[:, ObservationLayout.yaw]
+
+    def _recorded_features(self, run: int) -> Float[np.ndarray, "states features"]:
+        recording, start = self.starts[run]
+        return self._recorded[recording, start : len(self.motions[recording].qpos)]
+
+    @staticmethod
+    def _points(features: Float[np.ndarray, "*runs features"]) -> Float[np.ndarray, "*runs points 3"]:
+        return features[..., ObservationLayout.first_point :].reshape(*features.shape[:-1], -1, 6)[..., :3]
 
     def __call__(self, params: Any) -> Evaluation:
         """Return errors of the simulator with the residual, beside those of the ones without."""
         if self._without is None:
             self._without = self.errors(self.replay(params, scale=0.0)), self.nominal_errors(params)
         vanilla, nominal = self._without
-        return Evaluation(vanilla, self.errors(self.replay(params)), self.base, self.name, nominal)
+        return self.compared(vanilla, self.errors(self.replay(params)), nominal)
+
+    def compared(
+        self, vanilla: tuple[Errors, ...], residual: tuple[Errors, ...], nominal: tuple[Errors, ...]
+    ) -> Evaluation:
+        """Return errors without and with the residual, and nominal ones (empty: the same), side by side."""
+        angle = "yaw" if self.robot.upright else "orientation"
+        return Evaluation(vanilla, residual, self.base, self.name, nominal, angle)
 
     def nominal_errors(self, params: Any) -> tuple[Errors, ...]:
         """Return errors with nominal actuators and without the residual, of which `params` are any; empty where the
@@ -252,47 +333,91 @@ class OpenLoopEvaluator:
         results = []
         for index, motion in enumerate(self.motions):
             runs = [run for run, (recording, _) in enumerate(self.starts) if recording == index]
-            position: dict[float, list[float]] = {h: [] for h in HORIZONS}
-            yaw: dict[float, list[float]] = {h: [] for h in HORIZONS}
-            com_error, final_yaw, forces = np.inf, np.inf, []
+            found: dict[str, dict[float, list[float]]] = {
+                quantity: {h: [] for h in self.horizons} for quantity in _QUANTITIES
+            }
+            com_error, final_turn, forces, soonest = np.inf, np.inf, [], None
             for run in runs:
                 start = self.starts[run][1]
                 states = len(motion.qpos) - start
-                if against is None:
-                    other_position, other_yaw = self.recorded(run)
-                    other_com = self._recorded_com[index, start : start + states]
-                else:
-                    other_position, other_yaw, other_com = (
-                        x[run, :states] for x in (against.position, against.yaw, against.com)
-                    )
-                distance = np.linalg.norm(replay.position[run, :states] - other_position, axis=-1)
-                turn = replay.yaw[run, :states] - other_yaw
-                turn = np.rad2deg(np.arctan2(np.sin(turn), np.cos(turn)))
+                series = self._differences(replay, run, against)
                 forces.append(float(np.linalg.norm(replay.force[run, : states - 1], axis=-1).mean()))
-                for horizon in HORIZONS:
+                broken = np.flatnonzero(~(np.abs(series["position"]) < _LOST) | ~np.isfinite(series["orientation"]))
+                if len(broken) and (soonest is None or broken[0] < soonest[1]):
+                    soonest = start, int(broken[0])
+                for horizon in self.horizons:
                     steps = round(horizon / self.robot.control_timestep)
                     if steps < states:
-                        # A start that diverged counts for neither: its angles may still be numbers.
-                        far, turned = _rms(distance[1 : steps + 1]), _rms(turn[1 : steps + 1])
-                        broken = has_diverged(far) or has_diverged(turned)
-                        position[horizon].append(np.inf if broken else far)
-                        yaw[horizon].append(np.inf if broken else turned)
+                        # A start that diverged counts for none of them: its angles may still be numbers.
+                        errors = {q: _rms(series[q][1 : steps + 1]) for q in _QUANTITIES if q in series}
+                        lost = has_diverged(errors["position"]) or has_diverged(errors["orientation"])
+                        for quantity, error in errors.items():
+                            found[quantity][horizon].append(np.inf if lost else error)
                 if run == runs[0]:
-                    com_error = _finite(float(np.linalg.norm(replay.com[run, :states] - other_com, axis=-1).mean()))
-                    final_yaw = _finite(float(turn[-1]))
+                    com_error = _finite(float(series["com"].mean()))
+                    final_turn = _finite(float(series["orientation"][-1]))
+            position = found["position"]
+            means = {name: {h: summarize_starts(v) for h, v in values.items() if v} for name, values in found.items()}
             results.append(
                 Errors(
                     recording=motion.name,
                     group=group_of(motion.name),
-                    position={h: summarize_starts(v) for h, v in position.items() if v},
-                    yaw={h: summarize_starts(v) for h, v in yaw.items() if v},
+                    position=means["position"],
+                    orientation=means["orientation"],
                     mean_com_error=com_error,
-                    final_yaw_error=final_yaw,
+                    final_orientation_error=final_turn,
                     mean_force=summarize_starts(forces)[0],
                     diverged={h: (sum(map(has_diverged, v)), len(v)) for h, v in position.items() if v},
+                    points=means["points"],
+                    joints=means["joints"],
+                    medians={
+                        name: {h: median_of_starts(v) for h, v in values.items() if v} for name, values in found.items()
+                    },
+                    first_diverged=soonest if any(map(has_diverged, itertools.chain(*position.values()))) else None,
                 )
             )
         return tuple(results)
+
+    def _differences(
+        self, replay: Replay, run: int, against: Replay | None
+    ) -> dict[str, Float[np.ndarray, " states"] | Float[np.ndarray, "states several"]]:
+        """Differences between a run and the recording, or the same run of another replay, by quantity.
+
+        Of the tracked body and the centre of mass (m), of orientation (deg), of every point (m), of hinges (deg);
+        points and hinges that there are none of are left out.
+        """
+        recording, start = self.starts[run]
+        states = len(self.motions[recording].qpos) - start
+        hinges = list(self._hinges[recording])
+        if against is None:
+            features = self._recorded_features(run)
+            position, euler = features[:, ObservationLayout.position], features[:, ObservationLayout.euler_angles]
+            com, points = self._recorded_com[recording, start : start + states], self._points(features)
+            qpos = np.asarray(self._reference.qpos)[recording, start : start + states]
+            joints = qpos[:, [self._joints[name] for name in hinges]]
+        else:
+            columns = [list(self._joints).index(name) for name in hinges]
+            position, euler, com, points = (
+                x[run, :states] for x in (against.position, against.euler_angles, against.com, against.points)
+            )
+            joints = against.joints[run, :states][:, columns]
+        found = {
+            "position": np.linalg.norm(replay.position[run, :states] - position, axis=-1),
+            "orientation": orientation_errors(replay.euler_angles[run, :states], euler, self.robot.upright),
+            "com": np.linalg.norm(replay.com[run, :states] - com, axis=-1),
+        }
+        if points.shape[1]:
+            found["points"] = np.linalg.norm(replay.points[run, :states] - points, axis=-1)
+        if hinges:
+            columns = [list(self._joints).index(name) for name in hinges]
+            turn = replay.joints[run, :states][:, columns] - joints
+            found["joints"] = np.rad2deg(np.arctan2(np.sin(turn), np.cos(turn)))
+        return found
+
+
+_QUANTITIES = ("position", "orientation", "points", "joints")
+_LOST = 1e6
+"""m: a tracked body farther off is lost."""
 
 
 def _rms(values: np.ndarray) -> float:

@@ -77,6 +77,8 @@ class Motion:
     """Samples that the recording's reader filled in, by column."""
     robot: str = ""
     """Which robot was recorded."""
+    joints: tuple[str, ...] = ()
+    """The joints whose positions the recording holds; others are inferred."""
     uncertainty: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """What the robot's adapter states about its own part of the reconstruction, by name."""
 

@@ -78,6 +78,7 @@ def reconstruct(
         residual_mm=distance,
         interpolated=dict(recording.interpolated),
         robot=recording.robot,
+        joints=tuple(recording.joint_angles),
         uncertainty=fit.uncertainty,
     )
 

@@ -19,8 +19,9 @@ from jaxtyping import Array, Float
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.drivetrain import DrivetrainState
-from ballu_mjx.sim.observation import HISTORY, ObservationLayout, wrap_angle
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout, euler_to_matrix, wrap_angle
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
@@ -99,7 +100,7 @@ def start_segment(window: Segments) -> tuple[RolloutState, Float[Array, "windows
     return RolloutState(physics, history, commands[:past], drivetrain), commands[past:]
 
 
-def simulate_segment(simulator: AugmentedSimulator, window: Segments) -> Float[Array, "windowsteps 6"]:
+def simulate_segment(simulator: AugmentedSimulator, window: Segments) -> Float[Array, "windowsteps errors"]:
     """Return `segment_errors` of one window, simulated from its start; JAX's own transformations apply."""
     state, commands = start_segment(window)
 
@@ -108,25 +109,31 @@ def simulate_segment(simulator: AugmentedSimulator, window: Segments) -> Float[A
         return after, after.features
 
     _, features = jax.lax.scan(step, state, commands)
-    return segment_errors(features, window.features, simulator.control_timestep)
+    return segment_errors(features, window.features, simulator.robot)
 
 
 def segment_errors(
     features: Float[Array | np.ndarray, "windowsteps features"],
     recorded: Float[Array | np.ndarray, "windowsteps features"],
-    control_timestep: float,
-) -> Float[Array, "windowsteps 6"]:
+    robot: RobotDescription,
+) -> Float[Array, "windowsteps errors"]:
     """Return errors of the tracked body's position and orientation, in expected errors.
 
-    Neighbours in time say the same: all of a window's squares add up to one for each of the six where errors are as
-    expected.
+    Errors of orientation are those of roll, pitch and yaw of an upright robot. Of others they are the nine differences
+    of the rotation matrices over sqrt(2), whose length is the angle between small rotations and grows up to 180 deg.
+    Neighbours in time say the same: all of a window's squares add up to one for each of the six degrees of freedom
+    where errors are as expected.
     """
-    steps = len(recorded)
-    time = np.arange(1, steps + 1)[:, None] * control_timestep
-    start, each_second = np.array([POSITION] * 3 + [ANGLE] * 3).T
+    steps, layout = len(recorded), ObservationLayout
+    time = np.arange(1, steps + 1)[:, None] * robot.control_timestep
     difference = jnp.asarray(features) - recorded
-    position = difference[:, ObservationLayout.position]
-    angles = wrap_angle(difference[:, ObservationLayout.euler_angles])
+    position = difference[:, layout.position]
+    if robot.upright:
+        angles = wrap_angle(difference[:, layout.euler_angles])
+    else:
+        one, other = (jax.vmap(euler_to_matrix)(jnp.asarray(x)[:, layout.euler_angles]) for x in (features, recorded))
+        angles = ((one - other) / np.sqrt(2)).reshape(steps, 9)
+    start, each_second = np.array([POSITION] * 3 + [ANGLE] * angles.shape[1]).T
     return jnp.concatenate([position, angles], axis=1) / ((start + each_second * time) * np.sqrt(steps))
 
 

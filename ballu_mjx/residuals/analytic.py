@@ -23,6 +23,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.segments import Segments, check_segments, pseudo_huber, segment_errors, start_segment
 from ballu_mjx.residuals.envmimic import start_spread
 from ballu_mjx.residuals.network import NetworkForces, square_newtons
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.force_model import to_wrenches
 from ballu_mjx.sim.linearize import ControlSteps, Linearized, Linearizer
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
@@ -129,7 +130,7 @@ def train(
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
     plain = linearize.simulator.simulator
     starts = start_spread(plain.mj_model, plain.robot)
-    update = _updates(forces, wrap, optimizer, spread, starts, config, plain.robot.control_timestep)
+    update = _updates(forces, wrap, optimizer, spread, starts, config, plain.robot)
     carry = (start, optimizer.init(start), start)
     key = jax.random.key(config.seed)
     done = simulated = 0
@@ -140,11 +141,7 @@ def train(
         steps, features = simulate(wrap(jax.device_get(carry[0])), taken)
         data = _in_windows(linearize(steps), steps.loads, taken)
         simulated += len(steps.loads) * (2 + linearize.directions)
-        loss = float(
-            np.mean(
-                jax.vmap(functools.partial(_loss, control_timestep=plain.control_timestep))(features, taken.features)
-            )
-        )
+        loss = float(np.mean(jax.vmap(functools.partial(_loss, robot=plain.robot))(features, taken.features)))
         for first in range(0, config.updates, config.validate_every):
             key, own = jax.random.split(key)
             count = min(config.validate_every, config.updates - first)
@@ -166,10 +163,10 @@ def _in_windows(
 def _loss(
     features: Float[Array | np.ndarray, "windowsteps features"],
     recorded: Float[Array | np.ndarray, "windowsteps features"],
-    control_timestep: float,
+    robot: RobotDescription,
 ) -> Float[Array, ""]:
     """Of a whole window's error."""
-    return pseudo_huber(jnp.sum(segment_errors(features, recorded, control_timestep) ** 2))
+    return pseudo_huber(jnp.sum(segment_errors(features, recorded, robot) ** 2))
 
 
 def _updates(
@@ -179,7 +176,7 @@ def _updates(
     spread: Float[np.ndarray, " inputs"],
     start_spread: Float[np.ndarray, " directions"],
     config: AnalyticConfig,
-    control_timestep: float,
+    robot: RobotDescription,
 ) -> Callable[..., Any]:
     """Gradient steps on linearized windows, compiled."""
 
@@ -204,7 +201,7 @@ def _updates(
         steps = len(window.features)
         through = linear, about, jnp.arange(steps), jax.random.split(key_noise, steps)
         _, (features, loads) = jax.lax.scan(step, (first, window.history), through)
-        tracking = _loss(features, window.features, control_timestep)
+        tracking = _loss(features, window.features, robot)
         return tracking + config.force_cost * jnp.mean(square_newtons(loads, forces.config)), tracking
 
     @jax.jit

@@ -5,15 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ballu_mjx.sim.observation import ObservationLayout, heading_rotation
-
-
-def rotation(euler: Float[Array, " 3"]) -> Float[Array, "3 3"]:
-    """Return the rotation matrix, body to world, of roll, pitch and yaw (rad; intrinsic z-y-x)."""
-    roll, pitch, yaw = euler
-    cr, sr, cp, sp = jnp.cos(roll), jnp.sin(roll), jnp.cos(pitch), jnp.sin(pitch)
-    tilt = jnp.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
-    return heading_rotation(yaw) @ tilt
+from ballu_mjx.sim.observation import ObservationLayout, euler_to_matrix
 
 
 def turn(matrix: Float[Array, "3 3"]) -> Float[Array, " 3"]:
@@ -30,7 +22,7 @@ def body_motion(
     from the last features (`sim.observation.observe_features`): a force is held over that step.
     """
     layout = ObservationLayout
-    earlier, before, now = (rotation(seen[layout.euler_angles]) for seen in history[-3:])
+    earlier, before, now = (euler_to_matrix(seen[layout.euler_angles]) for seen in history[-3:])
     velocity = now.T @ (1.5 * history[-1, layout.velocity] - 0.5 * history[-2, layout.velocity])
     turned = 2 * turn(before.T @ now) - turn(earlier.T @ before)
     return now, velocity, turned / control_timestep

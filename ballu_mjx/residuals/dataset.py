@@ -10,7 +10,7 @@ from pathlib import Path
 import mujoco
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS
+from ballu_mjx.evaluation.errors_table import shortest_recording
 from ballu_mjx.identification.actuators import AUTO, NOMINAL, find_actuators, read_actuators
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.groups import group_of
@@ -194,7 +194,7 @@ def _read(files: Mapping[str, Sequence[Path]], description: RobotDescription) ->
     check_overlap(files)
     read = {path: read_recording(path, description) for paths in files.values() for path in paths}
     for path, recording in read.items():
-        check_recording(path, recording, long_enough=path in files["validation"] or path in files["test"])
+        check_recording(path, recording, description, long_enough=path in files["validation"] or path in files["test"])
     return {use: [read[path] for path in paths] for use, paths in files.items()}
 
 
@@ -208,11 +208,11 @@ def check_overlap(files: Mapping[str, Sequence[Path]]) -> None:
             raise InputError(f"{path}: is among the {one} and the {other} recordings; take it out of one of them.")
 
 
-def check_recording(path: Path, recording: Recording, *, long_enough: bool) -> None:
+def check_recording(path: Path, recording: Recording, robot: RobotDescription, *, long_enough: bool) -> None:
     """Refuse, with an `InputError`, a recording that EnvMimic cannot use: `long_enough` for an evaluation or not."""
     if recording.kind != "free":
         raise InputError(f"{path}: is a {recording.kind} recording; EnvMimic takes free ones only, leave it out.")
-    shortest = min(SCORE_HORIZONS) + 0.5
+    shortest = shortest_recording(robot.horizons)
     duration = recording.time[-1] - recording.time[0]
     if long_enough and duration < shortest:
         raise InputError(

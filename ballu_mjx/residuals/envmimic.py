@@ -35,7 +35,7 @@ from ballu_mjx.rl.learner import initial_state
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.coordinates import translations
 from ballu_mjx.sim.force_model import to_wrenches
-from ballu_mjx.sim.observation import HISTORY, ObservationLayout, world_rotation, wrap_angle
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout, euler_to_matrix, world_rotation, wrap_angle
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
@@ -100,14 +100,21 @@ def check_envmimic_config(config: EnvMimicConfig, control_timestep: float) -> No
 
 
 def reward_terms(
-    seen: Float[Array, " features"], target: Float[Array, " features"], config: EnvMimicConfig
+    seen: Float[Array, " features"], target: Float[Array, " features"], config: EnvMimicConfig, upright: bool = True
 ) -> dict[str, Float[Array, ""]]:
     """The paper's `r_pos` and `r_orn` (`position`, `orientation`) for simulated and recorded features, and the weighted
-    sum of these and of their sharper twins (`tracking`)."""
+    sum of these and of their sharper twins (`tracking`).
+
+    Of a robot that is not `upright`, Euler angles jump. Its orientation term takes the squared sine of half the angle
+    of the rotation between both, times four, with the mean weight of the three axes."""
     layout = ObservationLayout
     position_error = jnp.sum((target[layout.position] - seen[layout.position]) ** 2)
-    angles = wrap_angle(target[layout.euler_angles] - seen[layout.euler_angles])
-    orientation_error = jnp.sum(jnp.array(config.orientation_axes) * angles**2)
+    if upright:
+        angles = wrap_angle(target[layout.euler_angles] - seen[layout.euler_angles])
+        orientation_error = jnp.sum(jnp.array(config.orientation_axes) * angles**2)
+    else:
+        one, other = (euler_to_matrix(each[layout.euler_angles]) for each in (target, seen))
+        orientation_error = sum(config.orientation_axes) / 3 * jnp.sum((one - other) ** 2) / 2
 
     position = jnp.exp(-config.position_scale * position_error)
     orientation = jnp.exp(-config.orientation_scale * orientation_error)
@@ -219,7 +226,7 @@ class EnvMimicEnv(Env):
 
         target = self.reference.features[recording, time + 1]
         rollout, finite = after.keep_finite(before.rollout, target)
-        terms = reward_terms(rollout.features, target, self.config)
+        terms = reward_terms(rollout.features, target, self.config, self.robot.upright)
         cost = self.config.force_cost * square_newtons(loads, self.config)
         reward = jnp.where(finite, terms["tracking"] - cost, 0.0)
 

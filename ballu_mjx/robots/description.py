@@ -19,7 +19,10 @@ JSON with the keys
 - `mirror` (optional): for a robot that is its own mirror image about the xz plane, pairs of names (points, commands,
   joints) that change places, as `{"foot_left": "foot_right"}`; {} where nothing does;
 - `adapter` (optional): `module:Class`, a `robots.adapter.RobotAdapter` with what only this robot has;
-- `identify` (optional): parameters that recordings may identify, a list; see `identification.parameters`.
+- `identify` (optional): parameters that recordings may identify, a list; see `identification.parameters`;
+- `upright` (optional): true for a robot whose tracked body never tilts far, so that its yaw says how it is turned;
+  false, the default: errors of orientation are the angle of the rotation between two orientations;
+- `horizons` (optional): seconds over which errors are taken, 0.05 to 100, for a robot that the default ones do not fit.
 
 Joints are one free joint at the root or none, then hinges and slides. A robot without a free joint is anchored: what it
 sees and how it is pushed are told in the world's frame, for where it stands and how it is turned then matter.
@@ -58,10 +61,14 @@ _OPTIONAL = (
     "mirror",
     "adapter",
     "identify",
+    "upright",
+    "horizons",
 )
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 _LONGEST = 60
 _LONGEST_STEP = 1.0
+HORIZON_RANGE = (0.05, 100.0)
+"""Seconds that errors may be taken over."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,6 +119,10 @@ class RobotDescription:
     """What only this robot has."""
     identify: tuple[Mapping[str, Any], ...] = ()
     """Parameters that recordings may identify, as declared; `identification.parameters` reads them."""
+    upright: bool = False
+    """Whether yaw says how the tracked body is turned; errors of orientation are then those of yaw."""
+    horizons: tuple[float, ...] = ()
+    """Seconds over which errors are taken, increasing; empty: the default ones."""
 
     @property
     def features(self) -> int:
@@ -193,6 +204,8 @@ def read_description(path: Path | str) -> RobotDescription:
         mirror=_mirror(path, content.get("mirror"), (*points, *driven, *joints)),
         adapter=_adapter(path, content.get("adapter")),
         identify=_entries(path, "identify", content.get("identify", [])),
+        upright=_flag(path, "upright", content.get("upright", False)),
+        horizons=_horizons(path, content.get("horizons", [])),
     )
     twice = [column for number, column in enumerate(found.columns) if column in found.columns[:number]]
     if twice:
@@ -408,6 +421,19 @@ def _entries(path: Path, key: str, value: Any) -> tuple[Mapping[str, Any], ...]:
     if not isinstance(value, list) or not all(isinstance(each, dict) for each in value):
         _refuse(path, f'"{key}" is {_shown(value)}', "write a list of objects")
     return tuple(value)
+
+
+def _flag(path: Path, key: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        _refuse(path, f'"{key}" is {_shown(value)}', "write true or false")
+    return value
+
+
+def _horizons(path: Path, value: Any) -> tuple[float, ...]:
+    low, high = HORIZON_RANGE
+    if not isinstance(value, list) or not all(is_number(each) and low <= each <= high for each in value):
+        _refuse(path, f'"horizons" is {_shown(value)}', f"write a list of seconds from {low:g} to {high:g}")
+    return tuple(sorted({float(each) for each in value}))
 
 
 def _names(path: Path, key: str, value: Any) -> tuple[str, ...]:

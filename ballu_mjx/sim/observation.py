@@ -86,6 +86,14 @@ def euler_angles(quaternion: Float[Array, " 4"]) -> Float[Array, " 3"]:
     return jnp.stack([roll, pitch, yaw])
 
 
+def euler_to_matrix(euler: Float[Array, " 3"]) -> Float[Array, "3 3"]:
+    """Return the rotation matrix, body to world, of roll, pitch and yaw (rad; intrinsic z-y-x)."""
+    roll, pitch, yaw = euler
+    cr, sr, cp, sp = jnp.cos(roll), jnp.sin(roll), jnp.cos(pitch), jnp.sin(pitch)
+    tilt = jnp.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
+    return heading_rotation(yaw) @ tilt
+
+
 def wrap_angle(angle: Array) -> Array:
     """The same angle in (-pi, pi]."""
     return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))

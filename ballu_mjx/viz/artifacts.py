@@ -19,12 +19,10 @@ if TYPE_CHECKING:
 
 def write_evaluation(evaluator: OpenLoopEvaluator, params: Any, folder: Path) -> Evaluation:
     """Evaluate, and write `evaluation.txt`, `evaluation.json`, `tracking.png` and `replay.npz` into `folder`."""
-    from ballu_mjx.evaluation.errors_table import Evaluation
-
     names = evaluator.base, evaluator.name
     replays = dict(zip(names, (evaluator.replay(params, scale=0.0), evaluator.replay(params)), strict=True))
     vanilla, residual = (evaluator.errors(replays[name]) for name in names)
-    result = Evaluation(vanilla, residual, *names, evaluator.nominal_errors(params))
+    result = evaluator.compared(vanilla, residual, evaluator.nominal_errors(params))
     files.write(folder / "evaluation.txt", result.table() + "\n")
     files.write(folder / "evaluation.json", json.dumps(result.to_json(), indent=2) + "\n")
     draw_tracking(evaluator, replays, folder / "tracking.png")

@@ -35,8 +35,13 @@ _CURVES = {
     "validation_error": "validation error (ratio to vanilla)",
     "validation_reward": "reward per control step, without exploration (m/s)",
 }
-_QUANTITIES = (("position", "position RMSE (m)", 3), ("yaw", "yaw RMSE (deg)", 1))
-_WHOLE = (("mean_com_error", "mean CoM error (m)", 3), ("final_yaw_error", "final yaw error (deg)", 1))
+_QUANTITIES = (
+    ("position", "position RMSE (m)", 3),
+    ("orientation", "{angle} RMSE (deg)", 1),
+    ("points", "points RMSE (m)", 3),
+    ("joints", "joints RMSE (deg)", 1),
+)
+_WHOLE = (("mean_com_error", "mean CoM error (m)", 3), ("final_orientation_error", "final {angle} error (deg)", 1))
 _FORCE_COLOURS = ("#cc0000", "#7b3294", "#998ec3")
 _ROW_HEIGHT = 170
 
@@ -186,9 +191,10 @@ def _add_evaluation(content: Content, folder: Path, prefix: str = "") -> None:
     pairs = list(zip(found.vanilla, found.residual, strict=True))
     content.facts.append((f"{prefix}score", f"{found.score:.3f} (mean ratio to {base})"))
     content.tables += [
-        _horizons(f"{prefix}{without.recording}", (base, name), without, mimic) for without, mimic in pairs
+        _horizons(f"{prefix}{without.recording}", (base, name), without, mimic, found.angle) for without, mimic in pairs
     ]
-    header = ["", *(f"{title}, {each}" for _, title, _ in _WHOLE for each in (base, name)), "mean force (N)"]
+    header = ["", *(f"{title.format(angle=found.angle)}, {each}" for _, title, _ in _WHOLE for each in (base, name))]
+    header.append("mean force (N)")
     rows = []
     for without, mimic in pairs:
         cells = [_cell(getattr(errors, key), digits) for key, _, digits in _WHOLE for errors in (without, mimic)]
@@ -225,17 +231,22 @@ def _add_identification(content: Content, folder: Path) -> None:
         raise InputError(f"{path}: is damaged ({error!r}); identify again.") from None
 
 
-def _horizons(title: str, names: tuple[str, str], without: Errors, mimic: Errors) -> Table:
+def _horizons(title: str, names: tuple[str, str], without: Errors, mimic: Errors, angle: str) -> Table:
     """One recording's errors by horizon: mean over the starts, without and with the residual, and their ratio."""
     from ballu_mjx.evaluation.errors_table import quotient
 
     header = ["horizon (s)"]
-    for key, quantity, _ in _QUANTITIES:
-        header += [*(f"{quantity}, {name}" for name in names), f"{key}, ratio"]
+    shown = [each for each in _QUANTITIES if getattr(without, each[0])]
+    for key, quantity, _ in shown:
+        header += [*(f"{quantity.format(angle=angle)}, {name}" for name in names)]
+        header.append(f"{angle if key == 'orientation' else key}, ratio")
     rows = []
     for horizon in without.position:
         row = [Cell(f"{horizon:g}")]
-        for key, _, digits in _QUANTITIES:
+        for key, _, digits in shown:
+            if horizon not in getattr(without, key):
+                row += [Cell("")] * 3
+                continue
             one, other = getattr(without, key)[horizon][0], getattr(mimic, key)[horizon][0]
             row += [_cell(one, digits), _cell(other, digits), _cell(quotient(other, one), 2)]
         rows.append(row)
@@ -243,7 +254,7 @@ def _horizons(title: str, names: tuple[str, str], without: Errors, mimic: Errors
 
 
 def _cell(value: float, digits: int) -> Cell:
-    return Cell(f"{value:.{digits}f}", repr(float(value)))
+    return Cell(f"{value:.{digits}f}", repr(float(value))) if np.isfinite(value) else Cell("diverged")
 
 
 def _curves(folders: Mapping[str, Path]) -> list[Curve]:

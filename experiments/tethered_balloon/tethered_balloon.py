@@ -171,7 +171,7 @@ def main() -> None:
     curves: dict[str, list[list[float]]] = {"vanilla": [], "envmimic": []}
     for horizon in horizons:
         absolute, left = [], []
-        for quantity in ("position", "yaw"):
+        for quantity in ("position", "orientation"):
             without = errors(found[0].vanilla, quantity, horizon)
             each = [errors(result.residual, quantity, horizon) for result in found]
             absolute.append((without, float(np.mean(each))))

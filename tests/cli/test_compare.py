@@ -36,7 +36,7 @@ def write(folder: Path, seed: int, scale: float, reward: float, task: str = "env
         for name, x in (("near-1", 1.0), ("far-1", 2.0))
     ]
     half = [
-        Errors(e.recording, e.group, {h: (v / 2, s) for h, (v, s) in e.position.items()}, e.yaw, 0, 0, 0)
+        Errors(e.recording, e.group, {h: (v / 2, s) for h, (v, s) in e.position.items()}, e.orientation, 0, 0, 0)
         for e in errors
     ]
     content = Evaluation(tuple(errors), tuple(half)).to_json()

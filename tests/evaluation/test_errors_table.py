@@ -8,18 +8,22 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.errors_table import (
     HORIZONS,
     Errors,
     Evaluation,
+    choose_horizons,
     mean_by_group,
     quotient,
     read_evaluation,
     summarize_starts,
 )
+from ballu_mjx.evaluation.open_loop import orientation_errors
 from ballu_mjx.recordings.groups import group_of
 
 
@@ -99,7 +103,7 @@ def without(row: str) -> dict[str, Any]:
     "content",
     [
         without("diverged"),  # as before divergence was counted
-        without("yaw"),
+        without("orientation"),
         Evaluation((SOUND,), (SOUND,)).to_json() | {"vanilla": []},
         Evaluation((SOUND,), (errors("near-2", [[0.1]]),)).to_json(),
         Evaluation((dataclasses.replace(SOUND, group="far"),), (dataclasses.replace(SOUND, group="far"),)).to_json(),
@@ -130,3 +134,36 @@ def test_nominal_vanilla_stands_beside_vanilla_with_identified_actuators() -> No
     assert "0.900 ± 0.000" in result.table()
     assert Evaluation.from_json(json.loads(json.dumps(result.to_json()))) == result
     assert result.ratio("near", "position", 1.0) == pytest.approx(0.1 / 0.2), "ratios are to the base"
+
+
+def test_angles_between_orientations_pass_the_vertical() -> None:
+    """A pendulum swings about y: its yaw flips by 180 deg where it passes 90 deg of pitch, its angle does not."""
+    angles = np.deg2rad([80.0, 89.0, 91.0, 179.0, -170.0])
+    turned = Rotation.from_euler("y", angles[:, None]).as_euler("ZYX")[:, ::-1]
+    recorded = Rotation.from_euler("y", angles[:, None] - np.deg2rad(4.0)).as_euler("ZYX")[:, ::-1]
+    np.testing.assert_allclose(orientation_errors(turned, recorded, upright=False), 4.0, atol=1e-6)
+    assert np.abs(orientation_errors(turned, recorded, upright=True)).max() > 179
+    way = np.zeros((2, 3)), np.array([[0.3, 0.0, 3.1], [0.0, 0.2, 0.1]])
+    np.testing.assert_allclose(orientation_errors(*way, upright=True), -np.rad2deg([3.1, 0.1]))
+
+
+def test_horizons_are_the_robot_s_or_fit_the_recordings() -> None:
+    assert choose_horizons((), 30.0) == HORIZONS and max(choose_horizons((), 0.8)) < 0.8
+    assert choose_horizons((0.2, 0.4), 30.0) == (0.2, 0.4)
+    short = Errors("near-1", "near", {0.4: (0.1, 0.0)}, {0.4: (1.0, 0.0)}, 0.1, 1.0, 0.0)
+    assert Evaluation((short,), (short,)).score == 1.0 and f"{0.4:>8g} |" in Evaluation((short,), (short,)).table()
+
+
+def test_medians_and_the_share_of_finite_starts_are_told() -> None:
+    medians = {"position": {1.0: 0.2}, "orientation": {1.0: 3.0}, "joints": {1.0: math.inf}}
+    each = Errors(
+        "near-1", "near", {1.0: (0.2, 0.0)}, {1.0: (3.0, 0.0)}, 0.1, 1.0, 0.0, {1.0: (1, 4)},
+        joints={1.0: (math.inf, 0.0)}, medians=medians, first_diverged=(20, 7),
+    )  # fmt: skip
+    result = Evaluation((each,), (each,), angle="orientation")
+    table = result.table()
+    assert "near joints (deg)" in table and "75%" in table and "7 control steps after step 20" in table
+    assert (
+        "orientation RMSE (deg)" in table and "yaw" not in table and "nan" not in table and "inf" not in table.split()
+    )
+    assert Evaluation.from_json(json.loads(json.dumps(result.to_json()))) == result

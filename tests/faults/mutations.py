@@ -351,8 +351,10 @@ def metrics_fault(rows: Any) -> str | None:
 
 def evaluation_fault(found: Any) -> str | None:
     each = [*found.vanilla, *found.residual]
-    numbers = [x for errors in each for table in (errors.position, errors.yaw) for pair in table.values() for x in pair]
-    numbers += [x for e in each for x in (e.mean_com_error, e.final_yaw_error, e.mean_force)]
+    numbers = [
+        x for errors in each for table in (errors.position, errors.orientation) for pair in table.values() for x in pair
+    ]
+    numbers += [x for e in each for x in (e.mean_com_error, e.final_orientation_error, e.mean_force)]
     numbers = [x for x in [*numbers, found.score] if x != math.inf]  # of simulations that diverged
     return None if finite(*numbers) and printable(*(e.recording for e in each)) else "numbers"
 

@@ -25,10 +25,9 @@ from ballu_mjx.residuals.aerodynamics import (
     read_air_parameters,
 )
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, Optimum, at_whole_delay, identify_air
-from ballu_mjx.residuals.body_motion import rotation
 from ballu_mjx.robots.model import set_fields
 from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.sim.observation import HISTORY, heading_rotation
+from ballu_mjx.sim.observation import HISTORY, euler_to_matrix, heading_rotation
 from ballu_mjx.sim.simulator import Simulator
 
 SIMULATOR = Simulator(load_robot())
@@ -92,7 +91,7 @@ def blown(name: str, period: float, phase: float, steps: int = 160) -> Motion:
 
 def history(euler: np.ndarray, velocity: np.ndarray, turning: np.ndarray) -> jnp.ndarray:
     """Features of a balloon that moves and turns; `turning` in its own frame."""
-    now = rotation(jnp.asarray(euler))
+    now = euler_to_matrix(jnp.asarray(euler))
     hat = np.array([[0, -turning[2], turning[1]], [turning[2], 0, -turning[0]], [-turning[1], turning[0], 0]])
 
     def angles(age: int) -> jnp.ndarray:

@@ -234,7 +234,7 @@ def test_evaluator_finds_no_error_in_its_own_physics_and_some_in_pushed_ones(eva
     result = evaluator(jnp.array(FORCE))
     own, pushed = result.vanilla
     assert own.group == "near" and pushed.group == "far"
-    assert own.position[1.0][0] < 1e-3 and own.yaw[1.0][0] < 0.1
+    assert own.position[1.0][0] < 1e-3 and own.orientation[1.0][0] < 0.1
     assert pushed.position[2.0][0] > 0.03
     # The force that made the recording explains it; on the other recording it does harm, and the bound says so.
     assert result.ratio("far", "position", 2.0) < 0.1
@@ -268,7 +268,7 @@ def test_errors_of_starts_are_how_far_the_starts_lie_apart(evaluator: OpenLoopEv
     beside = [dataclasses.replace(m, qpos=m.qpos + 0.02 * np.eye(m.qpos.shape[1])[1]) for m in evaluator.motions]
     for errors in evaluator.of_starts(beside, jnp.array(FORCE)):
         assert errors.position[2.0][0] == pytest.approx(0.02, rel=0.02)
-        assert errors.yaw[2.0][0] < 0.1 and errors.mean_com_error == pytest.approx(0.02, rel=0.02)
+        assert errors.orientation[2.0][0] < 0.1 and errors.mean_com_error == pytest.approx(0.02, rel=0.02)
 
 
 def test_a_group_s_errors_are_not_those_of_its_luckiest_recording():
@@ -284,7 +284,7 @@ def test_a_group_s_errors_are_not_those_of_its_luckiest_recording():
     means = Evaluation(mean_by_group(vanilla), mean_by_group(mimic))
     worst, place = means.excess()
     assert worst == pytest.approx(2.0 / (1.2 * 2.0 + 0.02) - 1) and "near at 5 s" in place
-    assert means.ratio("near", "yaw", 5.0) == result.ratio("near", "yaw", 5.0) == 1.0
+    assert means.ratio("near", "orientation", 5.0) == result.ratio("near", "orientation", 5.0) == 1.0
 
 
 def test_one_program_serves_all_recordings_and_actuators(still: Motion, pushed: Motion):

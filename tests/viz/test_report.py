@@ -154,11 +154,11 @@ def test_numbers_are_those_of_the_evaluation(run: Path, page: Path):
     expected: list[float] = []
     for without, mimic in zip(stored["vanilla"], stored["residual"], strict=True):
         for horizon in map(str, HORIZONS):
-            for quantity in ("position", "yaw"):
+            for quantity in ("position", "orientation"):
                 pair = [e[quantity][horizon][0] for e in (without, mimic)]
                 expected += [*pair, pair[1] / pair[0]]
     for without, mimic in zip(stored["vanilla"], stored["residual"], strict=True):
-        expected += [e[key] for key in ("mean_com_error", "final_yaw_error") for e in (without, mimic)]
+        expected += [e[key] for key in ("mean_com_error", "final_orientation_error") for e in (without, mimic)]
         expected.append(mimic["mean_force"])
     assert [float(value or "nan") for value in shown] == expected
 
