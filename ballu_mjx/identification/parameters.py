@@ -38,6 +38,7 @@ from jaxtyping import Array, Float
 from mujoco import mjx
 
 from ballu_mjx.common.errors import InputError, is_number
+from ballu_mjx.common.rotations import matrix_to_quaternion, quaternion_to_matrix
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.drivetrain import QUANTITIES, DrivetrainParameters, count_slots, identity_drivetrain
 
@@ -263,7 +264,7 @@ def deform_body(
     - `numbers`: in the order of `BODY_QUANTITIES`.
     - `turned`: whether stretches and shears may differ from nominal, so that principal axes are sought anew.
     """
-    axes = _rotation(iquat)
+    axes = quaternion_to_matrix(iquat)
     ratio, shift, stretch, shear = numbers[0], numbers[1:4], numbers[4:7], numbers[7:]
     centre = ipos + axes @ shift
     if not turned:
@@ -277,39 +278,10 @@ def deform_body(
     own = jnp.trace(spread) * jnp.eye(3) - spread + split
     principal, vectors = jnp.linalg.eigh(own)
     vectors = vectors * jnp.where(jnp.linalg.det(vectors) < 0, -1.0, 1.0)
-    return ratio * mass, centre, _quaternion(axes @ vectors), ratio * principal
+    return ratio * mass, centre, matrix_to_quaternion(axes @ vectors), ratio * principal
 
 
 _SPLIT = 1e-6
-
-
-def _rotation(quaternion: Float[Array, " 4"]) -> Float[Array, "3 3"]:
-    w, x, y, z = quaternion
-    return jnp.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def _quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, " 4"]:
-    """Return the unit quaternion, by whichever of its four components is largest; differentiable."""
-    r = rotation
-    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
-    xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
-    # Each row is the quaternion, times four times one of its components.
-    rows = jnp.array(
-        [
-            [1 + r[0, 0] + r[1, 1] + r[2, 2], x, y, z],
-            [x, 1 + r[0, 0] - r[1, 1] - r[2, 2], xy, xz],
-            [y, xy, 1 - r[0, 0] + r[1, 1] - r[2, 2], yz],
-            [z, xz, yz, 1 - r[0, 0] - r[1, 1] + r[2, 2]],
-        ]
-    )
-    row = rows[jnp.argmax(jnp.diag(rows))]
-    return row / jnp.linalg.norm(row)
 
 
 @jax.tree_util.register_dataclass

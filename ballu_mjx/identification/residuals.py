@@ -20,9 +20,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
-from mujoco.mjx._src import math as mjx_math
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.common.rotations import quaternion_conjugate, quaternion_integrate, quaternion_product
 from ballu_mjx.identification.batched_solver import along_directions
 from ballu_mjx.identification.parameters import LEAST_FRICTION, ParameterSet
 from ballu_mjx.recordings.filters import interpolate, mean_command, savitzky_golay
@@ -369,14 +369,14 @@ class WindowSimulator:
         """Return `qpos` moved along the velocities' directions."""
         if len(qpos) == len(change):
             return qpos + change
-        turned = mjx_math.quat_integrate(qpos[3:7], change[3:6], jnp.asarray(1.0))
+        turned = quaternion_integrate(qpos[3:7], change[3:6])
         return jnp.concatenate([qpos[:3] + change[:3], turned, qpos[7:] + change[6:]])
 
     def _difference(self, qpos: Float[Array, " nq"], other: Float[Array, " nq"]) -> Float[Array, " nv"]:
         """Return what leads from `other` to `qpos`, along the velocities' directions."""
         if len(qpos) == self.nv:
             return qpos - other
-        turn = mjx_math.quat_mul(mjx_math.quat_inv(other[3:7]), qpos[3:7])
+        turn = quaternion_product(quaternion_conjugate(other[3:7]), qpos[3:7])
         turn = 2 * turn[1:] * jnp.where(turn[0] < 0, -1.0, 1.0)  # the small angle between them
         return jnp.concatenate([qpos[:3] - other[:3], turn, qpos[7:] - other[7:]])
 

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from ballu_mjx.common.rotations import quaternion_to_matrix
 from ballu_mjx.recordings.filters import (
     control_grid,
     interpolate,
@@ -28,7 +29,7 @@ from ballu_mjx.recordings.filters import (
 )
 from ballu_mjx.recordings.hooks import hooks_of
 from ballu_mjx.recordings.inverse_kinematics import solve_inverse_kinematics
-from ballu_mjx.recordings.kinematic_tree import KinematicTree, to_matrices
+from ballu_mjx.recordings.kinematic_tree import KinematicTree
 from ballu_mjx.recordings.motion import MeasurementGrid, Motion, ReconstructionParameters
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
@@ -139,11 +140,11 @@ def differentiate(
     body = int(model.site_bodyid[model.site(robot.tracked).id])
     tree = KinematicTree(model, [], [body])
     relative, _ = _from_root(tree, qpos)
-    tracked = _to_quaternions(to_matrices(qpos[:, 3:7]) @ relative)
+    tracked = _to_quaternions(quaternion_to_matrix(qpos[:, 3:7]) @ relative)
     quaternion, angular = smooth_rotation(sign_continuous(tracked), parameters.rotation_window, step, order)
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     relative, slope = _from_root(tree, smooth)
-    root = _to_quaternions(to_matrices(quaternion) @ relative.transpose(0, 2, 1))
+    root = _to_quaternions(quaternion_to_matrix(quaternion) @ relative.transpose(0, 2, 1))
     turning = (slope[:, :, 6:] @ rates[:, 7:, None])[..., 0]
     angular = (relative @ angular[..., None])[..., 0] - turning
     return (
