@@ -66,7 +66,7 @@ def train_envmimic(
     env = EnvMimicEnv(augmented, motions, config)
     sizes = env.observation_size, env.action_size, ppo_config
     infer = ppo.make_inference(*sizes)
-    forces = NetworkForces(config, robot, infer, ppo.make_sampler(*sizes))
+    forces = NetworkForces(config, robot, infer, ppo.make_sampler(*sizes), network=ppo_config)
     model, all_params = add_to_base(augmented.residual, forces)
     measure = (evaluators or Evaluators(plain)).of(model, motions if validation is None else validation)
     tells_best = Validation(lambda params: measure(all_params(params)).score)
