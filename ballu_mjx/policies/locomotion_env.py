@@ -24,7 +24,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.tasks import Step, Task
 from ballu_mjx.policies.variants import SimulatorVariant
 from ballu_mjx.residuals.trained import TrainedResidual
-from ballu_mjx.rl.learner import initial_state
+from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, bare_parameters
 from ballu_mjx.sim.drivetrain import DrivetrainParameters, drivetrain_of

@@ -16,7 +16,8 @@ from ballu_mjx.policies.tasks import TASKS, Task
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Params, PPOConfig
-from ballu_mjx.rl.training_loop import ResumePoint, TrainingLoop, Validation
+from ballu_mjx.rl.resume_point import ResumePoint
+from ballu_mjx.rl.training_loop import TrainingLoop, Validation
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.progress import Progress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord

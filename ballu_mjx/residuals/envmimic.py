@@ -32,7 +32,7 @@ from ballu_mjx.residuals.network import (
     square_newtons,
     world_loads,
 )
-from ballu_mjx.rl.learner import initial_state
+from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.coordinates import translations
 from ballu_mjx.sim.force_model import to_wrenches
@@ -173,7 +173,7 @@ class EnvMimicEnv(Env):
     def contents(self) -> dict[str, Any]:
         """What tells one environment from another of the same configuration, as arrays: the model's numbers, the
         recordings, and what a base residual has learned. Programs that take it as an argument (see
-        `learner.wrap_for_training`) serve them all."""
+        `training_env.wrap_for_training`) serve them all."""
         return {
             "model": self.simulator.simulator.model,
             "drivetrain": self.simulator.simulator.drivetrain,
