@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.policies.locomotion_env import Contents, LocomotionEnv, locomotion_state
 from ballu_mjx.rl.ppo import Inference, Params
+from ballu_mjx.sim.observation import ObservationLayout
 
 
 class Rollout(NamedTuple):
@@ -32,7 +33,7 @@ class Rollout(NamedTuple):
     @property
     def yaw(self) -> Float[np.ndarray, "runs states"]:
         """Of the tracked body (rad), not unwrapped."""
-        return self.features[..., 8]
+        return self.features[..., ObservationLayout.yaw]
 
 
 _CHUNK = 100

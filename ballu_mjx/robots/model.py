@@ -26,10 +26,6 @@ class ModelParameters(Protocol):
         ...
 
 
-CONTROL_TIMESTEP = 0.05
-"""Seconds between two commands (20 Hz)."""
-
-
 def assets() -> Path:
     """Folder with the model and the bundled recordings, from a wheel or from a checkout."""
     packaged = Path(str(resources.files("ballu_mjx"))) / "assets"
