@@ -52,9 +52,10 @@ from ballu_mjx.ballu.model import SIDES, suspend
 from ballu_mjx.ballu.sweep import Sweep, read_sweep
 from ballu_mjx.ballu.sysid_report import mean_error
 from ballu_mjx.identification.actuators import identify_actuators
+from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, fit_robot
 from ballu_mjx.identification.guard import HORIZONS, choose_actuators
-from ballu_mjx.identification.parameters import IdentifiedParameters, ParameterSet, declared_parameters
+from ballu_mjx.identification.parameters import IdentifiedParameters, ParameterSet
 from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, measure
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct

@@ -12,7 +12,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.identification.parameters import IdentifiedParameters, declared_parameters
+from ballu_mjx.identification.declarations import declared_parameters
+from ballu_mjx.identification.parameters import IdentifiedParameters
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.sim.drivetrain import count_slots, filter_commands
 

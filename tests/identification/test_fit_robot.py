@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, check_data, fit_robot, replay, soften
-from ballu_mjx.identification.parameters import ParameterSet, declared_parameters
+from ballu_mjx.identification.parameters import ParameterSet
 from ballu_mjx.identification.residuals import (
     MeasuredMotion,
     SamplingConfig,

@@ -12,13 +12,9 @@ import numpy as np
 import pytest
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.identification.parameters import (
-    BODY_QUANTITIES,
-    IdentifiedParameters,
-    ParameterSet,
-    declared_parameters,
-    deform_body,
-)
+from ballu_mjx.identification.body_deformation import BODY_QUANTITIES, deform_body
+from ballu_mjx.identification.declarations import declared_parameters
+from ballu_mjx.identification.parameters import IdentifiedParameters, ParameterSet
 from ballu_mjx.robots.description import read_description
 from ballu_mjx.robots.model import ModelParameters, set_fields
 from ballu_mjx.sim.drivetrain import identity_drivetrain
