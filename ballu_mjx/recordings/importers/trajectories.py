@@ -46,6 +46,8 @@ class Trajectories:
     """By the robot's site."""
     columns: Mapping[str, Float[np.ndarray, " T"]] = dataclasses.field(default_factory=dict)
     """Joint angles (rad; of slides, m) by joint."""
+    first_frame: int = 1
+    """Of the trial: a file that was cropped at its start begins later, and so does `time`."""
 
 
 def refuse(path: Path, place: str, problem: str, mend: str) -> NoReturn:

@@ -124,7 +124,8 @@ def read_vicon(path: Path, mapping: RoomMapping) -> Trajectories:
         else:
             bodies[role] = _body(path, mapping, source, wanted[role][0], markers[0], values)
     rate = mapping.rate or rates.pop()
-    return Trajectories(path, (frames - frames[0]) / rate, bodies)
+    start = max(int(frames[0]), 1)
+    return Trajectories(path, (frames - frames[0] + start - 1) / rate, bodies, first_frame=start)
 
 
 def _delimiter(path: Path, lines: Sequence[str]) -> str:
