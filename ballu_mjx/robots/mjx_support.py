@@ -91,9 +91,12 @@ def _collisions(model: mujoco.MjModel) -> tuple[str, str] | None:
             if count > limit and (largest is None or count / limit > largest[0]):
                 mesh = model.mesh(int(model.geom_dataid[geom])).name
                 what = f"it collides with {_geom(model, partner)}, a box or mesh" if against else "it collides"
-                largest = count / limit, (
-                    f"the hull of the mesh {mesh} ({_geom(model, geom)}) has {count:,} vertices, and {what}: more "
-                    f"than {limit} are too many"
+                largest = (
+                    count / limit,
+                    (
+                        f"the hull of the mesh {mesh} ({_geom(model, geom)}) has {count:,} vertices, and {what}: more "
+                        f"than {limit} are too many"
+                    ),
                 )
     if largest is None:
         return None

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from c3d_writer import DEC, INTEL, MIPS, c3d_bytes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -29,7 +30,6 @@ from ballu_mjx.recordings.importers.trajectories import rigid_body
 from ballu_mjx.recordings.importers.vicon import read_vicon
 from ballu_mjx.recordings.recording import Recording, cut
 from ballu_mjx.robots.registry import load_robot
-from c3d_writer import DEC, INTEL, MIPS, c3d_bytes
 
 ROBOT = load_robot()
 ROLES = ("balloon", "base", "foot_left", "foot_right")
@@ -379,6 +379,34 @@ def test_mutated_files_are_refused_or_hold_what_they_held(
         kept = [i for i, frame in enumerate(frames) if frame not in touched and frame < len(clean)]
         if 0 not in touched and not any("\n" in t or "\r" in t or "," in t for _, _, t in edits) and cut is None:
             np.testing.assert_allclose(recording.points["base"][kept], clean[frames[kept]], atol=2e-6)
+
+
+def test_names_that_stand_twice_matter_only_where_they_are_asked_for(tmp_path: Path):
+    text = section("Segments", captured(np.eye(3)))
+    twins = section("Segments", {"twin": captured(np.eye(3))["base"], "other": captured(np.eye(3))["base"]})
+    rooms = 'robot = "r"\n' + KEPT + BODIES
+    same(read(tmp_path, text + "\n" + twins.replace("ballu:other", "ballu:twin").replace("Segments", "Model"), rooms))
+    with pytest.raises(InputError, match="'ballu:base' has RX twice"):
+        read(tmp_path, text.replace("ballu:foot_left", "ballu:base"), rooms)
+
+
+def test_messages_count_frames_as_the_file_does(tmp_path: Path):
+    """A trial that was cropped to begin at frame 213; a marker that is off in its 51st sample, frame 263."""
+    found = poses(source())
+    position, rotation = found["balloon"]
+    markers = np.stack([position + rotation.apply(place) for place in cluster()], axis=1)
+    markers[50, 0] += 0.3
+    others = np.stack([found[role][0] for role in ROLES[1:]], axis=1)
+    labels = [*(f"B{i}" for i in range(5)), *(f"ballu:{role}" for role in ROLES[1:])]
+    (tmp_path / "walk.c3d").write_bytes(c3d_bytes(1e3 * np.concatenate([markers, others], axis=1), labels, first=213))
+    with pytest.raises(InputError, match="in frame 263 the markers of balloon are off their places"):
+        read_c3d(tmp_path / "walk.c3d", c3d_room(tmp_path))
+    text = section("Objects", captured(np.eye(3)), rotation="quaternion", first=213)
+    row = text.splitlines()[5 + 80].split(",")
+    text = text.replace(",".join(row), ",".join([*row[:2], "0.5", *row[3:]]))
+    bodies = "\n".join(f'[{role}]\nbody = "{role}"\nrotation = "quaternion"' for role in ROLES)
+    with pytest.raises(InputError, match="the quaternion of frame 293 has length"):
+        read(tmp_path, text, 'robot = "r"\n' + KEPT + bodies)
 
 
 # ---- markers ----

@@ -21,7 +21,13 @@ MODEL = """
 
 def load(**parts: str) -> mujoco.MjModel:
     text = MODEL
-    for key, default in (("OPTION", ""), ("ASSET", ""), ("LEFT", 'size="0.02"'), ("RIGHT", 'size="0.02"'), ("MORE", "")):
+    for key, default in (
+        ("OPTION", ""),
+        ("ASSET", ""),
+        ("LEFT", 'size="0.02"'),
+        ("RIGHT", 'size="0.02"'),
+        ("MORE", ""),
+    ):
         text = text.replace(key, parts.get(key.lower(), default))
     return mujoco.MjModel.from_xml_string(text)
 

@@ -53,14 +53,14 @@ def read_c3d(path: Path, mapping: RoomMapping) -> Trajectories:
 
     if not mapping.sources:
         refuse(mapping.path, "", "it asks for no marker of a C3D file", "say what its sites are, or give a table")
-    bodies = {}
+    frames, bodies = found.first_frame + np.arange(count), {}
     for role, source in mapping.sources.items():
         if source.position:
             refuse(mapping.path, f"[{role}]", "a C3D file has no columns", "write markers = [...] there")
         if source.markers:
             geometry = None if source.geometry is None else np.array(source.geometry)
             several = np.stack([marker(name) for name in source.markers])
-            bodies[role] = rigid_body(path, role, several, geometry, MARKER_TOLERANCE)
+            bodies[role] = rigid_body(path, role, several, geometry, MARKER_TOLERANCE, frames)
         else:
             bodies[role] = Body(marker(source.body or ""))
     start = max(found.first_frame - 1, 0)
