@@ -77,7 +77,7 @@ def c3d_bytes(
     header += floats(np.array([rate]), processor)
     table = bytes([1, 0x50, blocks, processor]) + bytes(section)
     words = np.zeros((frames, 4 * points + analog_words))
-    hidden = np.isnan(position).any(axis=2)
+    hidden = np.asarray(np.isnan(position).any(axis=2))
     values = np.where(hidden[..., None], 0.0, position) / (1.0 if scale < 0 else scale)
     places = words[:, : 4 * points].reshape(frames, points, 4)
     places[..., :3] = values if scale < 0 else np.round(values)

@@ -41,8 +41,8 @@ _COMMAND_DECIMALS = 4
 def read_recording(path: Path | str, robot: RobotDescription) -> Recording:
     """Read, validate and fill in the recording of `robot` at `path`, a `.csv` or `.csv.gz` with its `.json` beside it.
 
-    Gaps of up to 0.5 s are interpolated, linearly or, for orientations, along the shortest rotation. A pose that repeats
-    to the last digit is a gap too: streaming clients hold what they do not see.
+    Gaps of up to 0.5 s are interpolated, linearly or, for orientations, along the shortest rotation. A pose that
+    repeats to the last digit is a gap too: streaming clients hold what they do not see.
 
     **Raises** `InputError` at the first fault found, with file, column, row (as a spreadsheet counts them, the header
     being row 1) and fix.

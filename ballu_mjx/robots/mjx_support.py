@@ -47,14 +47,14 @@ def _options(model: mujoco.MjModel) -> tuple[str, str] | None:
 def _parts(model: mujoco.MjModel) -> tuple[str, str] | None:
     if model.nflex:
         return "it has deformable parts (flex)", "make them of rigid bodies"
-    own = mujoco.mjtObj
+    own, actuator = mujoco.mjtObj, mujoco.mjtObj.mjOBJ_ACTUATOR
     for what, kinds, known, kind, named, fix in (
-        ("an equality", model.eq_type, mjx.EqType, mujoco.mjtEq, own.mjOBJ_EQUALITY, "use connect, weld, joint or tendon"),
+        ("an equality", model.eq_type, mjx.EqType, mujoco.mjtEq, own.mjOBJ_EQUALITY, "use connect, weld or joint"),
         ("a sensor", model.sensor_type, mjx.SensorType, mujoco.mjtSensor, own.mjOBJ_SENSOR, "leave it out"),
-        ("an actuator on", model.actuator_trntype, mjx.TrnType, mujoco.mjtTrn, own.mjOBJ_ACTUATOR, "put it on a joint, tendon or site"),
-        ("an actuator with the gain", model.actuator_gaintype, mjx.GainType, mujoco.mjtGain, own.mjOBJ_ACTUATOR, "use fixed or affine gains"),
-        ("an actuator with the bias", model.actuator_biastype, mjx.BiasType, mujoco.mjtBias, own.mjOBJ_ACTUATOR, "use no or affine bias"),
-    ):  # fmt: skip
+        ("an actuator on", model.actuator_trntype, mjx.TrnType, mujoco.mjtTrn, actuator, "put it on a joint or site"),
+        ("the gain", model.actuator_gaintype, mjx.GainType, mujoco.mjtGain, actuator, "use fixed or affine gains"),
+        ("the bias", model.actuator_biastype, mjx.BiasType, mujoco.mjtBias, actuator, "use no or affine bias"),
+    ):
         for number, value in enumerate(kinds):
             if value not in set(known):
                 name = mujoco.mj_id2name(model, named, number) or f"number {number + 1}"

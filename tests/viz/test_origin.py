@@ -11,6 +11,7 @@ viser = pytest.importorskip("viser", reason="the live viewer needs the extra `re
 
 from websockets.exceptions import InvalidStatus  # noqa: E402
 from websockets.sync.client import connect  # noqa: E402
+from websockets.typing import Subprotocol  # noqa: E402
 
 from ballu_mjx.viz.viser_scene import LocalServer, serve  # noqa: E402
 
@@ -24,11 +25,11 @@ def server() -> Iterator[LocalServer]:
 
 def talk(server: LocalServer, origin: str | None) -> bytes | str:
     """The first message that a page of an origin is sent; None: a client that is no browser."""
-    protocol = f"viser-v{importlib.metadata.version('viser')}"
+    protocol = Subprotocol(f"viser-v{importlib.metadata.version('viser')}")
     headers = {} if origin is None else {"Origin": origin}
     with connect(
         f"ws://127.0.0.1:{server.get_port()}/", additional_headers=headers, subprotocols=[protocol], open_timeout=5
-    ) as socket:  # pyright: ignore[reportArgumentType]
+    ) as socket:
         return socket.recv(timeout=5)
 
 

@@ -1,8 +1,8 @@
 """The C3D file format (https://www.c3d.org): parameters and points, of all three processor types.
 
-A file has a header of 512 bytes, a section of parameters in groups, and frames of points and analog samples. Numbers are
-those of the processor that the parameters name: Intel and MIPS (IEEE, in either byte order) or DEC. Points are 16-bit
-integers with a scale, or floating point where the scale is negative.
+A file has a header of 512 bytes, a section of parameters in groups, and frames of points and analog samples. Numbers
+are those of the processor that the parameters name: Intel and MIPS (IEEE, in either byte order) or DEC. Points are
+16-bit integers with a scale, or floating point where the scale is negative.
 """
 
 from __future__ import annotations
