@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from mujoco.mjx._src import math as mjx_math
+
+from ballu_mjx.common.rotations import matrix_to_quaternion, quaternion_to_matrix
 
 BODY_QUANTITIES = (
     "mass",
@@ -43,7 +44,7 @@ def deform_body(
     - `numbers`: in the order of `BODY_QUANTITIES`.
     - `turned`: whether stretches and shears may differ from nominal, so that principal axes are sought anew.
     """
-    axes = mjx_math.quat_to_mat(iquat)
+    axes = quaternion_to_matrix(iquat)
     ratio, shift, stretch, shear = numbers[0], numbers[1:4], numbers[4:7], numbers[7:]
     centre = ipos + axes @ shift
     if not turned:
@@ -57,25 +58,7 @@ def deform_body(
     own = jnp.trace(spread) * jnp.eye(3) - spread + split
     principal, vectors = jnp.linalg.eigh(own)
     vectors = vectors * jnp.where(jnp.linalg.det(vectors) < 0, -1.0, 1.0)
-    return ratio * mass, centre, _quaternion(axes @ vectors), ratio * principal
+    return ratio * mass, centre, matrix_to_quaternion(axes @ vectors), ratio * principal
 
 
 _SPLIT = 1e-6
-
-
-def _quaternion(rotation: Float[Array, "3 3"]) -> Float[Array, " 4"]:
-    """Return the unit quaternion, by whichever of its four components is largest; differentiable."""
-    r = rotation
-    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
-    xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
-    # Each row is the quaternion, times four times one of its components.
-    rows = jnp.array(
-        [
-            [1 + r[0, 0] + r[1, 1] + r[2, 2], x, y, z],
-            [x, 1 + r[0, 0] - r[1, 1] - r[2, 2], xy, xz],
-            [y, xy, 1 - r[0, 0] + r[1, 1] - r[2, 2], yz],
-            [z, xz, yz, 1 - r[0, 0] - r[1, 1] + r[2, 2]],
-        ]
-    )
-    row = rows[jnp.argmax(jnp.diag(rows))]
-    return row / jnp.linalg.norm(row)
