@@ -70,7 +70,9 @@ def test_a_method_s_run_is_served_by_every_command(
         server.stop()
 
     capsys.readouterr()
-    assert export.main(["simulator", str(run), "--check-seconds", "0.5"]) == 0
-    assert "C MuJoCo differs from the simulator by" in capsys.readouterr().out
+    checked = method == "fluid"  # a program of its own, in double precision
+    assert export.main(["simulator", str(run), "--check-seconds", "0.5" if checked else "0"]) == 0
+    assert ("C MuJoCo differs from the simulator by" in capsys.readouterr().out) == checked
+    assert (run / "simulator" / "identified.xml").exists()
     assert compare.main([str(run)]) == 0
-    assert "flight" in capsys.readouterr().out or True
+    assert "flight position, 5 s (ratio)" in capsys.readouterr().out

@@ -23,6 +23,7 @@ from ballu_mjx.recordings.reference import ReferenceMotions, pad_to_bucket, stac
 from ballu_mjx.sim.drivetrain import DrivetrainParameters, identity_drivetrain
 from ballu_mjx.sim.force_model import BoundForces, ForceModel
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
+from ballu_mjx.sim.sharding import compile_for_devices, device_shardings
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState
 
@@ -100,19 +101,8 @@ class OpenLoopEvaluator:
         self.robot = simulator.robot
         devices = jax.local_devices()
         self._size = len(devices) * _RUNS[devices[0].platform == "cpu"]
-        mesh = jax.sharding.Mesh(np.array(devices), ("batch",))
-        spec = jax.sharding.PartitionSpec
-        self._everywhere = jax.sharding.NamedSharding(mesh, spec())
-        self._split = jax.sharding.NamedSharding(mesh, spec("batch"))
-        # XLA splits the batch over the devices: one core a device.
-        split = jax.shard_map(
-            jax.vmap(self._advance, in_axes=(None, None, None, None, None, 0, 0)),
-            mesh=mesh,
-            in_specs=(*[spec()] * 5, spec("batch"), spec("batch")),
-            out_specs=spec("batch"),
-            check_vma=False,
-        )
-        self._chunk = jax.jit(split)
+        self._everywhere, self._split = device_shardings()
+        self._chunk = compile_for_devices(self._advance, shared=5)
         self._look_at(motions)
 
     def on(self, motions: Sequence[Motion]) -> OpenLoopEvaluator:

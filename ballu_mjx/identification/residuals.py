@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -32,6 +32,7 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import with_fields
 from ballu_mjx.sim.derived_constants import ReferencePose, with_derived_constants
 from ballu_mjx.sim.drivetrain import filter_commands
+from ballu_mjx.sim.sharding import chunks
 from ballu_mjx.sim.step import PhysicsState, make_data, physics_step, put_model, state_at
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 
@@ -401,13 +402,10 @@ class WindowSimulator:
         cut = ctrl[self.windows.motion[:, None], self._steps]
         return cut.reshape(self.count, cut.shape[1] * cut.shape[2], *cut.shape[3:])
 
-    def _chunks(self, size: int) -> list[tuple[Int[np.ndarray, " chunk"], int]]:
-        """Rows of windows in equal parts, the last filled up; and how many of each count."""
-        size = min(size, self.count)
-        parts = -(-self.count // size)
-        size = -(-self.count // parts)
-        firsts = range(0, self.count, size)
-        return [((first + np.arange(size)) % self.count, min(size, self.count - first)) for first in firsts]
+    def _chunks(self, most: int) -> Iterator[tuple[Int[np.ndarray, " chunk"], int]]:
+        """Return chunks of windows, all about as large: a program is compiled for these windows anyway."""
+        parts = -(-self.count // most)
+        return chunks(self.count, -(-self.count // parts))
 
 
 _CHUNK = 1024

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import time
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.aerodynamics import (
     AERODYNAMICS_FILE,
     AERODYNAMICS_FORMAT,
@@ -21,8 +17,8 @@ from ballu_mjx.residuals.aerodynamics import (
     air_parameters_to_json,
 )
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, check_air_config, identify_air
-from ballu_mjx.residuals.network import ForceNetworkConfig, recorded_inputs
-from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
+from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.white_box_training import FitReport, fitted_residual
 from ballu_mjx.robots.model import same_parameters
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
@@ -65,32 +61,20 @@ def fit_aerodynamics(
     if fixed_from is not None and not isinstance(fixed_from.model, Aerodynamics):
         raise InputError(f"The earlier residual is of kind {fixed_from.model.name}, not aerodynamic; give another.")
     record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run
-    began, done = time.perf_counter(), 0
-
-    def report(evaluation: int, cost: float) -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress.update("air", evaluation, _BESIDE + config.evaluations, cost)
-        record.log(done, {"cost": cost, "seconds": time.perf_counter() - began})
-
+    report, most = FitReport(record, progress, "cost"), _BESIDE + config.evaluations
     values = None if fixed_from is None else fixed_from.params
-    found = identify_air(simulator, motions, config, report, fixed_from=values, free=free)
-    if progress is not None:
-        progress.close()
-    record.log(done, {"control_steps": found.control_steps})
-    record.write(AERODYNAMICS_FILE, json.dumps(air_details(found), indent=2) + "\n")
-    reference, _ = stack_motions(simulator, motions)
-    inputs = np.asarray(recorded_inputs(reference, ForceNetworkConfig(), simulator.robot))
-    write_observed(record, inputs)
-    return TrainedResidual(
-        Aerodynamics(simulator.robot, simulator.mj_model),
-        found.parameters,
-        observed_range(inputs),
-        0,
-        simulator.actuators,
-        air_table(found),
+    found = identify_air(
+        simulator,
+        motions,
+        config,
+        lambda evaluation, cost: report("air", evaluation, most, cost),
+        fixed_from=values,
+        free=free,
     )
+    report.close(found.control_steps)
+    record.write(AERODYNAMICS_FILE, json.dumps(air_details(found), indent=2) + "\n")
+    model = Aerodynamics(simulator.robot, simulator.mj_model)
+    return fitted_residual(simulator, motions, model, found.parameters, record, air_table(found))
 
 
 def air_details(found: AirFit) -> dict[str, Any]:
