@@ -139,5 +139,5 @@ def pseudo_huber(squared: Any) -> Any:
 
 def count_lost(errors: Float[np.ndarray, "windows entries"]) -> Float[np.ndarray, "windows entries"]:
     """Return errors of windows in which those that diverged have `_LOST` in all."""
-    lost = ~np.isfinite(errors).all(axis=1)
-    return np.where(lost[:, None], _LOST / math.sqrt(errors.shape[1]), errors)
+    finite = np.isfinite(errors).all(axis=1, keepdims=True)
+    return np.where(finite, errors, _LOST / math.sqrt(errors.shape[1]))

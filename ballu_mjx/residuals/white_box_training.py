@@ -43,7 +43,7 @@ class FitReport:
 def fitted_residual(
     simulator: Simulator, motions: Sequence[Motion], model: ForceModel, params: Any, record: TrainingRecord, text: str
 ) -> TrainedResidual:
-    """Return the residual of a fit to `motions`, with its report in words; `record` takes the range that it has seen."""
+    """Return the residual of a fit to `motions`, with its report in words; `record` takes the range of its inputs."""
     reference, _ = stack_motions(simulator, motions)
     inputs = np.asarray(recorded_inputs(reference, ForceNetworkConfig(), simulator.robot))
     write_observed(record, inputs)
