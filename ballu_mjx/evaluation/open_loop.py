@@ -12,11 +12,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
 from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, base_name, has_diverged, summarize_starts
+from ballu_mjx.identification.parameters import LEAST_FRICTION
 from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, pad_to_bucket, stack_motions
@@ -139,6 +141,15 @@ class OpenLoopEvaluator:
         self.first_runs = [recordings.index(index) for index in range(len(self.motions))]
         self._without: tuple[tuple[Errors, ...], tuple[Errors, ...]] | None = None
 
+    def _nominal_model(self) -> mujoco.MjModel:
+        """Return the nominal robot, with dry friction of no effect where the simulated one has any: both share a
+        program, and so their rows of constraints."""
+        model, own = self.robot.load_model(), self._simulator.mj_model
+        for name in ("dof_frictionloss", "tendon_frictionloss"):
+            field, rubbing = getattr(model, name), getattr(own, name) > 0
+            field[rubbing] = np.maximum(field[rubbing], LEAST_FRICTION)
+        return model
+
     def replay(self, params: Any, *, scale: float = 1.0, nominal: bool = False) -> Replay:
         """Simulate every start to its recording's end.
 
@@ -149,7 +160,7 @@ class OpenLoopEvaluator:
         """
         fixed = self._fixed
         if nominal:
-            model = jax.device_get(Simulator(self.robot).model)
+            model = jax.device_get(Simulator(self.robot, model=self._nominal_model()).model)
             unchanged = None if self._simulator.drivetrain is None else identity_drivetrain(len(self.robot.commands))
             fixed = jax.device_put((model, jax.device_get(unchanged), self._reference), self._everywhere)
         params = jax.device_get(params)  # they may live on one device; the batch is spread over all
