@@ -33,7 +33,7 @@ from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.description import RobotDescription
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from servo_arm import record_arm, write_arm
+from servo_arm import record_arm, write_arm  # pyright: ignore[reportMissingImports]
 
 DRAWS, NOISE, FRICTION = 50, 0.5, 1.0
 """Draws; deg."""

@@ -181,7 +181,9 @@ class Identification:
 
     @property
     def parameters(self) -> ActuatorParameters:
-        rows = dict(zip(LEG_PARAMETERS, np.stack([fit.vector for fit in self.fits], axis=1), strict=True))
+        rows: dict[str, np.ndarray] = dict(
+            zip(LEG_PARAMETERS, np.stack([fit.vector for fit in self.fits], axis=1), strict=True)
+        )
         dynamics = [fit.dynamics for fit in self.fits if fit.dynamics is not None]
         for name in LegDynamics._fields if dynamics else ():
             rows[name] = np.maximum([getattr(each, name) for each in dynamics], 0.0)
