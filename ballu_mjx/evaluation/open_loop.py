@@ -84,6 +84,16 @@ class Evaluators:
         return made
 
 
+def nominal_model(simulator: Simulator) -> mujoco.MjModel:
+    """Return the nominal robot, with dry friction of no effect where the simulated one has any: both share a program,
+    and so their rows of constraints."""
+    model = simulator.robot.load_model()
+    for name in ("dof_frictionloss", "tendon_frictionloss"):
+        field, rubbing = getattr(model, name), getattr(simulator.mj_model, name) > 0
+        field[rubbing] = np.maximum(field[rubbing], LEAST_FRICTION)
+    return model
+
+
 class OpenLoopEvaluator:
     """Replays a set of recordings; one compiled program for any parameters of the residual, any recordings and
     actuators."""
@@ -141,15 +151,6 @@ class OpenLoopEvaluator:
         self.first_runs = [recordings.index(index) for index in range(len(self.motions))]
         self._without: tuple[tuple[Errors, ...], tuple[Errors, ...]] | None = None
 
-    def _nominal_model(self) -> mujoco.MjModel:
-        """Return the nominal robot, with dry friction of no effect where the simulated one has any: both share a
-        program, and so their rows of constraints."""
-        model, own = self.robot.load_model(), self._simulator.mj_model
-        for name in ("dof_frictionloss", "tendon_frictionloss"):
-            field, rubbing = getattr(model, name), getattr(own, name) > 0
-            field[rubbing] = np.maximum(field[rubbing], LEAST_FRICTION)
-        return model
-
     def replay(self, params: Any, *, scale: float = 1.0, nominal: bool = False) -> Replay:
         """Simulate every start to its recording's end.
 
@@ -160,7 +161,7 @@ class OpenLoopEvaluator:
         """
         fixed = self._fixed
         if nominal:
-            model = jax.device_get(Simulator(self.robot, model=self._nominal_model()).model)
+            model = jax.device_get(Simulator(self.robot, model=nominal_model(self._simulator)).model)
             unchanged = None if self._simulator.drivetrain is None else identity_drivetrain(len(self.robot.commands))
             fixed = jax.device_put((model, jax.device_get(unchanged), self._reference), self._everywhere)
         params = jax.device_get(params)  # they may live on one device; the batch is spread over all
