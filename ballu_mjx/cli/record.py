@@ -284,7 +284,7 @@ def _write(options: Import, robot: RobotDescription, recording: Recording) -> No
         ) from error
     duration = read.time[-1] - read.time[0]
     filled = sum(read.interpolated.values())
-    held = "".join(f"; {count} samples of {site} were held, not seen" for site, count in read.held.items())
+    held = "".join(f"; {count} samples of {sites} were held, not seen" for sites, count in _held(read))
     print(f"{options.output}: {duration:.2f} s, {filled} cells filled in when read{held}; `record check` tells more")
 
 
@@ -368,8 +368,8 @@ def report(
         shown = names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
         told = f"{len(spans)} drop-outs, {sum(lengths):.2f} s in all, the longest {max(lengths):.2f} s"
         lines.append(f"  {shown}: " + (told if len(spans) > 1 else f"1 drop-out of {lengths[0]:.2f} s"))
-    for site, count in recording.held.items():
-        lines.append(f"  {site}: {count} samples repeat the one before to the last digit; taken as not seen")
+    for sites, count in _held(recording):
+        lines.append(f"  {sites}: {count} samples repeat the one before to the last digit; taken as not seen")
     if not gaps and not recording.held:
         lines.append("  no drop-outs")
     for label, value in _ranges(recording, robot):
@@ -383,6 +383,14 @@ def report(
             f"{changes} changes, held for {held:.2f} s on average"
         )
     return "\n".join(lines)
+
+
+def _held(recording: Recording) -> list[tuple[str, int]]:
+    """Sites that were held alike, and for how many samples."""
+    alike: dict[int, list[str]] = {}
+    for site, count in recording.held.items():
+        alike.setdefault(count, []).append(site)
+    return [(", ".join(sites), count) for count, sites in alike.items()]
 
 
 def _ranges(recording: Recording, robot: RobotDescription) -> list[tuple[str, np.ndarray]]:

@@ -27,6 +27,8 @@ _BURST = 3.0
 """Median steps: longer ones are gaps between bursts."""
 _LARGEST_BURST_SHARE = 0.5
 """Of the recording's time, in such gaps."""
+_LARGEST_RECURRING = 0.02
+"""Share of poses that recur to the last digit; above it, digits are too coarse to tell what was held."""
 _HELD_JUMP = 2.0
 """Times the 95th percentile of the movement between two samples: what ends a pose that was held, but not a rest."""
 _QUATERNION_TOLERANCE = 0.02
@@ -215,8 +217,9 @@ def _angle_bounds(robot: RobotDescription) -> dict[str, tuple[float, float]]:
 def blank_held(path: Path, columns: dict[str, Column], groups: Sequence[ColumnGroup]) -> dict[str, int]:
     """Take samples that a streaming client held for not seen: NaN, in place. Returns how many, by site.
 
-    They repeat the one before to the last digit in all columns of a body, as noise never lets them. A robot that rests
-    without noise (a simulated one) is told by how it moves on, and kept where it rests for long.
+    They repeat the one before to the last digit in all columns of a body, as noise never lets them. Where digits are
+    coarse (poses from encoders, say), and where a robot rests without noise for long (a simulated one), samples are
+    kept unless the body moves on with a jump.
 
     **Raises** `InputError` for what was held for longer than `LONGEST_GAP`.
     """
@@ -227,11 +230,12 @@ def blank_held(path: Path, columns: dict[str, Column], groups: Sequence[ColumnGr
             bodies.setdefault(group.part, []).append(group)
     for site, parts in bodies.items():
         names = [name for group in parts for name in group.names]
-        held = np.zeros(len(time), bool)
-        for start, end in _runs(_repeats(np.stack([columns[name] for name in names], axis=1))):
+        held, values = np.zeros(len(time), bool), np.stack([columns[name] for name in names], axis=1)
+        coarse = _recurring(values) > _LARGEST_RECURRING
+        for start, end in _runs(_repeats(values)):
             lasted = float(time[min(end, len(time) - 1)] - time[start - 1])
             inside = end < len(time) and start > 1
-            if (lasted <= LONGEST_GAP and inside) or _goes_on_with_a_jump(columns, parts, start, end):
+            if (lasted <= LONGEST_GAP and inside and not coarse) or _goes_on_with_a_jump(columns, parts, start, end, coarse):
                 held[start:end] = True
                 if lasted > LONGEST_GAP + 2 * float(np.median(np.diff(time))):
                     problem = (
@@ -261,14 +265,24 @@ def _repeats(values: Float[np.ndarray, "T columns"]) -> Bool[np.ndarray, " T"]:
     return found
 
 
+def _recurring(values: Float[np.ndarray, "T columns"]) -> float:
+    """Share of poses that the body was in before, other than in the sample before: none where there is noise."""
+    seen = values[~np.isnan(values).any(axis=1)]
+    left = seen[np.concatenate([[True], (seen[1:] != seen[:-1]).any(axis=1)])] if len(seen) else seen
+    return 1 - len(np.unique(left, axis=0)) / len(left) if len(left) else 0.0
+
+
 def _runs(chosen: Bool[np.ndarray, " T"]) -> list[tuple[int, int]]:
     edges = np.diff(np.concatenate([[0], chosen, [0]]))
     return list(zip(np.flatnonzero(edges > 0).tolist(), np.flatnonzero(edges < 0).tolist(), strict=True))
 
 
-def _goes_on_with_a_jump(columns: dict[str, Column], parts: Sequence[ColumnGroup], start: int, end: int) -> bool:
+def _goes_on_with_a_jump(
+    columns: dict[str, Column], parts: Sequence[ColumnGroup], start: int, end: int, coarse: bool
+) -> bool:
     """Whether the sample after a run of repeats (`start` to `end`) is farther than samples are; at the recording's end,
     whether the body stopped within a sample."""
+    ends_there = end == len(columns["time"])
     for group in parts:
         values = np.stack([columns[name] for name in group.names], axis=1)
         values = values[has_sample(columns, group.names)]
@@ -276,14 +290,14 @@ def _goes_on_with_a_jump(columns: dict[str, Column], parts: Sequence[ColumnGroup
         size = size[size > 1e-7]
         if not len(size):
             continue
-        ends = [start - 2, start - 1] if end == len(columns["time"]) else [start - 1, end]
+        ends = [start - 2, start - 1] if ends_there else [start - 1, end]
         if ends[0] < 0:
             continue
         jump = np.linalg.norm(
             _movements(np.stack([columns[name][ends] for name in group.names], axis=1), group.quantity)
         )
-        least = float(np.median(size)) if end == len(columns["time"]) else _HELD_JUMP * float(np.percentile(size, 95))
-        if jump > least:
+        usual = np.median(size) if ends_there and not coarse else _HELD_JUMP * np.percentile(size, 95)
+        if jump > usual:
             return True
     return False
 

@@ -580,6 +580,18 @@ def test_c3d_frames_beyond_16_bits_are_all_read_or_refused():
     assert read_c3d_points(c3d_bytes(position[:300], ["a"], parameters=long)).position.shape == (3, 1, 300)
 
 
+@pytest.mark.parametrize("said", [2, 16])
+def test_the_file_s_length_decides_how_many_analog_words_a_frame_has(said: int):
+    """Public files of one program count channels, not samples, in the header."""
+    position = np.random.default_rng(2).uniform(-1, 1, (80, 3, 3))
+    channels = {("ANALOG", "USED"): (2, [2]), ("ANALOG", "RATE"): (4, [700.0])}
+    content = bytearray(c3d_bytes(position, "abc", analog_words=14, parameters=channels))
+    content[4:6] = struct.pack("<H", said)
+    np.testing.assert_allclose(read_c3d_points(bytes(content)).position.transpose(2, 1, 0), position, rtol=1e-6)
+    with pytest.raises(C3DError, match="analog words in a frame"):
+        read_c3d_points(bytes(content) + bytes(3000))
+
+
 def test_a_c3d_that_contradicts_itself_is_refused():
     content = bytearray(c3d_bytes(np.ones((30, 2, 3)), "ab", scale=0.1))
     content[12:16] = struct.pack("<f", 0.2)

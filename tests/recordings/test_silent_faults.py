@@ -86,7 +86,7 @@ def test_held_poses_are_filled_in_as_gaps(robot: RobotDescription, seed: int, st
     expected = through_a_file(dataclasses.replace(whole, points=gaps), robot)
     np.testing.assert_allclose(found.points["nose"], expected.points["nose"], atol=2e-5)
     told = report(Path("flight.csv"), found, robot, {})
-    assert f"nose: {count} samples repeat the one before" in told and "no drop-outs" not in told
+    assert f"hull, nose: {count} samples repeat the one before" in told and "no drop-outs" not in told
 
 
 @pytest.mark.parametrize("count", [55, 80, 200])
@@ -122,6 +122,21 @@ def test_a_robot_that_rests_has_been_seen(robot: RobotDescription, decimals: int
     found = through_a_file(resting, robot, decimals)
     assert len(found.time) == SAMPLES
     np.testing.assert_allclose(found.points["nose"], resting.points["nose"], atol=2 * 10.0**-decimals)
+
+
+@pytest.mark.parametrize("turns", [256, 4096])
+def test_poses_from_encoders_have_been_seen(robot: RobotDescription, turns: int):
+    """Coarse angles repeat while a joint is slow, and come back to where they were."""
+    time = np.arange(SAMPLES) / 100
+    angle = np.round(0.3 * np.sin(4 * time) * turns / (2 * np.pi)) * 2 * np.pi / turns
+    arm = np.stack([np.sin(angle), 0 * time, -np.cos(angle)], axis=1)
+    quaternion = np.stack([np.cos(angle / 2), 0 * time, np.sin(angle / 2), 0 * time], axis=1)
+    swing = Recording(
+        name="flight", kind="free", robot="hull-1", time=time, command=np.zeros((SAMPLES, 1)),
+        tracked_position=0.5 * arm, tracked_quaternion=quaternion, points={"nose": 0.8 * arm},
+    )  # fmt: skip
+    found = through_a_file(swing, robot)
+    assert not found.held and not found.interpolated
 
 
 @settings(max_examples=40, deadline=None)

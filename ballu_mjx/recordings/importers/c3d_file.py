@@ -59,6 +59,8 @@ class _Header:
     last: int
     scale: float
     data_block: int
+    analog_samples: int
+    """Of each channel in a frame."""
     rate: float
 
 
@@ -118,11 +120,15 @@ def read_c3d_points(content: bytes) -> C3DPoints:
         raise C3DError("its header and POINT:SCALE do not agree whether its numbers are integers")
     if scale > 0 and abs(scale / header.scale - 1) > _SCALE_TOLERANCE:
         raise C3DError(f"its header says a scale of {header.scale:.4g}, POINT:SCALE {scale:.4g}", "export it again")
-    frame_bytes = (4 * header.points + header.analog_words) * (4 if scale < 0 else 2)
+    size = 4 if scale < 0 else 2
+    header = dataclasses.replace(header, analog_words=_analog_words(header, parameters, len(content) - begin, size))
+    frame_bytes = (4 * header.points + header.analog_words) * size
     if header.points == 0:
         raise C3DError("holds no points", "export it with its markers")
     if header.data_block < 2 or begin > len(content):
         raise C3DError("not a whole C3D file (its frames begin beyond its end)")
+    if not any(_labels(point)):
+        raise C3DError("names no points (POINT:LABELS)", "label its markers and export it again")
     first, count = _frames(header, parameters, (len(content) - begin) // frame_bytes)
     rate = _number(point, "RATE", header.rate)
     return C3DPoints(
@@ -136,9 +142,9 @@ def read_c3d_points(content: bytes) -> C3DPoints:
 
 def _read_header(content: bytes, numbers: _Numbers) -> _Header:
     points, analog, first, last = numbers.integers(content[2:10], signed=False).tolist()
-    (data_block,) = numbers.integers(content[16:18], signed=False).tolist()
+    data_block, samples = numbers.integers(content[16:20], signed=False).tolist()
     (scale,), (rate,) = numbers.floats(content[12:16]).tolist(), numbers.floats(content[20:24]).tolist()
-    return _Header(content[0], points, analog, first, last, scale, data_block, rate)
+    return _Header(content[0], points, analog, first, last, scale, data_block, samples, rate)
 
 
 def _read_parameters(section: bytes, numbers: _Numbers) -> dict[str, dict[str, Any]]:
@@ -240,6 +246,32 @@ def _frames(header: _Header, parameters: Mapping[str, Mapping[str, Any]], held: 
         problem = f"holds {held:,} frames, of which its header counts {count:,}: a count of 16 bits that wrapped"
         raise C3DError(problem, "export it in parts of fewer than 65,536 frames")
     return first, count
+
+
+def _analog_words(header: _Header, parameters: Mapping[str, Mapping[str, Any]], held: int, size: int) -> int:
+    """Return how many words each frame has behind its points, where `held` bytes hold all frames of numbers of `size`
+    bytes.
+
+    Header and parameters say it in several ways, of which some programs fill in one wrongly: the file's length decides.
+    """
+    analog = parameters.get("ANALOG", {})
+    channels = _number(analog, "USED", 0.0) % 2**16
+    if not channels >= 1:
+        return header.analog_words
+    counted = {header.analog_words, int(channels) * max(header.analog_samples, 1)}
+    rates = _number(analog, "RATE", 0.0), _number(parameters.get("POINT", {}), "RATE", header.rate)
+    if all(np.isfinite(rates)) and min(rates) > 0 and rates[0] / rates[1] < _LARGEST_COUNT:
+        counted.add(int(channels) * max(round(rates[0] / rates[1]), 1))
+    if len(counted) == 1 or header.last == _LARGEST_COUNT:
+        return header.analog_words
+    count = header.last - header.first + 1
+    fitting = [words for words in counted if 0 <= held - count * (4 * header.points + words) * size < BLOCK]
+    if header.analog_words in fitting:
+        return header.analog_words
+    if len(fitting) == 1:
+        return fitting[0]
+    said = " and ".join(map(str, sorted(counted)))
+    raise C3DError(f"its header and its parameters count {said} analog words in a frame", "export it again")
 
 
 def _long(trial: Mapping[str, Any], name: str) -> int | None:
