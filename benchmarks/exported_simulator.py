@@ -1,4 +1,6 @@
-"""How far an exported simulator in C MuJoCo is from ours: `python benchmarks/exported_simulator.py RUN --recordings ...`.
+"""How far an exported simulator in C MuJoCo is from ours.
+
+`python benchmarks/exported_simulator.py RUN --recordings FOLDER ...`
 
 From the first state of each recording, under its commands, three simulators run side by side: ours in single precision,
 ours in double precision, and the exported one. The differences tell a fault of the export from the rounding of single
@@ -108,7 +110,7 @@ def main() -> None:
     commands = np.stack([motion.command[:steps] for motion in motions])
     model = improved_model(simulator)
     with tempfile.TemporaryDirectory() as folder:
-        exported = export_simulator(simulator, Path(folder) / "simulator", check_seconds=0)
+        exported = export_simulator(simulator, Path(folder) / "simulator", check_seconds=0.0)
         found = {"exported": in_c(exported.folder, qpos, qvel, commands)}
     single = [np.asarray(x, np.float32) for x in (qpos, qvel, commands)]
     found["single"] = rollouts(simulator, *single)
@@ -117,19 +119,23 @@ def main() -> None:
     seen = {name: poses(robot, model, each) for name, each in found.items()}
     report: dict[str, Any] = {"robot": robot.name, "run": str(options.run), "recordings": [m.name for m in motions]}
     print(f"{robot.name}, {len(motions)} recordings, {options.seconds:g} s\n")
-    print(f"{'':22}{'after ' + format(options.seconds, 'g') + ' s, each':^34}largest at any time")
+    print("| simulators | after that, median | worst | largest at any time |")
+    print("| --- | ---: | ---: | ---: |")
     for one, other in PAIRS:
         distance, angle = apart(seen[one], seen[other])
         report[f"{one}-{other}"] = {"mm": distance[:, -1].tolist(), "deg": angle[:, -1].tolist()}
-        median, worst = np.median(distance[:, -1]), distance[:, -1].max()
-        print(
-            f"{one + ' - ' + other:20}  median {median:.2g} mm, {np.median(angle[:, -1]):.2g} deg; worst {worst:.2g} mm, "
-            f"{angle[:, -1].max():.2g} deg; {distance.max():.2g} mm, {angle.max():.2g} deg"
+        cells = (
+            (np.median(distance[:, -1]), np.median(angle[:, -1])),
+            (distance[:, -1].max(), angle[:, -1].max()),
+            (distance.max(), angle.max()),
         )
+        print(f"| {one} - {other} | {' | '.join(f'{mm:.2g} mm, {deg:.2g} deg' for mm, deg in cells)} |")
+    print("\n| recording | " + " | ".join(f"{one} - {other}" for one, other in PAIRS) + " |")
+    print("| --- |" + " ---: |" * len(PAIRS))
     for number, motion in enumerate(motions):
-        cells = [apart(seen[one], seen[other]) for one, other in PAIRS]
-        said = "  ".join(f"{d[number, -1]:9.2g} mm {a[number, -1]:9.2g} deg" for d, a in cells)
-        print(f"{motion.name:20}  {said}")
+        pairs = [apart(seen[one], seen[other]) for one, other in PAIRS]
+        said = " | ".join(f"{mm[number, -1]:.2g} mm, {deg[number, -1]:.2g} deg" for mm, deg in pairs)
+        print(f"| {motion.name} | {said} |")
     if options.output is not None:
         options.output.write_text(json.dumps(report, indent=2) + "\n")
 

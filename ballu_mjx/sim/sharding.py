@@ -19,7 +19,7 @@ def device_shardings() -> tuple[NamedSharding, NamedSharding]:
 
 def compile_for_devices(
     function: Callable[..., Any], shared: int, over: Callable[[Callable[..., Any]], Callable[..., Any]] = jax.vmap
-) -> Callable[..., Any]:
+) -> jax.stages.Wrapped:
     """Return `function`, compiled for batches (by `over`) and spread over the devices: one core a device, on the CPU.
 
     Of its arguments the first `shared` are the same for all. The others, like what it returns, are arrays (or trees of

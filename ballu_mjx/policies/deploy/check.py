@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Float
@@ -139,7 +140,7 @@ def check_policy(
     with tempfile.TemporaryDirectory() as temporary:
         if simulator is None:
             own = Simulator(policy.robot, policy.actuators).with_residual(policy.trained_residual)
-            simulator = export_simulator(own, Path(temporary) / "simulator", check_seconds=0).folder
+            simulator = export_simulator(own, Path(temporary) / "simulator", check_seconds=0.0).folder
         there = _read_simulator(Path(simulator), policy)
     loop = policy.closed_loop()
     qpos, qvel = loop.standing()
@@ -152,19 +153,15 @@ def check_policy(
         float(np.rad2deg(rollout.yaw[0, -1])),
     )
     masses = policy.robot.load_model(policy.actuators).body_mass
-    in_c = [
-        _run_trial(f"C MuJoCo{name}", there, policy, make(), (qpos[0], qvel[0]), steps, masses)
-        for name, make in (
-            ("", lambda: lambda frames: controller.act(there.features())),
-            (", from frames", lambda: _from_frames(folder, there)),
-        )
-    ]
+    rest = policy, (qpos[0], qvel[0]), steps, masses
+    network = _run_trial("C MuJoCo", there, lambda frames: controller.act(there.features()), *rest)
+    from_frames = _run_trial("C MuJoCo, from frames", there, _from_frames(folder), *rest)
     notes = []
     if policy.config.sampled_residual:
         notes.append("Training drew the residual's forces; C MuJoCo takes the most likely ones.")
     if policy.config.residual_decay > 0:
         notes.append("Training let the residual fade outside of its data; C MuJoCo does not.")
-    return PolicyCheck(trial, *in_c, steps * policy.robot.control_timestep, tuple(notes))
+    return PolicyCheck(trial, network, from_frames, steps * policy.robot.control_timestep, tuple(notes))
 
 
 Frames = list[tuple[float, dict[str, np.ndarray]]]
@@ -172,7 +169,7 @@ Act = Callable[[Frames], Any]
 """From the frames of the last control step to commands."""
 
 
-def _from_frames(folder: Path, there: ImprovedSimulator) -> Act:
+def _from_frames(folder: Path) -> Act:
     controller = Controller(folder)
 
     def act(frames: Frames) -> Any:
@@ -187,8 +184,8 @@ def _from_frames(folder: Path, there: ImprovedSimulator) -> Act:
 def _run_trial(
     name: str,
     there: ImprovedSimulator,
-    policy: Policy,
     act: Act,
+    policy: Policy,
     start: tuple[np.ndarray, np.ndarray],
     steps: int,
     masses: Float[np.ndarray, " bodies"],
@@ -207,7 +204,7 @@ def _run_trial(
                 frames.append((float(data.time), _frame(there)))
         features, com = there.features(), shares @ there.data.xipos
         velocity = (com - before) / there.control_timestep
-        rewards.append(float(policy.task.reward(Step(velocity, features, command))))
+        rewards.append(float(policy.task.reward(Step(*map(jnp.asarray, (velocity, features, command))))))
     moved, yaw = com - first, float(np.rad2deg(features[YAW]))
     return Trial(name, float(np.mean(rewards)), (float(moved[0]), float(moved[1])), yaw)
 

@@ -258,7 +258,7 @@ def _settings(simulator: AugmentedSimulator, model: mujoco.MjModel, parts: list[
         }
         for index, (name, (low, high)) in enumerate(zip(robot.commands, robot.command_ranges, strict=True))
     ]
-    drivetrain = None
+    drivetrain: dict[str, Any] | None = None
     if plain.drivetrain is not None:
         drivetrain = {
             name: [float(x) if math.isfinite(x) else None for x in np.asarray(value, float)]
