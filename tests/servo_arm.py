@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Float
+from robot_files import write_robot
 
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.parameters import IdentifiedParameters
-from ballu_mjx.robots.description import RobotDescription, read_description
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.drivetrain import count_slots, filter_commands
 
 _MODEL = """
@@ -55,19 +56,9 @@ TRUTH = {
 
 def write_arm(folder: Path, model: str = _MODEL) -> RobotDescription:
     """Return the description, written to `folder` with its model."""
-    (folder / "arm.xml").write_text(model)
-    content = {
-        "format": "ballu-robot/1",
-        "name": "arm",
-        "model": "arm.xml",
-        "tracked": "tip",
-        "points": [],
-        "commands": {"shoulder": "one", "elbow": "two"},
-        "joints": ["shoulder", "elbow"],
-        "identify": IDENTIFY,
-    }
-    (folder / "arm.robot.json").write_text(json.dumps(content))
-    return read_description(folder / "arm.robot.json")
+    commands = {"shoulder": "one", "elbow": "two"}
+    keys = {"tracked": "tip", "commands": commands, "joints": list(commands), "identify": IDENTIFY}
+    return write_robot(folder, "arm", model, **keys)
 
 
 def identified(robot: RobotDescription, **values: float) -> IdentifiedParameters:

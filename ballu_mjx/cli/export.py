@@ -6,12 +6,12 @@ JAX, and all that needs it, is imported inside functions: `runtime.prepare` has 
 from __future__ import annotations
 
 import dataclasses
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import tyro
 
+from ballu_mjx.cli._subcommands import run_subcommand
 from ballu_mjx.common import runtime
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.deploy.export import ExportOptions, export_policy
@@ -60,28 +60,20 @@ class CheckOptions(runtime.CommandOptions):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status (`runtime.exit_status`)."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-
-    def run() -> int:
-        runtime.prepare()
-        options = tyro.extras.subcommand_cli_from_dict(
-            subcommands(),
-            args=arguments,
-            prog="python -m ballu_mjx export",
-            description="Take results into other tools. Each subcommand explains its options with --help.",
-            config=(tyro.conf.OmitArgPrefixes,),
-        )
-        if isinstance(options, PolicyOptions):
-            export_policy(options)
-            return 0
-        return _simulator(options) if isinstance(options, SimulatorOptions) else _check(options)
-
-    return runtime.exit_status(run, arguments)
+    description = "Take results into other tools. Each subcommand explains its options with --help."
+    return run_subcommand("export", description, subcommands(), _run, arguments)
 
 
 def subcommands() -> dict[str, type]:
     """Options of the subcommands by name."""
     return {"policy": PolicyOptions, "simulator": SimulatorOptions, "check": CheckOptions}
+
+
+def _run(options: PolicyOptions | SimulatorOptions | CheckOptions) -> int:
+    if isinstance(options, PolicyOptions):
+        export_policy(options)
+        return 0
+    return _simulator(options) if isinstance(options, SimulatorOptions) else _check(options)
 
 
 def _simulator(options: SimulatorOptions) -> int:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import tyro
 
+from ballu_mjx.cli._subcommands import run_subcommand
 from ballu_mjx.common import files, runtime
 from ballu_mjx.common.errors import InputError
 
@@ -99,20 +100,8 @@ class Simulate(runtime.CommandOptions):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status (`runtime.exit_status`)."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-
-    def run() -> int:
-        runtime.prepare()
-        options = tyro.extras.subcommand_cli_from_dict(
-            subcommands(),
-            args=arguments,
-            prog="python -m ballu_mjx record",
-            description="Make and check recordings of the robot. Each subcommand explains its options with --help.",
-            config=(tyro.conf.OmitArgPrefixes,),
-        )
-        return _run(options)
-
-    return runtime.exit_status(run, arguments)
+    description = "Make and check recordings of the robot. Each subcommand explains its options with --help."
+    return run_subcommand("record", description, subcommands(), _run, arguments)
 
 
 def subcommands() -> dict[str, type]:

@@ -127,4 +127,4 @@ def check(project: str | None) -> None:
 
 
 def _finite(metrics: Mapping[str, float | int]) -> dict[str, float]:
-    return {name: value for name, value in metrics.items() if math.isfinite(value)}
+    return {name: float(value) for name, value in metrics.items() if math.isfinite(value)}
