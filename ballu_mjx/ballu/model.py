@@ -195,13 +195,6 @@ def _travel(parameters: ActuatorParameters) -> Float[Array, " sides"]:
     return jnp.ones_like(gain) if parameters.motor_travel is None else parameters.motor_travel
 
 
-def buoyancy_fields(model: mujoco.MjModel, ratio: Float[Array, ""] | float) -> dict[str, Array]:
-    """Model fields that carry the lift: `ratio` is lift over the whole robot's weight."""
-    balloon = model.body("balloon").id
-    gravcomp = ratio * model.body_mass.sum() / model.body_mass[balloon]
-    return {"body_gravcomp": jnp.asarray(model.body_gravcomp).at[balloon].set(gravcomp)}
-
-
 def buoyancy_ratio(model: mujoco.MjModel) -> float:
     """Lift over the whole robot's weight, as it stands in `model`."""
     balloon = model.body("balloon").id
