@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ballu_mjx.ballu.curves import curve_distances
 from ballu_mjx.ballu.leg_parameters import (
     DEGREE,
+    DYNAMICS_PRIOR,
     FIRST_DYNAMICS,
     FURTHER,
     LEG_PARAMETERS,
@@ -145,8 +146,8 @@ class Fit:
 
     vector: Float[np.ndarray, " parameters"]
     standard_errors: Float[np.ndarray, " parameters"]
-    """In the parameters' units, from the Jacobian and the scatter of the residuals taken as white noise; 0 for those
-    that were not free, and of the prior's size at most along open directions."""
+    """In the parameters' units, from the Jacobian, the scatter of the residuals, which err together over `_MEMORY`, and
+    what is known beforehand; 0 for those that were not free."""
     correlations: Float[np.ndarray, "free free"]
     directions: tuple[Direction, ...]
     """From the best to the least determined."""
@@ -209,7 +210,7 @@ def identify_legs(
     2. From the best of these, the whole motion.
        Both are done twice, with the `FURTHER` parameters held at their nominal values and with all. The richer model is
        kept where it explains what the simpler one leaves, by an F-test.
-    3. Directions that the data leave open, if any, are drawn to the nominal values, and to nothing else.
+    3. With what is known of robots beforehand: what a sweep hardly shows stays near the nominal values.
     4. With `objective="hausdorff"`, the paper's distance between curves, from there.
 
     **Raises** `InputError` from `IdentificationConfig`'s check.
@@ -261,11 +262,14 @@ class Identifier:
         leg = np.repeat(legs, self._starts)
         ended = np.sum(self._settled_residuals(found, leg, data)[0] ** 2, axis=1).reshape(len(legs), -1)
         analyses = self._analyse(coordinates, data)
-        if any(direction.standard_error > 1 for a in analyses for direction in a.directions):
-            coordinates, _ = self._squares(
-                lambda y: self._drawn(y, data, analyses), coordinates, config.steps, partial(report, "open directions")
-            )
-            analyses = self._analyse(coordinates, data)
+        coordinates, _ = self._squares(
+            lambda y: self._with_priors(y, data, analyses),
+            coordinates,
+            config.steps,
+            partial(report, "priors"),
+            _PATIENCE,
+        )
+        analyses = self._analyse(coordinates, data)
         if config.objective == "hausdorff":
             # From every search's end: a maximum over points and a sum over joints has more valleys still.
             starts = np.concatenate([coordinates[:, None, :size], found.reshape(len(legs), -1, size)[:, 1:]], axis=1)
@@ -337,9 +341,8 @@ class Identifier:
 
     def _independent(self, data: LegData) -> float:
         """Return how many of the residuals err independently."""
-        if not self.config.motion:
-            return data.settled.size
-        return data.motion[:, data.counts].size * SAMPLE_TIMESTEP / _MEMORY
+        values = data.motion[:, data.counts] if self.config.motion else data.settled
+        return values.size / self._together
 
     def _angles(
         self, coordinates: Float[np.ndarray, "n size"], command: Float[np.ndarray, "n holds"]
@@ -371,25 +374,31 @@ class Identifier:
         values = (paths - data.motion)[:, data.counts]
         return values.reshape(legs, -1), slopes[:, data.counts].reshape(legs, -1, slopes.shape[-1]) * self._kept
 
-    def _drawn(
+    def _with_priors(
         self, coordinates: Float[np.ndarray, "legs size"], data: LegData, analyses: list[_Analysis]
     ) -> tuple[Float[np.ndarray, "legs residuals"], Float[np.ndarray, "legs residuals size"]]:
-        """All residuals over their scatter, then how far from nominal along open directions, in units of the prior."""
+        """All residuals over their scatter, each counted for its share that is independent of its neighbours; then
+        how far parameters are from nominal, in units of what robots differ by."""
         values, jacobians = self._residuals(coordinates, data)
         space, size = self.space, self._size
         rows, row_slopes = [], []
-        for y, analysis in zip(coordinates, analyses, strict=True):
-            directions = np.zeros((len(analysis.directions), size))
-            directions[:, self._kept[:size]] = [d.weights * (d.standard_error > 1) for d in analysis.directions]
+        for y in coordinates:
             vector, slope = self._parameters(y[:size])
-            rows.append(directions @ space.deviations(vector)[space.free])
-            slope = directions / space.units(vector)[space.free] @ slope
-            row_slopes.append(np.pad(slope, [(0, 0), (0, len(y) - size)]))
-        scatter = np.array([analysis.scatter for analysis in analyses])
+            own = y[size:] / DYNAMICS_PRIOR[: len(y) - size]
+            rows.append(np.concatenate([space.deviations(vector)[space.free], own]))
+            slope = np.concatenate([slope / space.units(vector)[space.free, None], np.zeros((len(own), size))])
+            beside = np.concatenate([np.zeros((size, len(own))), np.diag(1 / DYNAMICS_PRIOR[: len(own)])])
+            row_slopes.append(np.concatenate([slope, beside], axis=1) * self._kept)
+        scatter = np.array([analysis.scatter for analysis in analyses]) * np.sqrt(self._together)
         return (
             np.concatenate([values / scatter[:, None], np.array(rows)], axis=1),
             np.concatenate([jacobians / scatter[:, None, None], np.array(row_slopes)], axis=1),
         )
+
+    @property
+    def _together(self) -> float:
+        """How many samples err together."""
+        return _MEMORY / SAMPLE_TIMESTEP if self.config.motion else 1.0
 
     def _distance(
         self, coordinates: Float[np.ndarray, "n size"], leg: Int[np.ndarray, " n"], data: LegData
@@ -412,18 +421,17 @@ class Identifier:
         for y, value, jacobian in zip(coordinates, *self._residuals(coordinates, data), strict=True):
             scatter = float(np.sqrt(np.sum(value**2) / max(np.count_nonzero(value) - len(y), 1)))
             vector, slope = self._parameters(y[:size])
-            prior = space.units(vector)[space.free]
-            # In units of the prior, whatever the coordinates; the dynamics, of which nobody knows anything, projected
-            # out.
             kept = self._kept[:size]
-            known = (jacobian[:, :size] / np.diag(slope) * prior / scatter)[:, kept]
+            prior = space.units(vector)[space.free]
+            # In units of the prior, whatever the coordinates; the dynamics projected out.
+            spread = scatter * np.sqrt(self._together)
+            known = (jacobian[:, :size] / np.diag(slope) * prior / spread)[:, kept]
             unknown, singular, _ = np.linalg.svd(jacobian[:, size:], full_matrices=False)
             unknown = unknown[:, singular > 1e-9 * singular.max(initial=0.0)]
             known = known - unknown @ (unknown.T @ known)
             _, singular, right = np.linalg.svd(known, full_matrices=False)
             errors = 1 / np.maximum(singular, 1e-12)
-            variances = np.where(errors > 1, 1 / (1 + singular**2), errors**2)
-            covariance = right.T @ np.diag(variances) @ right
+            covariance = right.T @ np.diag(1 / (1 + singular**2)) @ right
             deviation = np.sqrt(np.diag(covariance))
             standard_errors = np.zeros(len(LEG_PARAMETERS))
             standard_errors[np.flatnonzero(space.free)[kept]] = deviation * prior[kept]

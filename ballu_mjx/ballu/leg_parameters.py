@@ -108,6 +108,8 @@ FIRST_DYNAMICS = LegDynamics(0.03, 2e-3, 5e-4, 1 * DEGREE, 0.01, 2e-3)
 """Where the search begins."""
 
 
+DYNAMICS_PRIOR = np.array([3.0, 1.0, 1.0, 1.0, 2.0, 2.0])
+"""How much robots differ (standard deviation) in the coordinates of the dynamics, about where the search begins."""
 SIMPLE_DYNAMICS = FIRST_DYNAMICS._replace(lag=1e-4, knee_damping=1e-3)
 """The same of the simpler model: no lag to speak of, and the nominal damping."""
 FURTHER = ("motor_travel", "cable_stiffness", "knee_spring_reference", "lag", "knee_damping")

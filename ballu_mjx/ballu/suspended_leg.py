@@ -180,7 +180,7 @@ class SuspendedLeg:
 
 _RELAXATION_TIMESTEP = 0.05
 _RELAXATION_STEPS = 150
-_RELAXATION_DAMPING = {"hip": 0.1, "knee": 0.03, "motor": 0.05}
+_RELAXATION_DAMPING = {"hip": 0.1, "knee": 0.12, "motor": 0.2}
 """N m s/rad: more than half the time step times the stiffness of each joint, which keeps such long steps stable."""
 
 

@@ -93,7 +93,9 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
         lines.append(
             "Travel, cable stiffness, spring reference, lag and knee damping are nominal: the sweep asks for no more."
         )
-    lines.append("Standard errors take the residuals for white noise; what the model lacks is none.")
+    lines.append(
+        "Standard errors take residuals 0.2 s apart as independent, and hold what is known of robots beforehand."
+    )
     for side, fit in zip(SIDES, result.fits, strict=True):
         singular = ", ".join(f"{1 / d.standard_error:.3g}" for d in fit.directions)
         lines.append(f"Singular values, {side} (Jacobian over noise, in units of what robots differ by): {singular}")
