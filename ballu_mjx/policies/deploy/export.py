@@ -24,8 +24,7 @@ from ballu_mjx.policies.deploy import controller, estimator
 
 if TYPE_CHECKING:
     from ballu_mjx.policies.policy import Policy
-    from ballu_mjx.sim.observation import ObservationLayout
-from ballu_mjx.robots.description import RobotDescription
+    from ballu_mjx.robots.description import RobotDescription
 
 POLICY_FORMAT = "ballu-policy/1"
 POLICY_FILE = "policy.json"
@@ -194,6 +193,8 @@ def _check(options: ExportOptions) -> None:
 
 def _plausible(rng: np.random.Generator, count: int, size: int) -> Float[np.ndarray, "count size"]:
     """Return features of the order of a moving robot's."""
+    from ballu_mjx.sim.observation import ObservationLayout
+
     features = rng.normal(0.0, 0.2, (count, size))
     features[:, ObservationLayout.yaw] = rng.uniform(-np.pi, np.pi, count)
     return features
