@@ -19,8 +19,12 @@ if TYPE_CHECKING:
     from ballu_mjx.evaluation.open_loop import evaluate
     from ballu_mjx.identification.actuators import identify_actuators
     from ballu_mjx.identification.guard import choose_actuators
+    from ballu_mjx.policies.deploy.check import check_policy
+    from ballu_mjx.policies.environments.brax_env import brax_env
+    from ballu_mjx.policies.environments.gym_env import gym_env, gym_vector_env
     from ballu_mjx.policies.locomotion_env import LocomotionConfig
     from ballu_mjx.policies.policy import Policy
+    from ballu_mjx.policies.simulators import load_simulator
     from ballu_mjx.policies.training import locomotion_ppo, train_policy
     from ballu_mjx.recordings.load import load_recordings
     from ballu_mjx.recordings.motion import Motion
@@ -29,6 +33,7 @@ if TYPE_CHECKING:
     from ballu_mjx.residuals.aerodynamics_fit import AirConfig
     from ballu_mjx.residuals.aerodynamics_training import fit_aerodynamics
     from ballu_mjx.residuals.analytic import AnalyticConfig
+    from ballu_mjx.residuals.deploy.export import export_simulator
     from ballu_mjx.residuals.envmimic import EnvMimicConfig
     from ballu_mjx.residuals.envmimic_training import train_envmimic
     from ballu_mjx.residuals.fluid_fit import FluidConfig
@@ -66,16 +71,22 @@ _MODULES = {
     "Simulator": "sim.simulator",
     "SupervisedConfig": "residuals.supervised",
     "TrainedResidual": "residuals.trained",
+    "brax_env": "policies.environments.brax_env",
+    "check_policy": "policies.deploy.check",
     "choose_actuators": "identification.guard",
     "evaluate": "evaluation.open_loop",
+    "export_simulator": "residuals.deploy.export",
     "fit_aerodynamics": "residuals.aerodynamics_training",
     "FluidConfig": "residuals.fluid_fit",
     "fit_fluid": "residuals.fluid_training",
     "fit_analytic": "residuals.force_fitting",
     "fit_supervised": "residuals.force_fitting",
+    "gym_env": "policies.environments.gym_env",
+    "gym_vector_env": "policies.environments.gym_env",
     "identify_actuators": "identification.actuators",
     "load_recordings": "recordings.load",
     "load_robot": "robots.registry",
+    "load_simulator": "policies.simulators",
     "locomotion_ppo": "policies.training",
     "reconstruct": "recordings.reconstruct",
     "train_envmimic": "residuals.envmimic_training",
@@ -103,16 +114,22 @@ __all__ = [
     "Simulator",
     "SupervisedConfig",
     "TrainedResidual",
+    "brax_env",
+    "check_policy",
     "choose_actuators",
     "evaluate",
+    "export_simulator",
     "fit_aerodynamics",
     "fit_fluid",
     "FluidConfig",
     "fit_analytic",
     "fit_supervised",
+    "gym_env",
+    "gym_vector_env",
     "identify_actuators",
     "load_recordings",
     "load_robot",
+    "load_simulator",
     "locomotion_ppo",
     "reconstruct",
     "train_envmimic",

@@ -26,7 +26,9 @@ COMMANDS = (
     ("looking", "report RUN", "a run as one page for the browser, with a replay in 3D"),
     ("", "view RUN", "the replay, or a recording, live"),
     ("", "compare RUN RUN ...", "runs side by side, mean and interval over seeds"),
-    ("the robot", "export RUN", "a policy as a controller that needs NumPy alone"),
+    ("your own tools", "export policy RUN", "a policy as a controller that needs NumPy alone"),
+    ("", "export simulator RUN", "an improved simulator for C MuJoCo"),
+    ("", "export check FOLDER", "an exported policy in C MuJoCo, beside its own simulator"),
 )
 """Stage, what follows `python -m ballu_mjx`, what it is for."""
 NAMES = tuple(dict.fromkeys(command.split()[0] for _, command, _ in COMMANDS))

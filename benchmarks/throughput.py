@@ -30,7 +30,7 @@ from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
-from ballu_mjx.rl import learner, ppo
+from ballu_mjx.rl import learner, ppo, training_env
 from ballu_mjx.sim.step import count_substeps
 
 
@@ -48,7 +48,7 @@ def training_rates(env: EnvMimicEnv, config: ppo.PPOConfig) -> list[float]:
 
 def stepping_rates(env: EnvMimicEnv, num_envs: int, repeats: int, length: int = 20) -> list[float]:
     """Control steps per second of the environments alone, sharded over all devices."""
-    wrapped = learner.wrap_for_training(env)
+    wrapped = training_env.wrap_for_training(env)
     devices = jax.local_device_count()
     keys = jax.random.split(jax.random.key(0), num_envs).reshape(devices, -1)
     action = jnp.zeros((num_envs // devices, env.action_size))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import io
+import re
 import subprocess
 import sys
 import typing
@@ -43,50 +45,73 @@ def test_every_name_of_the_root_is_there():
         bm.fit_everything  # noqa: B018
 
 
-@pytest.fixture(scope="module")
-def robot() -> bm.RobotDescription:
-    return bm.load_robot("ballu")
+class Example(typing.NamedTuple):
+    """What the README's example leaves."""
+
+    robot: bm.RobotDescription
+    motions: list[bm.Motion]
+    actuators: bm.IdentifiedActuators
+    sim: bm.Simulator
+    air: bm.TrainedResidual
+    policy: bm.Policy
+    said: str
 
 
 @pytest.fixture(scope="module")
-def motions(robot: bm.RobotDescription) -> list[bm.Motion]:
-    """Two short ones."""
-    recordings = [
-        cut(each, slice(int(np.searchsorted(each.time, each.time[0] + 6.0))))
-        for each in bm.load_recordings("validation", robot)[1:3]
-    ]
-    return [bm.reconstruct(each, robot) for each in recordings]
+def example() -> Example:
+    """The README's example as it stands there, on two short recordings and with quick sizes."""
+    readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(import ballu_mjx as bm\n.*?)```", readme, re.DOTALL)
+    load = bm.load_recordings
+
+    def load_short(use: str, robot: bm.RobotDescription) -> list[bm.Recording]:
+        if use == "suspended":
+            return load(use, robot)
+        return [cut(each, slice(int(np.searchsorted(each.time, each.time[0] + 6.0)))) for each in load(use, robot)[1:3]]
+
+    identification = IdentificationConfig(motion=False, starts=4)
+    air = bm.AirConfig(window_seconds=0.5, evaluations=2)
+    quick = {
+        "load_recordings": load_short,
+        "identify_actuators": functools.partial(bm.identify_actuators, config=identification),
+        "fit_aerodynamics": functools.partial(bm.fit_aerodynamics, config=air, free=("added_mass", "lift")),
+        "train_policy": functools.partial(bm.train_policy, ppo_config=SIZES),
+    }
+    said, left = io.StringIO(), {}
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        for name, function in quick.items():
+            patch.setattr(bm, name, function)
+        exec(code, left)
+    return Example(said=said.getvalue(), **{name: left[name] for name in Example._fields if name != "said"})
 
 
 @pytest.fixture(scope="module")
-def actuators(robot: bm.RobotDescription) -> bm.IdentifiedActuators:
-    config = IdentificationConfig(motion=False, starts=4)
-    return bm.identify_actuators(bm.load_recordings("suspended", robot), robot, config)
+def robot(example: Example) -> bm.RobotDescription:
+    return example.robot
 
 
 @pytest.fixture(scope="module")
-def simulator(robot: bm.RobotDescription, actuators: bm.IdentifiedActuators) -> bm.Simulator:
-    return bm.Simulator(robot, actuators=actuators)
+def motions(example: Example) -> list[bm.Motion]:
+    return example.motions
 
 
 @pytest.fixture(scope="module")
-def air(simulator: bm.Simulator, motions: list[bm.Motion]) -> bm.TrainedResidual:
-    config = bm.AirConfig(window_seconds=0.5, evaluations=2)
-    return bm.fit_aerodynamics(simulator, motions, config, free=("added_mass", "lift"))
+def simulator(example: Example) -> bm.Simulator:
+    return example.sim
 
 
-def test_the_example_of_the_readme_prints_a_table_and_nothing_else(
-    simulator: bm.Simulator, actuators: bm.IdentifiedActuators, air: bm.TrainedResidual, motions: list[bm.Motion]
-):
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-        found = bm.evaluate(simulator.with_residual(air), motions)
-        policy = bm.train_policy(simulator.with_residual(air), task="walk", ppo_config=SIZES)
-    assert said.getvalue() == ""
-    assert "vanilla+sysid" in found.table() and "aerodynamic" in found.table()
-    assert "motor gain, left" in actuators.report and "std. error" in air.report
+@pytest.fixture(scope="module")
+def air(example: Example) -> bm.TrainedResidual:
+    return example.air
+
+
+def test_the_example_of_the_readme_prints_a_table_and_nothing_else(example: Example):
+    _, *table = example.said.splitlines()
+    assert "vanilla+sysid" in example.said and "aerodynamic" in example.said and table
+    assert "motor gain, left" in example.actuators.report and "std. error" in example.air.report
+    policy = example.policy
     assert policy.variant.name == "aerodynamic" and policy.step % 160 == 0
-    command = policy.act()(np.zeros(simulator.robot.features))
+    command = policy.act()(np.zeros(example.robot.features))
     assert command.shape == (2,) and np.all((command >= 0) & (command <= 1))
 
 

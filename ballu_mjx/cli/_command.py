@@ -14,6 +14,8 @@ import tyro
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.run_config import run_robot
+from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.rl.resume_point import ResumePoint, find_resume_point
 from ballu_mjx.rl.training_loop import TrainingInterrupted
 from ballu_mjx.robots.description import RobotDescription, check_simulates
 from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
@@ -141,6 +143,17 @@ def load_chosen_robot(robot: str | None, resume: Path | None = None, task: str |
     return found
 
 
+def start_from(task: str, data: Any, ppo: PPOConfig) -> ResumePoint:
+    """Return where training starts by a command's data section, and tell the user what is worth knowing of it.
+
+    **Raises** `InputError` from `find_resume_point`.
+    """
+    start = find_resume_point(task, data.resume, ppo, output=data.output, quick=data.quick)
+    if start.notice is not None:
+        print(start.notice, file=sys.stderr)
+    return start
+
+
 @dataclasses.dataclass
 class Written:
     """Where a command writes to."""
@@ -175,6 +188,7 @@ def open_run(
         print("Compiling: about a minute the first time ...", flush=True)
         try:
             yield run
-        except TrainingInterrupted:
+        except TrainingInterrupted as stopped:
+            print(f"Interrupted; saved at step {stopped.step:,}.", file=sys.stderr)
             print(f"To go on: {PROGRAM} {content['task']} --resume {folder}", file=sys.stderr)
             raise

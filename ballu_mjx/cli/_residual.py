@@ -1,22 +1,27 @@
-"""What the commands that learn a residual share: reading and checking, announcing, and the evaluation at the end."""
+"""What the commands that learn a residual share: reading and checking, the run, and the evaluation at the end."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 
-from ballu_mjx.cli._command import load_chosen_robot
+from ballu_mjx.cli._command import load_chosen_robot, open_run, written_to
+from ballu_mjx.common import files
 from ballu_mjx.evaluation.open_loop import Evaluators
 from ballu_mjx.identification.guard import choose_actuators
+from ballu_mjx.identification.stability import check_stability
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.dataset import USES, RecordingsData, ResidualDataset
 from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.rl.resume_point import ResumePoint
+from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import new_folder
+from ballu_mjx.runs.record import TrainingRecord
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 from ballu_mjx.viz import artifacts
 
@@ -63,6 +68,47 @@ class Prepared:
             print("\nThese numbers mean little: --quick trains for seconds.")
 
 
+def train_residual(
+    task: str,
+    data: RecordingsData,
+    sections: Mapping[str, Any],
+    learn: Callable[[Prepared, TrainingRecord], TrainedResidual],
+    show: Callable[[Path, TrainedResidual], None],
+    *,
+    base: Path | None = None,
+    start: ResumePoint | None = None,
+    first: bool = True,
+) -> int:
+    """Read and check everything, learn in a run's folder, show what came out; returns the exit status.
+
+    **Arguments**
+
+    - `sections`: the command's options, as `config.json` holds them.
+    - `learn`: what the command is for.
+    - `show`: takes the run's folder and the residual, before its evaluation is printed.
+    - `base`, `first`: see `prepare`.
+    - `start`: where training goes on; None: from the beginning.
+    """
+    start = start or ResumePoint()
+    loggers.check(data.wandb)
+    with written_to(first=first) as written:
+        prepared = prepare(task, data, base, start.folder, first=first)
+        folder = written.folder = prepared.folder
+        content = prepared.describe(sections)
+        with open_run(folder, content, start.resumed_at, data.wandb, first=first) as run:
+            residual = learn(prepared, run)
+        if first:
+            show(folder, residual)
+            prepared.show_evaluation(residual, quick=data.quick)
+    return 0
+
+
+def show_report(folder: Path, residual: TrainedResidual) -> None:
+    """Write what was identified to the run's folder, and print it."""
+    files.write(folder / "identification.txt", residual.report + "\n")
+    print(f"\n{residual.report}\n")
+
+
 def prepare(
     task: str, data: RecordingsData, base: Path | None = None, resume: Path | None = None, *, first: bool = True
 ) -> Prepared:
@@ -84,7 +130,9 @@ def prepare(
     if first:
         _announce(dataset, folder, data.quick)
     simulator = Simulator(robot, dataset.identified)
-    motions = dataset.reconstruct(simulator.mj_model)
+    motions = dataset.reconstruct(simulator)
+    if resume is None:
+        check_stability(robot, motions["training"], None)
     if dataset.identified is not None and resume is None:
         choice = choose_actuators(robot, dataset.identified, motions["validation"])
         if first:
@@ -93,7 +141,7 @@ def prepare(
             if first:
                 print("Nominal actuators are taken; --actuators FILE takes the identified ones.", flush=True)
             dataset, simulator = dataset.with_actuators(None, "nominal"), Simulator(robot)
-            motions = dataset.reconstruct(simulator.mj_model)
+            motions = dataset.reconstruct(simulator)
     return Prepared(task, folder, dataset, motions, simulator, residual, base, Evaluators(simulator))
 
 

@@ -19,6 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import CaptureController
 from ballu_mjx.ballu.virtual.trials import ExportedPolicy, run_trials
@@ -52,7 +53,6 @@ from ballu_mjx.residuals.analytic import AnalyticConfig
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.supervised import SupervisedConfig
 from ballu_mjx.rl.ppo import PPOConfig
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.checkpoints import list_checkpoints
@@ -302,7 +302,7 @@ class Story:
         def make(folder: Path) -> None:
             policy = Policy.load(source)
             draws = [virtual_robot.draw_trial(_draw(self.seed, task, "trials", number)) for number in range(count)]
-            found = run_trials(policy, self._robot, draws, folder)
+            found = run_trials(policy, self._robot, draws, folder, tell=functools.partial(print, flush=True))
             transfer.write_transfer(folder / "transfer.json", found)
 
         options = {"robot": self.options.robot_seed, "seed": self.seed, "trials": count}

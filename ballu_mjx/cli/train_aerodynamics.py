@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, open_run, written_to
-from ballu_mjx.cli._residual import prepare
+from ballu_mjx.cli._command import TrainCommand, load_chosen_robot
+from ballu_mjx.cli._residual import Prepared, show_report, train_residual
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS, Aerodynamics
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, check_air_config
@@ -16,8 +16,8 @@ from ballu_mjx.residuals.aerodynamics_training import fit_aerodynamics
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
-from ballu_mjx.runs import loggers
 from ballu_mjx.runs.progress import PhaseProgress
+from ballu_mjx.runs.record import TrainingRecord
 
 QUICK: Mapping[str, Any] = {"window_seconds": 0.5, "interval_seconds": 2.0, "evaluations": 3}
 """Defaults of `AirConfig` under `--quick`."""
@@ -38,27 +38,22 @@ class AirData(RecordingsData):
 def train(data: AirData, fit: AirConfig) -> int:
     """Read and check everything, identify, evaluate; returns the exit status."""
     check_air_config(fit, load_robot(data.robot or DEFAULT_ROBOT).control_timestep)
-    loggers.check(data.wandb)
     if not data.free:
         raise InputError(f"--free names no parameter; there are {', '.join(AIR_PARAMETERS)}.")
     earlier = _earlier(data)
-    with written_to() as written:
-        prepared = prepare("aerodynamic", data)
-        folder = written.folder = prepared.folder
-        with open_run(folder, prepared.describe({"fit": fit, "data": data}), None, data.wandb) as run:
-            residual = fit_aerodynamics(
-                prepared.simulator,
-                prepared.motions["training"],
-                fit,
-                fixed_from=earlier,
-                free=data.free,
-                run=run,
-                progress=PhaseProgress(),
-            )
-            run.write("identification.txt", residual.report + "\n")
-        print(f"\n{residual.report}\n")
-        prepared.show_evaluation(residual, quick=data.quick)
-    return 0
+
+    def learn(prepared: Prepared, run: TrainingRecord) -> TrainedResidual:
+        return fit_aerodynamics(
+            prepared.simulator,
+            prepared.motions["training"],
+            fit,
+            fixed_from=earlier,
+            free=data.free,
+            run=run,
+            progress=PhaseProgress(),
+        )
+
+    return train_residual("aerodynamic", data, {"fit": fit, "data": data}, learn, show_report)
 
 
 def _earlier(data: AirData) -> TrainedResidual | None:

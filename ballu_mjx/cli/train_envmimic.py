@@ -7,19 +7,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, open_run, written_to
-from ballu_mjx.cli._residual import prepare
+from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, start_from
+from ballu_mjx.cli._residual import Prepared, train_residual
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.envmimic_training import VALIDATE_EVERY, check_envmimic_options, check_resumes, train_envmimic
 from ballu_mjx.residuals.run_config import run_residual
+from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl import distributed, learner
 from ballu_mjx.rl.ppo import PPOConfig
-from ballu_mjx.rl.training_loop import find_resume_point
-from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import read_config
 from ballu_mjx.runs.progress import Progress
+from ballu_mjx.runs.record import TrainingRecord
 from ballu_mjx.viz import artifacts
 
 QUICK: Mapping[str, Any] = {"num_timesteps": 120_000, "num_envs": 256, "batch_size": 128}
@@ -45,33 +45,32 @@ def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
     distributed.join(data)
     robot = load_chosen_robot(data.robot, data.resume, "envmimic")
     check_envmimic_options(env, ppo, data.validate_every, robot.control_timestep)
-    loggers.check(data.wandb)
-    start = find_resume_point("envmimic", data.resume, ppo, output=data.output, quick=data.quick)
+    start = start_from("envmimic", data, ppo)
     check_resumes(start, env, robot)
     first = distributed.is_first()
-    with written_to(first=first) as written:
-        prepared = prepare("envmimic", data, _base_residual(data), data.resume, first=first)
-        folder = written.folder = prepared.folder
-        content = prepared.describe({"env": env, "ppo": ppo, "data": data})
-        with open_run(folder, content, start.resumed_at, data.wandb, first=first) as run:
-            residual = train_envmimic(
-                prepared.improved,
-                prepared.motions["training"],
-                env,
-                ppo,
-                validation=prepared.motions["validation"],
-                validate_every=data.validate_every,
-                run=run,
-                progress=Progress(learner.total_timesteps(ppo, start.step), start.step) if first else None,
-                start=start,
-                evaluators=prepared.evaluators,
-            )
-        if first:
-            artifacts.draw_learning_curve(folder, residual.step)
-            untrained = "" if residual.step else ", before any training: no later one validated better"
-            print(f"Best checkpoint: step {residual.step:,}{untrained}. ", end="")
-            prepared.show_evaluation(residual, quick=data.quick)
-    return 0
+
+    def learn(prepared: Prepared, run: TrainingRecord) -> TrainedResidual:
+        return train_envmimic(
+            prepared.improved,
+            prepared.motions["training"],
+            env,
+            ppo,
+            validation=prepared.motions["validation"],
+            validate_every=data.validate_every,
+            run=run,
+            progress=Progress(learner.total_timesteps(ppo, start.step), start.step) if first else None,
+            start=start,
+            evaluators=prepared.evaluators,
+        )
+
+    def show(folder: Path, residual: TrainedResidual) -> None:
+        artifacts.draw_learning_curve(folder, residual.step)
+        untrained = "" if residual.step else ", before any training: no later one validated better"
+        print(f"Best checkpoint: step {residual.step:,}{untrained}. ", end="")
+
+    sections = {"env": env, "ppo": ppo, "data": data}
+    base = _base_residual(data)
+    return train_residual("envmimic", data, sections, learn, show, base=base, start=start, first=first)
 
 
 def _base_residual(data: Data) -> Path | None:

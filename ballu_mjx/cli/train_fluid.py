@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, open_run, written_to
-from ballu_mjx.cli._residual import prepare
+from ballu_mjx.cli._command import TrainCommand, load_chosen_robot
+from ballu_mjx.cli._residual import Prepared, show_report, train_residual
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.fluid_fit import FluidConfig, check_fluid_config
 from ballu_mjx.residuals.fluid_training import fit_fluid
-from ballu_mjx.runs import loggers
+from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.runs.progress import PhaseProgress
+from ballu_mjx.runs.record import TrainingRecord
 
 QUICK: Mapping[str, Any] = {"terms": "linear", "window_seconds": (0.5,), "windows": 20, "steps": 2}
 """Defaults of `FluidConfig` under `--quick`."""
@@ -20,24 +21,14 @@ QUICK: Mapping[str, Any] = {"terms": "linear", "window_seconds": (0.5,), "window
 def train(data: RecordingsData, fit: FluidConfig) -> int:
     """Read and check everything, fit, evaluate; returns the exit status."""
     check_fluid_config(fit, load_chosen_robot(data.robot).control_timestep)
-    loggers.check(data.wandb)
-    with written_to() as written:
-        prepared = prepare("fluid", data)
-        folder = written.folder = prepared.folder
+
+    def learn(prepared: Prepared, run: TrainingRecord) -> TrainedResidual:
         motions = prepared.motions
-        with open_run(folder, prepared.describe({"fit": fit, "data": data}), None, data.wandb) as run:
-            residual = fit_fluid(
-                prepared.simulator,
-                motions["training"],
-                motions["validation"],
-                fit,
-                run=run,
-                progress=PhaseProgress(),
-            )
-            run.write("identification.txt", residual.report + "\n")
-        print(f"\n{residual.report}\n")
-        prepared.show_evaluation(residual, quick=data.quick)
-    return 0
+        return fit_fluid(
+            prepared.simulator, motions["training"], motions["validation"], fit, run=run, progress=PhaseProgress()
+        )
+
+    return train_residual("fluid", data, {"fit": fit, "data": data}, learn, show_report)
 
 
 COMMAND = TrainCommand(

@@ -7,17 +7,17 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ballu_mjx.cli._command import TrainCommand, open_run, written_to
-from ballu_mjx.cli._residual import prepare
+from ballu_mjx.cli._command import TrainCommand
+from ballu_mjx.cli._residual import Prepared, train_residual
 from ballu_mjx.residuals.analytic import AnalyticConfig, check_analytic_config
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.force_fitting import fit_analytic, fit_supervised, network_sections
 from ballu_mjx.residuals.supervised import SupervisedConfig, check_supervised_config
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
-from ballu_mjx.runs import loggers
 from ballu_mjx.runs.metrics import read_column
 from ballu_mjx.runs.progress import PhaseProgress
+from ballu_mjx.runs.record import TrainingRecord
 from ballu_mjx.sim.force_model import ForceSet
 from ballu_mjx.viz import plots
 
@@ -61,25 +61,21 @@ def _train(
     task: str,
     data: ForcesData,
     fit: SupervisedConfig | AnalyticConfig,
-    learn: Callable[..., TrainedResidual],
+    method: Callable[..., TrainedResidual],
 ) -> int:
-    loggers.check(data.wandb)
-    with written_to() as written:
-        prepared = prepare(task, data, data.residual)
-        folder = written.folder = prepared.folder
-        env, network = network_sections(data.forces, fit.seed)
-        content = prepared.describe({"env": env, "ppo": network, "fit": fit, "data": data})
-        with open_run(folder, content, None, data.wandb) as run:
-            residual = learn(
-                prepared.improved,
-                prepared.motions["training"],
-                fit,
-                forces=data.forces,
-                validation=prepared.motions["validation"],
-                run=run,
-                progress=PhaseProgress(),
-                evaluators=prepared.evaluators,
-            )
+    def learn(prepared: Prepared, run: TrainingRecord) -> TrainedResidual:
+        return method(
+            prepared.improved,
+            prepared.motions["training"],
+            fit,
+            forces=data.forces,
+            validation=prepared.motions["validation"],
+            run=run,
+            progress=PhaseProgress(),
+            evaluators=prepared.evaluators,
+        )
+
+    def show(folder: Path, residual: TrainedResidual) -> None:
         names = [name for name in ("loss", "linear_loss") if len(read_column(folder, name)[0])]
         losses = {name.replace("_", " "): read_column(folder, name) for name in names}
         metric, label = _CURVES[task]
@@ -88,8 +84,10 @@ def _train(
         if residual.report:
             print(residual.report)
         print(f"Best checkpoint: gradient step {residual.step:,}. ", end="")
-        prepared.show_evaluation(residual, quick=data.quick)
-    return 0
+
+    env, network = network_sections(data.forces, fit.seed)
+    sections = {"env": env, "ppo": network, "fit": fit, "data": data}
+    return train_residual(task, data, sections, learn, show, base=data.residual)
 
 
 SUPERVISED = TrainCommand(

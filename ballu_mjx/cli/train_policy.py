@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, open_run, written_to
+from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, open_run, start_from, written_to
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.actuators import AUTO, NOMINAL, read_actuators, validation_ratio
 from ballu_mjx.policies.closed_loop import Rollout
@@ -31,7 +31,6 @@ from ballu_mjx.residuals.run_config import describe_run, run_actuators, run_resi
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl import distributed, learner
 from ballu_mjx.rl.ppo import PPOConfig
-from ballu_mjx.rl.training_loop import find_resume_point
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 from ballu_mjx.runs import loggers
@@ -75,7 +74,7 @@ def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
     """Check everything, train, show the gait; returns the exit status."""
     distributed.join(data)
     loggers.check(data.wandb)
-    start = find_resume_point(task.name, data.resume, ppo, output=data.output, quick=data.quick)
+    start = start_from(task.name, data, ppo)
     robot = load_chosen_robot(data.robot, data.resume, task.name)
     check_task(task, robot)
     check_policy_options(env, ppo, data.keep_every, robot)

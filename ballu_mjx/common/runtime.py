@@ -13,6 +13,7 @@ import hashlib
 import importlib
 import importlib.metadata
 import io
+import logging
 import os
 import platform
 import re
@@ -50,6 +51,7 @@ def prepare() -> None:
       them again and again takes time.
     - glibc keeps one heap a core (its own limit: eight a core), unless `MALLOC_ARENA_MAX` is set. Every checkpoint is
       written by threads of its own, which otherwise leave ever more heaps in pieces.
+    - The package's log shows warnings as plain lines, unless it has a handler already.
     - A JAX that would hang is refused (`check_jax`), and MJX's report that Warp is not installed kept off the screen.
 
     Where JAX is imported already (a notebook, say), its settings stay as they are.
@@ -71,8 +73,19 @@ def prepare() -> None:
     gc.set_threshold(_ALLOCATIONS, *gc.get_threshold()[1:])
     if "MALLOC_ARENA_MAX" not in os.environ:
         _libc("mallopt", _M_ARENA_MAX, _cores())
+    log = logging.getLogger("ballu_mjx")
+    if not log.handlers:
+        log.addHandler(_PlainHandler(logging.WARNING))
+        log.propagate = False
     check_jax()
     _import_mjx()
+
+
+class _PlainHandler(logging.Handler):
+    """Shows messages on the standard error as they are."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(self.format(record), file=sys.stderr)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -27,6 +27,7 @@ from ballu_mjx.evaluation.errors_table import (
     median_of_starts,
     summarize_starts,
 )
+from ballu_mjx.identification.parameters import LEAST_FRICTION
 from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, pad_to_bucket, stack_motions
@@ -34,6 +35,7 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.drivetrain import DrivetrainParameters, identity_drivetrain
 from ballu_mjx.sim.force_model import BoundForces, ForceModel
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
+from ballu_mjx.sim.sharding import compile_for_devices, device_shardings
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState
 
@@ -141,6 +143,16 @@ class Evaluators:
         return made
 
 
+def nominal_model(simulator: Simulator) -> mujoco.MjModel:
+    """Return the nominal robot, with dry friction of no effect where the simulated one has any: both share a program,
+    and so their rows of constraints."""
+    model = simulator.robot.load_model()
+    for name in ("dof_frictionloss", "tendon_frictionloss"):
+        field, rubbing = getattr(model, name), getattr(simulator.mj_model, name) > 0
+        field[rubbing] = np.maximum(field[rubbing], LEAST_FRICTION)
+    return model
+
+
 class OpenLoopEvaluator:
     """Replays a set of recordings; one compiled program for any parameters of the residual, any recordings and
     actuators."""
@@ -159,19 +171,8 @@ class OpenLoopEvaluator:
         self.robot = simulator.robot
         devices = jax.local_devices()
         self._size = len(devices) * _RUNS[devices[0].platform == "cpu"]
-        mesh = jax.sharding.Mesh(np.array(devices), ("batch",))
-        spec = jax.sharding.PartitionSpec
-        self._everywhere = jax.sharding.NamedSharding(mesh, spec())
-        self._split = jax.sharding.NamedSharding(mesh, spec("batch"))
-        # XLA splits the batch over the devices: one core a device.
-        split = jax.shard_map(
-            jax.vmap(self._advance, in_axes=(None, None, None, None, None, 0, 0)),
-            mesh=mesh,
-            in_specs=(*[spec()] * 5, spec("batch"), spec("batch")),
-            out_specs=spec("batch"),
-            check_vma=False,
-        )
-        self._chunk = jax.jit(split)
+        self._everywhere, self._split = device_shardings()
+        self._chunk = compile_for_devices(self._advance, shared=5)
         self._look_at(motions)
 
     def on(self, motions: Sequence[Motion]) -> OpenLoopEvaluator:
@@ -214,7 +215,7 @@ class OpenLoopEvaluator:
         """
         fixed = self._fixed
         if nominal:
-            model = jax.device_get(Simulator(self.robot).model)
+            model = jax.device_get(Simulator(self.robot, model=nominal_model(self._simulator)).model)
             unchanged = None if self._simulator.drivetrain is None else identity_drivetrain(len(self.robot.commands))
             fixed = jax.device_put((model, jax.device_get(unchanged), self._reference), self._everywhere)
         params = jax.device_get(params)  # they may live on one device; the batch is spread over all

@@ -17,7 +17,6 @@ from jaxtyping import Float, Int
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.evaluation.statistics import LEVEL, seed_means, t_interval
-from ballu_mjx.robots.model import CONTROL_TIMESTEP
 
 STRIDE = 1.0
 """Seconds between the points that the length of a path is taken over."""
@@ -48,6 +47,8 @@ class Trajectory:
     """Of the tracked body (rad, world), not unwrapped."""
     steps: Int[np.ndarray, " T"]
     """How many steps a walking robot has made by each state."""
+    control_timestep: float
+    """s between two states."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,7 +139,7 @@ def compare_trajectories(simulation: Trajectory, robot: Trajectory) -> Transfer:
     return Transfer(
         com_error=float(np.linalg.norm(sim_com - com, axis=1).mean()),
         x_distance=float(way[0]),
-        total_distance=path_length(com),
+        total_distance=path_length(com, robot.control_timestep),
         y_distance=float(way[1]),
         yaw_error=float(np.rad2deg(np.arctan2(np.sin(start), np.cos(start))) + sim_turn - turn),
         yaw_change=float(turn),
@@ -150,12 +151,12 @@ def compare_trajectories(simulation: Trajectory, robot: Trajectory) -> Transfer:
     )
 
 
-def path_length(com: Float[np.ndarray, "T 3"]) -> float:
-    """Length (m) of the horizontal path through every `STRIDE`-th second's centre of mass, and the last.
+def path_length(com: Float[np.ndarray, "T 3"], control_timestep: float) -> float:
+    """Return the length (m) of the horizontal path through every `STRIDE`-th second's centre of mass, and the last.
 
     Not through all: the centre of mass of a walking robot sways within each step, and noise of sensors adds length.
     """
-    points = com[:: round(STRIDE / CONTROL_TIMESTEP), :2]
+    points = com[:: round(STRIDE / control_timestep), :2]
     points = np.concatenate([points, com[-1:, :2]])  # adds nothing where the last is there already
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -20,9 +20,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
-from mujoco.mjx._src import math as mjx_math
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.common.rotations import quaternion_conjugate, quaternion_integrate, quaternion_product
 from ballu_mjx.identification.batched_solver import along_directions
 from ballu_mjx.identification.parameters import LEAST_FRICTION, ParameterSet
 from ballu_mjx.recordings.filters import interpolate, mean_command, savitzky_golay
@@ -32,6 +32,7 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import with_fields
 from ballu_mjx.sim.derived_constants import ReferencePose, with_derived_constants
 from ballu_mjx.sim.drivetrain import filter_commands
+from ballu_mjx.sim.sharding import chunks
 from ballu_mjx.sim.step import PhysicsState, make_data, physics_step, put_model, state_at
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 
@@ -369,14 +370,14 @@ class WindowSimulator:
         """Return `qpos` moved along the velocities' directions."""
         if len(qpos) == len(change):
             return qpos + change
-        turned = mjx_math.quat_integrate(qpos[3:7], change[3:6], jnp.asarray(1.0))
+        turned = quaternion_integrate(qpos[3:7], change[3:6])
         return jnp.concatenate([qpos[:3] + change[:3], turned, qpos[7:] + change[6:]])
 
     def _difference(self, qpos: Float[Array, " nq"], other: Float[Array, " nq"]) -> Float[Array, " nv"]:
         """Return what leads from `other` to `qpos`, along the velocities' directions."""
         if len(qpos) == self.nv:
             return qpos - other
-        turn = mjx_math.quat_mul(mjx_math.quat_inv(other[3:7]), qpos[3:7])
+        turn = quaternion_product(quaternion_conjugate(other[3:7]), qpos[3:7])
         turn = 2 * turn[1:] * jnp.where(turn[0] < 0, -1.0, 1.0)  # the small angle between them
         return jnp.concatenate([qpos[:3] - other[:3], turn, qpos[7:] - other[7:]])
 
@@ -401,13 +402,10 @@ class WindowSimulator:
         cut = ctrl[self.windows.motion[:, None], self._steps]
         return cut.reshape(self.count, cut.shape[1] * cut.shape[2], *cut.shape[3:])
 
-    def _chunks(self, size: int) -> list[tuple[Int[np.ndarray, " chunk"], int]]:
-        """Rows of windows in equal parts, the last filled up; and how many of each count."""
-        size = min(size, self.count)
-        parts = -(-self.count // size)
-        size = -(-self.count // parts)
-        firsts = range(0, self.count, size)
-        return [((first + np.arange(size)) % self.count, min(size, self.count - first)) for first in firsts]
+    def _chunks(self, most: int) -> Iterator[tuple[Int[np.ndarray, " chunk"], int]]:
+        """Return chunks of windows, all about as large: a program is compiled for these windows anyway."""
+        parts = -(-self.count // most)
+        return chunks(self.count, -(-self.count // parts))
 
 
 _CHUNK = 1024

@@ -15,12 +15,8 @@ from jaxtyping import Float
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
-from ballu_mjx.identification.parameters import (
-    BodyTarget,
-    FieldTarget,
-    IdentifiedParameters,
-    declared_parameters,
-)
+from ballu_mjx.identification.declarations import declared_parameters
+from ballu_mjx.identification.parameters import BodyTarget, FieldTarget, IdentifiedParameters
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import set_fields
 

@@ -12,6 +12,8 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.policies.locomotion_env import Contents, LocomotionEnv, locomotion_state
 from ballu_mjx.rl.ppo import Inference, Params
+from ballu_mjx.sim.observation import ObservationLayout
+from ballu_mjx.sim.sharding import chunks
 
 
 class Rollout(NamedTuple):
@@ -32,7 +34,7 @@ class Rollout(NamedTuple):
     @property
     def yaw(self) -> Float[np.ndarray, "runs states"]:
         """Of the tracked body (rad), not unwrapped."""
-        return self.features[..., 8]
+        return self.features[..., ObservationLayout.yaw]
 
 
 _CHUNK = 100
@@ -81,15 +83,13 @@ class ClosedLoop:
         steps: int,
     ) -> Rollout:
         """Simulate `steps` control steps from each of the given states."""
-        batches = [slice(first, first + _BATCH) for first in range(0, len(qpos), _BATCH)]
-        rollouts = [self._batch(params, qpos[batch], qvel[batch], steps) for batch in batches]
+        parts = chunks(len(qpos), _BATCH)
+        rollouts = [self._batch(params, qpos[rows], qvel[rows], steps, kept) for rows, kept in parts]
         return Rollout(*(np.concatenate(parts) for parts in zip(*rollouts, strict=True)))
 
-    def _batch(self, params: Params, qpos: np.ndarray, qvel: np.ndarray, steps: int) -> Rollout:
-        runs = len(qpos)
-        filled = np.arange(_BATCH) % runs
+    def _batch(self, params: Params, qpos: np.ndarray, qvel: np.ndarray, steps: int, runs: int) -> Rollout:
         keys = jax.random.split(jax.random.key(0), _BATCH)
-        start = (jnp.asarray(x[filled], jnp.float32) for x in (qpos, qvel))
+        start = (jnp.asarray(x, jnp.float32) for x in (qpos, qvel))
         state = self._at(self._contents, *start, keys)
         pieces = [tuple(np.asarray(x)[:, None] for x in self._look(state))]
         outcomes = []

@@ -24,11 +24,11 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.tasks import Step, Task
 from ballu_mjx.policies.variants import SimulatorVariant
 from ballu_mjx.residuals.trained import TrainedResidual
-from ballu_mjx.rl.learner import initial_state
+from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, bare_parameters
 from ballu_mjx.sim.drivetrain import DrivetrainParameters, drivetrain_of
-from ballu_mjx.sim.observation import HISTORY, heading_observation
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout, heading_observation
 from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
@@ -173,7 +173,7 @@ def locomotion_observation(
     velocities, for a gait is the same one wherever it goes. The heading itself stands at the end, as cosine and sine:
     the task's direction is fixed in the world.
     """
-    yaw = features[8]
+    yaw = features[ObservationLayout.yaw]
     relative = heading_observation(features[None], anchored)  # its last entry is the yaw
     return jnp.concatenate([relative[:-1], jnp.cos(yaw)[None], jnp.sin(yaw)[None]])
 

@@ -12,11 +12,12 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.closed_loop import ClosedLoop, Rollout
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_locomotion_config
 from ballu_mjx.policies.policy import Policy, environment_of
-from ballu_mjx.policies.tasks import TASKS, Task
+from ballu_mjx.policies.tasks import Task, find_task
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Params, PPOConfig
-from ballu_mjx.rl.training_loop import ResumePoint, TrainingLoop, Validation
+from ballu_mjx.rl.resume_point import ResumePoint
+from ballu_mjx.rl.training_loop import TrainingLoop, Validation
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.progress import Progress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
@@ -80,7 +81,7 @@ def train_policy(
     start = start or ResumePoint()
     augmented = simulator.with_residual(None)
     check_policy_options(config, ppo_config, keep_every, augmented.robot)
-    chosen = _task(task) if isinstance(task, str) else task
+    chosen = find_task(task) if isinstance(task, str) else task
     actuators, residual = augmented.actuators, TrainedResidual.of(augmented)
     env = environment_of(augmented.robot, chosen, config, actuators, residual)
     infer = ppo.make_inference(env.observation_size, env.action_size, ppo_config)
@@ -121,9 +122,3 @@ def check_policy_options(
 def validation_trials(loop: ClosedLoop, params: Params, task: Task, control_timestep: float) -> Rollout:
     """Simulate whole trials of a policy without exploration, each from a starting state of its own."""
     return loop(params, *loop.standing(_VALIDATION_STARTS), round(task.trial_seconds / control_timestep))
-
-
-def _task(name: str) -> Task:
-    if name not in TASKS:
-        raise InputError(f"There is no task {name!r}; there are {', '.join(TASKS)}.")
-    return TASKS[name]

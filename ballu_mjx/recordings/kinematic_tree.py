@@ -9,6 +9,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from ballu_mjx.common.rotations import quaternion_integrate, quaternion_to_matrix, rotation_about
+
 _JOINT = mujoco.mjtJoint
 
 
@@ -75,13 +77,13 @@ class KinematicTree:
             if len(joints) and model.jnt_type[joints[0]] == _JOINT.mjJNT_FREE:
                 address, dof = model.jnt_qposadr[joints[0]], model.jnt_dofadr[joints[0]]
                 position = qpos[:, address : address + 3]
-                rotation = to_matrices(qpos[:, address + 3 : address + 7])
+                rotation = quaternion_to_matrix(qpos[:, address + 3 : address + 7])
                 axes[:, dof : dof + 3] = np.eye(3)
                 axes[:, dof + 3 : dof + 6] = rotation.transpose(0, 2, 1)
                 anchors[:, dof + 3 : dof + 6] = position[:, None]
             else:
                 position = positions[parent] + rotations[parent] @ model.body_pos[body]
-                rotation = rotations[parent] @ to_matrices(model.body_quat[body][None])[0]
+                rotation = rotations[parent] @ quaternion_to_matrix(model.body_quat[body][None])[0]
                 for joint in joints:
                     moved = qpos[:, model.jnt_qposadr[joint]] - model.qpos0[model.jnt_qposadr[joint]]
                     dof, place = model.jnt_dofadr[joint], model.jnt_pos[joint]
@@ -90,7 +92,7 @@ class KinematicTree:
                     if model.jnt_type[joint] == _JOINT.mjJNT_SLIDE:
                         position = position + axis * moved[:, None]
                     else:
-                        rotation = rotation @ _about(model.jnt_axis[joint], moved)
+                        rotation = rotation @ rotation_about(model.jnt_axis[joint], moved)
                         position = anchor - rotation @ place
             positions[body], rotations[body] = position, rotation
         points = tuple(positions[body] + rotations[body] @ place for body, place in self.points)
@@ -121,45 +123,5 @@ class KinematicTree:
         if self.model.jnt_type[0] != _JOINT.mjJNT_FREE:
             return qpos + step
         moved = np.concatenate([qpos[:, :3] + step[:, :3], qpos[:, 3:7], qpos[:, 7:] + step[:, 6:]], axis=1)
-        angle = np.linalg.norm(step[:, 3:6], axis=1, keepdims=True)
-        turn = np.concatenate([np.cos(angle / 2), step[:, 3:6] * np.sinc(angle / (2 * np.pi)) / 2], axis=1)
-        quaternion = multiply(qpos[:, 3:7], turn)
-        moved[:, 3:7] = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+        moved[:, 3:7] = quaternion_integrate(qpos[:, 3:7], step[:, 3:6])
         return moved
-
-
-# ---- rotations ----
-
-
-def multiply(a: Float[np.ndarray, "N 4"], b: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 4"]:
-    """Return products of quaternions (w, x, y, z)."""
-    w, x, y, z = a.T
-    p, q, r, s = b.T
-    return np.stack(
-        [
-            w * p - x * q - y * r - z * s,
-            w * q + x * p + y * s - z * r,
-            w * r - x * s + y * p + z * q,
-            w * s + x * r - y * q + z * p,
-        ],
-        axis=1,
-    )
-
-
-def to_matrices(quaternion: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 3 3"]:
-    """Return rotation matrices of unit quaternions (w, x, y, z)."""
-    w, x, y, z = quaternion.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
-
-
-def _about(axis: Float[np.ndarray, " 3"], angle: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 3 3"]:
-    """Rotations about one axis, by Rodrigues' formula."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    sine, versine = np.sin(angle)[:, None, None], 1 - np.cos(angle)[:, None, None]
-    return np.eye(3) + sine * cross + versine * (cross @ cross)

@@ -11,13 +11,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from ballu_mjx.common.rotations import quaternion_to_matrix
 from ballu_mjx.recordings.filters import (
     control_grid,
     interpolate,
@@ -28,10 +31,11 @@ from ballu_mjx.recordings.filters import (
 )
 from ballu_mjx.recordings.hooks import hooks_of
 from ballu_mjx.recordings.inverse_kinematics import solve_inverse_kinematics
-from ballu_mjx.recordings.kinematic_tree import KinematicTree, to_matrices
+from ballu_mjx.recordings.kinematic_tree import KinematicTree
 from ballu_mjx.recordings.motion import MeasurementGrid, Motion, ReconstructionParameters
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.sim.drivetrain import DrivetrainParameters, count_slots, filter_commands
 
 _STOP_GIVE = {False: float(np.deg2rad(0.5)), True: 5e-4}
 """How far beyond its range a hinge (rad) or a slide (m) may be: stops are soft, and springs hold joints inside."""
@@ -46,6 +50,7 @@ def reconstruct(
     robot: RobotDescription,
     model: mujoco.MjModel | None = None,
     parameters: ReconstructionParameters | None = None,
+    drivetrain: DrivetrainParameters | None = None,
 ) -> Motion:
     """Return states and commands at the control rate from a free recording.
 
@@ -54,6 +59,8 @@ def reconstruct(
     - `recording`: as `csv_format.read_recording` gives it: no missing values.
     - `model`: the robot to be simulated from these states, with its identified actuators, say; None: the nominal one.
     - `parameters`: noise and filters; the defaults suit motion capture of 0.5 mm and 0.3 deg.
+    - `drivetrain`: what commands meet on their way to that robot's actuators; joints that follow from commands follow
+      from what arrives.
 
     **Raises** `InputError` where measurements leave a joint open, or do not fit the model; `ValueError` for a suspended
     recording, and for one shorter than two control steps.
@@ -66,7 +73,7 @@ def reconstruct(
     # A semi-implicit integrator's velocity is the mean over the time step that led to the position.
     qvel -= np.gradient(qvel, grid.step, axis=0) * simulated.opt.timestep / 2
     _keep_ranges(simulated, qpos)
-    qpos, qvel = hooks.complete_joints(simulated, grid, qpos, qvel)
+    qpos, qvel = hooks.complete_joints(simulated, _driven(grid, drivetrain), qpos, qvel)
     states = slice(None, None, grid.samples_per_step)
     edges = np.arange(len(qpos[states])) * robot.control_timestep
     return Motion(
@@ -81,6 +88,15 @@ def reconstruct(
         joints=tuple(recording.joint_angles),
         uncertainty=fit.uncertainty,
     )
+
+
+def _driven(grid: MeasurementGrid, drivetrain: DrivetrainParameters | None) -> MeasurementGrid:
+    """Return the measurements with the commands as they arrive at the actuators."""
+    if drivetrain is None:
+        return grid
+    slots = count_slots(float(np.max(drivetrain.delay)), grid.step)
+    arrived = filter_commands(drivetrain, jnp.asarray(grid.command, jnp.float32), grid.step, slots)
+    return dataclasses.replace(grid, command=np.asarray(arrived, float))
 
 
 def resample(recording: Recording, model: mujoco.MjModel, robot: RobotDescription) -> MeasurementGrid:
@@ -140,11 +156,11 @@ def differentiate(
     body = int(model.site_bodyid[model.site(robot.tracked).id])
     tree = KinematicTree(model, [], [body])
     relative, _ = _from_root(tree, qpos)
-    tracked = _to_quaternions(to_matrices(qpos[:, 3:7]) @ relative)
+    tracked = _to_quaternions(quaternion_to_matrix(qpos[:, 3:7]) @ relative)
     quaternion, angular = smooth_rotation(sign_continuous(tracked), parameters.rotation_window, step, order)
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     relative, slope = _from_root(tree, smooth)
-    root = _to_quaternions(to_matrices(quaternion) @ relative.transpose(0, 2, 1))
+    root = _to_quaternions(quaternion_to_matrix(quaternion) @ relative.transpose(0, 2, 1))
     turning = (slope[:, :, 6:] @ rates[:, 7:, None])[..., 0]
     angular = (relative @ angular[..., None])[..., 0] - turning
     return (

@@ -29,6 +29,8 @@ POSITION = (0.002, 0.01)
 """Expected error of the tracked body's position (m) at a window's start, and what each second adds."""
 ANGLE = (np.deg2rad(0.3), np.deg2rad(0.6))
 """Likewise of its orientation (rad)."""
+_LOST = 20.0
+"""What a window counts as that diverged in simulation, in expected errors."""
 OUTLYING = 3.0
 """Expected errors beyond which a window counts less: a contact point slipped there, for example."""
 
@@ -140,3 +142,9 @@ def segment_errors(
 def pseudo_huber(squared: Any) -> Any:
     """Pseudo-Huber loss of windows, by their errors' squared length: that itself below `OUTLYING`, linear above."""
     return 2 * OUTLYING**2 * ((1 + squared / OUTLYING**2) ** 0.5 - 1)
+
+
+def count_lost(errors: Float[np.ndarray, "windows entries"]) -> Float[np.ndarray, "windows entries"]:
+    """Return errors of windows in which those that diverged have `_LOST` in all."""
+    finite = np.isfinite(errors).all(axis=1, keepdims=True)
+    return np.where(finite, errors, _LOST / math.sqrt(errors.shape[1]))

@@ -28,6 +28,7 @@ from ballu_mjx.recordings.segments import (
     OUTLYING,
     Segments,
     check_segments,
+    count_lost,
     cut_segments,
     pseudo_huber,
     simulate_segment,
@@ -83,8 +84,6 @@ _INSIDE = 0.01
 """Of `typical`: so far from its bounds a search begins. On one, the solver takes its first steps for nothing."""
 _GAIN, _STEP = 1e-4, 1e-3
 """Steps that gain less than that share of the cost, or are that short, are the contacts' noise."""
-_LOST = 20.0
-"""What a simulation that broke down counts as, in expected errors."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -308,10 +307,8 @@ class AirWindows:
 
     def _whole(self, vector: np.ndarray) -> Float[np.ndarray, "windows entries"]:
         """`errors`, at a whole delay."""
-        errors = np.array(self._run(np.float32(vector), self.windows), np.float64)
         self.control_steps += math.prod(np.shape(self.windows.features)[:2])
-        errors[~np.isfinite(errors).all(axis=1)] = _LOST / np.sqrt(errors.shape[1])
-        return errors
+        return count_lost(np.array(self._run(np.float32(vector), self.windows), np.float64))
 
     def simulate(self, vector: Float[Array, " parameters"], window: Segments) -> Float[Array, " entries"]:
         """`errors` of one window, at a whole delay; JAX's own transformations apply."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +11,6 @@ import numpy as np
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.aerodynamics import (
     AERODYNAMICS_FILE,
     AERODYNAMICS_FORMAT,
@@ -21,8 +19,8 @@ from ballu_mjx.residuals.aerodynamics import (
     air_parameters_to_json,
 )
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, check_air_config, identify_air
-from ballu_mjx.residuals.network import ForceNetworkConfig, recorded_inputs
-from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
+from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.white_box_training import FitReport, fitted_residual
 from ballu_mjx.robots.model import same_parameters
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
@@ -49,7 +47,8 @@ def fit_aerodynamics(
     - `motions`: what the simulator is to follow.
     - `config`: how to identify; None: the defaults.
     - `fixed_from`: an earlier result, whose parameters are kept but for those that are `free`; None: none are kept.
-    - `free`: names of the parameters to identify.
+    - `free`: names of the parameters to identify. Where the simulator's drivetrain has a delay, the delay is known and
+      not among them.
     - `run`: takes measurements and files, in a folder say; None: memory.
     - `progress`: is told of every evaluation.
 
@@ -58,39 +57,34 @@ def fit_aerodynamics(
     """
     config = config or AirConfig()
     check_air_config(config, simulator.control_timestep)
+    if has_delay(simulator):
+        free = [name for name in free if name != "delay"]
     if not free:
-        raise InputError(f"--free names no parameter; there are {', '.join(AIR_PARAMETERS)}.")
+        raise InputError(f"--free names no parameter that is unknown; there are {', '.join(AIR_PARAMETERS)}.")
     if fixed_from is not None and not same_parameters(fixed_from.actuators, simulator.actuators):
         raise InputError("The earlier residual belongs to other actuators than the simulator's; take the same.")
     if fixed_from is not None and not isinstance(fixed_from.model, Aerodynamics):
         raise InputError(f"The earlier residual is of kind {fixed_from.model.name}, not aerodynamic; give another.")
     record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run
-    began, done = time.perf_counter(), 0
-
-    def report(evaluation: int, cost: float) -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress.update("air", evaluation, _BESIDE + config.evaluations, cost)
-        record.log(done, {"cost": cost, "seconds": time.perf_counter() - began})
-
+    report, most = FitReport(record, progress, "cost"), _BESIDE + config.evaluations
     values = None if fixed_from is None else fixed_from.params
-    found = identify_air(simulator, motions, config, report, fixed_from=values, free=free)
-    if progress is not None:
-        progress.close()
-    record.log(done, {"control_steps": found.control_steps})
-    record.write(AERODYNAMICS_FILE, json.dumps(air_details(found), indent=2) + "\n")
-    reference, _ = stack_motions(simulator, motions)
-    inputs = np.asarray(recorded_inputs(reference, ForceNetworkConfig(), simulator.robot))
-    write_observed(record, inputs)
-    return TrainedResidual(
-        Aerodynamics(simulator.robot, simulator.mj_model),
-        found.parameters,
-        observed_range(inputs),
-        0,
-        simulator.actuators,
-        air_table(found),
+    found = identify_air(
+        simulator,
+        motions,
+        config,
+        lambda evaluation, cost: report("air", evaluation, most, cost),
+        fixed_from=values,
+        free=free,
     )
+    report.close(found.control_steps)
+    record.write(AERODYNAMICS_FILE, json.dumps(air_details(found), indent=2) + "\n")
+    model = Aerodynamics(simulator.robot, simulator.mj_model)
+    return fitted_residual(simulator, motions, model, found.parameters, record, air_table(found))
+
+
+def has_delay(simulator: Simulator) -> bool:
+    """Return whether the simulator's drivetrain delays commands."""
+    return simulator.drivetrain is not None and bool(np.max(simulator.drivetrain.delay) > 0)
 
 
 def air_details(found: AirFit) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from brax.envs.base import Env, State
 from jaxtyping import Array, Float, Int
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.common.rotations import quaternion_integrate
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import pad_to_bucket, stack_motions
 from ballu_mjx.residuals.network import (
@@ -31,7 +32,7 @@ from ballu_mjx.residuals.network import (
     square_newtons,
     world_loads,
 )
-from ballu_mjx.rl.learner import initial_state
+from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.coordinates import translations
 from ballu_mjx.sim.force_model import to_wrenches
@@ -179,7 +180,7 @@ class EnvMimicEnv(Env):
     def contents(self) -> dict[str, Any]:
         """What tells one environment from another of the same configuration, as arrays: the model's numbers, the
         recordings, and what a base residual has learned. Programs that take it as an argument (see
-        `learner.wrap_for_training`) serve them all."""
+        `training_env.wrap_for_training`) serve them all."""
         return {
             "model": self.simulator.simulator.model,
             "drivetrain": self.simulator.simulator.drivetrain,
@@ -261,10 +262,7 @@ class EnvMimicEnv(Env):
         if free:
             base = qpos[:3] + position[:3] * jax.random.normal(key_base, (3,))
             turn = position[3:6] * jax.random.normal(key_turn, (3,))
-            # A small rotation in the body frame: q (1, turn / 2), normalized.
-            w, v = qpos[3], qpos[4:7]
-            quaternion = jnp.concatenate([(w - v @ turn / 2)[None], v + (w * turn + jnp.cross(v, turn)) / 2])
-            root = [base, quaternion / jnp.linalg.norm(quaternion)]
+            root = [base, quaternion_integrate(qpos[3:7], turn)]
         recorded = qpos[len(qpos) - nv + free :]
         hinges = recorded + position[free:] * jax.random.normal(key_hinge, (nv - free,))
         hinges = hinges.at[self._held - free].set(recorded[self._held - free])

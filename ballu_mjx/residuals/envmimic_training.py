@@ -15,7 +15,8 @@ from ballu_mjx.residuals.network import NetworkForces, num_inputs
 from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
-from ballu_mjx.rl.training_loop import ResumePoint, TrainingLoop, Validation
+from ballu_mjx.rl.resume_point import ResumePoint
+from ballu_mjx.rl.training_loop import TrainingLoop, Validation
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.progress import Progress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
@@ -66,7 +67,7 @@ def train_envmimic(
     env = EnvMimicEnv(augmented, motions, config)
     sizes = env.observation_size, env.action_size, ppo_config
     infer = ppo.make_inference(*sizes)
-    forces = NetworkForces(config, robot, infer, ppo.make_sampler(*sizes))
+    forces = NetworkForces(config, robot, infer, ppo.make_sampler(*sizes), network=ppo_config)
     model, all_params = add_to_base(augmented.residual, forces)
     measure = (evaluators or Evaluators(plain)).of(model, motions if validation is None else validation)
     tells_best = Validation(lambda params: measure(all_params(params)).score)

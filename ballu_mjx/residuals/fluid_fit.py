@@ -26,6 +26,7 @@ from ballu_mjx.recordings.segments import (
     OUTLYING,
     Segments,
     check_segments,
+    count_lost,
     cut_segments,
     pseudo_huber,
     simulate_segment,
@@ -33,7 +34,7 @@ from ballu_mjx.recordings.segments import (
 from ballu_mjx.residuals.fluid import TERM_SETS, FluidCoefficients, FluidForces, TermSet, mirrored, terms_of
 from ballu_mjx.sim.force_model import BoundForces
 from ballu_mjx.sim.observation import HISTORY
-from ballu_mjx.sim.sharding import shard_over_devices
+from ballu_mjx.sim.sharding import chunks, shard_over_devices
 from ballu_mjx.sim.simulator import Simulator
 
 
@@ -169,15 +170,10 @@ class _Windows:
         self.count, self.steps = np.shape(self.segments.features)[:2]
 
     def errors(self, params: Float[np.ndarray, "terms 6"]) -> Float[np.ndarray, "windows entries"]:
-        """Return the errors of all windows, in expected errors; diverged ones count as `_LOST`."""
+        """Return the errors of all windows, in expected errors (`segments.count_lost`)."""
         self.program.control_steps += self.count * self.steps
-        filled = np.arange(-(-self.count // _BATCH) * _BATCH) % self.count
-        parts = filled.reshape(-1, _BATCH)
-        found = [self.program.errors(np.float32(params), self._chosen(part)) for part in parts]
-        errors = np.concatenate(found).astype(np.float64)[: self.count]
-        lost = ~np.isfinite(errors).all(axis=1)
-        errors[lost] = _LOST / np.sqrt(errors.shape[1])
-        return errors
+        found = [self.program.errors(np.float32(params), self._chosen(rows)) for rows, _ in chunks(self.count, _BATCH)]
+        return count_lost(np.concatenate(found).astype(np.float64)[: self.count])
 
     def slopes(
         self, params: Float[np.ndarray, "terms 6"], directions: Float[np.ndarray, "size terms 6"]
@@ -185,11 +181,11 @@ class _Windows:
         """Return how errors change along directions; diverged windows do not."""
         size = len(directions)
         self.program.control_steps += self.count * self.steps * size
-        window, direction = np.divmod(np.arange(-(-self.count * size // _BATCH) * _BATCH) % (self.count * size), size)
         found = []
-        for part in np.arange(len(window)).reshape(-1, _BATCH):
-            own = np.float32(directions[direction[part]])
-            found.append(self.program.slopes(np.float32(params), own, self._chosen(window[part])))
+        for rows, _ in chunks(self.count * size, _BATCH):
+            window, direction = np.divmod(rows, size)
+            own = np.float32(directions[direction])
+            found.append(self.program.slopes(np.float32(params), own, self._chosen(window)))
         slopes = np.concatenate(found).astype(np.float64)[: self.count * size].reshape(self.count, size, -1)
         slopes[~np.isfinite(slopes).all(axis=(1, 2))] = 0.0
         return np.swapaxes(slopes, 1, 2)
@@ -286,8 +282,6 @@ _BATCH = 1024
 """Simulations side by side."""
 _LEAST = 1e-3
 """Of the largest typical term: smaller ones count as so large, so that no coefficient may grow without limit."""
-_LOST = 20.0
-"""What a window that diverged counts as, in expected errors."""
 
 
 def _whole_body(simulator: Simulator) -> tuple[float, float]:

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Sequence
 
 import jax.numpy as jnp
-import numpy as np
 
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.fluid import FLUID_FILE, FluidForces
 from ballu_mjx.residuals.fluid_fit import FluidConfig, FluidFit, fit_fluid_forces
-from ballu_mjx.residuals.network import ForceNetworkConfig, recorded_inputs
-from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
+from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.white_box_training import FitReport, fitted_residual
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
 from ballu_mjx.sim.simulator import Simulator
@@ -43,31 +40,13 @@ def fit_fluid(
     """
     config = config or FluidConfig()
     record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run
-    began, done = time.perf_counter(), 0
-
-    def report(stage: str, iteration: int, steps: int, loss: float) -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress.update(stage, iteration, steps, loss)
-        record.log(done, {"loss": loss, "seconds": time.perf_counter() - began})
-
+    report = FitReport(record, progress, "loss")
     found = fit_fluid_forces(simulator, motions, validation, config, report)
-    if progress is not None:
-        progress.close()
-    record.log(done, {"control_steps": found.control_steps})
+    report.close(found.control_steps)
     record.write(FLUID_FILE, found.coefficients.to_json())
-    reference, _ = stack_motions(simulator, motions)
-    inputs = np.asarray(recorded_inputs(reference, ForceNetworkConfig(), simulator.robot))
-    write_observed(record, inputs)
-    return TrainedResidual(
-        FluidForces(simulator.robot, simulator.mj_model, found.coefficients.term_set),
-        jnp.asarray(found.coefficients.values, jnp.float32),
-        observed_range(inputs),
-        0,
-        simulator.actuators,
-        fluid_table(found),
-    )
+    model = FluidForces(simulator.robot, simulator.mj_model, found.coefficients.term_set)
+    params = jnp.asarray(found.coefficients.values, jnp.float32)
+    return fitted_residual(simulator, motions, model, params, record, fluid_table(found))
 
 
 def fluid_table(found: FluidFit) -> str:

@@ -249,7 +249,7 @@ def _fit(
     reference, _ = stack_motions(plain, motions.training)
     inputs = np.asarray(recorded_inputs(reference, env, robot))
     sizes = {ppo.STATE: (inputs.shape[1],)}, num_loads(env, robot), network
-    network_forces = NetworkForces(env, robot, ppo.make_inference(*sizes), None, name)
+    network_forces = NetworkForces(env, robot, ppo.make_inference(*sizes), None, name, network)
     start = ppo.initial_policy(inputs, sizes[1], network)
     model, all_params = add_to_base(augmented.residual, network_forces)
     measure = (evaluators or Evaluators(plain)).of(model, motions.validation)

@@ -79,7 +79,7 @@ def _load_network(run: StoredRun) -> LoadedResidual:
             f"{folder}: the stored parameters do not fit the networks in its config.json; restore one of them."
         )
     sample = ppo.make_sampler(*sizes) if task == "envmimic" else None
-    return LoadedResidual(NetworkForces(config, robot, infer, sample, task), params, inputs, step)
+    return LoadedResidual(NetworkForces(config, robot, infer, sample, task, network), params, inputs, step)
 
 
 def _load_aerodynamics(run: StoredRun) -> LoadedResidual:

@@ -12,9 +12,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ballu_mjx.recordings.reference import ReferenceMotions
+from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.force_model import Fields, ForceSet, num_vectors, to_wrenches
-from ballu_mjx.sim.observation import HISTORY, ObservationLayout, commands_seen, heading_observation, world_rotation
+from ballu_mjx.sim.observation import (
+    HISTORY,
+    ObservationLayout,
+    commands_seen,
+    heading_observation,
+    heading_observation_names,
+    world_rotation,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,6 +59,28 @@ def network_input(
         return seen
     low, high = np.array(robot.command_ranges, np.float32).T
     return jnp.concatenate([seen, ((commands - low) / (high - low)).ravel()])
+
+
+def network_input_names(config: ForceNetworkConfig, robot: RobotDescription) -> list[str]:
+    """Return the names of `network_input`, each with its unit and control step."""
+    steps = ["now", "one control step ago", "two control steps ago"][:HISTORY][::-1]
+    seen = heading_observation_names((robot.tracked, *robot.points))
+    names = [f"{name}, {step}" for step in steps for name in seen]
+    if config.observe_command:
+        steps = ["coming", "last", "last but one"][:HISTORY][::-1]
+        names += [f"command {command}, share of its range, {step}" for step in steps for command in robot.commands]
+    return names
+
+
+def load_names(config: ForceNetworkConfig, robot: RobotDescription) -> list[str]:
+    """Return the names of a network's loads, each with its unit."""
+    tracked = f"force on {robot.tracked}, N"
+    vectors = {
+        "force": [tracked],
+        "wrench": [tracked, f"torque on {robot.tracked}, N m"],
+        "multi": [tracked, *(f"force at {point}, N" for point in robot.points)],
+    }[config.forces]
+    return [f"{vector.partition(',')[0]} {axis},{vector.partition(',')[2]}" for vector in vectors for axis in "xyz"]
 
 
 def num_inputs(config: ForceNetworkConfig, robot: RobotDescription) -> int:
@@ -100,6 +130,7 @@ class NetworkForces:
     - `robot`: which it pushes.
     - `infer`: (parameters, observation) to the most likely action.
     - `sample`: (parameters, observation, key) to a drawn one; None: there is none to be had.
+    - `network`: the network's options; None: unknown, and the residual cannot be exported.
     """
 
     config: ForceNetworkConfig
@@ -107,6 +138,7 @@ class NetworkForces:
     infer: Callable[[Any, Float[Array, " inputs"]], Float[Array, " loads"]]
     sample: Callable[[Any, Float[Array, " inputs"], Array], Float[Array, " loads"]] | None = None
     name: str = "envmimic"
+    network: PPOConfig | None = None
 
     def inputs(
         self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]

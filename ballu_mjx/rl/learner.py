@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -32,7 +32,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int, UInt32
 
 from ballu_mjx.rl import distributed, ppo
-from ballu_mjx.rl.ppo import STATE, Normalizer, Params, PPOConfig
+from ballu_mjx.rl.ppo import Normalizer, Params, PPOConfig
+from ballu_mjx.rl.training_env import MEASURED, wrap_for_training
 
 
 class TrainingState(NamedTuple):
@@ -67,84 +68,7 @@ Stored = Mapping[str, np.ndarray]
 """A `TrainingState` on the host: its arrays by their place in it."""
 
 _AXIS = "devices"
-_MEASURED = "measured"
 _MAX_CALLS = 400
-
-
-def initial_state(inner: Any, observation: Any, metrics: Iterable[str]) -> State:
-    """Return an environment's state at the start of an episode: not done, reward and metrics (by name) 0."""
-    zero = jnp.zeros(())
-    return State(
-        pipeline_state=inner,
-        obs=observation,
-        reward=zero,
-        done=zero,
-        metrics={name: zero for name in metrics},
-        info={"truncation": zero},
-    )
-
-
-def wrap_for_training(env: Env) -> Wrapper:
-    """`env` vectorized, with every finished environment reset to a newly drawn state.
-
-    Brax's own auto-reset goes back to a cached first state for ever. Here all environments are reset in every step,
-    and the finished ones take the result: for environments whose reset costs nothing beside their step.
-
-    An `env` may have `contents`, a tree of arrays, and a method `with_contents(contents)` that gives the same with
-    others: a `Learner` hands them to its program, which so serves all environments that differ in nothing else.
-
-    An `env` with a method `renew(state, key)` is reset by it: what tells one variant of an environment from another can
-    then be handed on from state to state, instead of being a constant of the compiled program.
-
-    `env` ends its episodes itself, by time also: it sets `done` and, where only time ran out,
-    `info["truncation"]`, in both `reset` and `step`. What Brax's `compute_gae` makes of a truncated transition
-    `t`: its advantage is 0 and its value's target the value itself, so that it teaches nothing; the transition before
-    bootstraps from `V(s_t)`, as if the episode went on; the fresh state behind it never enters. So values are unbiased
-    at the price of one transition in an episode. A `done` without truncation is a termination, with 0 to come.
-
-    A step whose observation, reward or metrics are not all finite ends its episode with a reward of 0, and the numbers
-    that are none become 0: one robot that explodes must not spoil what all learn. The metric `diverged` is 1 there, and
-    otherwise the environment's own, if it has one.
-
-    The observation becomes a dictionary: `state` for the policy, `critic` for the value function where `env` gives both
-    by these names (else `state` serves both). `info["measured"]` has the step's reward and metrics, before any reset.
-    """
-    return _Training(env)
-
-
-class _Training(Wrapper):
-    """See `wrap_for_training`."""
-
-    def reset(self, rng: Array) -> State:
-        keys = jax.vmap(jax.random.split)(rng)
-        state = jax.vmap(self.env.reset)(keys[:, 0])
-        state = dataclasses.replace(state, metrics={_DIVERGED: jnp.zeros_like(state.reward)} | state.metrics)
-        return self._with_extras(state, state, keys[:, 1])
-
-    def step(self, state: State, action: Array) -> State:
-        keys = jax.vmap(jax.random.split)(state.info["reset_key"])
-        before = dataclasses.replace(state, done=jnp.zeros_like(state.done))
-        after = _only_finite(jax.vmap(self.env.step)(before, action))
-        renew = getattr(self.env, "renew", lambda state, key: self.env.reset(key))
-        fresh = jax.vmap(renew)(before, keys[:, 0])
-        done = after.done.astype(bool)
-
-        truncation = after.info["truncation"]
-        info = _where(done, fresh.info, {key: after.info[key] for key in fresh.info})
-        shown = dataclasses.replace(
-            after,
-            pipeline_state=_where(done, fresh.pipeline_state, after.pipeline_state),
-            obs=_where(done, fresh.obs, after.obs),
-            info=info | {"truncation": truncation},
-        )
-        return self._with_extras(shown, after, keys[:, 1])
-
-    def _with_extras(self, shown: State, outcome: State, keys: Array) -> State:
-        """Name the observations, and add the keys of the resets and the outcome's reward and metrics."""
-        measured = {"reward": outcome.reward} | outcome.metrics
-        info = shown.info | {"reset_key": keys, _MEASURED: jax.tree.map(jnp.float32, measured)}
-        named = dict(shown.obs) if isinstance(shown.obs, Mapping) else {STATE: shown.obs}
-        return dataclasses.replace(shown, obs=named, info=info)
 
 
 class Learner:
@@ -202,8 +126,8 @@ class Learner:
         """Control steps of a training step."""
         return _step_size(self._config)
 
-    def begin(self, seed: int) -> TrainingState:
-        """A fresh state; Brax's with this seed."""
+    def init(self, seed: int) -> TrainingState:
+        """Return a fresh state; Brax's with this seed."""
         arguments = np.array(jax.random.PRNGKey(seed)), self._contents
         first = self._first.lower(*arguments)
         state = jax.tree.map(
@@ -219,12 +143,12 @@ class Learner:
         return self._first(*arguments)
 
     def step(self, state: TrainingState) -> tuple[TrainingState, dict[str, Array]]:
-        """A training step: the state to the next one and its means, reward, metrics and losses. The memory of the state
+        """Take a training step; return the next state, and means of reward, metrics and losses. The memory of the state
         that goes in is used again."""
         return self._step(state, self._contents)
 
-    def go_on(self, stored: Stored, *, environments: bool = True) -> tuple[TrainingState, bool]:
-        """The state that `stored` was made of, and whether all of it could be used.
+    def resume(self, stored: Stored, *, environments: bool = True) -> tuple[TrainingState, bool]:
+        """Return the state that `stored` was made of, and whether all of it could be used.
 
         With `environments` False, or where theirs do not fit (another number of them, say), environments and random
         numbers are fresh ones, drawn from the configuration's seed and the steps done.
@@ -249,12 +173,12 @@ class Learner:
             name = _name(path)
             return leaf if name in drawn and not whole else np.array(stored[name])
 
-        template = shapes if whole else self.begin(_seed(self._config, steps))
+        template = shapes if whole else self.init(_seed(self._config, steps))
         return self._placed(jax.tree.map_with_path(choose, template)), whole
 
-    def begin_from(self, params: Params, steps: int) -> TrainingState:
-        """A state with what was learned in `steps` control steps, the optimizer and all else fresh."""
-        state = self.begin(_seed(self._config, steps))
+    def init_from(self, params: Params, steps: int) -> TrainingState:
+        """Return a state with what was learned in `steps` control steps, the optimizer and all else fresh."""
+        state = self.init(_seed(self._config, steps))
         known = params.normalizer
         normalizer = dataclasses.replace(
             state.normalizer,
@@ -287,7 +211,7 @@ class Learner:
             policy=self._networks.policy_network.init(key_policy),  # pyright: ignore[reportCallIssue]
             value=self._networks.value_network.init(key_value),  # pyright: ignore[reportCallIssue]
         )
-        return _settled(
+        return _with_own_memory(
             TrainingState(
                 networks=networks,
                 averaged=networks.policy,
@@ -307,14 +231,14 @@ class Learner:
         key_device = jax.random.split(key_step, self._devices)[jax.lax.axis_index(_AXIS)]
         key_learn, key_act, _ = jax.random.split(key_device, 3)
 
-        environments, data, measured = self._act(self._with_contents(contents), state, key_act)
+        environments, data, measured = self._collect(self._with_contents(contents), state, key_act)
 
         # Where the learning rate adapts, the old policy must still be what acted when the change is measured.
         adaptive = config.desired_kl > 0
         observe = functools.partial(running_statistics.update, batch=data.observation, pmap_axis_name=_AXIS)
         normalizer = state.normalizer if adaptive else observe(state.normalizer)
         (optimizer, networks, _), losses = jax.lax.scan(
-            functools.partial(self._pass, data=data, normalizer=normalizer),
+            functools.partial(self._epoch, data=data, normalizer=normalizer),
             (state.optimizer, state.networks, key_learn),
             length=config.num_updates_per_batch,
         )
@@ -334,9 +258,9 @@ class Learner:
             key=key,
             steps=state.steps + self.steps_each,
         )
-        return _settled(after), jax.lax.pmean(jax.tree.map(jnp.mean, measured | losses), _AXIS)
+        return _with_own_memory(after), jax.lax.pmean(jax.tree.map(jnp.mean, measured | losses), _AXIS)
 
-    def _act(self, env: Wrapper, state: TrainingState, key: Array) -> tuple[State, Transition, dict[str, Array]]:
+    def _collect(self, env: Wrapper, state: TrainingState, key: Array) -> tuple[State, Transition, dict[str, Array]]:
         """Environments one unroll or several on, the pieces of experience, leaves (pieces, unroll_length, ...), and
         rewards and metrics."""
         config = self._config
@@ -347,7 +271,7 @@ class Learner:
             environments, key = carry
             key, key_next = jax.random.split(key)
             environments, data = acting.generate_unroll(
-                env, environments, policy, key, config.unroll_length, extra_fields=("truncation", _MEASURED)
+                env, environments, policy, key, config.unroll_length, extra_fields=("truncation", MEASURED)
             )
             return (environments, key_next), data
 
@@ -355,10 +279,10 @@ class Learner:
         (environments, _), data = jax.lax.scan(unroll, (state.environments, key), length=count)
         data = jax.tree.map(lambda x: jnp.swapaxes(x, 1, 2).reshape(-1, x.shape[1], *x.shape[3:]), data)
         extras = dict(data.extras["state_extras"])
-        measured = extras.pop(_MEASURED)
+        measured = extras.pop(MEASURED)
         return environments, data._replace(extras={**data.extras, "state_extras": extras}), measured
 
-    def _pass(
+    def _epoch(
         self, carry: tuple[Any, Any, Array], nothing: None, *, data: Transition, normalizer: RunningStatisticsState
     ) -> tuple[tuple[Any, Any, Array], dict[str, Array]]:
         """Learn once from all that was collected, in minibatches drawn anew."""
@@ -371,13 +295,13 @@ class Learner:
             return x[order].reshape(self._config.num_minibatches, -1, *x.shape[1:])
 
         (optimizer, networks, _), losses = jax.lax.scan(
-            functools.partial(self._update, normalizer=normalizer),
+            functools.partial(self._minibatch, normalizer=normalizer),
             (optimizer, networks, key_loss),
             jax.tree.map(minibatches, data),
         )
         return (optimizer, networks, key), losses
 
-    def _update(
+    def _minibatch(
         self, carry: tuple[Any, Any, Array], data: Transition, *, normalizer: RunningStatisticsState
     ) -> tuple[tuple[Any, Any, Array], dict[str, Array]]:
         """Learn from one minibatch."""
@@ -408,7 +332,7 @@ def train(
     - `env`: unbatched; see `wrap_for_training` for what it must do.
     - `callback`: called before the first training step and then after every one, or every few of many. It may raise to
       stop.
-    - `start`: makes the state to go on from (see `Learner.go_on` and `Learner.begin_from`); without it a fresh one. A
+    - `start`: makes the state to go on from (see `Learner.resume` and `Learner.init_from`); without it a fresh one. A
       training that goes on from a stored state, on the same machine with the same number of devices, ends in the same
       numbers to the last bit as one that was never interrupted.
 
@@ -418,7 +342,7 @@ def train(
     **Raises** `InputError` from `ppo.check`.
     """
     learner = Learner(env, config)
-    state = start(learner) if start is not None else learner.begin(config.seed)
+    state = start(learner) if start is not None else learner.init(config.seed)
     call = callback or (lambda step, state, metrics: None)
     step = int(state.steps)
     per_call, calls = _schedule(config, step)
@@ -454,7 +378,7 @@ def params(state: TrainingState) -> Params:
 
 
 def stored(state: TrainingState) -> dict[str, np.ndarray]:
-    """All of `state`, copied to the host, for `Learner.go_on`; all processes must ask for it."""
+    """All of `state`, copied to the host, for `Learner.resume`; all processes must ask for it."""
     return {_name(path): distributed.on_host(leaf) for path, leaf in jax.tree.leaves_with_path(state)}
 
 
@@ -464,33 +388,7 @@ def with_learning_rate(stored: Stored, rate: float) -> dict[str, np.ndarray]:
     return {**stored, name: np.full_like(stored[name], rate)}
 
 
-_DIVERGED = "diverged"
-
-
-def _only_finite(state: State) -> State:
-    """What `wrap_for_training` says of numbers that are none; `state` is a batch."""
-    parts = jax.tree.leaves((state.obs, state.reward, state.metrics))
-    good = functools.reduce(jnp.logical_and, (jnp.isfinite(x).reshape(len(x), -1).all(axis=1) for x in parts))
-    metrics = {name: jnp.where(jnp.isfinite(x), x, 0.0) for name, x in state.metrics.items()}
-    return dataclasses.replace(
-        state,
-        reward=jnp.where(good, state.reward, 0.0),
-        done=jnp.where(good, state.done, 1.0),
-        metrics=metrics | {_DIVERGED: jnp.where(good, metrics.get(_DIVERGED, 0.0), 1.0)},
-        info=state.info | {"truncation": jnp.where(good, state.info["truncation"], 0.0)},
-    )
-
-
-def _where(done: Array, new: Any, old: Any) -> Any:
-    """`new` for the environments that are done, `old` for the others."""
-
-    def select(new: Array, old: Array) -> Array:
-        return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)
-
-    return jax.tree.map(select, new, old)
-
-
-def _settled(state: TrainingState) -> TrainingState:
+def _with_own_memory(state: TrainingState) -> TrainingState:
     """`state` as the compiled step takes it: no two arrays the same one (memory given away twice), and no type that
     only Python's numbers have (a second program)."""
     return jax.tree.map(lambda x: jnp.array(x, jnp.asarray(x).dtype, copy=True), state)

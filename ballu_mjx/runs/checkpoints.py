@@ -30,6 +30,7 @@ from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.runs.layout import CHECKPOINTS_FOLDER, KEPT, PARAMS_FOLDER, RECORD_FILE, TRAINING_FOLDER
 
+_LOG = logging.getLogger(__name__)
 CHECKPOINT_OVERHEAD = 2**20
 """Bytes of a checkpoint beside its arrays, at most."""
 
@@ -70,8 +71,7 @@ def restore_checkpoint(folder: Path, which: Which) -> tuple[int, dict[str, Any]]
 
 
 def last_checkpoint(folder: Path, *, training: bool = False) -> Checkpoint:
-    """A run's last checkpoint that is whole, with or without what it takes to go on; damaged ones are told on the
-    terminal.
+    """A run's last checkpoint that is whole, with or without what it takes to go on; damaged ones are logged.
 
     **Raises** `InputError` where there is none.
     """
@@ -80,7 +80,7 @@ def last_checkpoint(folder: Path, *, training: bool = False) -> Checkpoint:
         try:
             return _read(folder, step, training=training)
         except _DamagedError as error:
-            print(f"{error}; taking the one before.", file=sys.stderr)
+            _LOG.warning("%s; taking the one before.", error)
     if steps:
         raise InputError(f"{folder}: all checkpoints of the run are damaged; restore one from a copy or start anew.")
     raise _no_checkpoint(folder, "checkpoint")

@@ -246,7 +246,7 @@ class Run:
             then = f"go on with --resume {self.folder}: the checkpoint of step {self._whole:,} is whole"
         raise InputError(f"{self.folder}: its disk is full; make room there, then {then}.") from error
 
-    def log(self, step: int, metrics: Mapping[str, float]) -> None:
+    def log(self, step: int, metrics: Mapping[str, float | int]) -> None:
         """Add a line of measurements at `step`."""
         for logger in self._loggers:
             logger.log(step, metrics)

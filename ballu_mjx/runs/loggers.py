@@ -29,7 +29,7 @@ class LoggingOptions(runtime.CommandOptions):
 class Logger(Protocol):
     """A place for measurements."""
 
-    def log(self, step: int, metrics: Mapping[str, float]) -> None:
+    def log(self, step: int, metrics: Mapping[str, float | int]) -> None:
         """Add what was measured at `step`, by name; steps do not decrease."""
 
     def close(self, *, failed: bool = False) -> None:
@@ -43,7 +43,7 @@ class JsonLines:
         """Append to `path`."""
         self._file = path.open("a", encoding="utf-8")
 
-    def log(self, step: int, metrics: Mapping[str, float]) -> None:
+    def log(self, step: int, metrics: Mapping[str, float | int]) -> None:
         row = {"step": step, **{name: value if math.isfinite(value) else None for name, value in metrics.items()}}
         self._file.write(json.dumps(row) + "\n")
         self._file.flush()
@@ -70,7 +70,7 @@ class TensorBoard:
             status = event_pb2.SessionLog.START  # pyright: ignore[reportAttributeAccessIssue]
             self._write(first_step, session_log={"status": status})
 
-    def log(self, step: int, metrics: Mapping[str, float]) -> None:
+    def log(self, step: int, metrics: Mapping[str, float | int]) -> None:
         for name, value in _finite(metrics).items():
             self._write(step, summary=self._scalar(name, value))
         self._writer.flush()
@@ -111,7 +111,7 @@ class WeightsAndBiases:
             said = " ".join(str(error).split()).rstrip(".")
             raise InputError(f"--wandb {project}: {said}; run `wandb login`, or set WANDB_MODE=offline.") from error
 
-    def log(self, step: int, metrics: Mapping[str, float]) -> None:
+    def log(self, step: int, metrics: Mapping[str, float | int]) -> None:
         self._run.log(_finite(metrics), step=step)
 
     def close(self, *, failed: bool = False) -> None:
@@ -126,5 +126,5 @@ def check(project: str | None) -> None:
         )
 
 
-def _finite(metrics: Mapping[str, float]) -> dict[str, float]:
-    return {name: value for name, value in metrics.items() if math.isfinite(value)}
+def _finite(metrics: Mapping[str, float | int]) -> dict[str, float]:
+    return {name: float(value) for name, value in metrics.items() if math.isfinite(value)}

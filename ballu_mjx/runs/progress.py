@@ -51,6 +51,13 @@ class Progress:
             self._said = now
             print(f"{step:,} of {self._total:,} steps, {text}", file=self._stream, flush=True)
 
+    def tell(self, text: str) -> None:
+        """Show a line that stays."""
+        if self._bar is not None:
+            self._bar.write(text, file=self._stream)
+        else:
+            print(text, file=self._stream, flush=True)
+
     def close(self) -> None:
         """Leave the bar as it stands."""
         if self._bar is not None:

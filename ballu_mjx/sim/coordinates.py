@@ -11,6 +11,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ballu_mjx.common.rotations import quaternion_conjugate, quaternion_product
+
 _KINDS = mujoco.mjtJoint
 _TRANSLATIONS = {
     int(_KINDS.mjJNT_FREE): [True] * 3 + [False] * 3,
@@ -36,7 +38,7 @@ def expand(qpos: Float[Array, " nq"], change: Float[Array, " nv"], free: bool) -
     """
     if not free:
         return change
-    turn = product(qpos[3:7], jnp.concatenate([jnp.zeros(1), change[3:6]])) / 2
+    turn = quaternion_product(qpos[3:7], jnp.concatenate([jnp.zeros(1), change[3:6]])) / 2
     return jnp.concatenate([change[:3], turn, change[6:]])
 
 
@@ -44,11 +46,6 @@ def compress(qpos: Float[Array, " nq"], change: Float[Array, " nq"], free: bool)
     """Return the inverse of `expand`."""
     if not free:
         return change
-    conjugate = qpos[3:7] * jnp.array([1.0, -1.0, -1.0, -1.0])
-    return jnp.concatenate([change[:3], 2 * product(conjugate, change[3:7])[1:], change[7:]])
-
-
-def product(a: Float[Array, " 4"], b: Float[Array, " 4"]) -> Float[Array, " 4"]:
-    """Return the product of two quaternions (w, x, y, z)."""
-    v, w = a[1:], b[1:]
-    return jnp.concatenate([(a[0] * b[0] - v @ w)[None], a[0] * w + b[0] * v + jnp.cross(v, w)])
+    return jnp.concatenate(
+        [change[:3], 2 * quaternion_product(quaternion_conjugate(qpos[3:7]), change[3:7])[1:], change[7:]]
+    )

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.sim.coordinates import compress, expand, has_free_joint
 from ballu_mjx.sim.force_model import ForceSet, num_vectors, to_wrenches
-from ballu_mjx.sim.sharding import shard_over_devices
+from ballu_mjx.sim.sharding import chunks, shard_over_devices
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState
 from ballu_mjx.sim.vmap_last import nested_vmap
@@ -86,9 +86,8 @@ class Linearizer:
         """Linearize; a step whose derivatives are no numbers comes back with zeros."""
         count = len(steps.loads)
         found = []
-        for first in range(0, count, _CHUNK):
-            place = np.arange(first, first + _CHUNK) % count
-            found.append(self._each(jax.tree.map(lambda x, place=place: np.asarray(x, np.float32)[place], steps)))
+        for rows, _ in chunks(count, _CHUNK):
+            found.append(self._each(jax.tree.map(lambda x, rows=rows: np.asarray(x, np.float32)[rows], steps)))
         qpos, qvel, features, state, seen = (np.concatenate(parts)[:count] for parts in zip(*found, strict=True))
         good = np.isfinite(state).all(axis=(1, 2)) & np.isfinite(seen).all(axis=(1, 2))
         state, seen = (np.where(good.reshape(-1, 1, 1), x, 0.0).transpose(0, 2, 1) for x in (state, seen))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import ClassVar
 
 import jax
@@ -137,6 +138,20 @@ def heading_observation(
         return jnp.concatenate([vectors.ravel(), jnp.stack([roll, pitch, wrap_angle(yaw - heading)])])
 
     return jax.vmap(relative)(history).ravel()
+
+
+def heading_observation_names(names: Sequence[str]) -> list[str]:
+    """Return the names, with units, of one control step of `heading_observation`, in order.
+
+    `names` are the tracked body and the points.
+    """
+    kinematics = [
+        f"{name} {quantity} {axis}, {unit}"
+        for name in names
+        for quantity, unit in (("position", "m"), ("velocity", "m/s"))
+        for axis in "xyz"
+    ]
+    return [*kinematics, *(f"{names[0]} {angle}, rad" for angle in ("roll", "pitch", "yaw"))]
 
 
 def commands_seen(commands: Float[Array, "steps commands"], time: Int[Array, ""]) -> Float[Array, "3 commands"]:

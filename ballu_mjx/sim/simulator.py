@@ -29,6 +29,7 @@ from ballu_mjx.sim.drivetrain import (
 )
 from ballu_mjx.sim.force_model import BoundForces, HasForces, add_wrenches
 from ballu_mjx.sim.observation import observe_features
+from ballu_mjx.sim.sharding import chunks
 from ballu_mjx.sim.step import PhysicsState, control_step, count_substeps, load_state, make_data, put_model, state_at
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 
@@ -117,11 +118,10 @@ class Simulator:
     ) -> tuple[Float[Array, "... features"], Float[Array, "... 3"]]:
         """`observe`, of any number of states; one compiled program serves them all."""
         shape, count = qpos.shape[:-1], math.prod(qpos.shape[:-1])
-        filled = np.arange(-(-count // _CHUNK) * _CHUNK) % count
         flat = state_at(qpos.reshape(count, -1), qvel.reshape(count, -1))
-        chunks = [PhysicsState(*(x[part] for x in flat)) for part in filled.reshape(-1, _CHUNK)]
+        parts = [PhysicsState(*(x[rows] for x in flat)) for rows, _ in chunks(count, _CHUNK)]
         fixed = self._masses, self._sites, self._root
-        pieces = [_observe_chunk(self.model, self._template, chunk, *fixed) for chunk in chunks]
+        pieces = [_observe_chunk(self.model, self._template, part, *fixed) for part in parts]
         features, com = (jnp.concatenate(parts)[:count] for parts in zip(*pieces, strict=True))
         return features.reshape(*shape, -1), com.reshape(*shape, -1)
 

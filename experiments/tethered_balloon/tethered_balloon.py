@@ -6,16 +6,16 @@
 # of it, in the project's format, the project's own command learns the forces that its simulator lacks; all that it is
 # told of the robot stands in `balloon.robot.json`. The table gives errors on recordings that training never saw.
 #
-# `python experiments/tethered_balloon/tethered_balloon.py` takes some minutes a seed on two cores; `--quick` shows
-# that it works.
+# `python experiments/tethered_balloon/tethered_balloon.py` takes some minutes a seed on two cores. `--quick` shows
+# that it works. `--method` learns by another residual method than EnvMimic.
 
 # %%
 from __future__ import annotations
 
 import argparse
 import shutil
-import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 FOLDER = Path("experiments/tethered_balloon") if "ipykernel" in sys.modules else Path(__file__).parent
@@ -30,7 +30,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP
+from ballu_mjx.cli import train
 from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, read_evaluation
 from ballu_mjx.recordings.csv_format import write_recording
 from ballu_mjx.recordings.recording import Recording
@@ -75,7 +75,7 @@ def record(description: RobotDescription, name: str, seconds: float, seed: int) 
     model = real(description)
     data = mujoco.MjData(model)
     before, steps = 30 * RATE, round(seconds * RATE)
-    control = round(CONTROL_TIMESTEP * RATE)
+    control = round(description.control_timestep * RATE)
     sent = np.repeat(commands(rng, (before + steps) // control), control, axis=0)
     sites = [description.tracked, *description.points]
     gust, decay = 0.0, np.exp(-1 / (4 * RATE))
@@ -105,38 +105,65 @@ def record(description: RobotDescription, name: str, seconds: float, seed: int) 
     )
 
 
+FLIGHTS = {"training": (6, 20.0), "validation": (2, 12.0), "test": (3, 22.0)}
+"""Number of recordings and their length (s), by use."""
+QUICK_FLIGHTS = {use: (1, 6.0) for use in FLIGHTS}
+
+
 def record_all(description: RobotDescription, folder: Path, quick: bool) -> None:
     """Recordings for training, validation and test."""
-    first = 0
-    for use, count, seconds in (("training", 6, 20.0), ("validation", 2, 12.0), ("test", 3, 22.0)):
-        count, seconds = (1, 8.0) if quick else (count, seconds)
+    for number_of_use, (use, (count, seconds)) in enumerate((QUICK_FLIGHTS if quick else FLIGHTS).items()):
         (folder / use).mkdir(parents=True, exist_ok=True)
         for number in range(count):
-            flight = record(description, f"flight-{use}-{number}", seconds, first + number)
+            flight = record(description, f"flight-{use}-{number}", seconds, 100 * number_of_use + number)
             write_recording(flight, folder / use / f"{flight.name}.csv.gz", description)
-        first += 100
 
 
 # %% [markdown]
-# ## EnvMimic, by the command
+# ## A residual, by the command
 
 # %%
-QUICK: list[str] = ["--num-timesteps", "20000", "--num-envs", "64", "--batch-size", "64"]
+METHODS = {
+    "envmimic": ["envmimic"],
+    "envmimic-wrench": ["envmimic", "--forces", "wrench"],
+    "envmimic-multi": ["envmimic", "--forces", "multi"],
+    "supervised": ["supervised"],
+    "analytic": ["analytic"],
+    "aerodynamic": ["aerodynamic"],
+    "fluid": ["fluid"],
+}
+"""Beginnings of the commands, by method."""
+_FEW = ["--num-timesteps", "4000", "--num-envs", "16", "--batch-size", "16", "--num-minibatches", "4"]
+QUICK = {
+    "envmimic": _FEW,
+    "supervised": ["--updates", "50"],
+    "analytic": ["--window-seconds", "0.5", "--relinearizations", "1", "--updates", "20"],
+    "aerodynamic": ["--window-seconds", "0.5", "--evaluations", "2"],
+    "fluid": ["--terms", "linear", "--window-seconds", "0.5", "--steps", "1"],
+}
+"""Options of a training of seconds, by subcommand."""
 
 
-def learn(recordings: Path, run: Path, seed: int, quick: bool) -> Evaluation:
+def arguments_of(recordings: Path, run: Path, method: str, seed: int, quick: bool) -> list[str]:
+    """The arguments of `ballu_mjx.train`: of a new run, or of one that goes on."""
+    command = METHODS[method]
+    if list_checkpoints(run) and command[0] == "envmimic":
+        return [command[0], "--resume", str(run)]
+    shutil.rmtree(run, ignore_errors=True)
+    options = ["--robot", str(DESCRIPTION), "--output", str(run)]
+    for option, use in (("recordings", "training"), ("validation", "validation"), ("test", "test")):
+        options += [f"--{option}", str(recordings / use)]
+    if command[0] in ("envmimic", "supervised", "analytic"):  # the others draw nothing
+        options += ["--seed", str(seed)]
+    return [*command, *options, *(QUICK[command[0]] if quick else [])]
+
+
+def learn(recordings: Path, run: Path, method: str, seed: int, quick: bool) -> Evaluation:
     """Train, unless the run is there already, or go on with it; its evaluation on the test recordings."""
     if not (run / "evaluation.json").exists():
-        command = [sys.executable, "-m", "ballu_mjx.train", "envmimic"]
-        if list_checkpoints(run):
-            command += ["--resume", str(run)]
-        else:
-            shutil.rmtree(run, ignore_errors=True)
-            command += ["--robot", str(DESCRIPTION), "--seed", str(seed), "--output", str(run)]
-            for option, use in (("recordings", "training"), ("validation", "validation"), ("test", "test")):
-                command += [f"--{option}", str(recordings / use)]
-            command += QUICK if quick else []
-        subprocess.run(command, check=True)
+        status = train.main(arguments_of(recordings, run, method, seed, quick))
+        if status:
+            sys.exit(status)
     return read_evaluation(run / "evaluation.json")
 
 
@@ -150,25 +177,28 @@ def errors(found: tuple[Errors, ...], quantity: str, horizon: float) -> float:
 
 
 # %%
-def main() -> None:
-    parser = argparse.ArgumentParser(description="EnvMimic on a tethered balloon in wind.")
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description="A residual for a tethered balloon in wind.")
+    parser.add_argument("--method", choices=METHODS, default="envmimic", help="how the residual is learned")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="seeds of the trainings")
     parser.add_argument("--output", type=Path, default=Path("runs/tethered-balloon"), help="folder of all that is made")
     parser.add_argument("--quick", action="store_true", help="one seed, for seconds; the numbers mean little")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
 
     description = read_description(DESCRIPTION)
     recordings = options.output / "recordings"
     record_all(description, recordings, options.quick)
     seeds = options.seeds[:1] if options.quick else options.seeds
-    found = [learn(recordings, options.output / f"envmimic-{seed}", seed, options.quick) for seed in seeds]
+    method = options.method
+    found = [learn(recordings, options.output / f"{method}-{seed}", method, seed, options.quick) for seed in seeds]
+    name = METHODS[method][0]
 
     horizons = [h for h in HORIZONS if any(h in each.position for each in found[0].vanilla)]
     lines = [
-        "| horizon (s) | vanilla: m, deg | EnvMimic: m, deg | left of vanilla's: position | yaw |",
+        f"| horizon (s) | vanilla: m, deg | {label_of(name)}: m, deg | left of vanilla's: position | yaw |",
         "| ---: | --- | --- | --- | --- |",
     ]
-    curves: dict[str, list[list[float]]] = {"vanilla": [], "envmimic": []}
+    curves: dict[str, list[list[float]]] = {"vanilla": [], name: []}
     for horizon in horizons:
         absolute, left = [], []
         for quantity in ("position", "orientation"):
@@ -179,7 +209,7 @@ def main() -> None:
             left.append(f"{mean:.2f} [{low:.2f}, {high:.2f}]")
             if quantity == "position":
                 curves["vanilla"].append([without])
-                curves["envmimic"].append(each)
+                curves[name].append(each)
         (place, place_with), (yaw, yaw_with) = absolute
         lines.append(
             f"| {horizon:g} | {place:.3f}, {yaw:.1f} | {place_with:.3f}, {yaw_with:.1f} | {' | '.join(left)} |"

@@ -29,10 +29,10 @@ TRAININGS = (
 SUBCOMMANDS = [
     "compare",
     "evaluate",
-    "export",
     "report",
     "view",
     *(f"record {name}" for name in ("import", "check", "simulate", "example-mapping")),
+    *(f"export {name}" for name in ("policy", "simulator", "check")),
     *(f"train {name}" for name in TRAININGS),
 ]
 
@@ -73,7 +73,7 @@ def test_every_help_tells_of_debug(line: str, capsys: pytest.CaptureFixture[str]
     [
         "compare nowhere",
         "evaluate nowhere",
-        "export nowhere",
+        *(f"export {name} nowhere" for name in ("policy", "simulator", "check")),
         "report nowhere",
         "view nowhere",
         "record check nowhere",

@@ -123,7 +123,7 @@ def test_every_command_ends_well_on_every_run(
     [
         ("report RUN --output OUT/page.html", RUNS),
         ("compare RUN", (*RESIDUAL_TASKS, "walk")),
-        ("export RUN --output OUT/robot --no-open-loop", ("walk",)),
+        ("export policy RUN --output OUT/robot --no-open-loop", ("walk",)),
     ],
 )
 def test_commands_work_on_the_runs_they_are_for(

@@ -31,7 +31,7 @@ def clock(seconds: float) -> Float[np.ndarray, " T"]:
 
 def resting(com: Float[np.ndarray, "T 3"], yaw: Float[np.ndarray, " T"]) -> Trajectory:
     """Without a step."""
-    return Trajectory(com, yaw, np.zeros(len(com), int))
+    return Trajectory(com, yaw, np.zeros(len(com), int), CONTROL_TIMESTEP)
 
 
 def straight(seconds: float, speed: float, yaw: float = 0.0) -> Trajectory:
@@ -93,15 +93,15 @@ def test_path_length_ignores_sway_and_keeps_the_last_second() -> None:
     noise = np.random.default_rng(0).normal(scale=0.002, size=way.com.shape)
     swaying = way.com + 0.03 * np.sin(2 * np.pi * 2.1 * time)[:, None] * np.array([0.0, 1.0, 0.3]) + noise
     everywhere = np.linalg.norm(np.diff(swaying[:, :2], axis=0), axis=1).sum()
-    assert path_length(way.com) == pytest.approx(24.35 * 0.05)
+    assert path_length(way.com, CONTROL_TIMESTEP) == pytest.approx(24.35 * 0.05)
     assert everywhere > 4 * 24.35 * 0.05
-    assert path_length(swaying) == pytest.approx(24.35 * 0.05, rel=0.1)
-    assert path_length(way.com[:2]) == pytest.approx(0.05 * CONTROL_TIMESTEP)
+    assert path_length(swaying, CONTROL_TIMESTEP) == pytest.approx(24.35 * 0.05, rel=0.1)
+    assert path_length(way.com[:2], CONTROL_TIMESTEP) == pytest.approx(0.05 * CONTROL_TIMESTEP)
 
 
 def test_path_length_of_a_circle() -> None:
     """A chord a second: 2 r sin(angle / 2) each."""
-    assert path_length(circle(20, 1.0).com) == pytest.approx(20 * 2 * np.sin(np.pi / 20))
+    assert path_length(circle(20, 1.0).com, CONTROL_TIMESTEP) == pytest.approx(20 * 2 * np.sin(np.pi / 20))
 
 
 def test_single_precision_serves() -> None:
@@ -117,7 +117,7 @@ def test_refuses_paths_that_are_none() -> None:
         with pytest.raises(ValueError, match=f"The {name} has 1 states"):
             compare_trajectories(*pair)
     with pytest.raises(ValueError, match="21 centres of mass, but 20 yaws"):
-        compare_trajectories(way, Trajectory(way.com, way.yaw[:-1], way.steps))
+        compare_trajectories(way, Trajectory(way.com, way.yaw[:-1], way.steps, CONTROL_TIMESTEP))
 
 
 def test_json_round_trip() -> None:

@@ -50,7 +50,8 @@ def train(folder: Path) -> None:
     from ballu_mjx.residuals.run_config import describe_run
     from ballu_mjx.rl import learner
     from ballu_mjx.rl.ppo import PPOConfig
-    from ballu_mjx.rl.training_loop import TrainingLoop, Validation, find_resume_point
+    from ballu_mjx.rl.resume_point import find_resume_point
+    from ballu_mjx.rl.training_loop import TrainingLoop, Validation
     from ballu_mjx.runs.folder import Run
     from ballu_mjx.runs.progress import Progress
 

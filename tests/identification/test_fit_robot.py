@@ -9,10 +9,12 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from robot_files import write_robot
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, check_data, fit_robot, replay, soften
-from ballu_mjx.identification.parameters import ParameterSet, declared_parameters
+from ballu_mjx.identification.parameters import ParameterSet
 from ballu_mjx.identification.residuals import (
     MeasuredMotion,
     SamplingConfig,
@@ -21,7 +23,7 @@ from ballu_mjx.identification.residuals import (
     measure,
 )
 from ballu_mjx.recordings.csv_format import read_recording
-from ballu_mjx.robots.description import RobotDescription, read_description
+from ballu_mjx.robots.description import RobotDescription
 
 MODEL = """
 <mujoco>
@@ -52,19 +54,8 @@ NOISE = np.deg2rad(0.2)
 
 
 def robot(folder: Path) -> tuple[RobotDescription, ParameterSet, mujoco.MjModel]:
-    (folder / "arm.xml").write_text(MODEL)
-    content = {
-        "format": "ballu-robot/1",
-        "name": "arm",
-        "model": "arm.xml",
-        "tracked": "tip",
-        "points": [],
-        "commands": {"elbow": "servo"},
-        "joints": ["elbow"],
-        "identify": IDENTIFY,
-    }
-    (folder / "arm.robot.json").write_text(json.dumps(content))
-    description = read_description(folder / "arm.robot.json")
+    keys = {"tracked": "tip", "commands": {"elbow": "servo"}, "joints": ["elbow"], "identify": IDENTIFY}
+    description = write_robot(folder, "arm", MODEL, **keys)
     model = description.load_model()
     return description, declared_parameters(description, model), model
 

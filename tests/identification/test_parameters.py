@@ -1,7 +1,6 @@
 """Declared parameters: what they set, their coordinates, and what is refused."""
 
 import copy
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +9,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from robot_files import write_robot
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.identification.parameters import (
-    BODY_QUANTITIES,
-    IdentifiedParameters,
-    ParameterSet,
-    declared_parameters,
-    deform_body,
-)
-from ballu_mjx.robots.description import read_description
+from ballu_mjx.identification.body_deformation import BODY_QUANTITIES, deform_body
+from ballu_mjx.identification.declarations import declared_parameters
+from ballu_mjx.identification.parameters import IdentifiedParameters, ParameterSet
 from ballu_mjx.robots.model import ModelParameters, set_fields
 from ballu_mjx.sim.drivetrain import identity_drivetrain
 
@@ -50,18 +45,8 @@ MODEL = """
 
 
 def arm(folder: Path, *entries: dict[str, Any]) -> tuple[ParameterSet, mujoco.MjModel]:
-    (folder / "arm.xml").write_text(MODEL)
-    content = {
-        "format": "ballu-robot/1",
-        "name": "arm",
-        "model": "arm.xml",
-        "tracked": "tip",
-        "points": [],
-        "commands": {"left": "servo_left", "right": "servo_right"},
-        "identify": list(entries),
-    }
-    (folder / "arm.robot.json").write_text(json.dumps(content))
-    robot = read_description(folder / "arm.robot.json")
+    commands = {"left": "servo_left", "right": "servo_right"}
+    robot = write_robot(folder, "arm", MODEL, tracked="tip", commands=commands, identify=list(entries))
     model = robot.load_model()
     return declared_parameters(robot, model), model
 

@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_robot import replay
-from ballu_mjx.identification.parameters import ParameterSet, declared_parameters
+from ballu_mjx.identification.parameters import ParameterSet
 from ballu_mjx.robots.description import read_description
 
 ROOT = Path(__file__).parents[2]

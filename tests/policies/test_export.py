@@ -20,7 +20,7 @@ from rover import write_rover
 
 from ballu_mjx.cli import export as export_command
 from ballu_mjx.cli import train_policy
-from ballu_mjx.cli.export import Options
+from ballu_mjx.cli.export import PolicyOptions as Options
 from ballu_mjx.policies.deploy import controller, estimator, export
 from ballu_mjx.policies.deploy.controller import TIMEOUT, Controller, observation_names
 from ballu_mjx.policies.deploy.estimator import Capture
@@ -149,7 +149,7 @@ def test_onnx_that_is_not_installed_is_told_before_anything_is_written(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    assert export_command.main([str(run), "--output", str(tmp_path / "robot"), "--onnx"]) == 2
+    assert export_command.main(["policy", str(run), "--output", str(tmp_path / "robot"), "--onnx"]) == 2
     error = capsys.readouterr().err
     assert "ballu-mjx[onnx]" in error and error.count("\n") == 1
     assert not (tmp_path / "robot").exists()
@@ -338,7 +338,7 @@ def test_command_refuses_what_it_cannot_use(run: Path, tmp_path: Path, capsys: p
         ([run, "--pulse-low", "-1"], "--pulse-low"),
         ([run, "--pulse-low", "1500", "--pulse-high", "1500"], "nothing would move"),
     ):
-        assert export_command.main(list(map(str, arguments))) == 2
+        assert export_command.main(["policy", *map(str, arguments)]) == 2
         error = capsys.readouterr().err
         assert words in error and error.count("\n") == 1
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["notes.txt"]

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from robot_files import write_robot
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
@@ -21,7 +22,7 @@ from ballu_mjx.residuals.fluid import (
     terms_of,
 )
 from ballu_mjx.residuals.fluid_fit import FluidConfig, FluidFit, check_fluid_config, fit_fluid_forces
-from ballu_mjx.robots.description import RobotDescription, read_description
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.simulator import Simulator
 
@@ -41,18 +42,8 @@ LIFT = 0.15
 @pytest.fixture(scope="module")
 def glider(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
     folder = tmp_path_factory.mktemp("glider")
-    (folder / "glider.xml").write_text(GLIDER)
-    content = {
-        "format": "ballu-robot/1",
-        "name": "glider",
-        "model": "glider.xml",
-        "tracked": "hull",
-        "points": [],
-        "commands": {"left": "left", "right": "right"},
-        "mirror": {"left": "right"},
-    }
-    (folder / "glider.robot.json").write_text(json.dumps(content))
-    return read_description(folder / "glider.robot.json")
+    commands = {"left": "left", "right": "right"}
+    return write_robot(folder, "glider", GLIDER, tracked="hull", commands=commands, mirror={"left": "right"})
 
 
 def flights(robot: RobotDescription, seed: int, count: int) -> list[Motion]:

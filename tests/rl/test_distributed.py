@@ -25,7 +25,8 @@ from ballu_mjx.common import runtime
 runtime.prepare()
 from pathlib import Path
 from ballu_mjx.rl import distributed, ppo
-from ballu_mjx.rl.training_loop import ResumePoint, TrainingLoop, Validation
+from ballu_mjx.rl.resume_point import ResumePoint
+from ballu_mjx.rl.training_loop import TrainingLoop, Validation
 from ballu_mjx.runs.folder import Run
 from follower import Follower, weight
 

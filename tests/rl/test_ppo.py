@@ -16,7 +16,7 @@ from brax.training.agents.ppo.losses import compute_gae
 from follower import Follower, physics
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.rl import learner, ppo
+from ballu_mjx.rl import learner, ppo, training_env
 from ballu_mjx.rl.learner import Learner
 
 SMALL = ppo.PPOConfig(
@@ -82,7 +82,7 @@ def test_calls_count_every_control_step_once(trained):
     assert calls[-1][1].normalizer.count == calls[-1][0]
 
 
-class Braxs(learner._Training):
+class Braxs(training_env._Training):
     """With what only Brax's own loop reads."""
 
     def _with_extras(self, shown: State, outcome: State, keys: jax.Array) -> State:
@@ -152,16 +152,16 @@ def after(learned: Learner, state: learner.TrainingState, steps: int) -> dict[st
 
 
 def test_going_on_from_a_stored_state_is_as_if_never_stopped(short):
-    straight = after(short, short.begin(3), 5)
-    part = after(short, short.begin(3), 2)
+    straight = after(short, short.init(3), 5)
+    part = after(short, short.init(3), 2)
     other = Learner(Follower(), SMALL)  # as in another process
-    state, whole = other.go_on(part)
+    state, whole = other.resume(part)
     assert whole and same(after(other, state, 3), straight)
-    assert not same(after(short, short.begin(4), 5), straight), "another seed"
+    assert not same(after(short, short.init(4), 5), straight), "another seed"
 
 
 def test_the_policy_that_is_handed_out_is_an_average(short):
-    state = short.begin(0)
+    state = short.init(0)
     average: Any = None
     for count in (1, 2, 3, 3, 3):
         state, _ = short.step(state)
@@ -174,12 +174,12 @@ def test_the_policy_that_is_handed_out_is_an_average(short):
 
 
 def test_the_training_step_is_compiled_once(short):
-    state = short.begin(0)
+    state = short.init(0)
     for _ in range(3):
         state, _ = short.step(state)
-    state, _ = short.go_on(learner.stored(state))
+    state, _ = short.resume(learner.stored(state))
     short.step(state)
-    state = short.begin_from(learner.params(short.begin(1)), 100)
+    state = short.init_from(learner.params(short.init(1)), 100)
     short.step(state)
     assert short._step._cache_size() == 1
 
@@ -189,14 +189,14 @@ def test_one_device_compiles_the_training_step_once_too(monkeypatch: pytest.Monk
     monkeypatch.setattr(jax, "devices", lambda: first)
     monkeypatch.setattr(jax, "device_count", lambda: 1)
     alone = Learner(Follower(), SMALL)
-    state, _ = alone.step(alone.begin(0))
+    state, _ = alone.step(alone.init(0))
     alone.step(state)
     step: Any = alone._step
     assert step._cache_size() == 1
 
 
 def test_copies_of_a_state_outlive_it(short):
-    state = short.begin(0)
+    state = short.init(0)
     copies = learner.stored(state), learner.params(state)
     before = jax.tree.map(np.copy, copies)
     for _ in range(2):
@@ -205,9 +205,9 @@ def test_copies_of_a_state_outlive_it(short):
 
 
 def test_with_other_environments_the_optimizer_goes_on(short):
-    stored = after(short, short.begin(0), 2)
+    stored = after(short, short.init(0), 2)
     fewer = Learner(Follower(), dataclasses.replace(SMALL, num_envs=32))
-    state, whole = fewer.go_on(learner.with_learning_rate(stored, 0.125))
+    state, whole = fewer.resume(learner.with_learning_rate(stored, 0.125))
     kept = learner.stored(state)
     assert not whole
     assert kept["environments.reward"].shape == (32,)
@@ -219,7 +219,7 @@ def test_with_other_environments_the_optimizer_goes_on(short):
     assert len(going) > 20 and all(np.array_equal(stored[name], kept[name]) for name in going)
     wider = Learner(Follower(), dataclasses.replace(SMALL, value_layers=(17,)))
     with pytest.raises(ValueError, match="another shape"):
-        wider.go_on(stored)
+        wider.resume(stored)
 
 
 def test_training_goes_on_from_parameters_alone(trained):
@@ -230,7 +230,7 @@ def test_training_goes_on_from_parameters_alone(trained):
         Follower(),
         dataclasses.replace(SMALL, num_timesteps=2660),
         lambda step, state, metrics: steps.append((step, learner.params(state))),
-        start=lambda new: new.begin_from(params, 100),
+        start=lambda new: new.init_from(params, 100),
     )
     assert [step for step, _ in steps] == [100, 2660]
     for kept, given in zip(jax.tree.leaves(steps[0][1]), jax.tree.leaves(params), strict=True):
@@ -264,7 +264,7 @@ class Exploding(Follower):
 def test_numbers_that_are_none_reach_neither_learner_nor_means(part):
     environment = Exploding()
     environment.part = part
-    env = learner.wrap_for_training(environment)
+    env = training_env.wrap_for_training(environment)
     state = env.reset(jax.random.split(jax.random.PRNGKey(0), 2))
     before = physics(state)["goal"]
     state = env.step(state, jnp.array([[0.6], [0.1]]))
@@ -290,7 +290,7 @@ def test_fresh_policy_pushes_little(trained):
 
 
 def test_every_reset_draws_a_fresh_state():
-    env = learner.wrap_for_training(Follower())
+    env = training_env.wrap_for_training(Follower())
     step = jax.jit(env.step)
     state = jax.jit(env.reset)(jax.random.split(jax.random.key(0), 8))
     goals = [np.asarray(physics(state)["goal"])]
@@ -305,7 +305,7 @@ def test_every_reset_draws_a_fresh_state():
 
 
 def test_only_finished_environments_are_reset():
-    env = learner.wrap_for_training(Follower())
+    env = training_env.wrap_for_training(Follower())
     state = env.reset(jax.random.split(jax.random.key(0), 2))
     goals = np.asarray(physics(state)["goal"])
     for _ in range(3):
@@ -323,7 +323,7 @@ def test_only_finished_environments_are_reset():
 
 
 def test_time_limit_is_told_from_an_end():
-    env = learner.wrap_for_training(Follower())
+    env = training_env.wrap_for_training(Follower())
     state = env.reset(jax.random.split(jax.random.key(0), 2))
     ends = []
     for _ in range(Follower.limit + 1):

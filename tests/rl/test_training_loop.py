@@ -25,7 +25,9 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.rl import learner, ppo
 from ballu_mjx.rl.learner import Learner, TrainingState
 from ballu_mjx.rl.ppo import PPOConfig
-from ballu_mjx.rl.training_loop import ResumePoint, TrainingLoop, Validation, Watchdog, _made_with, find_resume_point
+from ballu_mjx.rl.resume_point import ResumePoint, find_resume_point, training_facts
+from ballu_mjx.rl.training_loop import TrainingLoop, Validation
+from ballu_mjx.rl.watchdog import Watchdog
 from ballu_mjx.runs.checkpoints import last_checkpoint, list_checkpoints, restore_checkpoint
 from ballu_mjx.runs.folder import Run, new_folder
 from ballu_mjx.runs.layout import RUN_FORMAT
@@ -70,8 +72,8 @@ def open_run(folder: Path) -> Run:
     return Run(folder, content())
 
 
-def session_in(run: Run, *, greatest: bool = False) -> TrainingLoop:
-    return TrainingLoop(run, Progress(1000, stream=io.StringIO()), 100, Validation(weight, "way", greatest))
+def session_in(run: Run, *, greatest: bool = False, stream: io.StringIO | None = None) -> TrainingLoop:
+    return TrainingLoop(run, Progress(1000, stream=stream or io.StringIO()), 100, Validation(weight, "way", greatest))
 
 
 def test_a_run_is_written_by_one_process_at_a_time(tmp_path):
@@ -115,12 +117,13 @@ def test_a_loss_that_is_no_number_ends_training_with_the_last_good_checkpoint(tm
     assert {row["step"] for row in read_metrics(tmp_path / "run")} == {100}
 
 
-def test_diverging_physics_is_told_once_and_only_above_a_thousandth(tmp_path, capsys):
+def test_diverging_physics_is_told_once_and_only_above_a_thousandth(tmp_path):
+    stream = io.StringIO()
     with open_run(tmp_path / "run") as run:
-        session = session_in(run)
+        session = session_in(run, stream=stream)
         for step, share in ((100, 0.0005), (200, 0.02), (300, 0.03)):
             session._step_done(step, state(1.0), GOOD | {"diverged": share})
-    error = capsys.readouterr().err
+    error = stream.getvalue()
     assert error.count("Physics diverged") == 1 and "2.00%" in error
 
 
@@ -144,7 +147,7 @@ def small() -> Learner:
 def saved(folder: Path, state: TrainingState, config: dict[str, Any], step: int = 160) -> Path:
     with Run(folder, config) as run:
         tree, training = ppo.as_tree(learner.params(state)), learner.stored(state)
-        run.save(step, tree, -1.0, training=training, notes=_made_with(config))
+        run.save(step, tree, -1.0, training=training, notes=training_facts(config))
     return folder
 
 
@@ -152,28 +155,28 @@ def resumed(folder: Path, config: PPOConfig) -> ResumePoint:
     return find_resume_point("walk", folder, config, output=None, quick=False)
 
 
-def test_a_run_goes_on_with_its_whole_state(tmp_path, small, capsys):
-    before = small.begin(5)
+def test_a_run_goes_on_with_its_whole_state(tmp_path, small):
+    before = small.init(5)
     start = resumed(saved(tmp_path / "run", before, content(env={"friction": (1.0, 2.0)})), CONFIG)
-    again = start.state(small, CONFIG, _made_with(content(env={"friction": [1.0, 2.0]})))
+    said: list[str] = []
+    again = start.state(small, CONFIG, training_facts(content(env={"friction": [1.0, 2.0]})), said.append)
     for name, value in learner.stored(before).items():
         np.testing.assert_array_equal(learner.stored(again)[name], value)
-    assert start.step == 160 and capsys.readouterr().out == ""
+    assert start.step == 160 and start.notice is None and said == []
 
 
 @pytest.mark.parametrize(
     ("ppo_change", "sections"),
     [({"seed": 1}, {}), ({}, {"env": {"friction": 2}}), ({}, {"recordings": {"training": [{"sha256": "1"}]}})],
 )
-def test_changed_options_start_the_environments_anew(tmp_path, small, capsys, ppo_change, sections):
-    before = small.begin(5)
+def test_changed_options_start_the_environments_anew(tmp_path, small, ppo_change, sections):
+    before = small.init(5)
     start = resumed(saved(tmp_path / "run", before, content()), CONFIG)
     changed = dataclasses.replace(CONFIG, learning_rate=0.5, **ppo_change)
-    again = learner.stored(start.state(small, changed, _made_with(content(changed, **sections))))
-    said = capsys.readouterr().out
-    assert (
-        "the environments start anew, for the options changed; the optimizer goes on" in said and said.count("\n") == 1
-    )
+    told: list[str] = []
+    again = learner.stored(start.state(small, changed, training_facts(content(changed, **sections)), told.append))
+    (said,) = told
+    assert "the environments start anew, for the options changed; the optimizer goes on" in said
     stored = learner.stored(before)
     assert np.array_equal(again["optimizer.1.count"], stored["optimizer.1.count"])
     assert again["optimizer.1.hyperparams.learning_rate"] == 0.5
@@ -181,8 +184,8 @@ def test_changed_options_start_the_environments_anew(tmp_path, small, capsys, pp
     assert again[goal].shape == stored[goal].shape and not np.array_equal(again[goal], stored[goal])
 
 
-def test_a_run_of_an_older_version_goes_on_from_its_parameters(tmp_path, small, capsys):
-    before = small.begin(5)
+def test_a_run_of_an_older_version_goes_on_from_its_parameters(tmp_path, small):
+    before = small.init(5)
     folder = tmp_path / "run"
     params = learner.params(before)
     with Run(folder, content()):
@@ -193,13 +196,14 @@ def test_a_run_of_an_older_version_goes_on_from_its_parameters(tmp_path, small, 
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config | {"format": "ballu-run/1"}))
     start = resumed(folder, CONFIG)
-    again = learner.params(start.state(small, CONFIG, _made_with(content())))
-    assert "an older version kept parameters alone" in capsys.readouterr().out
+    told: list[str] = []
+    again = learner.params(start.state(small, CONFIG, training_facts(content()), told.append))
+    assert "an older version kept parameters alone" in told[0]
     assert start.step == 160
     for name, value in learner.stored(before).items():
         if name.startswith("networks"):
             np.testing.assert_array_equal(
-                learner.stored(start.state(small, CONFIG, _made_with(content())))[name], value
+                learner.stored(start.state(small, CONFIG, training_facts(content()), told.append))[name], value
             )
     np.testing.assert_array_equal(again.normalizer.mean["state"], params.normalizer.mean["state"])
     with Run(folder, content(), resumed_at=160) as run:
@@ -221,18 +225,18 @@ def test_the_seconds_of_a_run_that_goes_on_go_on_too(tmp_path: Path) -> None:
     assert seconds == sorted(seconds)
 
 
-def test_a_run_without_a_checkpoint_begins_again_in_its_folder(tmp_path, capsys):
+def test_a_run_without_a_checkpoint_begins_again_in_its_folder(tmp_path):
     folder = tmp_path / "run"
     with open_run(folder) as run:
         run.log(0, {"validation_error": 1.0})
     start = resumed(folder, CONFIG)
-    assert "starting from the beginning" in capsys.readouterr().err
+    assert start.notice is not None and "starting from the beginning" in start.notice
     with Run(folder, content(), resumed_at=start.resumed_at):
         assert read_metrics(folder) == [], "it will be measured again"
 
 
 def test_a_run_that_ended_without_its_results_may_go_on_to_them(tmp_path, small):
-    folder = saved(tmp_path / "run", small.begin(5), content(), step=1120)
+    folder = saved(tmp_path / "run", small.init(5), content(), step=1120)
     assert resumed(folder, CONFIG).step == 1120
     (folder / "replay.npz").write_bytes(b"")
     with pytest.raises(InputError, match="already"):
@@ -242,13 +246,14 @@ def test_a_run_that_ended_without_its_results_may_go_on_to_them(tmp_path, small)
 def test_the_user_is_told_once_of_each_standstill_and_of_compiling_in_other_words(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    stream, now = io.StringIO(), [1000.0]
+    now = [1000.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    watchdog = Watchdog(Path("runs/walk"), limit=300.0, stream=stream)
+    told: list[str] = []
+    watchdog = Watchdog(Path("runs/walk"), told.append, limit=300.0)
 
     def told_at(moment: float) -> list[str]:
         watchdog.look(moment)
-        return stream.getvalue().splitlines()
+        return list(told)
 
     watchdog.step_done(None)
     assert not told_at(1299.0)
@@ -277,9 +282,9 @@ def watchdogs() -> list[threading.Thread]:
 
 
 def test_a_training_is_watched_until_it_ends(tmp_path: Path) -> None:
-    stream = io.StringIO()
-    with Watchdog(tmp_path, limit=0.01, stream=stream):
-        assert eventually(lambda: "No training step has finished" in stream.getvalue())
+    told: list[str] = []
+    with Watchdog(tmp_path, told.append, limit=0.01):
+        assert eventually(lambda: "No training step has finished" in "".join(told))
     with open_run(tmp_path / "run") as run:
         session = session_in(run)
         assert session._watchdog._limit == 300.0

@@ -14,7 +14,8 @@ from rover import write_rover
 from servo_arm import TRUTH, identified, true_path, wandering, write_arm
 
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
-from ballu_mjx.identification.parameters import IdentifiedParameters, declared_parameters
+from ballu_mjx.identification.declarations import declared_parameters
+from ballu_mjx.identification.parameters import IdentifiedParameters
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, LocomotionEnv, locomotion_state
 from ballu_mjx.policies.tasks import TASKS
 from ballu_mjx.recordings.motion import Motion

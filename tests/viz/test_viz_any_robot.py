@@ -147,7 +147,7 @@ def test_view_of_the_tethered_balloon(run: Path):
 
 
 def test_export_of_a_residual_says_what_it_needs(run: Path, capsys: pytest.CaptureFixture[str]):
-    assert export.main([str(run)]) == 2
+    assert export.main(["policy", str(run)]) == 2
     error = capsys.readouterr().err
     assert "is a residual (envmimic)" in error and "export that" in error and error.count("\n") == 1
     assert not (run / "export").exists()

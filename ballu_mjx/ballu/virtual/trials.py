@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtyping import Float
 from ballu_mjx.ballu import plots as ballu_plots
 from ballu_mjx.ballu.features import foot_positions
 from ballu_mjx.ballu.gait import count_steps
-from ballu_mjx.ballu.model import load_model
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import TrialConditions, VirtualRobot
 from ballu_mjx.evaluation.transfer import Trajectory, Transfer, compare_trajectories
@@ -24,6 +25,7 @@ from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.observation import ObservationLayout
 from ballu_mjx.sim.simulator import Simulator
 
 
@@ -54,11 +56,13 @@ def run_trials(
     draws: Sequence[TrialConditions],
     folder: Path,
     loop: ClosedLoop | None = None,
+    tell: Callable[[str], None] = lambda text: None,
 ) -> list[Transfer]:
     """Run each trial in closed loop from motion capture alone, under the controller that `export` ships, and compare it
     with the policy's own simulator (`loop`, where that is at hand already) from the same state.
 
-    Leaves in `folder` a recording a trial, and `trials.png`: the ways from above, on the robot and in simulation.
+    `tell` takes a sentence after each trial. Leaves in `folder` a recording a trial, and `trials.png`: the ways from
+    above, on the robot and in simulation.
     """
     stored = weights(policy)
     seconds, setting = policy.task.trial_seconds, policy.variant.name
@@ -70,11 +74,12 @@ def run_trials(
         path = folder / f"{name}.csv.gz"
         write_recording(recording, path, load_robot(), decimals=4)
         recordings.append(read_recording(path, load_robot()))  # reading fills the gaps
-        print(f"{policy.task.name}, {setting}: {name} of {len(draws)} done", flush=True)
+        tell(f"{policy.task.name}, {setting}: {name} of {len(draws)} done")
 
-    model = load_model(policy.actuators)
-    motions = [reconstruct(recording, load_robot(), model) for recording in recordings]
-    reference, com = stack_motions(Simulator(load_robot(), model=model), motions)
+    simulator = Simulator(load_robot(), policy.actuators)
+    restore = partial(reconstruct, robot=simulator.robot, model=simulator.mj_model, drivetrain=simulator.drivetrain)
+    motions = [restore(recording) for recording in recordings]
+    reference, com = stack_motions(simulator, motions)
     starts = [np.stack([getattr(motion, name)[0] for motion in motions]) for name in ("qpos", "qvel")]
     rollout = (loop or policy.closed_loop())(policy.params, starts[0], starts[1], len(motions[0].command))
     recorded = np.asarray(com), np.asarray(reference.features)
@@ -89,4 +94,5 @@ def run_trials(
 
 def _way(com: Float[np.ndarray, "T 3"], features: Float[np.ndarray, "T 27"]) -> Trajectory:
     """Of states as `observation.observe_features` sees them."""
-    return Trajectory(com, features[:, 8], count_steps(foot_positions(features)))
+    yaw, steps = features[:, ObservationLayout.yaw], count_steps(foot_positions(features))
+    return Trajectory(com, yaw, steps, CONTROL_TIMESTEP)

@@ -1,4 +1,4 @@
-"""A policy for the robot's own computer: `python -m ballu_mjx export RUN`.
+"""A policy for the robot's own computer: `python -m ballu_mjx export policy RUN`.
 
 What is written runs on Python and NumPy alone: `controller.py` and `estimator.py` of this package as they are, but for
 their imports, and the policy's parameters as `weights.npz`. JAX, and all that needs it, is imported inside functions:
@@ -9,25 +9,25 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import importlib.util
-import math
-import re
+import json
 import textwrap
 from collections.abc import Mapping
-from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.common.standalone import standalone_source
 from ballu_mjx.policies.deploy import controller, estimator
 
 if TYPE_CHECKING:
     from ballu_mjx.policies.policy import Policy
     from ballu_mjx.robots.description import RobotDescription
 
+POLICY_FORMAT = "ballu-policy/1"
+POLICY_FILE = "policy.json"
 _CHECKS = 20
 """Features and commands that go with the weights, for the robot to check its own arithmetic."""
 
@@ -46,7 +46,7 @@ class ExportOptions:
     """Write commands.csv, the commands that the policy gives in its own simulator."""
     onnx: bool = False
     """Write policy.onnx too, for other runtimes: from observation to commands, without estimator, rate limit and
-    time-out. Needs the extra onnx."""
+    time-out. Its properties name inputs and outputs, with units. Needs the extra onnx."""
     pulse_low: float = 1000.0
     """Pulse width, microseconds, that stands for the smallest value of a command."""
     pulse_high: float = 2000.0
@@ -83,8 +83,10 @@ def export_policy(options: ExportOptions) -> Path:
     for name, text in sources().items():
         (folder / name).write_text(text, encoding="utf-8")
     np.savez(folder / "weights.npz", **stored)  # pyright: ignore[reportArgumentType]
+    described = json.dumps(describe_policy(policy, stored, options.run), indent=2) + "\n"
+    (folder / POLICY_FILE).write_text(described, encoding="utf-8")
     if options.onnx:
-        (folder / "policy.onnx").write_bytes(onnx_model(stored))
+        (folder / "policy.onnx").write_bytes(policy_onnx(stored))
     if commands is not None:
         _write_commands(folder / "commands.csv", commands, policy.robot, options)
         if (said := _rate(commands, stored)) is not None:
@@ -96,17 +98,10 @@ def export_policy(options: ExportOptions) -> Path:
 
 def weights(policy: Policy) -> dict[str, np.ndarray]:
     """Return what `controller.Controller` reads: normalizer, layers of the mean's network, what the robot is seen and
-    driven by, and a few features and commands.
+    driven by, and a few features and commands."""
+    from ballu_mjx.rl.network_export import network_arrays
 
-    The policy's most likely action is the mean of its Gaussian: the network's output before the deviation, which is a
-    parameter of its own and is left out.
-    """
-    robot, network = policy.robot, policy.network
-    layers = _layers(policy.params.policy["params"])
-    mean, std = (np.asarray(m["state"]) for m in (policy.params.normalizer.mean, policy.params.normalizer.std))
-    clip = network.observation_clip
-    if not network.normalize_observations:
-        mean, std, clip = np.zeros_like(mean), np.ones_like(std), math.inf
+    robot = policy.robot
     features = _plausible(np.random.default_rng(0), _CHECKS, robot.features)
     act = policy.act()
     low, high = np.array(robot.command_ranges, float).T
@@ -121,66 +116,54 @@ def weights(policy: Policy) -> dict[str, np.ndarray]:
         "control_timestep": np.array(robot.control_timestep),
         "full_travel": np.array(robot.adapter.full_travel(robot)),
         "observation": np.array(controller.observation_names((robot.tracked, *robot.points))),
-        "mean": mean,
-        "std": std,
-        "observation_clip": np.array(clip),
-        "activation": np.array(network.activation),
-        **{f"kernel_{i}": kernel for i, (kernel, _) in enumerate(layers)},
-        **{f"bias_{i}": bias for i, (_, bias) in enumerate(layers)},
+        **network_arrays(policy.params, policy.network),
         "check_features": features,
         "check_commands": np.array([act(row) for row in features]),
     }
 
 
-def onnx_model(stored: Mapping[str, np.ndarray]) -> bytes:
-    """`weights` as an ONNX graph.
+def describe_policy(policy: Policy, stored: Mapping[str, np.ndarray], run: Path) -> dict[str, Any]:
+    """Return the content of `policy.json`: where the policy comes from, and what it sees and commands."""
+    robot = policy.robot
+    ranges = zip(robot.commands, robot.command_ranges, stored["command_rest"].tolist(), strict=True)
+    return {
+        "format": POLICY_FORMAT,
+        "run": str(run.resolve()),
+        "robot": robot.name,
+        "task": policy.task.name,
+        "step": policy.step,
+        "simulator": policy.variant.name,
+        "control_timestep": robot.control_timestep,
+        "observation": [_named(each) for each in stored["observation"].tolist()],
+        "commands": [
+            {"name": name, "unit": "that of the actuator's ctrl", "low": low, "high": high, "rest": rest}
+            for name, (low, high), rest in ranges
+        ],
+    }
+
+
+def _named(text: str) -> dict[str, str]:
+    name, _, unit = text.partition(", ")
+    return {"name": name, "unit": unit or "1"}
+
+
+def policy_onnx(stored: Mapping[str, np.ndarray]) -> bytes:
+    """Return `weights` as an ONNX graph.
 
     Input `observation`, float32 [batch, observations], in the order and units of `controller.observation_names`; output
     `command`, float32 [batch, commands], in the actuators' units.
     """
-    from onnx import TensorProto, checker, helper, numpy_helper
+    from ballu_mjx.rl.network_export import NetworkPort, OutputScale, onnx_model
 
-    nodes, constants = [], []
-
-    def constant(name: str, value: np.ndarray | float) -> str:
-        constants.append(numpy_helper.from_array(np.asarray(value, np.float32), name))
-        return name
-
-    def node(kind: str, inputs: list[str], output: str) -> str:
-        nodes.append(helper.make_node(kind, inputs, [output]))
-        return output
-
-    x = node("Sub", ["observation", constant("mean", stored["mean"])], "centred")
-    x = node("Div", [x, constant("std", stored["std"])], "normalized")
-    clip = float(stored["observation_clip"])
-    if math.isfinite(clip):
-        x = node("Clip", [x, constant("lowest", -clip), constant("highest", clip)], "clipped")
-    last = sum(name.startswith("kernel_") for name in stored) - 1
-    for i in range(last + 1):
-        kernel, bias = (constant(name, stored[name]) for name in (f"kernel_{i}", f"bias_{i}"))
-        x = node("Gemm", [x, kernel, bias], f"layer_{i}")
-        if i < last and str(stored["activation"]) == "swish":
-            x = node("Mul", [x, node("Sigmoid", [x], f"gate_{i}")], f"active_{i}")
-        elif i < last:
-            x = node("Tanh", [x], f"active_{i}")
-    x = node("Mul", [node("Add", [x, constant("one", 1.0)], "raised"), constant("half", 0.5)], "halved")
-    x = node("Clip", [x, constant("zero", 0.0), "one"], "share")
-    x = node("Mul", [x, constant("range", stored["command_high"] - stored["command_low"])], "scaled")
-    node("Add", [x, constant("low", stored["command_low"])], "command")
-    sizes = {"observation": len(stored["mean"]), "command": len(stored[f"bias_{last}"])}
-    ends = [helper.make_tensor_value_info(n, TensorProto.FLOAT, ["batch", size]) for n, size in sizes.items()]
-    graph = helper.make_graph(nodes, "policy", ends[:1], ends[1:], constants)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    checker.check_model(model)
-    return model.SerializeToString()
+    low, high = stored["command_low"], stored["command_high"]
+    commands = [f"{name}, the actuator's unit" for name in stored["commands"].tolist()]
+    ends = NetworkPort("observation", stored["observation"].tolist()), NetworkPort("command", commands)
+    return onnx_model(stored, *ends, OutputScale((high - low) / 2, (high + low) / 2, low, high), "policy")
 
 
 def sources() -> dict[str, str]:
     """The robot's files by name: the package's own text, free of the package and of jaxtyping."""
-    return {
-        name: _alone(resources.files("ballu_mjx.policies.deploy").joinpath(name).read_text(encoding="utf-8"))
-        for name in _FILES
-    }
+    return {name: standalone_source(__package__ or "", name) for name in _FILES}
 
 
 def open_loop(policy: Policy, steps: int) -> Float[np.ndarray, "steps commands"]:
@@ -190,28 +173,6 @@ def open_loop(policy: Policy, steps: int) -> Float[np.ndarray, "steps commands"]
 
 
 _FILES = ("controller.py", "estimator.py")
-_STAND_IN = '''
-
-class {name}:
-    """Stands in for jaxtyping's type of arrays, of which annotations here tell the shape."""
-
-    def __class_getitem__(cls, item):
-        return item[0]
-
-'''
-
-
-def _alone(source: str) -> str:
-    """A module's text that imports its neighbour from beside it, and nothing of jaxtyping."""
-    source = re.sub(r"^from ballu_mjx\.policies\.deploy\.(\w+) import", r"from \1 import", source, flags=re.MULTILINE)
-
-    def stand_ins(imported: re.Match[str]) -> str:
-        return "".join(_STAND_IN.format(name=name.strip()) for name in imported[1].split(","))
-
-    source = re.sub(r"^from jaxtyping import ([\w, ]+)\n", stand_ins, source, flags=re.MULTILINE)
-    left = re.search(r"^\s*(from|import) +(jaxtyping|ballu_mjx)\b.*", source, flags=re.MULTILINE)
-    assert left is None, left
-    return source
 
 
 def _check(options: ExportOptions) -> None:
@@ -222,25 +183,20 @@ def _check(options: ExportOptions) -> None:
             raise InputError(
                 f"--{name.replace('_', '-')} is {getattr(options, name):g}: give microseconds, above 0 and below 20000."
             )
-    if options.onnx and importlib.util.find_spec("onnx") is None:
-        raise InputError('--onnx: the package onnx is not installed; `pip install "ballu-mjx[onnx]"` brings it.')
+    if options.onnx:
+        from ballu_mjx.rl.network_export import check_onnx
+
+        check_onnx()
     if options.pulse_low == options.pulse_high:
         raise InputError(f"--pulse-low and --pulse-high are both {options.pulse_low:g}: nothing would move.")
 
 
-def _layers(tree: dict) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Kernel and bias of each layer of Brax's policy network, `PolicyModuleWithStd`."""
-    hidden = tree["MLP_0"]
-    assert set(tree) == {"MLP_0", "Dense_0", "std_logparam"}, set(tree)
-    assert set(hidden) == {f"hidden_{i}" for i in range(len(hidden))}, set(hidden)
-    layers = [hidden[f"hidden_{i}"] for i in range(len(hidden))] + [tree["Dense_0"]]
-    return [(np.asarray(layer["kernel"]), np.asarray(layer["bias"])) for layer in layers]
-
-
 def _plausible(rng: np.random.Generator, count: int, size: int) -> Float[np.ndarray, "count size"]:
     """Return features of the order of a moving robot's."""
+    from ballu_mjx.sim.observation import ObservationLayout
+
     features = rng.normal(0.0, 0.2, (count, size))
-    features[:, 8] = rng.uniform(-np.pi, np.pi, count)
+    features[:, ObservationLayout.yaw] = rng.uniform(-np.pi, np.pi, count)
     return features
 
 
@@ -342,6 +298,7 @@ Files
     estimator.py     its estimator: positions and velocities from motion capture frames so far
     weights.npz      the policy's network, the normalization of its observation, and names and units of what it
                      sees and commands
+    policy.json      the run that it comes from, and the same names and units, for other programs
     commands.csv     see 'Open loop' below
     policy.onnx      with --onnx: the network alone, from 'observation' (as below) to 'command', for other runtimes
 

@@ -1,0 +1,36 @@
+"""Commands with subcommands that are not `train`'s."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import tyro
+
+from ballu_mjx.common import runtime
+
+
+def run_subcommand(
+    name: str,
+    description: str,
+    subcommands: Mapping[str, type],
+    run: Callable[[Any], int],
+    arguments: Sequence[str] | None,
+) -> int:
+    """Parse the arguments (None: the process's own) of the command called `name`, and run the chosen subcommand's
+    options; returns the exit status (`runtime.exit_status`)."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+
+    def parse_and_run() -> int:
+        runtime.prepare()
+        options = tyro.extras.subcommand_cli_from_dict(
+            dict(subcommands),
+            args=arguments,
+            prog=f"python -m ballu_mjx {name}",
+            description=description,
+            config=(tyro.conf.OmitArgPrefixes,),
+        )
+        return run(options)
+
+    return runtime.exit_status(parse_and_run, arguments)

@@ -1,0 +1,397 @@
+"""Declarations of parameters that recordings may identify.
+
+A description's key `identify` lists them. An entry names an element of the model and what of it is identified:
+
+- `{"joint": "hinge", "field": "damping"}`; fields are damping, armature, frictionloss, stiffness, springref;
+- `{"actuator": "motor", "field": "kp"}`; kp and kd (position and velocity feedback; kp scales gain and bias together),
+  strength (scales gain and bias), gain, bias, forcerange (symmetric);
+- `{"tendon": "cable", "field": "springlength"}`; stiffness, damping, frictionloss, springlength (upper end);
+- `{"geom": "tip", "field": "friction"}` (sliding);
+- `{"body": "arm", "field": "mass"}`; mass (inertia grows along), com (3 parameters), inertia (6), or all 10 by
+  mass_properties;
+- `{"command": "left", "field": "delay"}`; scale, offset, delay, backlash, rate_limit, lag (`sim.drivetrain`);
+- any other numeric field of an element by MuJoCo's name for it: `{"joint": "hinge", "field": "jnt_range", "index": 0}`.
+
+Several elements in a list, `{"joint": ["hinge_left", "hinge_right"], ...}`, share one value. `"targets"`, a list of
+such element-field pairs, each with an optional `"factor"`, ties anything to anything. Optional keys: `name`, `unit`,
+`bounds`, `prior` (standard deviation among robots), `nominal`.
+
+Values of `mass` and of what a factor multiplies are those of the first element. A body's inertia is written as the
+nominal one deformed: its mass distribution is stretched by `stretch_x`, ... and sheared by `shear_xy`, ... along the
+nominal principal axes (a log-Cholesky factor relative to nominal; Rucker and Wensing, RA-L 7(2), 2022). Any mass above
+0 and any stretches above 0 then give an inertia that a rigid body can have.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+import mujoco
+import numpy as np
+
+from ballu_mjx.common.errors import InputError, is_number
+from ballu_mjx.identification.body_deformation import BODY_QUANTITIES, UNDEFORMED
+from ballu_mjx.identification.parameters import BodyTarget, CommandTarget, FieldTarget, Parameter, ParameterSet, Target
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.sim.drivetrain import QUANTITIES
+
+_BODY_GROUPS = {
+    "mass": BODY_QUANTITIES[:1],
+    "com": BODY_QUANTITIES[1:4],
+    "inertia": BODY_QUANTITIES[4:],
+    "mass_properties": BODY_QUANTITIES,
+}
+
+
+def declared_parameters(robot: RobotDescription, model: mujoco.MjModel) -> ParameterSet:
+    """Return the parameters that a robot description declares under `identify`.
+
+    **Raises** `InputError` naming the description, the entry and the fix.
+    """
+    if not robot.identify:
+        raise InputError(f'{robot.file}: "identify" is missing; list there which parameters to identify.')
+    found: list[Parameter] = []
+    for number, entry in enumerate(robot.identify, 1):
+        found += _Declaration(robot, model, number, entry).parameters()
+    names = [parameter.name for parameter in found]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f'{robot.file}: "identify" has two parameters {name}; give them different names.')
+    places = [(name, target[:2]) for name, p in zip(names, found, strict=True) for target in p.targets]
+    for name, place in places:
+        for other, same in places:
+            if name != other and place == same:
+                problem = f'"identify" sets the same number by {name} and {other}'
+                raise InputError(f"{robot.file}: {problem}; leave one out.")
+    return ParameterSet(found, len(robot.commands))
+
+
+_ELEMENTS = ("joint", "actuator", "tendon", "geom", "body", "command")
+_KEYS = (*_ELEMENTS, "field", "index", "factor", "targets", "name", "unit", "nominal", "bounds", "prior")
+_FIELDS: Mapping[str, Mapping[str, str]] = {
+    "joint": {
+        "damping": "dof_damping",
+        "armature": "dof_armature",
+        "frictionloss": "dof_frictionloss",
+        "stiffness": "jnt_stiffness",
+        "springref": "qpos_spring",
+    },
+    "actuator": {"gain": "actuator_gainprm", "bias": "actuator_biasprm"},
+    "tendon": {
+        "stiffness": "tendon_stiffness",
+        "damping": "tendon_damping",
+        "frictionloss": "tendon_frictionloss",
+        "springlength": "tendon_lengthspring",
+    },
+    "geom": {"friction": "geom_friction"},
+    "body": {},
+}
+_FIXED_INDEX = {"actuator_gainprm": 0, "actuator_biasprm": 0, "tendon_lengthspring": 1, "geom_friction": 0}
+_SERVO_FIELDS = ("kp", "kd", "strength", "forcerange")
+_PREFIXES = {
+    "joint": ("jnt_", "dof_", "qpos_"),
+    "actuator": ("actuator_",),
+    "tendon": ("tendon_",),
+    "geom": ("geom_",),
+    "body": ("body_",),
+}
+_OBJECTS = {
+    "joint": mujoco.mjtObj.mjOBJ_JOINT,
+    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
+    "tendon": mujoco.mjtObj.mjOBJ_TENDON,
+    "geom": mujoco.mjtObj.mjOBJ_GEOM,
+    "body": mujoco.mjtObj.mjOBJ_BODY,
+}
+_UNITS = {
+    "damping": "N m s/rad",
+    "armature": "kg m^2",
+    "frictionloss": "N m",
+    "stiffness": "N m/rad",
+    "springref": "rad",
+    "kp": "N m/rad",
+    "kd": "N m s/rad",
+    "forcerange": "N m",
+    "springlength": "m",
+    "mass": "kg",
+    "delay": "s",
+    "lag": "s",
+}
+_UNITS_OF_LENGTHS = {
+    "damping": "N s/m",
+    "armature": "kg",
+    "frictionloss": "N",
+    "stiffness": "N/m",
+    "springref": "m",
+    "kp": "N/m",
+    "kd": "N s/m",
+    "forcerange": "N",
+}
+"""Of slides and tendons."""
+_SCALAR_JOINTS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+_SIGNED = ("springref", "bias", "offset")
+"""Values may be below 0."""
+_FACTOR = 4.0
+"""Bounds are the nominal value divided and multiplied by this, where a declaration does not say."""
+_SPREAD = 0.3
+"""Prior standard deviation over the nominal value, where a declaration does not say."""
+_RADIUS = 0.5
+"""Of a body's radius of gyration: how far its centre of mass is sought, where a declaration does not say."""
+
+
+class _Declaration:
+    """One entry of `identify`."""
+
+    def __init__(self, robot: RobotDescription, model: mujoco.MjModel, number: int, entry: Mapping[str, Any]) -> None:
+        self.file, self.robot, self.model, self.entry = Path(robot.file), robot, model, entry
+        self.label = f'"identify" entry {number}'
+        for key in entry:
+            if key not in _KEYS:
+                self.refuse(f'has the key "{key}"', f"there are {', '.join(_KEYS)}")
+        self._nominal = [entry["nominal"]] if "nominal" in entry else []
+
+    def refuse(self, problem: str, fix: str) -> NoReturn:
+        raise InputError(f"{self.file}: {self.label} {problem}; {fix}.")
+
+    def parameters(self) -> list[Parameter]:
+        """Return the parameters of this entry: one, or those of a body's group."""
+        parts = self._parts()
+        kind, _, field, _ = parts[0]
+        if kind == "body" and field in _BODY_GROUPS:
+            return [self._body_parameter(parts, quantity) for quantity in _BODY_GROUPS[field]]
+        nominals, targets = [], []
+        for kind, element, field, factor in parts:
+            if kind == "body" and field in _BODY_GROUPS:
+                self.refuse("ties a body's mass properties to something else", "tie them among bodies alone")
+            nominal, own = self._targets(kind, element, field)
+            nominals.append(nominal / factor)
+            targets += [target._replace(factor=target.factor * factor) for target in own]
+        nominal = self._number("nominal", nominals[0])
+        if any(not math.isclose(x, nominals[0], rel_tol=1e-6, abs_tol=1e-12) for x in nominals):
+            shown = ", ".join(f"{x:g}" for x in nominals)
+            self.refuse(f"ties elements whose values differ ({shown})", 'write "targets", each with its "factor"')
+        name = "_and_".join(dict.fromkeys(str(part[1]) for part in parts)) + f"_{parts[0][2]}"
+        return [self._parameter(name, parts[0], nominal, tuple(targets))]
+
+    def _parts(self) -> list[tuple[str, str, str, float]]:
+        """Return (kind, element, field, factor) of everything that is set."""
+        if "targets" in self.entry:
+            targets = self.entry["targets"]
+            if not isinstance(targets, list) or not targets or not all(isinstance(each, dict) for each in targets):
+                self.refuse('"targets" is no list of objects', 'write [{"joint": ..., "field": ..., "factor": 1}]')
+            return [part for target in targets for part in self._part(target)]
+        return self._part(self.entry)
+
+    def _part(self, entry: Mapping[str, Any]) -> list[tuple[str, str, str, float]]:
+        kinds = [kind for kind in _ELEMENTS if kind in entry]
+        if len(kinds) != 1:
+            self.refuse(f"names {len(kinds)} kinds of elements", f"name one of {', '.join(_ELEMENTS)}")
+        elements, field, factor = entry[kinds[0]], entry.get("field"), entry.get("factor", 1.0)
+        elements = elements if isinstance(elements, list) else [elements]
+        if not elements or not all(isinstance(each, str) for each in elements):
+            self.refuse(f'"{kinds[0]}" is {elements!r}', "write a name, or a list of names that share the value")
+        if not isinstance(field, str):
+            self.refuse('"field" is missing', f"write one of {', '.join(self._known(kinds[0]))}")
+        if not is_number(factor) or factor == 0:
+            self.refuse(f'"factor" is {factor!r}', "write a number other than 0")
+        if "index" in entry:
+            field = f"{field}[{entry['index']}]"
+        return [(kinds[0], each, field, float(factor)) for each in elements]
+
+    def _known(self, kind: str) -> tuple[str, ...]:
+        if kind == "command":
+            return QUANTITIES
+        own = (*_FIELDS[kind], *(_SERVO_FIELDS if kind == "actuator" else ()))
+        return (*own, *(_BODY_GROUPS if kind == "body" else ()))
+
+    def _id(self, kind: str, element: str) -> int:
+        index = mujoco.mj_name2id(self.model, _OBJECTS[kind], element)
+        if index < 0:
+            count = {"joint": "njnt", "actuator": "nu", "tendon": "ntendon", "geom": "ngeom", "body": "nbody"}[kind]
+            own = [getattr(self.model, kind)(number).name for number in range(getattr(self.model, count))]
+            self.refuse(f"names {element!r}, no {kind} of the model", f"there are {', '.join(filter(None, own)) or 0}")
+        return int(index)
+
+    def _targets(self, kind: str, element: str, field: str) -> tuple[float, tuple[Target, ...]]:
+        """Return the model's value and what carries it."""
+        if kind == "command":
+            if element not in self.robot.commands:
+                self.refuse(f"names {element!r}, no command", f"there are {', '.join(self.robot.commands)}")
+            if field not in QUANTITIES:
+                self.refuse(f'has the field "{field}"', f"there are {', '.join(QUANTITIES)}")
+            command = self.robot.commands.index(element)
+            nominal = {"scale": 1.0, "rate_limit": math.inf}.get(field, 0.0)
+            return nominal, (CommandTarget(command, field, 1.0),)
+        index = self._id(kind, element)
+        if kind == "actuator" and field in _SERVO_FIELDS:
+            return self._position_control(index, element, field)
+        if field in _FIELDS[kind]:
+            own = _FIELDS[kind][field]
+            rest = (_FIXED_INDEX[own],) if own in _FIXED_INDEX else ()
+        else:
+            own, rest = self._raw(kind, field)
+        if own == "actuator_biasprm" and not self.model.actuator_biastype[index]:
+            self.refuse(f"has the bias of {element}, which has none", 'give the actuator biastype="affine"')
+        if kind == "joint":
+            address = {"dof_": self.model.jnt_dofadr, "qpos_": self.model.jnt_qposadr}.get(own.split("_")[0] + "_")
+            if address is not None:
+                if int(self.model.jnt_type[index]) not in _SCALAR_JOINTS:
+                    self.refuse(f"names {element}, no hinge or slide", "name hinges and slides only")
+                index = int(address[index])
+        place = (index, *rest)
+        array = np.asarray(getattr(self.model, own))
+        if array[place].ndim or not np.issubdtype(array.dtype, np.floating):
+            self.refuse(f"has the field {own} of shape {array.shape[1:]}", 'add the "index" of the number in it')
+        targets = [FieldTarget(own, place, 1.0)]
+        if field == "springlength" and array[index, 0] == array[index, 1]:
+            targets.append(FieldTarget(own, (index, 0), 1.0))  # no dead band: both ends are one
+        return float(array[place]), tuple(targets)
+
+    def _raw(self, kind: str, field: str) -> tuple[str, tuple[int, ...]]:
+        """Return a field of the model by MuJoCo's name, and the index that follows the element's."""
+        name, _, rest = field.partition("[")
+        known = name.startswith(_PREFIXES[kind]) and isinstance(getattr(self.model, name, None), np.ndarray)
+        if not known or name in ("body_mass", "body_ipos", "body_iquat", "body_inertia"):
+            self.refuse(f'has the field "{field}"', f"there are {', '.join(self._known(kind))}, and MuJoCo's own names")
+        shape = getattr(self.model, name).shape[1:]
+        number = rest.removesuffix("]")
+        if not rest:
+            return name, ()
+        if not number.isdecimal() or len(shape) != 1 or int(number) >= shape[0]:
+            self.refuse(f"has the index {number} in {name}, of shape {shape}", "give one that is there")
+        return name, (int(number),)
+
+    def _position_control(self, index: int, element: str, field: str) -> tuple[float, tuple[Target, ...]]:
+        model = self.model
+        gain, bias = model.actuator_gainprm[index], model.actuator_biasprm[index]
+        affine = model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_AFFINE
+
+        def of(name: str, place: int, factor: float) -> FieldTarget:
+            return FieldTarget(f"actuator_{name}", (index, place), factor)
+
+        if field == "forcerange":
+            low, high = model.actuator_forcerange[index]
+            if not model.actuator_forcelimited[index] or high <= 0:
+                self.refuse(f"has the forcerange of {element}, which has none", "give the actuator a forcerange")
+            return float(high), (of("forcerange", 0, float(low / high)), of("forcerange", 1, 1.0))
+        if field == "strength":
+            prms = [("gainprm", gain), *([("biasprm", bias)] if affine else [])]
+            return 1.0, tuple(of(n, i, float(x)) for n, prm in prms for i, x in enumerate(prm[:3]) if x)
+        place = {"kp": 1, "kd": 2}[field]
+        if not affine or (field == "kp" and bias[place] == 0):
+            self.refuse(f"has {field} of {element}, which feeds back no such thing", "give a position actuator")
+        value = float(-bias[place])
+        if field == "kd":
+            return value, (of("biasprm", 2, -1.0),)
+        others = [of("gainprm", 0, float(gain[0] / value)), of("biasprm", 0, float(bias[0] / value))]
+        return value, (of("biasprm", 1, -1.0), *others)
+
+    def _body_parameter(self, parts: list[tuple[str, str, str, float]], quantity: str) -> Parameter:
+        place, targets = BODY_QUANTITIES.index(quantity), []
+        first = self._id("body", parts[0][1])
+        mass, inertia = float(self.model.body_mass[first]), self.model.body_inertia[first]
+        if mass <= 0 or np.any(2 * inertia >= inertia.sum()):
+            problem = f"has mass properties of {parts[0][1]}, whose nominal mass or inertia no rigid body has"
+            self.refuse(problem, "give it a mass, and moments of inertia each smaller than the sum of the others")
+        for kind, element, field, factor in parts:
+            if kind != "body" or field != parts[0][2] or factor != 1.0:
+                self.refuse("ties a body's mass properties to something else", "tie them among bodies alone")
+            body = self._id("body", element)
+            targets.append(BodyTarget(body, place, 1 / mass if quantity == "mass" else 1.0))
+        nominal = mass if quantity == "mass" else UNDEFORMED[place]
+        name = "_and_".join(part[1] for part in parts) + f"_{quantity}"
+        group = len(_BODY_GROUPS[parts[0][2]]) > 1
+        reach = _RADIUS * math.sqrt(float(inertia.sum()) / 2 / mass) if quantity.startswith("com_") else _RADIUS
+        bounds = (-reach, reach) if nominal == 0 else (nominal / _FACTOR, nominal * _FACTOR)
+        if group:  # bounds and priors of one number are not those of ten
+            for key in ("bounds", "prior", "nominal", "unit"):
+                if key in self.entry:
+                    self.refuse(f'has "{key}" for several parameters', "leave it out")
+        else:
+            bounds = self._bounds(bounds)
+        prior = _SPREAD * (nominal or reach)
+        unit = {"m": "kg", "c": "m"}.get(quantity[0], "1")
+        prior = prior if group else self._positive("prior", prior)
+        name = name if group else self._text("name", name)
+        return Parameter(name, unit, nominal, bounds, prior, nominal > 0 and bounds[0] > 0, tuple(targets))
+
+    def _parameter(
+        self, name: str, part: tuple[str, str, str, float], nominal: float, targets: tuple[Target, ...]
+    ) -> Parameter:
+        kind, element, field, _ = part
+        bounds: tuple[float, float] | None = None
+        if nominal > 0 and math.isfinite(nominal) and field not in _SIGNED:
+            bounds = nominal / _FACTOR, nominal * _FACTOR
+        prior = math.nan
+        if kind == "command":
+            low, high = self.robot.command_ranges[self.robot.commands.index(element)]
+            span = high - low
+            bounds = {
+                "scale": (0.5, 1.5),
+                "offset": (-0.25 * span, 0.25 * span),
+                "delay": (0.0, 0.1),
+                "backlash": (0.0, 0.2 * span),
+                "rate_limit": (0.1 * span, span / float(self.model.opt.timestep)),
+                "lag": (0.0, 0.2),
+            }[field]
+            prior = {"scale": 0.1, "delay": 0.02, "lag": 0.03, "rate_limit": math.inf}.get(field, 0.05 * span)
+        bounds = self._bounds(bounds)
+        nominal = min(nominal, bounds[1]) if math.isinf(nominal) else nominal
+        if not bounds[0] <= nominal <= bounds[1]:
+            self.refuse(f'has "bounds" {bounds[0]:g} to {bounds[1]:g} without the nominal {nominal:g}', "widen them")
+        if math.isnan(prior):
+            prior = _SPREAD * nominal if nominal > 0 and field not in _SIGNED else (bounds[1] - bounds[0]) / 4
+        if field not in _SIGNED and bounds[0] < 0 and field in self._known(kind):
+            self.refuse(f'has "bounds" that begin at {bounds[0]:g}', f"{field} is 0 or more")
+        return Parameter(
+            name=self._text("name", name),
+            unit=self._text("unit", self._unit(kind, element, field)),
+            nominal=nominal,
+            bounds=bounds,
+            prior=self._positive("prior", prior),
+            logarithmic=nominal > 0 and bounds[0] > 0,
+            targets=targets,
+        )
+
+    def _unit(self, kind: str, element: str, field: str) -> str:
+        if kind in ("joint", "actuator"):
+            joint = self._id(kind, element)
+            if kind == "actuator":
+                joint = int(self.model.actuator_trnid[joint, 0])
+                on_joint = self.model.actuator_trntype[self._id(kind, element)] == mujoco.mjtTrn.mjTRN_JOINT
+            else:
+                on_joint = True
+            if on_joint and self.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
+                return _UNITS.get(field, "1" if field == "strength" else "")
+            return _UNITS_OF_LENGTHS.get(field, "1" if field == "strength" else "")
+        if kind == "tendon":
+            return _UNITS_OF_LENGTHS.get(field, _UNITS.get(field, ""))
+        return {"scale": "1", "friction": "1", "rate_limit": "1/s"}.get(field, _UNITS.get(field, ""))
+
+    def _bounds(self, default: tuple[float, float] | None) -> tuple[float, float]:
+        value = self.entry.get("bounds", default)
+        if value is None:
+            self.refuse('has no "bounds", and a nominal value that suggests none', 'add "bounds": [low, high]')
+        if len(value) != 2 or not all(map(is_number, value)) or not value[0] < value[1]:
+            self.refuse(f'has "bounds" {value!r}', "write two numbers, the smaller first")
+        return float(value[0]), float(value[1])
+
+    def _number(self, key: str, default: float) -> float:
+        value = self.entry.get(key, default)
+        if key in self.entry and not is_number(value):
+            self.refuse(f'has "{key}" {value!r}', "write a number")
+        return float(value)
+
+    def _positive(self, key: str, default: float) -> float:
+        value = self._number(key, default)
+        if value <= 0:
+            self.refuse(f'has "{key}" {value:g}', "write a number above 0")
+        return value
+
+    def _text(self, key: str, default: str) -> str:
+        value = self.entry.get(key, default)
+        if not isinstance(value, str) or (key == "name" and not value.isidentifier()):
+            self.refuse(f'has "{key}" {value!r}', "write a text of letters, digits and underscores")
+        return value

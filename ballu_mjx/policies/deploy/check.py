@@ -1,0 +1,240 @@
+"""An exported policy in C MuJoCo, beside the simulator that it was trained in: does it do there what it did here?"""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ballu_mjx.common import files
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.policies.deploy.controller import Controller
+from ballu_mjx.policies.deploy.export import POLICY_FILE, POLICY_FORMAT
+from ballu_mjx.policies.policy import Policy
+from ballu_mjx.policies.tasks import Step
+from ballu_mjx.residuals.deploy.export import export_simulator
+from ballu_mjx.residuals.deploy.residual import YAW, ImprovedSimulator
+from ballu_mjx.sim.simulator import Simulator
+
+TOLERANCE = 0.1
+"""Of the distance or reward in the policy's own simulator, by which another may differ."""
+_LEAST_DISTANCE, _LEAST_SPEED = 0.1, 0.01
+"""m and m/s that count as no difference."""
+_FRAME_INTERVAL = 0.005
+"""Shortest time between two frames (s) that the controller is given."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """A trial of a policy in one simulator."""
+
+    simulator: str
+    """What it is called in the table."""
+    reward: float
+    """Mean over the trial; of the tasks here a velocity (m/s)."""
+    displacement: tuple[float, float]
+    """Of the centre of mass along x and y (m)."""
+    yaw: float
+    """Of the tracked body at the end (deg)."""
+
+    def differs_from(self, other: Trial) -> str | None:
+        """Return in which respect this trial is another than `other`; None: in none."""
+        far = float(np.hypot(*other.displacement))
+        apart = float(np.hypot(*np.subtract(self.displacement, other.displacement)))
+        if not apart <= max(TOLERANCE * far, _LEAST_DISTANCE):
+            return f"it ends {apart:.2f} m from where it ends in its own simulator"
+        if not abs(self.reward - other.reward) <= max(TOLERANCE * abs(other.reward), _LEAST_SPEED):
+            return f"its mean reward is {self.reward:.3f}, not {other.reward:.3f}"
+        return None
+
+
+@dataclasses.dataclass(frozen=True)
+class PolicyCheck:
+    """Trials of an exported policy; `own` is that in the simulator of its training."""
+
+    own: Trial
+    network: Trial
+    """In C MuJoCo, its network on exact features."""
+    controller: Trial
+    """In C MuJoCo, the whole controller on frames of the true poses: estimator and rate limit act."""
+    seconds: float
+    """Length of a trial."""
+    notes: tuple[str, ...] = ()
+    """What of the policy's own simulator C MuJoCo leaves out."""
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the network does in C MuJoCo what it does in its own simulator."""
+        return self.network.differs_from(self.own) is None
+
+    def table(self) -> str:
+        """Return the trials side by side, and what follows."""
+        trials = (self.own, self.network, self.controller)
+        rows = [
+            ("", *(trial.simulator for trial in trials)),
+            ("mean reward", *(f"{trial.reward:.3f}" for trial in trials)),
+            ("return", *(f"{trial.reward * self.seconds:.2f}" for trial in trials)),
+            ("x (m)", *(f"{trial.displacement[0]:.2f}" for trial in trials)),
+            ("y (m)", *(f"{trial.displacement[1]:.2f}" for trial in trials)),
+            ("yaw (deg)", *(f"{trial.yaw:.1f}" for trial in trials)),
+        ]
+        widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+        lines = ["  ".join(f"{cell:>{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+        lines[0] = f"A trial of {self.seconds:g} s:\n{lines[0]}"
+        return "\n".join([*lines, *self.notes, self.verdict()])
+
+    def verdict(self) -> str:
+        """Return whether simulators agree, and what the controller changes, in two sentences."""
+        problem = self.network.differs_from(self.own)
+        said = "AGREES: in C MuJoCo the policy does what it does in its own simulator."
+        if problem is not None:
+            said = f"DIFFERS: in C MuJoCo {problem}."
+        changed = self.controller.differs_from(self.network)
+        if changed is None:
+            return f"{said} From frames, with estimator and rate limit, it does the same."
+        return f"{said} From frames, with estimator and rate limit, {changed}."
+
+
+def check_policy(
+    folder: Path | str,
+    *,
+    simulator: Path | str | None = None,
+    run: Path | str | None = None,
+    seconds: float | None = None,
+) -> PolicyCheck:
+    """Run an exported policy in C MuJoCo and in the simulator that it was trained in.
+
+    **Arguments**
+
+    - `folder`: what `export.export_policy` wrote.
+    - `simulator`: an exported simulator to run in; None: the policy's own one, exported for this.
+    - `run`: where the policy's run is; None: where it was.
+    - `seconds`: length of a trial; None: the task's.
+
+    **Raises** `InputError` where a folder is damaged, the run is gone, or the simulator is of another robot.
+    """
+    folder = Path(folder)
+    path, fix = folder / POLICY_FILE, "export the policy again"
+    if not path.is_file():
+        raise InputError(f"{folder}: is no exported policy ({POLICY_FILE} is missing); {fix}.")
+    described = files.read_json(path, fix)
+    if described.get("format") != POLICY_FORMAT or not isinstance(described.get("run"), str):
+        raise InputError(f'{path}: is not of the format "{POLICY_FORMAT}"; {fix}.')
+    try:
+        controller = Controller(folder)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{folder}: its weights cannot be read ({error}); {fix}.") from error
+    if seconds is not None and not 0 < seconds <= 3600:
+        raise InputError(f"--seconds is {seconds:g}: it must be above 0, and 3600 or less.")
+    policy = Policy.load(described["run"] if run is None else run)
+    _check_same(controller, policy, folder)
+    seconds = policy.task.trial_seconds if seconds is None else seconds
+    steps = max(round(seconds / policy.robot.control_timestep), 1)
+    with tempfile.TemporaryDirectory() as temporary:
+        if simulator is None:
+            own = Simulator(policy.robot, policy.actuators).with_residual(policy.trained_residual)
+            simulator = export_simulator(own, Path(temporary) / "simulator", check_seconds=0.0).folder
+        there = _read_simulator(Path(simulator), policy)
+    loop = policy.closed_loop()
+    qpos, qvel = loop.standing()
+    rollout = loop(policy.params, qpos, qvel, steps)
+    moved = rollout.com[0, -1] - rollout.com[0, 0]
+    trial = Trial(
+        "its own simulator",
+        float(rollout.reward[0].mean()),
+        (float(moved[0]), float(moved[1])),
+        float(np.rad2deg(rollout.yaw[0, -1])),
+    )
+    masses = policy.robot.load_model(policy.actuators).body_mass
+    rest = policy, (qpos[0], qvel[0]), steps, masses
+    network = _run_trial("C MuJoCo", there, lambda frames: controller.act(there.features()), *rest)
+    from_frames = _run_trial("C MuJoCo, from frames", there, _from_frames(folder), *rest)
+    notes = []
+    if policy.config.sampled_residual:
+        notes.append("Training drew the residual's forces; C MuJoCo takes the most likely ones.")
+    if policy.config.residual_decay > 0:
+        notes.append("Training let the residual fade outside of its data; C MuJoCo does not.")
+    return PolicyCheck(trial, network, from_frames, steps * policy.robot.control_timestep, tuple(notes))
+
+
+Frames = list[tuple[float, dict[str, np.ndarray]]]
+Act = Callable[[Frames], Any]
+"""From the frames of the last control step to commands."""
+
+
+def _from_frames(folder: Path) -> Act:
+    controller = Controller(folder)
+
+    def act(frames: Frames) -> Any:
+        command: Any = controller.command
+        for time, frame in frames:
+            command = controller.step(time, frame)
+        return command
+
+    return act
+
+
+def _run_trial(
+    name: str,
+    there: ImprovedSimulator,
+    act: Act,
+    policy: Policy,
+    start: tuple[np.ndarray, np.ndarray],
+    steps: int,
+    masses: Float[np.ndarray, " bodies"],
+) -> Trial:
+    there.reset(*start)
+    shares, rewards = masses / masses.sum(), []
+    frames = [(0.0, _frame(there))]
+    com = first = shares @ there.data.xipos
+    stride = max(round(_FRAME_INTERVAL / there.model.opt.timestep), 1)
+    for _ in range(steps):
+        command, before = np.asarray(act(frames), float), com
+        frames = []
+        for number, data in enumerate(there.substep(command), start=1):
+            if number % stride == 0 or number == there.substeps:
+                mujoco.mj_kinematics(there.model, data)
+                frames.append((float(data.time), _frame(there)))
+        features, com = there.features(), shares @ there.data.xipos
+        velocity = (com - before) / there.control_timestep
+        rewards.append(float(policy.task.reward(Step(*map(jnp.asarray, (velocity, features, command))))))
+    moved, yaw = com - first, float(np.rad2deg(features[YAW]))
+    return Trial(name, float(np.mean(rewards)), (float(moved[0]), float(moved[1])), yaw)
+
+
+def _frame(there: ImprovedSimulator) -> dict[str, np.ndarray]:
+    frame = {f"{name}_position": there.data.site(name).xpos.copy() for name in there.names}
+    body = there.model.site_bodyid[there.model.site(there.names[0]).id]
+    return {**frame, f"{there.names[0]}_quaternion": there.data.xquat[body].copy()}
+
+
+def _check_same(controller: Controller, policy: Policy, folder: Path) -> None:
+    stored = controller.weights
+    act, given = policy.act(), stored["check_commands"]
+    if given.shape[1:] == (len(policy.robot.commands),) and stored["check_features"].shape[1] == policy.robot.features:
+        now = np.array([act(row) for row in stored["check_features"]])
+        ranges = stored["command_high"] - stored["command_low"]
+        if np.max(np.abs(now - given) / ranges) < 1e-3:
+            return
+    raise InputError(f"{folder}: is another policy than that of its run; export it again, or give --run.")
+
+
+def _read_simulator(folder: Path, policy: Policy) -> ImprovedSimulator:
+    try:
+        there = ImprovedSimulator(folder)
+    except (OSError, ValueError, KeyError) as error:
+        problem = " ".join(str(error).split())
+        raise InputError(f"{folder}: is no exported simulator ({problem}); `export simulator` writes one.") from error
+    robot = policy.robot
+    if (there.names, there.commands) != ((robot.tracked, *robot.points), robot.commands) or (
+        there.model.nq != robot.load_model().nq
+    ):
+        raise InputError(f"{folder}: is a simulator of {there.settings['robot']}, not of {robot.name}.")
+    return there

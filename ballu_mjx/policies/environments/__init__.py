@@ -1,0 +1,1 @@
+"""Improved simulators as environments of other libraries."""

@@ -1,0 +1,112 @@
+"""A batch of environments for libraries that step from Python: one compiled program a step, finished ones renewed."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.envs.base import State
+from jaxtyping import Array, Bool, Float
+
+from ballu_mjx.policies.locomotion_env import LocomotionConfig, LocomotionEnv, check_locomotion_config
+from ballu_mjx.policies.policy import environment_of
+from ballu_mjx.policies.simulators import load_simulator
+from ballu_mjx.policies.tasks import find_task
+from ballu_mjx.policies.tasks.base import Task
+from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
+
+
+class BatchStep(NamedTuple):
+    """What a step of all environments gives."""
+
+    observation: Float[np.ndarray, "envs observations"]
+    """Of finished ones that of the fresh state."""
+    last_observation: Float[np.ndarray, "envs observations"]
+    """Before finished ones were renewed."""
+    reward: Float[np.ndarray, " envs"]
+    terminated: Bool[np.ndarray, " envs"]
+    """Where the simulation diverged."""
+    truncated: Bool[np.ndarray, " envs"]
+    """Where the time was over."""
+    metrics: dict[str, Float[np.ndarray, " envs"]]
+
+
+class LocomotionBatch:
+    """A task in a simulator, `num_envs` times side by side; the first of the devices shares them with the others."""
+
+    def __init__(self, env: LocomotionEnv, num_envs: int) -> None:
+        """Prepare; nothing is compiled before the first `reset`.
+
+        **Raises** `ValueError` for no environments.
+        """
+        if num_envs < 1:
+            raise ValueError(f"num_envs is {num_envs}: it must be 1 or more.")
+        self.env, self.num_envs = env, num_envs
+        devices = jax.local_devices()
+        # A batch that does not divide stays on one device.
+        devices = devices if num_envs % len(devices) == 0 else devices[:1]
+        mesh, spec = jax.sharding.Mesh(np.array(devices), ("batch",)), jax.sharding.PartitionSpec
+        self._split = jax.sharding.NamedSharding(mesh, spec("batch"))
+
+        def over_devices(function: Any) -> Any:
+            return jax.jit(
+                jax.shard_map(
+                    jax.vmap(function), mesh=mesh, in_specs=spec("batch"), out_specs=spec("batch"), check_vma=False
+                )
+            )
+
+        self._reset, self._step = over_devices(env.reset), over_devices(self._advance)
+        self._key = jax.random.key(0)
+        self._state: State | None = None
+
+    def reset(self, seed: int | None = None) -> Float[np.ndarray, "envs observations"]:
+        """Start all anew; a `seed` settles all randomness from here on."""
+        if seed is not None:
+            self._key = jax.random.key(seed)
+        self._key, own = jax.random.split(self._key)
+        state = self._state = self._reset(self._keys(own))
+        return np.array(state.obs)
+
+    def step(self, action: Float[np.ndarray, "envs commands"]) -> BatchStep:
+        """Advance all by a control step; actions from -1 to 1 are the commands' ranges.
+
+        **Raises** `ValueError` before the first `reset`.
+        """
+        if self._state is None:
+            raise ValueError("There is no episode yet; call reset first.")
+        self._key, own = jax.random.split(self._key)
+        action = jax.device_put(np.asarray(action, np.float32).reshape(self.num_envs, -1), self._split)
+        self._state, seen = self._step(self._state, action, self._keys(own))
+        return BatchStep(*jax.tree.map(np.array, jax.device_get(seen)))  # libraries write into what they get
+
+    def _keys(self, key: Array) -> Array:
+        return jax.device_put(jax.random.split(key, self.num_envs), self._split)
+
+    def _advance(self, state: State, action: Array, key: Array) -> tuple[State, tuple]:
+        after, fresh = self.env.step(state, action), self.env.renew(state, key)
+        done = after.done.astype(bool)
+        shown = jax.tree.map(lambda new, old: jnp.where(done, new, old), fresh, after)
+        truncated = after.info["truncation"].astype(bool)
+        return shown, (shown.obs, after.obs, after.reward, done & ~truncated, truncated, after.metrics)
+
+
+def make_environment(
+    task: str | Task,
+    simulator: Simulator | AugmentedSimulator | None = None,
+    config: LocomotionConfig | None = None,
+    *,
+    run: Any = None,
+    robot: Any = None,
+) -> LocomotionEnv:
+    """Return a task in a simulator, or in that of a run or robot (`simulators.load_simulator`).
+
+    **Raises** `InputError` for an unknown task, options out of range, and a robot that cannot do the task.
+    """
+    augmented = load_simulator(run, robot) if simulator is None else simulator.with_residual(None)
+    config = config or LocomotionConfig()
+    check_locomotion_config(config, augmented.robot.control_timestep)
+    chosen = find_task(task) if isinstance(task, str) else task
+    return environment_of(augmented.robot, chosen, config, augmented.actuators, TrainedResidual.of(augmented))

@@ -1,0 +1,44 @@
+"""The simulator of a run, of whatever task: for whoever trains, exports or compares in it next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.identification.actuators import ACTUATORS_FILE, read_actuators
+from ballu_mjx.policies.policy import check_belongs
+from ballu_mjx.policies.tasks import TASKS
+from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
+from ballu_mjx.residuals.run_config import run_actuators, run_residual, run_robot
+from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
+from ballu_mjx.runs.folder import read_config
+from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
+
+
+def load_simulator(run: Path | str | None = None, robot: str | Path | None = None) -> AugmentedSimulator:
+    """Return a run's simulator, with its identified actuators and its residual.
+
+    **Arguments**
+
+    - `run`: of a residual, of identified actuators, or of a policy (the simulator that it was trained in). None: the
+      nominal simulator of `robot`.
+    - `robot`: a name, or a description file; None: the run's, or the default one.
+
+    **Raises** `InputError` where `run` is none of these, or is damaged, and where both are given.
+    """
+    if run is None:
+        return Simulator(load_robot(DEFAULT_ROBOT if robot is None else robot)).with_residual(None)
+    if robot is not None:
+        raise InputError(f"{run}: a run has its own robot; leave the robot out.")
+    run = Path(run)
+    stored = read_config(run, *RESIDUAL_TASKS, "sysid", *TASKS)
+    own, task = run_robot(stored, run), stored["task"]
+    if task == "sysid":
+        _, actuators = read_actuators(own, run / ACTUATORS_FILE)
+        return Simulator(own, actuators).with_residual(None)
+    where = run if task in RESIDUAL_TASKS else run_residual(stored, run)
+    residual = None if where is None else TrainedResidual.load(where, own)
+    actuators = run_actuators(stored, run, own)
+    check_belongs(residual, actuators, where)
+    return Simulator(own, actuators).with_residual(residual)

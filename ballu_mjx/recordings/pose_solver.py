@@ -1,0 +1,222 @@
+"""Damped least squares over all joints: the poses nearest to a guess that fit what was measured, many at once.
+
+Joints keep their ranges, unless no pose within them fits. A closed loop (a model's `connect` or `joint` equality) is a
+measurement like others.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from ballu_mjx.common.rotations import matrix_to_rotation_vector, quaternion_to_matrix
+from ballu_mjx.recordings.closed_loops import closed_loops, joint_couplings
+from ballu_mjx.recordings.kinematic_tree import KinematicTree
+from ballu_mjx.recordings.motion import MeasurementGrid, ReconstructionParameters
+from ballu_mjx.robots.description import RobotDescription
+
+_MAX_STEPS = 100
+"""Levenberg-Marquardt steps: a handful, but from far away."""
+_CONVERGED = 1e-6
+"""Step (rad or m) of no consequence."""
+_NO_GAIN = 1e-6
+"""Of the squared misfit: where measurements do not fit the model, steps shrink slowly."""
+_LONGEST_STEP = 0.5
+"""rad: longer ones wind joints up."""
+_RANGE_GIVE = (0.05, 0.005)
+"""How far beyond its range a hinge (rad) or a slide (m) may be: measurements are noisy, and stops soft."""
+_LOOP_NOISE = 0.1
+"""Of a measured position's noise: how far a closed loop may be open."""
+_PRIOR = float(np.deg2rad(60.0))
+"""Standard deviation (rad, m) of a joint about its guess: keeps the problem of a single sample well posed."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class KinematicProblem:
+    """What was measured, and of which model."""
+
+    model: mujoco.MjModel
+    robot: RobotDescription
+    grid: MeasurementGrid
+    parameters: ReconstructionParameters
+    orientations: Mapping[str, tuple[Float[np.ndarray, "T 4"], Float[np.ndarray, " 3"]]]
+    """Quaternions (w, x, y, z) by site, and weights (1/rad) about the body's axes."""
+
+
+class PoseSolver:
+    """Differences to the measurements in units of their noise, their derivatives, and the poses that make them least.
+
+    `rows` are the samples that poses belong to: several poses may belong to one.
+    """
+
+    def __init__(self, problem: KinematicProblem) -> None:
+        self.problem = problem
+        model, grid, parameters = problem.model, problem.grid, problem.parameters
+        sites = {site: model.site(site) for site in {**grid.positions, **problem.orientations}}
+        points = [(int(sites[site].bodyid[0]), sites[site].pos) for site in grid.positions]
+        self._loops = closed_loops(model)
+        bodies = [int(sites[site].bodyid[0]) for site in problem.orientations]
+        self.tree = KinematicTree(model, [*points, *(end for loop in self._loops for end in loop)], bodies)
+        self._couplings = joint_couplings(model)
+        self._turned = [quaternion_to_matrix(quaternion) for quaternion, _ in problem.orientations.values()]
+        self._turn_weights = [weight for _, weight in problem.orientations.values()]
+
+        self.addresses, self.dofs = _scalar_joints(model)
+        """Places of hinges and slides in qpos and qvel."""
+        index = {model.joint(int(joint)).name: i for i, joint in enumerate(model.dof_jntid[self.dofs])}
+        self.recorded = np.array([index[joint] for joint in grid.joint_angles], int)
+        """Joints, by their place among these, whose angles were recorded; the others are `hidden`."""
+        self._angles = np.stack(list(grid.joint_angles.values()), 1) if grid.joint_angles else np.zeros((0, 0))
+        self.hidden = np.setdiff1d(np.arange(len(self.dofs)), self.recorded)
+        joints = model.dof_jntid[self.dofs]
+        low, high = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.inf, np.inf]).T
+        give = np.where(self.tree.rotates[self.dofs], *_RANGE_GIVE)
+        self.low, self.high = low, high
+        self._lowest, self._highest = low - give, high + give
+        self.bounded = True
+        """Whether poses keep within the joints' ranges."""
+        self.turns = self.tree.rotates[self.dofs] & ~(np.isfinite(self.low) & np.isfinite(self.high))
+        """Hinges that may turn on and on."""
+        places = 3 * (len(grid.positions) + len(problem.orientations) + len(self._loops))
+        self.measurements = places + len(self._couplings) + len(self.recorded)
+        """Numbers that were measured in each sample."""
+        self.joint_weight, self.prior_weight = np.zeros(model.nv), np.zeros(model.nv)
+        self.joint_weight[self.dofs[self.recorded]] = 1.0 / parameters.joint_noise
+        self.prior_weight[self.dofs[self.hidden]] = 1.0 / _PRIOR
+
+    # ---- misfit ----
+
+    def misfit(
+        self, qpos: Float[np.ndarray, "N nq"], rows: Int[np.ndarray, " N"]
+    ) -> tuple[Float[np.ndarray, "N m"], Float[np.ndarray, "N m nv"]]:
+        """Differences to all measurements but joint angles, and their derivatives along velocities."""
+        parameters, grid = self.problem.parameters, self.problem.grid
+        poses = self.tree.pose(qpos)
+        errors, slopes = [], []
+        for number, places in enumerate(grid.positions.values()):
+            errors.append((poses.points[number] - places[rows]) / parameters.position_noise)
+            slopes.append(self.tree.point_jacobian(poses, number) / parameters.position_noise)
+        for number, (turned, weight) in enumerate(zip(self._turned, self._turn_weights, strict=True)):
+            back = turned[rows].transpose(0, 2, 1)
+            errors.append(matrix_to_rotation_vector(back @ poses.rotations[number]) * weight)
+            slopes.append(back @ self.tree.turn_jacobian(poses, number) * weight[:, None])
+        noise, first = _LOOP_NOISE * parameters.position_noise, len(grid.positions)
+        for number in range(len(self._loops)):
+            one, other = first + 2 * number, first + 2 * number + 1
+            errors.append((poses.points[one] - poses.points[other]) / noise)
+            slopes.append((self.tree.point_jacobian(poses, one) - self.tree.point_jacobian(poses, other)) / noise)
+        for coupling in self._couplings:
+            error, slope = coupling.misfit(qpos, self.problem.model.nv)
+            errors.append(error[:, None] / (_LOOP_NOISE * parameters.joint_noise))
+            slopes.append(slope[:, None] / (_LOOP_NOISE * parameters.joint_noise))
+        return np.concatenate(errors, axis=1), np.concatenate(slopes, axis=1)
+
+    def information(self, qpos: Float[np.ndarray, "T nq"], rows: Int[np.ndarray, " T"]) -> np.ndarray:
+        """What each sample's measurements show, the prior included."""
+        _, slope = self.misfit(qpos, rows)
+        information = slope.transpose(0, 2, 1) @ slope
+        diagonal = np.arange(information.shape[1])
+        information[:, diagonal, diagonal] += self.joint_weight**2 + self.prior_weight**2
+        return information
+
+    # ---- fit ----
+
+    def fit(
+        self, guess: Float[np.ndarray, "N nq"], rows: Int[np.ndarray, " N"]
+    ) -> tuple[Float[np.ndarray, "N nq"], Float[np.ndarray, " N"]]:
+        """Poses of the least misfit near `guess`, and their squared misfit to what was measured."""
+        nv, diagonal = self.problem.model.nv, np.arange(self.problem.model.nv)
+        wanted = np.zeros((len(guess), nv))
+        wanted[:, self.dofs] = guess[:, self.addresses]
+        wanted[:, self.dofs[self.recorded]] = self._angles[rows] if len(self.recorded) else 0.0
+        weight = self.joint_weight**2 + self.prior_weight**2
+
+        def joint_errors(qpos: np.ndarray, lanes: np.ndarray) -> np.ndarray:
+            errors = np.zeros((len(qpos), nv))
+            errors[:, self.dofs] = qpos[:, self.addresses]
+            return errors - wanted[lanes]
+
+        def square(error: np.ndarray, joint_error: np.ndarray) -> np.ndarray:
+            return np.einsum("ij,ij->i", error, error) + np.einsum("ij,ij,j->i", joint_error, joint_error, weight)
+
+        qpos, active = guess.copy(), np.arange(len(guess))
+        damping, cost = np.full(len(guess), 1e-6), np.empty(len(guess))
+        error, slope = self.misfit(qpos, rows)
+        joint_error = joint_errors(qpos, active)
+        cost[:] = square(error, joint_error)
+        for _ in range(_MAX_STEPS):
+            transposed = slope.transpose(0, 2, 1)
+            curvature = transposed @ slope
+            curvature[:, diagonal, diagonal] += weight
+            gradient = (transposed @ error[..., None])[..., 0] + weight * joint_error
+            if self.bounded:
+                self._hold_stops(qpos[active], curvature, gradient)
+            scale = curvature[:, diagonal, diagonal]
+            scale = scale + 1e-12 * scale.sum(axis=1, keepdims=True)
+            curvature[:, diagonal, diagonal] += damping[active, None] * scale
+            step = -np.linalg.solve(curvature, gradient[..., None])[..., 0]
+            longest = np.abs(step[:, self.tree.rotates]).max(axis=1, initial=0.0)
+            step /= np.maximum(longest / _LONGEST_STEP, 1.0)[:, None]
+            moved = self.tree.move(qpos[active], step)
+            if self.bounded:
+                moved[:, self.addresses] = np.clip(moved[:, self.addresses], self._lowest, self._highest)
+            error_there, slope_there = self.misfit(moved, rows[active])
+            joint_error_there = joint_errors(moved, active)
+            there = square(error_there, joint_error_there)
+            gain = cost[active] - there
+            better = gain >= 0
+            taken = active[better]
+            qpos[taken], cost[taken] = moved[better], there[better]
+            damping[active] = np.where(better, np.maximum(damping[active] / 10, 1e-12), 10 * damping[active])
+            small = (np.abs(step).max(axis=1) < _CONVERGED) | (gain < _NO_GAIN * there)
+            going = ~np.where(better, small, damping[active] > 1e6)
+            chosen = better[:, None]
+            error = np.where(chosen, error_there, error)[going]
+            slope = np.where(chosen[..., None], slope_there, slope)[going]
+            joint_error = np.where(chosen, joint_error_there, joint_error)[going]
+            active = active[going]
+            if not len(active):
+                break
+        away = joint_errors(qpos, np.arange(len(qpos)))
+        return qpos, cost - np.einsum("ij,ij,j->i", away, away, self.prior_weight**2)
+
+    def _hold_stops(self, qpos: np.ndarray, curvature: np.ndarray, gradient: np.ndarray) -> None:
+        """Take joints at a stop, and pushed against it, out of the step, in place."""
+        angles, slope = qpos[:, self.addresses], gradient[:, self.dofs]
+        held = ((angles <= self._lowest) & (slope > 0)) | ((angles >= self._highest) & (slope < 0))
+        for joint in np.flatnonzero(held.any(axis=0)):
+            lanes, dof = np.flatnonzero(held[:, joint]), self.dofs[joint]
+            own = curvature[lanes, dof, dof]
+            curvature[lanes, dof, :] = curvature[lanes, :, dof] = 0.0
+            curvature[lanes, dof, dof], gradient[lanes, dof] = own, 0.0
+
+    def guess(
+        self, start: Float[np.ndarray, " nq"], joints: Float[np.ndarray, "N joints"], rows: Int[np.ndarray, " N"]
+    ) -> Float[np.ndarray, "N nq"]:
+        """Poses with these joints, or recorded ones, and a free root where the tracked body then is as recorded."""
+        qpos = np.tile(start, (len(rows), 1))
+        qpos[:, self.addresses] = joints
+        if len(self.recorded):
+            qpos[:, self.addresses[self.recorded]] = self._angles[rows]
+        if self.bounded:
+            qpos[:, self.addresses] = np.clip(qpos[:, self.addresses], self._lowest, self._highest)
+        if self.problem.robot.anchored:
+            return qpos
+        qpos[:, :7] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+        poses = self.tree.pose(qpos)
+        tracked = self.problem.grid.positions[self.problem.robot.tracked][rows]
+        rotation = self._turned[0][rows] @ poses.rotations[0].transpose(0, 2, 1)
+        qpos[:, :3] = tracked - (rotation @ poses.points[0][..., None])[..., 0]
+        qpos[:, 3:7] = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+        return qpos
+
+
+def _scalar_joints(model: mujoco.MjModel) -> tuple[Int[np.ndarray, " joints"], Int[np.ndarray, " joints"]]:
+    """Addresses of hinges and slides in qpos and in qvel."""
+    scalar = model.jnt_type != mujoco.mjtJoint.mjJNT_FREE
+    return model.jnt_qposadr[scalar].astype(int), model.jnt_dofadr[scalar].astype(int)

@@ -1,0 +1,1 @@
+"""An improved simulator for C MuJoCo."""

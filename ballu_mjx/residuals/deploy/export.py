@@ -1,0 +1,459 @@
+"""An improved simulator for C MuJoCo, as a folder: the model, the drivetrain and the residual, with what applies them.
+
+The folder runs on NumPy and MuJoCo alone; `residual.py` in it is this package's own, as it is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import textwrap
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.common.standalone import standalone_source
+from ballu_mjx.residuals.aerodynamics import Aerodynamics, air_parameters_to_json
+from ballu_mjx.residuals.deploy import residual as standalone
+from ballu_mjx.residuals.fluid import FluidForces
+from ballu_mjx.residuals.network import NetworkForces, load_names, load_units, network_input_names
+from ballu_mjx.rl.network_export import NetworkPort, OutputScale, check_onnx, network_arrays, onnx_model
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.mjcf import write_mjcf
+from ballu_mjx.runs.folder import new_folder
+from ballu_mjx.sim.drivetrain import QUANTITIES
+from ballu_mjx.sim.force_model import BoundForces, ForceModel, SumOfForces
+from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
+from ballu_mjx.sim.step import state_at
+
+CHECK_SECONDS = 5.0
+"""Length of the rollout that goes with a folder."""
+_SOURCE = "residual.py"
+_EXAMPLE = "example.py"
+_DERIVED = ("body_invweight0", "body_subtreemass", "dof_invweight0", "tendon_invweight0")
+"""Fields that C MuJoCo derives from the others."""
+_HOLD = 0.25
+"""Seconds for which the check's rollout holds a command."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ExportedSimulator:
+    """What `export_simulator` has written.
+
+    **Fields**
+
+    - `folder`: where it is.
+    - `deviation`: largest difference from the exported simulator over the rollout that goes with it: of the tracked
+      site (m) and of its body (deg). None: no rollout was made.
+    - `left_out`: fields of the model that MJCF cannot hold to six digits; `parameters.npz` has them.
+    """
+
+    folder: Path
+    deviation: tuple[float, float] | None
+    left_out: tuple[str, ...]
+
+
+class ExportedPart(NamedTuple):
+    """A part of a residual: its entry in `simulator.json`, and its arrays by name."""
+
+    settings: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+
+
+def export_simulator(
+    simulator: Simulator | AugmentedSimulator,
+    folder: Path | str,
+    *,
+    onnx: bool = False,
+    check_seconds: float = CHECK_SECONDS,
+) -> ExportedSimulator:
+    """Write a simulator, with its actuators, drivetrain and residual, for C MuJoCo into a folder, new or empty.
+
+    **Arguments**
+
+    - `onnx`: also write each network as `NAME.onnx`, from what it sees to the loads that it pushes with.
+    - `check_seconds`: length of a rollout in double precision that goes with the folder, for its self-test; 0: none.
+
+    **Raises** `InputError` where the folder holds something, the model cannot be written, or a part of the residual is
+    of a kind that cannot be exported.
+    """
+    augmented = simulator.with_residual(None)
+    if augmented.scale is not None:
+        raise InputError("A simulator with a scaled residual cannot be exported; leave the scale out.")
+    if onnx:
+        check_onnx()
+    robot, parts = augmented.robot, _parts(augmented)
+    networks = [part for part in parts if part.settings["kind"] == "network"]
+    if onnx and not networks:
+        raise InputError("--onnx: the simulator has no network; its residual stands as formulas in residual.py.")
+    place = new_folder(Path(folder), "export")
+    place.mkdir(parents=True, exist_ok=True)
+    wanted = improved_model(augmented)
+    exact = write_mjcf(robot.model, wanted, place, standalone.MODEL_FILE)
+    written = mujoco.MjModel.from_xml_path(str(place / standalone.MODEL_FILE))
+    left_out = tuple(
+        name.partition("/")[2]
+        for name, value in exact.items()
+        if name.startswith("model/")
+        and name.partition("/")[2] not in _DERIVED
+        and not np.allclose(getattr(written, name.partition("/")[2]), value, rtol=1e-4, atol=1e-7)
+    )
+    _write_json(place / standalone.SETTINGS_FILE, _settings(augmented, wanted, parts))
+    arrays = {f"part_{i}/{name}": value for i, part in enumerate(parts) for name, value in part.arrays.items()}
+    np.savez(place / standalone.PARAMETERS_FILE, **exact, **arrays)  # pyright: ignore[reportArgumentType]
+    (place / _SOURCE).write_text(standalone_source(__package__ or "", _SOURCE), encoding="utf-8")
+    (place / _EXAMPLE).write_text(_EXAMPLE_TEXT.format(name=robot.name), encoding="utf-8")
+    names = dict.fromkeys(part.settings["name"] for part in networks)
+    for number, part in enumerate(networks):
+        stem = part.settings["name"] if len(names) == len(networks) else f"{part.settings['name']}-{number + 1}"
+        if onnx:
+            (place / f"{stem}.onnx").write_bytes(_network_onnx(part))
+    deviation = None
+    if check_seconds > 0:
+        _write_check(place / standalone.CHECK_FILE, augmented, wanted, check_seconds)
+        distances, angles, _ = standalone.deviations(place)
+        deviation = float(distances.max()), float(angles.max())
+    text = _readme(augmented, parts, left_out, onnx=onnx, checked=deviation is not None)
+    (place / "README.md").write_text(text, encoding="utf-8")
+    return ExportedSimulator(place, deviation, left_out)
+
+
+def improved_model(simulator: AugmentedSimulator) -> mujoco.MjModel:
+    """Return the simulator's model for C MuJoCo: with identified actuators, and the residual's fields."""
+    plain = simulator.simulator
+    model = mujoco.MjModel.from_xml_path(str(simulator.robot.model))
+    for name in dir(model):  # a copy, but for what copies forget
+        value = None if name.startswith("_") else getattr(plain.mj_model, name, None)
+        if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+            getattr(model, name)[...] = value
+    changed = False
+    for name in dir(plain.model):
+        own = None if name.startswith("_") or name in _DERIVED else getattr(model, name, None)
+        if not isinstance(own, np.ndarray) or own.dtype.kind != "f":
+            continue
+        now = np.asarray(getattr(plain.model, name))
+        if now.shape != own.shape or now.dtype.kind != "f":
+            continue
+        # In MJX's precision, so that what it only rounds stays as it is.
+        different = now != own.astype(now.dtype)
+        own[different] = now[different]
+        changed = changed or bool(different.any())
+    if changed:
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+# ---- the residual's parts ----
+
+
+def _parts(simulator: AugmentedSimulator) -> list[ExportedPart]:
+    bound = simulator.residual
+    return [] if bound is None else [_export_part(simulator, *part) for part in _flat(bound.model, bound.params)]
+
+
+def _flat(model: ForceModel, params: Any) -> list[tuple[ForceModel, Any]]:
+    if isinstance(model, SumOfForces):
+        return [each for part, own in zip(model.parts, params, strict=True) for each in _flat(part, own)]
+    return [(model, params)]
+
+
+def _export_part(simulator: AugmentedSimulator, model: ForceModel, params: Any) -> ExportedPart:
+    for kind, export in _KINDS.items():
+        if isinstance(model, kind):
+            return export(simulator, model, jax.device_get(params))
+    known = ", ".join(kind.__name__ for kind in _KINDS)
+    raise InputError(f"The residual {model.name} is of a kind that cannot be exported; there are {known}.")
+
+
+def _network_part(simulator: AugmentedSimulator, model: NetworkForces, params: Any) -> ExportedPart:
+    if model.network is None:
+        raise InputError(f"The options of the network of {model.name} are unknown; load the residual from its run.")
+    config, robot = model.config, simulator.robot
+    units = load_units(config, len(load_names(config, robot)))
+    settings = {
+        "kind": "network",
+        "name": model.name,
+        "forces": config.forces,
+        "anchored": robot.anchored,
+        "observe_command": config.observe_command,
+        "command_ranges": [list(bounds) for bounds in robot.command_ranges],
+        "activation": model.network.activation,
+        "inputs": network_input_names(config, robot),
+        "outputs": load_names(config, robot),
+        "unit": units.tolist(),
+        "limit": (units * config.force_limit / config.force_scale).tolist(),
+    }
+    arrays = network_arrays(params, model.network)
+    del arrays["activation"]
+    return ExportedPart(settings, {name: np.asarray(value, float) for name, value in arrays.items()})
+
+
+def _aerodynamic_part(simulator: AugmentedSimulator, model: Aerodynamics, params: Any) -> ExportedPart:
+    settings = {"kind": "aerodynamic", "name": model.name, **_timing(simulator)}
+    return ExportedPart({**settings, "parameters": air_parameters_to_json(params)}, {})
+
+
+def _fluid_part(simulator: AugmentedSimulator, model: FluidForces, params: Any) -> ExportedPart:
+    gravity = np.asarray(simulator.simulator.mj_model.opt.gravity)
+    size = float(np.linalg.norm(gravity))
+    settings = {
+        "kind": "fluid",
+        "name": model.name,
+        **_timing(simulator),
+        "down": (gravity / size if size > 0 else gravity).tolist(),
+        "terms": [
+            {"name": term.name, "factors": list(term.factors), "power_of_speed": term.power} for term in model.terms
+        ],
+    }
+    return ExportedPart(settings, {"coefficients": np.asarray(params, float)})
+
+
+_KINDS: Mapping[type, Callable[..., ExportedPart]] = {
+    NetworkForces: _network_part,
+    Aerodynamics: _aerodynamic_part,
+    FluidForces: _fluid_part,
+}
+
+
+def _timing(simulator: AugmentedSimulator) -> dict[str, Any]:
+    plain = simulator.simulator
+    timestep = float(plain.mj_model.opt.timestep)
+    return {"control_timestep": plain.control_timestep, "timestep": timestep, "substeps": plain.substeps}
+
+
+def _network_onnx(part: ExportedPart) -> bytes:
+    settings, arrays = part
+    unit, limit = np.array(settings["unit"]), np.array(settings["limit"])
+    return onnx_model(
+        {**arrays, "activation": np.array(settings["activation"])},
+        NetworkPort("input", settings["inputs"]),
+        NetworkPort("loads", settings["outputs"]),
+        OutputScale(unit, np.zeros_like(unit), -limit, limit),
+        settings["name"],
+    )
+
+
+# ---- files ----
+
+
+def _settings(simulator: AugmentedSimulator, model: mujoco.MjModel, parts: list[ExportedPart]) -> dict[str, Any]:
+    robot, plain = simulator.robot, simulator.simulator
+    rest = robot.adapter.rest_command(robot, model)
+    commands = [
+        {
+            "name": name,
+            "actuator": model.actuator(index).name,
+            "low": low,
+            "high": high,
+            "rest": float(rest[index]),
+        }
+        for index, (name, (low, high)) in enumerate(zip(robot.commands, robot.command_ranges, strict=True))
+    ]
+    drivetrain: dict[str, Any] | None = None
+    if plain.drivetrain is not None:
+        drivetrain = {
+            name: [float(x) if math.isfinite(x) else None for x in np.asarray(value, float)]
+            for name, value in zip(QUANTITIES, plain.drivetrain, strict=True)
+        }
+        slots = plain.drivetrain_at_rest(jnp.asarray(rest, jnp.float32))
+        assert slots is not None
+        drivetrain["slots"] = len(slots.sent)
+    return {
+        "format": standalone.FORMAT,
+        "robot": robot.name,
+        "simulator": "vanilla" if simulator.residual is None else simulator.residual.model.name,
+        **_timing(simulator),
+        "tracked": robot.tracked,
+        "points": list(robot.points),
+        "commands": commands,
+        "initial_qpos": robot.adapter.initial_qpos(robot, model).tolist(),
+        "drivetrain": drivetrain,
+        "residual": [part.settings for part in parts],
+    }
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+class _Check(NamedTuple):
+    commands: Float[np.ndarray, "steps commands"]
+    qpos: Float[np.ndarray, " nq"]
+    qvel: Float[np.ndarray, " nv"]
+    position: Float[np.ndarray, "steps 3"]
+    quaternion: Float[np.ndarray, "steps 4"]
+
+
+def check_commands(robot: RobotDescription, seconds: float) -> Float[np.ndarray, "steps commands"]:
+    """Return random commands over their ranges, each held for a while."""
+    rng = np.random.default_rng(0)
+    steps, hold = (max(round(time / robot.control_timestep), 1) for time in (seconds, _HOLD))
+    low, high = np.array(robot.command_ranges).T
+    drawn = low + (high - low) * rng.uniform(size=(steps // hold + 1, len(low)))
+    return np.repeat(drawn, hold, axis=0)[:steps]
+
+
+def _write_check(path: Path, simulator: AugmentedSimulator, model: mujoco.MjModel, seconds: float) -> None:
+    robot = simulator.robot
+    qpos = robot.adapter.initial_qpos(robot, model)
+    commands = check_commands(robot, seconds)
+    states = rollout_in_double(simulator, model, qpos, np.zeros(model.nv), commands)
+    data, site = mujoco.MjData(model), model.site(robot.tracked).id
+    positions, quaternions = [], []
+    for after in states:
+        data.qpos[:] = after
+        mujoco.mj_kinematics(model, data)
+        positions.append(data.site_xpos[site].copy())
+        quaternions.append(data.xquat[model.site_bodyid[site]].copy())
+    check = _Check(commands, qpos, np.zeros(model.nv), np.array(positions), np.array(quaternions))
+    np.savez(path, **check._asdict())  # pyright: ignore[reportArgumentType]
+
+
+def rollout_in_double(
+    simulator: AugmentedSimulator,
+    model: mujoco.MjModel,
+    qpos: Float[np.ndarray, " nq"],
+    qvel: Float[np.ndarray, " nv"],
+    commands: Float[np.ndarray, "steps commands"],
+) -> Float[np.ndarray, "steps nq"]:
+    """Return the generalized positions after each control step, simulated in double precision.
+
+    `model` is the simulator's own for C MuJoCo (`improved_model`). The robot has been in the state for a while, under
+    the first command.
+    """
+    with jax.enable_x64(True):
+        start, augmented = begin_rollout(in_double(simulator, model), qpos, qvel, commands[0])
+
+        @jax.jit
+        def run(start: RolloutState, commands: Any) -> Any:
+            def step(state: RolloutState, command: Any) -> tuple[RolloutState, Any]:
+                after = augmented.step(state, command).state
+                return after, after.physics.qpos
+
+            return jax.lax.scan(step, start, commands)[1]
+
+        return np.asarray(run(start, jnp.asarray(commands)))
+
+
+def in_double(simulator: AugmentedSimulator, model: mujoco.MjModel) -> AugmentedSimulator:
+    """Return the simulator in double precision; to be called, and used, in `jax.enable_x64`."""
+
+    def double(tree: Any) -> Any:
+        return jax.tree.map(lambda x: jnp.asarray(x, jnp.float64) if np.asarray(x).dtype.kind == "f" else x, tree)
+
+    plain = Simulator(simulator.robot, simulator.actuators, model=model)
+    plain = plain.with_drivetrain(double(simulator.simulator.drivetrain))
+    bound = simulator.residual
+    return AugmentedSimulator(plain, None if bound is None else BoundForces(bound.model, double(bound.params)))
+
+
+def begin_rollout(
+    simulator: AugmentedSimulator,
+    qpos: Float[np.ndarray, " nq"],
+    qvel: Float[np.ndarray, " nv"],
+    command: Float[np.ndarray, " commands"],
+) -> tuple[RolloutState, AugmentedSimulator]:
+    """Return the state of a robot that has been at a place under a command for a while; and the simulator."""
+    plain = simulator.simulator
+    physics, held = state_at(jnp.asarray(qpos), jnp.asarray(qvel)), jnp.asarray(command)
+    features, _ = plain.observe(physics)
+    history, commands = jnp.tile(features, (HISTORY, 1)), jnp.tile(held, (HISTORY - 1, 1))
+    return RolloutState(physics, history, commands, plain.drivetrain_at_rest(held)), simulator
+
+
+# ---- texts ----
+
+_EXAMPLE_TEXT = '''"""A control loop in the improved simulator of {name}: random commands for 5 s."""
+
+from pathlib import Path
+
+import numpy as np
+from residual import ImprovedSimulator
+
+simulator = ImprovedSimulator(Path(__file__).resolve().parent)
+low, high = np.array([[command["low"], command["high"]] for command in simulator.settings["commands"]]).T
+rng = np.random.default_rng(0)
+simulator.reset()
+for step in range(round(5 / simulator.control_timestep)):
+    if step % 10 == 0:
+        command = low + (high - low) * rng.uniform(size=len(low))
+        data = simulator.step(command)
+        x, y, z = data.site(simulator.names[0]).xpos
+        print(f"{{data.time:5.2f}} s  {{simulator.names[0]}} at {{x:.3f}} {{y:.3f}} {{z:.3f}} m")
+    else:
+        simulator.step(command)
+'''
+
+
+def _readme(
+    simulator: AugmentedSimulator, parts: list[ExportedPart], left_out: tuple[str, ...], *, onnx: bool, checked: bool
+) -> str:
+    robot, plain = simulator.robot, simulator.simulator
+    names = " + ".join(part.settings["name"] for part in parts) or "none"
+    option = plain.mj_model.opt
+    lines = [
+        f"# {robot.name}, an improved simulator for C MuJoCo",
+        f"Residual: {names}. Identified actuators: {'no' if simulator.actuators is None else 'yes'}. Drivetrain: "
+        f"{'no' if plain.drivetrain is None else 'yes'}.",
+        "The folder needs Python 3.10, NumPy and MuJoCo. It was written for MuJoCo "
+        f"{mujoco.__version__}; the solver of another version may differ in the last digits.",
+        "| file | content |\n| --- | --- |\n"
+        "| `identified.xml` | the model, with the values of identified actuators and of the residual; numbers have six "
+        "digits |\n"
+        "| `simulator.json` | names, ranges, time steps, the drivetrain, and the residual's settings |\n"
+        "| `parameters.npz` | the residual's arrays, and the model's fields in all digits |\n"
+        "| `residual.py` | `ImprovedSimulator`, which applies drivetrain and residual |\n"
+        "| `example.py` | a control loop |\n"
+        + ("| `check.npz` | a rollout of the simulator that was exported |\n" if checked else "")
+        + ("| `*.onnx` | the networks, from what they see to the loads that they push with |\n" if onnx else ""),
+        "```python\n"
+        "from residual import ImprovedSimulator\n\n"
+        "simulator = ImprovedSimulator(folder)\n"
+        "simulator.reset(qpos, qvel)               # without arguments: the initial pose, at rest\n"
+        f"data = simulator.step([{', '.join(robot.commands)}])  # mujoco.MjData after a control step\n"
+        "```",
+    ]
+    if checked:
+        lines.append(
+            "`python residual.py` compares a rollout with the simulator that was exported, in double precision."
+        )
+    ranges = "; ".join(
+        f"`{name}` from {low:g} to {high:g}"
+        for name, (low, high) in zip(robot.commands, robot.command_ranges, strict=True)
+    )
+    lines += [
+        f"A control step is {robot.control_timestep:g} s: {plain.substeps} physics steps of {option.timestep:g} s. The "
+        f"solver makes at most {option.iterations} iterations, as in training.",
+        f"Commands are in the actuators' own units: {ranges}.",
+        "`ImprovedSimulator(folder, model)` takes a scene of your own that holds the robot, with the same names of "
+        "sites and actuators. It sets `ctrl` of the robot's actuators, and `xfrc_applied` of the bodies that the "
+        "residual pushes.",
+    ]
+    if left_out:
+        lines.append(f"MJCF cannot hold these fields; `parameters.npz` does: {', '.join(left_out)}.")
+    for part in parts:
+        if part.settings["kind"] == "network":
+            seen = "\n".join(f"{i}. {name}" for i, name in enumerate(part.settings["inputs"]))
+            pushed = ", ".join(part.settings["outputs"])
+            frame = "the world's axes" if robot.anchored else f"the heading frame of {robot.tracked}"
+            lines.append(f"## What the network {part.settings['name']} sees")
+            lines.append(
+                f"Vectors are in {frame}."
+                + (
+                    ""
+                    if robot.anchored
+                    else f" x and y of positions are from {robot.tracked} now; z is above the floor."
+                )
+                + f" It pushes with: {pushed}."
+            )
+            lines.append(seen)
+    return "\n\n".join(textwrap.dedent(line) for line in lines) + "\n"

@@ -1,0 +1,50 @@
+"""What fits of physical models (the air, fluid forces) share: reports to a run and to the user, and the residual."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reference import stack_motions
+from ballu_mjx.residuals.network import ForceNetworkConfig, recorded_inputs
+from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
+from ballu_mjx.runs.progress import PhaseProgress
+from ballu_mjx.runs.record import TrainingRecord
+from ballu_mjx.sim.force_model import ForceModel
+from ballu_mjx.sim.simulator import Simulator
+
+
+class FitReport:
+    """Takes every evaluation of a fit, for a record and a progress."""
+
+    def __init__(self, record: TrainingRecord, progress: PhaseProgress | None, metric: str) -> None:
+        """`metric` is what the record calls the number that the fit makes small."""
+        self._record, self._progress, self._metric = record, progress, metric
+        self._began, self._done = time.perf_counter(), 0
+
+    def __call__(self, stage: str, iteration: int, steps: int, loss: float) -> None:
+        """Take an iteration, of at most `steps` in its stage."""
+        self._done += 1
+        if self._progress is not None:
+            self._progress.update(stage, iteration, steps, loss)
+        self._record.log(self._done, {self._metric: loss, "seconds": time.perf_counter() - self._began})
+
+    def close(self, control_steps: int) -> None:
+        """End with the number of control steps that were simulated."""
+        if self._progress is not None:
+            self._progress.close()
+        self._record.log(self._done, {"control_steps": control_steps})
+
+
+def fitted_residual(
+    simulator: Simulator, motions: Sequence[Motion], model: ForceModel, params: Any, record: TrainingRecord, text: str
+) -> TrainedResidual:
+    """Return the residual of a fit to `motions`, with its report in words; `record` takes the range of its inputs."""
+    reference, _ = stack_motions(simulator, motions)
+    inputs = np.asarray(recorded_inputs(reference, ForceNetworkConfig(), simulator.robot))
+    write_observed(record, inputs)
+    return TrainedResidual(model, params, observed_range(inputs), 0, simulator.actuators, text)

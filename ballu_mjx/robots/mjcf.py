@@ -1,0 +1,129 @@
+"""A robot's model with other numbers, as an MJCF file with its assets in one folder."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from ballu_mjx.common.errors import InputError
+
+_ELEMENTS: Mapping[str, tuple[str, str]] = {
+    "dof_damping": ("joints", "damping"),
+    "dof_armature": ("joints", "armature"),
+    "dof_frictionloss": ("joints", "frictionloss"),
+    "jnt_stiffness": ("joints", "stiffness"),
+    "jnt_range": ("joints", "range"),
+    "qpos_spring": ("joints", "springref"),
+    "tendon_stiffness": ("tendons", "stiffness"),
+    "tendon_damping": ("tendons", "damping"),
+    "tendon_frictionloss": ("tendons", "frictionloss"),
+    "tendon_lengthspring": ("tendons", "springlength"),
+    "tendon_range": ("tendons", "range"),
+    "geom_friction": ("geoms", "friction"),
+    "actuator_gainprm": ("actuators", "gainprm"),
+    "actuator_biasprm": ("actuators", "biasprm"),
+    "actuator_forcerange": ("actuators", "forcerange"),
+    "body_gravcomp": ("bodies", "gravcomp"),
+}
+"""Where MuJoCo's specification of a model has a field of the compiled one."""
+_INERTIAL = ("body_mass", "body_ipos", "body_iquat", "body_inertia")
+_ASSETS = "assets"
+
+
+def write_mjcf(file: Path, wanted: mujoco.MjModel, folder: Path, name: str) -> dict[str, np.ndarray]:
+    """Write the model in `file` with the numbers of `wanted` as `folder / name`; its assets go into `folder / assets`.
+
+    **Returns** what MJCF's text, which has six digits, leaves out: `model/FIELD` and `option/FIELD` by name, whole
+    fields, with the values of `wanted`.
+
+    **Raises** `InputError` where MuJoCo does not read again what it writes.
+    """
+    spec = mujoco.MjSpec.from_file(str(file))
+    _write_fields(spec, wanted)
+    _copy_assets(spec, file, folder)
+    try:
+        spec.compile()
+        (folder / name).write_text(spec.to_xml(), encoding="utf-8")
+        written = mujoco.MjModel.from_xml_path(str(folder / name))
+    except (ValueError, mujoco.FatalError) as error:
+        problem = " ".join(str(error).split())
+        raise InputError(f"{file}: MuJoCo cannot write this model as one file ({problem}); simplify it.") from error
+    return _differences(written, wanted, file)
+
+
+def _write_fields(spec: mujoco.MjSpec, wanted: mujoco.MjModel) -> None:
+    base = spec.compile()
+    for field, (kind, own) in _ELEMENTS.items():
+        old, new = (getattr(model, field) for model in (base, wanted))
+        parts = {part.id: part for part in getattr(spec, kind)}
+        for place in np.argwhere(old != new):
+            index = int(place[0])
+            if field.startswith("dof_"):
+                index = int(base.dof_jntid[index])
+            elif field.startswith("qpos_"):
+                index = int(np.flatnonzero(base.jnt_qposadr <= index)[-1])
+            part, value = parts[index], float(new[tuple(place)])
+            if isinstance(getattr(part, own), np.ndarray):
+                getattr(part, own)[int(place[1]) if len(place) > 1 else 0] = value
+            else:
+                setattr(part, own, value)
+    moved = {
+        int(row) for field in _INERTIAL for row in np.argwhere(getattr(base, field) != getattr(wanted, field))[:, 0]
+    }
+    for body in spec.bodies:
+        if body.id in moved:
+            body.explicitinertial = True
+            body.mass, body.ipos = wanted.body_mass[body.id], wanted.body_ipos[body.id]
+            body.iquat, body.inertia = wanted.body_iquat[body.id], wanted.body_inertia[body.id]
+            body.fullinertia = [np.nan, 0, 0, 0, 0, 0]
+
+
+def _copy_assets(spec: mujoco.MjSpec, file: Path, folder: Path) -> None:
+    """Copy what the model names into one folder, and have the specification name it there."""
+    included = [Path(each).parent for each in mujoco.mju_getXMLDependencies(str(file)) if each.endswith(".xml")]
+    places = [place / sub for place in (file.parent, *included) for sub in (spec.meshdir, spec.texturedir, "")]
+    taken: dict[str, Path] = {}
+
+    def copy(named: str) -> str:
+        found = next((place / named for place in places if (place / named).is_file()), None)
+        if found is None:
+            raise InputError(f"{file}: names {named}, which is not there; restore it.")
+        name, number = found.name, 0
+        while taken.setdefault(name, found.resolve()) != found.resolve():
+            number += 1
+            name = f"{number}-{found.name}"
+        (folder / _ASSETS).mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(found, folder / _ASSETS / name)
+        return name
+
+    for asset in (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins):
+        if asset.file:
+            asset.name = asset.name or Path(asset.file).stem
+            asset.file = copy(asset.file)
+        for index, cube in enumerate(getattr(asset, "cubefiles", ())):
+            if cube:
+                asset.cubefiles[index] = copy(cube)
+    spec.meshdir = spec.texturedir = _ASSETS
+    spec.modelfiledir = str(folder)
+
+
+def _differences(written: mujoco.MjModel, wanted: mujoco.MjModel, file: Path) -> dict[str, np.ndarray]:
+    found: dict[str, np.ndarray] = {}
+    for owner, one, other in (("model", written, wanted), ("option", written.opt, wanted.opt)):
+        for name in dir(other):
+            value: Any = None if name.startswith("_") else getattr(other, name, None)
+            if isinstance(value, float):
+                value = np.array(value)
+            if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
+                continue
+            own = np.asarray(getattr(one, name))
+            if own.shape != value.shape:
+                raise InputError(f"{file}: MuJoCo writes this model with other parts ({name}); simplify it.")
+            if not np.array_equal(own, value, equal_nan=True):
+                found[f"{owner}/{name}"] = value.copy()
+    return found

@@ -1,0 +1,77 @@
+# %% [markdown]
+# # Stable-Baselines3's PPO in an improved simulator
+#
+# `python experiments/stable_baselines3_ppo.py --run runs/envmimic-...` trains a walk in the simulator of a run: of a
+# residual, of identified actuators, or of a policy. Without `--run` it is the nominal simulator. It needs
+# `pip install "ballu-mjx[gym]" stable-baselines3`. All environments step in one compiled program.
+
+# %%
+from __future__ import annotations
+
+import _setup
+
+_setup.prepare()
+
+import argparse
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+
+import ballu_mjx.environments  # noqa: F401  # registers the names
+
+
+# %%
+def returns(model, env, steps: int) -> float:
+    """Return the mean reward of a control step over `steps` of them, without exploration."""
+    observation, rewards = env.reset(), []
+    for _ in range(steps):
+        observation, reward, _, _ = env.step(model.predict(observation, deterministic=True)[0])
+        rewards.append(reward)
+    return float(np.mean(rewards))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Stable-Baselines3's PPO in an improved simulator.")
+    parser.add_argument("--run", type=Path, help="run whose simulator it is")
+    parser.add_argument("--task", default="Walk", choices=["Walk", "Turn", "TurnRight", "WalkBackward"])
+    parser.add_argument("--steps", type=int, default=1_000_000, help="control steps")
+    parser.add_argument("--num-envs", type=int, default=256)
+    parser.add_argument("--output", type=Path, default=Path("runs/sb3.zip"), help="where the policy goes")
+    options = parser.parse_args()
+    import torch  # pyright: ignore[reportMissingImports]
+    from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
+
+    from ballu_mjx.policies.environments.gym_env import GymVectorEnv
+    from ballu_mjx.policies.environments.sb3_env import StableBaselinesEnv  # says what is missing
+
+    torch.set_num_threads(1)  # its threads and the simulation's would wait for each other
+    vector = gymnasium.make_vec(f"ballu_mjx/{options.task}-v0", num_envs=options.num_envs, run=options.run)
+    assert isinstance(vector, GymVectorEnv)
+    env = StableBaselinesEnv(vector)
+    model = PPO(
+        "MlpPolicy",
+        env,
+        n_steps=32,
+        batch_size=options.num_envs * 4,
+        n_epochs=4,
+        learning_rate=1e-3,
+        gamma=0.97,
+        policy_kwargs={"log_std_init": -0.5},
+        device="cpu",
+        seed=0,
+    )
+    trial = round(
+        vector.unwrapped.locomotion.config.episode_seconds / vector.unwrapped.locomotion.robot.control_timestep
+    )
+    before = returns(model, env, trial)
+    model.learn(options.steps, progress_bar=False)
+    after = returns(model, env, trial)
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    model.save(options.output)
+    print(f"Mean reward of a control step: {before:.3f} before, {after:.3f} after; written to {options.output}.")
+
+
+# %%
+if __name__ == "__main__":
+    _setup.run(main)
