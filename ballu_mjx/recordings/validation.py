@@ -235,7 +235,9 @@ def blank_held(path: Path, columns: dict[str, Column], groups: Sequence[ColumnGr
         for start, end in _runs(_repeats(values)):
             lasted = float(time[min(end, len(time) - 1)] - time[start - 1])
             inside = end < len(time) and start > 1
-            if (lasted <= LONGEST_GAP and inside and not coarse) or _goes_on_with_a_jump(columns, parts, start, end, coarse):
+            if (lasted <= LONGEST_GAP and inside and not coarse) or _goes_on_with_a_jump(
+                columns, parts, start, end, coarse
+            ):
                 held[start:end] = True
                 if lasted > LONGEST_GAP + 2 * float(np.median(np.diff(time))):
                     problem = (
