@@ -76,7 +76,8 @@ def test_replay_of_a_robot_that_has_changed_is_refused(tmp_path: Path):
         read_rollouts(tmp_path / "replay.npz")
     with np.load(tmp_path / "replay.npz") as archive:
         arrays = dict(archive)
-    np.savez(tmp_path / "replay.npz", **(arrays | {"robot/path": np.zeros((11, 3))}))
+    arrays["robot/path"] = np.zeros((11, 3))
+    np.savez(tmp_path / "replay.npz", **arrays)  # pyright: ignore[reportArgumentType]
     with pytest.raises(view.InputError, match=r"replay\.npz: does not say of which robot it is"):
         read_rollouts(tmp_path / "replay.npz")
 
