@@ -149,7 +149,22 @@ def _cells(content: bytes, random: Random) -> bytes:
     return "\n".join(map(",".join, rows)).encode()
 
 
-CSV = (*TEXT, _cells, _cells, _cells, _cells)
+def _stream(content: bytes, random: Random) -> bytes:
+    """What a streaming client does: hold samples, or stamp several at once."""
+    rows = [line.split(",") for line in content.decode().split("\n")]
+    samples = [row for row in rows if len(row) > 2 and re.fullmatch(r"-?\d+(\.\d+)?", row[0])]
+    if len(samples) > 1 and random.integers(2):
+        start = int(random.integers(1, len(samples)))
+        for row in samples[start : start + int(random.integers(1, 120))]:
+            row[1:] = samples[start - 1][1:]
+    else:
+        burst = int(random.integers(2, 12))
+        for number, row in enumerate(samples):
+            row[0] = repr(float(samples[number - number % burst][0]) + 1e-4 * (number % burst))
+    return "\n".join(map(",".join, rows)).encode()
+
+
+CSV = (*TEXT, _cells, _cells, _cells, _cells, _stream, _stream)
 
 
 def _places(value: Any) -> Iterator[tuple[Any, Any]]:

@@ -74,7 +74,7 @@ def hold(recording: Recording, start: int, count: int) -> Recording:
     )
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 99), start=st.integers(2, 240), count=st.integers(1, 48))
 def test_held_poses_are_filled_in_as_gaps(robot: RobotDescription, seed: int, start: int, count: int):
     whole = flight(robot, seed)
@@ -139,7 +139,7 @@ def test_poses_from_encoders_have_been_seen(robot: RobotDescription, turns: int)
     assert not found.held and not found.interpolated
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 99),
     start=st.integers(2, SAMPLES - 1),
@@ -161,7 +161,7 @@ def test_flips_of_an_orientation_are_refused(
         through_a_file(dataclasses.replace(whole, tracked_quaternion=quaternion), robot)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 99), start=st.integers(1, SAMPLES - 1), count=st.integers(1, 60))
 def test_jumps_of_a_place_are_refused_without_limits_in_the_description(
     robot: RobotDescription, seed: int, start: int, count: int
@@ -173,7 +173,7 @@ def test_jumps_of_a_place_are_refused_without_limits_in_the_description(
         through_a_file(dataclasses.replace(whole, points={"nose": nose}), robot)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 99), rate=st.sampled_from([20.0, 50.0, 100.0, 240.0, 1000.0]), hit=st.booleans())
 def test_quick_but_honest_motion_is_read(robot: RobotDescription, seed: int, rate: float, hit: bool):
     """Spins at 15 rad/s and moves at 9 m/s, or stops from 4 m/s within a sample where it hits something."""
@@ -193,7 +193,7 @@ def test_quick_but_honest_motion_is_read(robot: RobotDescription, seed: int, rat
     assert len(found.time) == len(time) and not found.held
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(seed=st.integers(0, 99), burst=st.integers(4, 8), quick=st.floats(0.0003, 0.001))
 def test_bursts_of_stamps_are_refused(robot: RobotDescription, seed: int, burst: int, quick: float):
     """Times of arrival: several samples at once, then a pause, though the median step looks like a high rate."""
@@ -204,7 +204,7 @@ def test_bursts_of_stamps_are_refused(robot: RobotDescription, seed: int, burst:
         through_a_file(dataclasses.replace(whole, time=time), robot)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 99), jitter=st.floats(0.0, 0.004))
 def test_stamps_that_jitter_and_samples_that_are_missing_are_no_bursts(
     robot: RobotDescription, seed: int, jitter: float
