@@ -257,7 +257,8 @@ class Identifier:
             self._kept = kept
             fitted.append(self._search(data, report))
         lost, left = fitted[0][1], fitted[-1][1]
-        gained = (lost - left) / max(left, 1e-300) * self._independent(data) / max(int(self._further.sum()), 1)
+        more = max(len(SIDES) * int(self._further.sum()), 1)
+        gained = (lost - left) / max(left, 1e-300) * self._independent(data) / more
         coordinates, _, found = fitted[-1] if gained > _WORTH else fitted[0]
         self._kept = np.ones_like(self._further) if gained > _WORTH else ~self._further
         leg = np.repeat(legs, self._starts)
