@@ -264,7 +264,7 @@ def noisy(sweep: Sweep, seed: int, noise: float = np.deg2rad(0.5)) -> Sweep:
 
 def test_known_parameters_are_recovered_whatever_the_draws(noiseless: Sweep, identifier: Identifier) -> None:
     for seed in range(2):
-        identifier.config = IdentificationConfig(seed=seed, draws=16)
+        identifier.config = IdentificationConfig(seed=seed, draws=32)
         result = identifier.run(noiseless, lambda *_: None)
         for fit, truth in zip(result.fits, TRUTH, strict=True):
             for index, name in enumerate(LEG_PARAMETERS):
@@ -277,7 +277,7 @@ def test_known_parameters_are_recovered_whatever_the_draws(noiseless: Sweep, ide
 
 def test_standard_errors_are_honest(noiseless: Sweep, identifier: Identifier) -> None:
     """With 0.5 deg of noise, nine in ten estimates within two standard errors."""
-    identifier.config = IdentificationConfig(draws=16, steps=12)
+    identifier.config = IdentificationConfig(draws=32, steps=12)
     within = []
     for seed in range(3):
         result = identifier.run(noisy(noiseless, seed), lambda *_: None)
@@ -294,7 +294,7 @@ def test_friction_and_play_pass_for_actuators_only_where_settled_angles_are_all(
     sweep = noisy(dataclasses.replace(noiseless, settled=ends), 0)
     off = {}
     for motion in (True, False):
-        identifier.config = IdentificationConfig(motion=motion, draws=16, steps=12)
+        identifier.config = IdentificationConfig(motion=motion, draws=32, steps=15)
         fits = identifier.run(sweep, lambda *_: None).fits
         zero = LEG_PARAMETERS.index("default_motor_angle")
         off[motion] = [abs(fit.vector[zero] - truth[zero]) for fit, truth in zip(fits, TRUTH, strict=True)]
