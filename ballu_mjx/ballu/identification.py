@@ -210,7 +210,8 @@ def identify_legs(
     2. From the best of these, the whole motion.
        Both are done twice, with the `FURTHER` parameters held at their nominal values and with all. The richer model is
        kept where it explains what the simpler one leaves, by an F-test.
-    3. With what is known of robots beforehand: what a sweep hardly shows stays near the nominal values.
+    3. With the richer model, or where the data leave directions open: with what is known of robots beforehand, so that
+       what a sweep hardly shows stays near the nominal values.
     4. With `objective="hausdorff"`, the paper's distance between curves, from there.
 
     **Raises** `InputError` from `IdentificationConfig`'s check.
@@ -256,20 +257,22 @@ class Identifier:
             self._kept = kept
             fitted.append(self._search(data, report))
         lost, left = fitted[0][1], fitted[-1][1]
-        gained = (lost - left) / max(left, 1e-300) * self._independent(data) / max(int(self._further.sum()), 1)
+        more = max(len(SIDES) * int(self._further.sum()), 1)
+        gained = (lost - left) / max(left, 1e-300) * self._independent(data) / more
         coordinates, _, found = fitted[-1] if gained > _WORTH else fitted[0]
         self._kept = np.ones_like(self._further) if gained > _WORTH else ~self._further
         leg = np.repeat(legs, self._starts)
         ended = np.sum(self._settled_residuals(found, leg, data)[0] ** 2, axis=1).reshape(len(legs), -1)
         analyses = self._analyse(coordinates, data)
-        coordinates, _ = self._squares(
-            lambda y: self._with_priors(y, data, analyses),
-            coordinates,
-            config.steps,
-            partial(report, "priors"),
-            _PATIENCE,
-        )
-        analyses = self._analyse(coordinates, data)
+        if self._kept.all() or any(direction.standard_error > 1 for a in analyses for direction in a.directions):
+            coordinates, _ = self._squares(
+                lambda y: self._with_priors(y, data, analyses),
+                coordinates,
+                config.steps,
+                partial(report, "priors"),
+                _PATIENCE,
+            )
+            analyses = self._analyse(coordinates, data)
         if config.objective == "hausdorff":
             # From every search's end: a maximum over points and a sum over joints has more valleys still.
             starts = np.concatenate([coordinates[:, None, :size], found.reshape(len(legs), -1, size)[:, 1:]], axis=1)
