@@ -48,6 +48,9 @@ COMMANDS = (
     *(f"train {task} --resume RUN --num-timesteps 0" for task in ("envmimic", "walk", "turn")),
     *(f"train {task} --residual RUN --recordings nowhere" for task in ("envmimic", "supervised", "analytic")),
     "train walk --residual RUN --num-envs 0",
+    "export check RUN",
+    "export policy RUN --output RUN",
+    "export simulator RUN --output RUN",
     "train aerodynamic --fixed-from RUN --recordings nowhere",
     "train supervised --actuators RUN --recordings ONE",
     "train supervised --output RUN --recordings ONE",
@@ -124,6 +127,7 @@ def test_every_command_ends_well_on_every_run(
         ("report RUN --output OUT/page.html", RUNS),
         ("compare RUN", (*RESIDUAL_TASKS, "walk")),
         ("export policy RUN --output OUT/robot --no-open-loop", ("walk",)),
+        ("export simulator RUN --output OUT/simulator --check-seconds 0", (*RESIDUAL_TASKS, "walk")),
     ],
 )
 def test_commands_work_on_the_runs_they_are_for(

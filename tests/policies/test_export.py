@@ -6,6 +6,7 @@ import importlib.util
 import json
 import math
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -17,11 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rover import write_rover
+from servo_arm import write_arm
 
 from ballu_mjx.cli import export as export_command
 from ballu_mjx.cli import train_policy
 from ballu_mjx.cli.export import PolicyOptions as Options
 from ballu_mjx.policies.deploy import controller, estimator, export
+from ballu_mjx.policies.deploy.check import PolicyCheck, Trial
 from ballu_mjx.policies.deploy.controller import TIMEOUT, Controller, observation_names
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, locomotion_observation, num_observations
@@ -34,13 +37,15 @@ from ballu_mjx.residuals.aerodynamics import (
     air_parameters_to_json,
 )
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig
+from ballu_mjx.residuals.deploy.export import export_simulator
 from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.residuals.trained import write_observed
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Normalizer, Params, PPOConfig
-from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.folder import Run
+from ballu_mjx.sim.simulator import Simulator
 
 BALLU = load_robot()
 NAMES = ("balloon", "base", "foot_left", "foot_right")
@@ -444,3 +449,67 @@ def test_export_can_be_imported_from_anywhere(exported: Path, monkeypatch: pytes
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     assert module.Controller(exported).step(0.0, None) == (0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def rover_policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An exported policy of a small robot that hovers, so that contacts are those of C MuJoCo."""
+    folder = tmp_path_factory.mktemp("rover")
+    path = write_rover(folder).model
+    text = path.read_text().replace("<option ", '<option gravity="0 0 0" ')
+    path.write_text(text.replace('size="0 0 0.05"', 'size="0 0 0.05" pos="0 0 -1"'))
+    rover = read_description(folder / "rover.robot.json")
+    return export.export_policy(Options(write_run(folder / "run", robot=rover), open_loop=False, onnx=True))
+
+
+def test_what_a_policy_sees_and_commands_is_named_for_other_programs(rover_policy: Path):
+    import onnx
+
+    described = json.loads((rover_policy / "policy.json").read_text())
+    assert described["robot"] == "rover" and described["task"] == "walk" and Path(described["run"]).is_dir()
+    assert described["observation"][3] == {"name": "hull velocity x", "unit": "m/s"}
+    assert described["observation"][-1] == {"name": "sine of hull yaw", "unit": "1"}
+    assert [(each["name"], each["low"], each["high"]) for each in described["commands"]] == [
+        ("arm", -0.4, 0.6),
+        ("push", 0.0, 10.0),
+    ]
+    props = {each.key: json.loads(each.value) for each in onnx.load(rover_policy / "policy.onnx").metadata_props}
+    assert [name.partition(", ")[0] for name in props["inputs"]] == [each["name"] for each in described["observation"]]
+    assert len(props["outputs"]) == 2
+
+
+def test_check_runs_an_exported_policy_in_c_mujoco(
+    rover_policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Side by side with its own simulator; in another robot's simulator, and damaged, it says so."""
+    assert export_command.main(["check", str(rover_policy), "--seconds", "2"]) == 0
+    told = capsys.readouterr().out
+    assert "AGREES" in told and "its own simulator" in told and "from frames" in told
+    trials = [line.split() for line in told.splitlines() if line.strip().startswith(("x (m)", "yaw"))]
+    assert all(abs(float(line[2]) - float(line[3])) < 0.02 for line in trials)
+    arm = export_simulator(Simulator(write_arm(tmp_path)), tmp_path / "arm", check_seconds=0.0).folder
+    damaged = tmp_path / "damaged"
+    shutil.copytree(rover_policy, damaged)
+    with np.load(damaged / "weights.npz") as file:
+        stored: dict[str, Any] = {name: file[name] for name in file.files}
+    np.savez(damaged / "weights.npz", **stored | {"check_commands": stored["check_commands"] + 1})
+    for arguments, words in (
+        ([rover_policy, "--simulator", arm], "is a simulator of arm, not of rover"),
+        ([rover_policy, "--simulator", tmp_path], "is no exported simulator"),
+        ([rover_policy, "--run", tmp_path / "gone"], "there is no run"),
+        ([damaged], "is another policy than that of its run"),
+        ([rover_policy, "--seconds", "-1"], "--seconds"),
+    ):
+        assert export_command.main(["check", *map(str, arguments)]) == 2
+        error = capsys.readouterr().err
+        assert words in error and error.count("\n") == 1, error
+
+
+def test_a_policy_that_does_otherwise_differs():
+    own = Trial("own", 0.3, (6.0, 0.5), 10.0)
+    assert dataclasses.replace(own, displacement=(6.3, 0.3)).differs_from(own) is None
+    assert "1.00 m" in str(dataclasses.replace(own, displacement=(5.0, 0.5)).differs_from(own))
+    assert "mean reward is 0.200" in str(dataclasses.replace(own, reward=0.2).differs_from(own))
+    assert Trial("c", math.nan, (math.nan, 0.0), 0.0).differs_from(own) is not None
+    found = PolicyCheck(own, dataclasses.replace(own, reward=0.2), own, 24.0)
+    assert not found.agrees and "DIFFERS" in found.table() and "mean reward" in found.verdict()

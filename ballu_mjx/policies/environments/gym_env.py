@@ -50,7 +50,7 @@ class GymEnv(gymnasium.Env):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, SupportsFloat, bool, bool, dict[str, Any]]:
         """Advance by a control step."""
-        found = self._batch.step(action)
+        found = self._batch.step(np.asarray(action, np.float32)[None])
         info = {name: float(value[0]) for name, value in found.metrics.items()}
         return (
             found.last_observation[0],
