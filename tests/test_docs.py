@@ -14,7 +14,7 @@ from ballu_mjx.cli import completion, record
 
 ROOT = Path(__file__).parents[1]
 API = ROOT / "docs" / "api"
-PROGRAMS = {"ballu_mjx.__main__", "ballu_mjx.train", "ballu_mjx.recordings.importers.c3d_process"}
+PROGRAMS = {"ballu_mjx.__main__", "ballu_mjx.train"}
 """Run as processes, imported by nobody."""
 FOLDERS = ("", "ballu_mjx", "ballu_mjx/recordings/importers", "ballu_mjx/policies", "benchmarks")
 """Where the pages' paths begin."""

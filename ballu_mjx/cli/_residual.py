@@ -12,6 +12,7 @@ import jax
 from ballu_mjx.cli._command import load_chosen_robot
 from ballu_mjx.evaluation.open_loop import Evaluators
 from ballu_mjx.identification.guard import choose_actuators
+from ballu_mjx.identification.stability import check_stability
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.dataset import USES, RecordingsData, ResidualDataset
 from ballu_mjx.residuals.run_config import describe_run
@@ -85,6 +86,8 @@ def prepare(
         _announce(dataset, folder, data.quick)
     simulator = Simulator(robot, dataset.identified)
     motions = dataset.reconstruct(simulator.mj_model)
+    if resume is None:
+        check_stability(robot, motions["training"], None)
     if dataset.identified is not None and resume is None:
         choice = choose_actuators(robot, dataset.identified, motions["validation"])
         if first:

@@ -165,7 +165,10 @@ def _import(options: Import) -> None:
     recording = place(trajectories, mapping, robot, recording_name(options.output))
     if recording.time[-1] - recording.time[0] < SHORTEST:
         raise InputError(f"{options.file}: lasts less than {SHORTEST:g} s; capture for longer.")
-    print(f"{options.file}: {len(recording.time)} samples, {recording.time[-1] - recording.time[0]:.2f} s")
+    cropped = trajectories.first_frame > 1
+    begins = f", from frame {trajectories.first_frame}, {recording.time[0]:.2f} s of the trial" if cropped else ""
+    duration = recording.time[-1] - recording.time[0]
+    print(f"{options.file}: {len(recording.time)} samples, {duration:.2f} s{begins}")
     if options.commands is None:
         if table is None or next(iter(mapping.commands.columns.values())) not in table.header:
             raise InputError(
@@ -281,7 +284,8 @@ def _write(options: Import, robot: RobotDescription, recording: Recording) -> No
         ) from error
     duration = read.time[-1] - read.time[0]
     filled = sum(read.interpolated.values())
-    print(f"{options.output}: {duration:.2f} s, {filled} cells filled in when read; `record check` tells more")
+    held = "".join(f"; {count} samples of {sites} were held, not seen" for sites, count in _held(read))
+    print(f"{options.output}: {duration:.2f} s, {filled} cells filled in when read{held}; `record check` tells more")
 
 
 def _check_output(output: Path) -> None:
@@ -364,7 +368,9 @@ def report(
         shown = names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
         told = f"{len(spans)} drop-outs, {sum(lengths):.2f} s in all, the longest {max(lengths):.2f} s"
         lines.append(f"  {shown}: " + (told if len(spans) > 1 else f"1 drop-out of {lengths[0]:.2f} s"))
-    if not gaps:
+    for sites, count in _held(recording):
+        lines.append(f"  {sites}: {count} samples repeat the one before to the last digit; taken as not seen")
+    if not gaps and not recording.held:
         lines.append("  no drop-outs")
     for label, value in _ranges(recording, robot):
         low, high = value.min(axis=0), value.max(axis=0)
@@ -377,6 +383,14 @@ def report(
             f"{changes} changes, held for {held:.2f} s on average"
         )
     return "\n".join(lines)
+
+
+def _held(recording: Recording) -> list[tuple[str, int]]:
+    """Sites that were held alike, and for how many samples."""
+    alike: dict[int, list[str]] = {}
+    for site, count in recording.held.items():
+        alike.setdefault(count, []).append(site)
+    return [(", ".join(sites), count) for count, sites in alike.items()]
 
 
 def _ranges(recording: Recording, robot: RobotDescription) -> list[tuple[str, np.ndarray]]:

@@ -6,8 +6,9 @@ test uses: the validation recordings.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -181,8 +182,8 @@ def _replay(
         if not len(starts):
             continue
         steps = min(round(max(horizons) / robot.control_timestep), len(motion.command))
-        ctrl = _ctrl(parameters, motion.command, substeps, float(model.opt.timestep))
-        qpos, intact = _simulate(model, motion, starts, ctrl, steps, substeps)
+        ctrl = physics_commands(parameters, motion.command, substeps, float(model.opt.timestep))
+        qpos, intact = simulate_motion(model, motion, starts, ctrl, steps, substeps)
         ways = [_look(model, robot, each) for each in (motion.qpos, qpos.reshape(-1, model.nq))]
         (recorded, angles), (position, joints) = ways
         position, joints = position.reshape(len(starts), steps, 3), joints.reshape(len(starts), steps, -1)
@@ -202,7 +203,7 @@ def _replay(
     return {key: np.array(errors) for key, errors in found.items()}
 
 
-def _ctrl(
+def physics_commands(
     parameters: ModelParameters | None, commands: Float[np.ndarray, "steps commands"], substeps: int, timestep: float
 ) -> Float[np.ndarray, "physics commands"]:
     """Return what the actuators get in each physics step, the drivetrain at rest before the first."""
@@ -213,7 +214,7 @@ def _ctrl(
     return np.asarray(filter_commands(drivetrain, jnp.asarray(fine, jnp.float32), timestep, slots), np.float64)
 
 
-def _simulate(
+def simulate_motion(
     model: mujoco.MjModel,
     motion: Motion,
     starts: Int[np.ndarray, " starts"],
@@ -228,12 +229,24 @@ def _simulate(
         data.qpos[:], data.qvel[:] = motion.qpos[start], motion.qvel[start]
         mujoco.mj_getState(model, data, row, kind)
     place = np.minimum(starts[:, None] * substeps + np.arange(steps * substeps), len(ctrl) - 1)
-    state, _ = mujoco.rollout.rollout(model, data, initial, ctrl[place])
+    with _quiet():
+        state, _ = mujoco.rollout.rollout(model, data, initial, ctrl[place])
     after = np.asarray(state, float)[:, substeps - 1 :: substeps]
     # MuJoCo begins anew where a simulation breaks down, and its clock with it.
     expected = np.arange(1, steps + 1) * substeps * model.opt.timestep
     intact = np.isfinite(after).all(axis=2) & (np.abs(after[..., 0] - expected) < 1e-6 * expected)
     return after[..., 1 : 1 + model.nq], intact
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep MuJoCo's warnings of a breakdown off the screen, and out of a log file in the current folder."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def _look(

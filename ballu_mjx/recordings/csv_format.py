@@ -21,6 +21,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.hooks import hooks_of
 from ballu_mjx.recordings.recording import Column, ColumnGroup, Kind, Recording, Split, column_groups, values_of
 from ballu_mjx.recordings.validation import (
+    blank_held,
     check_cells,
     check_gaps,
     check_time,
@@ -40,7 +41,8 @@ _COMMAND_DECIMALS = 4
 def read_recording(path: Path | str, robot: RobotDescription) -> Recording:
     """Read, validate and fill in the recording of `robot` at `path`, a `.csv` or `.csv.gz` with its `.json` beside it.
 
-    Gaps of up to 0.5 s are interpolated, linearly or, for orientations, along the shortest rotation.
+    Gaps of up to 0.5 s are interpolated, linearly or, for orientations, along the shortest rotation. A pose that
+    repeats to the last digit is a gap too: streaming clients hold what they do not see.
 
     **Raises** `InputError` at the first fault found, with file, column, row (as a spreadsheet counts them, the header
     being row 1) and fix.
@@ -51,6 +53,7 @@ def read_recording(path: Path | str, robot: RobotDescription) -> Recording:
     kind, made_by, notes = _read_description(description)
     groups = present_groups(path, columns, known, kind)
     check_time(path, columns["time"], robot)
+    held = blank_held(path, columns, groups)
     check_cells(path, columns, groups, robot, kind)
     first, last = check_gaps(path, columns, groups, kind)
     values, interpolated = _fill(columns, groups, slice(first, last + 1))
@@ -72,6 +75,7 @@ def read_recording(path: Path | str, robot: RobotDescription) -> Recording:
         orientations=quaternions,
         joint_angles={joint: value[:, 0] for joint, value in by_part("angle").items()},
         interpolated=interpolated,
+        held=held,
         trimmed=(first, len(columns["time"]) - 1 - last),
     )
     hooks_of(robot).check_recording(path, recording)

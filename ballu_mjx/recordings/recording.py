@@ -51,6 +51,8 @@ class Recording:
     """rad (hinges) or m (slides), by joint: of some of the description's, of all in suspended recordings."""
     interpolated: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """Samples filled in, by column; columns without any are left out."""
+    held: Mapping[str, int] = dataclasses.field(default_factory=dict)
+    """Samples that repeat the one before, and so were not seen, by site; sites without any are left out."""
     trimmed: tuple[int, int] = (0, 0)
     """Rows cut off the file's start and end, where some column has a gap with a sample on one side only."""
 

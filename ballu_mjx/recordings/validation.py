@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.recording import Column, ColumnGroup, Kind, Quantity
@@ -19,6 +20,17 @@ SHORTEST = 1.0
 """Shortest recording (s)."""
 _LARGEST_STEP = 0.02
 """m along an axis: noise between two samples, beside what the robot's speed explains."""
+_LARGEST_BEND = {"position": (0.1, 1000.0), "quaternion": (0.5, 600.0)}
+"""By how much (m, rad) a sample may be off the straight way of those beside it; more only where an acceleration below
+the second number (m/s^2, rad/s^2) explains it. Markers that were mixed up go beyond."""
+_BURST = 3.0
+"""Median steps: longer ones are gaps between bursts."""
+_LARGEST_BURST_SHARE = 0.5
+"""Of the recording's time, in such gaps."""
+_LARGEST_RECURRING = 0.02
+"""Share of poses that recur to the last digit; above it, digits are too coarse to tell what was held."""
+_HELD_JUMP = 2.0
+"""Times the 95th percentile of the movement between two samples: what ends a pose that was held, but not a rest."""
 _QUATERNION_TOLERANCE = 0.02
 
 
@@ -77,6 +89,15 @@ def check_time(path: Path, time: Column, robot: RobotDescription) -> None:
             "control step"
         )
         refuse_recording(path, problem, "record faster, or convert to seconds if this is milliseconds", column="time")
+    long = steps[(steps > _BURST * np.median(steps)) & (steps <= LONGEST_GAP)] if len(steps) else steps
+    if long.sum() > _LARGEST_BURST_SHARE * (time[-1] - time[0]):
+        problem = (
+            f"samples come in bursts: half of the steps are of {1e3 * np.median(steps):.3g} ms or less, and "
+            f"{len(long)} of {1e3 * long.min():.3g} ms or more make up most of the time"
+        )
+        fix = "record the capture's own times, not those of arrival"
+        row = first_true(steps > _BURST * np.median(steps))
+        refuse_recording(path, problem, fix, column="time", row=None if row is None else row + 1)
     if time[-1] - time[0] < SHORTEST * (1 - 1e-6):
         problem = f"{time[-1] - time[0]:.3g} s are shorter than {SHORTEST:g} s"
         refuse_recording(path, problem, "record longer or leave it out", column="time", row=len(time) - 1)
@@ -125,6 +146,8 @@ def check_cells(
     for group in groups:
         if group.quantity == "quaternion":
             _check_lengths(path, group.names, columns)
+        if group.quantity in _LARGEST_BEND:
+            _check_bends(path, group, columns)
 
 
 def _check_jumps(path: Path, name: str, columns: dict[str, Column], speed: float) -> None:
@@ -136,6 +159,39 @@ def _check_jumps(path: Path, name: str, columns: dict[str, Column], speed: float
         fix = "convert millimetres to metres, or empty the cells where markers were mixed up"
         problem = f"jumps by {steps[row]:.3g} m, farther than the robot can move between samples"
         refuse_recording(path, problem, fix, column=name, row=int(seen[row + 1]))
+
+
+def _check_bends(path: Path, group: ColumnGroup, columns: dict[str, Column]) -> None:
+    """Refuse jumps that no robot's motion explains, of places and of orientations."""
+    seen = np.flatnonzero(has_sample(columns, group.names))
+    moved = _movements(np.stack([columns[name][seen] for name in group.names], axis=1), group.quantity)
+    if len(moved) < 2:
+        return
+    steps = np.diff(columns["time"][seen])
+    speed = moved / np.maximum(steps, np.median(steps))[:, None]
+    with np.errstate(over="ignore"):
+        bend = np.linalg.norm(moved[1:] - speed[:-1] * steps[1:, None], axis=1)
+    least, acceleration = _LARGEST_BEND[group.quantity]
+    sample = first_true(bend > np.maximum(least, acceleration * steps[:-1] * steps[1:]))
+    if sample is None:
+        return
+    size = np.linalg.norm(moved, axis=1)
+    step = sample + int(size[sample + 1] > 2 * size[sample])  # at a single sample that is off, both are large
+    within = f"within {1e3 * steps[step]:.3g} ms, as no robot does"
+    name, row = group.names[0], int(seen[step + 1])
+    if group.quantity == "quaternion":
+        fix = "empty the cells where the body was taken for itself turned"
+        refuse_recording(path, f"turned by {np.rad2deg(size[step]):.0f} deg {within}", fix, column=name, row=row)
+    fix = "empty the cells where markers were mixed up, or convert millimetres to metres"
+    refuse_recording(path, f"jumps by {size[step]:.3g} m {within}", fix, column=name, row=row)
+
+
+def _movements(values: Float[np.ndarray, "T columns"], quantity: Quantity) -> Float[np.ndarray, "steps 3"]:
+    """From each sample to the next: m, or rotation vectors (rad)."""
+    if quantity != "quaternion":
+        return np.diff(values, axis=0)
+    turned = Rotation.from_quat(values, scalar_first=True)
+    return (turned[:-1].inv() * turned[1:]).as_rotvec() if len(values) > 1 else np.zeros((0, 3))
 
 
 def _check_lengths(path: Path, names: Sequence[str], columns: dict[str, Column]) -> None:
@@ -156,6 +212,96 @@ def _angle_bounds(robot: RobotDescription) -> dict[str, tuple[float, float]]:
     limited = [joint for joint in robot.joints if model.jnt_limited[model.joint(joint).id]]
     ranges = {joint: tuple(map(float, model.joint(joint).range)) for joint in limited}
     return {joint: (2 * low - high, 2 * high - low) for joint, (low, high) in ranges.items()}
+
+
+def blank_held(path: Path, columns: dict[str, Column], groups: Sequence[ColumnGroup]) -> dict[str, int]:
+    """Take samples that a streaming client held for not seen: NaN, in place. Returns how many, by site.
+
+    They repeat the one before to the last digit in all columns of a body, as noise never lets them. Where digits are
+    coarse (poses from encoders, say), and where a robot rests without noise for long (a simulated one), samples are
+    kept unless the body moves on with a jump.
+
+    **Raises** `InputError` for what was held for longer than `LONGEST_GAP`.
+    """
+    time, counts = columns["time"], {}
+    bodies: dict[str, list[ColumnGroup]] = {}
+    for group in groups:
+        if group.quantity in ("position", "quaternion"):
+            bodies.setdefault(group.part, []).append(group)
+    for site, parts in bodies.items():
+        names = [name for group in parts for name in group.names]
+        held, values = np.zeros(len(time), bool), np.stack([columns[name] for name in names], axis=1)
+        coarse = _recurring(values) > _LARGEST_RECURRING
+        for start, end in _runs(_repeats(values)):
+            lasted = float(time[min(end, len(time) - 1)] - time[start - 1])
+            inside = end < len(time) and start > 1
+            if (lasted <= LONGEST_GAP and inside and not coarse) or _goes_on_with_a_jump(
+                columns, parts, start, end, coarse
+            ):
+                held[start:end] = True
+                if lasted > LONGEST_GAP + 2 * float(np.median(np.diff(time))):
+                    problem = (
+                        f"the pose of {site} repeats for {lasted:.3g} s to the last digit, so it was not seen for more "
+                        f"than {LONGEST_GAP:g} s"
+                    )
+                    refuse_recording(path, problem, "cut the recording there", column=names[0], row=start)
+        for name in names:
+            columns[name] = np.where(held, np.nan, columns[name])
+        if held.any():
+            counts[site] = int(held.sum())
+    return counts
+
+
+def _repeats(values: Float[np.ndarray, "T columns"]) -> Bool[np.ndarray, " T"]:
+    """Samples equal to the one before in all columns, as chance does not explain."""
+    moving = values[:, ~(values[1:] == values[:-1]).all(axis=0)]
+    found = np.zeros(len(values), bool)
+    if not moving.shape[1]:
+        return found
+    equal = (moving[1:] == moving[:-1]).sum(axis=1)
+    found[1:] = equal == moving.shape[1]
+    if found.sum() <= (equal == moving.shape[1] - 1).sum():
+        # Coarse digits: single repeats in all columns are no more frequent than in all but one.
+        for start, end in _runs(found):
+            found[start:end] &= end - start > 1
+    return found
+
+
+def _recurring(values: Float[np.ndarray, "T columns"]) -> float:
+    """Share of poses that the body was in before, other than in the sample before: none where there is noise."""
+    seen = values[~np.isnan(values).any(axis=1)]
+    left = seen[np.concatenate([[True], (seen[1:] != seen[:-1]).any(axis=1)])] if len(seen) else seen
+    return 1 - len(np.unique(left, axis=0)) / len(left) if len(left) else 0.0
+
+
+def _runs(chosen: Bool[np.ndarray, " T"]) -> list[tuple[int, int]]:
+    edges = np.diff(np.concatenate([[0], chosen, [0]]))
+    return list(zip(np.flatnonzero(edges > 0).tolist(), np.flatnonzero(edges < 0).tolist(), strict=True))
+
+
+def _goes_on_with_a_jump(
+    columns: dict[str, Column], parts: Sequence[ColumnGroup], start: int, end: int, coarse: bool
+) -> bool:
+    """Whether the sample after a run of repeats (`start` to `end`) is farther than samples are; at the recording's end,
+    whether the body stopped within a sample."""
+    ends_there = end == len(columns["time"])
+    for group in parts:
+        values = np.stack([columns[name] for name in group.names], axis=1)
+        values = values[has_sample(columns, group.names)]
+        size = np.linalg.norm(_movements(values, group.quantity), axis=1)
+        size = size[size > 1e-7]
+        if not len(size):
+            continue
+        ends = [start - 2, start - 1] if ends_there else [start - 1, end]
+        if ends[0] < 0:
+            continue
+        jump = np.linalg.norm(
+            _movements(np.stack([columns[name][ends] for name in group.names], axis=1), group.quantity)
+        )
+        usual = np.median(size) if ends_there and not coarse else _HELD_JUMP * np.percentile(size, 95)
+        if jump > usual:
+            return True
+    return False
 
 
 def check_gaps(path: Path, columns: dict[str, Column], groups: Sequence[ColumnGroup], kind: Kind) -> tuple[int, int]:

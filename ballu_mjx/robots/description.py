@@ -37,11 +37,11 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import mujoco
-from mujoco import mjx
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.robots.adapter import RobotAdapter
+from ballu_mjx.robots.mjx_support import check_mjx
 from ballu_mjx.robots.model import ModelParameters, load_model
 
 DESCRIPTION_FORMAT = "ballu-robot/1"
@@ -203,11 +203,10 @@ def read_description(path: Path | str) -> RobotDescription:
 
 
 def check_simulates(description: RobotDescription) -> None:
-    """**Raises** `InputError` where MJX cannot simulate the model, with its reason."""
-    try:
-        mjx.put_model(description.load_model())
-    except (NotImplementedError, ValueError) as error:
-        _refuse(description.file, f"MJX cannot simulate {description.model.name} ({_said(error)})", "mend the model")
+    """**Raises** `InputError` where MJX cannot simulate the model, with the reason."""
+    found = check_mjx(description.load_model())
+    if found is not None:
+        _refuse(description.file, f"MJX cannot simulate {description.model.name}: {found[0]}", found[1])
 
 
 # ---- the model ----
@@ -259,7 +258,11 @@ def _check_joints(path: Path, model: mujoco.MjModel, control_timestep: float) ->
         _refuse(path, '"model" has no joints', "give a robot that moves")
     for index, kind in enumerate(model.jnt_type):
         if kind == kinds.mjJNT_BALL or (kind == kinds.mjJNT_FREE and index > 0):
-            called = {int(kinds.mjJNT_BALL): "a ball joint", int(kinds.mjJNT_FREE): "a second free joint"}[int(kind)]
+            if kind == kinds.mjJNT_BALL:
+                called = "a ball joint"
+            else:
+                later = model.jnt_type[0] != kinds.mjJNT_FREE
+                called = "a free joint that is not the first joint" if later else "a second free joint"
             mend = "make it of hinges and slides; one free joint may come first"
             _refuse(path, f'"model" has {called}, {_shown(model.joint(index).name)}', mend)
     count = control_timestep / model.opt.timestep

@@ -107,7 +107,10 @@ def read_rollouts(path: Path) -> list[StoredRollout]:
     found = arrays.pop("format", None)
     if found is None or str(found) != ROLLOUT_FORMAT:
         raise InputError(f"{path}: is not of the format {ROLLOUT_FORMAT}; {_MEND}.")
-    robot = find_robot({key: str(arrays.pop(f"robot/{key}", "")) for key in ("path", "sha256")}, path)
+    said = {key: arrays.pop(f"robot/{key}", np.zeros(1)) for key in ("path", "sha256")}
+    if any(value.dtype.kind != "U" or value.ndim for value in said.values()):
+        raise InputError(f"{path}: does not say of which robot it is; {_MEND}.")
+    robot = find_robot({key: str(value) for key, value in said.items()}, path)
     names, nq = arrays.pop("names", np.array([], str)), robot.load_model().nq
     return [_rollout(path, str(name), f"{index}/", arrays, robot, nq) for index, name in enumerate(names.ravel())]
 

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Sequence
+import re
+import threading
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import viser
+import websockets.asyncio.server
 from jaxtyping import Float
 
 from ballu_mjx.common.errors import InputError
@@ -23,6 +26,8 @@ HOST = "127.0.0.1"
 """Servers listen here alone: nothing is served to other machines."""
 _GRAIN = 2.0**-14
 """Positions (m) and quaternions are rounded to multiples of this, so that recordings pack well."""
+_OWN_PAGES = re.compile(r"http://(127\.0\.0\.1|localhost)(:[0-9]+)?")
+_PATCHING = threading.Lock()
 _FIELD_OF_VIEW = np.deg2rad(40.0)
 
 
@@ -112,7 +117,15 @@ class RobotScene:
 
 
 class LocalServer(viser.ViserServer):
-    """A server that no client can ask for a tunnel to the outside."""
+    """A server that no client can ask for a tunnel to the outside, and that pages of other origins cannot talk to."""
+
+    def __init__(self, *, port: int) -> None:
+        """Listen at `port` or the next that is free; at any free one for 0.
+
+        **Raises** `OSError` where there is none.
+        """
+        with _own_origin_only():
+            super().__init__(host=HOST, port=port, verbose=False)
 
     def request_share_url(self, verbose: bool = True) -> None:
         """None: nothing is shared."""
@@ -123,6 +136,28 @@ class LocalServer(viser.ViserServer):
             super().stop()
 
 
+@contextlib.contextmanager
+def _own_origin_only() -> Iterator[None]:
+    """Let websockets that are opened meanwhile accept this machine's own pages alone, and clients that are no browser.
+
+    Any port will do: a tunnel to another machine may change it.
+
+    A web page elsewhere may open a websocket to this machine; browsers then say which page it was (RFC 6455, 10.2).
+    viser has no option for it, and calls this function of websockets'.
+    """
+
+    def serve_own(handler: Any, host: str, port: int, **options: Any) -> Any:
+        return opened(handler, host, port, origins=[None, _OWN_PAGES], **options)
+
+    with _PATCHING:
+        opened = websockets.asyncio.server.serve
+        websockets.asyncio.server.serve = serve_own  # pyright: ignore[reportAttributeAccessIssue]
+        try:
+            yield
+        finally:
+            websockets.asyncio.server.serve = opened
+
+
 def serve(port: int) -> LocalServer:
     """A server for this machine alone, on `port` or the next that is free; on any free one for 0.
 
@@ -130,7 +165,7 @@ def serve(port: int) -> LocalServer:
     """
     try:
         with contextlib.redirect_stdout(io.StringIO()):
-            server = LocalServer(host=HOST, port=port, verbose=False)
+            server = LocalServer(port=port)
     except OSError as error:
         raise InputError(f"--port {port}: cannot be listened on ({error}); give another one.") from error
     server.scene.set_up_direction("+z")

@@ -88,6 +88,18 @@ def test_import_by_hand_gives_the_recording_back(room: Path, recorded: Recording
     assert "15.00 s" in capsys.readouterr().out
 
 
+def test_a_trial_cropped_at_its_start_keeps_its_commands(
+    room: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]
+):
+    """The frames before are gone, not the time: the same offset serves, and the import says where it begins."""
+    lines = (room / "walk.csv").read_text().splitlines()
+    (room / "walk.csv").write_text("\n".join([*lines[:5], *lines[217:]]) + "\n")
+    assert record.main([*LINE, "--offset", "-512.25"]) == 0
+    read = read_recording(room / "out" / "walk.csv.gz", load_robot())
+    np.testing.assert_allclose(read.command, recorded.command[212:], atol=1e-4)
+    assert "12.88 s, from frame 213, 2.12 s of the trial" in capsys.readouterr().out
+
+
 def test_import_finds_the_offset_and_says_how_sure_it_is(room: Path, capsys: pytest.CaptureFixture[str]):
     assert record.main(LINE) == 0
     said = capsys.readouterr().out

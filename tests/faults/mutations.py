@@ -149,7 +149,22 @@ def _cells(content: bytes, random: Random) -> bytes:
     return "\n".join(map(",".join, rows)).encode()
 
 
-CSV = (*TEXT, _cells, _cells, _cells, _cells)
+def _stream(content: bytes, random: Random) -> bytes:
+    """What a streaming client does: hold samples, or stamp several at once."""
+    rows = [line.split(",") for line in content.decode().split("\n")]
+    samples = [row for row in rows if len(row) > 2 and re.fullmatch(r"-?\d+(\.\d+)?", row[0])]
+    if len(samples) > 1 and random.integers(2):
+        start = int(random.integers(1, len(samples)))
+        for row in samples[start : start + int(random.integers(1, 120))]:
+            row[1:] = samples[start - 1][1:]
+    else:
+        burst = int(random.integers(2, 12))
+        for number, row in enumerate(samples):
+            row[0] = repr(float(samples[number - number % burst][0]) + 1e-4 * (number % burst))
+    return "\n".join(map(",".join, rows)).encode()
+
+
+CSV = (*TEXT, _cells, _cells, _cells, _cells, _stream, _stream)
 
 
 def _places(value: Any) -> Iterator[tuple[Any, Any]]:
@@ -680,24 +695,17 @@ def _import_formats(place: Callable[[], Path], short: Any) -> list[Format]:
     add("table", "walk.csv", CSV, "walk.csv", metres, table.encode(), False, 10)
     add("command log", "log.csv", CSV, "walk.csv", top + bodies, vicon.encode(), True, 8)
     add("mapping of an import", "room.toml", TEXT, "walk.csv", metres, table.encode(), False, 8)
-    try:
-        import ezc3d
-    except ImportError:
-        print("C3D files are left out: the extra import is not installed.", file=sys.stderr)
-        return found
+    sys.path.append(str(Path(__file__).parents[1]))
+    from c3d_writer import c3d_bytes
+
     cluster = np.array([[0.1, 0, 0], [0, 0.1, 0], [-0.1, 0, 0], [0, 0, 0.1]])
     markers = {f"B{i}": positions["balloon"] + turn.apply(corner) for i, corner in enumerate(cluster)}
     markers |= {f"ballu:{role}": positions[role] for role in roles[1:]}
-    points = np.stack([1e3 * value.T for value in markers.values()], axis=1)
-    content = ezc3d.c3d()
-    for key, value in (("RATE", [100.0]), ("LABELS", list(markers)), ("UNITS", ["mm"])):
-        content["parameters"]["POINT"][key]["value"] = value
-    content["data"]["points"] = np.concatenate([points, np.ones((1, *points.shape[1:]))])
-    path = place() / "walk.c3d"
-    content.write(str(path))
+    points = 1e3 * np.stack(list(markers.values()), axis=1)
     named = ", ".join(f'"B{i}"' for i in range(len(cluster)))
     rooms = f"{top}[balloon]\nmarkers = [{named}]\ngeometry = {cluster.tolist()}\n" + bodies.split("\n", 2)[2]
-    add("C3D", "walk.c3d", BYTES, "walk.c3d", rooms, path.read_bytes(), True, 1)
+    c3d = c3d_bytes(points, list(markers))
+    add("C3D", "walk.c3d", BYTES, "walk.c3d", rooms, c3d, True, 10)
     return found
 
 

@@ -96,11 +96,15 @@ def test_limits_are_the_description_s_and_rates_the_control_step_s(tmp_path: Pat
     with pytest.raises(InputError, match="column tip_z, row 2: 3.55 m is not a height between -1 and 3 m"):
         read_recording(path, describe(tmp_path, limits={"height": [-1, 3]}))
     elbow = swing().points["elbow"].copy()
-    elbow[100:, 0] += 0.5
+    elbow[100:, 0] += 9.0 * (swing().time[100:] - swing().time[100])
     write_recording(dataclasses.replace(swing(), points={"elbow": elbow}), path, robot)
     read_recording(path, robot)
-    with pytest.raises(InputError, match="column elbow_x, row 102: jumps by 0.5"):
+    with pytest.raises(InputError, match="column elbow_x, row 103: jumps by 0.09"):
         read_recording(path, describe(tmp_path, limits={"speed": 3.0}))
+    elbow[100:, 0] += 0.5
+    write_recording(dataclasses.replace(swing(), points={"elbow": elbow}), path, robot)
+    with pytest.raises(InputError, match="column elbow_x, row 102: jumps by 0.5.* m within 10 ms, as no robot does"):
+        read_recording(path, robot)
 
 
 @pytest.mark.parametrize(

@@ -105,6 +105,7 @@ def in_model(old: str, new: str) -> Callable[[Path], None]:
     return damage
 
 
+BUOY = '<body><freejoint name="afloat"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
 SWIVEL = '<joint name="swivel" axis="0 0 1" stiffness="0.008"/>'
 
 
@@ -142,6 +143,7 @@ SWIVEL = '<joint name="swivel" axis="0 0 1" stiffness="0.008"/>'
         (in_json(mirror={"left": "right", "right": "left"}), "one twice"),
         (in_json(commands={"left": {"actuator": "propeller_left"}, "right": "propeller_right"}), "for left"),
         (in_model(SWIVEL, '<joint name="swivel" type="ball"/>'), "a ball joint"),
+        (in_model("</worldbody>", BUOY + "</worldbody>"), "a free joint that is not the first joint, 'afloat'"),
         (in_model('timestep="0.01"', 'timestep="0.015"'), "divide the control step"),
         (in_model('ctrlrange="0 1"', 'ctrllimited="false"'), "has no ctrlrange"),
         (in_model('<body name="lower"', '<site name="tripod"/><body name="lower"'), ""),

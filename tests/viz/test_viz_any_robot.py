@@ -74,6 +74,12 @@ def test_replay_of_a_robot_that_has_changed_is_refused(tmp_path: Path):
     robot.file.unlink()
     with pytest.raises(view.InputError, match="the robot description is gone"):
         read_rollouts(tmp_path / "replay.npz")
+    with np.load(tmp_path / "replay.npz") as archive:
+        arrays = dict(archive)
+    arrays["robot/path"] = np.zeros((11, 3))
+    np.savez(tmp_path / "replay.npz", **arrays)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(view.InputError, match=r"replay\.npz: does not say of which robot it is"):
+        read_rollouts(tmp_path / "replay.npz")
 
 
 def test_rollouts_of_two_robots_are_no_file(tmp_path: Path):

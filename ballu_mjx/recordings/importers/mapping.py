@@ -130,7 +130,7 @@ def read_mapping(path: Path, robot: RobotDescription) -> RoomMapping:
         try:
             content = tomllib.loads(files.read_text(path))
         except (ValueError, RecursionError) as error:
-            refuse(path, "", f"not TOML ({shorten(str(error))})", fix)
+            refuse(path, "", f"not TOML ({error})", fix)
     roles = (robot.tracked, *robot.points)
     _check_names(path, roles, robot)
     top = _Keys(path, "", content)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.common.errors import InputError
@@ -58,6 +58,8 @@ class Trajectories:
     """Joint angles (rad; of slides, m) by joint."""
     commands: CommandLog | None = None
     """None where the file holds none."""
+    first_frame: int = 1
+    """Of the trial: a file that was cropped at its start begins later, and so does `time`."""
 
 
 def refuse(path: Path, place: str, problem: str, mend: str) -> NoReturn:
@@ -100,7 +102,12 @@ def find(path: Path, name: str, known: Iterable[str], what: str, mapping: Path) 
 
 
 def to_quaternion(
-    path: Path, place: str, values: Float[np.ndarray, "T n"], rotation: str, unit: float
+    path: Path,
+    place: str,
+    values: Float[np.ndarray, "T n"],
+    rotation: str,
+    unit: float,
+    frames: Int[np.ndarray, " T"] | None = None,
 ) -> Float[np.ndarray, "T 4"]:
     """Unit quaternions (w, x, y, z) from a file's columns; NaN where any of the columns is.
 
@@ -110,11 +117,16 @@ def to_quaternion(
     - `rotation`: "quaternion" (columns w, x, y, z), "helical" (rotation vector, of the angle's length) or Euler angles
       in SciPy's notation: "XYZ" about the body's own axes in turn, "xyz" about the capture's, and so on.
     - `unit`: radians in a unit of the columns; not for quaternions.
+    - `frames`: the file's own numbers of the samples, for messages; None: it has none.
 
     **Raises** `InputError` for quaternions that are none, and angles that are too large to be meant.
     """
     quaternion = np.full((len(values), 4), np.nan)
     seen = ~np.isnan(values).any(axis=1)
+
+    def called(row: int) -> str:
+        return f"sample {row + 1}" if frames is None else f"frame {frames[row]}"
+
     if rotation == "quaternion":
         with np.errstate(over="ignore"):
             length = np.linalg.norm(values, axis=1)
@@ -122,7 +134,7 @@ def to_quaternion(
         bad = seen & (np.abs(length - 1) > QUATERNION_TOLERANCE)
         if bad.any():
             row = int(bad.argmax())
-            problem = f"the quaternion of sample {row + 1} has length {length[row]:.3g} instead of 1"
+            problem = f"the quaternion of {called(row)} has length {length[row]:.3g} instead of 1"
             refuse(path, place, problem, "export unit quaternions, or mend the order of the columns in the mapping")
         quaternion[seen] = values[seen] / length[seen, None]
         return quaternion
@@ -130,7 +142,7 @@ def to_quaternion(
     bad = seen & (np.abs(angles) > _LARGEST_TURN).any(axis=1)
     if bad.any():
         row = int(bad.argmax())
-        problem = f"sample {row + 1} is turned by {np.abs(angles[row]).max():.3g} rad"
+        problem = f"{called(row)} is turned by {np.abs(angles[row]).max():.3g} rad"
         refuse(path, place, problem, "mend the unit of angles, in the file or under [units] in the mapping")
     if rotation == "helical":
         turned = Rotation.from_rotvec(angles[seen])
@@ -146,6 +158,7 @@ def rigid_body(
     markers: Float[np.ndarray, "markers T 3"],
     geometry: Float[np.ndarray, "markers 3"] | None,
     tolerance: float,
+    frames: Int[np.ndarray, " T"] | None = None,
 ) -> Body:
     """The rigid body that carries `markers`, by least squares from all that are seen, three at least.
 
@@ -156,6 +169,7 @@ def rigid_body(
     - `geometry`: where they sit in the body's frame (m). None: the frame has its origin in their middle and stands
       like the capture's in the first sample that shows all of them.
     - `tolerance`: m; a sample that fits no better (root mean square) is refused, for a marker was then mixed up.
+    - `frames`: the file's own numbers of the samples, for messages; None: it has none.
 
     **Raises** `InputError` for markers on a line, never seen together, or not rigid.
     """
@@ -191,7 +205,8 @@ def rigid_body(
         error = np.sqrt(((fitted - points) ** 2).sum(axis=2).mean(axis=1))
         if error.max() > tolerance:
             worst = int(rows[int(error.argmax())])
-            problem = f"in sample {worst + 1} the markers of {name} are off their places by {1e3 * error.max():.0f} mm"
+            where = f"sample {worst + 1}" if frames is None else f"frame {frames[worst]}"
+            problem = f"in {where} the markers of {name} are off their places by {1e3 * error.max():.0f} mm"
             refuse(path, "", problem, "mend their labels there, or leave the marker out")
         position[rows] = middle - np.einsum("tij,j->ti", turn, centre)
         quaternion[rows] = Rotation.from_matrix(turn).as_quat(scalar_first=True)

@@ -22,7 +22,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ballu_mjx.common.files import read_text
 from ballu_mjx.recordings.importers.mapping import MARKER_TOLERANCE, RoomMapping, Source
@@ -60,6 +60,8 @@ class _Group:
     columns: Mapping[str, int]
     """By component."""
     units: Mapping[str, str]
+    repeated: str | None
+    """A component that stands there twice: names that are not used may be untidy."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +100,7 @@ def read_vicon(path: Path, mapping: RoomMapping) -> Trajectories:
     """
     lines = read_text(path).splitlines()
     delimiter = _delimiter(path, lines)
-    groups = _groups(path, _sections(path, lines, delimiter), mapping)
+    groups = _groups(_sections(path, lines, delimiter))
     wanted = {role: _wanted(path, mapping.path, source, groups) for role, source in mapping.sources.items()}
     if not wanted:
         refuse(mapping.path, "", "it asks for no body of a Vicon file", "say what its sites are, or give a table")
@@ -115,16 +117,17 @@ def read_vicon(path: Path, mapping: RoomMapping) -> Trajectories:
         spread[np.searchsorted(frames, frame)] = np.stack([columns[group.columns[name]] for name in names], axis=1)
         return spread
 
-    bodies = {}
+    numbers, bodies = frames.astype(int), {}
     for role, source in mapping.sources.items():
         markers = [_position(path, mapping, group, values) for group in wanted[role]]
         if source.markers:
             geometry = None if source.geometry is None else np.array(source.geometry)
-            bodies[role] = rigid_body(path, role, np.stack(markers), geometry, MARKER_TOLERANCE)
+            bodies[role] = rigid_body(path, role, np.stack(markers), geometry, MARKER_TOLERANCE, numbers)
         else:
-            bodies[role] = _body(path, mapping, source, wanted[role][0], markers[0], values)
+            bodies[role] = _body(path, mapping, source, wanted[role][0], markers[0], values, numbers)
     rate = mapping.rate or rates.pop()
-    return Trajectories(path, (frames - frames[0]) / rate, bodies)
+    start = max(int(frames[0]), 1)
+    return Trajectories(path, (frames - frames[0] + start - 1) / rate, bodies, first_frame=start)
 
 
 def _delimiter(path: Path, lines: Sequence[str]) -> str:
@@ -190,7 +193,7 @@ def _section(path: Path, lines: Sequence[str], delimiter: str, start: int, end: 
     return _Section(title[0], rate, start + _HEADER_ROWS, end, width, spread, components, units)
 
 
-def _groups(path: Path, sections: Sequence[_Section], mapping: RoomMapping) -> dict[str, list[_Group]]:
+def _groups(sections: Sequence[_Section]) -> dict[str, list[_Group]]:
     """All positions in the file by name."""
     groups: dict[str, list[_Group]] = {}
     for section in sections:
@@ -199,13 +202,10 @@ def _groups(path: Path, sections: Sequence[_Section], mapping: RoomMapping) -> d
             components = [section.components[i] for i in places]
             if not any(set(axes) <= set(components) for axes in _TRANSLATIONS):
                 continue
-            for component in components:
-                if components.count(component) > 1 and component:
-                    problem = f"{shorten(name)!r} has {component} twice"
-                    refuse(path, f"line {section.first - 1}", problem, "give bodies different names and export again")
+            repeated = next((c for c in components if c and components.count(c) > 1), None)
             columns = dict(zip(components, places, strict=True))
             units = {component: section.units[i] for component, i in columns.items()}
-            groups.setdefault(name, []).append(_Group(section, columns, units))
+            groups.setdefault(name, []).append(_Group(section, columns, units, repeated))
     return groups
 
 
@@ -225,7 +225,11 @@ def _wanted(path: Path, mapping: Path, source: Source, groups: Mapping[str, list
             titles = ", ".join(dict.fromkeys(g.section.title for g in candidates))
             mend = f'add section = "..." to [{source.role}] in {mapping}'
             refuse(path, "", f"{shorten(full)!r} stands in several sections ({titles})", mend)
-        found.append(candidates[0])
+        chosen = candidates[0]
+        if chosen.repeated is not None:
+            problem = f"{shorten(full)!r} has {chosen.repeated} twice"
+            refuse(path, f"line {chosen.section.first - 1}", problem, "give bodies different names and export again")
+        found.append(chosen)
     return found
 
 
@@ -310,6 +314,7 @@ def _body(
     group: _Group,
     position: Float[np.ndarray, "T 3"],
     values: _Values,
+    frames: Int[np.ndarray, " T"],
 ) -> Body:
     if not set(_ROTATION) <= set(group.columns):
         return Body(position)
@@ -330,4 +335,4 @@ def _body(
         columns = values(group, _ROTATION)
         unit = _unit(path, group, _ROTATION, ANGLES, mapping.angle, "angle")
     columns[np.isnan(position).any(axis=1)] = np.nan
-    return Body(position, to_quaternion(path, place, columns, rotation, unit))
+    return Body(position, to_quaternion(path, place, columns, rotation, unit, frames))

@@ -1,0 +1,138 @@
+"""What MJX cannot simulate of a model, or not in reasonable time, in words that say where and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+from mujoco import mjx
+from mujoco.mjx._src import collision_driver
+
+LARGEST_HULL = 200
+"""Vertices of a collision mesh's hull, as MJX's documentation advises; against a box or another mesh: `LARGEST_PAIR`.
+Compiling and stepping take minutes and gigabytes beyond."""
+LARGEST_PAIR = 32
+_MESH, _BOX = int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_BOX)
+_LOOKS_ALONE = 'contype="0" conaffinity="0"'
+
+
+def find_unsupported(model: mujoco.MjModel) -> tuple[str, str] | None:
+    """Return the first problem of a model in MJX, and its fix; None where there is none."""
+    for check in _CHECKS:
+        found = check(model)
+        if found is not None:
+            return found
+    return None
+
+
+def _options(model: mujoco.MjModel) -> tuple[str, str] | None:
+    option = model.opt
+    for name, value, kind, known in (
+        ("integrator", option.integrator, mujoco.mjtIntegrator, mjx.IntegratorType),
+        ("solver", option.solver, mujoco.mjtSolver, mjx.SolverType),
+    ):
+        if value not in set(known):
+            usual = "implicitfast or Euler" if name == "integrator" else "Newton or CG"
+            return f'it has the {name} "{_word(kind(value))}"', f'write {name}="{usual.split()[0]}" ({usual})'
+    fluid = option.density > 0 or option.viscosity > 0 or np.any(option.wind)
+    if fluid and option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
+        problem = 'it has a fluid (density, viscosity or wind) beside integrator="implicitfast"'
+        return problem, 'write integrator="Euler", or leave the fluid out and identify it by `train fluid`'
+    if option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and np.any(model.geom_condim[_colliding(model)] == 1):
+        return 'it has elliptic cones beside condim="1"', 'write cone="pyramidal", or condim="3"'
+    return None
+
+
+def _parts(model: mujoco.MjModel) -> tuple[str, str] | None:
+    if model.nflex:
+        return "it has deformable parts (flex)", "make them of rigid bodies"
+    own, actuator = mujoco.mjtObj, mujoco.mjtObj.mjOBJ_ACTUATOR
+    for what, kinds, known, kind, named, fix in (
+        ("an equality", model.eq_type, mjx.EqType, mujoco.mjtEq, own.mjOBJ_EQUALITY, "use connect, weld or joint"),
+        ("a sensor", model.sensor_type, mjx.SensorType, mujoco.mjtSensor, own.mjOBJ_SENSOR, "leave it out"),
+        ("an actuator on", model.actuator_trntype, mjx.TrnType, mujoco.mjtTrn, actuator, "put it on a joint or site"),
+        ("the gain", model.actuator_gaintype, mjx.GainType, mujoco.mjtGain, actuator, "use fixed or affine gains"),
+        ("the bias", model.actuator_biastype, mjx.BiasType, mujoco.mjtBias, actuator, "use no or affine bias"),
+    ):
+        for number, value in enumerate(kinds):
+            if value not in set(known):
+                name = mujoco.mj_id2name(model, named, number) or f"number {number + 1}"
+                return f'it has {what} "{_word(kind(value))}" ({name})', fix
+    contact = model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT
+    if contact.any() and np.isin(
+        np.concatenate([model.sensor_objtype[contact], model.sensor_reftype[contact]]),
+        [int(own.mjOBJ_SITE), int(own.mjOBJ_BODY), int(own.mjOBJ_XBODY)],
+    ).any():  # fmt: skip
+        return "it has a contact sensor of sites or bodies", "name geoms there, or leave it out"
+    return None
+
+
+def _collisions(model: mujoco.MjModel) -> tuple[str, str] | None:
+    largest: tuple[float, str] | None = None
+    for one, other, pair in collision_driver.geom_pairs(model):
+        kinds = model.geom_type[[one, other]]
+        names = f"{_geom(model, one)} and {_geom(model, other)}"
+        if not collision_driver.has_collision_fn(*kinds):
+            shapes = " and ".join(_word(mujoco.mjtGeom(kind)) for kind in kinds)
+            fix = f"exclude the pair, give one of them {_LOOKS_ALONE}, or use spheres, capsules or boxes"
+            return f"{names} collide, and for {shapes} it has no collisions", fix
+        if not np.isin(kinds, [_MESH, int(mujoco.mjtGeom.mjGEOM_HFIELD)]).any():
+            continue
+        margin = model.pair_margin[pair] if pair >= 0 else model.geom_margin[one] + model.geom_margin[other]
+        if np.any(margin):
+            return f"{names} collide with a margin, which meshes cannot have", 'write margin="0" there'
+        for geom, partner in ((one, other), (other, one)):
+            if model.geom_type[geom] != _MESH:
+                continue
+            count = _hull_vertices(model, int(model.geom_dataid[geom]))
+            against = bool(np.isin(model.geom_type[partner], [_MESH, _BOX]))
+            limit = LARGEST_PAIR if against else LARGEST_HULL
+            if count > limit and (largest is None or count / limit > largest[0]):
+                mesh = model.mesh(int(model.geom_dataid[geom])).name
+                what = f"it collides with {_geom(model, partner)}, a box or mesh" if against else "it collides"
+                largest = (
+                    count / limit,
+                    (
+                        f"the hull of the mesh {mesh} ({_geom(model, geom)}) has {count:,} vertices, and {what}: more "
+                        f"than {limit} are too many"
+                    ),
+                )
+    if largest is None:
+        return None
+    fix = f'give the mesh maxhullvert="{LARGEST_PAIR}", or its geoms {_LOOKS_ALONE} and primitives beside them'
+    return largest[1], fix
+
+
+_CHECKS: tuple[Callable[[mujoco.MjModel], tuple[str, str] | None], ...] = (_options, _parts, _collisions)
+
+
+def check_mjx(model: mujoco.MjModel) -> tuple[str, str] | None:
+    """Return why MJX does not take a model, and a fix; None where it does."""
+    found = find_unsupported(model)
+    if found is not None:
+        return found
+    try:
+        mjx.put_model(model)
+    except (NotImplementedError, ValueError) as error:
+        return f"it says: {' '.join(str(error).split())[:200]}", "take out of the model what it names"
+    return None
+
+
+def _colliding(model: mujoco.MjModel) -> np.ndarray:
+    return (model.geom_contype | model.geom_conaffinity) != 0
+
+
+def _hull_vertices(model: mujoco.MjModel, mesh: int) -> int:
+    """Vertices of a mesh's convex hull."""
+    graph = int(model.mesh_graphadr[mesh])
+    return int(model.mesh_graph[graph] if graph >= 0 else model.mesh_vertnum[mesh])
+
+
+def _geom(model: mujoco.MjModel, geom: int) -> str:
+    return model.geom(geom).name or f"a geom of {model.body(int(model.geom_bodyid[geom])).name or 'the world'}"
+
+
+def _word(value: object) -> str:
+    """Return what the MJCF calls a value of MuJoCo's enumerations."""
+    return str(getattr(value, "name", value)).rpartition("_")[2].lower()

@@ -1,0 +1,91 @@
+"""What MJX cannot simulate is found before anything is compiled, and said with its place and a fix."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from ballu_mjx.robots.mjx_support import LARGEST_HULL, LARGEST_PAIR, check_mjx
+
+MODEL = """
+<mujoco><option timestep="0.01" OPTION/><asset>ASSET</asset>
+<worldbody><geom name="floor" type="plane" size="0 0 0.1"/>
+  <body name="trunk" pos="0 0 1"><freejoint/><geom name="trunk" size="0.1" contype="0" conaffinity="0"/>
+    <site name="imu"/>
+    <body name="left" pos="0 0.1 0"><joint name="left" axis="0 1 0"/><geom LEFT/></body>
+    <body name="right" pos="0 -0.1 0"><joint name="right" axis="0 1 0"/><geom RIGHT/></body></body></worldbody>
+<actuator><motor name="m" joint="left"/></actuator>MORE</mujoco>
+"""
+
+
+def load(**parts: str) -> mujoco.MjModel:
+    text = MODEL
+    for key, default in (
+        ("OPTION", ""),
+        ("ASSET", ""),
+        ("LEFT", 'size="0.02"'),
+        ("RIGHT", 'size="0.02"'),
+        ("MORE", ""),
+    ):
+        text = text.replace(key, parts.get(key.lower(), default))
+    return mujoco.MjModel.from_xml_string(text)
+
+
+def ball(vertices: int, **more: str) -> str:
+    """A mesh with that many vertices in its hull."""
+    points = np.random.default_rng(0).normal(size=(vertices, 3))
+    points *= 0.03 / np.linalg.norm(points, axis=1, keepdims=True)
+    keys = "".join(f' {name}="{value}"' for name, value in more.items())
+    return f'<mesh name="ball" vertex="{" ".join(f"{x:.6f}" for x in points.reshape(-1))}"{keys}/>'
+
+
+MESH = 'name="foot" type="mesh" mesh="ball" mass="0.1"'
+
+
+@pytest.mark.parametrize("vertices", [LARGEST_HULL + 60, 700])
+def test_fine_collision_meshes_are_refused_with_limit_and_fix(vertices: int):
+    found = check_mjx(load(asset=ball(vertices), left=MESH))
+    assert found is not None
+    assert f"the mesh ball (foot) has {vertices} vertices" in found[0] and "more than 200" in found[0]
+    assert 'maxhullvert="32"' in found[1] and 'contype="0"' in found[1]
+
+
+@pytest.mark.parametrize("other", [MESH.replace("foot", "other"), 'name="other" type="box" size="0.1 0.1 0.1"'])
+def test_meshes_against_meshes_and_boxes_must_be_coarser(other: str):
+    vertices = (LARGEST_HULL + LARGEST_PAIR) // 2
+    assert check_mjx(load(asset=ball(vertices), left=MESH)) is None
+    found = check_mjx(load(asset=ball(vertices), left=MESH, right=other))
+    assert found is not None and f"{vertices} vertices, and it collides with" in found[0]
+    assert check_mjx(load(asset=ball(vertices, maxhullvert="32"), left=MESH, right=other)) is None
+    assert check_mjx(load(asset=ball(LARGEST_PAIR), left=MESH, right=other)) is None
+
+
+def test_meshes_for_looks_may_be_as_fine_as_they_like():
+    assert check_mjx(load(asset=ball(3000), left=MESH + ' contype="0" conaffinity="0"')) is None
+
+
+@pytest.mark.parametrize(
+    ("parts", "problem", "fix"),
+    [
+        ({"option": 'integrator="implicit"'}, 'integrator "implicit"', "implicitfast"),
+        ({"option": 'solver="PGS"'}, 'solver "pgs"', "Newton"),
+        ({"option": 'integrator="implicitfast" density="1.2"'}, "fluid", "Euler"),
+        ({"option": 'cone="elliptic"', "left": 'size="0.02" condim="1"'}, "elliptic cones", "pyramidal"),
+        ({"left": 'name="rod" type="cylinder" size="0.02 0.1"', "right": 'name="cube" type="box" size="0.1 0.1 0.1"'},
+         "rod and cube collide, and for cylinder and box it has no collisions", "exclude the pair"),
+        ({"asset": ball(20), "left": MESH + ' margin="0.01"'}, "foot collide with a margin", 'margin="0"'),
+        ({"more": '<sensor><user name="mood" dim="1"/></sensor>'}, 'a sensor "user" (mood)', "leave it out"),
+        ({"more": '<sensor><contact name="foot" body1="left"/></sensor>'}, "contact sensor", "name geoms"),
+        ({"more": '<actuator><adhesion name="sticky" body="left" ctrlrange="0 1"/></actuator>'},
+         'an actuator on "body" (sticky)', "put it on a joint"),
+    ],
+)  # fmt: skip
+def test_what_mjx_lacks_is_said_in_words_of_the_model(parts: dict[str, str], problem: str, fix: str):
+    found = check_mjx(load(**parts))
+    assert found is not None and problem in found[0] and fix in found[1]
+
+
+def test_what_mjx_simulates_passes():
+    for option in ('integrator="Euler" density="1.2"', 'integrator="RK4"', 'cone="elliptic"', 'solver="CG"'):
+        assert check_mjx(load(option=option)) is None
