@@ -2,8 +2,8 @@
 
 A column of a one-dimensional array has the array's name, column i of a two-dimensional one `name[i]`.
 
-A LeRobot dataset is a folder with `meta/info.json` and parquet files under `data/`, of versions 2 (a file an episode) and
-3 (several episodes a file). Its times are the feature `timestamp`, in s. Parquet is read by pyarrow: the extra
+A LeRobot dataset is a folder with `meta/info.json` and parquet files under `data/`, of versions 2 (a file an episode)
+and 3 (several episodes a file). Its times are the feature `timestamp`, in s. Parquet is read by pyarrow: the extra
 `lerobot`.
 """
 
@@ -58,8 +58,10 @@ def open_npz(path: Path, mapping: RoomMapping | None) -> Capture:
                         raise
                     notes.append(f"{shorten(name)!r} holds Python objects, and is not read.")
                     continue
-                if array.dtype.kind in "fiub" and array.ndim in (1, 2) and array.shape[-1] <= _WIDEST * (
-                    1 if array.ndim == 2 else _LARGEST
+                if (
+                    array.dtype.kind in "fiub"
+                    and array.ndim in (1, 2)
+                    and array.shape[-1] <= _WIDEST * (1 if array.ndim == 2 else _LARGEST)
                 ):
                     arrays[name] = array
                 else:
@@ -75,7 +77,12 @@ def open_npz(path: Path, mapping: RoomMapping | None) -> Capture:
 
 
 def _capture(
-    path: Path, program: str, arrays: Mapping[str, np.ndarray], time_column: str | None, notes: list[str]
+    path: Path,
+    program: str,
+    arrays: Mapping[str, np.ndarray],
+    time_column: str | None,
+    notes: list[str],
+    labels: Mapping[str, str] | None = None,
 ) -> Capture:
     lengths = {name: len(array) for name, array in arrays.items()}
     rows = max(lengths.values(), key=lambda n: (list(lengths.values()).count(n), n), default=0)
@@ -90,7 +97,7 @@ def _capture(
         bad = np.isinf(values)
         if bad.any():
             refuse(path, f"{shorten(name)}, sample {int(bad.argmax()) + 1}", "it is infinite", "write NaN if missing")
-        return Series(values)
+        return Series(values, label=(labels or {}).get(name))
 
     makers = {}
     for name, array in arrays.items():
@@ -104,11 +111,13 @@ def _capture(
     def clock(name: str, unit: str) -> np.ndarray:
         time = columns[name].values * TIMES[unit]
         if np.isnan(time).any():
-            refuse(path, f"{shorten(name)}, sample {int(np.isnan(time).argmax()) + 1}", "the time is missing", "fill it")
+            refuse(
+                path, f"{shorten(name)}, sample {int(np.isnan(time).argmax()) + 1}", "the time is missing", "fill it"
+            )
         back = np.diff(time) <= 0
         if back.any():
             row = int(back.argmax())
-            problem = f"time runs back or stands still, from {time[row]:.10g} to {time[row + 1]:.10g} s"
+            problem = f"time runs back or stands still, from {time[row]:.6f} to {time[row + 1]:.6f} s"
             refuse(path, f"{shorten(name)}, sample {row + 2}", problem, "sort the samples, one trial a file")
         return time
 
@@ -176,13 +185,9 @@ def open_lerobot(path: Path, mapping: RoomMapping | None) -> Capture:
     for name, parts in arrays.items():
         if len({part.shape[1:] for part in parts}) == 1:
             joined[name] = np.concatenate(parts)
-    for name, feature in features.items():
-        labels = _labels(feature)
-        if name in joined and labels:
-            shown = ", ".join(f"[{i}] {shorten(label)}" for i, label in enumerate(labels[:32]))
-            notes.append(f"{shorten(name)} is {shown}.")
+    labels = {f"{name}[{i}]": label for name, feature in features.items() for i, label in enumerate(_labels(feature))}
     notes.append("LeRobot states no units of angles: they may be degrees, radians or shares of a range.")
-    return _capture(path, "a LeRobot dataset", joined, _TIME if _TIME in joined else None, notes)
+    return _capture(path, "a LeRobot dataset", joined, _TIME if _TIME in joined else None, notes, labels)
 
 
 def _numbers(column: Any, chosen: np.ndarray) -> np.ndarray | None:

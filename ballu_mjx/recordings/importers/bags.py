@@ -28,6 +28,8 @@ from ballu_mjx.recordings.importers.trajectories import LENGTHS, refuse, shorten
 
 HEADER, RECEIVED = "header", "received"
 """The two clocks of a bag: the stamps in the messages' headers, and when each was recorded."""
+_EITHER = "either"
+"""To list a bag's topics: the header's stamps where there are any."""
 _POSES = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped", "PointStamped")
 _TREE, _JOINTS = "TFMessage", "JointState"
 _LONGEST_ARRAY = 256
@@ -71,8 +73,8 @@ def open_bag(path: Path, mapping: RoomMapping | None) -> Capture:
     """
     if not path.exists():
         refuse(path, "", "there is no such file or folder", "check the path")
-    clock = None if mapping is None else mapping.clock.time
-    if clock not in (None, HEADER, RECEIVED):
+    clock = _EITHER if mapping is None else mapping.clock.time
+    if clock not in (None, HEADER, RECEIVED, _EITHER) or (mapping is not None and clock == _EITHER):
         fix = f'write "{HEADER}" (the messages\' stamps) or "{RECEIVED}" (when they were recorded)'
         refuse(mapping.path if mapping else path, "[clock] time", f"a bag has no column {shorten(clock)!r}", fix)
     length = 1.0 if mapping is None or mapping.length is None else LENGTHS[mapping.length]
@@ -214,7 +216,10 @@ def _decode(path: Path, topic: _Topic, of: Callable[..., Any]) -> dict[str, _Dec
     return found
 
 
-def _times(path: Path, name: str, decoded: _Decoded, clock: str | None) -> np.ndarray:
+def _times(path: Path, name: str, decoded: _Decoded, clock: str | None) -> tuple[np.ndarray, str]:
+    """Times (s), and which clock they are."""
+    if clock == _EITHER:
+        clock = RECEIVED if decoded.stamped is None else HEADER
     if clock != RECEIVED and decoded.stamped is None:
         fix = f'write time = "{RECEIVED}" under [clock] in the mapping: when each message was recorded'
         refuse(path, shorten(name), "its messages have no stamp in a header", fix)
@@ -225,7 +230,7 @@ def _times(path: Path, name: str, decoded: _Decoded, clock: str | None) -> np.nd
         other = RECEIVED if clock != RECEIVED else HEADER
         problem = f"time runs back or stands still at message {row + 1}, by {(ns[row - 1] - ns[row]) * 1e-9:.6f} s"
         refuse(path, shorten(name), problem, f'try time = "{other}" under [clock] in the mapping, or cut the bag')
-    return ns * 1e-9
+    return ns * 1e-9, clock or HEADER
 
 
 def _stream(
@@ -242,11 +247,11 @@ def _stream(
     table = np.stack(list(decoded.values.values()), axis=1)
     bad = ~np.isfinite(table).all(axis=1)
     table[bad] = np.nan
-    time = _times(path, name, decoded, clock)
+    time, known = _times(path, name, decoded, clock)
     if table.shape[1] == 3:
-        return Stream(time, table * length)
+        return Stream(time, table * length, clock=known)
     quaternion = to_quaternion(path, shorten(name), table[:, 3:], "quaternion", 1.0)
-    return Stream(time, table[:, :3] * length, quaternion)
+    return Stream(time, table[:, :3] * length, quaternion, clock=known)
 
 
 def _series(
@@ -256,7 +261,8 @@ def _series(
     values = decoded.values[name]
     if np.isinf(values).any():
         refuse(path, shorten(name), f"message {int(np.isinf(values).argmax()) + 1} is infinite", "cut the bag there")
-    return Series(values, _times(path, name, decoded, clock), si=topic.kind == _JOINTS)
+    time, known = _times(path, topic.name, decoded, clock)
+    return Series(values, time, topic.kind == _JOINTS, known)
 
 
 # ---- files ----

@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.importers.contents import Contents, Item
 from ballu_mjx.recordings.importers.mapping import MARKER_TOLERANCE, Commands, Joint, RoomMapping, Source
 from ballu_mjx.recordings.importers.trajectories import (
     ANGLES,
@@ -46,6 +48,8 @@ class Stream:
     """w, x, y, z: the body's frame in the capture's."""
     angles: Float[np.ndarray, "T 3"] | None = None
     """rad; three angles of which the file does not say what they are, in place of a quaternion."""
+    clock: str | None = None
+    """Which of the file's clocks `time` is, where it has several."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -57,6 +61,10 @@ class Series:
     """s. None: a sample a row, and a column of the file holds the times."""
     si: bool = False
     """Whether the format fixes the unit: rad and m."""
+    clock: str | None = None
+    """As of a `Stream`."""
+    label: str | None = None
+    """What the file calls it beside its name."""
 
 
 class Lazy(Mapping[str, _Value]):
@@ -95,6 +103,67 @@ class Capture:
     """Which column that is, where the format fixes it."""
     notes: Sequence[str] = ()
     """Sentences about what is in the file and not read, and what is not certain."""
+
+
+def list_capture(capture: Capture) -> Contents:
+    """Return what `capture` holds. What cannot be read is told in the notes."""
+    items: list[Item] = []
+    notes = list(capture.notes)
+    for name in capture.bodies:
+        try:
+            stream = capture.bodies[name]
+        except InputError as error:
+            notes.append(str(error))
+            continue
+        turns = stream.quaternion is not None or stream.angles is not None
+        seen = ~np.isnan(stream.position).any(axis=1)
+        items.append(
+            Item(
+                name,
+                "body" if turns else "marker",
+                len(stream.time),
+                _rate(stream.time),
+                share=float(seen.mean()),
+                unit="m",
+                rotation=None if stream.angles is None else "XYZ",
+                clock=stream.clock,
+                low=float(stream.position[seen].min()) if seen.any() else None,
+                high=float(stream.position[seen].max()) if seen.any() else None,
+            )
+        )
+    for name in capture.columns:
+        try:
+            series = capture.columns[name]
+        except InputError as error:
+            notes.append(str(error))
+            continue
+        seen = series.values[~np.isnan(series.values)]
+        items.append(
+            Item(
+                name,
+                "column",
+                len(series.values),
+                None if series.time is None else _rate(series.time),
+                share=len(seen) / max(len(series.values), 1),
+                unit="rad or m" if series.si else None,
+                clock=series.clock,
+                label=series.label,
+                low=float(seen.min()) if len(seen) else None,
+                high=float(seen.max()) if len(seen) else None,
+                step=_step(series.values),
+            )
+        )
+    return Contents(capture.path, capture.program, items, rows=capture.clock is not None, notes=notes)
+
+
+def _rate(time: np.ndarray) -> float | None:
+    return 1 / float(np.median(np.diff(time))) if len(time) > 1 else None
+
+
+def _step(values: np.ndarray) -> float | None:
+    """The median step of a column that could be a clock."""
+    steps = np.diff(values)
+    return float(np.median(steps)) if len(steps) and np.isfinite(steps).all() and (steps > 0).all() else None
 
 
 # ---- what a mapping asks for ----

@@ -417,8 +417,8 @@ floor = 0.0              # m, height of the floor in the capture{floors}
 # angle = "deg"          # rad, deg
 
 [clock]                  # of the captured file, where it does not say; [commands] has the log's own
-# time = "time"          # the column of times; default: the name that stands under [commands].
-                         # Of a ROS bag or MCAP: "header" (the messages' stamps), or "received" (when they were recorded)
+# time = "time"          # the column of times; default: the name that stands under [commands]. Of a bag or MCAP:
+                         # "header" (the messages' stamps), or "received" (when they were recorded)
 # time_unit = "s"        # s, ms, us, ns
 # episode = 0            # of a LeRobot dataset
 

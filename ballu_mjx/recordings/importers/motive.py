@@ -17,8 +17,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from ballu_mjx.common.files import read_text
 from ballu_mjx.recordings.importers.capture import Capture, Stream
 from ballu_mjx.recordings.importers.mapping import RoomMapping

@@ -1,9 +1,9 @@
 """Files of one body's poses: TUM trajectories and EuRoC's CSV.
 
-TUM (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats): lines of `timestamp tx ty tz qx qy qz qw`, in s and
-m, with # before comments. EuRoC (https://projects.asl.ethz.ch/datasets, state_groundtruth_estimate0): a CSV whose first
-line begins with `#timestamp`, in ns, then the position (m), then the quaternion w, x, y, z; what follows is not read.
-Both give the body's frame in the world's.
+TUM (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats): lines of `timestamp tx ty tz qx qy qz qw`, in s
+and m, with # before comments. EuRoC (https://projects.asl.ethz.ch/datasets, state_groundtruth_estimate0): a CSV whose
+first line begins with `#timestamp`, in ns, then the position (m), then the quaternion w, x, y, z; what follows is not
+read. Both give the body's frame in the world's.
 """
 
 from __future__ import annotations

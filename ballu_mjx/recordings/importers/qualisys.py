@@ -143,9 +143,7 @@ def _marker(table: np.ndarray, index: Mapping[str, int], name: str, time: np.nda
     return Stream(time, position)
 
 
-def _body(
-    path: Path, table: np.ndarray, index: Mapping[str, int], name: str, time: np.ndarray, unit: float
-) -> Stream:
+def _body(path: Path, table: np.ndarray, index: Mapping[str, int], name: str, time: np.ndarray, unit: float) -> Stream:
     stream = _marker(table, index, name, time, unit)
     present = [part for part in _ROTATION if f"{name} {part}" in index]
     if len(present) < len(_ROTATION):

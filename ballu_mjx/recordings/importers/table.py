@@ -128,7 +128,8 @@ def _check_header(path: Path, line: int, header: list[str]) -> list[str]:
     while header and not header[-1]:
         header.pop()
     header[:1] = [name.removeprefix(_COMMENT).strip() for name in header[:1]]
-    if header and all(parse_number(name) is not None for name in header):
+    numbers = sum(parse_number(name) is not None for name in header)
+    if 2 * numbers > len(header):
         fix = "write the columns' names above the numbers, or export with a header"
         refuse(path, f"line {line}", "it holds numbers where the names of the columns should stand", fix)
     return header

@@ -81,5 +81,5 @@ def check_times(path: Path, time: Float[np.ndarray, " T"], first: int, mend: str
     back = np.diff(time) <= 0
     if back.any():
         row = int(back.argmax()) + 1
-        problem = f"time runs back or stands still, from {time[row - 1]:.10g} to {time[row]:.10g} s"
+        problem = f"time runs back or stands still, from {time[row - 1]:.6f} to {time[row]:.6f} s"
         refuse(path, f"line {first + row + 1}", problem, mend)
