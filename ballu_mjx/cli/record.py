@@ -22,13 +22,13 @@ from ballu_mjx.common.errors import InputError
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    from ballu_mjx.recordings.importers.mapping import RoomMapping
-    from ballu_mjx.recordings.importers.table import Table
-    from ballu_mjx.recordings.importers.trajectories import Trajectories
     from ballu_mjx.recordings.recording import Recording
     from ballu_mjx.robots.description import RobotDescription
 
 
+Format = Literal[
+    "auto", "lerobot", "bag", "npz", "c3d", "motive", "qualisys", "euroc", "tum", "vicon", "table"
+]  # fmt: skip
 LEAST_CONFIDENCE = 0.4
 """Of an `Alignment`: below it, another offset may as well be meant."""
 LEAST_CORRELATION = 0.35
@@ -40,13 +40,14 @@ class Import(runtime.CommandOptions):
     """Turn a motion-capture file into a recording, with the commands of a log beside it."""
 
     file: tyro.conf.Positional[Path]
-    """Vicon CSV (Nexus or Tracker), C3D, or a table: a CSV with names in its first row."""
+    """What was captured: an export of OptiTrack, Qualisys or Vicon, C3D, a TUM or EuRoC trajectory, a ROS bag or MCAP,
+    a LeRobot dataset's folder, an .npz archive, or a table (a CSV with names in its first row)."""
     mapping: Path
     """What in it is which part of the robot: a TOML or JSON file, see `example-mapping`."""
     output: Path
     """The recording to write, NAME.csv or NAME.csv.gz; NAME.json comes beside it."""
     commands: Path | None = None
-    """Log of the commands: a CSV. Without this option they must be columns of the table itself."""
+    """Log of the commands: a CSV, an .npz archive or a bag. Without this option they must be in the file itself."""
     offset: float | None = None
     """Seconds to add to the log's times for those of the capture (whose first sample is at 0, or at its own time in a
     table); 0 for one clock. Without this option the offset is looked for in how the robot moves, where its adapter
@@ -56,8 +57,22 @@ class Import(runtime.CommandOptions):
     delay: float = 0.05
     """Seconds from a command as logged to the servo's start, beyond what the nominal robot takes: what an offset that
     was looked for does not count as the clock's."""
-    format: Literal["auto", "vicon", "c3d", "table"] = "auto"
-    """Of the file. auto: by its ending and first line."""
+    format: Format = "auto"
+    """Of the file. auto: by its ending and first lines."""
+    robot: str = "ballu"
+    """The robot: a name, or a description file."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Map(runtime.CommandOptions):
+    """List what a file holds, and write a first mapping for it."""
+
+    file: tyro.conf.Positional[Path]
+    """As of `import`."""
+    output: Path | None = None
+    """The mapping to write, a .toml. Without this option it is printed."""
+    format: Format = "auto"
+    """Of the file. auto: by its ending and first lines."""
     robot: str = "ballu"
     """The robot: a name, or a description file."""
 
@@ -106,7 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def subcommands() -> dict[str, type]:
     """Options of the subcommands by name."""
-    return {"import": Import, "check": Check, "simulate": Simulate, "example-mapping": _Example}
+    return {"import": Import, "map": Map, "check": Check, "simulate": Simulate, "example-mapping": _Example}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,9 +132,11 @@ class _Example(runtime.CommandOptions):
     """The robot: a name, or a description file."""
 
 
-def _run(options: Import | Check | Simulate | _Example) -> int:
+def _run(options: Import | Map | Check | Simulate | _Example) -> int:
     if isinstance(options, Import):
         _import(options)
+    elif isinstance(options, Map):
+        _map(options)
     elif isinstance(options, Check):
         return _check(options)
     elif isinstance(options, Simulate):
@@ -137,9 +154,10 @@ def _run(options: Import | Check | Simulate | _Example) -> int:
 
 def _import(options: Import) -> None:
     from ballu_mjx.recordings.csv_format import recording_name
+    from ballu_mjx.recordings.importers.capture import read_commands
     from ballu_mjx.recordings.importers.mapping import read_mapping
     from ballu_mjx.recordings.importers.placement import place, with_commands
-    from ballu_mjx.recordings.importers.table import Table, commands_in, read_commands
+    from ballu_mjx.recordings.importers.readers import open_log, read_capture
     from ballu_mjx.recordings.validation import SHORTEST
     from ballu_mjx.robots.registry import load_robot
 
@@ -150,7 +168,7 @@ def _import(options: Import) -> None:
         raise InputError("--offset: it is a command log's, and there is none; add --commands.")
     robot = load_robot(options.robot)
     mapping = read_mapping(options.mapping, robot)
-    trajectories, table = _read(options, mapping)
+    trajectories = read_capture(options.file, mapping, None if options.format == "auto" else options.format)
     recording = place(trajectories, mapping, robot, recording_name(options.output))
     if recording.time[-1] - recording.time[0] < SHORTEST:
         raise InputError(f"{options.file}: lasts less than {SHORTEST:g} s; capture for longer.")
@@ -159,39 +177,20 @@ def _import(options: Import) -> None:
     duration = recording.time[-1] - recording.time[0]
     print(f"{options.file}: {len(recording.time)} samples, {duration:.2f} s{begins}")
     if options.commands is None:
-        if table is None or next(iter(mapping.commands.columns.values())) not in table.header:
+        if trajectories.commands is None:
             raise InputError(
                 f"{options.file}: holds no commands; give their log by --commands, or name their columns under "
                 f"[commands] in {options.mapping}."
             )
-        time, command = trajectories.time, commands_in(table, mapping.commands)
+        time, command = trajectories.commands.time, trajectories.commands.command
     else:
-        time, command = read_commands(Table(options.commands, options.mapping), mapping.commands)
+        time, command = read_commands(open_log(options.commands, mapping), mapping.commands, mapping)
         found = _offset(options, robot, recording, time, command) if options.offset is None else options.offset
         time = time + found
     recording, cut = with_commands(options.commands or options.file, recording, time, command)
     if max(cut) > 0:
         print(f"cut off, for there are no commands: {cut[0]:.2f} s at the start, {cut[1]:.2f} s at the end")
     _write(options, robot, recording)
-
-
-def _read(options: Import, mapping: RoomMapping) -> tuple[Trajectories, Table | None]:
-    from ballu_mjx.recordings.importers.c3d import read_c3d
-    from ballu_mjx.recordings.importers.table import Table, read_table
-    from ballu_mjx.recordings.importers.vicon import is_vicon, read_vicon
-
-    kind = options.format
-    if kind == "auto":
-        if options.file.suffix.lower() == ".c3d":
-            kind = "c3d"
-        else:
-            kind = "vicon" if is_vicon(options.file) else "table"
-    if kind == "c3d":
-        return read_c3d(options.file, mapping), None
-    if kind == "vicon":
-        return read_vicon(options.file, mapping), None
-    table = Table(options.file, options.mapping)
-    return read_table(table, mapping), table
 
 
 def _offset(
@@ -285,6 +284,33 @@ def _check_output(output: Path) -> None:
         if path.exists():
             raise InputError(f"{path}: stands there already; delete it, or give another --output.")
     files.check_folder(output.parent)
+
+
+# ---- map ----
+
+
+def _map(options: Map) -> None:
+    from ballu_mjx.recordings.importers.contents import describe_contents
+    from ballu_mjx.recordings.importers.draft import draft_mapping
+    from ballu_mjx.recordings.importers.readers import find_reader
+    from ballu_mjx.robots.registry import load_robot
+
+    if options.output is not None:
+        if options.output.suffix != ".toml":
+            raise InputError(f"--output {options.output}: a mapping is TOML; give a name that ends in .toml.")
+        if options.output.exists():
+            raise InputError(f"{options.output}: stands there already; delete it, or give another --output.")
+        files.check_folder(options.output.parent)
+    robot = load_robot(options.robot)
+    contents = find_reader(options.file, None if options.format == "auto" else options.format).list(options.file)
+    text = draft_mapping(contents, robot)
+    if options.output is None:
+        print(text, end="")
+        return
+    print("\n".join(describe_contents(contents)))
+    files.write(options.output, text)
+    guesses, empty = text.count("a guess"), text.count("choose ")
+    print(f"{options.output}: {guesses} guesses to check, {empty} places to complete; then `record import` takes it")
 
 
 # ---- check ----
@@ -442,8 +468,9 @@ def _simulate(options: Simulate) -> None:
 def _commands(options: Simulate, robot: RobotDescription) -> tuple[Float[np.ndarray, "steps 2"], str]:
     """Commands at the control rate, and what to say of them."""
     from ballu_mjx.ballu.gaits import GAITS
+    from ballu_mjx.recordings.importers.capture import read_commands
     from ballu_mjx.recordings.importers.mapping import Commands
-    from ballu_mjx.recordings.importers.table import Table, read_commands
+    from ballu_mjx.recordings.importers.table import open_table
 
     if (options.commands is None) == (options.gait is None):
         raise InputError("--commands, --gait: give one of them, or --suspended for a sweep.")
@@ -453,7 +480,7 @@ def _commands(options: Simulate, robot: RobotDescription) -> tuple[Float[np.ndar
         assert options.gait is not None
         gaits: dict[str, Callable[[float], Float[np.ndarray, "steps 2"]]] = dict(GAITS)
         return gaits[options.gait](options.seconds), f"{options.gait}, open loop."
-    time, command = read_commands(Table(options.commands), Commands.of(robot))
+    time, command = read_commands(open_table(options.commands), Commands.of(robot))
     step = robot.control_timestep
     steps = int(round((time[-1] - time[0]) / step, 6)) + 1
     if not 1.0 <= steps * step <= 3600.0:

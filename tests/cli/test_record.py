@@ -164,7 +164,7 @@ def test_a_sweep_comes_from_a_table_with_its_commands(tmp_path: Path):
     rows = [",".join(f"{x:.11g}" for x in row) for row in zip(*columns, strict=True)]
     (tmp_path / "bench.csv").write_text("\n".join(["ms,cl,cr,ml,mr,kl,kr", *rows]) + "\n")
     joints = {"motor_left": "ml", "motor_right": "mr", "knee_left": "kl", "knee_right": "kr"}
-    room = 'robot = "r"\nkind = "suspended"\n[units]\nangle = "deg"\ntime = "ms"\n'
+    room = 'robot = "r"\nkind = "suspended"\n[units]\nangle = "deg"\n[clock]\ntime_unit = "ms"\n'
     room += '[commands]\ntime = "ms"\nleft = "cl"\nright = "cr"\n'
     room += "".join(f'[{name}]\ncolumn = "{column}"\n' for name, column in joints.items())
     room = room.replace('column = "kl"', 'column = "kl"\nsign = -1\nzero = 90')

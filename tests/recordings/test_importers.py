@@ -23,9 +23,10 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.importers.c3d import read_c3d
 from ballu_mjx.recordings.importers.c3d_file import C3DError, read_c3d_points
+from ballu_mjx.recordings.importers.capture import read_commands, select
 from ballu_mjx.recordings.importers.mapping import Commands, RoomMapping, Source, example_mapping, read_mapping
 from ballu_mjx.recordings.importers.placement import place, with_commands
-from ballu_mjx.recordings.importers.table import Table, commands_in, read_commands, read_table
+from ballu_mjx.recordings.importers.table import open_table
 from ballu_mjx.recordings.importers.trajectories import rigid_body
 from ballu_mjx.recordings.importers.vicon import read_vicon
 from ballu_mjx.recordings.recording import Recording, cut
@@ -633,7 +634,8 @@ start = false
 [units]
 length = "cm"
 angle = "deg"
-time = "ms"
+[clock]
+time_unit = "ms"
 [balloon]
 position = ["bx", "by", "bz"]
 orientation = ["bw", "bi", "bj", "bk"]
@@ -682,8 +684,9 @@ def read_columns(folder: Path, text: str, rooms: str = COLUMNS) -> tuple[Recordi
     (folder / "walk.csv").write_text(text)
     (folder / "room.toml").write_text(rooms)
     room = read_mapping(folder / "room.toml", ROBOT)
-    table = Table(folder / "walk.csv")
-    return place(read_table(table, room), room, ROBOT, "walk"), commands_in(table, room.commands)
+    found = select(open_table(folder / "walk.csv"), room)
+    assert found.commands is not None
+    return place(found, room, ROBOT, "walk"), found.commands.command
 
 
 def test_tables_come_back(tmp_path: Path):
@@ -697,7 +700,7 @@ def test_tables_come_back(tmp_path: Path):
 @pytest.mark.parametrize(
     "damage, said",
     [
-        (lambda t, m: (t.replace("lx", "mx"), m), ["walk.csv: there is no column 'lx'", "fix the mapping"]),
+        (lambda t, m: (t.replace("lx", "mx"), m), ["walk.csv: there is no column 'lx'", "fix", "room.toml"]),
         (lambda t, m: (t.replace("bx,by", "by,by"), m), ["walk.csv"]),
         (lambda t, m: ("\n".join(t.split("\n")[:50]) + "\n1,2,3\n", m), ["line 51", "3 cells, the header 21"]),
         (lambda t, m: (t.replace("\n10,", "\nten,"), m), ["line 3, column clock", "'ten' is not a number"]),
@@ -720,7 +723,7 @@ def test_damaged_tables_are_refused(tmp_path: Path, damage: Callable[[str, str],
 def test_logs_hold_commands_until_the_next(tmp_path: Path):
     log = tmp_path / "log.csv"
     log.write_text("time,command_left,command_right\n5,0.2,0\n5.5,,1\n6.25,0.7,\n")
-    time, command = read_commands(Table(log), Commands.of(ROBOT))
+    time, command = read_commands(open_table(log), Commands.of(ROBOT))
     assert time.tolist() == [5.0, 5.5, 6.25]
     assert command.tolist() == [[0.2, 0.0], [0.2, 1.0], [0.7, 1.0]]
     with_log, lost = with_commands(log, source(), time - 5.0, command)
@@ -804,6 +807,7 @@ KEYS = [("", field.name) for field in dataclasses.fields(RoomMapping)]
 KEYS += [("balloon", field.name) for field in dataclasses.fields(Source)]
 KEYS += [("commands", key) for key in ("time", "time_unit", "left", "right", "range_left", "range_right")]
 KEYS += [("axes", "up"), ("origin", "start"), ("origin", "floor"), ("units", "angle"), ("knee_left", "column")]
+KEYS += [("clock", key) for key in ("time", "time_unit", "episode")]
 
 
 @settings(max_examples=150, deadline=None)

@@ -135,7 +135,7 @@ def test_check_and_import_take_the_robot(tmp_path: Path, capsys: pytest.CaptureF
     names = "ms,tx,ty,tz,tw,ti,tj,tk,ex,ey,ez,angle,reach,percent,mm"
     (tmp_path / "take.csv").write_text("\n".join([names, *rows]) + "\n")
     (tmp_path / "room.toml").write_text(
-        'robot = "arm-1"\n[units]\nlength = "mm"\nangle = "deg"\ntime = "ms"\n'
+        'robot = "arm-1"\n[units]\nlength = "mm"\nangle = "deg"\n[clock]\ntime_unit = "ms"\n'
         '[tip]\nposition = ["tx", "ty", "tz"]\norientation = ["tw", "ti", "tj", "tk"]\nrotation = "quaternion"\n'
         '[elbow]\nposition = ["ex", "ey", "ez"]\n[shoulder]\ncolumn = "angle"\n[reach]\ncolumn = "reach"\n'
         '[commands]\ntime = "ms"\nturn = "percent"\nrange_turn = [-100, 100]\npush = "mm"\nrange_push = [0, 4]\n'

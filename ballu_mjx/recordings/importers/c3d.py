@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ballu_mjx.recordings.importers.c3d_file import C3DError, read_c3d_points
+from ballu_mjx.recordings.importers.c3d_file import C3DError, C3DPoints, read_c3d_points
+from ballu_mjx.recordings.importers.contents import Contents, Item
 from ballu_mjx.recordings.importers.mapping import MARKER_TOLERANCE, RoomMapping
 from ballu_mjx.recordings.importers.trajectories import LENGTHS, Body, Trajectories, find, refuse, rigid_body, shorten
 
@@ -16,6 +17,38 @@ _SPELLINGS |= {f"centi{name}": "cm" for name in _METRES} | {f"milli{name}": "mm"
 """Units as programs write them; Visual3D keeps four letters."""
 
 
+def recognise_c3d(path: Path, start: str) -> bool:
+    """Whether the file's name ends in .c3d."""
+    del start
+    return path.suffix.lower() == ".c3d"
+
+
+def list_c3d(path: Path) -> Contents:
+    """Return what the C3D at `path` holds.
+
+    **Raises** `InputError` as `read_c3d`.
+    """
+    found = _read_points(path)
+    seen = np.isfinite(found.position).all(axis=0)
+    items = [
+        Item(label, "marker", len(each), found.rate, share=float(np.mean(each)), unit=found.unit or "unknown")
+        for label, each in zip(found.labels, seen, strict=False)
+        if label
+    ]
+    return Contents(path, "a C3D file", items, notes=["C3D holds markers alone: a body is given by three or more."])
+
+
+def _read_points(path: Path) -> C3DPoints:
+    if not path.is_file():
+        refuse(path, "", "there is no such file", "check the path")
+    try:
+        return read_c3d_points(path.read_bytes())
+    except OSError as error:
+        refuse(path, "", f"cannot be read ({error.strerror})", "check the file and its permissions")
+    except C3DError as error:
+        refuse(path, "", error.problem, error.fix)
+
+
 def read_c3d(path: Path, mapping: RoomMapping) -> Trajectories:
     """The markers that `mapping` names, from the C3D at `path`; a negative residual is a sample not seen.
 
@@ -23,14 +56,7 @@ def read_c3d(path: Path, mapping: RoomMapping) -> Trajectories:
 
     **Raises** `InputError` for files that are damaged, cut off, without unit or rate, or without such markers.
     """
-    if not path.is_file():
-        refuse(path, "", "there is no such file", "check the path")
-    try:
-        found = read_c3d_points(path.read_bytes())
-    except OSError as error:
-        refuse(path, "", f"cannot be read ({error.strerror})", "check the file and its permissions")
-    except C3DError as error:
-        refuse(path, "", error.problem, error.fix)
+    found = _read_points(path)
     points, count = found.position, found.position.shape[2]
     rate = mapping.rate or found.rate
     if rate is None or not 1 <= rate <= 1e5:

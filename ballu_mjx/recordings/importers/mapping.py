@@ -23,7 +23,7 @@ from ballu_mjx.robots.description import RobotDescription
 
 MARKER_TOLERANCE = 0.01
 """m, see `trajectories.rigid_body`."""
-_TABLES = ("axes", "origin", "units", "commands")
+_TABLES = ("axes", "origin", "units", "clock", "commands")
 _RESERVED = ("robot", "kind", "notes", "rate", *_TABLES)
 """Names that no site or joint of a mapping file can have."""
 _RESERVED_COMMANDS = ("time", "time_unit")
@@ -83,6 +83,18 @@ class Commands:
 
 
 @dataclasses.dataclass(frozen=True)
+class Clock:
+    """Where the captured file has its times."""
+
+    time: str | None = None
+    """The column of times, or of a bag "header" or "received". None: the format's own."""
+    time_unit: str = "s"
+    """Of a column whose unit the format does not fix."""
+    episode: int | None = None
+    """Of a LeRobot dataset with several."""
+
+
+@dataclasses.dataclass(frozen=True)
 class RoomMapping:
     """A mapping file, checked."""
 
@@ -100,9 +112,7 @@ class RoomMapping:
     """m, or a name among the robot's `RecordingHooks.floors`."""
     length: str | None
     angle: str | None
-    time: str
-    time_column: str
-    """Of tables; that of `commands`, for there is one clock in a table."""
+    clock: Clock
     sources: Mapping[str, Source]
     joints: Mapping[str, Joint]
     commands: Commands
@@ -138,8 +148,8 @@ def read_mapping(path: Path, robot: RobotDescription) -> RoomMapping:
     units = top.keys("units")
     length = units.choice("length", LENGTHS, None)
     angle = units.choice("angle", ANGLES, None)
-    time = units.choice("time", TIMES, "s")
     units.finish()
+    clock = _clock(top.keys("clock"))
     sources = {role: _source(top.keys(role), role) for role in roles if role in content}
     for role in roles:
         if role not in sources and kind == "free":
@@ -154,11 +164,10 @@ def read_mapping(path: Path, robot: RobotDescription) -> RoomMapping:
     commands = _commands(top.keys("commands"), robot)
     top.taken |= {*roles, *robot.joints}
     top.finish()
-    assert time is not None and floor is not None
+    assert floor is not None
     return RoomMapping(
-        path, specimen, kind, notes, rate, axes, start, floor, length, angle, time, commands.time, sources, joints,
-        commands,
-    )  # fmt: skip
+        path, specimen, kind, notes, rate, axes, start, floor, length, angle, clock, sources, joints, commands
+    )
 
 
 def _check_names(path: Path, roles: Sequence[str], robot: RobotDescription) -> None:
@@ -328,6 +337,15 @@ def _joint(keys: _Keys, *, slides: bool) -> Joint:
     return Joint(column, sign, zero, slides)
 
 
+def _clock(keys: _Keys) -> Clock:
+    episode = keys.get("episode")
+    if episode is not None and (isinstance(episode, bool) or not isinstance(episode, int) or not 0 <= episode < 2**31):
+        keys.bad("episode", "write its number, such as 0")
+    clock = Clock(keys.optional_text("time"), keys.choice("time_unit", TIMES, "s") or "s", episode)
+    keys.finish()
+    return clock
+
+
 def _commands(keys: _Keys, robot: RobotDescription) -> Commands:
     default = Commands.of(robot)
     time = keys.text("time", default.time)
@@ -383,7 +401,7 @@ _EXAMPLE = """\
 robot = "{name}-1"{pad}# the name that all recordings of this robot carry
 kind = "free"            # "suspended": the root is held
 notes = ""
-# rate = 100.0           # Hz; only for tables without a time column, or where the file's own is wrong
+# rate = 100.0           # Hz; only for files without times, or where the file's own rate is wrong
 
 [axes]                   # the capture's axes that point along the format's; all of "x", "-x" ... "-z"
 forward = "x"
@@ -397,7 +415,12 @@ floor = 0.0              # m, height of the floor in the capture{floors}
 [units]                  # only where the file does not say, or says something wrong
 # length = "mm"          # m, cm, mm
 # angle = "deg"          # rad, deg
-# time = "s"             # s, ms, us, ns; tables only
+
+[clock]                  # of the captured file, where it does not say; [commands] has the log's own
+# time = "time"          # the column of times; default: the name that stands under [commands]. Of a bag or MCAP:
+                         # "header" (the messages' stamps), or "received" (when they were recorded)
+# time_unit = "s"        # s, ms, us, ns
+# episode = 0            # of a LeRobot dataset
 
 [{tracked}]{pad_tracked}# needs an orientation: a Vicon object or segment, three markers or more, or columns
 body = "{name}:{tracked}"   # "subject:segment", an object, or the name behind the colon where only one subject has it

@@ -36,6 +36,16 @@ class Body:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
+class CommandLog:
+    """Commands that a file holds beside its motion."""
+
+    time: Float[np.ndarray, " N"]
+    """s, the clock of the file's motion."""
+    command: Float[np.ndarray, "N commands"]
+    """In the actuators' units, each held until the next."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Trajectories:
     """T samples of what a file holds, as far as a mapping asks for it."""
 
@@ -46,6 +56,8 @@ class Trajectories:
     """By the robot's site."""
     columns: Mapping[str, Float[np.ndarray, " T"]] = dataclasses.field(default_factory=dict)
     """Joint angles (rad; of slides, m) by joint."""
+    commands: CommandLog | None = None
+    """None where the file holds none."""
     first_frame: int = 1
     """Of the trial: a file that was cropped at its start begins later, and so does `time`."""
 

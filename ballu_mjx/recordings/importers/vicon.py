@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ballu_mjx.common.files import read_text
+from ballu_mjx.recordings.importers.contents import Contents, Item
 from ballu_mjx.recordings.importers.mapping import MARKER_TOLERANCE, RoomMapping, Source
 from ballu_mjx.recordings.importers.trajectories import (
     ANGLES,
@@ -46,6 +47,8 @@ _HELICAL = ("Segments",)
 """Sections whose three rotation components are a rotation vector unless the mapping says otherwise."""
 _USED = ("Objects", "Segments", "Trajectories")
 """Sections that must be whole; others that are laid out alike are read, and those that are not (Events) left alone."""
+_TITLES = (*_USED, "Joints", "Model Outputs", "Devices", "Events")
+_SEARCHED_ROWS = 12
 _HEADER_ROWS = 5
 _SPELLINGS: Mapping[str, str] = {"degrees": "deg", "degree": "deg", "°": "deg", "radians": "rad", "radian": "rad"}
 _LARGEST = 1e6
@@ -83,13 +86,44 @@ _Values = Callable[[_Group, Sequence[str]], Float[np.ndarray, "T n"]]
 """The columns of a group by component, over all frames."""
 
 
-def is_vicon(path: Path) -> bool:
-    """Whether the first line with text in it has one cell of it alone, as a section's title does."""
-    for line in read_text(path).splitlines():
-        cells = [cell for cell in line.replace(";", ",").replace("\t", ",").split(",") if cell.strip(' "')]
-        if cells:
-            return len(cells) == 1
-    return False
+def recognise_vicon(path: Path, start: str) -> bool:
+    """Whether the first line with text has one cell alone, as a section's title does, and a section follows."""
+    del path
+    rows = [_cells(line, ",") for line in start.replace(";", ",").replace("\t", ",").splitlines()]
+    rows = [row for row in rows if any(row)]
+    if not rows or any(rows[0][1:]) or _number(rows[0][0]) is not None:
+        return False
+    return rows[0][0] in _TITLES or any(row[0] == "Frame" for row in rows[:_SEARCHED_ROWS])
+
+
+def list_vicon(path: Path) -> Contents:
+    """Return what the Vicon CSV at `path` holds.
+
+    **Raises** `InputError` as `read_vicon`, for its headers.
+    """
+    lines = read_text(path).splitlines()
+    items = []
+    for name, groups in _groups(_sections(path, lines, _delimiter(path, lines))).items():
+        for group in groups:
+            turns = set(_ROTATION) <= set(group.columns)
+            axes = next(axes for axes in _TRANSLATIONS if set(axes) <= set(group.columns))
+            section = group.section
+            open_rotation = turns and "RW" not in group.columns and section.title not in _HELICAL
+            items.append(
+                Item(
+                    name,
+                    "body" if turns else "marker",
+                    section.last - section.first,
+                    section.rate,
+                    unit=group.units[axes[0]] or "unknown",
+                    section=section.title if len(groups) > 1 else None,
+                    rotation="helical" if open_rotation else None,
+                )
+            )
+    notes = []
+    if any(item.rotation for item in items):
+        notes.append("RX, RY, RZ may be a rotation vector (helical) or Euler angles, as was chosen at export.")
+    return Contents(path, "a Vicon CSV", items, notes=notes)
 
 
 def read_vicon(path: Path, mapping: RoomMapping) -> Trajectories:

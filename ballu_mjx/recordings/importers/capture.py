@@ -1,0 +1,390 @@
+"""What a laboratory's file holds, by name: bodies, markers and columns; and the part of it that a mapping asks for."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation, Slerp
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.importers.contents import Contents, Item
+from ballu_mjx.recordings.importers.mapping import MARKER_TOLERANCE, Commands, Joint, RoomMapping, Source
+from ballu_mjx.recordings.importers.trajectories import (
+    ANGLES,
+    LENGTHS,
+    Body,
+    CommandLog,
+    Trajectories,
+    find,
+    refuse,
+    rigid_body,
+    shorten,
+    suggest,
+    to_quaternion,
+)
+
+_COMMAND_TOLERANCE = 0.005
+"""Of a command's range: values that exceed it by at most this share are measurement noise and are clipped."""
+_LONGEST_BRIDGE = 2.5
+"""Sample spacings: streams at other times are interpolated over shorter steps only, the rest was not seen."""
+
+_Value = TypeVar("_Value")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Stream:
+    """A marker or a rigid body with times of its own; NaN where it was not seen."""
+
+    time: Float[np.ndarray, " T"]
+    """s, strictly increasing."""
+    position: Float[np.ndarray, "T 3"]
+    """m, capture frame."""
+    quaternion: Float[np.ndarray, "T 4"] | None = None
+    """w, x, y, z: the body's frame in the capture's."""
+    angles: Float[np.ndarray, "T 3"] | None = None
+    """rad; three angles of which the file does not say what they are, in place of a quaternion."""
+    clock: str | None = None
+    """Which of the file's clocks `time` is, where it has several."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Series:
+    """A column of numbers; NaN where a sample is missing."""
+
+    values: Float[np.ndarray, " T"]
+    time: Float[np.ndarray, " T"] | None = None
+    """s. None: a sample a row, and a column of the file holds the times."""
+    si: bool = False
+    """Whether the format fixes the unit: rad and m."""
+    clock: str | None = None
+    """As of a `Stream`."""
+    label: str | None = None
+    """What the file calls it beside its name."""
+
+
+class Lazy(Mapping[str, _Value]):
+    """Values by name, each made when it is first asked for."""
+
+    def __init__(self, makers: Mapping[str, Callable[[], _Value]]) -> None:
+        self._makers = makers
+        self._made: dict[str, _Value] = {}
+
+    def __getitem__(self, name: str) -> _Value:
+        if name not in self._made:
+            self._made[name] = self._makers[name]()
+        return self._made[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._makers)
+
+    def __len__(self) -> int:
+        return len(self._makers)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Capture:
+    """What one file holds."""
+
+    path: Path
+    program: str
+    """What wrote it, for messages: "a table", "an OptiTrack Motive CSV"."""
+    bodies: Mapping[str, Stream] = dataclasses.field(default_factory=dict)
+    columns: Mapping[str, Series] = dataclasses.field(default_factory=dict)
+    clock: Callable[[str, str], Float[np.ndarray, " T"]] | None = None
+    """Of the columns that hold a sample a row: times (s) by the name and the unit of the column that holds them."""
+    rows: int = 0
+    """Samples of these columns."""
+    time_column: str | None = None
+    """Which column that is, where the format fixes it."""
+    notes: Sequence[str] = ()
+    """Sentences about what is in the file and not read, and what is not certain."""
+
+
+def list_capture(capture: Capture) -> Contents:
+    """Return what `capture` holds. What cannot be read is told in the notes."""
+    items: list[Item] = []
+    notes = list(capture.notes)
+    for name in capture.bodies:
+        try:
+            stream = capture.bodies[name]
+        except InputError as error:
+            notes.append(str(error))
+            continue
+        turns = stream.quaternion is not None or stream.angles is not None
+        seen = ~np.isnan(stream.position).any(axis=1)
+        items.append(
+            Item(
+                name,
+                "body" if turns else "marker",
+                len(stream.time),
+                _rate(stream.time),
+                share=float(seen.mean()),
+                unit="m",
+                rotation=None if stream.angles is None else "XYZ",
+                clock=stream.clock,
+                low=float(stream.position[seen].min()) if seen.any() else None,
+                high=float(stream.position[seen].max()) if seen.any() else None,
+            )
+        )
+    for name in capture.columns:
+        try:
+            series = capture.columns[name]
+        except InputError as error:
+            notes.append(str(error))
+            continue
+        seen = series.values[~np.isnan(series.values)]
+        items.append(
+            Item(
+                name,
+                "column",
+                len(series.values),
+                None if series.time is None else _rate(series.time),
+                share=len(seen) / max(len(series.values), 1),
+                unit="rad or m" if series.si else None,
+                clock=series.clock,
+                label=series.label,
+                low=float(seen.min()) if len(seen) else None,
+                high=float(seen.max()) if len(seen) else None,
+                step=_step(series.values),
+            )
+        )
+    return Contents(capture.path, capture.program, items, rows=capture.clock is not None, notes=notes)
+
+
+def _rate(time: np.ndarray) -> float | None:
+    return 1 / float(np.median(np.diff(time))) if len(time) > 1 else None
+
+
+def _step(values: np.ndarray) -> float | None:
+    """The median step of a column that could be a clock."""
+    steps = np.diff(values)
+    return float(np.median(steps)) if len(steps) and np.isfinite(steps).all() and (steps > 0).all() else None
+
+
+# ---- what a mapping asks for ----
+
+
+def select(capture: Capture, mapping: RoomMapping) -> Trajectories:
+    """Return what `mapping` asks for of `capture`, all on the times of the tracked site (in a suspended recording: of
+    the first joint).
+
+    Streams with times of their own are interpolated, orientations along the shortest rotation.
+
+    **Raises** `InputError` naming file and fix for what is not there, has no unit, or lacks times.
+    """
+    picked = {role: _pick(capture, mapping, source) for role, source in mapping.sources.items()}
+    joints = {name: _joint(capture, mapping, joint) for name, joint in mapping.joints.items()}
+    clocks = [stream.time for stream in picked.values()] + [time for time, _ in joints.values()]
+    if not clocks:
+        fix = "say what its sites are, or what its joints are"
+        refuse(mapping.path, "", f"it asks for nothing of {capture.program}", fix)
+    time = clocks[0]
+    bodies = {role: _on_clock(stream, time) for role, stream in picked.items()}
+    angles = {name: _values_on_clock(each, values, time) for name, (each, values) in joints.items()}
+    commands = None
+    if any(name in capture.columns for name in mapping.commands.columns.values()):
+        commands = CommandLog(*_commands(capture, mapping.commands, mapping, log=False))
+    return Trajectories(capture.path, time, bodies, angles, commands)
+
+
+def read_commands(
+    capture: Capture, columns: Commands, mapping: RoomMapping | None = None
+) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N commands"]]:
+    """Return times (s, the log's own clock) and commands of a log, in the actuators' units; an empty cell goes on with
+    the command before.
+
+    **Raises** `InputError` naming file, line, column and fix.
+    """
+    return _commands(capture, columns, mapping, log=True)
+
+
+def _pick(capture: Capture, mapping: RoomMapping, source: Source) -> Stream:
+    place = f"[{source.role}]"
+    if source.section is not None:
+        refuse(mapping.path, f"{place} section", f"{capture.program} has no sections", "leave it out")
+    if source.position:
+        return _from_columns(capture, mapping, source)
+    if not capture.bodies:
+        fix = 'it has columns, write position = ["x", "y", "z"] there'
+        refuse(mapping.path, place, f"it is given by name, and {capture.path.name} is {capture.program}", fix)
+
+    def named(name: str) -> Stream:
+        return capture.bodies[find(capture.path, name, capture.bodies, "body or marker", mapping.path)]
+
+    if source.markers:
+        streams = [named(name) for name in source.markers]
+        time = streams[0].time
+        markers = np.stack([_on_clock(stream, time).position for stream in streams])
+        geometry = None if source.geometry is None else np.array(source.geometry)
+        body = rigid_body(capture.path, source.role, markers, geometry, MARKER_TOLERANCE)
+        return Stream(time, body.position, body.quaternion)
+    stream = named(source.body or "")
+    if stream.angles is None:
+        if source.rotation not in (None, "quaternion"):
+            fix = "leave rotation out"
+            refuse(mapping.path, f"{place} rotation", f"{capture.program} says itself what its rotations are", fix)
+        return stream
+    if source.rotation in (None, "quaternion"):
+        fix = (
+            'export quaternions, or write rotation = "XYZ" (about the body\'s own axes in turn) or "xyz" (about the '
+            "capture's)"
+        )
+        refuse(mapping.path, place, f"{capture.program} does not say about which axes its angles turn", fix)
+    where = f"the angles of {shorten(source.body or '')}"
+    quaternion = to_quaternion(capture.path, where, stream.angles, source.rotation, 1.0)
+    return Stream(stream.time, stream.position, quaternion)
+
+
+def _from_columns(capture: Capture, mapping: RoomMapping, source: Source) -> Stream:
+    parts = [_column(capture, mapping, name) for name in (*source.position, *source.orientation)]
+    time = parts[0][0]
+    values = np.stack([_values_on_clock(each, series.values, time) for each, series in parts], axis=1)
+    position = values[:, :3] * _unit(capture, mapping, parts[0][1], LENGTHS, "length")
+    if not source.orientation:
+        return Stream(time, position)
+    assert source.rotation is not None
+    unit = 1.0 if source.rotation == "quaternion" else _unit(capture, mapping, parts[3][1], ANGLES, "angle")
+    place = f"columns {source.orientation[0]} to {source.orientation[-1]}"
+    return Stream(time, position, to_quaternion(capture.path, place, values[:, 3:], source.rotation, unit))
+
+
+def _joint(capture: Capture, mapping: RoomMapping, joint: Joint) -> tuple[np.ndarray, np.ndarray]:
+    time, series = _column(capture, mapping, joint.column)
+    known, kind = (LENGTHS, "length") if joint.slides else (ANGLES, "angle")
+    return time, (series.values - joint.zero) * joint.sign * _unit(capture, mapping, series, known, kind)
+
+
+def _unit(capture: Capture, mapping: RoomMapping, series: Series, known: Mapping[str, float], name: str) -> float:
+    unit = mapping.length if name == "length" else mapping.angle
+    if unit is None and series.si:
+        return 1.0
+    if unit is None:
+        fix = f'write {name} = "{next(iter(known))}" or another there'
+        whose = "a table's" if capture.program == "a table" else f"{capture.path.name}'s"
+        refuse(mapping.path, "[units]", f"the {name} of {whose} columns is not said", fix)
+    return known[unit]
+
+
+def _look_up(capture: Capture, name: str, mapping: RoomMapping | None) -> Series:
+    if name not in capture.columns:
+        where = "the mapping" if mapping is None else mapping.path
+        hint = suggest(name, capture.columns).rstrip("?")
+        refuse(capture.path, "", f"there is no column {shorten(name)!r}", f"fix {where}, {hint}")
+    return capture.columns[name]
+
+
+def _column(capture: Capture, mapping: RoomMapping, name: str) -> tuple[np.ndarray, Series]:
+    """Times and values of a column."""
+    series = _look_up(capture, name, mapping)
+    return (_rows_clock(capture, mapping) if series.time is None else series.time), series
+
+
+def _rows_clock(capture: Capture, mapping: RoomMapping) -> np.ndarray:
+    column = mapping.clock.time or capture.time_column or mapping.commands.time
+    if capture.clock is not None and column in capture.columns:
+        return capture.clock(column, mapping.clock.time_unit)
+    if mapping.rate is not None:
+        return np.arange(capture.rows) / mapping.rate
+    fix = f'write time = "..." under [clock] in {mapping.path}, {suggest(column, capture.columns)}'.rstrip("?")
+    refuse(capture.path, "", f"there is no column {shorten(column)!r} of times", f"{fix}; or rate = ... (Hz)")
+
+
+# ---- commands ----
+
+
+def _commands(
+    capture: Capture, columns: Commands, mapping: RoomMapping | None, *, log: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    series = {command: _look_up(capture, name, mapping) for command, name in columns.columns.items()}
+    clocks: list[np.ndarray] = []
+    rows: np.ndarray | None = None
+    for each in series.values():
+        if each.time is None and rows is None:
+            if log:
+                _look_up(capture, columns.time, mapping)
+                assert capture.clock is not None
+                rows = capture.clock(columns.time, columns.time_unit)
+            else:
+                assert mapping is not None
+                rows = _rows_clock(capture, mapping)
+        clocks.append(rows if each.time is None else each.time)  # pyright: ignore[reportArgumentType]
+    time = clocks[0]
+    if any(len(clock) != len(time) or (clock != time).any() for clock in clocks):
+        # Held until the next: all instants at which any of them changes, from where all of them are known.
+        time = np.unique(np.concatenate(clocks))
+        time = time[time >= max(clock[0] for clock in clocks)]
+    values = []
+    for (command, each), clock, shown, limits in zip(
+        series.items(), clocks, columns.ranges, columns.limits, strict=True
+    ):
+        share = _share(capture, columns.columns[command], command, each.values, shown)
+        held = np.searchsorted(clock, time, side="right") - 1
+        values.append(limits[0] + share[held] * (limits[1] - limits[0]))
+    return time, np.stack(values, axis=1)
+
+
+def _share(
+    capture: Capture, name: str, command: str, raw: Float[np.ndarray, " N"], shown: tuple[float, float]
+) -> Float[np.ndarray, " N"]:
+    """How far a command is from its smallest (0) to its largest (1) value."""
+    held = np.maximum.accumulate(np.where(np.isnan(raw), -1, np.arange(len(raw))))
+    if held[0] < 0:
+        fix = "write what was being sent, or delete the samples before the first command"
+        refuse(capture.path, f"column {shorten(name)}", "the first command is missing", fix)
+    with np.errstate(over="ignore"):
+        share = (raw[held] - shown[0]) / (shown[1] - shown[0])
+    outside = (share < -_COMMAND_TOLERANCE) | (share > 1 + _COMMAND_TOLERANCE)
+    if outside.any():
+        row = int(outside.argmax())
+        problem = f"{raw[held][row]:g} is outside of {shown[0]:g} to {shown[1]:g}"
+        fix = (
+            "write under [commands] in the mapping what the column shows at the smallest and the largest command, as "
+            f"range_{command}"
+        )
+        refuse(capture.path, f"sample {row + 1}, column {shorten(name)}", problem, fix)
+    return np.clip(share, 0.0, 1.0)
+
+
+# ---- one clock ----
+
+
+def _on_clock(stream: Stream, time: Float[np.ndarray, " T"]) -> Body:
+    if stream.time is time or np.array_equal(stream.time, time):
+        return Body(stream.position, stream.quaternion)
+    position = np.stack([_values_on_clock(stream.time, axis, time) for axis in stream.position.T], axis=1)
+    if stream.quaternion is None:
+        return Body(position)
+    quaternion = np.full((len(time), 4), np.nan)
+    seen = np.flatnonzero(~np.isnan(stream.quaternion).any(axis=1))
+    inside = _bridged(stream.time, seen, time)
+    if inside.any():
+        turned = Rotation.from_quat(stream.quaternion[seen], scalar_first=True)
+        quaternion[inside] = Slerp(stream.time[seen], turned)(time[inside]).as_quat(scalar_first=True)
+    return Body(position, quaternion)
+
+
+def _values_on_clock(own: np.ndarray, values: np.ndarray, time: np.ndarray) -> np.ndarray:
+    if own is time or np.array_equal(own, time):
+        return values
+    found = np.full(len(time), np.nan)
+    seen = np.flatnonzero(~np.isnan(values))
+    inside = _bridged(own, seen, time)
+    if inside.any():
+        found[inside] = np.interp(time[inside], own[seen], values[seen])
+    return found
+
+
+def _bridged(own: np.ndarray, seen: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Which of `time` lie between two samples that are seen, one after the other but for `_LONGEST_BRIDGE`."""
+    if len(seen) < 2:
+        return np.zeros(len(time), bool)
+    known = own[seen]
+    after = np.clip(np.searchsorted(known, time), 1, len(known) - 1)
+    step = known[after] - known[after - 1]
+    longest = _LONGEST_BRIDGE * max(float(np.median(np.diff(own))), float(np.median(np.diff(time))))
+    return (time >= known[0] - 1e-9) & (time <= known[-1] + 1e-9) & (step <= longest)

@@ -1,0 +1,289 @@
+"""A first mapping for a file: what can be told by names, and what is guessed, said to be a guess."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Mapping, Sequence
+
+from ballu_mjx.recordings.importers.contents import Contents, Item, describe_contents, printable
+from ballu_mjx.recordings.importers.trajectories import TIMES
+from ballu_mjx.robots.description import RobotDescription
+
+_CLOCKS = ("time", "timestamp", "t", "stamp", "times", "timesec", "seconds", "sec", "clock", "ms", "ns", "us")
+_COMMANDS = ("command", "cmd", "action", "ctrl", "control", "target")
+_UP = "OptiTrack Motive"
+"""Programs whose own axes have y up."""
+_LONGEST_M = 20.0
+"""Positions beyond are taken for mm."""
+_LISTED = 16
+"""Names in a comment."""
+_LONGEST_RAD = 7.0
+"""Angles beyond are taken for deg."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Part:
+    """Lines of a mapping's table, and what of the file they name."""
+
+    lines: Sequence[str]
+    columns: Sequence[str] = ()
+    items: Sequence[Item] = ()
+
+
+def draft_mapping(contents: Contents, robot: RobotDescription) -> str:
+    """Return a mapping file for `robot` that `record import` takes where the file's names leave no doubt.
+
+    What is guessed has a comment that says so. What is not found stands there empty, with what there is to choose from.
+    """
+    roles = (robot.tracked, *robot.points)
+    parts = {role: _role(contents, role, roles, robot.tracked) for role in roles}
+    joints = {joint: found for joint in robot.joints if (found := _match(joint, _columns(contents))) is not None}
+    joints = {joint: item for joint, item in joints.items() if item.name not in parts[robot.tracked].columns}
+    commands = _find_commands(contents, robot)
+    used = [item for part in parts.values() for item in part.items] + [*joints.values(), *commands.values()]
+    lines = [
+        "# A first mapping, by `ballu_mjx record map`. Check what is marked as a guess; complete what is empty.",
+        *(f"# {line}" for line in describe_contents(contents, most=24)),
+        "",
+        f"robot = {json.dumps(robot.name.lower().replace(' ', '_') + '-1')}  # the name of this specimen",
+        *_rate_line(contents),
+        "",
+        *_axes(contents),
+        *_units(parts, joints, contents),
+        *_clock(contents, used),
+    ]
+    for role, part in parts.items():
+        lines += [f"[{role}]", *part.lines, ""]
+    for joint, item in joints.items():
+        lines += [f"[{joint}]", f"column = {json.dumps(item.name)}", "# sign = -1, zero = ...: see example-mapping", ""]
+    return "\n".join([*lines, *_command_lines(contents, robot, commands)]) + "\n"
+
+
+# ---- names ----
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def _last(name: str) -> str:
+    """What a name ends in: behind a subject, a topic, a frame; within brackets that hold a name."""
+    inside = re.fullmatch(r".*\[([^\]]*[^\]\d][^\]]*)\]", name)
+    return _plain(inside[1] if inside else re.split(r"[:/]", name.rstrip("/"))[-1])
+
+
+def _match(role: str, items: Sequence[Item]) -> Item | None:
+    """The one item that is called like `role`: wholly, by its last part, or, where that is one alone, in part."""
+    wanted = _plain(role)
+    for fits in (
+        lambda item: _plain(item.called) == wanted,
+        lambda item: _last(item.called) == wanted,
+        lambda item: wanted in _plain(item.called) and "velocity" not in item.called and "effort" not in item.called,
+    ):
+        found = [item for item in items if fits(item)]
+        if "position" in "".join(item.called for item in found) and len(found) > 1:
+            found = [item for item in found if "position" in item.called]
+        if len(found) == 1:
+            return found[0]
+    return None
+
+
+def _columns(contents: Contents) -> list[Item]:
+    return [item for item in contents.items if item.kind == "column"]
+
+
+# ---- sites ----
+
+
+def _role(contents: Contents, role: str, roles: Sequence[str], tracked: str) -> _Part:
+    bodies = [item for item in contents.items if item.kind == "body"]
+    markers = [item for item in contents.items if item.kind == "marker"]
+    found = _match(role, bodies if role == tracked else [*bodies, *markers])
+    guess = ""
+    if found is None and role == tracked and len(bodies) == 1:
+        found, guess = bodies[0], "  # a guess: the only body"
+    if found is not None:
+        lines = [f"body = {json.dumps(found.name)}{guess}"]
+        if found.section is not None:
+            lines.append(f"section = {json.dumps(found.section)}")
+        if found.rotation is not None:
+            lines.append(f'rotation = "{found.rotation}"  # a guess: the file does not say')
+        return _Part(lines, items=[found])
+    cluster = [
+        item for item in markers if _plain(item.name).startswith(_plain(role)) or _plain(role) in _last(item.name)
+    ]
+    if role == tracked and len(cluster) >= 3:
+        names = ", ".join(json.dumps(item.name) for item in cluster)
+        return _Part([f"markers = [{names}]  # its axes are the capture's in the first whole sample"], items=cluster)
+    if (part := _from_columns(contents, role, tracked, alone=len(roles) == 1)) is not None:
+        return part
+    choice = bodies if role == tracked and bodies else [*bodies, *markers]
+    if not choice and _columns(contents):
+        return _Part([f'position = ["", "", ""]  # choose from {_names(_columns(contents))}'])
+    return _Part([f'body = ""  # choose from {_names(choice)}'])
+
+
+def _names(items: Sequence[Item]) -> str:
+    """Names for a comment, the likely ones first: what moves has more than one sample."""
+    names = [
+        printable(item.name + (f" ({item.label})" if item.label else ""))
+        for item in sorted(items, key=lambda item: item.samples < 2)
+    ]
+    return ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")
+
+
+def _stems(names: Sequence[str]) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
+    """Names that differ in a last letter x, y, z, and w, x, y, z, and arrays of three, four or seven columns."""
+    known = set(names)
+    places: dict[str, list[str]] = {}
+    turns: dict[str, list[str]] = {}
+    for letters in ("wxyz", "WXYZ"):
+        for name in names:
+            if not name.endswith(letters[1]):
+                continue
+            stem = name[:-1]
+            three = [stem + letter for letter in letters[1:]]
+            if all(each in known for each in three):
+                if stem + letters[0] in known:
+                    turns[stem] = [stem + letters[0], *three]
+                else:
+                    places[stem] = three
+    arrays: dict[str, int] = {}
+    for name in names:
+        inside = re.fullmatch(r"(.*)\[(\d+)\]", name)
+        if inside:
+            arrays[inside[1]] = max(arrays.get(inside[1], 0), int(inside[2]) + 1)
+    for stem, count in arrays.items():
+        if count in (3, 7):
+            places[stem] = [f"{stem}[{i}]" for i in range(3)]
+        if count in (4, 7):
+            turns[stem] = [f"{stem}[{i}]" for i in range(count - 4, count)]
+    return places, turns
+
+
+def _from_columns(contents: Contents, role: str, tracked: str, *, alone: bool) -> _Part | None:
+    items = {item.called: item for item in _columns(contents)}
+    places, turns = _stems(list(items))
+
+    def choose(stems: Mapping[str, list[str]]) -> str | None:
+        found = [stem for stem in stems if _plain(role) in _plain(stem)]
+        found = [stem for stem in found if not re.search(r"vel|acc|rate|omega|gyro", stem)] or found
+        if len(found) == 1:
+            return found[0]
+        return next(iter(stems)) if alone and len(stems) == 1 else None
+
+    place = choose(places)
+    if place is None:
+        return None
+    found = [items[name] for name in places[place]]
+    chosen = [item.name for item in found]
+    lines = [f"position = {json.dumps(chosen)}"]
+    turn, guess = choose(turns), ""
+    if turn is None and role == tracked and len(turns) == 1:
+        turn, guess = next(iter(turns)), "  # a guess: the only quaternion"
+    if role == tracked and turn is None:
+        lines.append('orientation = ["", "", "", ""]  # choose its columns')
+    elif role == tracked and turn is not None:
+        names = [items[name].name for name in turns[turn]]
+        guess = "  # a guess: w, x, y, z" if "[" in turns[turn][0] else guess
+        lines.append(f"orientation = {json.dumps(names)}{guess}")
+    if role == tracked:
+        lines.append('rotation = "quaternion"')
+    return _Part(lines, chosen, found)
+
+
+# ---- the rest ----
+
+
+def _axes(contents: Contents) -> list[str]:
+    if _UP in contents.program:
+        return ["[axes]  # a guess: y is up, and the robot looks along z at the start",
+                'forward = "z"', 'left = "x"', 'up = "y"', ""]  # fmt: skip
+    return ["[axes]  # a guess: z is up, and the robot looks along x at the start",
+            'forward = "x"', 'left = "y"', 'up = "z"', ""]  # fmt: skip
+
+
+def _units(parts: Mapping[str, _Part], joints: Mapping[str, Item], contents: Contents) -> list[str]:
+    by_name = {item.name: item for item in _columns(contents)}
+    places = [by_name[name] for part in parts.values() for name in part.columns if by_name[name].unit is None]
+    angles = [item for item in joints.values() if item.unit is None]
+    lines = []
+    if places:
+        unit = "mm" if _largest(places) > _LONGEST_M else "m"
+        lines.append(f'length = "{unit}"  # a guess: places reach {_largest(places):.4g}')
+    if angles:
+        unit = "deg" if _largest(angles) > _LONGEST_RAD else "rad"
+        lines.append(f'angle = "{unit}"  # a guess: angles reach {_largest(angles):.4g}')
+    return ["[units]", *lines, ""] if lines else []
+
+
+def _largest(items: Sequence[Item]) -> float:
+    return max((max(abs(item.low), abs(item.high)) for item in items if item.low is not None and item.high is not None),
+               default=0.0)  # fmt: skip
+
+
+def _time_item(contents: Contents) -> Item | None:
+    rising = [item for item in _columns(contents) if item.step is not None]
+    named = [item for item in rising if _plain(item.name) in _CLOCKS or _plain(item.name).startswith("time")]
+    return (named or [None])[0]
+
+
+def _rate_line(contents: Contents) -> list[str]:
+    if contents.rows and _time_item(contents) is None:
+        return ["rate = 100.0  # Hz; a guess: no column rises as a clock does"]
+    return []
+
+
+def _clock(contents: Contents, used: Sequence[Item]) -> list[str]:
+    clocks = {item.clock for item in used if item.clock is not None}
+    if clocks:
+        if len(clocks) == 1:
+            return ["[clock]", f'time = "{clocks.pop()}"', ""]
+        return ["[clock]", 'time = "received"  # not all messages have stamps in a header', ""]
+    item = _time_item(contents)
+    if not contents.rows or item is None:
+        return []
+    step = item.step or 0.0
+    # A capture has 5 Hz to 5 kHz.
+    unit = next((unit for unit, scale in TIMES.items() if 2e-4 <= step * scale <= 0.2), "s")
+    return [
+        "[clock]",
+        f"time = {json.dumps(item.name)}",
+        f'time_unit = "{unit}"  # a guess: samples are {step:.4g} apart',
+        "",
+    ]
+
+
+def _find_commands(contents: Contents, robot: RobotDescription) -> dict[str, Item]:
+    columns = _columns(contents)
+    likely = [item for item in columns if any(word in item.name.lower() for word in _COMMANDS)]
+    found = {}
+    for name in robot.commands:
+        item = _match(f"command_{name}", columns) or _match(name, likely)
+        if item is not None:
+            found[name] = item
+    if len(found) == len(robot.commands):
+        return found
+    arrays: dict[str, list[Item]] = {}
+    for item in likely:
+        inside = re.fullmatch(r"(.*)\[\d+\]", item.name)
+        arrays.setdefault(inside[1] if inside else item.name, []).append(item)
+    whole = [items for items in arrays.values() if len(items) == len(robot.commands)]
+    return dict(zip(robot.commands, whole[0], strict=True)) if len(whole) == 1 else {}
+
+
+def _command_lines(contents: Contents, robot: RobotDescription, commands: Mapping[str, Item]) -> list[str]:
+    if not commands:
+        return [
+            "[commands]  # none were found in the file: give their log by --commands, and name its columns here",
+            *(f"# {name} = {json.dumps(f'command_{name}')}" for name in robot.commands),
+        ]
+    lines = ["[commands]"]
+    for (name, found), (low, high) in zip(commands.items(), robot.command_ranges, strict=True):
+        guess = "" if _plain(name) in _plain(found.called) else "  # a guess: by their order"
+        lines.append(f"{name} = {json.dumps(found.name)}{guess}")
+        shown = f"the column reaches from {found.low:.4g} to {found.high:.4g}" if found.low is not None else ""
+        lines.append(f"range_{name} = [{low:g}, {high:g}]  # what the column shows at the command's ends; {shown}")
+    return lines

@@ -1,0 +1,154 @@
+"""OptiTrack Motive's CSV exports, format versions 1.2x (https://docs.optitrack.com, "Data Export: CSV").
+
+    Format Version,1.23,Take Name,...,Rotation Type,Quaternion,Length Units,Meters,Coordinate Space,Global
+    (empty)
+    ,Type,Rigid Body,Rigid Body,...             Rigid Body, Rigid Body Marker, Bone, Bone Marker, Marker
+    ,Name,hull,hull,...
+    ,ID,506381AA,...                            some versions have a row Parent here
+    ,,Rotation,Rotation,Rotation,Rotation,Position,...,Mean Marker Error
+    Frame,Time (Seconds),X,Y,Z,W,X,Y,Z,,...
+    0,0.000000,...                              an empty cell is a sample not seen
+
+Motive's own axes have y up. Quaternions are x, y, z, w: the body's frame in the room's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ballu_mjx.common.files import read_text
+from ballu_mjx.recordings.importers.capture import Capture, Stream
+from ballu_mjx.recordings.importers.mapping import RoomMapping
+from ballu_mjx.recordings.importers.text import check_times, read_numbers, split_cells
+from ballu_mjx.recordings.importers.trajectories import ANGLES, LENGTHS, refuse, shorten, to_quaternion
+
+_PROGRAM = "an OptiTrack Motive CSV"
+_UNITS = {"meters": "m", "metres": "m", "centimeters": "cm", "millimeters": "mm"}
+_BODIES, _MARKERS = ("rigid body", "bone"), ("marker",)
+_EXPECTED = ("rigid body marker", "bone marker")
+"""Where the body's definition has its markers: nothing that was measured."""
+_AXES, _LETTERS = ("X", "Y", "Z"), ("X", "Y", "Z", "W")
+_FIRST_ROWS = 20
+"""Among which the row that begins with Frame stands."""
+_MEND = "export again, with header"
+
+
+def recognise_motive(path: Path, start: str) -> bool:
+    """Whether the file that begins with `start` is one."""
+    del path
+    return start.lstrip("\ufeff\n\r").startswith(("Format Version", '"Format Version"'))
+
+
+def open_motive(path: Path, mapping: RoomMapping | None) -> Capture:
+    """Return the bodies and markers of the Motive CSV at `path`.
+
+    **Raises** `InputError` naming file, line and mend: for what is missing, cut off, counted backwards or no number,
+    and for units that are not known.
+    """
+    lines = read_text(path).splitlines()
+    delimiter = max(",;\t", key=next((line for line in lines if line.strip()), "").count)
+    top = split_cells(next((line for line in lines if line.strip()), ""), delimiter)
+    header = next(
+        (
+            i
+            for i, line in enumerate(lines[:_FIRST_ROWS])
+            if (cells := split_cells(line, delimiter))[0] == "Frame" and cells[1:2] and cells[1].startswith("Time")
+        ),
+        None,
+    )
+    if header is None:
+        refuse(path, "", "no line begins with Frame, Time (Seconds)", _MEND)
+    axes = split_cells(lines[header], delimiter)
+    types, names, components = _header_rows(path, lines, header, delimiter, len(axes))
+    for row in (types, names, components):
+        if len(row) > len(axes) and any(row[len(axes) :]):
+            refuse(path, f"line {header + 1}", "the row ends before the names above it", _MEND)
+    columns = [f"{names[i]} {components[i]} {axes[i]}".strip() if i > 1 else axes[i] for i in range(len(axes))]
+    table = read_numbers(path, lines, header + 1, columns, delimiter)
+    frame = table[:, 0]
+    check_times(path, frame, header + 1, "export again, one take a file")
+    rate = None if mapping is None else mapping.rate
+    if rate is None:
+        time = table[:, 1]
+        check_times(path, time, header + 1, "export again, one take a file")
+    else:
+        time = (frame - frame[0]) / rate
+    unit = _length(path, _value(top, "Length Units"), mapping)
+    rotation = _value(top, "Rotation Type")
+    local = _value(top, "Coordinate Space").lower() == "local"
+
+    groups: dict[tuple[str, str], dict[tuple[str, str], int]] = {}
+    for i in range(2, len(axes)):
+        if types[i] and names[i]:
+            group = groups.setdefault((types[i].lower(), names[i]), {})
+            if (components[i], axes[i]) in group:
+                problem = f"{shorten(names[i])!r} has {components[i]} {axes[i]} twice"
+                refuse(path, f"line {header + 1}", problem, "give assets different names and export again")
+            group[components[i], axes[i]] = i
+    bodies: dict[str, Stream] = {}
+    notes = ["Motive's axes have y up unless the export settings say otherwise."]
+    for (kind, name), group in groups.items():
+        if kind not in (*_BODIES, *_MARKERS) or any(("Position", axis) not in group for axis in _AXES):
+            continue
+        if kind == "bone" and local:
+            notes.append(f"{shorten(name)!r} is in its parent's frame (Coordinate Space Local), and is not read.")
+            continue
+        if name in bodies:
+            problem = f"{shorten(name)!r} is the name of an asset and of a marker"
+            refuse(path, f"line {header + 1}", problem, "rename one and export again")
+        position = table[:, [group["Position", axis] for axis in _AXES]] * unit
+        bodies[name] = Stream(time, position)
+        turns = [group.get(("Rotation", letter)) for letter in _LETTERS]
+        if kind not in _BODIES or all(turn is None for turn in turns[:3]):
+            continue
+        place = f"line {header + 1}, {shorten(name)}"
+        if any(turn is None for turn in turns[:3]) or (rotation == "Quaternion") != (turns[3] is not None):
+            problem = f"its rotation has the columns {', '.join(a for (c, a) in group if c == 'Rotation')}"
+            refuse(path, place, f"{problem}, and Rotation Type is {shorten(rotation)!r}", "export quaternions again")
+        values = table[:, [turn for turn in turns if turn is not None]]
+        if turns[3] is not None:
+            quaternion = to_quaternion(path, place, values[:, [3, 0, 1, 2]], "quaternion", 1.0)
+            bodies[name] = Stream(time, position, quaternion)
+        else:
+            bodies[name] = Stream(time, position, angles=values * ANGLES["deg"])
+    expected = [name for (kind, name), _ in groups.items() if kind in _EXPECTED and name not in bodies]
+    if expected:
+        shown = ", ".join(shorten(name) for name in expected[:4]) + (", ..." if len(expected) > 4 else "")
+        notes.append(f"Expected places of markers are not measured, and are not read: {shown}.")
+    return Capture(path, _PROGRAM, bodies, notes=notes)
+
+
+def _header_rows(
+    path: Path, lines: Sequence[str], header: int, delimiter: str, width: int
+) -> tuple[list[str], list[str], list[str]]:
+    """Types, names and components over each column: rows that say what they are in their second cell, or, without
+    that, by their order."""
+    rows = [split_cells(line, delimiter) for line in lines[1:header]]
+    rows = [row for row in rows if any(row)]
+    found = {row[1].lower(): row for row in rows if len(row) > 1 and row[1]}
+    bare = [row for row in rows if len(row) > 1 and not row[1]]
+    if "type" in found and "name" in found and bare:
+        chosen = found["type"], found["name"], bare[-1]
+    elif not found and len(bare) >= 3:
+        chosen = bare[0], bare[1], bare[-1]
+    else:
+        problem = "above it the rows Type, Name and Rotation or Position do not all stand"
+        refuse(path, f"line {header + 1}", problem, _MEND)
+    types, names, components = ([*row, *[""] * width] if len(row) < width else list(row) for row in chosen)
+    return types, names, components
+
+
+def _value(top: Sequence[str], key: str) -> str:
+    place = next((i for i, cell in enumerate(top) if cell == key), len(top))
+    return top[place + 1] if place + 1 < len(top) else ""
+
+
+def _length(path: Path, stated: str, mapping: RoomMapping | None) -> float:
+    unit = _UNITS.get(stated.lower())
+    if mapping is not None and mapping.length is not None:
+        unit = mapping.length
+    if unit is None:
+        mend = 'export in Meters, or write length = "..." under [units] in the mapping'
+        refuse(path, "line 1, Length Units", f"{shorten(stated)!r} is no length that is known", mend)
+    return LENGTHS[unit]

@@ -1,0 +1,705 @@
+"""Every format that is read: written as its vendor lays it out, mapped by `record map`, imported, and compared."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import typing
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rover import write_rover
+from scipy.spatial.transform import Rotation
+
+from ballu_mjx.cli import record
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.csv_format import read_recording
+from ballu_mjx.recordings.importers.mapping import RoomMapping, read_mapping
+from ballu_mjx.recordings.importers.readers import READERS, find_reader, read_capture
+from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.robots.description import RobotDescription
+
+SAMPLES, RATE = 300, 100.0
+TIME = np.arange(SAMPLES) / RATE
+HIDDEN = slice(60, 71)
+"""Samples in which the hull is not seen, where a format has a way to say so."""
+Y_UP = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""From Motive's axes (y up) to the format's, for a robot that looks along z."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pose:
+    place: np.ndarray
+    turn: Rotation
+
+
+def motion() -> tuple[Pose, Pose, np.ndarray]:
+    """Hull, tip and commands: from the origin, looking along x, and about all axes."""
+    wave = np.stack([np.sin((1.3 + 0.4 * i) * TIME) for i in range(6)], axis=1)
+    place = wave[:, :3] * [0.5, 0.3, 0.05] + [0.0, 0.0, 0.25]
+    turn = Rotation.from_rotvec(0.6 * wave[:, 3:])
+    tip = Pose(place + turn.apply([0.35, 0.0, 0.05]), turn)
+    command = np.stack([0.1 + 0.4 * wave[:, 0], 5 + 4 * wave[:, 1]], axis=1)
+    return Pose(place, turn), tip, command
+
+
+HULL, TIP, COMMAND = motion()
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
+    return write_rover(tmp_path_factory.mktemp("rover"))
+
+
+# ---- the formats, as their vendors lay them out ----
+
+
+def rows(columns: list[np.ndarray], delimiter: str, decimals: int, *, lost: list[int], first: str = "") -> str:
+    """Lines of numbers; `lost` columns are empty in the hidden samples."""
+    lines = []
+    for i, row in enumerate(np.column_stack(columns)):
+        cells = [f"{x:.{decimals}f}" for x in row]
+        if HIDDEN.start <= i < HIDDEN.stop:
+            for column in lost:
+                cells[column] = ""
+        lines.append(delimiter.join(([f"{i}"] if first else []) + cells))
+    return "\n".join(lines) + "\n"
+
+
+def write_motive(folder: Path, version: str = "1.23", unit: str = "Meters") -> Path:
+    """https://docs.optitrack.com, "Data Export: CSV", and public takes of versions 1.22 to 1.25."""
+    scale = {"Meters": 1.0, "Millimeters": 1e3}[unit]
+    hull = Rotation.from_matrix(Y_UP.T) * HULL.turn * Rotation.from_matrix(Y_UP)
+    top = f"Format Version,{version},Take Name,trial 1,Take Notes,,Capture Frame Rate,{RATE:.6f},Export Frame Rate,"
+    top += f"{RATE:.6f},Capture Start Time,2023-06-02 12.09.45.344 PM,Total Frames in Take,{SAMPLES},Rotation Type,"
+    top += f"Quaternion,Length Units,{unit},Coordinate Space,Global"
+    kinds = ["Rigid Body"] * 8 + ["Rigid Body Marker"] * 3 + ["Marker"] * 3
+    names = ["hull"] * 8 + ["hull:Marker 001"] * 3 + ["tip"] * 3
+    ids = ["506381AA"] * 8 + ["506381AB"] * 3 + ["0"] * 3
+    parts = ["Rotation"] * 4 + ["Position"] * 3 + ["Mean Marker Error"] + ["Position"] * 6
+    axes = [*"XYZW", *"XYZ", "", *"XYZ", *"XYZ"]
+    heads = [["", "Type", *kinds], ["", "Name", *names], ["", "ID", *ids]]
+    if version == "1.25":
+        heads.append(["", "Parent", *[""] * len(kinds)])
+    heads += [["", "", *parts], ["Frame", "Time (Seconds)", *axes]]
+    place, tip = scale * HULL.place @ Y_UP, scale * TIP.place @ Y_UP
+    columns = [TIME, *hull.as_quat().T, *place.T, np.full(SAMPLES, 3e-4), *(place + 1).T, *tip.T]
+    body = rows(columns, ",", 6, lost=[*range(1, 9)], first="frame")
+    path = folder / "take.csv"
+    path.write_text("\n".join([top, "", *(",".join(row) for row in heads)]) + "\n" + body)
+    return path
+
+
+def qualisys_header(included: str, names: list[str]) -> str:
+    kind, key = ("MARKERS", "MARKER_NAMES") if included == "3D" else ("BODIES", "BODY_NAMES")
+    keys = [f"NO_OF_FRAMES\t{SAMPLES}", "NO_OF_CAMERAS\t8", f"NO_OF_{kind}\t{len(names)}", f"FREQUENCY\t{RATE:g}"]
+    keys += [
+        "NO_OF_ANALOG\t0",
+        "ANALOG_FREQUENCY\t0",
+        "DESCRIPTION\t--",
+        "TIME_STAMP\t2022-06-03, 10:47:36.627\t9424.4",
+    ]
+    return "\n".join([*keys, f"DATA_INCLUDED\t{included}", "\t".join([key, *names])]) + "\n"
+
+
+def write_qualisys_bodies(folder: Path) -> Path:
+    """6DOF data: as https://github.com/shiplab/dt_cv has it; the matrix stands column after column."""
+    angles = ["X", "Y", "Z", "Roll", "Pitch", "Yaw", "Residual", *(f"Rot[{i}]" for i in range(9))]
+    names = [
+        "Frame",
+        "Time",
+        *(f"{name} {part}" if part == "X" else part for name in ("hull", "tip") for part in angles),
+    ]
+    columns = [np.arange(SAMPLES) + 1, TIME]
+    for pose in (HULL, TIP):
+        matrix = pose.turn.as_matrix().transpose(0, 2, 1).reshape(-1, 9)
+        columns += [*(1e3 * pose.place.T), *pose.turn.as_euler("XYZ", degrees=True).T, np.ones(SAMPLES), *matrix.T]
+    body = rows(columns, "\t", 5, lost=[]).split("\n")
+    for i in range(HIDDEN.start, HIDDEN.stop):
+        cells = body[i].split("\t")
+        body[i] = "\t".join([*cells[:2], *["0.00000"] * 16, *cells[18:]])
+    # Frames are whole numbers, and every row ends in a tab.
+    body = [f"{int(float(line.split(chr(9))[0]))}\t{line.partition(chr(9))[2]}\t" if line else line for line in body]
+    text = qualisys_header("6D", ["hull", "tip"]) + "\t".join(names) + "\t\n" + "\n".join(body)
+    path = folder / "trial.tsv"
+    path.write_bytes(text.replace("\n", "\r\n").encode())
+    return path
+
+
+CORNERS = {"hull1": [0.1, 0, 0], "hull2": [-0.1, 0.1, 0], "hull3": [-0.1, -0.1, 0], "hull4": [0, 0, 0.1]}
+
+
+def write_qualisys_markers(folder: Path) -> Path:
+    names = [*CORNERS, "tip"]
+    places = [HULL.place + HULL.turn.apply(corner) for corner in CORNERS.values()] + [TIP.place]
+    header = "\t".join(["Frame", "Time", *(f"{name} {axis}" for name in names for axis in "XYZ")])
+    body = rows([TIME, *(1e3 * np.hstack(places).T)], "\t", 3, lost=[*range(1, 7)], first="frame")
+    path = folder / "trial.tsv"
+    path.write_text(qualisys_header("3D", names) + header + "\n" + body)
+    return path
+
+
+def write_npz(folder: Path) -> Path:
+    place = HULL.place.copy()
+    place[HIDDEN] = np.nan
+    path = folder / "trial.npz"
+    np.savez(
+        path, time=TIME, hull_pos=place, hull_quat=HULL.turn.as_quat(scalar_first=True), tip_pos=TIP.place,
+        command_arm=COMMAND[:, 0], command_push=COMMAND[:, 1], note=np.array("first try"),
+    )  # fmt: skip
+    return path
+
+
+def write_table(folder: Path) -> Path:
+    """What others write by hand: milliseconds, comments, a comma at the end of each row."""
+    names = "time,hull_x,hull_y,hull_z,hull_qx,hull_qy,hull_qz,hull_qw,tip_x,tip_y,tip_z,arm_cmd,push_cmd,"
+    columns = [1e3 * TIME, *HULL.place.T, *HULL.turn.as_quat().T, *TIP.place.T, *COMMAND.T]
+    body = rows(columns, ",", 7, lost=[*range(1, 8)]).replace("\n", ",\n")
+    path = folder / "trial.csv"
+    path.write_text(f"# exported on a Tuesday, by hand\n{names}\n{body}")
+    return path
+
+
+def ros_messages(store: Any) -> Any:
+    """Topic, type, received (ns) and message, in order: the hull at 100 Hz with stamps, the tip between at 50 Hz,
+    commands without a header."""
+    types = store.types
+    version = {"seq": 0} if "seq" in types["std_msgs/msg/Header"].__dataclass_fields__ else {}
+
+    def header(ns: int) -> Any:
+        stamp = types["builtin_interfaces/msg/Time"](sec=ns // 10**9, nanosec=ns % 10**9)
+        return types["std_msgs/msg/Header"](**version, stamp=stamp, frame_id="room")
+
+    point, turn = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Quaternion"]
+    layout = types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+    quaternion = HULL.turn.as_quat()
+    for i in range(SAMPLES):
+        ns = START + i * 10**7
+        pose = types["geometry_msgs/msg/Pose"](
+            position=point(*HULL.place[i].tolist()), orientation=turn(*quaternion[i].tolist())
+        )
+        yield (
+            "/mocap/hull",
+            "geometry_msgs/msg/PoseStamped",
+            ns + LATE,
+            types["geometry_msgs/msg/PoseStamped"](header=header(ns), pose=pose),
+        )
+        if i % 2 == 0:
+            yield (
+                "/mocap/tip",
+                "geometry_msgs/msg/PointStamped",
+                ns + LATE + 1,
+                types["geometry_msgs/msg/PointStamped"](header=header(ns), point=point(*TIP.place[i].tolist())),
+            )
+        yield (
+            "/cmd",
+            "std_msgs/msg/Float64MultiArray",
+            ns + LATE + 2,
+            types["std_msgs/msg/Float64MultiArray"](layout=layout, data=COMMAND[i]),
+        )
+
+
+START, LATE = 1_700_000_000 * 10**9, 3_000_000
+"""ns: when it began, and how long messages take to be recorded."""
+
+
+def write_bag(folder: Path, kind: str = "ros2") -> Path:
+    pytest.importorskip("rosbags", reason="bags are read where rosbags is installed")
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_typestore
+
+    store: Any = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    path = folder / ("trial.bag" if kind == "ros1" else "trial")
+    writer: Any
+    if kind == "ros1":
+        writer = Writer1(path)
+    else:
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        writer = Writer2(path, version=9, storage_plugin=plugin)
+    with writer:
+        topics: dict[str, Any] = {}
+        for topic, message_type, ns, message in ros_messages(store):
+            if topic not in topics:
+                topics[topic] = writer.add_connection(topic, message_type, typestore=store)
+            serialize = store.serialize_ros1 if kind == "ros1" else store.serialize_cdr
+            writer.write(topics[topic], ns, serialize(message, message_type))
+    return next(path.glob("*.mcap")) if kind == "mcap" else path
+
+
+def write_json_mcap(folder: Path, encoding: str = "json") -> Path:
+    writer_module = pytest.importorskip("mcap.writer", reason="MCAP is read where mcap is installed")
+    path = folder / "trial.mcap"
+    with path.open("wb") as stream:
+        writer = writer_module.Writer(stream)
+        writer.start(profile="", library="test")
+        schema = writer.register_schema("State", "jsonschema", b'{"type": "object"}')
+        channel = writer.register_channel("/state", encoding, schema)
+        quaternion = HULL.turn.as_quat(scalar_first=True)
+        for i in range(SAMPLES):
+            content = {
+                "hull": dict(zip("xyz", HULL.place[i].tolist(), strict=True)),
+                "hull_q": dict(zip("wxyz", quaternion[i].tolist(), strict=True)),
+                "tip": dict(zip("xyz", TIP.place[i].tolist(), strict=True)),
+                "command": COMMAND[i].tolist(),
+                "comment": "text is no column",
+            }
+            writer.add_message(channel, START + i * 10**7, json.dumps(content).encode(), START + i * 10**7)
+        writer.finish()
+    return path
+
+
+def write_lerobot(folder: Path, version: str = "v2.1", episodes: int = 1) -> Path:
+    pyarrow = pytest.importorskip("pyarrow", reason="LeRobot datasets are read where pyarrow is installed")
+    from pyarrow import parquet
+
+    state = np.hstack([HULL.place, HULL.turn.as_quat(scalar_first=True), TIP.place]).astype(np.float32)
+    names = ["hull_x", "hull_y", "hull_z", "qw", "qx", "qy", "qz", "tip_x", "tip_y", "tip_z"]
+    path = folder / "dataset"
+    (path / "meta").mkdir(parents=True)
+    features = {
+        "observation.state": {"dtype": "float32", "shape": [10], "names": {"motors": names}},
+        "action": {"dtype": "float32", "shape": [2], "names": ["arm", "push"]},
+    }
+    info = {"codebase_version": version, "fps": int(RATE), "total_episodes": episodes, "features": features}
+    (path / "meta" / "info.json").write_text(json.dumps(info))
+    tables = [
+        pyarrow.table(
+            {
+                "observation.state": list(state + 0.01 * number),
+                "action": list(COMMAND.astype(np.float32)),
+                "timestamp": TIME.astype(np.float32),
+                "frame_index": np.arange(SAMPLES),
+                "episode_index": np.full(SAMPLES, number),
+                "task": ["swing"] * SAMPLES,
+            }
+        )
+        for number in range(episodes)
+    ]
+    data = path / "data" / "chunk-000"
+    data.mkdir(parents=True)
+    if version == "v3.0":
+        parquet.write_table(pyarrow.concat_tables(tables), data / "file-000.parquet")
+    else:
+        for number, table in enumerate(tables):
+            parquet.write_table(table, data / f"episode_{number:06d}.parquet")
+    return path
+
+
+def write_log(folder: Path, start: float = 0.0) -> Path:
+    path = folder / "log.csv"
+    body = rows([TIME + start, *COMMAND.T], ",", 6, lost=[])
+    path.write_text("time,command_arm,command_push\n" + body)
+    return path
+
+
+# ---- map, import, compare ----
+
+
+def run(*line: object) -> None:
+    assert record.main([str(each) for each in line]) == 0
+
+
+def imported(folder: Path, path: Path, robot: RobotDescription, change: Mapping[str, str] | None = None) -> Recording:
+    """By the mapping that `record map` writes, completed by `change`."""
+    room, output = folder / "room.toml", folder / "out" / "trial.csv"
+    run("map", path, "--output", room, "--robot", robot.file)
+    text = room.read_text()
+    for old, new in (change or {}).items():
+        assert old in text, text
+        text = text.replace(old, new)
+    room.write_text(text)
+    log = ["--commands", folder / "log.csv", "--offset", 0] if (folder / "log.csv").exists() else []
+    run("import", path, "--mapping", room, "--output", output, "--robot", robot.file, *log)
+    return read_recording(output, robot)
+
+
+def same(found: Recording, *, gaps: bool, tip: float = 2e-5) -> None:
+    count = len(found.time)
+    assert SAMPLES - 2 <= count <= SAMPLES
+    np.testing.assert_allclose(found.time, TIME[:count], atol=2e-6)
+    shown = np.ones(count, bool)
+    if gaps:
+        assert found.interpolated["hull_x"] == HIDDEN.stop - HIDDEN.start
+        shown[HIDDEN] = False
+    np.testing.assert_allclose(np.asarray(found.tracked_position)[shown], HULL.place[:count][shown], atol=2e-5)
+    turned = Rotation.from_quat(np.asarray(found.tracked_quaternion)[shown], scalar_first=True)
+    assert (Rotation.from_quat(HULL.turn.as_quat()[:count][shown]).inv() * turned).magnitude().max() < 2e-4
+    np.testing.assert_allclose(found.points["tip"], TIP.place[:count], atol=tip)
+    np.testing.assert_allclose(found.command, COMMAND[:count], atol=1e-4)
+
+
+@pytest.mark.parametrize("version, unit", [("1.22", "Meters"), ("1.25", "Millimeters")])
+def test_motive(tmp_path: Path, robot: RobotDescription, version: str, unit: str):
+    write_log(tmp_path)
+    same(imported(tmp_path, write_motive(tmp_path, version, unit), robot), gaps=True)
+
+
+def test_motive_tells_measured_markers_from_expected_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    run("map", write_motive(tmp_path))
+    said = capsys.readouterr().out
+    assert "Expected places of markers are not measured, and are not read: hull:Marker 001." in said
+    assert "96.3 % seen" in said and 'up = "y"' in said
+
+
+def test_qualisys_bodies(tmp_path: Path, robot: RobotDescription):
+    write_log(tmp_path)
+    same(imported(tmp_path, write_qualisys_bodies(tmp_path), robot), gaps=True)
+
+
+def test_qualisys_markers(tmp_path: Path, robot: RobotDescription):
+    write_log(tmp_path)
+    geometry = f"\ngeometry = {list(CORNERS.values())}"
+    line = 'markers = ["hull1", "hull2", "hull3", "hull4"]'
+    same(imported(tmp_path, write_qualisys_markers(tmp_path), robot, {line: line + geometry + " #"}), gaps=True)
+
+
+def test_archives(tmp_path: Path, robot: RobotDescription):
+    same(imported(tmp_path, write_npz(tmp_path), robot), gaps=True)
+
+
+def test_tables(tmp_path: Path, robot: RobotDescription):
+    same(imported(tmp_path, write_table(tmp_path), robot), gaps=True)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "ros2", "mcap"])
+def test_bags(tmp_path: Path, robot: RobotDescription, kind: str):
+    """Commands have no stamps, so that all is on the recorder's clock; the tip, at half the rate, is interpolated."""
+    found = imported(tmp_path, write_bag(tmp_path, kind), robot)
+    assert 'time = "received"' in (tmp_path / "room.toml").read_text()
+    same(found, gaps=False, tip=3e-4)
+
+
+def test_a_bag_s_stamps_are_another_clock_than_its_recorder_s(tmp_path: Path, robot: RobotDescription):
+    path = write_bag(tmp_path)
+    for clock, start in (("header", START), ("received", START + LATE)):
+        found = read_capture(path, room(tmp_path, robot, BAG + f'[clock]\ntime = "{clock}"\n', commands=NO_COMMANDS))
+        assert found.time[0] == pytest.approx(start * 1e-9, abs=1e-6)
+        np.testing.assert_allclose(np.diff(found.time), 0.01, atol=1e-6)
+        np.testing.assert_allclose(found.bodies["hull"].position, HULL.place, atol=1e-12)
+
+
+def test_a_bag_may_be_the_log_of_a_capture(tmp_path: Path, robot: RobotDescription):
+    """The capture by Motive, the commands by a bag with a clock of its own."""
+    take, log = write_motive(tmp_path), write_bag(tmp_path)
+    mapping = tmp_path / "room.toml"
+    text = 'robot = "r"\n[axes]\nforward = "z"\nleft = "x"\nup = "y"\n[hull]\nbody = "hull"\n[tip]\nbody = "tip"\n'
+    mapping.write_text(text + '[commands]\ntime = "received"\narm = "/cmd:data[0]"\npush = "/cmd:data[1]"\n')
+    line = ["--mapping", mapping, "--output", tmp_path / "out.csv", "--robot", robot.file, "--commands", log]
+    run("import", take, *line, f"--offset={-(START + LATE) * 1e-9 - 1e-4:.6f}")
+    same(read_recording(tmp_path / "out.csv", robot), gaps=True)
+
+
+def test_mcap_with_json(tmp_path: Path, robot: RobotDescription):
+    pytest.importorskip("rosbags")
+    same(imported(tmp_path, write_json_mcap(tmp_path), robot), gaps=False)
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_lerobot_datasets(tmp_path: Path, robot: RobotDescription, version: str):
+    path = write_lerobot(tmp_path, version, episodes=2)
+    text = LEROBOT + "[clock]\nepisode = 0\n"
+    found = read_capture(path, room(tmp_path, robot, text, commands='arm = "action[0]"\npush = "action[1]"\n'))
+    assert found.commands is not None
+    np.testing.assert_allclose(found.time, TIME, atol=1e-6)
+    np.testing.assert_allclose(found.bodies["hull"].position, HULL.place, atol=1e-6)
+    np.testing.assert_allclose(found.bodies["tip"].position, TIP.place, atol=1e-6)
+    np.testing.assert_allclose(found.commands.command, COMMAND, atol=1e-6)
+    later = read_capture(path, room(tmp_path, robot, text.replace("episode = 0", "episode = 1")))
+    np.testing.assert_allclose(later.bodies["hull"].position, HULL.place + 0.01, atol=1e-6)
+    with pytest.raises(InputError, match=r"holds 2 episodes, 0 to 1; say which by episode = ... under \[clock\]"):
+        read_capture(path, room(tmp_path, robot, LEROBOT))
+    with pytest.raises(InputError, match="there is no episode 7; there are 2, 0 to 1"):
+        read_capture(path, room(tmp_path, robot, text.replace("episode = 0", "episode = 7")))
+
+
+def test_lerobot_datasets_are_mapped_by_the_names_of_their_features(tmp_path: Path, robot: RobotDescription):
+    path = write_lerobot(tmp_path)
+    same(imported(tmp_path, path, robot), gaps=False)
+    contents = find_reader(path).list(path)
+    assert [item.label for item in contents.items if item.name == "observation.state[3]"] == ["qw"]
+    assert any("states no units" in note for note in contents.notes)
+
+
+# ---- files of one body ----
+
+
+def tum_text() -> str:
+    columns = [TIME + 1.7e9, *HULL.place.T, *HULL.turn.as_quat().T]
+    return "# timestamp tx ty tz qx qy qz qw\n" + rows(columns, " ", 7, lost=[])
+
+
+def euroc_text() -> str:
+    header = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v [m]\n"
+    numbers = np.hstack([HULL.place, HULL.turn.as_quat(scalar_first=True), 0 * HULL.place[:, :1]])
+    lines = [f"{START + i * 10**7}," + ",".join(f"{x:.7f}" for x in row) for i, row in enumerate(numbers)]
+    return header + "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("name, text", [("pose.txt", tum_text()), ("data.csv", euroc_text())])
+def test_trajectories_of_one_body(tmp_path: Path, robot: RobotDescription, name: str, text: str):
+    (tmp_path / name).write_text(text)
+    found = read_capture(tmp_path / name, room(tmp_path, robot, '[hull]\nbody = "pose"\n[tip]\nbody = "pose"\n'))
+    np.testing.assert_allclose(found.time - found.time[0], TIME, atol=1e-6)
+    assert found.time[0] == pytest.approx(1.7e9)
+    body = found.bodies["hull"]
+    np.testing.assert_allclose(body.position, HULL.place, atol=1e-6)
+    turned = Rotation.from_quat(np.asarray(body.quaternion), scalar_first=True)
+    assert (HULL.turn.inv() * turned).magnitude().max() < 1e-6
+
+
+def room(folder: Path, robot: RobotDescription, text: str, commands: str = "", **top: object) -> RoomMapping:
+    (folder / "room.toml").write_text(
+        'robot = "r"\n' + "".join(f"{key} = {value}\n" for key, value in top.items()) + text + "[commands]\n" + commands
+    )
+    return read_mapping(folder / "room.toml", robot)
+
+
+NAMED = '[hull]\nbody = "hull"\n[tip]\nbody = "tip"\n'
+BAG = '[hull]\nbody = "/mocap/hull"\n[tip]\nbody = "/mocap/tip"\n'
+NO_COMMANDS = 'arm = "none"\npush = "none"\n'
+COLUMNS = """[units]
+length = "m"
+[hull]
+position = ["hull_pos[0]", "hull_pos[1]", "hull_pos[2]"]
+orientation = ["hull_quat[0]", "hull_quat[1]", "hull_quat[2]", "hull_quat[3]"]
+rotation = "quaternion"
+[tip]
+position = ["tip_pos[0]", "tip_pos[1]", "tip_pos[2]"]
+"""
+LEROBOT = """[units]
+length = "m"
+[hull]
+position = ["observation.state[0]", "observation.state[1]", "observation.state[2]"]
+orientation = ["observation.state[3]", "observation.state[4]", "observation.state[5]", "observation.state[6]"]
+rotation = "quaternion"
+[tip]
+position = ["observation.state[7]", "observation.state[8]", "observation.state[9]"]
+"""
+
+
+# ---- damage ----
+
+
+def replaced(old: str, new: str, count: int = -1) -> Callable[[Path], None]:
+    def damage(path: Path) -> None:
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new, count))
+
+    return damage
+
+
+def in_line(number: int, cell: int, text: str, delimiter: str = ",") -> Callable[[Path], None]:
+    def damage(path: Path) -> None:
+        lines = path.read_text().split("\n")
+        cells = lines[number - 1].split(delimiter)
+        cells[cell] = text
+        lines[number - 1] = delimiter.join(cells)
+        path.write_text("\n".join(lines))
+
+    return damage
+
+
+def cut_text(path: Path) -> None:
+    text = path.read_text()
+    path.write_text(text[: int(len(text) * 0.7)].rpartition("\n")[0] + "\n99,")
+
+
+def cut_bytes(path: Path) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * 0.7)])
+
+
+@pytest.mark.parametrize(
+    "write, damage, text, said",
+    [
+        (write_motive, cut_text, NAMED, ["the row ends before", "cut off"]),
+        (write_motive, replaced("Meters", "Cubits"), NAMED, ["line 1, Length Units: 'Cubits' is no length"]),
+        (write_motive, replaced("Frame,Time (Seconds)", "Frames,Times"), NAMED, ["no line begins with Frame, Time"]),
+        (write_motive, replaced(",Name,", ",Named,"), NAMED, ["the rows Type, Name and Rotation or Position"]),
+        (write_motive, in_line(80, 1, "0.1"), NAMED, ["line 80", "time runs back or stands still"]),
+        (write_motive, in_line(80, 0, "3"), NAMED, ["line 80", "runs back", "one take a file"]),
+        (write_motive, in_line(80, 3, "0,5"), NAMED, ["line 80", "more cells than the header"]),
+        (write_motive, in_line(80, 3, "ten"), NAMED, ["line 80, hull Rotation Y: 'ten' is not a number"]),
+        (write_motive, in_line(100, 2, "0.9"), NAMED, ["hull: the quaternion of sample 93 has length"]),
+        (write_motive, replaced("Quaternion", "XYZ"), NAMED, ["Rotation Type is 'XYZ'", "export quaternions"]),
+        (
+            write_motive,
+            replaced("hull,hull,hull,hull,hull,hull,hull,hull", "a,a,a,a,a,a,a,a"),
+            NAMED,
+            ["no body or marker 'hull'", "room.toml"],
+        ),
+        (
+            write_motive,
+            None,
+            NAMED + '[clock]\ntime = "t"\n',
+            ["room.toml, [clock]", "OptiTrack Motive CSV", "leave it"],
+        ),
+        (write_motive, None, NAMED.replace('"hull"', '"hull"\nrotation = "XYZ"'), ["[hull] rotation", "says itself"]),
+        (
+            write_qualisys_bodies,
+            lambda path: path.write_text("\n".join(path.read_text().split("\n")[:200])),
+            NAMED,
+            ["holds 189 of the 300 frames that its header states", "cut off"],
+        ),
+        (write_qualisys_bodies, replaced("Rot[4]\t", "", 1), NAMED, ["the row has more cells than the header"]),
+        (write_qualisys_bodies, replaced("DATA_INCLUDED\t6D", "DATA_INCLUDED\t2D"), NAMED, ["DATA_INCLUDED is '2D'"]),
+        (
+            write_qualisys_bodies,
+            in_line(50, 10, "0.2", "\t"),
+            NAMED,
+            ["hull: Rot[0] to Rot[8] of sample", "no rotation"],
+        ),
+        (write_qualisys_bodies, in_line(50, 1, "0.01", "\t"), NAMED, ["line 50", "time runs back"]),
+        (
+            write_qualisys_bodies,
+            replaced("BODY_NAMES\thull\ttip", "BODY_NAMES\thull\thull"),
+            NAMED,
+            ["'hull'", "twice"],
+        ),
+        (write_npz, cut_bytes, COLUMNS, ["not a whole .npz archive"]),
+        (
+            write_npz,
+            None,
+            COLUMNS.replace("tip_pos[0]", "tip_pos[3]"),
+            ["there is no column 'tip_pos[3]'", "room.toml"],
+        ),
+        (write_npz, None, COLUMNS.replace('length = "m"', ""), ["[units]", "the length of trial.npz's columns"]),
+        (
+            write_npz,
+            lambda path: np.savez(path, time=-TIME, hull_pos=HULL.place),
+            COLUMNS.partition("[hull]")[0] + NAMED,
+            ["it has columns, write position"],
+        ),
+        (
+            write_npz,
+            lambda path: np.savez(path, x=np.array([{}], object)),
+            COLUMNS,
+            ["no array with a number a sample"],
+        ),
+        (write_bag, None, BAG.replace("/mocap/tip", "/mocap/top"), ["no body or marker '/mocap/top'"]),
+        (write_bag, None, BAG + '[clock]\ntime = "t"\n', ["[clock] time", "a bag has no column 't'", '"received"']),
+        (write_bag, lambda path: cut_bytes(next(path.glob("*.db3"))), BAG, ["trial"]),
+        (write_json_mcap, cut_bytes, NAMED, ["not a whole MCAP file", "mcap recover"]),
+        (lambda folder: write_json_mcap(folder, "protobuf"), None, NAMED, ["encoded as 'protobuf'", "JSON"]),
+        (lambda folder: write_bag(folder, "ros1"), cut_bytes, BAG, ["trial.bag: not a whole bag"]),
+        (write_lerobot, lambda path: cut_bytes(next(path.rglob("*.parquet"))), LEROBOT, ["not a whole parquet file"]),
+        (write_lerobot, lambda path: next(path.rglob("*.parquet")).unlink(), LEROBOT, ["no parquet file under data/"]),
+        (
+            write_lerobot,
+            lambda path: (path / "meta" / "info.json").write_text("{}"),
+            LEROBOT,
+            ['"features" is missing'],
+        ),
+        (write_table, replaced("# exported on a Tuesday, by hand\ntime,", "#\n0.5,", 1), NAMED, ["it has columns"]),
+        (
+            write_table,
+            lambda path: path.write_text("1,2,3\n4,5,6\n"),
+            NAMED,
+            ["line 1: it holds numbers where the names"],
+        ),
+    ],
+)
+def test_damage_is_refused_by_its_name(
+    tmp_path: Path,
+    robot: RobotDescription,
+    write: Callable[[Path], Path],
+    damage: Callable[[Path], object] | None,
+    text: str,
+    said: list[str],
+):
+    path = write(tmp_path)
+    if damage is not None:
+        damage(path)
+    with pytest.raises(InputError) as refusal:
+        read_capture(path, room(tmp_path, robot, text, commands=NO_COMMANDS))
+    message = str(refusal.value)
+    assert message.startswith(str(tmp_path)) and message.endswith(".") and "\n" not in message
+    for part in said:
+        assert part in message, message
+
+
+def test_one_pose_file_s_damage(tmp_path: Path, robot: RobotDescription):
+    for name, text, said in (
+        ("a.txt", tum_text().replace("\n1700000000.5", "\n1600000000.5", 1), "time runs back"),
+        ("b.txt", tum_text()[:-40], "the row ends before"),
+        ("c.csv", euroc_text().replace("q_RS_w", "p_w"), "the header is not #timestamp"),
+        ("d.csv", euroc_text()[:-30], "the row ends before"),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError, match=rf"{name}.*{said}"):
+            read_capture(tmp_path / name, room(tmp_path, robot, '[hull]\nbody = "pose"\n[tip]\nbody = "pose"\n'))
+
+
+@pytest.mark.parametrize(
+    "package, extra, write", [("rosbags", "bags", write_bag), ("mcap", "bags", write_json_mcap),
+                              ("pyarrow", "lerobot", write_lerobot)],
+)  # fmt: skip
+def test_a_missing_package_is_named_with_its_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, extra: str, write: Callable[[Path], Path]
+):
+    path = write(tmp_path)
+    for name in [each for each in sys.modules if each.partition(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=rf"{package}, which is not installed; install it by .*\[{extra}\]"):
+        find_reader(path).list(path)
+
+
+# ---- the registry and the wizard ----
+
+
+def test_every_format_has_its_name_in_the_options():
+    assert set(typing.get_args(record.Format)) == {"auto", *READERS}
+
+
+def test_a_folder_of_no_format_is_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="a folder of no format that is known; give a file in it"):
+        find_reader(tmp_path)
+
+
+def test_a_table_and_its_log_have_clocks_of_their_own(tmp_path: Path, robot: RobotDescription):
+    write_table(tmp_path)
+    text = (tmp_path / "trial.csv").read_text().replace("time,", "%time,", 1).replace("arm_cmd,push_cmd", "a,b", 1)
+    (tmp_path / "trial.csv").write_text(text)
+    write_log(tmp_path, 12.0)
+    columns = COLUMNS.replace("tip_pos[0]", "tip_x").replace("tip_pos[1]", "tip_y").replace("tip_pos[2]", "tip_z")
+    for old, new in (("hull_pos[0]", "hull_x"), ("hull_pos[1]", "hull_y"), ("hull_pos[2]", "hull_z"),
+                     ("hull_quat[0]", "hull_qw"), ("hull_quat[1]", "hull_qx"), ("hull_quat[2]", "hull_qy"),
+                     ("hull_quat[3]", "hull_qz")):  # fmt: skip
+        columns = columns.replace(old, new)
+    room(tmp_path, robot, columns + '[clock]\ntime = "%time"\ntime_unit = "ms"\n')
+    line = ["import", tmp_path / "trial.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "out.csv"]
+    run(*line, "--robot", robot.file, "--commands", tmp_path / "log.csv", "--offset=-12")
+    same(read_recording(tmp_path / "out.csv", robot), gaps=True)
+
+
+def test_what_the_wizard_cannot_tell_is_left_empty_and_refused(
+    tmp_path: Path, robot: RobotDescription, capsys: pytest.CaptureFixture[str]
+):
+    path = write_qualisys_bodies(tmp_path)
+    text = path.read_text()
+    path.write_text(text.replace("tip X", "beak X").replace("hull\ttip", "hull\tbeak"))
+    run("map", path, "--output", tmp_path / "room.toml", "--robot", robot.file)
+    assert "1 places to complete" in capsys.readouterr().out
+    assert 'body = ""  # choose from hull, beak' in (tmp_path / "room.toml").read_text()
+    with pytest.raises(InputError, match=r'\[tip\] body: it is ""; write text there'):
+        read_mapping(tmp_path / "room.toml", robot)
+    assert record.main(["map", str(path), "--output", str(tmp_path / "room.toml")]) == 2
+    assert "stands there already" in capsys.readouterr().err
+
+
+def test_names_that_break_lines_do_not_break_the_mapping(tmp_path: Path, robot: RobotDescription):
+    np.savez(tmp_path / "x.npz", **{'a"\n[hull]\n': HULL.place, "time": TIME})
+    contents = find_reader(tmp_path / "x.npz").list(tmp_path / "x.npz")
+    from ballu_mjx.recordings.importers.draft import draft_mapping
+
+    (tmp_path / "room.toml").write_text(draft_mapping(contents, robot))
+    with pytest.raises(InputError, match=r"\[hull\] position"):
+        read_mapping(tmp_path / "room.toml", robot)
