@@ -130,7 +130,7 @@ def prepare(
     if first:
         _announce(dataset, folder, data.quick)
     simulator = Simulator(robot, dataset.identified)
-    motions = dataset.reconstruct(simulator)
+    motions = dataset.reconstruct(simulator.mj_model)
     if resume is None:
         check_stability(robot, motions["training"], None)
     if dataset.identified is not None and resume is None:
@@ -141,7 +141,7 @@ def prepare(
             if first:
                 print("Nominal actuators are taken; --actuators FILE takes the identified ones.", flush=True)
             dataset, simulator = dataset.with_actuators(None, "nominal"), Simulator(robot)
-            motions = dataset.reconstruct(simulator)
+            motions = dataset.reconstruct(simulator.mj_model)
     return Prepared(task, folder, dataset, motions, simulator, residual, base, Evaluators(simulator))
 
 

@@ -41,7 +41,7 @@ from ballu_mjx.sim.step import (
 )
 
 CABLES = [f"cable_{side}" for side in SIDES]
-FIELDS = [f.name for f in dataclasses.fields(ActuatorParameters) if f.default is dataclasses.MISSING]
+FIELDS = [field.name for field in dataclasses.fields(ActuatorParameters)]
 
 
 def tight_model() -> mujoco.MjModel:
