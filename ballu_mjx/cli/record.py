@@ -309,7 +309,7 @@ def _map(options: Map) -> None:
         return
     print("\n".join(describe_contents(contents)))
     files.write(options.output, text)
-    guesses, empty = text.count("a guess"), text.count("choose ")
+    guesses, empty = text.count("# a guess"), text.count("# choose ")
     print(f"{options.output}: {guesses} guesses to check, {empty} places to complete; then `record import` takes it")
 
 

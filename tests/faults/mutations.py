@@ -708,7 +708,108 @@ def _import_formats(place: Callable[[], Path], short: Any) -> list[Format]:
     rooms = f"{top}[balloon]\nmarkers = [{named}]\ngeometry = {cluster.tolist()}\n" + bodies.split("\n", 2)[2]
     c3d = c3d_bytes(points, list(markers))
     add("C3D", "walk.c3d", BYTES, "walk.c3d", rooms, c3d, True, 10)
+
+    quaternions = {role: short.tracked_quaternion for role in roles}
+    heads = [f"Format Version,1.23,Capture Frame Rate,{1 / np.diff(short.time)[0]:.6f},Rotation Type,Quaternion,"
+             "Length Units,Meters,Coordinate Space,Global", ""]  # fmt: skip
+    heads += [f",Type{',Rigid Body' * 28}", ",Name" + "".join(f",{role}" * 7 for role in roles)]
+    heads += [
+        ",," + ",".join([*["Rotation"] * 4, *["Position"] * 3] * 4),
+        "Frame,Time (Seconds)" + ",X,Y,Z,W,X,Y,Z" * 4,
+    ]
+    poses = [np.column_stack([quaternions[role][:, [1, 2, 3, 0]], positions[role]]) for role in roles]
+    motive = rows(heads, np.arange(count), short.time, *poses)
+    add("Motive CSV", "walk.csv", CSV, "walk.csv", top + bodies.replace("ballu:", ""), motive.encode(), True, 8)
+    heads = [f"NO_OF_FRAMES,{count}", "FREQUENCY,100", "DATA_INCLUDED,6D", "BODY_NAMES," + ",".join(roles)]
+    angles = "Y,Z,Roll,Pitch,Yaw,Residual," + ",".join(f"Rot[{i}]" for i in range(9))
+    heads.append("Frame,Time," + ",".join(f"{role} X,{angles}" for role in roles))
+    matrix = turn.as_matrix().transpose(0, 2, 1).reshape(-1, 9)
+    poses = [np.column_stack([1e3 * positions[role], np.ones((count, 4)), matrix]) for role in roles]
+    qualisys = rows(heads, np.arange(count) + 1, short.time, *poses).replace(",", "\t").encode()
+    add("Qualisys TSV", "walk.tsv", TEXT, "walk.tsv", top + bodies.replace("ballu:", ""), qualisys, True, 8)
+    archive = io.BytesIO()
+    np.savez(archive, **{name: column for name, column in zip(
+        table.partition("\n")[0].split(","), np.loadtxt(io.StringIO(table), delimiter=",", skiprows=1).T, strict=True
+    )})  # fmt: skip
+    add("NumPy archive", "walk.npz", ARCHIVE, "walk.npz", metres, archive.getvalue(), False, 5)
+    pose = np.column_stack([positions["balloon"], short.tracked_quaternion])
+    tum = rows([], short.time, pose[:, [0, 1, 2, 4, 5, 6, 3]]).replace(",", " ")
+    found.append(_one_body("TUM trajectory", place() / "walk.txt", TEXT, tum))
+    ns = [str(1_700_000_000 * 10**9 + round(1e9 * t)) for t in short.time]
+    lines = ["#timestamp, p_x [m], p_y [m], p_z [m], q_w [], q_x [], q_y [], q_z []"]
+    lines += [f"{t}," + ",".join(f"{x:.7g}" for x in row) for t, row in zip(ns, pose, strict=True)]
+    found.append(_one_body("EuRoC CSV", place() / "walk.csv", CSV, "\n".join(lines) + "\n"))
+    for name, ending in (("ROS bag", "bag"), ("MCAP", "mcap")):
+        bag = _write_bag(place(), ending, short, positions)
+        if bag is not None:
+            clock = '[clock]\ntime = "received"\n[commands]\nleft = "/cmd:data[0]"\nright = "/cmd:data[1]"\n'
+            rooms = top + bodies.replace("ballu:", "/") + "\n" + clock
+            add(name, f"walk.{ending}", BYTES, f"walk.{ending}", rooms, bag, False, 3)
     return found
+
+
+def _one_body(name: str, path: Path, damages: Sequence[Any], text: str) -> Format:
+    """A format of one body, which is no recording of a robot with several."""
+    from ballu_mjx.recordings.importers.mapping import read_mapping
+    from ballu_mjx.recordings.importers.readers import read_capture
+    from ballu_mjx.robots.registry import load_robot
+
+    room = path.with_name("room.toml")
+    robot = load_robot()
+    room.write_text(
+        f'robot = "{ROBOT}"\n' + "".join(f'[{role}]\nbody = "pose"\n' for role in (robot.tracked, *robot.points))
+    )
+    path.write_text(text)
+    mapping = read_mapping(room, robot)
+    names = {"TUM trajectory": "tum", "EuRoC CSV": "euroc"}
+
+    def fault(found: Any) -> str | None:
+        body = found.bodies[robot.tracked]
+        seen = ~np.isnan(body.quaternion).any(axis=1)
+        if not (finite(found.time) and (np.diff(found.time) > 0).all()):
+            return "time"
+        if np.isinf(body.position).any() or np.nanmax(np.abs(body.position), initial=0) > 1e6:
+            return "position"
+        return None if np.allclose(np.linalg.norm(body.quaternion[seen], axis=1), 1) else "quaternion"
+
+    return Format(name, path, damages, lambda: read_capture(path, mapping, names[name]), fault, 4)
+
+
+def _write_bag(folder: Path, ending: str, short: Any, positions: Mapping[str, Any]) -> bytes | None:
+    """Poses by topic, and commands; None where rosbags or mcap is not installed."""
+    try:
+        import mcap  # noqa: F401
+        from rosbags.rosbag1 import Writer as Writer1
+        from rosbags.rosbag2 import StoragePlugin
+        from rosbags.rosbag2 import Writer as Writer2
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        print("Bags are left out: the extra bags is not installed.", file=sys.stderr)
+        return None
+    store: Any = get_typestore(Stores.ROS1_NOETIC if ending == "bag" else Stores.ROS2_HUMBLE)
+    types, version = store.types, {"seq": 0} if ending == "bag" else {}
+    path = folder / ("walk.bag" if ending == "bag" else "walk")
+    writer: Any = Writer1(path) if ending == "bag" else Writer2(path, version=9, storage_plugin=StoragePlugin.MCAP)
+    point, turn = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Quaternion"]
+    layout = types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
+    pose_type, array_type = "geometry_msgs/msg/PoseStamped", "std_msgs/msg/Float64MultiArray"
+    serialize = store.serialize_ros1 if ending == "bag" else store.serialize_cdr
+    with writer:
+        topics = {role: writer.add_connection(f"/{role}", pose_type, typestore=store) for role in positions}
+        commands = writer.add_connection("/cmd", array_type, typestore=store)
+        for i, time in enumerate(short.time):
+            ns = 1_700_000_000_000_000_000 + round(time * 1e9)
+            stamp = types["builtin_interfaces/msg/Time"](sec=ns // 10**9, nanosec=ns % 10**9)
+            header = types["std_msgs/msg/Header"](**version, stamp=stamp, frame_id="room")
+            w, *vector = short.tracked_quaternion[i].tolist()
+            for role, topic in topics.items():
+                pose = types["geometry_msgs/msg/Pose"](
+                    position=point(*positions[role][i].tolist()), orientation=turn(*vector, w)
+                )
+                writer.write(topic, ns, serialize(types[pose_type](header=header, pose=pose), pose_type))
+            message = types[array_type](layout=layout, data=np.array(short.command[i], float))
+            writer.write(commands, ns, serialize(message, array_type))
+    return path.read_bytes() if ending == "bag" else next(path.glob("*.mcap")).read_bytes()
 
 
 def _write_weights(folder: Path) -> Path:

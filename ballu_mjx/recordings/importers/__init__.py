@@ -1,5 +1,6 @@
-"""Importers: from what a laboratory has (Vicon CSV, C3D, tables, command logs) to `ballu-recording/1`.
+"""Importers: from what a laboratory has to `ballu-recording/1`.
 
-Each format's module gives `Trajectories` in SI units and the capture's own frame; `placement` turns them into the
-model's sites in the format's frame, by a `mapping` file that says what is what.
+`readers` lists the formats. Each gives what a `mapping` asks for as `Trajectories`, in SI units and the capture's own
+frame; most do so by a `capture`, the file's bodies and columns by name. `placement` turns trajectories into the model's
+sites in the format's frame. `draft` writes a first mapping for a file.
 """

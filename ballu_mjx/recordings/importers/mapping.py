@@ -375,7 +375,7 @@ def example_mapping(robot: RobotDescription) -> str:
     lines += [f'[{point}]\nbody = "{name}:{point}"\n' for point in robot.points]
     if robot.joints:
         lines.append(
-            f"# [{robot.joints[0]}]{' ' * max(1, 22 - len(robot.joints[0]))}# tables only: {', '.join(robot.joints)}\n"
+            f"# [{robot.joints[0]}]{' ' * max(1, 22 - len(robot.joints[0]))}# from columns: {', '.join(robot.joints)}\n"
             '# column = "angle"\n'
             "# sign = 1               # -1 turns it round\n"
             "# zero = 0.0             # in the column's unit: what it shows where the model's angle is 0\n"
@@ -430,7 +430,7 @@ body = "{name}:{tracked}"   # "subject:segment", an object, or the name behind t
                          # say it
 # markers = ["M1", "M2", "M3", "M4"]                        # instead of body
 # geometry = [[0.1, 0, 0], [0, 0.1, 0], [-0.1, 0, 0], [0, 0, 0.1]]  # where they sit, m; default: as at the start
-# position = ["x", "y", "z"]                                # instead of body, in tables: names of columns
+# position = ["x", "y", "z"]                                # instead of body: names of columns
 # orientation = ["qw", "qx", "qy", "qz"]                    # with rotation = "quaternion" (w, x, y, z), or three angles
 offset = [0.0, 0.0, 0.0] # m: the model's site `{tracked}` in the tracked body's frame
 turn = [0.0, 0.0, 0.0]   # deg, a rotation vector: the model's frame of this body in the tracked body's frame.

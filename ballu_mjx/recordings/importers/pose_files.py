@@ -65,7 +65,7 @@ def open_euroc(path: Path, mapping: RoomMapping | None) -> Capture:
     **Raises** `InputError` naming file, line and fix.
     """
     lines = read_text(path).splitlines()
-    header = split_cells(lines[0], ",")
+    header = split_cells(lines[0], ",") if lines else []
     if len(header) < len(_EUROC) or "q" not in header[4].lower() or "w" not in header[4].lower():
         problem = "the header is not #timestamp, position x, y, z, quaternion w, x, y, z"
         refuse(path, "line 1", problem, "give EuRoC's ground truth; another table needs a header without #")
