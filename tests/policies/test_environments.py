@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 from pathlib import Path
 from typing import Any
@@ -105,7 +106,9 @@ def test_gymnasium_makes_both_kinds_by_name(run: Path):
     env.reset(seed=1)
     ends = [env.step(env.action_space.sample())[2:4] for _ in range(16)]
     assert any(truncated for _, truncated in ends)
-    vector = gymnasium.make_vec("ballu_mjx/Turn-v0", num_envs=4, run=str(run), episode_seconds=0.4)
+    # The batch's program, compiled already.
+    settings = dataclasses.asdict(SHORT)
+    vector = gymnasium.make_vec("ballu_mjx/Walk-v0", num_envs=4, run=str(run), **settings)
     observation, _ = vector.reset(seed=1)
     assert vector.observation_space.contains(observation)
     for _ in range(16):
