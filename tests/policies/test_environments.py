@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 from pathlib import Path
 from typing import Any
@@ -103,9 +104,11 @@ def test_gymnasium_makes_both_kinds_by_name(run: Path):
     names = env.unwrapped.observation_names
     assert len(names) == env.observation_space.shape[0] and names[2] == "hull position z, m"
     env.reset(seed=1)
-    ends = [env.step(env.action_space.sample())[2:4] for _ in range(12)]
+    ends = [env.step(env.action_space.sample())[2:4] for _ in range(16)]
     assert any(truncated for _, truncated in ends)
-    vector = gymnasium.make_vec("ballu_mjx/Turn-v0", num_envs=4, run=str(run), episode_seconds=0.4)
+    # The batch's program, compiled already.
+    settings = dataclasses.asdict(SHORT)
+    vector = gymnasium.make_vec("ballu_mjx/Walk-v0", num_envs=4, run=str(run), **settings)
     observation, _ = vector.reset(seed=1)
     assert vector.observation_space.contains(observation)
     for _ in range(16):
@@ -131,7 +134,7 @@ def test_braxs_own_ppo_trains_on_it_unchanged(run: Path):
     assert learned.episode_length == 25
     ppo.train(
         learned,
-        num_timesteps=20_000,
+        num_timesteps=60_000,
         episode_length=learned.episode_length,
         num_envs=64,
         num_eval_envs=8,

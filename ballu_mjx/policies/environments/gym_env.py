@@ -84,14 +84,16 @@ class GymVectorEnv(VectorEnv):
         super().reset(seed=first)
         return self._batch.reset(first), {}
 
-    def step(self, actions: Float[np.ndarray, "envs commands"]) -> tuple[np.ndarray, ...]:  # pyright: ignore
+    def step(
+        self, actions: Float[np.ndarray, "envs commands"]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance all by a control step."""
         found = self._batch.step(actions)
         info: dict[str, Any] = dict(found.metrics)
         done = found.terminated | found.truncated
         if done.any():
             info |= {"final_obs": found.last_observation, "_final_obs": done}
-        return found.observation, found.reward, found.terminated, found.truncated, info  # pyright: ignore
+        return found.observation, found.reward, found.terminated, found.truncated, info
 
 
 def _spaces(env: LocomotionEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
