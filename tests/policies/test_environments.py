@@ -122,6 +122,7 @@ def test_gymnasium_makes_both_kinds_by_name(run: Path):
 
 
 @pytest.mark.filterwarnings("ignore:jax.device_put_replicated is deprecated:DeprecationWarning")  # in Brax
+@pytest.mark.slow
 def test_braxs_own_ppo_trains_on_it_unchanged(run: Path):
     from brax import envs
     from brax.training.agents.ppo import train as ppo
