@@ -627,8 +627,9 @@ def test_damage_is_refused_by_its_name(
 
 def test_one_pose_file_s_damage(tmp_path: Path, robot: RobotDescription):
     for name, text, said in (
-        ("a.txt", tum_text().replace("\n1700000000.5", "\n1600000000.5", 1), "time runs back"),
-        ("b.txt", tum_text()[:-40], "the row ends before"),
+        ("a.txt", tum_text().replace("\n1700000000.5", "\n1600000000.5", 1), "line 52: time runs back"),
+        ("b.txt", tum_text()[:-40], "line 301: the row ends before"),
+        ("e.txt", tum_text().replace("\n1700000000.5", "\n# lost\n1700000000.5", 1), "line 52: a line without a pose"),
         ("c.csv", euroc_text().replace("q_RS_w", "p_w"), "the header is not #timestamp"),
         ("d.csv", euroc_text()[:-30], "the row ends before"),
     ):
