@@ -548,6 +548,7 @@ def cut_bytes(path: Path) -> None:
             NAMED,
             ["holds 189 of the 300 frames that its header states", "cut off"],
         ),
+        (write_qualisys_bodies, None, COLUMNS, ["a Qualisys TSV, which has bodies", 'body = "..."', "hull, tip"]),
         (write_qualisys_bodies, replaced("Rot[4]\t", "", 1), NAMED, ["the row has more cells than the header"]),
         (write_qualisys_bodies, replaced("DATA_INCLUDED\t6D", "DATA_INCLUDED\t2D"), NAMED, ["DATA_INCLUDED is '2D'"]),
         (
