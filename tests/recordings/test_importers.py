@@ -777,6 +777,8 @@ def test_json_is_read_alike(tmp_path: Path):
         ('robot = "r"', 'robot = "r"\n[axes]\nup = "-z"', ["[axes]", "left-handed"]),
         ('robot = "r"', 'robot = "r"\n[axes]\nup = "y"', ["[axes]", "same way"]),
         ('robot = "r"', 'robot = "r"\n[units]\nlength = "inch"', ["[units] length", "m, cm, mm"]),
+        ('robot = "r"', 'robot = "r"\n[units]\ntime = "ms"', ["[units] time", "time_unit", "[clock]"]),
+        ('robot = "r"', 'robot = "r"\n[clock]\nepisode = -1', ["[clock] episode", "-1"]),
         ('robot = "r"', 'robot = "r"\nkind = "loose"', ["key kind", "free, suspended"]),
         ('robot = "r"', 'robot = "r"\nrate = 0', ["key rate", "positive"]),
         ('robot = "r"', 'robot = "r"\nbase = 3', ["not TOML"]),

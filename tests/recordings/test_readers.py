@@ -548,6 +548,7 @@ def cut_bytes(path: Path) -> None:
             NAMED,
             ["holds 189 of the 300 frames that its header states", "cut off"],
         ),
+        (write_qualisys_bodies, None, COLUMNS, ["a Qualisys TSV, which has bodies", 'body = "..."', "hull, tip"]),
         (write_qualisys_bodies, replaced("Rot[4]\t", "", 1), NAMED, ["the row has more cells than the header"]),
         (write_qualisys_bodies, replaced("DATA_INCLUDED\t6D", "DATA_INCLUDED\t2D"), NAMED, ["DATA_INCLUDED is '2D'"]),
         (
@@ -627,8 +628,9 @@ def test_damage_is_refused_by_its_name(
 
 def test_one_pose_file_s_damage(tmp_path: Path, robot: RobotDescription):
     for name, text, said in (
-        ("a.txt", tum_text().replace("\n1700000000.5", "\n1600000000.5", 1), "time runs back"),
-        ("b.txt", tum_text()[:-40], "the row ends before"),
+        ("a.txt", tum_text().replace("\n1700000000.5", "\n1600000000.5", 1), "line 52: time runs back"),
+        ("b.txt", tum_text()[:-40], "line 301: the row ends before"),
+        ("e.txt", tum_text().replace("\n1700000000.5", "\n# lost\n1700000000.5", 1), "line 52: a line without a pose"),
         ("c.csv", euroc_text().replace("q_RS_w", "p_w"), "the header is not #timestamp"),
         ("d.csv", euroc_text()[:-30], "the row ends before"),
     ):

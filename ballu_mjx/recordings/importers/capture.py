@@ -271,6 +271,10 @@ def _unit(capture: Capture, mapping: RoomMapping, series: Series, known: Mapping
 
 
 def _look_up(capture: Capture, name: str, mapping: RoomMapping | None) -> Series:
+    if name not in capture.columns and not capture.columns:
+        bodies = suggest("", capture.bodies)
+        problem = f"it is {capture.program}, which has bodies and markers in place of columns such as {shorten(name)!r}"
+        refuse(capture.path, "", problem, f'write body = "..." in the mapping, {bodies}')
     if name not in capture.columns:
         where = "the mapping" if mapping is None else mapping.path
         hint = suggest(name, capture.columns).rstrip("?")

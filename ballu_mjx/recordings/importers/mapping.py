@@ -148,6 +148,8 @@ def read_mapping(path: Path, robot: RobotDescription) -> RoomMapping:
     units = top.keys("units")
     length = units.choice("length", LENGTHS, None)
     angle = units.choice("angle", ANGLES, None)
+    if "time" in units.values:
+        units.bad("time", 'the unit of times is time_unit = "..." under [clock]')
     units.finish()
     clock = _clock(top.keys("clock"))
     sources = {role: _source(top.keys(role), role) for role in roles if role in content}
@@ -254,7 +256,10 @@ class _Keys:
             if key not in self.taken:
                 where = f"[{self.name}] {shorten(key)}" if self.name else f"key {shorten(key)}"
                 refuse(
-                    self.path, where, "there is no such key", f"leave it out, {suggest(key, self.taken).rstrip('?')}"
+                    self.path,
+                    where,
+                    "there is no such key",
+                    f"leave it out, {suggest(key, sorted(self.taken)).rstrip('?')}",
                 )
 
 

@@ -38,19 +38,16 @@ def open_tum(path: Path, mapping: RoomMapping | None) -> Capture:
 
     **Raises** `InputError` naming file, line and fix.
     """
-    # Comments keep their lines, so that lines are counted right.
-    lines = ["" if line.startswith("#") else line for line in read_text(path).splitlines()]
-    numbers = [i for i, line in enumerate(lines) if line.strip()]
-    table = read_numbers(path, [lines[i] for i in numbers], 0, _TUM, None) if _contiguous(numbers) else None
-    if table is None or not numbers:
-        at = next((a for a, b in zip(numbers, numbers[1:], strict=False) if b > a + 1), 0)
-        refuse(path, f"line {at + 2}", "here a line without a pose stands among the poses", "delete it")
-    first = numbers[0]
+    lines = read_text(path).splitlines()
+    poses = [i for i, line in enumerate(lines) if line.strip() and not line.startswith("#")]
+    if not poses:
+        refuse(path, "", "there is no line of eight numbers", "give a trajectory")
+    first, last = poses[0], poses[-1]
+    if last - first >= len(poses):
+        between = next(a for a, b in zip(poses, poses[1:], strict=False) if b > a + 1) + 1
+        refuse(path, f"line {between + 1}", "a line without a pose stands among the poses", "delete it")
+    table = read_numbers(path, lines[: last + 1], first, _TUM, None, unlimited=[0])
     return _pose(path, "a TUM trajectory", table, table[:, 0], first, [7, 4, 5, 6], mapping)
-
-
-def _contiguous(numbers: list[int]) -> bool:
-    return bool(numbers) and numbers[-1] - numbers[0] == len(numbers) - 1
 
 
 def recognise_euroc(path: Path, start: str) -> bool:
