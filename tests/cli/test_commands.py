@@ -18,6 +18,7 @@ from ballu_mjx.cli import completion
 from ballu_mjx.cli._command import TrainCommand, run_command
 from ballu_mjx.common import runtime
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.importers.readers import READERS
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.runs.layout import RUN_FORMAT
@@ -231,10 +232,10 @@ def bash_script(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         ("", {"record", "train", "evaluate", "report", "view", "compare", "export"}),
         ("tr", {"train"}),
-        ("record ", {"import", "check", "simulate", "example-mapping"}),
+        ("record ", {"import", "map", "check", "simulate", "example-mapping"}),
         ("train ", set(TRAININGS)),
         ("train envmimic --num-t", {"--num-timesteps"}),
-        ("record import --format ", {"auto", "vicon", "c3d", "table"}),
+        ("record import --format ", {"auto", *READERS}),
         ("view --po", {"--port"}),
         ("report rec", {"recordings"}),  # a path
     ],

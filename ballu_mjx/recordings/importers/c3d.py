@@ -29,7 +29,7 @@ def list_c3d(path: Path) -> Contents:
     **Raises** `InputError` as `read_c3d`.
     """
     found = _read_points(path)
-    seen = np.isfinite(found.position).min(axis=0)
+    seen = np.all(np.isfinite(found.position), axis=0)
     items = [
         Item(label, "marker", len(each), found.rate, share=float(np.mean(each)), unit=found.unit or "unknown")
         for label, each in zip(found.labels, seen, strict=False)
