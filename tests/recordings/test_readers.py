@@ -256,7 +256,7 @@ def write_json_mcap(folder: Path, encoding: str = "json") -> Path:
 
 def write_lerobot(folder: Path, version: str = "v2.1", episodes: int = 1) -> Path:
     pyarrow = pytest.importorskip("pyarrow", reason="LeRobot datasets are read where pyarrow is installed")
-    from pyarrow import parquet
+    from pyarrow import parquet  # pyright: ignore[reportMissingImports]
 
     state = np.hstack([HULL.place, HULL.turn.as_quat(scalar_first=True), TIP.place]).astype(np.float32)
     names = ["hull_x", "hull_y", "hull_z", "qw", "qx", "qy", "qz", "tip_x", "tip_y", "tip_z"]

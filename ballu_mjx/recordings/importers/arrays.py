@@ -140,8 +140,8 @@ def open_lerobot(path: Path, mapping: RoomMapping | None) -> Capture:
     episodes and the mapping does not say which.
     """
     try:
-        import pyarrow
-        from pyarrow import parquet
+        import pyarrow  # pyright: ignore[reportMissingImports]
+        from pyarrow import parquet  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         mend = 'install it by `pip install "ballu-mjx[lerobot]"`'
         raise InputError(f"{path}: LeRobot datasets are read by pyarrow, which is not installed; {mend}.") from error
