@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
+from ballu_mjx.common.rotations import quaternion_conjugate, quaternion_product
 from ballu_mjx.evaluation.errors_table import (
     Errors,
     Evaluation,
@@ -89,24 +90,22 @@ def orientation_errors(
     if upright:
         turn = simulated[..., 2] - recorded[..., 2]
         return np.rad2deg(np.arctan2(np.sin(turn), np.cos(turn)))
-    (w, x, y, z), (a, b, c, d) = map(_quaternion, (simulated, recorded))
-    scalar = w * a + x * b + y * c + z * d
-    vector = np.sqrt(
-        (w * b - x * a + y * d - z * c) ** 2
-        + (w * c - y * a + z * b - x * d) ** 2
-        + (w * d - z * a + x * c - y * b) ** 2
-    )
+    turn = quaternion_product(quaternion_conjugate(_quaternion(simulated)), _quaternion(recorded))
+    scalar, vector = turn[..., 0], np.linalg.norm(turn[..., 1:], axis=-1)
     return np.rad2deg(2 * np.arctan2(vector, np.abs(scalar)))
 
 
-def _quaternion(euler: Float[np.ndarray, "*states 3"]) -> tuple[np.ndarray, ...]:
+def _quaternion(euler: Float[np.ndarray, "*states 3"]) -> Float[np.ndarray, "*states 4"]:
     halves = np.moveaxis(np.asarray(euler, np.float64), -1, 0) / 2
     (cr, cp, cy), (sr, sp, sy) = np.cos(halves), np.sin(halves)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
+    return np.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ],
+        axis=-1,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -11,21 +11,25 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Int
 
 
-def device_shardings() -> tuple[NamedSharding, NamedSharding]:
-    """Return where arrays lie that every local device has, and those whose first axis is spread over them."""
-    mesh = Mesh(np.array(jax.local_devices()), ("batch",))
+def device_shardings(devices: Sequence[Any] | None = None) -> tuple[NamedSharding, NamedSharding]:
+    """Return where arrays lie that every device has, and those whose first axis is spread over them; None: all local
+    devices."""
+    mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("batch",))
     return NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec("batch"))
 
 
 def compile_for_devices(
-    function: Callable[..., Any], shared: int, over: Callable[[Callable[..., Any]], Callable[..., Any]] = jax.vmap
+    function: Callable[..., Any],
+    shared: int,
+    over: Callable[[Callable[..., Any]], Callable[..., Any]] = jax.vmap,
+    devices: Sequence[Any] | None = None,
 ) -> jax.stages.Wrapped:
     """Return `function`, compiled for batches (by `over`) and spread over the devices: one core a device, on the CPU.
 
     Of its arguments the first `shared` are the same for all. The others, like what it returns, are arrays (or trees of
     them), along whose first axis it runs; their length is a multiple of the number of devices.
     """
-    everywhere, split = device_shardings()
+    everywhere, split = device_shardings(devices)
 
     @jax.jit
     def run(*arguments: Any) -> Any:

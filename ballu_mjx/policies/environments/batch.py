@@ -16,6 +16,7 @@ from ballu_mjx.policies.simulators import load_simulator
 from ballu_mjx.policies.tasks import find_task
 from ballu_mjx.policies.tasks.base import Task
 from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.sim.sharding import compile_for_devices, device_shardings
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 
@@ -48,17 +49,10 @@ class LocomotionBatch:
         devices = jax.local_devices()
         # A batch that does not divide stays on one device.
         devices = devices if num_envs % len(devices) == 0 else devices[:1]
-        mesh, spec = jax.sharding.Mesh(np.array(devices), ("batch",)), jax.sharding.PartitionSpec
-        self._split = jax.sharding.NamedSharding(mesh, spec("batch"))
-
-        def over_devices(function: Any) -> Any:
-            return jax.jit(
-                jax.shard_map(
-                    jax.vmap(function), mesh=mesh, in_specs=spec("batch"), out_specs=spec("batch"), check_vma=False
-                )
-            )
-
-        self._reset, self._step = over_devices(env.reset), over_devices(self._advance)
+        _, self._split = device_shardings(devices)
+        self._reset, self._step = (
+            compile_for_devices(function, shared=0, devices=devices) for function in (env.reset, self._advance)
+        )
         self._key = jax.random.key(0)
         self._state: State | None = None
 

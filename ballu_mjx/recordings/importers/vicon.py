@@ -27,6 +27,7 @@ from jaxtyping import Float, Int
 from ballu_mjx.common.files import read_text
 from ballu_mjx.recordings.importers.contents import Contents, Item
 from ballu_mjx.recordings.importers.mapping import MARKER_TOLERANCE, RoomMapping, Source
+from ballu_mjx.recordings.importers.text import LARGEST, parse_number
 from ballu_mjx.recordings.importers.trajectories import (
     ANGLES,
     LENGTHS,
@@ -51,8 +52,6 @@ _TITLES = (*_USED, "Joints", "Model Outputs", "Devices", "Events")
 _SEARCHED_ROWS = 12
 _HEADER_ROWS = 5
 _SPELLINGS: Mapping[str, str] = {"degrees": "deg", "degree": "deg", "°": "deg", "radians": "rad", "radian": "rad"}
-_LARGEST = 1e6
-"""No unit makes sense of a larger number."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +90,7 @@ def recognise_vicon(path: Path, start: str) -> bool:
     del path
     rows = [_cells(line, ",") for line in start.replace(";", ",").replace("\t", ",").splitlines()]
     rows = [row for row in rows if any(row)]
-    if not rows or any(rows[0][1:]) or _number(rows[0][0]) is not None:
+    if not rows or any(rows[0][1:]) or parse_number(rows[0][0]) is not None:
         return False
     return rows[0][0] in _TITLES or any(row[0] == "Frame" for row in rows[:_SEARCHED_ROWS])
 
@@ -197,17 +196,17 @@ def _section(path: Path, lines: Sequence[str], delimiter: str, start: int, end: 
     title = _cells(lines[start], delimiter)
     components = _cells(lines[start + 3], delimiter) if end - start >= _HEADER_ROWS else []
     laid_out = components[:1] == ["Frame"] and components[1:2] in (["Sub Frame"], ["SubFrame"])
-    if not laid_out and not any(title[1:]) and _number(title[0]) is None and title[0] not in _USED:
+    if not laid_out and not any(title[1:]) and parse_number(title[0]) is None and title[0] not in _USED:
         return None
     place = f"line {start + 1}"
-    if any(title[1:]) or _number(title[0]) is not None:
+    if any(title[1:]) or parse_number(title[0]) is not None:
         mend = "export again; sections begin with a title such as Segments in a line of its own, after a blank line"
         refuse(path, place, "here a section's title is missing", mend)
     if end - start < _HEADER_ROWS:
         problem = f"the section {shorten(title[0])!r} ends within its header"
         refuse(path, place, problem, "export again: title, rate, names, components and units stand above the samples")
     rate_row, names, units = (_cells(lines[start + i], delimiter) for i in (1, 2, 4))
-    rate = _number(rate_row[0])
+    rate = parse_number(rate_row[0])
     if rate is None or not 1 <= rate <= 1e5 or any(rate_row[1:]):
         problem = f"{shorten(delimiter.join(rate_row))!r} is not a rate in Hz"
         refuse(path, f"line {start + 2}", problem, "export again; the rate stands alone below the title")
@@ -280,7 +279,7 @@ def _read(
     for number in range(section.first, section.last):
         cells = lines[number].split(delimiter)
         place = f"line {number + 1}"
-        frame, sub = (_number(cells[i].strip(' "')) if i < len(cells) else None for i in (0, 1))
+        frame, sub = (parse_number(cells[i].strip(' "')) if i < len(cells) else None for i in (0, 1))
         if frame is None or sub is None or frame != round(frame) or not 0 <= frame < 2**40:
             problem = f"{shorten(delimiter.join(cells[:2]))!r} is not a frame and a sub-frame"
             refuse(path, place, problem, "export again, or delete the line if it is no sample")
@@ -299,8 +298,8 @@ def _read(
         row = []
         for i in columns:
             cell = cells[i].strip(' "') if i < len(cells) else ""
-            value = _number(cell) if cell and cell.lower() != "nan" else math.nan
-            if value is None or abs(value) > _LARGEST:
+            value = parse_number(cell) if cell and cell.lower() != "nan" else math.nan
+            if value is None or abs(value) > LARGEST:
                 name = f"{shorten(section.names[i])} {section.components[i]}"
                 mend = "leave the cell empty if the sample is missing, and write points in numbers"
                 refuse(path, f"{place}, {name}", f"{shorten(cell)!r} is not a number that can be meant", mend)
@@ -308,14 +307,6 @@ def _read(
         table.append(row)
     values = np.array(table, float).reshape(len(table), len(columns))
     return np.array(frames), {place: values[:, i] for i, place in enumerate(columns)}
-
-
-def _number(text: str) -> float | None:
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) and "_" not in text else None
 
 
 def _unit(
