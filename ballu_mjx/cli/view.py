@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tyro
 
+from ballu_mjx.cli._help import parse_options
 from ballu_mjx.common import runtime
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, read_rollouts
@@ -53,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def run() -> None:
         try:
-            options = tyro.cli(Options, args=arguments, prog="python -m ballu_mjx view")
+            options = parse_options(Options, arguments, "python -m ballu_mjx view")
             if not 0 <= options.port <= 65535:
                 raise InputError(f"--port is {options.port}: it must be between 0 and 65535.")
             if options.mujoco:
