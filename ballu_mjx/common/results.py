@@ -1,7 +1,7 @@
 """Tables as data: `results/NAME.json`, written by the command that measured, and rendered as Markdown.
 
 A table has rows of cells. A cell is text, or numbers: one a seed or repetition. Rendering shows their mean, with the
-lowest and the highest where there are several.
+lowest and the highest, or an interval, where there are several.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ class Cell:
     unit: str = ""
     spread: bool = True
     """Show the lowest and the highest beside the mean."""
+    bounds: tuple[float, float] | None = None
+    """Ends of a confidence interval, shown instead of the lowest and the highest; None: there is none."""
 
     def to_text(self) -> str:
         """Return the mean, and the lowest and the highest in brackets; without them where there is one value."""
@@ -43,7 +45,8 @@ class Cell:
         if not all(map(math.isfinite, self.values)):
             broken = sum(not math.isfinite(value) for value in self.values)
             return "diverged" if len(self.values) == 1 else f"diverged in {broken} of {len(self.values)}"
-        mean, low, high = (format(f(self.values), self.form) for f in (statistics.fmean, min, max))
+        ends = (min(self.values), max(self.values)) if self.bounds is None else self.bounds
+        mean, low, high = (format(value, self.form) for value in (statistics.fmean(self.values), *ends))
         unit = f" {self.unit}" if self.unit else ""
         return f"{mean}{unit}" + (f" [{low}, {high}]" if self.spread and len(self.values) > 1 else "")
 
@@ -179,6 +182,8 @@ def _table_from_json(content: Mapping[str, Any]) -> Table:
             return value
         if not all(x is None or is_number(x) for x in value["values"]):
             raise ValueError("a cell holds what is no number")
-        return Cell(**value | {"values": tuple(math.inf if x is None else float(x) for x in value["values"])})
+        values = tuple(math.inf if x is None else float(x) for x in value["values"])
+        bounds = None if value["bounds"] is None else (float(value["bounds"][0]), float(value["bounds"][1]))
+        return Cell(**value | {"values": values, "bounds": bounds})
 
     return Table(tuple(content["columns"]), tuple(tuple(cell(value) for value in row) for row in content["rows"]))

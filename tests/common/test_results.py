@@ -6,9 +6,9 @@ import json
 import math
 from pathlib import Path
 
-import prose
+import prose  # pyright: ignore[reportMissingImports]  # docs/, on pytest's path
 import pytest
-import render
+import render  # pyright: ignore[reportMissingImports]
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table, read_results, write_results
