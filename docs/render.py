@@ -3,11 +3,9 @@
 python docs/render.py           # rewrite the pages
 python docs/render.py --check   # name the pages that differ, and fail where there are any
 
-A mark names the file and the table; `caption` says where the numbers come from:
+A mark names the file and its tables; `caption` says where the numbers come from:
 
-    <!-- results: main_job short -->
-    <!-- /results -->
-    <!-- results: main_job caption -->
+    <!-- results: main_job short caption -->
     <!-- /results -->
 """
 
@@ -26,7 +24,7 @@ from ballu_mjx.common.results import read_results
 RESULTS = prose.ROOT / "results"
 CAPTION = "caption"
 _WIDTH = 120
-_MARK = re.compile(r"<!-- results: (?P<file>[\w-]+) (?P<table>[\w-]+) -->\n(?P<old>.*?)<!-- /results -->", re.DOTALL)
+_MARK = re.compile(r"<!-- results: (?P<file>[\w-]+) (?P<parts>[\w-]+(?: [\w-]+)*) -->\n.*?<!-- /results -->", re.DOTALL)
 _OPENED = re.compile(r"<!-- results:")
 
 
@@ -39,16 +37,18 @@ def render_page(text: str, results: Path = RESULTS) -> str:
         raise InputError("A mark has no end, or is none: <!-- results: FILE TABLE -->, then <!-- /results -->.")
 
     def rendered(found: re.Match[str]) -> str:
-        file, name = found["file"], found["table"]
-        content = read_results(results / f"{file}.json")
-        if name == CAPTION:
-            body = textwrap.fill(content.caption(), _WIDTH, break_long_words=False, break_on_hyphens=False)
-        elif name in content.tables:
-            body = content.tables[name].to_markdown()
-        else:
-            raise InputError(f"{results / file}.json has no table {name!r}; it has {', '.join(content.tables)}.")
-        # Blank lines: Markdown would take the comments for the table's first and last rows.
-        return f"<!-- results: {file} {name} -->\n\n{body}\n\n<!-- /results -->"
+        path = results / f"{found['file']}.json"
+        content = read_results(path)
+        bodies = []
+        for name in found["parts"].split():
+            if name == CAPTION:
+                bodies.append(textwrap.fill(content.caption(), _WIDTH, break_long_words=False, break_on_hyphens=False))
+            elif name in content.tables:
+                bodies.append(content.tables[name].to_markdown())
+            else:
+                raise InputError(f"{path} has no table {name!r}; it has {', '.join(content.tables)}.")
+        body = "\n\n".join(bodies)
+        return f"<!-- results: {found['file']} {found['parts']} -->\n{body}\n<!-- /results -->"
 
     return _MARK.sub(rendered, text)
 

@@ -46,7 +46,7 @@ class Cell:
             broken = sum(not math.isfinite(value) for value in self.values)
             return "diverged" if len(self.values) == 1 else f"diverged in {broken} of {len(self.values)}"
         ends = (min(self.values), max(self.values)) if self.bounds is None else self.bounds
-        mean, low, high = (format(value, self.form) for value in (statistics.fmean(self.values), *ends))
+        mean, low, high = (_format(value, self.form) for value in (statistics.fmean(self.values), *ends))
         unit = f" {self.unit}" if self.unit else ""
         return f"{mean}{unit}" + (f" [{low}, {high}]" if self.spread and len(self.values) > 1 else "")
 
@@ -99,6 +99,12 @@ class Results:
             commit = f" at commit {self.commit[:7]}" + (" with changes" if provenance.CHANGED in self.commit else "")
         seeds = "".join(f" {use.capitalize()} seeds: {', '.join(map(str, s))}." for use, s in self.seeds.items())
         return f"{self.data}. `{self.command}`{commit}, {self.machine['cores']} cores of {self.machine['cpu']}.{seeds}"
+
+
+def _format(value: float, form: str) -> str:
+    """Return a number in a format; what rounds to zero has no sign."""
+    text = format(value, form)
+    return text.removeprefix("-") if not text.strip("-0.") else text
 
 
 def command_line(arguments: Sequence[str] | None = None) -> str:

@@ -29,6 +29,8 @@ def test_cells_show_mean_and_range_and_what_diverged():
     assert Cell((5e-7,), ".0e", "mm").to_text() == "5e-07 mm"
     assert Cell((1.0, math.inf)).to_text() == "diverged in 1 of 2"
     assert Cell(()).to_text() == ""
+    assert Cell((-0.4, -3.0, 2.0), ".0f").to_text() == "0 [-3, 2]"
+    assert Cell((1.0, 3.0), ".1f", bounds=(0.5, 3.5)).to_text() == "2.0 [0.5, 3.5]"
     with pytest.raises(ValueError, match="2 cells"):
         Table(("a", "b"), (("one",),))
 
@@ -50,8 +52,8 @@ def test_a_page_is_rendered_once_and_then_stays(folder: Path):
     assert "| one | 0.500 [0.250, 0.750] |" in page and "old" not in page
     assert page.startswith("before\n") and page.endswith("after\n")
     assert render.render_page(page, folder) == page
-    captioned = render.render_page(MARK.replace("errors", "caption"), folder)
-    assert "Training seeds: 3, 4." in " ".join(captioned.split())
+    captioned = render.render_page(MARK.replace("errors", "errors caption"), folder)
+    assert "| one | 0.500" in captioned and "Training seeds: 3, 4." in " ".join(captioned.split())
 
 
 def test_what_cannot_be_rendered_is_refused(folder: Path):

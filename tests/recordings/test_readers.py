@@ -705,3 +705,17 @@ def test_names_that_break_lines_do_not_break_the_mapping(tmp_path: Path, robot: 
     (tmp_path / "room.toml").write_text(draft_mapping(contents, robot))
     with pytest.raises(InputError, match=r"\[hull\] position"):
         read_mapping(tmp_path / "room.toml", robot)
+
+
+def test_a_table_without_telling_names_asks_for_places_alone(tmp_path: Path, robot: RobotDescription):
+    names = "t,arm,push,bx,by,bz,qw,qx,qy,qz,kx,ky,kz"
+    values = np.column_stack([TIME, COMMAND, HULL.place, HULL.turn.as_quat(scalar_first=True), TIP.place])
+    np.savetxt(tmp_path / "x.csv", values, "%.6f", ",", header=names, comments="")
+    run("map", tmp_path / "x.csv", "--output", tmp_path / "room.toml", "--robot", robot.file)
+    text = (tmp_path / "room.toml").read_text()
+    for stem in ("b", "k"):
+        text = text.replace('position = ["", "", ""]', f'position = ["{stem}x", "{stem}y", "{stem}z"]', 1)
+    (tmp_path / "room.toml").write_text(text)
+    line = ["import", tmp_path / "x.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "out.csv"]
+    run(*line, "--robot", robot.file)
+    same(read_recording(tmp_path / "out.csv", robot))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 
 from ballu_mjx.recordings.importers.contents import Contents, Item, describe_contents, printable
 from ballu_mjx.recordings.importers.trajectories import TIMES
@@ -30,6 +30,8 @@ class _Part:
     lines: Sequence[str]
     columns: Sequence[str] = ()
     items: Sequence[Item] = ()
+    empty: bool = False
+    """The user has to name columns of places."""
 
 
 def draft_mapping(contents: Contents, robot: RobotDescription) -> str:
@@ -41,7 +43,8 @@ def draft_mapping(contents: Contents, robot: RobotDescription) -> str:
     parts = {role: _role(contents, role, roles, robot.tracked) for role in roles}
     joints = {joint: found for joint in robot.joints if (found := _match(joint, _columns(contents))) is not None}
     joints = {joint: item for joint, item in joints.items() if item.name not in parts[robot.tracked].columns}
-    commands = _find_commands(contents, robot)
+    taken = {name for part in parts.values() for name in part.columns}
+    commands = _find_commands(contents, robot, taken)
     used = [item for part in parts.values() for item in part.items] + [*joints.values(), *commands.values()]
     lines = [
         "# A first mapping, by `ballu_mjx record map`. Check what is marked as a guess; complete what is empty.",
@@ -121,7 +124,8 @@ def _role(contents: Contents, role: str, roles: Sequence[str], tracked: str) -> 
         return part
     choice = bodies if role == tracked and bodies else [*bodies, *markers]
     if not choice and _columns(contents):
-        return _Part([f'position = ["", "", ""]  # choose from {_names(_columns(contents))}'])
+        lines = [f'position = ["", "", ""]  # choose from {_names(_columns(contents))}']
+        return _Part(lines + (_turn_lines(contents, None) if role == tracked else []), empty=True)
     return _Part([f'body = ""  # choose from {_names(choice)}'])
 
 
@@ -180,18 +184,21 @@ def _from_columns(contents: Contents, role: str, tracked: str, *, alone: bool) -
     found = [items[name] for name in places[place]]
     chosen = [item.name for item in found]
     lines = [f"position = {json.dumps(chosen)}"]
-    turn, guess = choose(turns), ""
-    if turn is None and role == tracked and len(turns) == 1:
-        turn, guess = next(iter(turns)), "  # a guess: the only quaternion"
-    if role == tracked and turn is None:
-        lines.append('orientation = ["", "", "", ""]  # choose its columns')
-    elif role == tracked and turn is not None:
-        names = [items[name].name for name in turns[turn]]
-        guess = "  # a guess: w, x, y, z" if "[" in turns[turn][0] else guess
-        lines.append(f"orientation = {json.dumps(names)}{guess}")
     if role == tracked:
-        lines.append('rotation = "quaternion"')
+        lines += _turn_lines(contents, choose(turns))
     return _Part(lines, chosen, found)
+
+
+def _turn_lines(contents: Contents, stem: str | None) -> list[str]:
+    """Lines for the tracked site's orientation: the quaternion called `stem`, or else the only one that there is."""
+    items = {item.called: item for item in _columns(contents)}
+    turns, guess = _stems(list(items))[1], ""
+    if stem is None and len(turns) == 1:
+        stem, guess = next(iter(turns)), "  # a guess: the only quaternion"
+    if stem is None:
+        return ['orientation = ["", "", "", ""]  # choose its columns', 'rotation = "quaternion"']
+    guess = "  # a guess: w, x, y, z" if "[" in turns[stem][0] else guess
+    return [f"orientation = {json.dumps([items[name].name for name in turns[stem]])}{guess}", 'rotation = "quaternion"']
 
 
 # ---- the rest ----
@@ -210,6 +217,8 @@ def _units(parts: Mapping[str, _Part], joints: Mapping[str, Item], contents: Con
     places = [by_name[name] for part in parts.values() for name in part.columns if by_name[name].unit is None]
     angles = [item for item in joints.values() if item.unit is None]
     lines = []
+    if not places and any(part.empty for part in parts.values()):
+        lines.append('length = "m"  # a guess: of the places that you name below')
     if places:
         unit = "mm" if _largest(places) > _LONGEST_M else "m"
         lines.append(f'length = "{unit}"  # a guess: places reach {_largest(places):.4g}')
@@ -256,12 +265,13 @@ def _clock(contents: Contents, used: Sequence[Item]) -> list[str]:
     ]
 
 
-def _find_commands(contents: Contents, robot: RobotDescription) -> dict[str, Item]:
-    columns = _columns(contents)
+def _find_commands(contents: Contents, robot: RobotDescription, taken: Container[str]) -> dict[str, Item]:
+    columns = [item for item in _columns(contents) if item.name not in taken]
     likely = [item for item in columns if any(word in item.name.lower() for word in _COMMANDS)]
     found = {}
     for name in robot.commands:
-        item = _match(f"command_{name}", columns) or _match(name, likely)
+        called = [item for item in columns if _plain(item.called) == _plain(name)]
+        item = _match(f"command_{name}", columns) or _match(name, likely) or (called[0] if len(called) == 1 else None)
         if item is not None:
             found[name] = item
     if len(found) == len(robot.commands):
