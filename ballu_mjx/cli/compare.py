@@ -123,9 +123,17 @@ def figures(folder: Path) -> dict[str, float]:
 
 
 def table(found: Mapping[str, Sequence[Mapping[str, float]]]) -> str:
-    """Markdown: rows by label, a column for each figure that all of their runs have."""
+    """Markdown: rows by label, a column for each figure that all of their runs have.
+
+    **Raises** `InputError` where there is no such figure.
+    """
     everything = [figures for members in found.values() for figures in members]
     names = [name for name in everything[0] if all(name in figures for figures in everything)]
+    if not names:
+        raise InputError(
+            "The runs have no figure in common: their recordings are of other groups or lengths; `python -m ballu_mjx "
+            "evaluate RUN --recordings ... --output RUN` measures them on the same."
+        )
     lines = ["| | runs | " + " | ".join(names) + " |", "| --- | ---: |" + " ---: |" * len(names)]
     for label, members in found.items():
         cells = []
@@ -194,6 +202,10 @@ def _options(config: Mapping[str, Any]) -> dict[str, str]:
         for name, value in config.get(section, {}).items()
         if name not in _UNTOLD
     }
+    from ballu_mjx.robots.registry import DEFAULT_ROBOT
+
+    robot = config.get("robot_description")
+    found["robot"] = DEFAULT_ROBOT if robot is None else Path(robot["path"]).name.removesuffix(".robot.json")
     found["actuators"] = "nominal" if config.get("actuators") is None else _digest(config["actuators"])
     for use, files in config.get("recordings", {}).items():
         found[f"{use} recordings"] = _digest([file["sha256"] for file in files])

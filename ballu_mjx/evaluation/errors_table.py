@@ -197,7 +197,8 @@ class Evaluation:
         whole recordings, and where starts diverged."""
         sides = self.simulators
         wide = [max(16, len(name) + 2) for name in sides]
-        narrow = [max(13, len(name) + 2) for name in sides]
+        final = f"final {self.angle} error (deg)"
+        narrow = [max(13, len(name) + 2, -(-(len(final) + 2) // len(sides))) for name in sides]
         margin = max(7, 2 + max(map(len, self.groups)))
         titles = "".join(f"{name:>{width}}" for name, width in zip(sides, wide, strict=True)) + f"{'ratio':>8}"
         lines = [
@@ -220,8 +221,7 @@ class Evaluation:
         lines += [
             f"± is the standard deviation over starts; ratio: {self.name} over {self.base}.",
             "",
-            f"{'whole recording':24}{'mean CoM error (m)':>{sum(narrow)}}"
-            f"{f'final {self.angle} error (deg)':>{sum(narrow)}}",
+            f"{'whole recording':24}{'mean CoM error (m)':>{sum(narrow)}}{final:>{sum(narrow)}}",
             f"{'':24}" + 2 * "".join(f"{name:>{width}}" for name, width in zip(sides, narrow, strict=True)),
         ]
         for each in zip(*sides.values(), strict=True):

@@ -151,8 +151,10 @@ def _choose(data: RecordingsData, robot: RobotDescription, earlier: Path | None)
     if data.quick:
         few = files["training"][:QUICK_RECORDINGS]
         on_training = files["validation"] == files["training"]
-        files = {"training": few, "validation": few if on_training else _one_a_group(files["validation"])}
-        files["test"] = files["validation"]  # a second set would be a second program to compile
+        validation = few if on_training else _one_a_group(files["validation"])
+        # Of bundled recordings a second set would be a second program to compile.
+        test = _one_a_group(files["test"]) if data.test else validation
+        files = {"training": few, "validation": validation, "test": test}
     return files
 
 

@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 from ballu_mjx.cli import compare
+from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, quotient
 from ballu_mjx.evaluation.statistics import t_interval
 from ballu_mjx.runs.folder import Run
@@ -99,3 +100,21 @@ def test_a_ratio_of_errors_is_a_number_where_there_is_no_error() -> None:
     assert quotient(0.0, 0.0) == 1.0
     assert quotient(0.2, 0.1) == pytest.approx(2.0)
     assert 1.0 < quotient(0.1, 0.0) < np.inf
+
+
+def altered(folder: Path, **changed: object) -> Path:
+    path = folder / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changed))
+    return folder
+
+
+def test_methods_and_robots_are_told_apart(tmp_path: Path):
+    one, other = write(tmp_path / "one", 0, 0.05, 1.0), write(tmp_path / "other", 0, 0.05, 1.0)
+    altered(other, robot_description={"path": "somewhere/rover.robot.json", "sha256": "2"})
+    assert [row.label for row in compare.rows([one, other])] == ["robot ballu", "robot rover"]
+    fitted = altered(write(tmp_path / "fitted", 0, 0.05, 1.0), task="fluid", fit={"steps": 3})
+    assert [row.label for row in compare.rows([one, fitted])] == ["task envmimic", "task fluid"]
+    found = [compare.figures(folder) for folder in (one, fitted)]
+    assert "near position, 5 s (ratio)" in compare.table({"envmimic": [found[0]], "fluid": [found[1]]})
+    with pytest.raises(InputError, match="no figure in common"):
+        compare.table({"envmimic": [{"near position, 5 s (ratio)": 0.5}], "fluid": [{"flight position, 5 s": 0.5}]})

@@ -230,6 +230,8 @@ def test_quick_validates_on_own_recordings_where_there_are_no_others(folder: Pat
     files = _choose(train_envmimic.Data(recordings=(folder / "data",), quick=True), load_robot(), None)
     assert len(files["training"]) == 2 and files["validation"] == files["training"] == files["test"]
     _read(files, load_robot())
+    data = train_envmimic.Data(recordings=(folder / "data",), test=(files["training"][0],), quick=True)
+    assert _choose(data, load_robot(), None)["test"] == files["training"][:1]
 
 
 def test_help_explains_every_option(folder: Path):
