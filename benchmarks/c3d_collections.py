@@ -28,6 +28,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ballu_mjx.common.results import Cell, Table, write_results
 from ballu_mjx.recordings.importers.c3d_file import C3DError, read_c3d_points
 
 ROUNDING = 2e-7
@@ -117,7 +118,9 @@ def _verdict(ours: np.ndarray, theirs: np.ndarray | str) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="folder that holds the files, at any depth")
-    folder: Path = parser.parse_args().data
+    parser.add_argument("--results", type=Path, help="JSON file to write the table to")
+    options = parser.parse_args()
+    folder: Path = options.data
     found: dict[str, Path] = {}
     for path in sorted(folder.rglob("*")):
         if path.suffix.lower() == ".c3d" and path.is_file():
@@ -126,17 +129,25 @@ def main() -> int:
     for each in results:
         others = "; ".join(f"{name}: {said}" for name, said in each.others.items())
         print(f"{each.path.relative_to(folder)} | {each.ours} | {others}")
-    print("\n| collection | files | equal | refused | read alone | DIFFERENT | ezc3d differs or fails | py-c3d |")
-    print("| --- |" + " ---: |" * 7)
-    names = [each.path.relative_to(folder).parts[0] for each in results]
-    for name in [*dict.fromkeys(names), "all"]:
-        own = [each for each, of in zip(results, names, strict=True) if name in (of, "all")]
+    table = count_table(results, [each.path.relative_to(folder).parts[0] for each in results])
+    print(f"\n{table.to_markdown()}")
+    if options.results is not None:
+        write_results(options.results, {"collections": table}, "Public files", packages=("ballu-mjx", "ezc3d", "c3d"))
+    return 1 if any(each.ours == "DIFFERENT" for each in results) else 0
+
+
+def count_table(results: list[Compared], collections_of: list[str]) -> Table:
+    """Return how many files of each collection were read, and how."""
+    head = ("collection", "files", "equal", "refused", "read alone", "different", "ezc3d differs or fails", "py-c3d")
+    rows = []
+    for name in [*dict.fromkeys(collections_of), "all"]:
+        own = [each for each, of in zip(results, collections_of, strict=True) if name in (of, "all")]
         count = collections.Counter(each.ours.partition(":")[0] for each in own)
         kinds = [count[kind] for kind in ("equal", "refused", "read alone", "DIFFERENT")]
         readable = [each for each in own if not each.ours.startswith("refused")]
         lost = [sum(each.others[reader] != "equal" for each in readable) for reader in READERS]
-        print(f"| {name} | {len(own)} | " + " | ".join(map(str, [*kinds, *lost])) + " |")
-    return 1 if any(each.ours == "DIFFERENT" for each in results) else 0
+        rows.append((name, *(Cell((number,), "g") for number in (len(own), *kinds, *lost))))
+    return Table(head, tuple(rows))
 
 
 if __name__ == "__main__":
