@@ -82,6 +82,7 @@ AIR = "aerodynamic"
 METHODS = {
     "nominal": Method("EnvMimic on nominal actuators", ("envmimic",), nominal=True),
     "identified": Method("EnvMimic", ("envmimic",)),
+    "paper": Method("EnvMimic, the paper's preset", ("envmimic", "--preset", "paper")),
     "wrench": Method("EnvMimic, wrench", ("envmimic", "--forces", "wrench")),
     "multi": Method("EnvMimic, forces at balloon, base and feet", ("envmimic", "--forces", "multi")),
     "regression": Method("supervised, all of its forces", ("supervised", "--force-scales", "1")),
