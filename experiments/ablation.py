@@ -39,6 +39,7 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.residuals.network import NetworkForces
+from ballu_mjx.residuals.presets import preset_values
 from ballu_mjx.rl import learner, ppo
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.model import assets
@@ -58,6 +59,7 @@ class Row:
     ppo: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
+PAPER = preset_values("paper")
 PAPER_REWARD = {"fine_position_weight": 0.0, "fine_orientation_weight": 0.0}
 ROWS: Mapping[str, Row] = {
     "defaults": Row(),
@@ -69,12 +71,12 @@ ROWS: Mapping[str, Row] = {
     "no cost on force": Row({"force_cost": 0.0}),
     "constant learning rate": Row(ppo={"desired_kl": 0.0}),
     "last iterate instead of the average": Row(ppo={"averaging": 1}),
-    "none of these (the paper's method to the letter)": Row(
-        PAPER_REWARD
-        | {"critic_sees_error": False, "force_scale": 1.0, "observe_command": False, "observation_noise": 0.0}
-        | {"start_noise": 0.0, "force_cost": 0.0},
-        {"desired_kl": 0.0, "averaging": 1},
-    ),
+    "absolute observation": Row({"relative_observation": False}),
+    "world frame": Row({"heading_frame": False}),
+    "episodes of one length": Row({"episode_spread": 0.0}),
+    "the paper's preset": Row(PAPER["env"], PAPER["ppo"]),
+    "the paper's preset, learning rate 1e-4": Row(PAPER["env"], {**PAPER["ppo"], "learning_rate": 1e-4}),
+    "the paper's preset, learning rate 1e-3": Row(PAPER["env"], {**PAPER["ppo"], "learning_rate": 1e-3}),
 }
 
 # %% [markdown]

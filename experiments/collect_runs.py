@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from ballu_mjx.cli.compare import rows as rows_of_runs
+from ballu_mjx.common import provenance
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table, write_results
 from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS, Errors, Evaluation, read_evaluation
@@ -55,6 +56,19 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[Evaluation], list[dict[str,
     if any(config["data"]["quick"] for config in configs):
         raise InputError("A run was made with --quick, and its numbers mean little; make it without.")
     return [read_evaluation(folder / "evaluation.json") for folder in folders], configs
+
+
+def provenance_of(config: dict[str, Any], commit: str | None) -> dict[str, Any]:
+    """Return commit, machine and versions of a run; runs from before these were recorded are taken for this machine's.
+
+    **Raises** `InputError` where the run does not say its commit, and none is given.
+    """
+    start = config["starts"][0]
+    commit = start.get("commit") or commit
+    if commit is None:
+        raise InputError("The runs do not say which commit they were made with; give it by --commit.")
+    machine = start.get("machine") or provenance.describe_machine()
+    return {"commit": commit, "machine": machine, "versions": start["versions"]}
 
 
 def errors_table(runs: Sequence[Evaluation], horizons: Sequence[float] | None = None) -> Table:
@@ -110,6 +124,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Tables of residual runs that differ in their seed alone.")
     parser.add_argument("runs", type=Path, nargs="+", help="folders of the runs")
     parser.add_argument("--results", type=Path, help="JSON file to write; without it the tables are only printed")
+    parser.add_argument("--commit", help="of the code that the runs were made with, where they do not say")
     parser.add_argument("--data", default="Development data", help="what the recordings are, for the caption")
     options = parser.parse_args()
     runs, configs = read_runs(options.runs)
@@ -121,7 +136,7 @@ def main() -> None:
     for table in tables.values():
         print(table.to_markdown(), end="\n\n")
     if options.results is not None:
-        measured = configs[0]["starts"][0]
+        measured = provenance_of(configs[0], options.commit)
         seeds = {"training": sorted(map(seed_of, configs))}
         write_results(options.results, tables, options.data, seeds=seeds, measured=measured)
         print(f"Written to {options.results}.")

@@ -7,9 +7,9 @@
 # and feet) and with what the other methods learn: regression on the forces that explain the recordings (supervised;
 # with all of its forces, as in the paper, and with the share of them that helps), gradients through the simulator
 # (analytic), the air's parameters (aerodynamic; all, or all but the lift), and networks for what the air leaves
-# (aerodynamic+analytic, aerodynamic+EnvMimic). One training a method and seed; runs that are there already are not
-# repeated. Beside gaits and commands unlike any, the actions of a walking policy that was trained in vanilla are
-# replayed, as in the paper.
+# (aerodynamic+analytic, aerodynamic+EnvMimic). Rows that isolate have the command delay without air, and the air
+# without delay and centre. One training a method and seed; runs that are there already are not repeated. Beside gaits
+# and commands unlike any, the actions of a walking policy that was trained in vanilla are replayed, as in the paper.
 #
 # `python experiments/fidelity.py` takes hours on two cores, `--methods` names some of it; `--robot N` does the same on
 # another virtual robot, recorded and its actuators identified first; `--quick` shows that it works.
@@ -73,29 +73,38 @@ class Method:
     seeded: bool = True
     nominal: bool = False
     """On nominal actuators instead of identified ones."""
-    beside_air: bool = False
-    """Learns what the identified air leaves."""
+    beside: str | None = None
+    """Learns what another method leaves; None: what identified actuators leave."""
 
 
 AIR = "aerodynamic"
+
+
+def _air_without(*names: str) -> tuple[str, ...]:
+    """Arguments of a training that identifies the air but for some of its parameters."""
+    return AIR, "--free", *(name for name in AIR_PARAMETERS if name not in names)
+
+
 METHODS = {
     "nominal": Method("EnvMimic on nominal actuators", ("envmimic",), nominal=True),
     "identified": Method("EnvMimic", ("envmimic",)),
+    "paper": Method("EnvMimic, the paper's preset", ("envmimic", "--preset", "paper")),
     "wrench": Method("EnvMimic, wrench", ("envmimic", "--forces", "wrench")),
     "multi": Method("EnvMimic, forces at balloon, base and feet", ("envmimic", "--forces", "multi")),
     "regression": Method("supervised, all of its forces", ("supervised", "--force-scales", "1")),
     "supervised": Method("supervised", ("supervised",)),
     "analytic": Method("analytic", ("analytic",)),
     "analytic-wrench": Method("analytic, wrench", ("analytic", "--forces", "wrench")),
-    AIR: Method("aerodynamic", ("aerodynamic",), seeded=False),
-    "air-lift": Method(
-        "aerodynamic, the model's lift",
-        ("aerodynamic", "--free", *(name for name in AIR_PARAMETERS if name != "lift")),
-        seeded=False,
-    ),
-    "air-analytic": Method("aerodynamic+analytic", ("analytic",), beside_air=True),
-    "air-envmimic": Method("aerodynamic+EnvMimic", ("envmimic",), beside_air=True),
+    AIR: Method("aerodynamic", (AIR,), seeded=False),
+    "air-lift": Method("aerodynamic, the model's lift", _air_without("lift"), seeded=False),
+    "air-analytic": Method("aerodynamic+analytic", ("analytic",), beside=AIR),
+    "air-envmimic": Method("aerodynamic+EnvMimic", ("envmimic",), beside=AIR),
+    "delay": Method("vanilla+sysid+delay", (AIR, "--free", "delay"), seeded=False),
+    "delay-envmimic": Method("vanilla+sysid+delay+EnvMimic", ("envmimic",), beside="delay"),
+    "air-alone": Method("aerodynamic, no delay or centre", _air_without("delay", "centre"), seeded=False),
 }
+"""The last three isolate the command delay and the balloons' centre, which the white box alone has: the delay,
+identified from the same recordings, for simulators without air, and the air without both."""
 
 
 def train(folder: Path, *arguments: str, result: str = "evaluation.json") -> None:
@@ -318,7 +327,8 @@ def parse() -> Options:
     parser.add_argument("--quick", action="store_true", help="train for seconds; the numbers mean nothing")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     arguments = parser.parse_args()
-    methods = [name for name in METHODS if name in always or name in arguments.methods]
+    needed = {*always, *arguments.methods, *(METHODS[name].beside for name in arguments.methods)}
+    methods = [name for name in METHODS if name in needed]
     chosen = (arguments.seeds, arguments.robot, arguments.fresh, arguments.output, arguments.quick, arguments.results)
     return Options(methods, *chosen)
 
@@ -332,14 +342,14 @@ def arguments_of(method: Method, recorded: Recorded, training: list[Path], quick
 
 
 def learn(options: Options, recorded: Recorded) -> dict[str, list[Path]]:
-    """All runs of all methods; the air first, beside which others learn."""
+    """All runs of all methods; first those beside which others learn."""
     folders = {}
-    for name in sorted(options.methods, key=lambda name: name != AIR):
+    for name in sorted(options.methods, key=lambda name: METHODS[name].beside is not None):
         method = METHODS[name]
         # A quick training would test on what it validates on: the tables need the test recordings.
         training = recorded.training[:2] if options.quick else recorded.training
         arguments = arguments_of(method, recorded, training, options.quick)
-        arguments += ["--residual", str(options.output / AIR)] if method.beside_air else []
+        arguments += [] if method.beside is None else ["--residual", str(options.output / method.beside)]
         runs = [(options.output / f"{name}-seed-{seed}", ["--seed", str(seed)]) for seed in options.seeds]
         for folder, seed in runs if method.seeded else [(options.output / name, [])]:
             train(folder, *arguments, *seed)

@@ -45,7 +45,7 @@ _FIRST = (
     _Group(
         "what to learn",
         "Choices that decide what comes out.",
-        ("forces", "terms", "free", "force_scales", "motion", "objective", "also", "domain_randomization"),
+        ("preset", "forces", "terms", "free", "force_scales", "motion", "objective", "also", "domain_randomization"),
     ),
 )
 _LAST = (

@@ -13,6 +13,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.envmimic_training import VALIDATE_EVERY, check_envmimic_options, check_resumes, train_envmimic
+from ballu_mjx.residuals.presets import PresetName, describe_preset, preset_values
 from ballu_mjx.residuals.run_config import run_residual
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl import distributed, learner
@@ -36,6 +37,9 @@ class Data(RecordingsData, distributed.DistributedOptions):
     resume: Path | None = None
     """Go on with the run in this folder, from its last checkpoint, with its recordings and configuration; options
     given beside it change these. --num-timesteps counts from the run's start."""
+    preset: PresetName | None = None
+    """Other defaults of the options, which may still be given beside it. paper: state, action, reward, network and
+    optimizer of the paper, and Stable-Baselines3's defaults (docs/envmimic.md). Without this option: none."""
     validate_every: int = VALIDATE_EVERY
     """Control steps between two validations, each of which leaves a checkpoint."""
 
@@ -43,11 +47,15 @@ class Data(RecordingsData, distributed.DistributedOptions):
 def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
     """Read and check everything, train, evaluate; returns the exit status."""
     distributed.join(data)
+    if data.preset is not None and data.resume is not None:
+        raise InputError("--preset does not go with --resume, which keeps the run's options; leave one out.")
     robot = load_chosen_robot(data.robot, data.resume, "envmimic")
     check_envmimic_options(env, ppo, data.validate_every, robot.control_timestep)
     start = start_from("envmimic", data, ppo)
     check_resumes(start, env, robot)
     first = distributed.is_first()
+    if first and data.preset is not None:
+        print(f"--preset {data.preset} sets:\n{describe_preset(data.preset, env, ppo)}\n")
 
     def learn(prepared: Prepared, run: TrainingRecord) -> TrainedResidual:
         return train_envmimic(
@@ -82,10 +90,21 @@ def _base_residual(data: Data) -> Path | None:
     return run_residual(read_config(data.resume, "envmimic"), data.resume)
 
 
+def _defaults(data: Data) -> Mapping[str, Mapping[str, Any]]:
+    """Return the defaults that --preset and --quick imply. A preset keeps its own sizes under --quick: they fit each
+    other."""
+    quick = QUICK if data.quick else {}
+    if data.preset is None:
+        return {"ppo": quick} if quick else {}
+    preset = preset_values(data.preset)
+    return {**preset, "ppo": {**quick, **preset["ppo"]}}
+
+
 COMMAND = TrainCommand(
     "Learn residual forces from recordings by reinforcement learning, and measure them on recordings that training "
     "never saw.",
     {"data": Data(), "env": EnvMimicConfig(), "ppo": PPOConfig()},
     train,
     {"ppo": QUICK},
+    _defaults,
 )

@@ -98,6 +98,7 @@ class Results:
         if self.commit is not None:
             commit = f" at commit {self.commit[:7]}" + (" with changes" if provenance.CHANGED in self.commit else "")
         seeds = "".join(f" {use.capitalize()} seeds: {', '.join(map(str, s))}." for use, s in self.seeds.items())
+        seeds += " One seed ranks nothing." if len(self.seeds.get("training", (0, 1))) == 1 else ""
         return f"{self.data}. `{self.command}`{commit}, {self.machine['cores']} cores of {self.machine['cpu']}.{seeds}"
 
 

@@ -26,6 +26,7 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import pad_to_bucket, stack_motions
 from ballu_mjx.residuals.network import (
     ForceNetworkConfig,
+    force_frame,
     network_input,
     num_loads,
     recorded_inputs,
@@ -36,7 +37,7 @@ from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.coordinates import translations
 from ballu_mjx.sim.force_model import to_wrenches
-from ballu_mjx.sim.observation import HISTORY, ObservationLayout, euler_to_matrix, world_rotation, wrap_angle
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout, euler_to_matrix, wrap_angle
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
@@ -68,8 +69,10 @@ class EnvMimicConfig(ForceNetworkConfig):
     force_cost: float = 20.0
     """Reward lost per N^2 of force."""
     episode_seconds: float = 3.0
-    """Mean length of an episode, s; each lasts between half and one and a half times as long (robots reset together
-    would stay in step, and every batch show one phase of the episode), and a recording's end cuts it short."""
+    """Mean length of an episode, s; a recording's end cuts it short."""
+    episode_spread: float = 0.5
+    """Lengths of episodes are drawn from the mean less and plus this share of it: robots that are reset together would
+    stay in step, and every batch show one phase of the episode. 0 makes all episodes alike."""
     critic_sees_error: bool = True
     """Let the value function (never the policy) see how far off the recording the robot is."""
     observation_noise: float = 0.3
@@ -96,6 +99,10 @@ def check_envmimic_config(config: EnvMimicConfig, control_timestep: float) -> No
             least = 2 * control_timestep
             if not (value >= least and math.isfinite(value)):
                 raise InputError(f"{option} is {value:g}: it must be {least:g} or more; {least:g} is the nearest.")
+        elif field.name == "episode_spread":
+            if not 0 <= value <= 1:
+                nearest = int(value > 1)
+                raise InputError(f"{option} is {value:g}: it must be between 0 and 1; {nearest} is the nearest.")
         elif not all(x >= 0 and math.isfinite(x) for x in (value if isinstance(value, tuple) else (value,))):
             raise InputError(f"{option} is {value}: it must be 0 or more; 0 is the nearest.")
 
@@ -209,8 +216,9 @@ class EnvMimicEnv(Env):
         qpos, qvel = self._perturb(key_noise, qpos, qvel, self.config.start_noise)
         history = jax.lax.dynamic_slice_in_dim(reference.features[recording], time - HISTORY + 1, HISTORY)
         commands = jax.lax.dynamic_slice_in_dim(reference.command[recording], time - HISTORY + 1, HISTORY - 1)
+        spread = int(self.config.episode_spread * self.episode_length)
         remaining = jax.random.randint(
-            key_length, (), max(self.episode_length // 2, 1), self.episode_length + self.episode_length // 2 + 1
+            key_length, (), max(self.episode_length - spread, 1), self.episode_length + spread + 1
         )
         drivetrain = reference.drivetrain_at(recording, time)
         rollout = RolloutState(state_at(qpos, qvel), history, commands, drivetrain)
@@ -295,7 +303,7 @@ class EnvMimicEnv(Env):
         if self.config.critic_sees_error:
             error = self.reference.features[recording, time] - rollout.features
             layout = ObservationLayout
-            to_heading = world_rotation(rollout.features[layout.yaw], self.robot.anchored).T
+            to_heading = force_frame(rollout.features[layout.yaw], self.config, self.robot).T
             critic += [to_heading @ error[layout.position], to_heading @ error[layout.velocity]]
             critic += [wrap_angle(error[layout.euler_angles])]
         return {"state": seen + noise, "critic": jnp.concatenate([*critic, commands.ravel()])}

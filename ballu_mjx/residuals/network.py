@@ -42,6 +42,12 @@ class ForceNetworkConfig:
     for unit, those of a force."""
     observe_command: bool = True
     """Let the policy see the commands (now and the last two), which the paper's state leaves out."""
+    relative_observation: bool = True
+    """Horizontal positions that the policy sees are from the tracked body, so that forces do not depend on the place in
+    the room. The paper's are the room's. Those of an anchored robot always are."""
+    heading_frame: bool = True
+    """Directions that the policy sees, yaw and forces are in the tracked body's heading frame. The paper's are the
+    world's. Those of an anchored robot always are."""
 
 
 def network_input(
@@ -54,7 +60,9 @@ def network_input(
 
     Commands come as fractions of their ranges, 0 to 1, whatever their units.
     """
-    seen = heading_observation(history, robot.anchored)
+    seen = heading_observation(
+        history, robot.anchored, relative=config.relative_observation, turned=config.heading_frame
+    )
     if not config.observe_command:
         return seen
     low, high = np.array(robot.command_ranges, np.float32).T
@@ -113,11 +121,16 @@ def world_loads(
     """Return the loads (N, N m; world; see `to_wrenches`) that an action stands for, within the limit along each axis.
 
     Actions are in the tracked body's heading frame, like the observation: the same situation met in another direction
-    calls for the same force, turned. Those on an anchored robot are in the world's.
+    calls for the same force, turned. Those on an anchored robot, or without `heading_frame`, are in the world's.
     """
     most = config.force_limit / config.force_scale
     loads = jnp.asarray(load_units(config, len(action))) * jnp.clip(action, -most, most)
-    return (loads.reshape(-1, 3) @ world_rotation(yaw, robot.anchored).T).ravel()
+    return (loads.reshape(-1, 3) @ force_frame(yaw, config, robot).T).ravel()
+
+
+def force_frame(yaw: Float[Array, ""], config: ForceNetworkConfig, robot: RobotDescription) -> Float[Array, "3 3"]:
+    """Return the rotation that takes vectors in the frame of a network's actions to the world."""
+    return world_rotation(yaw, robot.anchored or not config.heading_frame)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,11 +24,11 @@ from jaxtyping import Array, Float
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.residuals.network import ForceNetworkConfig, load_units, recorded_inputs
+from ballu_mjx.residuals.network import ForceNetworkConfig, force_frame, load_units, recorded_inputs
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.coordinates import translations
 from ballu_mjx.sim.linearize import ControlSteps, Linearizer
-from ballu_mjx.sim.observation import HISTORY, ObservationLayout, world_rotation
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
@@ -211,8 +211,8 @@ def examples(
     headings = np.asarray(reference.features[..., ObservationLayout.yaw])
     yaw = [seen[first:count] for seen, count in zip(headings, reference.steps, strict=True)]
     labels = np.concatenate([each[first:] for each in loads])
-    anchored = simulator.robot.anchored
-    to_world = np.asarray(jax.vmap(lambda yaw: world_rotation(yaw, anchored))(jnp.asarray(np.concatenate(yaw))))
+    robot = simulator.robot
+    to_world = np.asarray(jax.vmap(lambda yaw: force_frame(yaw, config, robot))(jnp.asarray(np.concatenate(yaw))))
     turned = np.einsum("nji,nvj->nvi", to_world, labels.reshape(len(labels), -1, 3)).reshape(labels.shape)
     actions = turned / load_units(config, labels.shape[1])
     return np.asarray(recorded_inputs(reference, config, simulator.robot)), np.asarray(actions, np.float32)

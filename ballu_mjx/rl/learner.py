@@ -99,7 +99,7 @@ class Learner:
         # The learning rate is part of the state also where it stays: one program for all of them.
         self._optimizer = optax.chain(
             optax.clip_by_global_norm(config.max_grad_norm),
-            optax.inject_hyperparams(optax.adam)(learning_rate=config.learning_rate),
+            optax.inject_hyperparams(optax.adam)(learning_rate=config.learning_rate, eps=config.adam_epsilon),
         )
         loss = functools.partial(
             compute_ppo_loss,
@@ -109,6 +109,7 @@ class Learner:
             reward_scaling=config.reward_scaling,
             gae_lambda=config.gae_lambda,
             clipping_epsilon=config.clipping_epsilon,
+            vf_coefficient=2 * config.value_cost,  # Brax halves it
         )
         self._gradient = jax.grad(loss, has_aux=True)
 

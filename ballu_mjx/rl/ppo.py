@@ -51,8 +51,12 @@ class PPOConfig:
     """Largest relative change of an action's probability that is rewarded."""
     reward_scaling: float = 1.0
     """Factor on rewards. A fresh value function gives numbers of order 1: returns should not be small beside that."""
+    value_cost: float = 0.25
+    """Weight of the value function's mean squared error in the objective."""
     max_grad_norm: float = 1.0
     """Gradients longer than this are shortened to it."""
+    adam_epsilon: float = 1e-8
+    """What Adam adds to the root of its second moment."""
     normalize_observations: bool = True
     """Shift and scale observations by their running mean and standard deviation."""
     observation_clip: float = 10.0
@@ -63,6 +67,8 @@ class PPOConfig:
     """Widths of the value function's hidden layers."""
     activation: Literal["swish", "tanh"] = "swish"
     """Activation of the hidden layers."""
+    orthogonal_init: bool = False
+    """Draw the hidden layers' weights as orthogonal matrices times the root of 2, instead of uniformly (LeCun)."""
     initial_std: float = 0.5
     """Standard deviation of a fresh policy's actions, in the environment's units; the mean starts near 0."""
     averaging: int = 25
@@ -110,7 +116,15 @@ _COUNTS = (
     "num_updates_per_batch",
     "averaging",
 )
-_POSITIVE = ("learning_rate", "initial_std", "reward_scaling", "max_grad_norm", "observation_clip", "clipping_epsilon")
+_POSITIVE = (
+    "learning_rate",
+    "initial_std",
+    "reward_scaling",
+    "max_grad_norm",
+    "adam_epsilon",
+    "observation_clip",
+    "clipping_epsilon",
+)
 _WIDEST, _LARGEST = 2**14, 2**31 - 1
 
 
@@ -132,7 +146,7 @@ def check_values(config: PPOConfig) -> None:
             raise InputError(
                 f"{_option(name)} is {getattr(config, name)}: it must be greater than 0; {usual} is usual."
             )
-    for name in ("entropy_cost", "desired_kl"):
+    for name in ("entropy_cost", "value_cost", "desired_kl"):
         if not (getattr(config, name) >= 0 and math.isfinite(getattr(config, name))):
             raise InputError(f"{_option(name)} is {getattr(config, name)}: it must be 0 or more; 0 is the nearest.")
     for name in ("discounting", "gae_lambda"):
@@ -179,6 +193,11 @@ def make_networks(observation_size: ObservationSize, action_size: int, config: P
         normalized = (observation - preprocessor_params.mean) / preprocessor_params.std
         return jnp.clip(normalized, -config.observation_clip, config.observation_clip)
 
+    hidden: dict[str, Any] = {}
+    if config.orthogonal_init:
+        for network in ("policy", "value"):
+            hidden[f"{network}_network_kernel_init_fn"] = jax.nn.initializers.orthogonal
+            hidden[f"{network}_network_kernel_init_kwargs"] = {"scale": math.sqrt(2)}
     return brax_networks.make_ppo_networks(
         observation_size,
         action_size,
@@ -193,6 +212,7 @@ def make_networks(observation_size: ObservationSize, action_size: int, config: P
         init_noise_std=config.initial_std,
         mean_kernel_init_fn=jax.nn.initializers.orthogonal,
         mean_kernel_init_kwargs={"scale": _INITIAL_MEAN_SCALE},
+        **hidden,
     )
 
 

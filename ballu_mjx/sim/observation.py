@@ -115,18 +115,19 @@ def world_rotation(yaw: Float[Array, ""], anchored: bool) -> Float[Array, "3 3"]
 
 
 def heading_observation(
-    history: Float[Array, "steps features"], anchored: bool = False
+    history: Float[Array, "steps features"], anchored: bool = False, *, relative: bool = True, turned: bool = True
 ) -> Float[Array, " observations"]:
     """Return what policies see of the features of the last control steps (three in the paper; the current one last).
 
     It is the paper's state, made independent of place and heading: horizontal positions are taken from the tracked
     body's current one, and positions, velocities and yaw from its heading. A force that depends on where in the room
     the robot stands would fit the recordings and nothing else. Heights stay absolute, for the floor is. Of an anchored
-    robot everything is absolute: its place and heading are part of its physics.
+    robot everything is absolute: its place and heading are part of its physics. Without `relative` and `turned`, places
+    and headings of any robot stay absolute (the paper's state).
     """
     now, layout = history[-1], ObservationLayout
-    origin = now[layout.position] * jnp.array([0.0, 0.0, 0.0] if anchored else [1.0, 1.0, 0.0])
-    heading = jnp.zeros_like(now[layout.yaw]) if anchored else now[layout.yaw]
+    origin = now[layout.position] * jnp.array([1.0, 1.0, 0.0] if relative and not anchored else [0.0, 0.0, 0.0])
+    heading = now[layout.yaw] if turned and not anchored else jnp.zeros_like(now[layout.yaw])
     to_heading = heading_rotation(heading).T
 
     def relative(frame: Float[Array, " features"]) -> Array:

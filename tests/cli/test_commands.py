@@ -15,12 +15,15 @@ import pytest
 from ballu_mjx import __main__ as package
 from ballu_mjx import cli
 from ballu_mjx.__main__ import COMMANDS, NAMES
-from ballu_mjx.cli import completion, train
+from ballu_mjx.cli import completion, train, train_envmimic
 from ballu_mjx.cli._command import TrainCommand, run_command
 from ballu_mjx.common import runtime
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.importers.readers import READERS
 from ballu_mjx.residuals.dataset import RecordingsData
+from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.presets import describe_preset, preset_configs
+from ballu_mjx.rl import ppo as ppo_options
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.runs.layout import RUN_FORMAT
 
@@ -165,6 +168,38 @@ def test_quick_changes_defaults_wherever_it_stands_and_no_option_that_is_given()
     assert given("learn --quick") == (Data(quick=True), small)
     _, ppo = given("learn --num-envs 1024 --quick --normalize-observations --seed 3")
     assert ppo == dataclasses.replace(PPOConfig(), seed=3)  # given, though equal to the defaults without --quick
+
+
+def test_a_preset_changes_defaults_and_no_option_that_is_given(tmp_path: Path):
+    found = []
+
+    def keep(data: train_envmimic.Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
+        found.append((data.preset, env, ppo))
+        return 0
+
+    commands = {"envmimic": dataclasses.replace(train_envmimic.COMMAND, run=keep)}
+    run_command(commands, ["envmimic", "--preset", "paper"], "")
+    run_command(
+        commands, ["envmimic", "--learning-rate", "1e-3", "--preset", "paper", "--heading-frame", "--quick"], ""
+    )
+    (name, env, ppo), (_, other_env, quick) = found
+    assert name == "paper" and (env, ppo) == preset_configs("paper")
+    assert env.force_scale == 1.0 and not env.relative_observation and ppo.activation == "tanh"
+    assert other_env == dataclasses.replace(env, heading_frame=True)
+    assert quick == dataclasses.replace(ppo, learning_rate=1e-3, num_timesteps=train_envmimic.QUICK["num_timesteps"])
+    told = describe_preset("paper", other_env, quick)
+    assert "False, but given as True" in told and "0.0003, but given as 0.001" in told
+    with pytest.raises(InputError, match="--preset does not go with --resume"):
+        train_envmimic.train(train_envmimic.Data(preset="paper", resume=tmp_path), env, ppo)
+
+
+def test_the_paper_s_sizes_are_stable_baselines_():
+    """2048 control steps for an update, 64 in a minibatch; and they fit each other, on two devices too."""
+    _, config = preset_configs("paper")
+    ppo_options.check(config, 2)
+    assert config.batch_size * config.unroll_length == 64
+    assert config.batch_size * config.unroll_length * config.num_minibatches == 2048
+    assert config.num_envs * config.unroll_length == 2048
 
 
 def test_a_run_that_goes_on_keeps_its_options_but_for_those_given(tmp_path: Path):

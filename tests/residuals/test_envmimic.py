@@ -16,7 +16,7 @@ from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, reward_terms, tracking_state
-from ballu_mjx.residuals.network import NetworkForces, world_loads
+from ballu_mjx.residuals.network import NetworkForces, network_input, world_loads
 from ballu_mjx.rl.learner import Learner
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.registry import load_robot
@@ -127,6 +127,29 @@ def test_observation_and_force_turn_with_the_robot(still: Motion, seed: int):
         world_loads(action, there[-1, 8], config, load_robot()),
         atol=1e-5,
     )
+
+
+def test_the_paper_s_state_and_force_are_the_room_s(still: Motion):
+    """Without relative observation and heading frame: features as they are, forces whatever the heading."""
+    config = EnvMimicConfig(relative_observation=False, heading_frame=False, observe_command=False)
+    robot = load_robot()
+    reference, _ = stack_motions(Simulator(robot), [still])
+    history = np.array(reference.features[0, 5 : 5 + HISTORY])
+    history[:, :3] += [3.0, -2.0, 0.0]
+    seen = network_input(jnp.asarray(history), jnp.zeros((HISTORY, 2)), config, robot)
+    features = np.concatenate([history[:, :6], history[:, 9:], history[:, 6:9]], axis=1)
+    np.testing.assert_allclose(np.asarray(seen).reshape(HISTORY, -1), features, atol=1e-5)
+    action = jnp.array([0.5, -0.2, 0.1])
+    loads = [world_loads(action, jnp.asarray(yaw), config, robot) for yaw in (0.0, 2.0)]
+    np.testing.assert_allclose(loads[0], loads[1], atol=1e-7)
+
+
+@pytest.mark.parametrize(("spread", "lengths"), [(0.0, {10}), (0.5, set(range(5, 16)))])
+def test_episodes_are_as_long_as_the_options_say(spread: float, lengths: set[int], still: Motion):
+    config = EnvMimicConfig(episode_seconds=10 * CONTROL_TIMESTEP, episode_spread=spread)
+    env = EnvMimicEnv(Simulator(load_robot()), [still], config)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 200))
+    assert set(np.asarray(tracking_state(state).remaining).tolist()) == lengths
 
 
 def test_force_stays_within_its_limit():

@@ -62,9 +62,11 @@ sys.exit(residual.self_test(sys.argv[1]))
 """Runs an exported simulator where there are NumPy and MuJoCo only."""
 
 
-def network(robot: RobotDescription, forces: ForceSet, seed: int = 0, activation: Any = "swish") -> BoundForces:
+def network(
+    robot: RobotDescription, forces: ForceSet, seed: int = 0, activation: Any = "swish", **settings: bool
+) -> BoundForces:
     """A network drawn at random, that pushes with tenths of a newton."""
-    config = ForceNetworkConfig(forces=forces, force_scale=0.1, torque_scale=0.01)
+    config = ForceNetworkConfig(forces=forces, force_scale=0.1, torque_scale=0.01, **settings)
     options = PPOConfig(policy_layers=(16, 8), value_layers=(4,), activation=activation)
     rng = np.random.default_rng(seed)
     inputs, loads = num_inputs(config, robot), num_loads(config, robot)
@@ -98,14 +100,15 @@ def air(robot: RobotDescription, delay: float) -> BoundForces:
 
 
 def rover(folder: Path) -> AugmentedSimulator:
-    """Forces at the points by a network, and a fluid, on top of a second network."""
+    """Forces at the points by a network, and a fluid, below a second network that sees and pushes in the world."""
     robot = write_rover(folder)
     text = robot.model.read_text()
     # MJX finds other points of contact between a box and a plane than C MuJoCo.
     robot.model.write_text(text.replace("<option ", '<option gravity="0 0 -0.1" ').replace("<worldbody>", OFF, 1))
     robot = read_description(robot.file)
     simulator = Simulator(robot).with_residual(network(robot, "multi"))
-    return simulator.with_residual(fluid(robot)).with_residual(network(robot, "wrench", 1, "tanh"))
+    in_the_world = network(robot, "wrench", 1, "tanh", relative_observation=False, heading_frame=False)
+    return simulator.with_residual(fluid(robot)).with_residual(in_the_world)
 
 
 def arm(folder: Path) -> AugmentedSimulator:

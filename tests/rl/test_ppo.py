@@ -47,6 +47,17 @@ def trained() -> tuple[dict[str, np.ndarray], Calls]:
     return learner.stored(last), calls
 
 
+def test_orthogonal_hidden_layers_keep_lengths():
+    """Times the root of 2, as Stable-Baselines3 draws them; the output's layer is drawn as always."""
+    config = dataclasses.replace(SMALL, orthogonal_init=True, policy_layers=(24, 16))
+    layers = ppo.make_networks({ppo.STATE: (32,)}, 3, config).policy_network.init(jax.random.key(0))["params"]
+    hidden = [np.asarray(x) for x in jax.tree.leaves(layers) if x.shape in ((32, 24), (24, 16))]
+    squares = [kernel.T @ kernel for kernel in hidden]
+    assert len(squares) == 2
+    for square in squares:
+        np.testing.assert_allclose(square, 2 * np.eye(len(square)), atol=1e-5)
+
+
 def test_learning_curve_rises(trained):
     _, calls = trained
     rewards = [metrics["reward"] for _, _, metrics in calls[1:]]

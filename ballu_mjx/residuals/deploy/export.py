@@ -183,7 +183,8 @@ def _network_part(simulator: AugmentedSimulator, model: NetworkForces, params: A
         "kind": "network",
         "name": model.name,
         "forces": config.forces,
-        "anchored": robot.anchored,
+        "relative_observation": config.relative_observation and not robot.anchored,
+        "heading_frame": config.heading_frame and not robot.anchored,
         "observe_command": config.observe_command,
         "command_ranges": [list(bounds) for bounds in robot.command_ranges],
         "activation": model.network.activation,
@@ -444,14 +445,14 @@ def _readme(
         if part.settings["kind"] == "network":
             seen = "\n".join(f"{i}. {name}" for i, name in enumerate(part.settings["inputs"]))
             pushed = ", ".join(part.settings["outputs"])
-            frame = "the world's axes" if robot.anchored else f"the heading frame of {robot.tracked}"
+            frame = f"the heading frame of {robot.tracked}" if part.settings["heading_frame"] else "the world's axes"
             lines.append(f"## What the network {part.settings['name']} sees")
             lines.append(
                 f"Vectors are in {frame}."
                 + (
-                    ""
-                    if robot.anchored
-                    else f" x and y of positions are from {robot.tracked} now; z is above the floor."
+                    f" x and y of positions are from {robot.tracked} now; z is above the floor."
+                    if part.settings["relative_observation"]
+                    else ""
                 )
                 + f" It pushes with: {pushed}."
             )

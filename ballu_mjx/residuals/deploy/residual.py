@@ -76,9 +76,9 @@ def heading_rotation(yaw: float) -> np.ndarray:
 
 def network_input(history: np.ndarray, commands: np.ndarray, part: Mapping[str, Any]) -> np.ndarray:
     """Return what a network sees, in the order of its `inputs` in `simulator.json`."""
-    now, anchored = history[-1], part["anchored"]
-    origin = now[POSITION] * (0.0 if anchored else np.array([1.0, 1.0, 0.0]))
-    heading = 0.0 if anchored else now[YAW]
+    now = history[-1]
+    origin = now[POSITION] * (np.array([1.0, 1.0, 0.0]) if part["relative_observation"] else 0.0)
+    heading = now[YAW] if part["heading_frame"] else 0.0
     seen = []
     for frame in history:
         vectors = np.concatenate([frame[:6], frame[FIRST_POINT:]]).reshape(-1, 3)
@@ -133,7 +133,7 @@ class NetworkPart:
         """Return the wrenches (N, N m; world): on the tracked body, then at the points where there are more."""
         part = self._part
         loads = self.loads(network_input(history, commands, part)).reshape(-1, 3)
-        if not part["anchored"]:
+        if part["heading_frame"]:
             loads = loads @ heading_rotation(history[-1, YAW]).T
         return loads.reshape(1, 6) if part["forces"] == "wrench" else np.pad(loads, [(0, 0), (0, 3)])
 
