@@ -117,10 +117,12 @@ def compare(
     effort: Effort,
     measure: Measure,
     columns: Sequence[str],
+    elsewhere: Mapping[str, Mapping[str, Simulator]] | None = None,
 ) -> str:
     """Return a Markdown table: each simulator alone and with each method's residual, on each group of tests.
 
-    Cells of several seeds are their mean, with the lowest and the highest.
+    Cells of several seeds are their mean, with the lowest and the highest. `elsewhere` are simulators, by group and
+    name, of tests with another model (a load) than the residual is learned with.
     """
     groups = list(tests)
     heads = [f"{group}: {', '.join(columns)}" for group in groups]
@@ -137,7 +139,13 @@ def compare(
                 residual = learn(method, simulator, motions, settled, seed, effort, evaluators)
                 _say(f"{name}, {method}, seed {seed}: step {residual.step}, {time.perf_counter() - began:.0f} s")
                 _say(residual.report)
-                looks = {g: evaluators.of(residual.model, tests[g]) for g in groups}
+                others = {group: by_name[name] for group, by_name in (elsewhere or {}).items()}
+                looks = {
+                    g: OpenLoopEvaluator(others[g], tests[g], residual.model)
+                    if g in others
+                    else evaluators.of(residual.model, tests[g])
+                    for g in groups
+                }
                 if alone is None:
                     alone = {g: [measure(look, look.replay(residual.params, scale=0.0))] for g, look in looks.items()}
                     lines.append(_row(name, alone))
