@@ -144,7 +144,7 @@ class Robot:
         states = world.getJointStates(body, self._driven)
         forces, targets = [], []
         for i, leg in enumerate(self._legs):
-            torque, velocity = leg.drive(command[i], *states[i][:2], *states[i + 2][:2])
+            torque, velocity = leg.drive(command[i], states[i][0], *states[i + 2][:2])
             forces.append(torque)
             targets.append(velocity)
         world.setJointMotorControlArray(body, self._driven[:2], pybullet.TORQUE_CONTROL, forces=forces)
@@ -216,7 +216,6 @@ class _Leg:
         self._gain, (self._bias, self._slope) = model.actuator_gainprm[servo, 0], model.actuator_biasprm[servo, :2]
         self._low, self._high = model.actuator_forcerange[servo]
         self._stiffness, self._rest = model.tendon_stiffness[cable], model.tendon_lengthspring[cable, 1]
-        self._damping = model.tendon_damping[cable]
         self._spring, self._springref = model.jnt_stiffness[knee], model.qpos_spring[model.jnt_qposadr[knee]]
         anchor = model.site(f"cable_femur_{side}").pos - model.body(f"tibia_{side}").pos
         arm = model.body(f"arm_{side}").pos
@@ -230,9 +229,7 @@ class _Leg:
         for name, value in vars(self).items():  # NumPy's scalars are slow
             setattr(self, name, value.tolist() if isinstance(value, np.generic | np.ndarray) else value)
 
-    def drive(
-        self, command: float, knee: float, knee_velocity: float, motor: float, motor_velocity: float
-    ) -> tuple[float, float]:
+    def drive(self, command: float, knee: float, motor: float, motor_velocity: float) -> tuple[float, float]:
         """Torque on the knee (N m), and the motor's velocity (rad/s) at the end of the physics step."""
         # The cable's upper end turns with the motor (about -y) and then with the knee (about y) around the knee's axis.
         sin_m, cos_m, sin_k, cos_k = math.sin(motor), math.cos(motor), math.sin(knee), math.cos(knee)
@@ -244,8 +241,7 @@ class _Leg:
         x_m, z_m = -self._radius * cos_m, -self._radius * sin_m
         by_motor = (dx * (cos_k * x_m + sin_k * z_m) + dz * (-sin_k * x_m + cos_k * z_m)) / length
 
-        rate = by_knee * knee_velocity + by_motor * motor_velocity
-        tension = self._stiffness * max(length - self._rest, 0.0) + self._damping * rate
+        tension = self._stiffness * max(length - self._rest, 0.0)
         servo = self._gain * command + self._bias + self._slope * motor
         servo = min(max(servo, self._low), self._high)
         pushed = motor_velocity + self._timestep * (servo - tension * by_motor) / self._inertia

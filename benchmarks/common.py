@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import datetime
-import importlib.metadata
 import json
 import os
-import platform
-import re
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -19,20 +15,12 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ballu_mjx.common import runtime
+from ballu_mjx.common import provenance, runtime
+from ballu_mjx.common.provenance import usable_cores as cores
 
 CHILD = "--child"
 """First argument of a script that is to measure one thing; the second is JSON."""
-_PACKAGES = (
-    "ballu-mjx", "jax", "mujoco", "mujoco-mjx", "brax", "pybullet", "torch", "stable-baselines3", "playground", "numpy"
-)  # fmt: skip
-
-
-def cores() -> list[int]:
-    """Ids of the cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return sorted(os.sched_getaffinity(0))
-    return list(range(os.cpu_count() or 1))
+_PACKAGES = (*provenance.PACKAGES, "pybullet", "torch", "stable-baselines3", "playground")
 
 
 def core_counts() -> list[int]:
@@ -46,25 +34,9 @@ def core_counts() -> list[int]:
 
 def machine() -> dict[str, Any]:
     """What a figure's reader must know of the machine. The load tells whether others were at work at the same time."""
-    facts: dict[str, str] = {}
-    for path, name in (("/proc/cpuinfo", "model name"), ("/proc/meminfo", "MemTotal")):
-        with contextlib.suppress(OSError):
-            found = re.search(rf"^{name}\s*:\s*(.+)$", Path(path).read_text(), re.MULTILINE)
-            facts[name] = found[1] if found else ""
-    versions = {}
-    for package in _PACKAGES:
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            versions[package] = importlib.metadata.version(package)
-    return {
-        "cpu": facts.get("model name", platform.processor()),
-        "architecture": platform.machine(),
-        "cores": len(cores()),
-        "memory": facts.get("MemTotal"),
-        "system": platform.system(),
-        "python": platform.python_version(),
-        "versions": versions,
-        "load": os.getloadavg() if hasattr(os, "getloadavg") else None,
-    }
+    versions = {name: version for name, version in provenance.package_versions(_PACKAGES).items() if version}
+    load = os.getloadavg() if hasattr(os, "getloadavg") else None
+    return {**provenance.describe_machine(), "versions": versions, "load": load}
 
 
 def described(machine: Mapping[str, Any]) -> str:

@@ -1,6 +1,6 @@
 """How far an exported simulator in C MuJoCo is from ours.
 
-`python benchmarks/exported_simulator.py RUN --recordings FOLDER ...`
+`python benchmarks/exported_simulator.py --case RUN FOLDER --case RUN FOLDER`
 
 From the first state of each recording, under its commands, three simulators run side by side: ours in single precision,
 ours in double precision, and the exported one. The differences tell a fault of the export from the rounding of single
@@ -10,11 +10,11 @@ precision. Positions are of the tracked site, angles of its body.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ballu_mjx.common import runtime
 
@@ -27,6 +27,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.common.results import Cell, Table, write_results
 from ballu_mjx.policies.simulators import load_simulator
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.reconstruct import reconstruct
@@ -34,6 +35,7 @@ from ballu_mjx.residuals.deploy.export import begin_rollout, export_simulator, i
 from ballu_mjx.residuals.deploy.residual import ImprovedSimulator
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState
+from ballu_mjx.viz.style import label_of
 
 PAIRS = (("exported", "double"), ("exported", "single"), ("single", "double"))
 """Simulators that are compared."""
@@ -88,24 +90,36 @@ def apart(one: Poses, other: Poses) -> tuple[Float[np.ndarray, "runs steps"], Fl
     return distance, 2 * np.rad2deg(np.arcsin(np.minimum(np.linalg.norm(turned, axis=-1), 1.0)))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("run", type=Path, help="run of a residual, of identified actuators or of a policy")
-    parser.add_argument("--recordings", type=Path, nargs="+", required=True, help="recordings, or folders of them")
-    parser.add_argument("--count", type=int, default=10, help="recordings to use")
-    parser.add_argument("--seconds", type=float, default=5.0, help="length of a rollout")
-    parser.add_argument("--output", type=Path, help="JSON file for the numbers")
-    options = parser.parse_args()
-    simulator = load_simulator(options.run)
+class Case(NamedTuple):
+    """A run's simulators beside each other, at the end of each rollout.
+
+    **Fields**
+
+    - `label`: robot and residual.
+    - `recordings`: their names.
+    - `apart`: distances (mm) and angles (deg) by pair of simulators.
+    """
+
+    label: str
+    recordings: list[str]
+    apart: dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]
+
+
+def measure(run: Path, recordings: Sequence[Path], count: int, seconds: float) -> Case:
+    """Return how far a run's simulators are apart after `seconds`, from the starts of `count` recordings.
+
+    **Raises** `InputError` where no recording is long enough.
+    """
+    simulator = load_simulator(run)
     robot = simulator.robot
-    steps = round(options.seconds / robot.control_timestep)
+    steps = round(seconds / robot.control_timestep)
     motions = []
-    for path in list_recordings(options.recordings):
-        motion = reconstruct(read_recording(path, robot), robot)
-        if len(motion.command) >= steps and len(motions) < options.count:
-            motions.append(motion)
+    for path in list_recordings(recordings):
+        if len(motions) < count:
+            motion = reconstruct(read_recording(path, robot), robot)
+            motions += [motion] if len(motion.command) >= steps else []
     if not motions:
-        raise InputError(f"No recording is {options.seconds:g} s long; give longer ones, or a smaller --seconds.")
+        raise InputError(f"No recording is {seconds:g} s long; give longer ones, or a smaller --seconds.")
     qpos, qvel = (np.stack([getattr(motion, name)[0] for motion in motions]) for name in ("qpos", "qvel"))
     commands = np.stack([motion.command[:steps] for motion in motions])
     model = improved_model(simulator)
@@ -117,27 +131,63 @@ def main() -> None:
     with jax.enable_x64(True):
         found["double"] = rollouts(in_double(simulator, model), qpos, qvel, commands)
     seen = {name: poses(robot, model, each) for name, each in found.items()}
-    report: dict[str, Any] = {"robot": robot.name, "run": str(options.run), "recordings": [m.name for m in motions]}
-    print(f"{robot.name}, {len(motions)} recordings, {options.seconds:g} s\n")
-    print("| simulators | after that, median | worst | largest at any time |")
-    print("| --- | ---: | ---: | ---: |")
+    differences = {(one, other): apart(seen[one], seen[other]) for one, other in PAIRS}
+    ends = {pair: (distance[:, -1], angle[:, -1]) for pair, (distance, angle) in differences.items()}
+    residual = "" if simulator.residual is None else f", {label_of(simulator.residual.model.name)}"
+    return Case(f"{robot.name}{residual}", [motion.name for motion in motions], ends)
+
+
+def cases_table(cases: Sequence[Case]) -> Table:
+    """Return median and worst differences over the recordings, one row a run."""
+    columns = ["robot, residual", "recordings"]
     for one, other in PAIRS:
-        distance, angle = apart(seen[one], seen[other])
-        report[f"{one}-{other}"] = {"mm": distance[:, -1].tolist(), "deg": angle[:, -1].tolist()}
-        cells = (
-            (np.median(distance[:, -1]), np.median(angle[:, -1])),
-            (distance[:, -1].max(), angle[:, -1].max()),
-            (distance.max(), angle.max()),
-        )
-        print(f"| {one} - {other} | {' | '.join(f'{mm:.2g} mm, {deg:.2g} deg' for mm, deg in cells)} |")
-    print("\n| recording | " + " | ".join(f"{one} - {other}" for one, other in PAIRS) + " |")
-    print("| --- |" + " ---: |" * len(PAIRS))
-    for number, motion in enumerate(motions):
-        pairs = [apart(seen[one], seen[other]) for one, other in PAIRS]
-        said = " | ".join(f"{mm[number, -1]:.2g} mm, {deg[number, -1]:.2g} deg" for mm, deg in pairs)
-        print(f"| {motion.name} | {said} |")
-    if options.output is not None:
-        options.output.write_text(json.dumps(report, indent=2) + "\n")
+        columns += [f"{one} - {other}: median (mm)", "worst (mm)", "worst (deg)"]
+    rows = []
+    for case in cases:
+        row: list[Cell | str] = [case.label, Cell((len(case.recordings),), "g")]
+        for pair in PAIRS:
+            distance, angle = case.apart[pair]
+            row += [Cell((float(x),), ".1g") for x in (np.median(distance), distance.max(), angle.max())]
+        rows.append(tuple(row))
+    return Table(tuple(columns), tuple(rows))
+
+
+def recordings_table(cases: Sequence[Case]) -> Table:
+    """Return the differences of every recording."""
+    columns = ["robot, residual", "recording"]
+    for one, other in PAIRS:
+        columns += [f"{one} - {other} (mm)", "(deg)"]
+    rows = []
+    for case in cases:
+        for number, recording in enumerate(case.recordings):
+            values = [float(each[number]) for pair in PAIRS for each in case.apart[pair]]
+            rows.append((case.label, recording, *(Cell((value,), ".1g") for value in values)))
+    return Table(tuple(columns), tuple(rows))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--case",
+        type=Path,
+        nargs="+",
+        action="append",
+        required=True,
+        metavar="PATH",
+        help="a run of a residual, of identified actuators or of a policy, then recordings or folders of them",
+    )
+    parser.add_argument("--count", type=int, default=10, help="recordings to use (10)")
+    parser.add_argument("--seconds", type=float, default=5.0, help="length of a rollout (5)")
+    parser.add_argument("--results", type=Path, help="JSON file to write; without it the tables are only printed")
+    options = parser.parse_args()
+    if any(len(case) < 2 for case in options.case):
+        raise InputError("--case takes a run and its recordings; give both.")
+    cases = [measure(run, recordings, options.count, options.seconds) for run, *recordings in options.case]
+    tables = {"cases": cases_table(cases), "recordings": recordings_table(cases)}
+    for table in tables.values():
+        print(table.to_markdown(), end="\n\n")
+    if options.results is not None:
+        write_results(options.results, tables, f"Differences after {options.seconds:g} s")
 
 
 if __name__ == "__main__":

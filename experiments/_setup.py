@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ballu_mjx.common.results import Table
 
 
 def prepare() -> None:
@@ -26,10 +30,22 @@ def prepare() -> None:
 
 
 def write_table(text: str, folder: Path) -> None:
-    """Print a Markdown table, and write it to `table.md` in a folder."""
+    """Print Markdown, and write it to `table.md` in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "table.md").write_text(text + "\n")
+    (folder / "table.md").write_text(text + "\n", encoding="utf-8")
     print(text)
+
+
+def write_tables(
+    tables: Mapping[str, Table], folder: Path, results: Path | None, seeds: Mapping[str, Sequence[int]]
+) -> None:
+    """Print tables, write them to `table.md` in a folder, and as data to `results` (None: not)."""
+    from ballu_mjx.common.results import write_results
+
+    write_table("\n\n".join(f"### {name}\n\n{table.to_markdown()}" for name, table in tables.items()), folder)
+    if results is not None:
+        write_results(results, tables, "Development data", seeds=seeds)
+        print(f"\nWritten to {results}; `python docs/render.py` renders it.")
 
 
 def run(main: Callable[[], None]) -> None:

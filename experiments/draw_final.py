@@ -9,17 +9,14 @@ from __future__ import annotations
 import argparse
 import datetime
 import hashlib
-import importlib.metadata
 import json
-import os
-import platform
 import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ballu_mjx.common import files
+from ballu_mjx.common import files, provenance
 from ballu_mjx.common.errors import InputError
 
 FORMAT = "ballu-final/1"
@@ -28,19 +25,6 @@ COUNTS: Mapping[str, int] = {"robots": 3, "robots_outside": 2, "recordings": 1, 
 sets of recordings, sets of trials, trainings of each method."""
 FIRST_SEED, SEEDS = 10_000, 2**31
 """Drawn seeds are from the first to below the second: development used small ones and a year's number."""
-_PACKAGES = (
-    "ballu-mjx",
-    "jax",
-    "jaxlib",
-    "mujoco",
-    "mujoco-mjx",
-    "brax",
-    "flax",
-    "optax",
-    "optimistix",
-    "numpy",
-    "scipy",
-)
 _ROOT = Path(__file__).parents[1]
 
 
@@ -75,12 +59,8 @@ def draw_final(tag: str, output: Path, repository: Path) -> dict[str, Any]:
         "commit": commit,
         "drawn": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
         "seeds": draw_seeds(commit),
-        "machine": {
-            "system": platform.system(),
-            "processor": platform.processor() or platform.machine(),
-            "cores": os.cpu_count(),
-        },
-        "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
+        "machine": provenance.describe_machine(),
+        "versions": provenance.package_versions(),
         "results": {},
     }
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -92,13 +72,6 @@ def _git(repository: Path, *arguments: str) -> str:
     """Return what git says; nothing where it fails."""
     done = subprocess.run(["git", "-C", str(repository), *arguments], capture_output=True, text=True)
     return done.stdout.strip() if done.returncode == 0 else ""
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def main() -> int:

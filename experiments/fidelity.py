@@ -22,7 +22,7 @@ import dataclasses
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 sys.path.append("experiments")  # a notebook runs in the repository's root
@@ -31,17 +31,16 @@ import _setup
 
 _setup.prepare()
 
+import collect_runs
 import numpy as np
-from jaxtyping import Float
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import dataset
+from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.errors_table import (
-    HORIZONS,
     SCORE_HORIZONS,
     Errors,
     Evaluation,
-    mean_by_group,
     quotient,
     read_evaluation,
 )
@@ -129,32 +128,6 @@ def simulated(folder: Path) -> float:
     return float(counted[-1] if len(counted) else read_column(folder, "reward")[0][-1])
 
 
-def race(folders: Mapping[str, list[Path]]) -> str:
-    """Markdown: how soon methods whose progress is measured open loop are as good on the validation recordings as
-    EnvMimic ever is, and how good after a fifth of the time that EnvMimic takes; means over seeds."""
-
-    def curve(folder: Path) -> tuple[Float[np.ndarray, " steps"], Float[np.ndarray, " steps"]]:
-        steps, error = read_column(folder, "validation_error")
-        return np.interp(steps, *read_column(folder, "seconds")), error
-
-    goal = float(np.mean([curve(folder)[1].min() for folder in folders["identified"]]))
-    fifth = float(np.mean([seconds(folder) for folder in folders["identified"]])) / 5
-    lines = [
-        f"| method | lowest validation error (score) | within {fifth:.0f} s | seconds to EnvMimic's lowest |",
-        "| --- | ---: | ---: | ---: |",
-    ]
-    for name, members in folders.items():
-        if METHODS[name].nominal or name in ("regression", "supervised", AIR, "air-lift"):
-            continue
-        curves = [curve(folder) for folder in members]
-        first = [float(time[np.argmax(error <= goal)]) for time, error in curves if np.any(error <= goal)]
-        soon = spread([float(error[time <= fifth].min(initial=1.0)) for time, error in curves])
-        when = f"{np.mean(first):.0f} ({len(first)} of {len(curves)} seeds)" if first else "never"
-        lowest = spread([float(error.min()) for _, error in curves])
-        lines.append(f"| {METHODS[name].label} | {lowest} | {soon} | {when} |")
-    return "\n".join(lines)
-
-
 @dataclasses.dataclass(frozen=True)
 class Recorded:
     """A virtual robot's recordings, and its identified actuators."""
@@ -218,22 +191,10 @@ def vanilla_errors(folder: Path, paths: list[Path]) -> tuple[Errors, ...]:
 
 
 # %% [markdown]
-# ## Table: mean over seeds, with the lowest and the highest
+# ## Tables
 
 
 # %%
-def spread(values: list[float], digits: int = 2) -> str:
-    """Mean and range, of one value that alone."""
-    if len(values) == 1:
-        return f"{values[0]:.{digits}f}"
-    return f"{np.mean(values):.{digits}f} ({min(values):.{digits}f} to {max(values):.{digits}f})"
-
-
-def ratios(values: list[float]) -> str:
-    """Mean and, in brackets, the range."""
-    return f"{np.mean(values):.2f}" + ("" if len(values) == 1 else f" [{min(values):.2f}, {max(values):.2f}]")
-
-
 Rows = Mapping[str, list[tuple[Errors, ...]]]
 """Of each simulator, by its label, what it is off by on a set of recordings, those of all seeds; vanilla first."""
 
@@ -249,101 +210,35 @@ def groups_of(rows: Rows) -> list[str]:
     return sorted({errors.group for errors in rows["vanilla"][0]}, reverse=True)
 
 
-def comparison(rows: Rows, effort: Mapping[str, str], horizon: float) -> str:
-    """Markdown: what simulators leave of vanilla's RMSE over `horizon` s, the range of that over seeds, and `effort`,
-    what learning took. In vanilla's row stand its errors themselves; the least of a column is bold, unless there is one
-    seed alone, which ranks nothing."""
+def comparison(rows: Rows, effort: Mapping[str, tuple[Cell, Cell]], horizon: float) -> Table:
+    """Return what simulators leave of vanilla's RMSE over `horizon` s, and `effort`, what learning took. In vanilla's
+    row stand its errors themselves."""
     columns = [(group, quantity) for group in groups_of(rows) for quantity in ("position", "orientation")]
-
-    def mean(run: Sequence[Errors], group: str, quantity: str) -> float:
-        return float(np.mean([getattr(e, quantity)[horizon][0] for e in run if e.group == group]))
-
-    head = [quantity if group == OTHER else f"{group}: {quantity}" for group, quantity in columns]
-    lines = [
-        f"| {horizon:g} s | " + " | ".join(head) + " | learning (s) | thousand control steps |",
-        "| --- " + "| ---: " * (2 + len(head)) + "|",
-    ]
-    whole = {column: mean(rows["vanilla"][0], *column) for column in columns}
-    errors = [f"{whole[c]:.3f} m" if c[1] == "position" else f"{whole[c]:.1f} deg" for c in columns]
-    lines.append("| vanilla | " + " | ".join(errors) + " | | |")
-    left = {
-        row: [[quotient(mean(run, *column), whole[column]) for run in runs] for column in columns]
-        for row, runs in rows.items()
-        if row != "vanilla"
-    }
-    least = [min(np.mean(cells[place]) for cells in left.values()) for place in range(len(columns))]
-    ranked = max(map(len, rows.values())) > 1
-    for row, cells in left.items():
-        best = [ranked and np.mean(c) == low for c, low in zip(cells, least, strict=True)]
-        said = [f"**{ratios(c)}**" if bold else ratios(c) for c, bold in zip(cells, best, strict=True)]
-        lines.append(f"| {row} | " + " | ".join([*said, effort.get(row, " | ")]) + " |")
-    return "\n".join(lines)
-
-
-def final_yaw(rows: Rows) -> str:
-    """Markdown: final yaw error (deg, absolute) after whole recordings, mean over a group's; mean and range over
-    seeds."""
-    groups = groups_of(rows)
-    lines = ["| final yaw error (deg) | " + " | ".join(groups) + " |", "| --- " + "| ---: " * len(groups) + "|"]
-    for row, found in rows.items():
-        cells = [
-            spread(
-                [float(np.mean([abs(e.final_orientation_error) for e in run if e.group == group])) for run in found], 0
-            )
-            for group in groups
+    called = {"position": "position", "orientation": "yaw"}
+    head = [called[q] if group == OTHER else f"{group}: {called[q]}" for group, q in columns]
+    whole = {column: collect_runs.group_mean(rows["vanilla"][0], *column, horizon) for column in columns}
+    first = [Cell((whole[c],), *((".3f", "m") if c[1] == "position" else (".1f", "deg"))) for c in columns]
+    made: list[tuple[Cell | str, ...]] = [("vanilla", *first, "", "")]
+    for row, runs in list(rows.items())[1:]:
+        left = [
+            Cell(tuple(quotient(collect_runs.group_mean(run, *column, horizon), whole[column]) for run in runs))
+            for column in columns
         ]
-        lines.append(f"| {row} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        made.append((row, *left, *effort.get(row, ("", ""))))
+    return Table((f"{horizon:g} s", *head, "learning (s)", "thousand control steps"), tuple(made))
 
 
-def worst_cases(rows: Rows) -> str:
-    """Markdown: how near each simulator comes to making things worse than vanilla: the largest excess over 1.2 times
-    vanilla's error plus 2 cm and 3 deg, over horizons and seeds (negative: within), of a group's mean and of a single
-    recording."""
-    lines = [
-        "| largest excess over 1.2 times vanilla + 2 cm, 3 deg | of a group's mean | of a single recording |",
-        "| --- | --- | --- |",
-    ]
-    vanilla = rows["vanilla"][0]
-    for row, found in list(rows.items())[1:]:
-        single = [Evaluation(vanilla, errors) for errors in found]
-        means = [Evaluation(mean_by_group(vanilla), mean_by_group(errors)) for errors in found]
-        worst = [max(each.excess() for each in some) for some in (means, single)]
-        lines.append(f"| {row} | " + " | ".join(f"{relative:+.0%}: {place}" for relative, place in worst) + " |")
-    return "\n".join(lines)
-
-
-def table(runs: list[Evaluation], base: str, name: str) -> str:
-    """Markdown: RMSE of the simulator `base` and of `name`, and their ratio, by group and horizon."""
-    lines = [
-        f"| test recordings | horizon (s) | position, {base} (m) | {name} (m) | ratio | yaw, {base} (deg) | "
-        f"{name} (deg) | ratio |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for group in runs[0].groups:
-        for horizon in HORIZONS:
-            cells = []
-            for quantity, digits in (("position", 3), ("orientation", 1)):
-                mean = [
-                    [np.mean([getattr(e, quantity)[horizon][0] for e in side if e.group == group]) for side in pair]
-                    for pair in ((run.vanilla, run.residual) for run in runs)
-                ]
-                cells.append(f"{mean[0][0]:.{digits}f}")
-                cells.append(spread([float(pair[1]) for pair in mean], digits))
-                cells.append("**" + spread([run.ratio(group, quantity, horizon) for run in runs]) + "**")
-            lines.append(f"| {group} | {horizon:g} | " + " | ".join(cells) + " |")
-    lines += [
-        "",
-        f"| whole recording | CoM error, {base} (m) | {name} (m) | final yaw error, {base} (deg) | {name} (deg) |",
-    ]
-    lines.append("| --- | --- | --- | --- | --- |")
-    for index, without in enumerate(runs[0].vanilla):
-        ours = [run.residual[index] for run in runs]
-        lines.append(
-            f"| {without.recording} | {without.mean_com_error:.2f} | {spread([e.mean_com_error for e in ours])} | "
-            f"{without.final_orientation_error:.0f} | {spread([e.final_orientation_error for e in ours], 0)} |"
-        )
-    return "\n".join(lines)
+def final_yaw(rows: Rows) -> Table:
+    """Return the final yaw error (deg, absolute) after whole recordings: means over a group's."""
+    groups = groups_of(rows)
+    made = []
+    for row, found in rows.items():
+        cells = []
+        for group in groups:
+            errors = [[abs(e.final_orientation_error) for e in run if e.group == group] for run in found]
+            cells.append(Cell(tuple(float(np.mean(each)) for each in errors), ".0f"))
+        made.append((row, *cells))
+    return Table(("final yaw error (deg)", *groups), tuple(made))
 
 
 # %% [markdown]
@@ -403,6 +298,7 @@ class Options:
     fresh: int
     output: Path
     quick: bool
+    results: Path | None
 
 
 def parse() -> Options:
@@ -420,9 +316,11 @@ def parse() -> Options:
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the larger test set")
     parser.add_argument("--output", type=Path, default=Path("runs/fidelity"), help="folder of the runs")
     parser.add_argument("--quick", action="store_true", help="train for seconds; the numbers mean nothing")
+    parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     arguments = parser.parse_args()
     methods = [name for name in METHODS if name in always or name in arguments.methods]
-    return Options(methods, arguments.seeds, arguments.robot, arguments.fresh, arguments.output, arguments.quick)
+    chosen = (arguments.seeds, arguments.robot, arguments.fresh, arguments.output, arguments.quick, arguments.results)
+    return Options(methods, *chosen)
 
 
 def arguments_of(method: Method, recorded: Recorded, training: list[Path], quick: bool) -> list[str]:
@@ -454,34 +352,30 @@ def main() -> None:
     recorded = record(options.robot, options.output)
     folders = learn(options, recorded)
     effort = {
-        METHODS[name].label: " | ".join(
-            f"{np.mean([of(folder) for folder in members]) / unit:,.0f}"
-            for of, unit in ((seconds, 1), (simulated, 1e3))
+        METHODS[name].label: (
+            Cell(tuple(seconds(folder) for folder in members), ".0f", spread=False),
+            Cell(tuple(simulated(folder) / 1e3 for folder in members), ",.0f", spread=False),
         )
         for name, members in folders.items()
     }
     each = 1 if options.quick else 6
     fresh = dataset.record_fresh(options.fresh, options.output, each, options.robot)
     policy = replayed_policy(options)
-    sets = {
-        "Bundled test recordings": recorded.test,
-        "Fresh test recordings": fresh,
-        "A vanilla policy's actions": [policy],
-    }
-    parts = []
+    sets = {"bundled": recorded.test, "fresh": fresh, "policy": [policy]}
+    tables: dict[str, Table] = {}
     for title, paths in sets.items():
         found = {
             name: [load(folder) for folder in members] if paths is recorded.test else evaluate(members, paths)
             for name, members in folders.items()
         }
         rows = rows_of(vanilla_errors(folders["identified"][0], paths), found)
-        parts += [f"### {title}", *(comparison(rows, effort, horizon) for horizon in SCORE_HORIZONS)]
-        parts += [final_yaw(rows), worst_cases(rows)]
-        parts += [table(found[name], "vanilla+sysid", METHODS[name].label) for name in ("identified", AIR)]
-    parts += ["### Progress", race(folders)]
-    text = "\n\n".join(parts)
+        tables |= {f"{title}-{horizon:g}": comparison(rows, effort, horizon) for horizon in SCORE_HORIZONS}
+        tables[f"{title}-yaw"] = final_yaw(rows)
+        for name in ("identified", AIR):
+            tables[f"{title}-{name}"] = collect_runs.errors_table(found[name])
     figure(folders, [*recorded.test, policy], options.output / "tracking.png")
-    _setup.write_table(text, options.output)
+    seeds = {"training": options.seeds, "robot": [options.robot], "recordings": [options.fresh]}
+    _setup.write_tables(tables, options.output, options.results, seeds)
     print(f"\nWritten to {options.output}.")
 
 

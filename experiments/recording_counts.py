@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.ballu.virtual import dataset
+from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.viz.style import colour_of, label_of
 
 METHODS = {"identified": "envmimic", "regression": "supervised", "analytic": "analytic", "aerodynamic": "aerodynamic"}
@@ -69,16 +70,15 @@ def left(folders: list[Path], group: str, quantity: str) -> Float[np.ndarray, " 
     return np.array([fidelity.load(folder).ratio(group, quantity, HORIZON) for folder in folders])
 
 
-def table(found: dict[str, dict[int, list[Path]]]) -> str:
-    """Markdown: mean and range over seeds."""
+def table(found: dict[str, dict[int, list[Path]]]) -> Table:
+    """Return mean and range over seeds."""
     columns = [(group, quantity) for group in GROUPS for quantity in QUANTITIES]
-    lines = ["| method | recordings | " + " | ".join(f"{group}, {quantity}" for group, quantity in columns) + " |"]
-    lines.append("| --- " * (2 + len(columns)) + "|")
+    rows = []
     for name, counts in found.items():
         for count, folders in counts.items():
-            cells = [fidelity.ratios(list(left(folders, *column))) for column in columns]
-            lines.append(f"| {label_of(METHODS[name])} | {count} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+            cells = [Cell(tuple(left(folders, *column).tolist())) for column in columns]
+            rows.append((label_of(METHODS[name]), Cell((count,), "g"), *cells))
+    return Table(("method", "recordings", *(f"{group}, {quantity}" for group, quantity in columns)), tuple(rows))
 
 
 def figure(found: dict[str, dict[int, list[Path]]], path: Path) -> None:
@@ -122,13 +122,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="one training a seed (0 1 2)")
     parser.add_argument("--output", type=Path, default=Path("runs/recording_counts"), help="folder of the runs")
     parser.add_argument("--quick", action="store_true", help="learn for seconds; the numbers mean nothing")
+    parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()
     if arguments.quick:
         arguments.counts, arguments.seeds = arguments.counts[:2], arguments.seeds[:1]
     found = learn(arguments)
-    text = table(found)
     figure(found, arguments.output / "recording_counts.png")
-    _setup.write_table(text, arguments.output)
+    seeds = {"training": arguments.seeds}
+    _setup.write_tables({"recordings": table(found)}, arguments.output, arguments.results, seeds)
     print(f"\nWritten to {arguments.output}.")
 
 

@@ -46,6 +46,8 @@ from matplotlib.figure import Figure
 from ballu_mjx.ballu.recordings import base_position
 from ballu_mjx.cli import pipeline
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.common.results import write_results
+from ballu_mjx.evaluation.transfer import Transfer, read_transfer, transfer_table
 from ballu_mjx.policies import pipeline_layout
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.registry import load_robot
@@ -70,8 +72,8 @@ Way = Float[np.ndarray, "samples 2"]
 
 
 # %%
-def read_ways(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[list[Way]]]:
-    """Read the base's way from above (m), `[setting][seed][trial]`, from its start, of settings that all seeds have.
+def finished_trials(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[Path]]:
+    """Return the folders of trials, `[setting][seed]`, of settings that all seeds have.
 
     **Raises** `InputError` where `folder` holds no such trials.
     """
@@ -79,7 +81,7 @@ def read_ways(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[l
     for setting in (*pipeline_layout.SETTINGS, *pipeline_layout.settings_beyond(folder / f"seed-{seeds[0]}", task)):
         trials = [folder / f"seed-{seed}" / f"trials-{task}-{setting}" for seed in seeds]
         if all(_finished(trial) for trial in trials):
-            found[setting] = [[_way(path) for path in sorted(trial.glob("trial-*.csv.gz"))] for trial in trials]
+            found[setting] = trials
     if not found:
         numbers = " ".join(map(str, seeds))
         raise InputError(
@@ -87,6 +89,22 @@ def read_ways(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[l
             f"`python -m ballu_mjx.train all --output {folder} --tasks {task} --seeds {numbers}`."
         )
     return found
+
+
+def read_ways(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[list[Way]]]:
+    """Read the base's way from above (m), `[setting][seed][trial]`, from its start."""
+    return {
+        setting: [[_way(path) for path in sorted(trial.glob("trial-*.csv.gz"))] for trial in trials]
+        for setting, trials in finished_trials(folder, task, seeds).items()
+    }
+
+
+def read_trials(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[list[Transfer]]]:
+    """Read what the trials came to, `[setting][seed][trial]`."""
+    return {
+        setting: [read_transfer(trial / "transfer.json") for trial in trials]
+        for setting, trials in finished_trials(folder, task, seeds).items()
+    }
 
 
 def _finished(trials: Path) -> bool:
@@ -177,6 +195,7 @@ def main() -> None:
     )
     parser.add_argument("--quick", action="store_true", help="train for seconds; the numbers mean nothing")
     parser.add_argument("--figure-only", action="store_true", help="draw from the trials that are there; run nothing")
+    parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     given = parser.parse_args()
     output = given.output or (QUICK_OUTPUT if given.quick else OUTPUT)
     written = []
@@ -193,6 +212,11 @@ def main() -> None:
             )
         )
         written.append(pipeline_layout.table_file(output, given.task))
+        if given.results is not None:
+            table = transfer_table(given.task, read_trials(output, given.task, given.seeds))
+            seeds = {"training": given.seeds, "robot": [given.robot_seed]}
+            write_results(given.results, {given.task: table}, "Development data", seeds=seeds)
+            written.append(given.results)
     written.append(output / FIGURES[given.task])
     draw(read_ways(output, given.task, given.seeds), given.seeds, written[-1])
     print(f"Written: {', '.join(map(str, written))}.")

@@ -37,7 +37,7 @@ class Ballu(RobotAdapter, RecordingHooks):
     """A robot with BALLU's legs: hips, knees with springs, and servos on the feet that bend the knees by cables."""
 
     def check(self, robot: RobotDescription, model: mujoco.MjModel) -> str | None:
-        """Return which name of BALLU's the model or the description lacks."""
+        """Return which name of BALLU's the model or the description lacks, or that a slack cable transmits forces."""
         kinds = mujoco.mjtObj
         needed = [(kinds.mjOBJ_BODY, name) for name in ("base", "balloon")]
         needed += [(kinds.mjOBJ_BODY, f"{part}_{side}") for part in ("femur", "tibia", "arm") for side in SIDES]
@@ -49,6 +49,9 @@ class Ballu(RobotAdapter, RecordingHooks):
         own = (robot.tracked, robot.points, robot.commands, robot.joints)
         if robot.anchored or hinges != JOINTS or missing or own != ("balloon", _POINTS, SIDES, _ANGLES):
             return f"it has other {missing[0] if missing else 'names'} than BALLU"
+        for side in SIDES:
+            if model.tendon_damping[model.tendon(f"cable_{side}").id] > 0:
+                return f'tendon cable_{side} has damping, which acts while it is slack (write damping="0")'
         return None
 
     def initial_qpos(self, robot: RobotDescription, model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:

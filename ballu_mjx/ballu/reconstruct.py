@@ -186,7 +186,6 @@ def _servos(
         "radius": tips[:, 2],
         "sideways": ties[:, 1] - arms[:, 1] - tips[:, 1],
         "stiffness": model.tendon_stiffness[cables],
-        "cable_damping": model.tendon_damping[cables],
         "rest": model.tendon_lengthspring[cables, 1],
         "gain": model.actuator_gainprm[servos, 0],
         "offset": model.actuator_biasprm[servos, 0],
@@ -244,7 +243,6 @@ def _servo_chunk(
 
     def sample(state: tuple[Array, Array], inputs: tuple[Array, Array, Array]) -> tuple:
         tie, ahead, command = inputs
-        tie_rate = (ahead - tie) / (substeps * dt)
 
         def substep(i: Array, state: tuple[Array, Array]) -> tuple[Array, Array]:
             angle, rate = state
@@ -253,11 +251,9 @@ def _servo_chunk(
             gap = tip - (tie + (ahead - tie) * (i / substeps))
             length = jnp.sqrt(jnp.sum(gap**2, -1) + c["sideways"] ** 2)
             moment = jnp.sum(gap * along, -1) / length
-            length_rate = moment * rate - jnp.sum(gap * tie_rate, -1) / length
-            tension = c["stiffness"] * jnp.maximum(length - c["rest"], 0.0) + c["cable_damping"] * length_rate
+            tension = c["stiffness"] * jnp.maximum(length - c["rest"], 0.0)
             servo = jnp.clip(c["gain"] * command + c["offset"] + c["feedback"] * angle, *c["limits"])
-            resistance = c["damping"] + c["cable_damping"] * moment**2
-            rate += dt * (servo - c["damping"] * rate - moment * tension) / (c["armature"] + dt * resistance)
+            rate += dt * (servo - c["damping"] * rate - moment * tension) / (c["armature"] + dt * c["damping"])
             return angle + dt * rate, rate
 
         return jax.lax.fori_loop(0, substeps, substep, state), state

@@ -12,6 +12,7 @@ from typing import Any
 
 import tyro
 
+from ballu_mjx.cli._help import arranged, asks_for_help
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.run_config import run_robot
 from ballu_mjx.rl.ppo import PPOConfig
@@ -50,11 +51,7 @@ class TrainCommand:
     @property
     def help(self) -> str:
         """The summary, and what --quick makes of the options."""
-        changed = [
-            f"--{name.replace('_', '-')} {value}" if not isinstance(value, bool) else _flag(name, value)
-            for values in self.quick.values()
-            for name, value in values.items()
-        ]
+        changed = [_flag(name, value) for values in self.quick.values() for name, value in values.items()]
         return self.summary + (f" Defaults under --quick: {' '.join(changed)}." if changed else "")
 
     def implied(self, name: str, data: Any) -> Mapping[str, Any] | None:
@@ -84,8 +81,12 @@ class TrainCommand:
         }
 
 
-def _flag(name: str, value: bool) -> str:
-    return f"--{'' if value else 'no-'}{name.replace('_', '-')}"
+def _flag(name: str, value: Any) -> str:
+    """Return an option as one would type it."""
+    flag = name.replace("_", "-")
+    if isinstance(value, bool):
+        return f"--{'' if value else 'no-'}{flag}"
+    return " ".join([f"--{flag}", *map(str, value if isinstance(value, tuple) else (value,))])
 
 
 def parsers(commands: Mapping[str, TrainCommand], sections: Mapping[str, Mapping[str, Any]] | None = None) -> dict:
@@ -110,8 +111,11 @@ def run_command(commands: Mapping[str, TrainCommand], arguments: Sequence[str] |
     """
 
     def parse(sections: Mapping[str, Mapping[str, Any]] | None = None) -> Any:
+        made = parsers(commands, sections)
+        if asks_for_help(arguments):
+            made = {name: arranged(each, commands[name].sections) for name, each in made.items()}
         return tyro.extras.subcommand_cli_from_dict(
-            parsers(commands, sections),
+            made,
             args=arguments,
             prog=PROGRAM,
             description=description,

@@ -8,6 +8,7 @@ from typing import Any
 
 import tyro
 
+from ballu_mjx.cli._help import arranged, asks_for_help
 from ballu_mjx.common import runtime
 
 
@@ -24,8 +25,9 @@ def run_subcommand(
 
     def parse_and_run() -> int:
         runtime.prepare()
+        helps = asks_for_help(arguments)
         options = tyro.extras.subcommand_cli_from_dict(
-            dict(subcommands),
+            {name: arranged(each) if helps else each for name, each in subcommands.items()},
             args=arguments,
             prog=f"python -m ballu_mjx {name}",
             description=description,

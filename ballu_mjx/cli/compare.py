@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import tyro
 
+from ballu_mjx.cli._help import parse_options
 from ballu_mjx.common import runtime
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.statistics import LEVEL, t_interval
@@ -51,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def run() -> None:
         runtime.prepare()
-        _compare(tyro.cli(Options, args=arguments, prog="python -m ballu_mjx compare"))
+        _compare(parse_options(Options, arguments, "python -m ballu_mjx compare"))
 
     return runtime.exit_status(run, arguments)
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from ballu_mjx.cli._help import parse_options
 from ballu_mjx.common import files, runtime
 from ballu_mjx.common.errors import InputError
 
@@ -45,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def run() -> None:
         runtime.prepare()
-        options = tyro.cli(Options, args=arguments, prog="python -m ballu_mjx evaluate")
+        options = parse_options(Options, arguments, "python -m ballu_mjx evaluate")
         _evaluate(options)
 
     return runtime.exit_status(run, arguments)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import tyro
 
+from ballu_mjx.cli._help import parse_options
 from ballu_mjx.common import files, runtime
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.viz import video
@@ -36,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status (`runtime.exit_status`)."""
 
     def run() -> None:
-        options = tyro.cli(Options, args=arguments, prog="python -m ballu_mjx report")
+        options = parse_options(Options, arguments, "python -m ballu_mjx report")
         if options.video:
             video.choose_renderer()
         runtime.prepare()

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tyro
 
+from ballu_mjx.cli._help import parse_options
 from ballu_mjx.common import runtime
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, read_rollouts
@@ -42,6 +43,8 @@ class Options(runtime.CommandOptions):
     """Show it in the browser at once."""
     mujoco: bool = False
     """Open MuJoCo's own viewer instead, which needs a screen."""
+    rerun: Path | None = None
+    """Write a file for Rerun's viewer instead, NAME.rrd: the recording (or task) of --show. Needs the extra rerun."""
     robot: str = "ballu"
     """Robot of a recording: its name, or the file of its description. A run knows its own."""
     show: str | None = None
@@ -53,15 +56,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def run() -> None:
         try:
-            options = tyro.cli(Options, args=arguments, prog="python -m ballu_mjx view")
+            options = parse_options(Options, arguments, "python -m ballu_mjx view")
             if not 0 <= options.port <= 65535:
                 raise InputError(f"--port is {options.port}: it must be between 0 and 65535.")
+            if options.rerun is not None and options.mujoco:
+                raise InputError("--rerun does not go with --mujoco; leave one out.")
             if options.mujoco:
                 check_screen()
             runtime.prepare()
             takes = load(options.source, options.robot)
             first = choose(takes, options.show)
-            if options.mujoco:
+            if options.rerun is not None:
+                from ballu_mjx.viz.rerun_file import write_rerun
+
+                write_rerun(options.rerun, takes[first])
+                print(f"Written to {options.rerun}; `rerun {options.rerun}` shows it.")
+            elif options.mujoco:
                 _mujoco(takes[first])
             else:
                 _serve(takes, first, options)

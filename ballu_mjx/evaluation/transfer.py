@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
+from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.statistics import LEVEL, seed_means, t_interval
 
 STRIDE = 1.0
@@ -188,7 +189,7 @@ def walking_table(results: Mapping[str, Sequence[Sequence[Transfer]]]) -> str:
     have, tells gaits from what is none: mean and range of `gait.count_steps` over all trials, on the robot and in the
     policies' own simulators. The caption says what the brackets are.
     """
-    return _table(results, _WALKING, PAPER_WALKING)
+    return _text(results, "walk")
 
 
 def turning_table(results: Mapping[str, Sequence[Sequence[Transfer]]]) -> str:
@@ -196,26 +197,30 @@ def turning_table(results: Mapping[str, Sequence[Sequence[Transfer]]]) -> str:
 
     The final yaw error is the mean of absolute values, for errors to either side cancel; the paper's is signed.
     """
-    return _table(results, _TURNING, PAPER_TURNING)
+    return _text(results, "turn")
 
 
-def _table(
-    results: Mapping[str, Sequence[Sequence[Transfer]]],
-    columns: Sequence[_Column],
-    paper: Mapping[str, tuple[float, float, float]],
-) -> str:
+def transfer_table(task: str, results: Mapping[str, Sequence[Sequence[Transfer]]]) -> Table:
+    """Return `walking_table` or `turning_table`, by the task `walk` or `turn`, as data."""
+    columns, paper = {"walk": (_WALKING, PAPER_WALKING), "turn": (_TURNING, PAPER_TURNING)}[task]
     titles = ["setting", *(title for column in columns for title in (column.title, column.paper))]
-    titles.append("steps; in simulation")
-    lines = [titles, ["---"] + ["---:"] * (len(titles) - 1)]
+    rows = []
     for setting, seeds in results.items():
-        cells = [setting]
+        cells: list[Cell | str] = [setting]
         for index, column in enumerate(columns):
-            cells.append(_cell([[column.of(trial) for trial in trials] for trials in seeds], column.digits))
-            cells.append(f"{paper[setting][index]:.2f}" if setting in paper else "-")
+            means = seed_means([[column.of(trial) for trial in trials] for trials in seeds])
+            found = t_interval(means)
+            bounds = None if found.low is None or found.high is None else (found.low, found.high)
+            cells.append(Cell(tuple(means), f".{column.digits}f", bounds=bounds))
+            cells.append(Cell((paper[setting][index],)) if setting in paper else "-")
         trials = [trial for trials in seeds for trial in trials]
         cells.append(f"{_range([each.steps for each in trials])}; {_range([each.sim_steps for each in trials])}")
-        lines.append(cells)
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines) + f"\n\n{_caption(results)}"
+        rows.append(tuple(cells))
+    return Table((*titles, "steps; in simulation"), tuple(rows))
+
+
+def _text(results: Mapping[str, Sequence[Sequence[Transfer]]], task: str) -> str:
+    return f"{transfer_table(task, results).to_markdown()}\n\n{_caption(results)}"
 
 
 def _caption(results: Mapping[str, Sequence[Sequence[Transfer]]]) -> str:
@@ -227,13 +232,6 @@ def _caption(results: Mapping[str, Sequence[Sequence[Transfer]]]) -> str:
         f"Means over {count} seeds, each the mean of its trials. Brackets are {LEVEL:.0%} confidence intervals over "
         "seeds (Student's t); a single seed has none."
     )
-
-
-def _cell(values: Sequence[Sequence[float]], digits: int) -> str:
-    found = t_interval(seed_means(values))
-    if found.half is None:
-        return f"{found.mean:.{digits}f}"
-    return f"{found.mean:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
 
 
 def _range(values: Sequence[float]) -> str:

@@ -6,13 +6,13 @@ import contextlib
 import dataclasses
 import datetime
 import hashlib
-import importlib.metadata
 import reprlib
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ballu_mjx.common import provenance
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.actuators import actuators_from_json, actuators_to_json
 from ballu_mjx.recordings.csv_format import sidecar_path
@@ -23,7 +23,6 @@ from ballu_mjx.runs.folder import config_section
 from ballu_mjx.runs.layout import CONFIG_FILE, RUN_FORMAT
 
 _LONGEST_PATH = 300
-_PACKAGES = ("ballu-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "optimistix", "numpy")
 
 
 def run_actuators(config: Mapping[str, Any], folder: Path, robot: RobotDescription) -> ModelParameters | None:
@@ -104,8 +103,9 @@ def describe_run(
             {
                 "time": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
                 "command": list(sys.argv),
-                "python": sys.version.split()[0],
-                "versions": {name: _version(name) for name in _PACKAGES},
+                "commit": provenance.source_commit(),
+                "machine": provenance.describe_machine(),
+                "versions": provenance.package_versions(),
                 "devices": list(devices),
             }
         ],
@@ -152,10 +152,3 @@ def find_recordings(config: Mapping[str, Any], use: str, folder: Path) -> list[P
 
 def _cut(place: str) -> str:
     return place if len(place) < _LONGEST_PATH else place[:_LONGEST_PATH] + "..."
-
-
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None

@@ -9,10 +9,10 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model, standing_qpos
-from ballu_mjx.ballu.reconstruct import BASE_PITCH, _servo_chunk
+from ballu_mjx.ballu.reconstruct import BASE_PITCH, _servo_chunk, complete_joints
 from ballu_mjx.ballu.recordings import make_recording
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
-from ballu_mjx.recordings.motion import Motion, ReconstructionParameters, add_capture_noise
+from ballu_mjx.recordings.motion import MeasurementGrid, Motion, ReconstructionParameters, add_capture_noise
 from ballu_mjx.recordings.reconstruct import differentiate, reconstruct
 from ballu_mjx.recordings.recording import Recording, cut
 from ballu_mjx.robots.registry import load_robot
@@ -200,16 +200,22 @@ def test_pitch_follows_the_measured_base_against_the_torque_balance(truth):
 
 
 def test_velocities_have_no_lag(truth, seen_with_base, seen_without_base):
-    """The error is least against the truth of the same instant, not of one 10 ms before or after."""
+    """The error is least against the truth of the same instant, not of one 10 ms before or after.
+
+    In one sample in ten a foot lands or a knee meets its stop: these make most of the mean square, and say little of
+    the lag. The other nine tell it.
+    """
+    bounds = (([0, 1, 2], 0.02, 0.008), ([3, 5], 0.04, 0.02), ([4], 0.35, 0.12), ([7, 10], 0.4, 0.15))
     for motion in (seen_with_base, seen_without_base):
-        for columns, limit in (([0, 1, 2], 0.02), ([3, 5], 0.04), ([4], 0.35), ([7, 10], 0.4), ([8, 11], 1.1)):
-            error = {
-                shift: np.sqrt(
-                    np.mean((motion.qvel[2:-2] - at_control_rate(truth.qvel, motion, shift))[:, columns] ** 2)
-                )
-                for shift in range(-3, 4)
-            }
-            assert error[0] < limit, columns
+        for columns, limit, usual_limit in (*bounds, ([8, 11], 1.3, 0.4)):
+            error = {}
+            for shift in range(-3, 4):
+                apart = np.abs(motion.qvel[2:-2] - at_control_rate(truth.qvel, motion, shift))[:, columns].ravel()
+                if shift == 0:
+                    assert np.sqrt(np.mean(apart**2)) < limit, columns
+                usual = np.sort(apart)[: len(apart) * 9 // 10]
+                error[shift] = np.sqrt(np.mean(usual**2))
+            assert error[0] < usual_limit, columns
             if columns != [3, 5]:  # slower than the shifts can tell
                 assert min(error, key=lambda shift: error[shift]) == 0, (columns, error)
 
@@ -359,6 +365,30 @@ def test_lengths_share_a_program(truth, seen_without_base):
     assert len(motion.qpos) == 67
     assert _servo_chunk._cache_size() == before  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
     np.testing.assert_allclose(motion.qpos[5:50, 7:], seen_without_base.qpos[5:50, 7:], atol=np.deg2rad(1.0))
+
+
+def test_a_slack_cable_leaves_the_servo_alone():
+    """Knees that swing, bent further than the cables reach: the motors go as without cables."""
+    time = np.arange(200) * STEP
+    command = np.where(time[:, None] % 1.0 < 0.5, 0.3, 0.0) * np.ones(2)
+    grid = MeasurementGrid(STEP, 5, command, {}, {}, {})
+    qpos = np.tile(standing_qpos(MODEL), (len(time), 1))
+    qpos[:, KNEES] = np.deg2rad(75 + 10 * np.sin(2 * np.pi * 2.0 * time))[:, None]
+    cut = load_model()
+    cut.tendon_stiffness[:] = cut.tendon_damping[:] = 0
+    found, alone = (complete_joints(model, grid, qpos, np.zeros((len(time), 14)))[0] for model in (MODEL, cut))
+    assert np.ptp(alone[:, MOTORS]) > 0.3
+    np.testing.assert_allclose(found[:, MOTORS], alone[:, MOTORS], atol=1e-12)
+
+
+def test_a_model_with_damped_cables_is_refused():
+    """The reconstruction has none, and MuJoCo's would act on slack cables."""
+    damped = load_model()
+    robot = load_robot()
+    assert robot.adapter.check(robot, damped) is None
+    damped.tendon_damping[1] = 1.0
+    problem = robot.adapter.check(robot, damped)
+    assert problem is not None and "cable_right" in problem
 
 
 def test_suspended_and_short_recordings_are_refused(truth):

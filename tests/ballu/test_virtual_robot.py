@@ -51,6 +51,57 @@ def _balloon_acceleration(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndar
     return acceleration[3:] + model.opt.gravity
 
 
+def test_the_air_is_one_added_mass_and_a_magnus_force_beside_drag(virtual: virtual_robot.VirtualRobot):
+    """Translating, rotating and accelerating at once, without drag: what the air adds to inverse dynamics.
+
+    Kirchhoff's equations for a mass and inertia alike along all axes: m a and I alpha at the balloon's centre, with
+    no further force or torque of velocity (Coriolis, Munk); and the Magnus force of its volume. In the world's axes.
+    """
+    whole = virtual_robot.build(virtual)
+    airless = virtual_robot.build(dataclasses.replace(virtual, added_mass=0.0, added_inertia=0.0))
+    airless.opt.density = 0.0
+    whole.geom_fluid[whole.geom("air").id, 1:5] = 0.0  # drag and the lift that goes with it
+    balloon = whole.body("balloon").id
+    air = virtual_robot.AIR_DENSITY * 4 / 3 * np.pi * np.prod(virtual.balloon_semi_axes)
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        position, rates, accelerations = rng.normal(0, 1.0, (3, whole.nv))
+        needed = []
+        for model in (whole, airless):
+            model.opt.gravity[:] = 0.0
+            data = mujoco.MjData(model)
+            mujoco.mj_integratePos(model, data.qpos, position, 0.3)
+            data.qpos[2] = 3.0
+            data.qvel[:], data.qacc[:] = rates, accelerations
+            mujoco.mj_inverse(model, data)
+            needed.append(data.qfrc_inverse + data.qfrc_constraint)
+        velocity, acceleration = np.zeros(6), np.zeros(6)
+        mujoco.mj_rnePostConstraint(airless, data)
+        mujoco.mj_objectVelocity(airless, data, mujoco.mjtObj.mjOBJ_BODY, balloon, velocity, 0)
+        mujoco.mj_objectAcceleration(airless, data, mujoco.mjtObj.mjOBJ_BODY, balloon, acceleration, 0)
+        translation, rotation = np.zeros((2, 3, whole.nv))
+        mujoco.mj_jacBodyCom(airless, data, translation, rotation, balloon)
+        force = virtual.added_mass * acceleration[3:] - air * np.cross(velocity[:3], velocity[3:])
+        torque = virtual.added_inertia * acceleration[:3]
+        expected = translation.T @ force + rotation.T @ torque
+        np.testing.assert_allclose(needed[0] - needed[1], expected, atol=1e-9)
+
+
+def test_drag_is_that_of_the_balloon_alone(virtual: virtual_robot.VirtualRobot):
+    """Along the ellipsoid's shortest axis: half of density, frontal area and squared speed. Legs feel no air."""
+    model = virtual_robot.build(virtual)
+    data = mujoco.MjData(model)
+    data.qvel[0], data.qvel[6:] = 0.3, 0.0
+    mujoco.mj_forward(model, data)
+    _, b, c = virtual.balloon_semi_axes
+    drag = 0.5 * virtual_robot.AIR_DENSITY * np.pi * b * c * 0.3**2
+    np.testing.assert_allclose(data.qfrc_fluid[:3], [-drag, 0.0, 0.0], atol=1e-9)
+    assert np.all(data.qfrc_fluid[7:] == 0.0)
+    data.qvel[:7], data.qvel[7:] = 0.0, 5.0
+    mujoco.mj_forward(model, data)
+    assert np.all(data.qfrc_fluid == 0.0)
+
+
 def test_lift_is_the_stated_share_of_the_robots_weight(virtual: virtual_robot.VirtualRobot):
     """Standing still in still air, the floor carries what lift does not; the added mass of air weighs nothing."""
     model = virtual_robot.build(virtual)

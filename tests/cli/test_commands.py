@@ -4,6 +4,7 @@ import dataclasses
 import importlib.util
 import json
 import pkgutil
+import re
 import shutil
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import pytest
 from ballu_mjx import __main__ as package
 from ballu_mjx import cli
 from ballu_mjx.__main__ import COMMANDS, NAMES
-from ballu_mjx.cli import completion
+from ballu_mjx.cli import completion, train
 from ballu_mjx.cli._command import TrainCommand, run_command
 from ballu_mjx.common import runtime
 from ballu_mjx.common.errors import InputError
@@ -123,6 +124,19 @@ def test_help_tells_the_defaults_without_and_with_quick(line: str, sizes: str, c
     told = " ".join(capsys.readouterr().out.split())
     assert f"Defaults under --quick: {sizes}" in told
     assert "(default: 3000000)" in told or "sysid" in line
+
+
+@pytest.mark.parametrize("line", [line for line in SUBCOMMANDS if line.startswith("train ")])
+def test_help_shows_every_option_once_in_a_newcomers_order(line: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit):
+        main(f"{line} --help")
+    shown = re.findall(r"^\W{1,3}--([a-z][\w-]*)", capsys.readouterr().out, re.MULTILINE)
+    sections = train._commands()[line.split()[1]].sections.values()
+    options = [field.name.replace("_", "-") for section in sections for field in dataclasses.fields(section)]
+    assert sorted(shown) == sorted(options)
+    order = ("recordings", "output", "num-timesteps", "forces", "learning-rate", "coordinator", "debug")
+    found = [shown.index(name) for name in order if name in shown]
+    assert found == sorted(found) and shown[-1] == "debug"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -153,8 +153,10 @@ def test_braxs_own_ppo_trains_on_it_unchanged(run: Path):
     assert after > before + 1.0, (before, after)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
-    importlib.util.find_spec("stable_baselines3") is None, reason="stable-baselines3 (and PyTorch) are not installed"
+    importlib.util.find_spec("stable_baselines3") is None,
+    reason="not installed: pip install -c constraints.txt stable-baselines3 and PyTorch's build for the CPU",
 )
 def test_stable_baselines3_improves_in_an_improved_simulator():
     import torch  # pyright: ignore[reportMissingImports]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import mujoco
@@ -18,6 +19,7 @@ from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.runs.folder import Run
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, read_rollouts, write_rollouts
 from ballu_mjx.viz import robot_meshes, viser_scene
+from ballu_mjx.viz.style import label_of
 
 BALLOON = Path(__file__).parents[2] / "experiments" / "tethered_balloon" / "balloon.robot.json"
 
@@ -163,3 +165,41 @@ def test_replay_is_of_the_format_that_the_documentation_names(run: Path):
     with np.load(run / ROLLOUT_FILE) as file:
         assert str(file["format"]) == "ballu-replay/2" and str(file["robot/path"]).endswith("balloon.robot.json")
         assert json.loads((run / "config.json").read_text())["robot_description"]["sha256"] == str(file["robot/sha256"])
+
+
+def test_a_rerun_file_holds_the_poses_of_every_robot(run: Path, tmp_path: Path):
+    rerun = pytest.importorskip("rerun", reason='rerun-sdk is not installed: pip install -e ".[rerun]"')
+    path = tmp_path / "replay.rrd"
+    assert view.main([str(run), "--rerun", str(path)]) == 0
+    chunks = {
+        chunk.entity_path: chunk.to_record_batch() for chunk in rerun.chunk.RrdReader(str(path)).stream().to_chunks()
+    }
+    (rollout,) = read_rollouts(run / ROLLOUT_FILE)
+    model = rollout.description.load_model()
+    data = mujoco.MjData(model)
+    data.qpos[:] = rollout.qpos["envmimic"][7]
+    mujoco.mj_kinematics(model, data)
+    # Down the tree of bodies, as the viewer does.
+    body, place, turn = model.nbody - 1, np.zeros(3), np.array([1.0, 0, 0, 0])
+    above = [body]
+    while model.body_parentid[above[0]] != 0:
+        above.insert(0, model.body_parentid[above[0]])
+    entity = f"/world/{label_of('envmimic')}"
+    for each in above:
+        entity += f"/{model.body(each).name}"
+        row = chunks[entity].slice(7, 1).to_pydict()
+        (x, y, z, w), moved = row["Transform3D:quaternion"][0][0], np.zeros(3)
+        mujoco.mju_rotVecQuat(moved, np.array(row["Transform3D:translation"][0][0], float), turn)
+        place, before = place + moved, turn.copy()
+        mujoco.mju_mulQuat(turn, before, np.array([w, x, y, z], float))
+    np.testing.assert_allclose(place, data.xpos[body], atol=1e-6)
+    assert chunks["/world/force"].num_rows == len(rollout.time) - 1
+    assert f"/command/{rollout.description.commands[0]}" in chunks
+
+
+def test_without_rerun_one_line_says_what_to_install(run: Path, tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert view.main([str(run), "--rerun", str(tmp_path / "replay.rrd")]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and 'pip install -c constraints.txt -e ".[rerun]"' in told
+    assert view.main([str(run), "--rerun", "x.rrd", "--mujoco"]) == 2

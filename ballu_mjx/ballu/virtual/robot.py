@@ -1,8 +1,8 @@
 """A stand-in for the hardware: a family of virtual robots in C MuJoCo that the training simulator does not contain.
 
 What differs from `assets/ballu.xml`: a time step of 0.5 ms and explicit (semi-implicit Euler) integration in double
-precision; air, by MuJoCo's ellipsoid model on the balloon cluster (drag, lift, Magnus force) with the added mass that
-model leaves out, and a slow draught that is another one in every trial; servos and cables that differ left to right
+precision; air on the balloon cluster, by MuJoCo's ellipsoid model (drag, lift, Magnus force) and an added mass and
+inertia in its body, and a slow draught that is another one in every trial; servos and cables that differ left to right
 (gain, zero, torque limit, friction, backlash, slack); knee springs and stops likewise; a balloon cluster a little off
 centre; command latency. The robot is seen through motion capture alone: 100 Hz, 0.5 mm, 0.3 deg, hidden markers.
 
@@ -45,7 +45,6 @@ CAPTURE_TIMESTEP = 0.01
 _TICK = 1e-3
 """Seconds between two looks at the command queue; latency is resolved to it."""
 AIR_DENSITY = 1.2
-AIR_VISCOSITY = 1.8e-5
 POSITION_NOISE = 5e-4
 ORIENTATION_NOISE = float(np.deg2rad(0.3))
 
@@ -80,7 +79,7 @@ class VirtualRobot:
     balloon_semi_axes: tuple[float, float, float]
     """The ellipsoid of air that the cluster displaces (m)."""
     added_mass: float
-    """Mass of air that the cluster drags along (kg); its weight is carried by lift."""
+    """Mass of air that the cluster drags along (kg), alike in all directions; its weight is carried by lift."""
     added_inertia: float
     """Rotational counterpart of `added_mass` (kg m^2)."""
     buoyancy: float
@@ -164,7 +163,7 @@ def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     spec.option.iterations, spec.option.ls_iterations, spec.option.tolerance = 50, 50, 1e-9
-    spec.option.density, spec.option.viscosity = AIR_DENSITY, AIR_VISCOSITY
+    spec.option.density = AIR_DENSITY
 
     balloon = spec.body("balloon")
     centre = np.asarray(balloon.ipos) + virtual.balloon_offset
@@ -200,7 +199,28 @@ def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
     model.body_inertia[index] += virtual.added_inertia
     model.body_gravcomp[index] = (lift + virtual.added_mass * gravity) / (model.body_mass[index] * gravity)
     mujoco.mj_setConst(model, mujoco.MjData(model))
+    _leave_drag_lift_and_magnus_force(model)
     return model
+
+
+def _leave_drag_lift_and_magnus_force(model: mujoco.MjModel) -> None:
+    """Take from MuJoCo's fluid model, in place, what does not belong to this robot's air.
+
+    - The virtual mass and inertia of the ellipsoid. MuJoCo has their velocity-dependent forces alone. The body has the
+      whole of an added mass already: mass `added_mass` at the centre has momentum m v, whose rate is m (dv/dt + w x v)
+      in the body's frame, Kirchhoff's force for equal added masses along all axes, without a Munk moment (m v x v = 0).
+    - Drag of the other bodies. A body without an ellipsoid would get that of its inertia box; one whose coefficients
+      are all 0 gets none.
+    """
+    air = model.geom("air").id
+    model.geom_fluid[air, _VIRTUAL_MASS] = 0.0
+    for body in range(1, model.nbody):
+        if body != model.geom_bodyid[air]:
+            model.geom_fluid[model.body_geomadr[body]] = np.eye(model.geom_fluid.shape[1])[0]
+
+
+_VIRTUAL_MASS = slice(6, 12)
+"""In a row of `geom_fluid`: interaction, five coefficients of drag, lift and Magnus force, virtual mass and inertia."""
 
 
 @dataclasses.dataclass

@@ -1,0 +1,152 @@
+"""The order of options in --help: data, length of training and what to learn first; processes and debugging last.
+
+tyro shows options by the dataclass that holds them, those of base classes first. Help alone is therefore made from
+other dataclasses, which hold the same options by what they are for.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import sys
+import textwrap
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, NamedTuple, TypeVar
+
+import tyro
+
+_Options = TypeVar("_Options")
+_ASKS_FOR_HELP = ("-h", "--help")
+
+
+class _Group(NamedTuple):
+    title: str
+    description: str
+    names: tuple[str, ...]
+    """Options in the order that help shows them in."""
+
+
+_FIRST = (
+    _Group(
+        "data",
+        "Recordings, robot and simulator, and where results go. A path is a recording (.csv or .csv.gz) or a folder of "
+        "them.",
+        ("recordings", "validation", "test", "robot", "actuators", "residual", "levels", "fixed_from", "mapping")
+        + ("commands", "format", "robot_seed", "tasks", "output"),
+    ),
+    _Group(
+        "length of training",
+        "How long and how often to learn, and from where to go on.",
+        ("quick", "num_timesteps", "policy_steps", "residual_steps", "updates", "relinearizations", "evaluations")
+        + ("starts", "steps", "rounds", "seed", "seeds", "trials", "takes", "validate_every", "keep_every", "resume"),
+    ),
+    _Group(
+        "what to learn",
+        "Choices that decide what comes out.",
+        ("forces", "terms", "free", "force_scales", "motion", "objective", "also", "domain_randomization"),
+    ),
+)
+_LAST = (
+    _Group(
+        "several processes",
+        "One training by several processes, on one machine or many (docs/distributed.md).",
+        ("coordinator", "num_processes", "process_id"),
+    ),
+    _Group("logging and debugging", "", ("wandb", "debug")),
+)
+_DETAILS = {
+    "data": "more",
+    "env": "task details",
+    "ppo": "reinforcement learning details",
+    "fit": "method details",
+    "windows": "details of windows",
+    "sampling": "details of sampling",
+    "story": "more",
+}
+"""Titles of what is left of a section."""
+
+
+def asks_for_help(arguments: Sequence[str] | None) -> bool:
+    """Return whether the arguments (None: the process's own) ask for --help."""
+    return any(each in _ASKS_FOR_HELP for each in (sys.argv[1:] if arguments is None else arguments))
+
+
+def parse_options(options: type[_Options], arguments: Sequence[str] | None, prog: str) -> _Options:
+    """Return a command's options from its arguments (None: the process's own); --help shows them in order."""
+    if asks_for_help(arguments):
+        tyro.cli(arranged(options), args=arguments, prog=prog, config=(tyro.conf.OmitArgPrefixes,))
+    return tyro.cli(options, args=arguments, prog=prog)
+
+
+def arranged(options: type, sections: Mapping[str, Any] | None = None) -> type:
+    """Return a dataclass for --help alone, which holds the options of another one in groups.
+
+    **Arguments**
+
+    - `options`: the command's options; where it has `sections`, a dataclass of these.
+    - `sections`: the defaults of each section, by name; None: `options` has none.
+    """
+    held = {"": options} if sections is None else sections
+    found = {name: _described_fields(section) for name, section in held.items()}
+
+    def take(wanted: Sequence[_Group]) -> list[tuple[str, str, list[Any]]]:
+        taken = []
+        for group in wanted:
+            fields = [fields.pop(name) for name in group.names for fields in found.values() if name in fields]
+            if fields:
+                taken.append((group.title, group.description, fields))
+        return taken
+
+    first, last = take(() if sections is None else _FIRST), take(_LAST)
+    rest = []
+    for name, fields in found.items():
+        if fields:
+            described = "" if sections is None or name == "data" else inspect.getdoc(type(sections[name])) or ""
+            rest.append((_DETAILS.get(name, name), described, list(fields.values())))
+    made = []
+    for number, (title, description, fields) in enumerate([*first, *rest, *last]):
+        if not title:
+            made += fields
+            continue
+        group = dataclasses.make_dataclass(f"Group{number}", fields, frozen=True, kw_only=True)
+        group.__doc__ = description or " "  # without text, dataclasses write their signature there
+        made.append((f"group{number}", Annotated[group, tyro.conf.arg(name=title)]))
+    result = dataclasses.make_dataclass(options.__name__, made, frozen=True, kw_only=True)
+    result.__doc__ = options.__doc__
+    return result
+
+
+def _described_fields(section: Any) -> dict[str, tuple[str, Any, Any]]:
+    """Return the fields of a dataclass, or of an instance with other defaults, as `dataclasses.make_dataclass` takes
+    them, by name, with their help."""
+    options = section if isinstance(section, type) else type(section)
+    hints, said, found = typing.get_type_hints(options, include_extras=True), _field_docstrings(options), {}
+    for field in dataclasses.fields(options):
+        kind = Annotated[hints[field.name], tyro.conf.arg(help=said.get(field.name, ""))]
+        copied = dataclasses.field(default=field.default, default_factory=field.default_factory)  # pyright: ignore
+        if section is not options:
+            copied = dataclasses.field(default=getattr(section, field.name))
+        found[field.name] = (field.name, kind, copied)
+    return found
+
+
+def _field_docstrings(options: type) -> dict[str, str]:
+    """Return the text under each field, of the class and of those that it is made from."""
+    found: dict[str, str] = {}
+    for cls in reversed(options.__mro__):
+        if not dataclasses.is_dataclass(cls):
+            continue
+        body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+        assert isinstance(body, ast.ClassDef)
+        for field, text in zip(body.body, body.body[1:], strict=False):
+            if (
+                isinstance(field, ast.AnnAssign)
+                and isinstance(field.target, ast.Name)
+                and isinstance(text, ast.Expr)
+                and isinstance(text.value, ast.Constant)
+                and isinstance(text.value.value, str)
+            ):
+                found[field.target.id] = " ".join(text.value.value.split())
+    return found

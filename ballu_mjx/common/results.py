@@ -1,0 +1,189 @@
+"""Tables as data: `results/NAME.json`, written by the command that measured, and rendered as Markdown.
+
+A table has rows of cells. A cell is text, or numbers: one a seed or repetition. Rendering shows their mean, with the
+lowest and the highest, or an interval, where there are several.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import json
+import math
+import statistics
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ballu_mjx.common import files, provenance
+from ballu_mjx.common.errors import InputError, is_number
+
+RESULTS_FORMAT = "ballu-results/1"
+_ROOT = Path(__file__).parents[2]
+_FIX = "write it anew by the command that it names"
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """Numbers of one cell: one a seed or repetition."""
+
+    values: tuple[float, ...]
+    """Infinite ones stand for simulations that diverged."""
+    form: str = ".2f"
+    """Python's format of a number."""
+    unit: str = ""
+    spread: bool = True
+    """Show the lowest and the highest beside the mean."""
+    bounds: tuple[float, float] | None = None
+    """Ends of a confidence interval, shown instead of the lowest and the highest; None: there is none."""
+
+    def to_text(self) -> str:
+        """Return the mean, and the lowest and the highest in brackets; without them where there is one value."""
+        if not self.values:
+            return ""
+        if not all(map(math.isfinite, self.values)):
+            broken = sum(not math.isfinite(value) for value in self.values)
+            return "diverged" if len(self.values) == 1 else f"diverged in {broken} of {len(self.values)}"
+        ends = (min(self.values), max(self.values)) if self.bounds is None else self.bounds
+        mean, low, high = (format(value, self.form) for value in (statistics.fmean(self.values), *ends))
+        unit = f" {self.unit}" if self.unit else ""
+        return f"{mean}{unit}" + (f" [{low}, {high}]" if self.spread and len(self.values) > 1 else "")
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Rows of cells under the columns' names."""
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell | str, ...], ...]
+
+    def __post_init__(self) -> None:
+        if any(len(row) != len(self.columns) for row in self.rows):
+            raise ValueError(f"a row has not the {len(self.columns)} cells of the columns")
+
+    def to_markdown(self) -> str:
+        """Return the table as Markdown; columns with numbers are aligned to the right."""
+        numbers = [any(isinstance(row[i], Cell) for row in self.rows) for i in range(len(self.columns))]
+        lines = [self.columns, tuple("---:" if right else "---" for right in numbers)]
+        lines += [tuple(cell.to_text() if isinstance(cell, Cell) else cell for cell in row) for row in self.rows]
+        return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+@dataclasses.dataclass(frozen=True)
+class Results:
+    """Tables of one command, and where their numbers come from.
+
+    **Fields**
+
+    - `command`: what measured, as typed in the repository's root.
+    - `commit`: of the code that measured; None: not a checkout.
+    - `machine`, `versions`: see `common.provenance`.
+    - `seeds`: by use.
+    - `data`: what the numbers are of, for the caption, such as "Development data".
+    """
+
+    tables: Mapping[str, Table]
+    command: str
+    commit: str | None
+    time: str
+    machine: Mapping[str, Any]
+    versions: Mapping[str, str | None]
+    seeds: Mapping[str, Sequence[int]]
+    data: str
+
+    def caption(self) -> str:
+        """Return sentences that say what the numbers are of, and where they come from."""
+        commit = ""
+        if self.commit is not None:
+            commit = f" at commit {self.commit[:7]}" + (" with changes" if provenance.CHANGED in self.commit else "")
+        seeds = "".join(f" {use.capitalize()} seeds: {', '.join(map(str, s))}." for use, s in self.seeds.items())
+        return f"{self.data}. `{self.command}`{commit}, {self.machine['cores']} cores of {self.machine['cpu']}.{seeds}"
+
+
+def command_line(arguments: Sequence[str] | None = None) -> str:
+    """Return what was typed (None: this process), as from the repository's root; other folders are left out."""
+    script, *rest = sys.argv if arguments is None else arguments
+    parts = []
+    for part in (script, *rest):
+        path = Path(part)
+        if path.is_absolute() or (part == script and path.exists()):
+            path = path.resolve()
+            part = str(path.relative_to(_ROOT)) if path.is_relative_to(_ROOT) else path.name
+        parts.append(part)
+    return " ".join(["python", *parts])
+
+
+def write_results(
+    path: Path,
+    tables: Mapping[str, Table],
+    data: str,
+    *,
+    seeds: Mapping[str, Sequence[int]] | None = None,
+    measured: Mapping[str, Any] | None = None,
+    packages: Sequence[str] = provenance.PACKAGES,
+) -> None:
+    """Write tables with the command, commit, machine, versions and seeds that they come from.
+
+    **Arguments**
+
+    - `data`: what the numbers are of, for the caption.
+    - `measured`: `commit`, `machine` and `versions` of what measured, where that was another process; None: this one.
+    - `packages`: whose versions are written.
+    """
+    here: Mapping[str, Any] = measured or {
+        "commit": provenance.source_commit(),
+        "machine": provenance.describe_machine(),
+        "versions": provenance.package_versions(packages),
+    }
+    content = {
+        "format": RESULTS_FORMAT,
+        "data": data,
+        "command": command_line(),
+        "commit": here["commit"],
+        "time": datetime.datetime.now().astimezone().isoformat(timespec="seconds"),
+        "machine": here["machine"],
+        "versions": here["versions"],
+        "seeds": {use: list(values) for use, values in (seeds or {}).items()},
+        "tables": {name: _table_to_json(table) for name, table in tables.items()},
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files.write(path, json.dumps(content, indent=1) + "\n")
+
+
+def read_results(path: Path) -> Results:
+    """Return what `write_results` wrote.
+
+    **Raises** `InputError` where the file is none of the format.
+    """
+    content = files.read_json(path, _FIX)
+    if content.get("format") != RESULTS_FORMAT:
+        raise InputError(f"{path}: is not of the format {RESULTS_FORMAT}; {_FIX}.")
+    try:
+        tables = {name: _table_from_json(table) for name, table in content["tables"].items()}
+        return Results(tables, **{f.name: content[f.name] for f in dataclasses.fields(Results) if f.name != "tables"})
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: lacks a part, or holds a wrong one ({error}); {_FIX}.") from None
+
+
+def _table_to_json(table: Table) -> dict[str, Any]:
+    def cell(value: Cell | str) -> Any:
+        if isinstance(value, str):
+            return value
+        stored = dataclasses.asdict(value)
+        return stored | {"values": [x if math.isfinite(x) else None for x in value.values]}
+
+    return {"columns": list(table.columns), "rows": [[cell(value) for value in row] for row in table.rows]}
+
+
+def _table_from_json(content: Mapping[str, Any]) -> Table:
+    def cell(value: Any) -> Cell | str:
+        if isinstance(value, str):
+            return value
+        if not all(x is None or is_number(x) for x in value["values"]):
+            raise ValueError("a cell holds what is no number")
+        values = tuple(math.inf if x is None else float(x) for x in value["values"])
+        bounds = None if value["bounds"] is None else (float(value["bounds"][0]), float(value["bounds"][1]))
+        return Cell(**value | {"values": values, "bounds": bounds})
+
+    return Table(tuple(content["columns"]), tuple(tuple(cell(value) for value in row) for row in content["rows"]))
