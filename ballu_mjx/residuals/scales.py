@@ -4,7 +4,7 @@ That size is told by one-step inverse dynamics along the training recordings. Ea
 from its recorded state, under what the model and a base residual explain. What the velocities after it lack is averaged
 over a quarter of a second, for single steps show noise. It is then shared out to the loads of a force set by least
 squares in kinetic energy. What a load does to the velocities is measured by a second simulation: by mass and time alone
-a stiff servo, which undoes most of it within the step, would look like a small load.
+what acts on a stiffly driven joint, whose actuator undoes most of it within the step, would look like a small load.
 """
 
 from __future__ import annotations
