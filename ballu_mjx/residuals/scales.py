@@ -111,21 +111,21 @@ def missing_loads(
     reference, _ = stack_motions(plain, motions)
     found = []
     for number, motion in enumerate(motions):
-        applied = _base_forces(augmented, model, reference, number, motion)
-        after = _step(plain, model, motion, motion.command, applied)
+        applied, sent = _base_residual(augmented, model, reference, number, motion)
+        after = _step(plain, model, motion, sent, applied)
         lacking = _averaged(motion.qvel[1:] - after, window)[::every]
         here = np.arange(0, len(motion.command), every)
         mass, acts = _inertia(robot, model, motion.qpos[here], forces)
         root = np.linalg.cholesky(mass).swapaxes(1, 2)
         if acts is None:
             low, high = np.array(robot.command_ranges).T
-            nudges = _NUDGE * (high - low) * np.where(motion.command > (low + high) / 2, -1.0, 1.0)
+            nudges = _NUDGE * (high - low) * np.where(sent > (low + high) / 2, -1.0, 1.0)
         else:
             guess = _shared_out(root, np.linalg.solve(mass, acts) * robot.control_timestep, lacking)
             nudges = np.broadcast_to(_size(guess), (len(motion.command), acts.shape[2]))
         effects = []
         for place, nudge in enumerate(nudges.T):
-            command, pushed = motion.command.copy(), applied.copy()
+            command, pushed = sent.copy(), applied.copy()
             if acts is None:
                 command[:, place] += nudge
             else:
@@ -194,28 +194,31 @@ def _averaged(values: Float[np.ndarray, "steps nv"], window: int) -> Float[np.nd
         return np.array(sums).T / np.asarray(count)[:, None]
 
 
-def _base_forces(
+def _base_residual(
     simulator: AugmentedSimulator, model: mujoco.MjModel, reference: ReferenceMotions, number: int, motion: Motion
-) -> Float[np.ndarray, "steps nv"]:
-    """Return the generalized forces of the base residual in recorded states; 0 where there is no history."""
-    applied = np.zeros((len(motion.command), model.nv))
+) -> tuple[Float[np.ndarray, "steps nv"], Float[np.ndarray, "steps commands"]]:
+    """Return what the base residual does in recorded states that have a history: generalized forces, and the commands
+    that it makes of the recorded ones, as their mean over each control step."""
+    applied, sent = np.zeros((len(motion.command), model.nv)), motion.command.copy()
     if simulator.residual is None:
-        return applied
+        return applied, sent
     bound: BoundForces = simulator.residual
 
-    def ask(time: Array) -> tuple[Array, Array]:
+    def ask(time: Array) -> tuple[Array, Array, Array]:
         history = jax.lax.dynamic_slice_in_dim(reference.features[number], time - HISTORY + 1, HISTORY)
         seen = history, commands_seen(reference.command[number], time)
-        along = bound.model.joint_force(bound.params, *seen)
-        return bound.model.wrench(bound.params, *seen), jnp.zeros(model.nv) if along is None else along
+        along, change = (ask(bound.params, *seen) for ask in (bound.model.joint_force, bound.model.command_change))
+        command = bound.model.command(bound.params, seen[1]).mean(axis=0) + (0.0 if change is None else change)
+        return bound.model.wrench(bound.params, *seen), jnp.zeros(model.nv) if along is None else along, command
 
     times = np.arange(HISTORY - 1, len(motion.command))
-    wrenches, along = map(np.asarray, jax.jit(jax.vmap(ask))(times))
+    wrenches, along, commands = map(np.asarray, jax.jit(jax.vmap(ask))(times))
+    sent[times] = np.clip(commands, *np.array(simulator.robot.command_ranges).T)
     data = mujoco.MjData(model)
     for time, wrench, joint in zip(times, wrenches, along, strict=True):
         data.qpos[:] = motion.qpos[time]
         applied[time] = joint + _jacobians(simulator.robot, model, data, len(wrench)).T @ wrench.ravel()
-    return applied
+    return applied, sent
 
 
 def _jacobians(

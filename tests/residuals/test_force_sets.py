@@ -138,9 +138,8 @@ def test_labels_and_scales_are_what_is_missing(
     motion = move(robot, **truth)
     np.testing.assert_allclose(missing_loads(simulator, [motion], forces), np.abs(loads), rtol=0.1)
     # With half of it in a base residual, half is missing.
-    if forces == "joints":
-        base = simulator.with_residual(constant(robot, forces, loads / 2))
-        np.testing.assert_allclose(missing_loads(base, [motion], forces), np.abs(loads) / 2, rtol=0.15)
+    base = simulator.with_residual(constant(robot, forces, loads / 2))
+    np.testing.assert_allclose(missing_loads(base, [motion], forces), np.abs(loads) / 2, rtol=0.15)
     config = settle_scales(ForceNetworkConfig(forces=forces), simulator, [motion])
     labels = supervised.ForceLabeller(Linearizer(simulator, forces=forces), SupervisedConfig(), config)(motion)
     np.testing.assert_allclose(np.median(labels, axis=0), loads, rtol=0.1)
