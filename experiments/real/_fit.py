@@ -11,18 +11,12 @@ import numpy as np
 
 from ballu_mjx.identification.fit_robot import RobotFit
 
-METHODS = ("supervised", "analytic", "envmimic")
-"""Ways to learn a residual."""
-
 
 def parse(description: str | None) -> argparse.Namespace:
-    """Return the options of the command line."""
+    """Return the options `data` and `quick` of the command line."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
     parser.add_argument("--quick", action="store_true", help="show that it works; the numbers mean little")
-    parser.add_argument("--seeds", type=int, default=3, help="trainings of each residual (3)")
-    parser.add_argument("--methods", nargs="+", default=["supervised"], choices=METHODS, help="residuals to learn")
-    parser.add_argument("--residuals-only", action="store_true", help="leave the identification out")
     return parser.parse_args()
 
 

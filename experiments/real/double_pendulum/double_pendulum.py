@@ -8,10 +8,6 @@
 # `pos_meas2` (rad); `command_shoulder`, `command_elbow` are `tau_con / 20 + 0.5`. Places of `middle` and `tip` follow
 # by forward kinematics.
 #
-# Then residual torques at the joints are learned (`--forces joints`): beside the nominal model, and beside the one with
-# the published friction, for what that leaves. `--residuals-only` leaves the identification out. `--seeds` says how
-# many trainings there are, `--methods` by which methods.
-#
 # Masses, lengths and inertias of the model are the published ones. Six recordings train, two choose nothing but show
 # whether identification helps (validation), two are the test. The published friction is replayed beside.
 #
@@ -31,18 +27,13 @@ import _setup
 _setup.prepare()
 
 import _fit
-import _residuals
 import numpy as np
 
-from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_robot import FitConfig, HeldOut, RobotFit, fit_robot, replay
-from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, cut_windows, held_motion, measure
+from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, cut_windows, measure
 from ballu_mjx.recordings.csv_format import read_recording
-from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.robots.description import read_description
-from ballu_mjx.sim.simulator import Simulator
 
 TRAINING = ("143339", "143524", "143601", "143704", "144115", "154220")
 VALIDATION = ("143747", "143906")
@@ -109,76 +100,20 @@ def tip(angles: np.ndarray) -> np.ndarray:
     return np.stack([0.2 * np.sin(upper) + 0.3 * np.sin(lower), -0.2 * np.cos(upper) - 0.3 * np.cos(lower)], axis=-1)
 
 
-# %% [markdown]
-# ## Residuals
-
-
-# %%
-HORIZONS = (0.2, 0.4, 1.0)
-
-
-def end_errors(evaluator: OpenLoopEvaluator, replay: Replay) -> np.ndarray:
-    """Median absolute errors (deg) of shoulder and elbow after 0.2, 0.4 and 1 s."""
-    each = [np.median(_residuals.angle_errors(evaluator, replay, seconds), axis=0) for seconds in HORIZONS]
-    return np.concatenate(each)
-
-
-def residuals(data: Path, seeds: int, methods: list[str], *, quick: bool) -> str:
-    """Return the table of residuals, on test recordings and on the acrobot's swing-ups (far)."""
-    robot = read_description(FOLDER / "double_pendulum.robot.json")
-    model, step = robot.load_model(), robot.control_timestep
-
-    def motions(paths: list[Path]) -> list[Motion]:
-        return [held_motion(read_recording(path, robot), robot, model, SAMPLING) for path in paths]
-
-    def named(names: tuple[str, ...]) -> list[Motion]:
-        return motions([data / f"sysid-20230629-{name}.csv.gz" for name in names])
-
-    swings = sorted(data.glob("acrobot-ilqr_tvlqr_lqr-experiment*.csv.gz"))
-    few = slice(0, 1) if quick else slice(None)
-    tests = {"near": named(TEST[few]), "far": motions([] if quick else swings)}
-    uses = {"training": named(TRAINING[few]), "validation": _cut(named(VALIDATION[few]), step)}
-    return _residuals.compare(
-        {
-            "nominal": Simulator(robot),
-            "published friction": Simulator(robot, _residuals.with_values(robot, PUBLISHED)),
-        },
-        uses,
-        {group: _cut(found, step) for group, found in tests.items() if found},
-        EnvMimicConfig(forces="joints"),
-        methods,
-        _residuals.Effort.of(seeds, quick=quick),
-        end_errors,
-        [f"{joint} {seconds:g} s (deg)" for seconds in HORIZONS for joint in ("q1", "q2")],
-    )
-
-
-def _cut(motions: list[Motion], step: float) -> list[Motion]:
-    return [piece for motion in motions for piece in _residuals.pieces(motion, HORIZONS[-1], step)]
-
-
 # %%
 def main() -> None:
     options = _fit.parse(__doc__)
-    if not options.residuals_only:
-        identification(options.data, quick=options.quick)
-    print("\nResiduals: median |error| at the horizon's end; of several seeds the mean (lowest to highest)\n")
-    print(residuals(options.data, options.seeds, options.methods, quick=options.quick))
-
-
-def identification(data: Path, *, quick: bool) -> None:
-    """Identify, and print what it found and how it predicts."""
-    fit = identify(data, quick=quick)
+    fit = identify(options.data, quick=options.quick)
     _fit.show(fit)
     print(f"validation, score: nominal {fit.nominal.score:.3g}, identified {fit.identified.score:.3g}")
     points = _fit.candidates(fit, PUBLISHED)
-    for seconds in (0.4,) if quick else (0.4, 1.0):
+    for seconds in (0.4,) if options.quick else (0.4, 1.0):
         print(f"\nMedian |error| after {seconds:g} s, deg, shoulder / elbow: all, validation, test\n")
-        motions = load(data, (*VALIDATION, *TEST))
+        motions = load(options.data, (*VALIDATION, *TEST))
         found = replay(fit.parameters, motions, list(points.values()), seconds, 0.2)
         for name, errors in zip(points, found, strict=True):
             print(row(name, errors, len(motions)))
-    if swing_ups := [] if quick else load_swing_ups(data):
+    if swing_ups := [] if options.quick else load_swing_ups(options.data):
         print("\nSwing-ups of the acrobot (other motions, another controller): tip after 0.4 s, m, median and 90 %\n")
         found = replay(fit.parameters, swing_ups, list(points.values()), 0.4, 0.2)
         for name, errors in zip(points, found, strict=True):

@@ -10,10 +10,6 @@
 #
 # The fit sees 0, 1 and 2 kg. Each load is a model of its own; the parameters are common.
 #
-# Then residual torques at the motor are learned (`--forces joints`) with 2 kg, from `sin_sin` and `sin_time_square`;
-# `up_and_down` validates. They are tested with 3 kg, in the model of that load. `--residuals-only` leaves the
-# identification out. `--seeds` says how many trainings there are, `--methods` by which methods.
-#
 # `python experiments/real/go1/go1.py --data FOLDER`; `--quick` shows that it works.
 
 # %%
@@ -29,23 +25,15 @@ import _setup
 
 _setup.prepare()
 
-import json
-import tempfile
-
 import _fit
-import _residuals
 import mujoco
 import numpy as np
 
-from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, fit_robot, replay
-from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, held_motion, measure
+from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, measure
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
-from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.robots.description import RobotDescription, read_description
-from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.robots.description import read_description
 
 LOADS = (0, 1, 2, 3)
 """kg; the last is the test."""
@@ -82,87 +70,16 @@ def mean_errors(fit: RobotFit, motions: list[MeasuredMotion], points: list[np.nd
     return np.array([np.rad2deg(np.abs(errors.errors[..., 0]).mean(axis=1)) for errors in found])
 
 
-# %% [markdown]
-# ## Residuals
-
-
-# %%
-LEARNED_WITH = 2
-"""kg."""
-
-
-def loaded_robot(folder: Path, kilograms: int) -> RobotDescription:
-    """Write the robot with a load to a folder, and return it."""
-    robot = read_description(FOLDER / "go1.robot.json")
-    spec = mujoco.MjSpec.from_file(str(robot.model))
-    spec.body("load").mass = max(kilograms, LIGHTEST)
-    spec.compile()
-    (folder / f"go1_{kilograms}.xml").write_text(spec.to_xml())
-    content = json.loads(robot.file.read_text()) | {"name": f"Go1, {kilograms} kg", "model": f"go1_{kilograms}.xml"}
-    (folder / f"go1_{kilograms}.robot.json").write_text(json.dumps(content))
-    return read_description(folder / f"go1_{kilograms}.robot.json")
-
-
-def whole_errors(evaluator: OpenLoopEvaluator, replay: Replay) -> np.ndarray:
-    """Mean absolute error (deg) of the motor's angle over whole recordings; its mean over recordings."""
-    steps, found = round(SECONDS / evaluator.robot.control_timestep), []
-    for run, motion in zip(evaluator.first_runs, evaluator.motions, strict=True):
-        start = evaluator.starts[run][1]
-        recorded = motion.qpos[start : start + steps, 0]
-        found.append(np.rad2deg(np.abs(replay.joints[run, : len(recorded), 0] - recorded)).mean())
-    return np.array([np.mean(np.where(np.isfinite(found), found, np.inf))])
-
-
-def residuals(data: Path, seeds: int, methods: list[str], *, quick: bool) -> str:
-    """Return the table of residuals with 3 kg, learned with 2 kg."""
-    with tempfile.TemporaryDirectory() as folder:
-        robots = {kilograms: loaded_robot(Path(folder), kilograms) for kilograms in (LEARNED_WITH, LOADS[-1])}
-        simulators = {
-            kilograms: {
-                "nominal": Simulator(robot),
-                "published friction": Simulator(robot, _residuals.with_values(robot, PUBLISHED)),
-            }
-            for kilograms, robot in robots.items()
-        }
-
-        def motions(kilograms: int, *names: str) -> list[Motion]:
-            robot = robots[kilograms]
-            paths = [data / f"go1_{kilograms}" / "recordings" / f"{name}.csv.gz" for name in names]
-            return [held_motion(read_recording(path, robot), robot, robot.load_model(), SAMPLING) for path in paths]
-
-        names = ("sin_sin", "sin_time_square", "up_and_down")
-        uses = {"training": motions(LEARNED_WITH, *names[:2]), "validation": motions(LEARNED_WITH, names[2])}
-        return _residuals.compare(
-            simulators[LEARNED_WITH],
-            uses,
-            {"2 kg, up_and_down": uses["validation"], "3 kg, all": motions(LOADS[-1], *names)},
-            EnvMimicConfig(forces="joints"),
-            methods,
-            _residuals.Effort.of(seeds, quick=quick),
-            whole_errors,
-            ["mean |error| (deg)"],
-            {"3 kg, all": simulators[LOADS[-1]]},
-        )
-
-
 # %%
 def main() -> None:
     options = _fit.parse(__doc__)
-    if not options.residuals_only:
-        identification(options.data, quick=options.quick)
-    print(f"\nResiduals: mean |error| over {SECONDS:g} s; of several seeds the mean (lowest to highest)\n")
-    print(residuals(options.data, options.seeds, options.methods, quick=options.quick))
-
-
-def identification(data: Path, *, quick: bool) -> None:
-    """Identify, and print what it found and how it predicts."""
-    fit = identify(data, quick=quick)
+    fit = identify(options.data, quick=options.quick)
     _fit.show(fit)
     points = list(_fit.candidates(fit, PUBLISHED).values())
     print(f"\nMean |error| over {SECONDS:g} s, deg\n")
     print("| load (kg) | nominal | published friction | identified |\n| --- | --- | --- | --- |")
-    for kilograms in LOADS[-1:] if quick else LOADS:
-        errors = mean_errors(fit, load(data, kilograms), points)
+    for kilograms in LOADS[-1:] if options.quick else LOADS:
+        errors = mean_errors(fit, load(options.data, kilograms), points)
         print(f"| {kilograms} | " + " | ".join(f"{x:.2f}" for x in errors.mean(axis=1)) + " |")
 
 
