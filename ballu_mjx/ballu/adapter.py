@@ -19,7 +19,13 @@ from ballu_mjx.recordings.hooks import RecordingHooks
 from ballu_mjx.recordings.inverse_kinematics import KinematicFit
 from ballu_mjx.recordings.motion import MeasurementGrid
 from ballu_mjx.recordings.recording import Recording
-from ballu_mjx.robots.adapter import DeploymentNotes, IdentificationProgress, IdentifiedActuators, RobotAdapter
+from ballu_mjx.robots.adapter import (
+    DeploymentNotes,
+    IdentificationProgress,
+    IdentifiedActuators,
+    ResidualScales,
+    RobotAdapter,
+)
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 
@@ -52,6 +58,19 @@ class Ballu(RobotAdapter, RecordingHooks):
         """Return the standing pose: knees at their stops, feet on the floor."""
         del robot
         return standing_qpos(model)
+
+    def residual_scales(self) -> ResidualScales:
+        """Return the sizes that the ablation chose (docs/envmimic.md). The forces that close the gap are hundredths of
+        a newton: with 1 N a unit, PPO's first steps throw the robot over. Limit: the paper's."""
+        return ResidualScales(
+            force_scale=0.05,
+            torque_scale=0.005,
+            force_limit=1.0,
+            force_cost=20.0,
+            force_spread=0.3,
+            force_change=0.1,
+            torque_spread=0.05,
+        )
 
     def full_travel(self, robot: RobotDescription) -> float:
         """Return 0.2 s: the servo takes 0.14 s for 60 deg without load, 0.21 s for 90."""

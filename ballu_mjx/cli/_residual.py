@@ -16,7 +16,9 @@ from ballu_mjx.identification.guard import choose_actuators
 from ballu_mjx.identification.stability import check_stability
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.dataset import USES, RecordingsData, ResidualDataset
+from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.run_config import describe_run
+from ballu_mjx.residuals.scales import describe_scales, settle_scales
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl.resume_point import ResumePoint
 from ballu_mjx.runs import loggers
@@ -71,7 +73,7 @@ class Prepared:
 def train_residual(
     task: str,
     data: RecordingsData,
-    sections: Mapping[str, Any],
+    sections: Callable[[Prepared], Mapping[str, Any]],
     learn: Callable[[Prepared, TrainingRecord], TrainedResidual],
     show: Callable[[Path, TrainedResidual], None],
     *,
@@ -83,7 +85,7 @@ def train_residual(
 
     **Arguments**
 
-    - `sections`: the command's options, as `config.json` holds them.
+    - `sections`: returns the command's options as `config.json` holds them, what the recordings tell filled in.
     - `learn`: what the command is for.
     - `show`: takes the run's folder and the residual, before its evaluation is printed.
     - `base`, `first`: see `prepare`.
@@ -94,13 +96,24 @@ def train_residual(
     with written_to(first=first) as written:
         prepared = prepare(task, data, base, start.folder, first=first)
         folder = written.folder = prepared.folder
-        content = prepared.describe(sections)
+        content = prepared.describe(sections(prepared))
         with open_run(folder, content, start.resumed_at, data.wandb, first=first) as run:
             residual = learn(prepared, run)
         if first:
             show(folder, residual)
             prepared.show_evaluation(residual, quick=data.quick)
     return 0
+
+
+def settle(env: EnvMimicConfig, prepared: Prepared, *, first: bool = True) -> EnvMimicConfig:
+    """Return the network's options with scales, limit and cost as numbers, and tell the user.
+
+    **Raises** `InputError` from `scales.settle_scales`.
+    """
+    settled = settle_scales(env, prepared.improved, prepared.motions["training"])
+    if first:
+        print(describe_scales(settled, prepared.dataset.robot), flush=True)
+    return settled
 
 
 def show_report(folder: Path, residual: TrainedResidual) -> None:

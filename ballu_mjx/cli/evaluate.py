@@ -14,6 +14,7 @@ import tyro
 
 from ballu_mjx.cli._help import parse_options
 from ballu_mjx.common import files, runtime
+from ballu_mjx.common.errors import InputError
 
 if TYPE_CHECKING:
     from ballu_mjx.evaluation.errors_table import Errors
@@ -27,6 +28,9 @@ class Options(runtime.CommandOptions):
     """Folder of the run."""
     recordings: tuple[Path, ...] = ()
     """Recordings to replay, files or folders. Without this option: the run's own for the test."""
+    robot: str | None = None
+    """Replay in this robot's model instead of the run's: the name of a robot that comes with the package, or the file
+    of a description. Both may differ in masses, lengths and the like, as with another load; goes with --recordings."""
     last: bool = False
     """Take the last checkpoint instead of the best by validation error."""
     noise_floor: bool = False
@@ -57,14 +61,20 @@ def _evaluate(options: Options) -> None:
     from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
     from ballu_mjx.residuals.run_config import find_recordings, run_robot
     from ballu_mjx.residuals.trained import TrainedResidual
+    from ballu_mjx.robots.description import check_simulates
+    from ballu_mjx.robots.registry import load_robot
     from ballu_mjx.runs.folder import read_config
     from ballu_mjx.sim.simulator import Simulator
     from ballu_mjx.viz.artifacts import write_evaluation
 
     config = read_config(options.run, *RESIDUAL_TASKS)
     which = "last" if options.last else "best"
-    robot = run_robot(config, options.run)
-    loaded = TrainedResidual.load(options.run, robot, which)
+    own = run_robot(config, options.run)
+    if options.robot is not None and not options.recordings:
+        raise InputError("--robot goes with --recordings, of that robot; give some.")
+    robot = own if options.robot is None else load_robot(options.robot)
+    check_simulates(robot)
+    loaded = TrainedResidual.load(options.run, robot, which, other_model=robot is not own)
     paths = list_recordings(options.recordings) or find_recordings(config, "test", options.run)
     recordings = [read_recording(path, robot) for path in paths]
     for path, recording in zip(paths, recordings, strict=True):

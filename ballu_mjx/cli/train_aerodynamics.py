@@ -53,7 +53,7 @@ def train(data: AirData, fit: AirConfig) -> int:
             progress=PhaseProgress(),
         )
 
-    return train_residual("aerodynamic", data, {"fit": fit, "data": data}, learn, show_report)
+    return train_residual("aerodynamic", data, lambda prepared: {"fit": fit, "data": data}, learn, show_report)
 
 
 def _earlier(data: AirData) -> TrainedResidual | None:

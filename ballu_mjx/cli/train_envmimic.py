@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, start_from
-from ballu_mjx.cli._residual import Prepared, train_residual
+from ballu_mjx.cli._residual import Prepared, settle, train_residual
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
@@ -21,6 +21,7 @@ from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.runs.folder import read_config
 from ballu_mjx.runs.progress import Progress
 from ballu_mjx.runs.record import TrainingRecord
+from ballu_mjx.sim.force_model import check_force_set
 from ballu_mjx.viz import artifacts
 
 QUICK: Mapping[str, Any] = {"num_timesteps": 120_000, "num_envs": 256, "batch_size": 128}
@@ -51,6 +52,7 @@ def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
         raise InputError("--preset does not go with --resume, which keeps the run's options; leave one out.")
     robot = load_chosen_robot(data.robot, data.resume, "envmimic")
     check_envmimic_options(env, ppo, data.validate_every, robot.control_timestep)
+    check_force_set(env.forces, robot)
     start = start_from("envmimic", data, ppo)
     check_resumes(start, env, robot)
     first = distributed.is_first()
@@ -76,7 +78,11 @@ def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
         untrained = "" if residual.step else ", before any training: no later one validated better"
         print(f"Best checkpoint: step {residual.step:,}{untrained}. ", end="")
 
-    sections = {"env": env, "ppo": ppo, "data": data}
+    def sections(prepared: Prepared) -> Mapping[str, Any]:
+        nonlocal env
+        env = settle(env, prepared, first=first)
+        return {"env": env, "ppo": ppo, "data": data}
+
     base = _base_residual(data)
     return train_residual("envmimic", data, sections, learn, show, base=base, start=start, first=first)
 

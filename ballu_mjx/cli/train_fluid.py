@@ -28,7 +28,7 @@ def train(data: RecordingsData, fit: FluidConfig) -> int:
             prepared.simulator, motions["training"], motions["validation"], fit, run=run, progress=PhaseProgress()
         )
 
-    return train_residual("fluid", data, {"fit": fit, "data": data}, learn, show_report)
+    return train_residual("fluid", data, lambda prepared: {"fit": fit, "data": data}, learn, show_report)
 
 
 COMMAND = TrainCommand(

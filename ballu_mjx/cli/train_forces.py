@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ballu_mjx.cli._command import TrainCommand
-from ballu_mjx.cli._residual import Prepared, train_residual
+from ballu_mjx.cli._residual import Prepared, settle, train_residual
 from ballu_mjx.residuals.analytic import AnalyticConfig, check_analytic_config
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.force_fitting import fit_analytic, fit_supervised, network_sections
@@ -18,7 +18,7 @@ from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
 from ballu_mjx.runs.metrics import read_column
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import TrainingRecord
-from ballu_mjx.sim.force_model import ForceSet
+from ballu_mjx.sim.force_model import ForceSet, check_force_set
 from ballu_mjx.viz import plots
 
 QUICK: Mapping[str, Mapping[str, Any]] = {
@@ -38,8 +38,9 @@ class ForcesData(RecordingsData):
     """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
     forces: ForceSet = "force"
-    """What the network pushes with: a force on the tracked body (the paper's), a force and a torque there (wrench), or
-    forces there and at every measured point (multi)."""
+    """What the network acts with: a force on the tracked body (the paper's), a force and a torque there (wrench),
+    forces there and at every measured point (multi), forces and torques along joints (joints), or changes of the
+    commands (commands)."""
     residual: Path | None = None
     """Folder of another residual's run, which acts beside the forces: these learn what it leaves. It must have been
     learned beside the same actuators. Without this option: none."""
@@ -68,7 +69,7 @@ def _train(
             prepared.improved,
             prepared.motions["training"],
             fit,
-            forces=data.forces,
+            forces=env,
             validation=prepared.motions["validation"],
             run=run,
             progress=PhaseProgress(),
@@ -86,7 +87,13 @@ def _train(
         print(f"Best checkpoint: gradient step {residual.step:,}. ", end="")
 
     env, network = network_sections(data.forces, fit.seed)
-    sections = {"env": env, "ppo": network, "fit": fit, "data": data}
+    check_force_set(data.forces, load_robot(data.robot or DEFAULT_ROBOT))
+
+    def sections(prepared: Prepared) -> Mapping[str, Any]:
+        nonlocal env
+        env = settle(env, prepared)
+        return {"env": env, "ppo": network, "fit": fit, "data": data}
+
     return train_residual(task, data, sections, learn, show, base=data.residual)
 
 

@@ -157,6 +157,7 @@ def held_motion(
         residual_mm={},
         interpolated=dict(recording.interpolated),
         robot=recording.robot,
+        joints=robot.joints,
     )
 
 

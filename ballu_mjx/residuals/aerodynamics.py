@@ -24,7 +24,7 @@ from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.residuals.body_motion import body_motion
 from ballu_mjx.residuals.network import ForceNetworkConfig, network_input
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.sim.force_model import Fields
+from ballu_mjx.sim.force_model import Fields, ForceModel
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.step import count_substeps
 
@@ -77,10 +77,8 @@ def longest_delay(robot: RobotDescription) -> float:
     return (HISTORY - 1) * robot.control_timestep
 
 
-class Aerodynamics:
+class Aerodynamics(ForceModel):
     """The force model (see `force_model.ForceModel`) whose parameters are `AirParameters`."""
-
-    name = "aerodynamic"
 
     def __init__(self, robot: RobotDescription, model: mujoco.MjModel) -> None:
         """Prepare for `robot`; `model` is its C model without the residual.
@@ -99,6 +97,11 @@ class Aerodynamics:
         self._centre, self._gravcomp = jnp.asarray(model.body_ipos), jnp.asarray(model.body_gravcomp)
         self._timestep, self._substeps = float(model.opt.timestep), count_substeps(model, robot.control_timestep)
         self._gravity = float(np.linalg.norm(model.opt.gravity))
+
+    @property
+    def name(self) -> str:
+        """Return what a simulator improved by it is called."""
+        return "aerodynamic"
 
     def inputs(
         self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]

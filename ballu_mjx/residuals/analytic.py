@@ -24,7 +24,7 @@ from ballu_mjx.recordings.segments import Segments, check_segments, pseudo_huber
 from ballu_mjx.residuals.envmimic import start_spread
 from ballu_mjx.residuals.network import NetworkForces, square_newtons
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.sim.force_model import to_wrenches
+from ballu_mjx.sim.force_model import FORCE_SETS
 from ballu_mjx.sim.linearize import ControlSteps, Linearized, Linearizer
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.sharding import shard_over_devices
@@ -86,7 +86,8 @@ def compile_rollout(
         def step(state: RolloutState, command: Array) -> tuple[RolloutState, tuple[ControlSteps, Array]]:
             seen = forces.inputs(state.history, state.with_command(command))
             loads = forces.loads(params, seen, state.features[ObservationLayout.yaw])
-            after = simulator.step(state, command, wrench=to_wrenches(loads, forces.config.forces)).state
+            does = FORCE_SETS[forces.config.forces].act(loads, forces.robot)
+            after = simulator.step(state, command, **does._asdict()).state
             return after, (ControlSteps(state, command, loads), after.features)
 
         return jax.lax.scan(step, *start_segment(window))[1]
@@ -202,7 +203,7 @@ def _updates(
         through = linear, about, jnp.arange(steps), jax.random.split(key_noise, steps)
         _, (features, loads) = jax.lax.scan(step, (first, window.history), through)
         tracking = _loss(features, window.features, robot)
-        return tracking + config.force_cost * jnp.mean(square_newtons(loads, forces.config)), tracking
+        return tracking + config.force_cost * jnp.mean(square_newtons(loads, forces.config, robot)), tracking
 
     @jax.jit
     def some(carry: tuple, keys: Array, data: tuple) -> tuple[tuple, tuple]:

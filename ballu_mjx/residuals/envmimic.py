@@ -33,10 +33,11 @@ from ballu_mjx.residuals.network import (
     square_newtons,
     world_loads,
 )
+from ballu_mjx.residuals.scales import settle_scales
 from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.coordinates import translations
-from ballu_mjx.sim.force_model import to_wrenches
+from ballu_mjx.sim.force_model import FORCE_SETS
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout, euler_to_matrix, wrap_angle
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
@@ -66,8 +67,8 @@ class EnvMimicConfig(ForceNetworkConfig):
     """Sharpness of the added position term, 1/m^2."""
     fine_orientation_scale: float = 200.0
     """Sharpness of the added orientation term, 1/rad^2: at 20 it still pays 0.92 for 6 deg of yaw."""
-    force_cost: float = 20.0
-    """Reward lost per N^2 of force."""
+    force_cost: float | None = None
+    """Reward lost per N^2 of force. Without this option: the robot's own, or 0.05 for a squared unit."""
     episode_seconds: float = 3.0
     """Mean length of an episode, s; a recording's end cuts it short."""
     episode_spread: float = 0.5
@@ -90,11 +91,11 @@ def check_envmimic_config(config: EnvMimicConfig, control_timestep: float) -> No
     """
     for field in dataclasses.fields(config):
         option, value = f"--{field.name.replace('_', '-')}", getattr(config, field.name)
-        if isinstance(value, bool | str):
+        if value is None or isinstance(value, bool | str):
             continue
-        if field.name in ("force_limit", "force_scale", "torque_scale"):
-            if not (value > 0 and math.isfinite(value)):
-                raise InputError(f"{option} is {value:g}: it must be greater than 0; {field.default:g} is usual.")
+        if field.name in ("force_limit", "force_scale", "torque_scale", "scales"):
+            if not all(x > 0 and math.isfinite(x) for x in (value if isinstance(value, tuple) else (value,))):
+                raise InputError(f"{option} is {value}: it must be greater than 0; leave it out for the usual one.")
         elif field.name == "episode_seconds":
             least = 2 * control_timestep
             if not (value >= least and math.isfinite(value)):
@@ -169,8 +170,8 @@ class EnvMimicEnv(Env):
         config: EnvMimicConfig,
     ) -> None:
         """Make the task of following `motions`. Where `simulator` has a residual, the policy learns what it leaves."""
-        self.config = config
         self.simulator = simulator.with_residual(None)
+        self.config = settle_scales(config, self.simulator, motions)
         plain = self.simulator.simulator
         model, self.robot = plain.mj_model, plain.robot
         self._held = np.array([model.joint(name).dofadr[0] for name in self.robot.held], int)
@@ -230,13 +231,14 @@ class EnvMimicEnv(Env):
         before = tracking_state(state)
         recording, time = before.recording, before.time
         loads = world_loads(action, before.rollout.features[ObservationLayout.yaw], self.config, self.robot)
-        command, wrench = self.reference.command[recording, time], to_wrenches(loads, self.config.forces)
-        after = self.simulator.step(before.rollout, command, wrench=wrench).state
+        command, does = self.reference.command[recording, time], FORCE_SETS[self.config.forces].act(loads, self.robot)
+        after = self.simulator.step(before.rollout, command, **does._asdict()).state
 
         target = self.reference.features[recording, time + 1]
         rollout, finite = after.keep_finite(before.rollout, target)
         terms = reward_terms(rollout.features, target, self.config, self.robot.upright)
-        cost = self.config.force_cost * square_newtons(loads, self.config)
+        assert self.config.force_cost is not None, "Settled."
+        cost = self.config.force_cost * square_newtons(loads, self.config, self.robot)
         reward = jnp.where(finite, terms["tracking"] - cost, 0.0)
 
         remaining = before.remaining - 1

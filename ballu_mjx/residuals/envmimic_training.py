@@ -12,6 +12,7 @@ from ballu_mjx.evaluation.open_loop import Evaluators
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, check_envmimic_config
 from ballu_mjx.residuals.network import NetworkForces, num_inputs
+from ballu_mjx.residuals.scales import settle_scales
 from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
@@ -61,9 +62,10 @@ def train_envmimic(
     augmented = simulator.with_residual(None)
     plain, robot = augmented.without_residual(), augmented.robot
     check_envmimic_options(config, ppo_config, validate_every, robot.control_timestep)
+    check_resumes(start, config, robot)
+    config = settle_scales(config, augmented, motions)
     sections = {"env": dataclasses.asdict(config), "ppo": dataclasses.asdict(ppo_config)}
     record = MemoryRecord(sections) if run is None else run
-    check_resumes(start, config, robot)
     env = EnvMimicEnv(augmented, motions, config)
     sizes = env.observation_size, env.action_size, ppo_config
     infer = ppo.make_inference(*sizes)

@@ -25,7 +25,7 @@ from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.residuals.body_motion import body_motion
 from ballu_mjx.residuals.network import ForceNetworkConfig, network_input
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.sim.force_model import Fields
+from ballu_mjx.sim.force_model import Fields, ForceModel
 
 FLUID_FORMAT = "ballu-fluid/1"
 FLUID_FILE = "fluid.json"
@@ -89,10 +89,8 @@ def mirrored(terms: Sequence[Term]) -> Bool[np.ndarray, "terms 6"]:
     return np.array([term.odd for term in terms])[:, None] == _ODD_AXES
 
 
-class FluidForces:
+class FluidForces(ForceModel):
     """The force model (see `sim.force_model.ForceModel`) whose parameters are coefficients, (terms, 6), in SI units."""
-
-    name = "fluid"
 
     def __init__(self, robot: RobotDescription, model: mujoco.MjModel, term_set: TermSet) -> None:
         """Prepare for `robot`, whose C model is `model`."""
@@ -107,6 +105,11 @@ class FluidForces:
             [[*map(every.index, term.factors), *[len(every)] * (most - len(term.factors))] for term in self.terms]
         )
         self._power = np.array([term.power for term in self.terms])
+
+    @property
+    def name(self) -> str:
+        """Return what a simulator improved by it is called."""
+        return "fluid"
 
     def inputs(
         self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]

@@ -20,13 +20,15 @@ from ballu_mjx.residuals import analytic, supervised
 from ballu_mjx.residuals.analytic import AnalyticConfig
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.network import NetworkForces, num_loads, recorded_inputs
+from ballu_mjx.residuals.scales import missing_loads, settle_scales
 from ballu_mjx.residuals.supervised import SupervisedConfig
 from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Params, PPOConfig
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
-from ballu_mjx.sim.force_model import ForceSet, add_to_base
+from ballu_mjx.sim.force_model import FORCE_SETS, ForceSet, add_to_base
 from ballu_mjx.sim.linearize import Linearizer
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
@@ -36,7 +38,7 @@ def fit_supervised(
     motions: Sequence[Motion],
     config: SupervisedConfig | None = None,
     *,
-    forces: ForceSet = "force",
+    forces: ForceSet | EnvMimicConfig = "force",
     validation: Sequence[Motion] | None = None,
     run: TrainingRecord | None = None,
     progress: PhaseProgress | None = None,
@@ -50,7 +52,8 @@ def fit_supervised(
       and the result is both together.
     - `motions`: recorded ones.
     - `config`: how to label and regress; None: the defaults.
-    - `forces`: what the network pushes with.
+    - `forces`: what the network acts with, or options that say so, with its scales. Scales that are not given are the
+      robot's own, or follow from the motions (`scales.settle_scales`).
     - `validation`: motions that choose the best; None: `motions`.
     - `run`: takes measurements and checkpoints, in a folder say; None: memory.
     - `progress`: is told of every step.
@@ -69,7 +72,7 @@ def fit_analytic(
     motions: Sequence[Motion],
     config: AnalyticConfig | None = None,
     *,
-    forces: ForceSet = "force",
+    forces: ForceSet | EnvMimicConfig = "force",
     validation: Sequence[Motion] | None = None,
     run: TrainingRecord | None = None,
     progress: PhaseProgress | None = None,
@@ -85,9 +88,17 @@ def fit_analytic(
     return _fit(_Analytic, "analytic", simulator, uses, config, forces, run, progress, evaluators)
 
 
-def network_sections(forces: ForceSet, seed: int) -> tuple[EnvMimicConfig, PPOConfig]:
+def network_sections(forces: ForceSet | EnvMimicConfig, seed: int) -> tuple[EnvMimicConfig, PPOConfig]:
     """Return what the network sees and means, and its sizes: both methods learn EnvMimic's."""
-    return EnvMimicConfig(forces=forces), PPOConfig(seed=seed)
+    return EnvMimicConfig(forces=forces) if isinstance(forces, str) else forces, PPOConfig(seed=seed)
+
+
+def free_torques(forces: ForceSet, robot: RobotDescription) -> tuple[str, ...]:
+    """Return the joints whose torques are unknowns beside the forces that labels are of.
+
+    Forces along joints and changes of commands are torques themselves.
+    """
+    return robot.joints if FORCE_SETS[forces].turns else ()
 
 
 class _Uses(NamedTuple):
@@ -157,7 +168,11 @@ class _Supervised(_Fit):
         setup, config = self.setup, self.config
         assert isinstance(config, SupervisedConfig)
         robot, env = setup.simulator.robot, setup.forces.config
-        linearize = Linearizer(setup.simulator, robot.joints, env.forces)
+        joints = free_torques(env.forces, robot)
+        if joints and config.torque_spread is None and robot.adapter.residual_scales() is None:
+            size = missing_loads(setup.simulator, setup.motions.training, "joints")
+            config = dataclasses.replace(config, torque_spread=float(size.max(initial=0.0)))
+        linearize = Linearizer(setup.simulator, joints, env.forces)
         label = supervised.ForceLabeller(linearize, config, env)
         uses = {"training": setup.motions.training}
         if setup.motions.validation is not setup.motions.training:
@@ -169,8 +184,7 @@ class _Supervised(_Fit):
                 loads.append(label(motion))
                 self.show(f"labels, {use}", len(loads), len(motions), math.nan)
             found[use] = supervised.examples(setup.simulator.simulator, motions, loads, env)
-            force = _rms(np.concatenate(loads)[:, :3])
-            self.notes.append(f"Labels, {use}: {force * 1e3:.1f} mN on the {robot.tracked} (RMS of an axis).")
+            self.notes.append(f"Labels, {use}: {_sizes(np.concatenate(loads), env.forces, robot)}.")
         infer = jax.jit(lambda policy, seen: setup.forces.infer(setup.with_policy(policy), seen))
         seen, actions = found.get("validation", found["training"])
         best = math.inf, 0, self.still
@@ -227,6 +241,15 @@ class _Analytic(_Fit):
         )
 
 
+def _sizes(loads: Float[np.ndarray, "steps loads"], forces: ForceSet, robot: RobotDescription) -> str:
+    if FORCE_SETS[forces].turns:
+        return f"{_rms(loads[:, :3]) * 1e3:.1f} mN on the {robot.tracked} (RMS of an axis)"
+    sizes = zip(FORCE_SETS[forces].names(robot), np.sqrt(np.mean(loads**2, axis=0)), strict=True)
+    return (
+        ", ".join(f"{name.rpartition(',')[0]} {size:.3g}{name.rpartition(',')[2]}" for name, size in sizes) + " (RMS)"
+    )
+
+
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
@@ -237,7 +260,7 @@ def _fit(
     simulator: Simulator | AugmentedSimulator,
     motions: _Uses,
     config: SupervisedConfig | AnalyticConfig,
-    forces: ForceSet,
+    forces: ForceSet | EnvMimicConfig,
     run: TrainingRecord | None,
     progress: PhaseProgress | None,
     evaluators: Evaluators | None,
@@ -246,6 +269,7 @@ def _fit(
     plain, robot = augmented.without_residual(), augmented.robot
     record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run
     env, network = network_sections(forces, config.seed)
+    env = settle_scales(env, augmented, motions.training)
     reference, _ = stack_motions(plain, motions.training)
     inputs = np.asarray(recorded_inputs(reference, env, robot))
     sizes = {ppo.STATE: (inputs.shape[1],)}, num_loads(env, robot), network

@@ -60,7 +60,7 @@ class ResidualKind:
 
 def _load_network(run: StoredRun) -> LoadedResidual:
     from ballu_mjx.residuals.envmimic import EnvMimicConfig, check_envmimic_config
-    from ballu_mjx.residuals.network import NetworkForces, num_inputs, num_loads
+    from ballu_mjx.residuals.network import NetworkForces, load_scales, num_inputs, num_loads
     from ballu_mjx.rl import ppo
     from ballu_mjx.runs.checkpoints import restore_checkpoint
     from ballu_mjx.runs.folder import typed_config
@@ -72,6 +72,10 @@ def _load_network(run: StoredRun) -> LoadedResidual:
     check = functools.partial(check_envmimic_config, control_timestep=robot.control_timestep)
     config = typed_config(EnvMimicConfig, run.config, "env", folder, check)
     network = typed_config(ppo.PPOConfig, run.config, "ppo", folder, ppo.check_values)
+    try:
+        load_scales(config, robot)
+    except ValueError as error:
+        raise InputError(f"{folder}: its config.json lacks the scales of the forces; restore it.") from error
     sizes = inputs, num_loads(config, robot), network
     infer = ppo.make_inference(*sizes)
     if not (inputs == num_inputs(config, robot) and ppo.fits(infer, params, inputs)):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 from ballu_mjx.recordings.reference import ReferenceMotions
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.sim.force_model import Fields, ForceSet, num_vectors, to_wrenches
+from ballu_mjx.sim import force_model
+from ballu_mjx.sim.force_model import FORCE_SETS, Action, Fields, ForceModel, ForceSet
 from ballu_mjx.sim.observation import (
     HISTORY,
     ObservationLayout,
@@ -30,16 +31,22 @@ class ForceNetworkConfig:
     """What a force network sees, and what its output means."""
 
     forces: ForceSet = "force"
-    """What the policy pushes with: a force on the tracked body (the paper's), a force and a torque there (wrench), or
-    forces there and at all measured points (multi)."""
-    force_limit: float = 1.0
-    """Largest force along each axis, N (paper: 1)."""
-    force_scale: float = 0.05
-    """Force, N, that one unit of the policy's output stands for. The forces that close the gap are hundredths of a
-    newton: with 1 N a unit, PPO's first steps throw the robot over, with a constant learning rate for good."""
-    torque_scale: float = 0.005
-    """Torque, N m, that one unit of the policy's output stands for, where it pushes with one. Limit and cost are, unit
-    for unit, those of a force."""
+    """What the policy acts with: a force on the tracked body (the paper's), a force and a torque there (wrench), forces
+    there and at all measured points (multi), forces and torques along joints (joints), or changes of the commands
+    (commands)."""
+    force_limit: float | None = None
+    """Largest force along each axis, N (paper: 1). Other loads may be as many units. Without this option: the robot's
+    own, or 20 units."""
+    force_scale: float | None = None
+    """Force, N, that one unit of the policy's output stands for. Without this option: the robot's own, or the size of
+    what the model leaves unexplained in the training recordings. Joints and commands have `scales`: for limit and cost
+    one of their units counts as this force."""
+    torque_scale: float | None = None
+    """Torque, N m, that one unit of the policy's output stands for, where it pushes with one. Without this option:
+    likewise. Limit and cost are, unit for unit, those of a force."""
+    scales: tuple[float, ...] = ()
+    """What one unit of each output stands for, with `--forces joints` (N m, of slides N) and `commands` (their units),
+    in their order. Without this option: from the training recordings."""
     observe_command: bool = True
     """Let the policy see the commands (now and the last two), which the paper's state leaves out."""
     relative_observation: bool = True
@@ -82,13 +89,7 @@ def network_input_names(config: ForceNetworkConfig, robot: RobotDescription) -> 
 
 def load_names(config: ForceNetworkConfig, robot: RobotDescription) -> list[str]:
     """Return the names of a network's loads, each with its unit."""
-    tracked = f"force on {robot.tracked}, N"
-    vectors = {
-        "force": [tracked],
-        "wrench": [tracked, f"torque on {robot.tracked}, N m"],
-        "multi": [tracked, *(f"force at {point}, N" for point in robot.points)],
-    }[config.forces]
-    return [f"{vector.partition(',')[0]} {axis},{vector.partition(',')[2]}" for vector in vectors for axis in "xyz"]
+    return FORCE_SETS[config.forces].names(robot)
 
 
 def num_inputs(config: ForceNetworkConfig, robot: RobotDescription) -> int:
@@ -98,33 +99,68 @@ def num_inputs(config: ForceNetworkConfig, robot: RobotDescription) -> int:
 
 def num_loads(config: ForceNetworkConfig, robot: RobotDescription) -> int:
     """Return the size of an action."""
-    return 3 * num_vectors(config.forces, len(robot.points))
+    return force_model.num_loads(config.forces, robot)
 
 
-def load_units(config: ForceNetworkConfig, size: int) -> Float[np.ndarray, " loads"]:
-    """What one unit of each number of an action stands for, N or N m."""
-    scale = np.full(size, config.force_scale)
-    if config.forces == "wrench":
-        scale[3:] = config.torque_scale
-    return scale
+class LoadScales(NamedTuple):
+    """What a network's outputs stand for."""
+
+    units: Float[np.ndarray, " loads"]
+    """One unit of each output (N, N m, commands' units)."""
+    newtons: float
+    """Force (N) that a unit counts as, for limit and cost."""
+    limit: float
+    """Largest output, in units."""
 
 
-def square_newtons(loads: Float[Array, "*batch loads"], config: ForceNetworkConfig) -> Float[Array, "*batch"]:
-    """What loads cost force for (N^2): their squares, a torque counted as the force that takes as many units."""
-    in_newtons = loads / load_units(config, loads.shape[-1]) * config.force_scale
+def load_scales(config: ForceNetworkConfig, robot: RobotDescription) -> LoadScales:
+    """Return what the outputs of a network stand for; what the configuration leaves open is the robot's own.
+
+    **Raises** `ValueError` where nothing tells (`scales.settle_scales` asks the recordings).
+    """
+    own, size = robot.adapter.residual_scales(), num_loads(config, robot)
+    names = ("force_scale", "torque_scale", "force_limit")
+    force, torque, limit = (
+        getattr(own, name, None) if getattr(config, name) is None else getattr(config, name) for name in names
+    )
+    if FORCE_SETS[config.forces].turns:
+        scales = None if force is None else [force] * size
+        if scales is not None and config.forces == "wrench":
+            scales[3:] = [torque] * 3
+    else:
+        scales = list(config.scales) if len(config.scales) == size else None
+    if force is None or limit is None or scales is None or None in scales:
+        raise ValueError("The scales of the forces are open; give them, or let settle_scales find them.")
+    return LoadScales(np.array(scales, float), float(force), float(limit / force))
+
+
+def load_units(config: ForceNetworkConfig, robot: RobotDescription) -> Float[np.ndarray, " loads"]:
+    """What one unit of each number of an action stands for (N, N m, commands' units)."""
+    return load_scales(config, robot).units
+
+
+def square_newtons(
+    loads: Float[Array, "*batch loads"], config: ForceNetworkConfig, robot: RobotDescription
+) -> Float[Array, "*batch"]:
+    """What loads cost force for (N^2): their squares, another load counted as the force that takes as many units."""
+    scales = load_scales(config, robot)
+    in_newtons = loads / scales.units * scales.newtons
     return jnp.sum(in_newtons**2, axis=-1)
 
 
 def world_loads(
     action: Float[Array, " loads"], yaw: Float[Array, ""], config: ForceNetworkConfig, robot: RobotDescription
 ) -> Float[Array, " loads"]:
-    """Return the loads (N, N m; world; see `to_wrenches`) that an action stands for, within the limit along each axis.
+    """Return the loads (N, N m, commands' units; world) that an action stands for, within the limit on each.
 
-    Actions are in the tracked body's heading frame, like the observation: the same situation met in another direction
-    calls for the same force, turned. Those on an anchored robot, or without `heading_frame`, are in the world's.
+    Vectors of actions are in the tracked body's heading frame, like the observation: the same situation met in another
+    direction calls for the same force, turned. Those on an anchored robot, or without `heading_frame`, are in the
+    world's.
     """
-    most = config.force_limit / config.force_scale
-    loads = jnp.asarray(load_units(config, len(action))) * jnp.clip(action, -most, most)
+    scales = load_scales(config, robot)
+    loads = jnp.asarray(scales.units) * jnp.clip(action, -scales.limit, scales.limit)
+    if not FORCE_SETS[config.forces].turns:
+        return loads
     return (loads.reshape(-1, 3) @ force_frame(yaw, config, robot).T).ravel()
 
 
@@ -134,7 +170,7 @@ def force_frame(yaw: Float[Array, ""], config: ForceNetworkConfig, robot: RobotD
 
 
 @dataclasses.dataclass(frozen=True)
-class NetworkForces:
+class NetworkForces(ForceModel):
     """EnvMimic's kind of residual (see `force_model.ForceModel`): a policy's action is what pushes the robot.
 
     **Fields**
@@ -174,16 +210,40 @@ class NetworkForces:
         commands: Float[Array, "steps commands"],
         key: Array | None = None,
     ) -> Float[Array, "loaded 6"]:
-        """The policy's loads, where they act."""
+        """The policy's forces and torques, where they act."""
+        return self._act(params, history, commands, key).wrench
+
+    def joint_force(
+        self,
+        params: Any,
+        history: Float[Array, "steps features"],
+        commands: Float[Array, "steps commands"],
+        key: Array | None = None,
+    ) -> Float[Array, " nv"] | None:
+        """The policy's forces and torques along joints; None: it has others."""
+        return self._act(params, history, commands, key).joint_force
+
+    def command_change(
+        self,
+        params: Any,
+        history: Float[Array, "steps features"],
+        commands: Float[Array, "steps commands"],
+        key: Array | None = None,
+    ) -> Float[Array, " commands"] | None:
+        """The policy's changes of the command; None: it has none."""
+        return self._act(params, history, commands, key).command_change
+
+    def _act(self, params: Any, history: Array, commands: Array, key: Array | None) -> Action:
+        # Evaluated by each of the three methods: compiled, it is one evaluation.
         seen, yaw = self.inputs(history, commands), history[-1, ObservationLayout.yaw]
         if key is None or self.sample is None:
             loads = self.loads(params, seen, yaw)
         else:
             loads = world_loads(self.sample(params, seen, key), yaw, self.config, self.robot)
-        return to_wrenches(loads, self.config.forces)
+        return FORCE_SETS[self.config.forces].act(loads, self.robot)
 
     def loads(self, params: Any, seen: Float[Array, " inputs"], yaw: Float[Array, ""]) -> Float[Array, " loads"]:
-        """The most likely loads (N, N m; world) for what the policy sees, at a heading."""
+        """The most likely loads (N, N m, commands' units; world) for what the policy sees, at a heading."""
         return world_loads(self.infer(params, seen), yaw, self.config, self.robot)
 
 

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import datetime
 import hashlib
+import reprlib
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -40,6 +41,34 @@ def run_robot(config: Mapping[str, Any], folder: Path) -> RobotDescription:
     """
     stored = config.get("robot_description")
     return load_robot() if stored is None else find_robot(stored, folder / CONFIG_FILE)
+
+
+def check_stands_in(robot: RobotDescription, own: RobotDescription, folder: Path) -> None:
+    """Check that what was learned for the robot `own` of a run can act on another model.
+
+    **Raises** `InputError` where the two differ in what residuals see or act on, naming it.
+    """
+    for name, words in _SHARED.items():
+        one, other = getattr(robot, name), getattr(own, name)
+        if one != other:
+            shown = [reprlib.repr(dict(x) if isinstance(x, Mapping) else x) for x in (one, other)]
+            raise InputError(
+                f"{robot.file}: cannot stand in for {own.name}, the robot of {folder}: its {words} differ ({shown[0]}, "
+                f"there {shown[1]}); give a model that differs in its numbers only."
+            )
+
+
+_SHARED = {
+    "tracked": "tracked site",
+    "points": "points",
+    "commands": "commands",
+    "command_ranges": "commands' ranges",
+    "control_timestep": "control time step",
+    "anchored": "root joint",
+    "directions": "directions of motion",
+    "force_joints": "joints that forces act along",
+}
+"""What residuals see and act on, by the description's field."""
 
 
 def run_residual(config: Mapping[str, Any], folder: Path) -> Path | None:

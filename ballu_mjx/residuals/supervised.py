@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,9 +24,10 @@ from jaxtyping import Array, Float
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.residuals.network import ForceNetworkConfig, force_frame, load_units, recorded_inputs
+from ballu_mjx.residuals.network import ForceNetworkConfig, force_frame, load_scales, load_units, recorded_inputs
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.coordinates import translations
+from ballu_mjx.sim.force_model import FORCE_SETS
 from ballu_mjx.sim.linearize import ControlSteps, Linearizer
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.simulator import RolloutState, Simulator
@@ -37,14 +38,16 @@ from ballu_mjx.sim.step import state_at
 class SupervisedConfig:
     """Labels and regression."""
 
-    force_spread: float = 0.3
-    """Standard deviation of the prior on the force along each axis, N. That on a torque is, in units of the network's
-    output, as wide."""
-    force_change: float = 0.1
-    """Standard deviation of the prior on how it changes from one control step to the next, N. A buoyant body's
-    added mass pushes back at every contact: a smoother prior removes most of that force."""
-    torque_spread: float = 0.05
-    """Standard deviation of what the robot's joints pull beyond the model, N m."""
+    force_spread: float | None = None
+    """Standard deviation of the prior on the force along each axis, N. That on another load is, in units of the
+    network's output, as wide. Without this option: the robot's own, or 6 units."""
+    force_change: float | None = None
+    """Standard deviation of the prior on how it changes from one control step to the next, N. A body that drags air
+    along is pushed back at every contact: a smoother prior removes most of that force. Without this option: the robot's
+    own, or 2 units."""
+    torque_spread: float | None = None
+    """Standard deviation of what the robot's joints pull beyond the model, N m. Without this option: the robot's own,
+    or the size of what the model leaves unexplained at joints in the training recordings."""
     position_noise: float = 0.0005
     """Standard deviation of the recorded place, m."""
     angle_noise: float = 0.3
@@ -79,10 +82,32 @@ def check_supervised_config(config: SupervisedConfig) -> None:
     """**Raises** `InputError` for options out of range, naming the option."""
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        if field.name not in ("observation_noise", "force_scales", "seed") and not value > 0:
+        if value is None or field.name in ("observation_noise", "force_scales", "seed"):
+            continue
+        if not value > 0:
             raise InputError(f"--{field.name.replace('_', '-')} is {value}: it must be greater than 0.")
     if not config.force_scales or not all(0.0 <= scale <= 1.0 for scale in config.force_scales):
         raise InputError(f"--force-scales is {' '.join(map(str, config.force_scales))}: give one or more from 0 to 1.")
+
+
+class _Priors(NamedTuple):
+    """Standard deviations: of forces, of their change in a control step (N), of joints' torques (N m)."""
+
+    spread: float
+    change: float
+    torque: float | None
+
+
+def _priors(config: SupervisedConfig, unit: float, robot: RobotDescription) -> _Priors:
+    own = robot.adapter.residual_scales()
+    names = "force_spread", "force_change", "torque_spread"
+    given = [getattr(own, name, None) if getattr(config, name) is None else getattr(config, name) for name in names]
+    spread, change, torque = given
+    return _Priors(_SPREAD * unit if spread is None else spread, _CHANGE * unit if change is None else change, torque)
+
+
+_SPREAD, _CHANGE = 6.0, 2.0
+"""Of the priors, in units of the network's output."""
 
 
 class ForceLabeller:
@@ -101,8 +126,12 @@ class ForceLabeller:
         """
         env = env or ForceNetworkConfig()
         self._simulator = linearize.simulator.simulator
-        self._model, self._config, self._linearize = self._simulator.mj_model, config, linearize
-        self._in_newtons = load_units(env, linearize.loads) / env.force_scale
+        self._model, self._linearize = self._simulator.mj_model, linearize
+        scales = load_scales(env, self._simulator.robot)
+        self._in_newtons = scales.units / scales.newtons
+        self._priors = _priors(config, scales.newtons, self._simulator.robot)
+        if self._priors.torque is None and linearize.directions > 2 * self._model.nv + linearize.loads:
+            raise ValueError("Nothing tells the spread of the joints' torques; give torque_spread.")
         self._measured, self._process = _noise(self._model, self._simulator.robot, config)
 
     def __call__(self, motion: Motion) -> Float[np.ndarray, "steps loads"]:
@@ -135,22 +164,22 @@ class ForceLabeller:
         Unknown at each time are the state's deviation from the recorded one and the step's inputs; each time is tied to
         the next alone, so that one banded factorization solves for a whole recording.
         """
-        config, (count, after, every), loads = self._config, state.shape, self._linearize.loads
+        (count, after, every), loads = state.shape, self._linearize.loads
         force = np.arange(after, after + loads)
         known = np.any(state, axis=(1, 2), keepdims=True)[:, 0]  # zeros where there are no derivatives
         weight = known / self._process**2
         spread = np.r_[
             self._measured,
             np.full(self._model.nv, _ANY_VELOCITY),
-            config.force_spread * self._in_newtons,
-            np.full(every - after - loads, config.torque_spread),
+            self._priors.spread * self._in_newtons,
+            np.full(every - after - loads, self._priors.torque),
         ]
         here = np.tile(np.diag(spread**-2.0), (count + 1, 1, 1))
         here[:-1] += state.transpose(0, 2, 1) @ (weight[:, :, None] * state)
         here[1:, range(after), range(after)] += weight
         towards = np.zeros_like(here)  # rows of the time after, columns of this one
         towards[:-1, :after] -= weight[:, :, None] * state
-        change = (config.force_change * self._in_newtons) ** -2.0
+        change = (self._priors.change * self._in_newtons) ** -2.0
         here[:-1, force, force] += change
         here[1:, force, force] += change
         towards[:-1, force, force] -= change
@@ -208,14 +237,17 @@ def examples(
     """
     reference, _ = stack_motions(simulator, motions)
     first = HISTORY - 1
+    inputs = np.asarray(recorded_inputs(reference, config, simulator.robot))
+    units = load_units(config, simulator.robot)
+    if not FORCE_SETS[config.forces].turns:
+        return inputs, np.asarray(np.concatenate([each[first:] for each in loads]) / units, np.float32)
     headings = np.asarray(reference.features[..., ObservationLayout.yaw])
     yaw = [seen[first:count] for seen, count in zip(headings, reference.steps, strict=True)]
     labels = np.concatenate([each[first:] for each in loads])
     robot = simulator.robot
     to_world = np.asarray(jax.vmap(lambda yaw: force_frame(yaw, config, robot))(jnp.asarray(np.concatenate(yaw))))
     turned = np.einsum("nji,nvj->nvi", to_world, labels.reshape(len(labels), -1, 3)).reshape(labels.shape)
-    actions = turned / load_units(config, labels.shape[1])
-    return np.asarray(recorded_inputs(reference, config, simulator.robot)), np.asarray(actions, np.float32)
+    return inputs, np.asarray(turned / units, np.float32)
 
 
 Validate = Callable[[int, Any, float], None]

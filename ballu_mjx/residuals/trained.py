@@ -15,7 +15,7 @@ from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.residuals.aerodynamics import AirParameters
 from ballu_mjx.residuals.kinds import KINDS, RESIDUAL_TASKS, StoredRun
-from ballu_mjx.residuals.run_config import run_actuators, run_residual, run_robot
+from ballu_mjx.residuals.run_config import check_stands_in, run_actuators, run_residual, run_robot
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 from ballu_mjx.runs.folder import read_config
@@ -69,11 +69,13 @@ class TrainedResidual:
         robot: RobotDescription,
         which: Literal["best", "last"] = "best",
         *,
+        other_model: bool = False,
         loading: frozenset[Path] = frozenset(),
     ) -> TrainedResidual:
         """Load the residual of a run; of a network that in the best (by validation error) or last checkpoint.
 
-        `robot` is the one that it has to be of; `loading` are the runs whose base residual it is.
+        `robot` is the one that it has to be of; with `other_model` one whose model may differ in its numbers, such as a
+        load. `loading` are the runs whose base residual it is.
 
         **Raises** `InputError` where `folder` is no such run, is of another robot or has no such checkpoint.
         """
@@ -81,15 +83,17 @@ class TrainedResidual:
         loading |= {folder.resolve()}
         stored = read_config(folder, *RESIDUAL_TASKS)
         own = run_robot(stored, folder)
-        if own.sha256 != robot.sha256:
+        if other_model:
+            check_stands_in(robot, own, folder)
+        elif own.sha256 != robot.sha256:
             raise InputError(f"{folder}: is of the robot {own.name}, not of {robot.name}; give one of the same robot.")
-        identified = run_actuators(stored, folder, own)
+        identified = run_actuators(stored, folder, robot)
         model, params, inputs, step = KINDS[stored["task"]].load(StoredRun(folder, stored, robot, identified, which))
         where = run_residual(stored, folder) if KINDS[stored["task"]].network else None
         if where is not None:
             if where.resolve() in loading:
                 raise InputError(f"{folder}: is its own base residual; restore its config.json.")
-            base = TrainedResidual.load(where, robot, loading=loading)
+            base = TrainedResidual.load(where, robot, other_model=other_model, loading=loading)
             both = base.bound.plus(BoundForces(model, params))
             model, params = both.model, both.params
         return TrainedResidual(model, params, _read_observed(folder / _OBSERVED, inputs), step, identified)

@@ -33,6 +33,29 @@ class DeploymentNotes(NamedTuple):
     """What to measure before the first run."""
 
 
+@dataclasses.dataclass(frozen=True)
+class ResidualScales:
+    """Sizes of residual forces, for a robot whose own were chosen by experiment; see `residuals.scales`.
+
+    Forces are in N, torques in N m.
+    """
+
+    force_scale: float
+    """What one unit of a network's output stands for, of a force."""
+    torque_scale: float
+    """Likewise of a torque."""
+    force_limit: float
+    """Largest force along each axis."""
+    force_cost: float
+    """Reward lost per N^2 of force."""
+    force_spread: float
+    """Standard deviation of the prior on forces in labels."""
+    force_change: float
+    """Standard deviation of the prior on how they change from one control step to the next."""
+    torque_spread: float
+    """Standard deviation of what joints pull beyond the model."""
+
+
 IdentificationProgress = Callable[[str, int, int, float], None]
 """(stage, iteration, most iterations, the lowest loss so far)."""
 
@@ -77,6 +100,9 @@ class RobotAdapter:
         given = np.zeros(model.nu) if robot.keyframe is None else model.key(robot.keyframe).ctrl
         low, high = np.array(robot.command_ranges).T
         return np.clip(given, low, high)
+
+    def residual_scales(self) -> ResidualScales | None:
+        """Return sizes of residual forces that were chosen by experiment; None: the recordings tell them."""
 
     # ---- deployment ----
 

@@ -13,6 +13,8 @@ JSON with the keys
 - `joints` (optional): hinges (rad) and slides (m) that recordings may hold, as columns of their names;
 - `oriented_points` (optional): points whose orientation recordings may hold too;
 - `held` (optional): joints that no noise on starting states moves;
+- `force_joints` (optional): hinges and slides that residual forces may act along (the force set `joints`); without it,
+  all that have names and are not held;
 - `keyframe` (optional): the model's keyframe that simulations and inverse kinematics start from;
 - `limits` (optional): what no recording of this robot exceeds: `height` ([low, high], m), `distance` (m),
   `speed` (m/s), `angle` (rad or m);
@@ -37,7 +39,7 @@ import re
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import mujoco
 
@@ -56,6 +58,7 @@ _OPTIONAL = (
     "joints",
     "oriented_points",
     "held",
+    "force_joints",
     "keyframe",
     "limits",
     "mirror",
@@ -83,6 +86,15 @@ class Limits:
     """m/s, between two samples along an axis."""
     angle: float | None = None
     """rad of a hinge, m of a slide."""
+
+
+class ForceJoint(NamedTuple):
+    """A joint that residual forces may act along."""
+
+    place: int
+    """In generalized velocities."""
+    unit: str
+    """Of what acts along it: `N m` of a hinge, `N` of a slide."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -123,6 +135,10 @@ class RobotDescription:
     """Whether yaw says how the tracked body is turned; errors of orientation are then those of yaw."""
     horizons: tuple[float, ...] = ()
     """Seconds over which errors are taken, increasing; empty: the default ones."""
+    force_joints: Mapping[str, ForceJoint] = dataclasses.field(default_factory=dict)
+    """Joints that residual forces may act along."""
+    directions: int = 0
+    """Size of generalized velocities."""
 
     @property
     def features(self) -> int:
@@ -173,7 +189,9 @@ def read_description(path: Path | str) -> RobotDescription:
     _check_joints(path, model, step)
     _check_sites(path, model, tracked, points)
     ranges = _check_actuators(path, model, driven)
-    for key, names in (("joints", joints), ("held", held)):
+    given = content.get("force_joints")
+    forced = _names(path, "force_joints", _free_joints(model, held) if given is None else given)
+    for key, names in (("joints", joints), ("held", held), ("force_joints", forced)):
         for joint in names:
             index = _find(path, model, mujoco.mjtObj.mjOBJ_JOINT, key, joint)
             if model.jnt_type[index] == mujoco.mjtJoint.mjJNT_FREE:
@@ -206,6 +224,8 @@ def read_description(path: Path | str) -> RobotDescription:
         identify=_entries(path, "identify", content.get("identify", [])),
         upright=_flag(path, "upright", content.get("upright", False)),
         horizons=_horizons(path, content.get("horizons", [])),
+        force_joints={joint: _force_joint(model, joint) for joint in forced},
+        directions=model.nv,
     )
     twice = [column for number, column in enumerate(found.columns) if column in found.columns[:number]]
     if twice:
@@ -282,6 +302,20 @@ def _check_joints(path: Path, model: mujoco.MjModel, control_timestep: float) ->
     if abs(count - round(count)) > 1e-6 or count < 1:
         problem = f'"model" has a time step of {model.opt.timestep:g} s'
         _refuse(path, problem, f"it must divide the control step of {control_timestep:g} s")
+
+
+def _free_joints(model: mujoco.MjModel, held: tuple[str, ...]) -> list[str]:
+    """Return the hinges and slides that have names fit for recordings and are not held."""
+    names = (model.joint(index).name for index in range(model.njnt) if model.jnt_type[index] in _ONE_DIRECTION)
+    return [name for name in names if _NAME.fullmatch(name) and len(name) <= _LONGEST and name not in held]
+
+
+def _force_joint(model: mujoco.MjModel, name: str) -> ForceJoint:
+    joint = model.joint(name)
+    return ForceJoint(int(joint.dofadr[0]), "N" if joint.type[0] == mujoco.mjtJoint.mjJNT_SLIDE else "N m")
+
+
+_ONE_DIRECTION = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 
 
 def _check_sites(path: Path, model: mujoco.MjModel, tracked: str, points: tuple[str, ...]) -> None:

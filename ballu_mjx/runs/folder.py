@@ -17,6 +17,7 @@ import dataclasses
 import datetime
 import json
 import math
+import types
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -321,6 +322,8 @@ def _locked(path: Path) -> IO[str]:
 def _is_of_type(hint: Any, value: Any) -> bool:
     """Whether a value from JSON can be one of a field's type."""
     kind, inner = typing.get_origin(hint), typing.get_args(hint)
+    if kind is types.UnionType:
+        return any(_is_of_type(each, value) for each in inner)
     if kind is typing.Literal:
         return any(type(value) is type(each) and value == each for each in inner)
     if kind is tuple:

@@ -6,30 +6,119 @@ Everything that simulates takes residuals by this one interface, whatever they w
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.robots.description import RobotDescription
 
 Fields = dict[str, Array]
 """Fields of `mjx.Model` by name."""
-ForceSet = Literal["force", "wrench", "multi"]
-"""What a network pushes with: a force on the tracked body (the paper's), a force and a torque on it, or forces on it
-and at every measured point."""
+ForceSet = Literal["force", "wrench", "multi", "joints", "commands"]
+"""What a network acts with: a force on the tracked body (the paper's), a force and a torque on it, forces on it and at
+every measured point, forces and torques along joints, or changes of the commands. `FORCE_SETS` says all of each."""
 
 
-def num_vectors(forces: ForceSet, points: int) -> int:
-    """Vectors in the loads of a robot with so many points."""
-    return {"force": 1, "wrench": 2, "multi": 1 + points}[forces]
+class Action(NamedTuple):
+    """What a residual does over a control step."""
+
+    wrench: Float[Array, "loaded 6"]
+    """Force (N) and torque (N m), world frame; see `ForceModel.wrench`."""
+    joint_force: Float[Array, " nv"] | None = None
+    """N m or N, along `mjx.Data.qvel`; None: none."""
+    command_change: Float[Array, " commands"] | None = None
+    """In the actuators' own units; None: none."""
+
+    def scaled(self, share: Float[Array, ""] | float) -> Action:
+        """Return a share of it."""
+        joint, change = (None if part is None else share * part for part in self[1:])
+        return Action(share * self.wrench, joint, change)
 
 
-def to_wrenches(loads: Float[Array, " loads"], forces: ForceSet) -> Float[Array, "loaded 6"]:
-    """Loads, vector after vector (N, N m; world), as wrenches on the bodies that they act on; the tracked one first,
-    then those of the points."""
-    if forces == "wrench":
-        return loads[None]
+class ForceSetKind(NamedTuple):
+    """A force set."""
+
+    names: Callable[[RobotDescription], list[str]]
+    """Its loads, each with its unit."""
+    turns: bool
+    """Whether loads are vectors, three numbers each, that turn with the robot's heading."""
+    act: Callable[[Float[Array, " loads"], RobotDescription], Action]
+    """Loads, vectors in the world frame, as what they do."""
+
+
+def _vectors(*heads: str) -> list[str]:
+    return [f"{head.partition(',')[0]} {axis},{head.partition(',')[2]}" for head in heads for axis in "xyz"]
+
+
+def _joint_names(robot: RobotDescription) -> list[str]:
+    return [
+        f"{'force' if joint.unit == 'N' else 'torque'} along {name}, {joint.unit}"
+        for name, joint in robot.force_joints.items()
+    ]
+
+
+def _act_at_joints(loads: Float[Array, " loads"], robot: RobotDescription) -> Action:
+    places = np.array([joint.place for joint in robot.force_joints.values()], int)
+    return Action(_nothing(), jnp.zeros(robot.directions, loads.dtype).at[places].set(loads))
+
+
+def _nothing() -> Float[Array, "1 6"]:
+    return jnp.zeros((1, 6))
+
+
+FORCE_SETS: Mapping[ForceSet, ForceSetKind] = {
+    "force": ForceSetKind(
+        lambda robot: _vectors(f"force on {robot.tracked}, N"),
+        True,
+        lambda loads, robot: Action(_forces_alone(loads)),
+    ),
+    "wrench": ForceSetKind(
+        lambda robot: _vectors(f"force on {robot.tracked}, N", f"torque on {robot.tracked}, N m"),
+        True,
+        lambda loads, robot: Action(loads[None]),
+    ),
+    "multi": ForceSetKind(
+        lambda robot: _vectors(f"force on {robot.tracked}, N", *(f"force at {point}, N" for point in robot.points)),
+        True,
+        lambda loads, robot: Action(_forces_alone(loads)),
+    ),
+    "joints": ForceSetKind(_joint_names, False, _act_at_joints),
+    "commands": ForceSetKind(
+        lambda robot: [f"change of command {command}, its units" for command in robot.commands],
+        False,
+        lambda loads, robot: Action(_nothing(), None, loads),
+    ),
+}
+"""By name. All methods that learn a network take all of them."""
+
+
+def _forces_alone(loads: Float[Array, " loads"]) -> Float[Array, "loaded 6"]:
     return jnp.pad(loads.reshape(-1, 3), [(0, 0), (0, 3)])
+
+
+def num_loads(forces: ForceSet, robot: RobotDescription) -> int:
+    """Return the number of a force set's loads on a robot."""
+    return len(FORCE_SETS[forces].names(robot))
+
+
+def check_force_set(forces: ForceSet, robot: RobotDescription) -> None:
+    """**Raises** `InputError` where the robot has nothing that the force set acts on."""
+    if not num_loads(forces, robot):
+        raise InputError(
+            f'--forces {forces}: {robot.name} has no hinge or slide to act along; name some under "force_joints" in '
+            f"{robot.file}, or give another force set."
+        )
+
+
+def add_parts(one: Array | None, other: Array | None) -> Array | None:
+    """Return the sum of what may be missing."""
+    if one is None or other is None:
+        return other if one is None else one
+    return one + other
 
 
 def add_wrenches(one: Float[Array, "loaded 6"], other: Float[Array, "others 6"]) -> Float[Array, "bodies 6"]:
@@ -81,6 +170,27 @@ class ForceModel(Protocol):
         """
         ...
 
+    def joint_force(
+        self,
+        params: Any,
+        history: Float[Array, "steps features"],
+        commands: Float[Array, "steps commands"],
+        key: Array | None = None,
+    ) -> Float[Array, " nv"] | None:
+        """Generalized forces (N m, N, along `mjx.Data.qvel`) over the coming control step; None: there are none."""
+        del params, history, commands, key
+
+    def command_change(
+        self,
+        params: Any,
+        history: Float[Array, "steps features"],
+        commands: Float[Array, "steps commands"],
+        key: Array | None = None,
+    ) -> Float[Array, " commands"] | None:
+        """What is added to the coming command (the actuators' own units); None: nothing. The sum stays within the
+        commands' ranges."""
+        del params, history, commands, key
+
 
 class BoundForces(NamedTuple):
     """A kind of residual with its parameters."""
@@ -124,7 +234,7 @@ def add_to_base(base: BoundForces | None, further: ForceModel) -> tuple[ForceMod
     return SumOfForces(base.model, further), lambda params: (base.params, params)
 
 
-class SumOfForces:
+class SumOfForces(ForceModel):
     """Two residuals, acting together: `params` of both, in order. It sees what the second sees."""
 
     def __init__(self, first: ForceModel, second: ForceModel) -> None:
@@ -159,4 +269,26 @@ class SumOfForces:
     ) -> Float[Array, "loaded 6"]:
         return add_wrenches(
             *(part.wrench(own, history, commands, key) for part, own in zip(self.parts, params, strict=True))
+        )
+
+    def joint_force(
+        self,
+        params: Any,
+        history: Float[Array, "steps features"],
+        commands: Float[Array, "steps commands"],
+        key: Array | None = None,
+    ) -> Float[Array, " nv"] | None:
+        return add_parts(
+            *(part.joint_force(own, history, commands, key) for part, own in zip(self.parts, params, strict=True))
+        )
+
+    def command_change(
+        self,
+        params: Any,
+        history: Float[Array, "steps features"],
+        commands: Float[Array, "steps commands"],
+        key: Array | None = None,
+    ) -> Float[Array, " commands"] | None:
+        return add_parts(
+            *(part.command_change(own, history, commands, key) for part, own in zip(self.parts, params, strict=True))
         )

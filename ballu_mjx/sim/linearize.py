@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ballu_mjx.sim.coordinates import compress, expand, has_free_joint
-from ballu_mjx.sim.force_model import ForceSet, num_vectors, to_wrenches
+from ballu_mjx.sim.force_model import FORCE_SETS, ForceSet, num_loads
 from ballu_mjx.sim.sharding import chunks, shard_over_devices
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState
@@ -36,7 +36,7 @@ class ControlSteps(NamedTuple):
     command: Float[Array | np.ndarray, "steps commands"]
     """Of the coming control step."""
     loads: Float[Array | np.ndarray, "steps loads"]
-    """What pushes the robot (N, N m; world), of the linearizer's force set."""
+    """What acts on the robot (N, N m, commands' units; world), of the linearizer's force set."""
 
 
 class Linearized(NamedTuple):
@@ -73,7 +73,7 @@ class Linearizer:
         self._nv, self._free = plain.nv, has_free_joint(plain.mj_model)
         self._forces: ForceSet = forces
         self._joints = np.array([plain.mj_model.joint(name).dofadr[0] for name in joints], int)
-        self.loads = 3 * num_vectors(forces, len(plain.robot.points))
+        self.loads = num_loads(forces, plain.robot)
         over = functools.partial(nested_vmap, inner=self.directions)
         self._each = shard_over_devices(self._one, shared=0, over=over)
 
@@ -102,14 +102,15 @@ class Linearizer:
         moves = PhysicsState(rates, units[:, nv : 2 * nv], jnp.zeros_like(units[:, :nv])), units[:, 2 * nv :]
 
         def after(moved: PhysicsState, inputs: Float[Array, " inputs"]) -> tuple[PhysicsState, Array]:
-            wrench = to_wrenches(jnp.asarray(step.loads) + inputs[: self.loads], self._forces)
+            loads = jnp.asarray(step.loads) + inputs[: self.loads]
+            does = FORCE_SETS[self._forces].act(loads, self.simulator.robot)._asdict()
             torques = jnp.zeros(nv).at[self._joints].set(inputs[self.loads :])
             history = jnp.asarray(step.state.history)
             if self.simulator.residual is not None:  # which sees the moved state
                 history = history.at[-1].set(self.simulator.simulator.observe(moved)[0])
             state = jax.tree.map(jnp.asarray, step.state._replace(physics=moved, history=history))
             simulator = self.simulator.with_generalized_force(torques)
-            done = simulator.step(state, jnp.asarray(step.command), wrench=wrench).state
+            done = simulator.step(state, jnp.asarray(step.command), **does).state
             return done.physics, done.features
 
         # The step itself is the same for all directions, and simulated once for all.

@@ -27,7 +27,7 @@ from ballu_mjx.sim.drivetrain import (
     init_drivetrain,
     scan_drivetrain,
 )
-from ballu_mjx.sim.force_model import BoundForces, HasForces, add_wrenches
+from ballu_mjx.sim.force_model import Action, BoundForces, HasForces, add_parts, add_wrenches
 from ballu_mjx.sim.observation import observe_features
 from ballu_mjx.sim.sharding import chunks
 from ballu_mjx.sim.step import PhysicsState, control_step, count_substeps, load_state, make_data, put_model, state_at
@@ -154,14 +154,21 @@ class Simulator:
         return scan_drivetrain(self.drivetrain, state, self._in_substeps(command), self._timestep)
 
     def step(
-        self, state: PhysicsState, ctrl: Float[Array, "*parts commands"], wrench: Float[Array, "loaded 6"]
+        self,
+        state: PhysicsState,
+        ctrl: Float[Array, "*parts commands"],
+        wrench: Float[Array, "loaded 6"],
+        joint_force: Float[Array, " nv"] | None = None,
     ) -> PhysicsState:
         """One control step under the actuators' `ctrl`, or one for each of equal parts of it; wrenches are on the
         tracked body and, if more, at the robot's points. See `step.control_step`."""
         commands = self._in_substeps(ctrl)
         sites, bodies = zip(*self._sites[: len(wrench)], strict=True)
+        template = self._template
+        if joint_force is not None:
+            template = template.replace(qfrc_applied=template.qfrc_applied + joint_force)  # pyright: ignore
         return control_step(
-            self.model, self._template, state, commands, wrench, bodies=bodies, points=sites[1:], count=self.substeps
+            self.model, template, state, commands, wrench, bodies=bodies, points=sites[1:], count=self.substeps
         )
 
     @property
@@ -243,6 +250,8 @@ class RolloutStep(NamedTuple):
     """Centre of mass (m, world) after the step."""
     wrench: Float[Array, "loaded 6"]
     """Force (N) and torque (N m, world) that pushed over the step: on the tracked body, then at the points."""
+    joint_force: Float[Array, " nv"] | None = None
+    """Generalized forces (N m, N) of residuals over the step; None: there were none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -315,6 +324,8 @@ class AugmentedSimulator:
         command: Float[Array, " commands"],
         *,
         wrench: Float[Array, "others 6"] | None = None,
+        joint_force: Float[Array, " nv"] | None = None,
+        command_change: Float[Array, " commands"] | None = None,
         wrench_scale: Float[Array, ""] | float | None = None,
         key: Array | None = None,
     ) -> RolloutStep:
@@ -327,33 +338,43 @@ class AugmentedSimulator:
         - `state`: where the simulation stands; the residual sees its history and commands.
         - `command`: of the coming control step, in the actuators' own units.
         - `wrench`: further force (N) and torque (N m, world), on the tracked body and, if more, at the points.
-        - `wrench_scale`: multiplies the residual's wrenches, not its commands and model fields.
+        - `joint_force`: further generalized forces (N m, N, along `mjx.Data.qvel`).
+        - `command_change`: what is further added to the command, within its range.
+        - `wrench_scale`: multiplies the residual's wrenches, joint forces and changes of the command, not its delays
+          and model fields.
         - `key`: to draw the residual's wrenches; None: the most likely ones.
         """
         commands = state.with_command(command)
         if self.residual is None:
             sent, total = command, jnp.zeros((1, 6)) if wrench is None else wrench
         else:
-            sent, total = self._ask(state.history, commands, key)
-            total = total if wrench_scale is None else wrench_scale * total
-            total = total if wrench is None else add_wrenches(wrench, total)
+            sent, own = self._ask(state.history, commands, key)
+            if wrench_scale is not None:
+                own = own.scaled(wrench_scale)
+            total = own.wrench if wrench is None else add_wrenches(wrench, own.wrench)
+            joint_force = add_parts(joint_force, own.joint_force)
+            command_change = add_parts(command_change, own.command_change)
+        if command_change is not None:
+            low, high = np.array(self.robot.command_ranges, np.float32).T
+            sent = jnp.clip(sent + command_change, low, high)
         drivetrain, ctrl = self.simulator.drive(state.drivetrain, sent)
-        physics = self.simulator.step(state.physics, ctrl, total)
+        physics = self.simulator.step(state.physics, ctrl, total, joint_force)
         features, com = self.simulator.observe(physics)
         history = jnp.concatenate([state.history[1:], features[None]])
-        return RolloutStep(RolloutState(physics, history, commands[1:], drivetrain), com, total)
+        return RolloutStep(RolloutState(physics, history, commands[1:], drivetrain), com, total, joint_force)
 
     def _ask(
         self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"], key: Array | None
-    ) -> tuple[Float[Array, "*parts commands"], Float[Array, "loaded 6"]]:
-        """Return the residual's commands and wrenches."""
+    ) -> tuple[Float[Array, "*parts commands"], Action]:
+        """Return the residual's commands before it changes them, and what it does."""
         assert self.residual is not None
         model, params = self.residual.model, self.residual.params
-        wrench = model.wrench(params, history, commands, key)
+        seen = params, history, commands, key
+        does = Action(model.wrench(*seen), model.joint_force(*seen), model.command_change(*seen))
         sent = model.command(params, commands)
         if self.scale is None:
-            return sent, wrench
-        return (1 - self.scale) * commands[-1] + self.scale * sent, self.scale * wrench
+            return sent, does
+        return (1 - self.scale) * commands[-1] + self.scale * sent, does.scaled(self.scale)
 
 
 @functools.partial(jax.jit, static_argnames=("sites", "root"))

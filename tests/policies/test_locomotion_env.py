@@ -21,7 +21,7 @@ from ballu_mjx.policies.locomotion_env import (
 )
 from ballu_mjx.policies.tasks import TASKS, Step
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.residuals.network import NetworkForces
+from ballu_mjx.residuals.network import NetworkForces, load_units
 from ballu_mjx.residuals.trained import MARGIN, TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.learner import Learner
@@ -32,6 +32,8 @@ from ballu_mjx.sim.step import state_at
 
 BALLU = load_robot()
 MODEL = BALLU.load_model()
+UNIT = load_units(EnvMimicConfig(), BALLU)[0]
+"""N."""
 INPUTS = 87
 """Of the residual: three steps of 27 features, and three commands."""
 
@@ -158,7 +160,7 @@ def test_residual_pushes_in_the_balloon_s_heading_and_only_so_hard():
     state = jax.jit(lambda qpos: env.step(env.at(qpos, zeros, jax.random.key(0)), -jnp.ones(2)))(qpos)
 
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    force = turn @ (EnvMimicConfig().force_scale * action)
+    force = turn @ (UNIT * action)
     pushed = jax.jit(lambda wrench: simulator.step(state_at(qpos, zeros), jnp.zeros(2), wrench))
     expected = pushed(jnp.asarray([[*force, 0, 0, 0]], jnp.float32))
     np.testing.assert_allclose(inner(state).rollout.physics.qvel, expected.qvel, atol=1e-5)
@@ -186,7 +188,7 @@ def test_force_fades_outside_of_what_the_residual_has_seen():
         )
         assert float(state.metrics["excess"]) == pytest.approx(expected, rel=1e-5)
         forces.append(float(state.metrics["force"]))
-    assert forces[0] == pytest.approx(EnvMimicConfig().force_scale, rel=1e-5)
+    assert forces[0] == pytest.approx(UNIT, rel=1e-5)
     assert forces[1] == pytest.approx(forces[0] * np.exp(-3.0 * expected), rel=1e-5)
 
 

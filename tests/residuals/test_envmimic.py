@@ -16,7 +16,7 @@ from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, reward_terms, tracking_state
-from ballu_mjx.residuals.network import NetworkForces, network_input, world_loads
+from ballu_mjx.residuals.network import NetworkForces, load_units, network_input, world_loads
 from ballu_mjx.rl.learner import Learner
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.registry import load_robot
@@ -229,7 +229,7 @@ def test_the_missing_force_earns_more_than_none_and_its_opposite_less(pushed: Mo
         run, reward = state, 0.0
         for _ in range(20):
             heading = np.asarray(heading_rotation(tracking_state(run).rollout.features[8]))
-            action = jnp.zeros(env.action_size).at[:3].set(heading.T @ force / env.config.force_scale)
+            action = jnp.zeros(env.action_size).at[:3].set(heading.T @ force / load_units(env.config, env.robot)[:3])
             run = step(run, action)
             reward += float(run.reward)
         return reward
@@ -249,7 +249,7 @@ def evaluator() -> OpenLoopEvaluator:
     """Of a recording without and a shorter one with `FORCE`; the policy's parameters are the force it gives."""
     config = EnvMimicConfig()
     motions = [make_motion(np.zeros(3), "near-own", 60), make_motion(FORCE, "far-pushed", 50)]
-    constant = NetworkForces(config, load_robot(), lambda params, _: params / config.force_scale)
+    constant = NetworkForces(config, load_robot(), lambda params, _: params / load_units(config, load_robot()))
     return OpenLoopEvaluator(Simulator(load_robot()), motions, constant)
 
 

@@ -62,11 +62,17 @@ sys.exit(residual.self_test(sys.argv[1]))
 """Runs an exported simulator where there are NumPy and MuJoCo only."""
 
 
+SCALES: dict[ForceSet, tuple[float, ...]] = {"joints": (0.05, 0.02), "commands": (0.1, 0.2)}
+"""Of the arm."""
+
+
 def network(
     robot: RobotDescription, forces: ForceSet, seed: int = 0, activation: Any = "swish", **settings: bool
 ) -> BoundForces:
     """A network drawn at random, that pushes with tenths of a newton."""
-    config = ForceNetworkConfig(forces=forces, force_scale=0.1, torque_scale=0.01, **settings)
+    config = ForceNetworkConfig(
+        forces=forces, force_scale=0.1, torque_scale=0.01, force_limit=1.0, scales=SCALES.get(forces, ()), **settings
+    )
     options = PPOConfig(policy_layers=(16, 8), value_layers=(4,), activation=activation)
     rng = np.random.default_rng(seed)
     inputs, loads = num_inputs(config, robot), num_loads(config, robot)
@@ -112,9 +118,10 @@ def rover(folder: Path) -> AugmentedSimulator:
 
 
 def arm(folder: Path) -> AugmentedSimulator:
-    """An anchored robot with an identified drivetrain, and a network."""
+    """An anchored robot with an identified drivetrain, and networks for its body, its joints and its commands."""
     robot = write_arm(folder)
-    return Simulator(robot, identified(robot, **TRUTH)).with_residual(network(robot, "force"))
+    simulator = Simulator(robot, identified(robot, **TRUTH)).with_residual(network(robot, "force"))
+    return simulator.with_residual(network(robot, "joints", 1)).with_residual(network(robot, "commands", 2))
 
 
 def balloon(folder: Path) -> AugmentedSimulator:
@@ -224,10 +231,10 @@ def test_onnx_networks_are_the_networks_and_name_their_inputs(tmp_path_factory: 
 
 def test_names_say_what_a_network_sees_and_gives(tmp_path: Path):
     robot = write_rover(tmp_path)
-    config = ForceNetworkConfig(forces="multi")
+    config = ForceNetworkConfig(forces="multi", force_scale=0.1, force_limit=1.0)
     names = network_input_names(config, robot)
     assert len(names) == len(set(names)) == num_inputs(config, robot)
-    assert len(load_names(config, robot)) == num_loads(config, robot) == len(load_units(config, 6))
+    assert len(load_names(config, robot)) == num_loads(config, robot) == len(load_units(config, robot))
     history = np.zeros((3, robot.features))
     history[0, 6], history[1, 12], history[2, 2], history[2, 11] = 0.1, 0.2, 0.3, 0.7
     commands = np.array([[-0.4, 0.0], [0.6, 0.0], [0.1, 2.0]])

@@ -36,7 +36,8 @@ ROBOT = read_description(FOLDER / "balloon.robot.json")
 SIMULATOR = Simulator(ROBOT)
 PUSH = np.array([0.02, -0.03, 0.015])
 """N, world."""
-CONFIG = EnvMimicConfig()
+CONFIG = EnvMimicConfig(force_scale=0.05, torque_scale=0.005, force_limit=1.0, force_cost=20.0)
+PRIORS = SupervisedConfig(force_spread=0.3, force_change=0.1, torque_spread=0.05)
 NETWORK = PPOConfig(policy_layers=(16,), value_layers=(4,))
 STEPS = 60
 
@@ -74,10 +75,10 @@ def linearize() -> Linearizer:
 
 def test_labels_are_the_push(motions: list[Motion], linearize: Linearizer):
     """In the world's frame, whichever way the balloon faces."""
-    labels = supervised.ForceLabeller(linearize, SupervisedConfig())(motions[0])
+    labels = supervised.ForceLabeller(linearize, PRIORS, CONFIG)(motions[0])
     np.testing.assert_allclose(np.median(labels, axis=0), PUSH, atol=0.1 * float(np.linalg.norm(PUSH)))
     _, actions = supervised.examples(SIMULATOR, motions[:1], [np.tile(PUSH, (STEPS, 1))], CONFIG)
-    np.testing.assert_allclose(load_units(CONFIG, 3) * actions, np.tile(PUSH, (len(actions), 1)), atol=1e-6)
+    np.testing.assert_allclose(load_units(CONFIG, ROBOT) * actions, np.tile(PUSH, (len(actions), 1)), atol=1e-6)
     yaw = stack_motions(SIMULATOR, motions)[0].features[0, :, ObservationLayout.yaw]
     assert np.ptp(np.asarray(yaw)) > 0.1  # in a heading frame these would be other actions
 
@@ -106,7 +107,7 @@ def test_gradients_through_the_simulation_find_the_push(motions: list[Motion], l
     )
     policy, metrics = found[-1]
     actions = np.asarray(forces.infer(start._replace(policy=policy), jnp.asarray(inputs)))
-    found_push = (load_units(CONFIG, 3) * actions).mean(axis=0)
+    found_push = (load_units(CONFIG, ROBOT) * actions).mean(axis=0)
     # A force along the taut tether moves the balloon no more than another one: only the horizontal part shows.
     np.testing.assert_allclose(found_push[:2], PUSH[:2], atol=0.05 * float(np.linalg.norm(PUSH)))
     assert metrics["loss"] < 0.1 * found[0][1]["loss"]

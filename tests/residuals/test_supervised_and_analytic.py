@@ -208,7 +208,7 @@ def test_gradients_find_the_push(recorded: Segments, inputs: np.ndarray, start: 
     )
     policy, metrics = found[-1]
     actions_found = np.asarray(FORCES.infer(start._replace(policy=policy), jnp.asarray(inputs)))
-    stepping, falling = (load_units(WRENCH, ACTIONS) * actions_found).reshape(2, -1, ACTIONS).mean(axis=1)
+    stepping, falling = (load_units(WRENCH, BALLU) * actions_found).reshape(2, -1, ACTIONS).mean(axis=1)
     np.testing.assert_allclose(falling[:3], PUSH, atol=CLOSE)
     np.testing.assert_allclose(falling[3:], 0.0, atol=CLOSE_TWIST)
     # On legs other forces and torques, which change from step to step, move the balloon almost as this force does.

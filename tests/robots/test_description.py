@@ -23,7 +23,7 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, tracking_state
-from ballu_mjx.residuals.network import world_loads
+from ballu_mjx.residuals.network import load_units, world_loads
 from ballu_mjx.residuals.run_config import describe_recording, find_recordings, run_robot
 from ballu_mjx.robots.description import read_description
 from ballu_mjx.robots.model import assets
@@ -332,7 +332,7 @@ def test_the_environment_steps_as_c_mujoco_does(env: EnvMimicEnv):
     for number in range(10):
         data.ctrl[:] = np.asarray(env.reference.command[0, int(start.time) + number])
         mujoco.mj_step(model, data, count_substeps(model, CONTROL_TIMESTEP))
-        state = step(state, jnp.asarray(PUSH / env.config.force_scale, jnp.float32))
+        state = step(state, jnp.asarray(PUSH / load_units(env.config, DESCRIPTION), jnp.float32))
     after = tracking_state(state)
     np.testing.assert_allclose(after.rollout.physics.qpos, data.qpos, atol=2e-4)
     mujoco.mj_forward(model, data)
@@ -354,7 +354,9 @@ def test_an_anchored_robot_sees_the_world(motion: Motion, env: EnvMimicEnv):
     changed = np.flatnonzero(np.abs(seen - other) > 1e-6)
     assert len(changed) == HISTORY, "the yaw alone"
     np.testing.assert_allclose(np.sort(np.asarray(seen)[:3]), np.sort(np.asarray(history[0, :3])), atol=1e-6)
-    force = world_loads(jnp.array([1.0, 2.0, 3.0]), turned[-1, 8], EnvMimicConfig(), DESCRIPTION)
+    force = world_loads(
+        jnp.array([1.0, 2.0, 3.0]), turned[-1, 8], EnvMimicConfig(force_scale=0.05, force_limit=1.0), DESCRIPTION
+    )
     np.testing.assert_allclose(force, [0.05, 0.1, 0.15], atol=1e-6)
 
 

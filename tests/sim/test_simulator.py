@@ -12,7 +12,7 @@ import pytest
 from jaxtyping import Array, Float
 
 from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.sim.force_model import BoundForces, Fields
+from ballu_mjx.sim.force_model import BoundForces, Fields, ForceModel
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState, state_at
@@ -23,10 +23,12 @@ LAYOUT = ObservationLayout.of(ROBOT)
 BODY = SIMULATOR.mj_model.body("balloon").id
 
 
-class Springs:
+class Springs(ForceModel):
     """A residual that changes everything a residual can: heavier, late by a step, pulled towards its last places."""
 
-    name = "springs"
+    @property
+    def name(self) -> str:
+        return "springs"
 
     def inputs(self, history: Array, commands: Array) -> Array:
         return jnp.concatenate([history.ravel(), commands.ravel()])
@@ -96,7 +98,9 @@ def test_further_wrenches_and_residuals_add_up(start: RolloutState):
     """Two residuals in a row, a scaled wrench and another one on the base: their sum pushes."""
 
     class Push(Springs):
-        name = "push"
+        @property
+        def name(self) -> str:
+            return "push"
 
         def fields(self, params: Array) -> Fields:
             return {}

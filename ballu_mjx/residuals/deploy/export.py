@@ -24,7 +24,7 @@ from ballu_mjx.common.standalone import standalone_source
 from ballu_mjx.residuals.aerodynamics import Aerodynamics, air_parameters_to_json
 from ballu_mjx.residuals.deploy import residual as standalone
 from ballu_mjx.residuals.fluid import FluidForces
-from ballu_mjx.residuals.network import NetworkForces, load_names, load_units, network_input_names
+from ballu_mjx.residuals.network import NetworkForces, load_names, load_scales, network_input_names
 from ballu_mjx.rl.network_export import NetworkPort, OutputScale, check_onnx, network_arrays, onnx_model
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.mjcf import write_mjcf
@@ -178,11 +178,12 @@ def _network_part(simulator: AugmentedSimulator, model: NetworkForces, params: A
     if model.network is None:
         raise InputError(f"The options of the network of {model.name} are unknown; load the residual from its run.")
     config, robot = model.config, simulator.robot
-    units = load_units(config, len(load_names(config, robot)))
+    scales = load_scales(config, robot)
     settings = {
         "kind": "network",
         "name": model.name,
         "forces": config.forces,
+        "joints": list(robot.force_joints) if config.forces == "joints" else [],
         "relative_observation": config.relative_observation and not robot.anchored,
         "heading_frame": config.heading_frame and not robot.anchored,
         "observe_command": config.observe_command,
@@ -190,8 +191,8 @@ def _network_part(simulator: AugmentedSimulator, model: NetworkForces, params: A
         "activation": model.network.activation,
         "inputs": network_input_names(config, robot),
         "outputs": load_names(config, robot),
-        "unit": units.tolist(),
-        "limit": (units * config.force_limit / config.force_scale).tolist(),
+        "unit": scales.units.tolist(),
+        "limit": (scales.units * scales.limit).tolist(),
     }
     arrays = network_arrays(params, model.network)
     del arrays["activation"]
@@ -436,8 +437,8 @@ def _readme(
         f"solver makes at most {option.iterations} iterations, as in training.",
         f"Commands are in the actuators' own units: {ranges}.",
         "`ImprovedSimulator(folder, model)` takes a scene of your own that holds the robot, with the same names of "
-        "sites and actuators. It sets `ctrl` of the robot's actuators, and `xfrc_applied` of the bodies that the "
-        "residual pushes.",
+        "sites and actuators. It sets `ctrl` of the robot's actuators, and `xfrc_applied` of the bodies and "
+        "`qfrc_applied` of the joints that the residual pushes.",
     ]
     if left_out:
         lines.append(f"MJCF cannot hold these fields; `parameters.npz` does: {', '.join(left_out)}.")

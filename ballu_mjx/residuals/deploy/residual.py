@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -115,8 +115,34 @@ def _turn(matrix: np.ndarray) -> np.ndarray:
 # ---- the residual's parts ----
 
 
-class NetworkPart:
-    """Forces, or a force and a torque, by a neural network; `part` is its entry in `simulator.json`."""
+class Part:
+    """A part of the residual. What it does not do has these answers."""
+
+    joints: Sequence[str] = ()
+    """Joints that it acts along."""
+
+    def command(self, commands: np.ndarray) -> np.ndarray:
+        """Return the command, as it is or late, for equal parts of the control step."""
+        return commands[-1:]
+
+    def wrench(self, history: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        """Return the wrenches (N, N m; world): on the tracked body, then at the points where there are more."""
+        del history, commands
+        return np.zeros((1, 6))
+
+    def joint_force(self, history: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        """Return forces and torques (N, N m) along `joints`."""
+        del history, commands
+        return np.zeros(len(self.joints))
+
+    def command_change(self, history: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        """Return what is added to the command."""
+        del history
+        return np.zeros(commands.shape[1])
+
+
+class NetworkPart(Part):
+    """Forces, torques or changes of the command by a neural network; `part` is its entry in `simulator.json`."""
 
     def __init__(self, part: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
         self._part = part
@@ -124,21 +150,32 @@ class NetworkPart:
         count = sum(name.startswith("kernel_") for name in arrays)
         self._layers = [(arrays[f"kernel_{i}"], arrays[f"bias_{i}"]) for i in range(count)]
         self._activation = {"swish": _swish, "tanh": np.tanh}[part["activation"]]
+        self.joints = part["joints"]
 
-    def command(self, commands: np.ndarray) -> np.ndarray:
-        """Return the command as it is."""
-        return commands[-1:]
+    def joint_force(self, history: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        """Return forces and torques (N, N m) along `joints`."""
+        if self._part["forces"] != "joints":
+            return super().joint_force(history, commands)
+        return self.loads(network_input(history, commands, self._part))
+
+    def command_change(self, history: np.ndarray, commands: np.ndarray) -> np.ndarray:
+        """Return what is added to the command."""
+        if self._part["forces"] != "commands":
+            return super().command_change(history, commands)
+        return self.loads(network_input(history, commands, self._part))
 
     def wrench(self, history: np.ndarray, commands: np.ndarray) -> np.ndarray:
         """Return the wrenches (N, N m; world): on the tracked body, then at the points where there are more."""
         part = self._part
+        if part["forces"] in ("joints", "commands"):
+            return super().wrench(history, commands)
         loads = self.loads(network_input(history, commands, part)).reshape(-1, 3)
         if part["heading_frame"]:
             loads = loads @ heading_rotation(history[-1, YAW]).T
         return loads.reshape(1, 6) if part["forces"] == "wrench" else np.pad(loads, [(0, 0), (0, 3)])
 
     def loads(self, seen: np.ndarray) -> np.ndarray:
-        """Return the loads (N, N m), in the frame of what the network sees."""
+        """Return the loads (N, N m, commands' units), in the frame of what the network sees."""
         x = np.clip((seen - self._mean) / self._std, -self._clip, self._clip)
         for number, (kernel, bias) in enumerate(self._layers):
             x = x @ kernel + bias
@@ -152,7 +189,7 @@ def _swish(x: np.ndarray) -> np.ndarray:
     return x * (1 + np.tanh(x / 2)) / 2  # without overflow
 
 
-class AerodynamicPart:
+class AerodynamicPart(Part):
     """Drag of the tracked body, and late commands; its mass, inertia, centre and lift stand in the model."""
 
     def __init__(self, part: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
@@ -178,7 +215,7 @@ class AerodynamicPart:
         return np.concatenate([now @ force, now @ (-self._turning * rate)])[None]
 
 
-class FluidPart:
+class FluidPart(Part):
     """Force and torque on the tracked body as polynomials of its motion, in its own axes."""
 
     _NAMES = ("vx", "vy", "vz", "wx", "wy", "wz", "gx", "gy", "gz")
@@ -188,10 +225,6 @@ class FluidPart:
         self._factors = [[self._NAMES.index(name) for name in term["factors"]] for term in part["terms"]]
         self._power = np.array([term["power_of_speed"] for term in part["terms"]])
         self._coefficients = arrays["coefficients"]
-
-    def command(self, commands: np.ndarray) -> np.ndarray:
-        """Return the command as it is."""
-        return commands[-1:]
 
     def wrench(self, history: np.ndarray, commands: np.ndarray) -> np.ndarray:
         """Return the wrench (N, N m; world)."""
@@ -299,8 +332,15 @@ class ImprovedSimulator:
         drivetrain, timestep = settings["drivetrain"], float(self.model.opt.timestep)
         self.drivetrain = None if drivetrain is None else Drivetrain(drivetrain, timestep)
         """None where commands arrive unchanged."""
+        self._places = [
+            self.model.jnt_dofadr[self._find(mujoco.mjtObj.mjOBJ_JOINT, part.joints)] if len(part.joints) else []
+            for part in self.residual
+        ]
+        self._ranges = np.array([[command["low"], command["high"]] for command in settings["commands"]]).T
         self.wrench = np.zeros((1, 6))
         """Force (N) and torque (N m, world) of the last control step: on the tracked body, then at the points."""
+        self.joint_force = np.zeros(self.model.nv)
+        """Generalized forces (N, N m) of the last control step."""
         self.reset()
 
     def reset(
@@ -348,6 +388,12 @@ class ImprovedSimulator:
             self.wrench = np.zeros((max(map(len, wrenches)), 6))
             for wrench in wrenches:
                 self.wrench[: len(wrench)] += wrench
+            self.joint_force[:] = 0.0
+            for places, part in zip(self._places, self.residual, strict=True):
+                self.joint_force[places] += part.joint_force(self._history, commands)
+            change = sum(part.command_change(self._history, commands) for part in self.residual)
+            if np.any(change):
+                sent = np.clip(sent + change, *self._ranges)
         for ctrl in np.repeat(sent, self.substeps // len(sent), axis=0):
             self._physics_step(ctrl if self.drivetrain is None else self.drivetrain.step(ctrl))
             yield self.data
@@ -358,6 +404,8 @@ class ImprovedSimulator:
         model, data = self.model, self.data
         data.ctrl[self._actuators] = ctrl
         data.xfrc_applied[self._bodies] = 0.0
+        for places in self._places:
+            data.qfrc_applied[places] = self.joint_force[places]
         if len(self.wrench) > 1:  # where the points are now decides on the torques
             mujoco.mj_kinematics(model, data)
         for number, (wrench, site, body) in enumerate(zip(self.wrench, self._sites, self._bodies, strict=False)):

@@ -137,10 +137,9 @@ def load(data: Path, numbers: Sequence[int], robot: RobotDescription, made: Path
 
 
 # %%
-class PublishedAerodynamics:
+class PublishedAerodynamics(ForceModel):
     """The published model as a residual; it has no parameters."""
 
-    name = "published"
     pressure_area = 0.5 * 1.2187 * 0.25
     damping = np.array([-0.0503, -0.0264, -0.0137])
     centre = np.array([-0.0436, 0.0003, -0.008])
@@ -148,6 +147,10 @@ class PublishedAerodynamics:
 
     def __init__(self, control_timestep: float) -> None:
         self._control_timestep = control_timestep
+
+    @property
+    def name(self) -> str:
+        return "published"
 
     def inputs(self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]) -> Array:
         del commands

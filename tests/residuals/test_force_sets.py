@@ -1,0 +1,199 @@
+"""Force sets on a servo arm: what each does, that labels and gradients find it, and scales from the data."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from servo_arm import wandering, write_arm
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reference import stack_motions
+from ballu_mjx.residuals import supervised
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, tracking_state
+from ballu_mjx.residuals.network import ForceNetworkConfig, NetworkForces, load_scales, num_loads
+from ballu_mjx.residuals.scales import describe_scales, missing_loads, settle_scales
+from ballu_mjx.residuals.supervised import SupervisedConfig
+from ballu_mjx.robots.description import RobotDescription, read_description
+from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.force_model import BoundForces, ForceModel, ForceSet
+from ballu_mjx.sim.linearize import Linearizer
+from ballu_mjx.sim.simulator import RolloutState, Simulator
+from ballu_mjx.sim.step import count_substeps, state_at
+
+STEPS = 80
+TORQUE = np.array([0.08, -0.03])
+"""N m, at shoulder and elbow."""
+SHIFT = np.array([0.05, -0.1])
+"""Of the commands, rad."""
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
+    return write_arm(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def simulator(robot: RobotDescription) -> Simulator:
+    return Simulator(robot)
+
+
+def move(robot: RobotDescription, torque: Any = 0.0, shift: Any = 0.0, friction: float = 0.0) -> Motion:
+    """The arm in C MuJoCo with torques at its joints, other commands than told, or friction at the shoulder."""
+    model, told = robot.load_model(), 0.8 * wandering(0, STEPS)
+    model.dof_frictionloss[0] = friction
+    data = mujoco.MjData(model)
+    data.qfrc_applied[:] = torque
+    states = [(data.qpos.copy(), data.qvel.copy())]
+    for command in told:
+        data.ctrl[:] = command + shift
+        mujoco.mj_step(model, data, count_substeps(model, robot.control_timestep))
+        states.append((data.qpos.copy(), data.qvel.copy()))
+    qpos, qvel = map(np.array, zip(*states, strict=True))
+    return Motion("near-arm", np.arange(STEPS + 1) * robot.control_timestep, told, qpos, qvel, {})
+
+
+def constant(robot: RobotDescription, forces: ForceSet, loads: np.ndarray) -> BoundForces:
+    """A residual that always gives `loads`."""
+    config = ForceNetworkConfig(forces=forces, force_scale=1.0, force_limit=20.0, scales=(1.0,) * len(loads))
+    return BoundForces(NetworkForces(config, robot, lambda params, _: params), jnp.asarray(loads, jnp.float32))
+
+
+def begin(simulator: Simulator, motion: Motion) -> RolloutState:
+    reference, _ = stack_motions(simulator, [motion])
+    physics = state_at(reference.qpos[0, 2], reference.qvel[0, 2])
+    return RolloutState(physics, reference.features[0, :3], reference.command[0, :2])
+
+
+SETS: list[tuple[ForceSet, np.ndarray, dict[str, Any]]] = [
+    ("joints", TORQUE, {"torque": TORQUE}),
+    ("commands", SHIFT, {"shift": SHIFT}),
+]
+
+
+@pytest.mark.parametrize(("forces", "loads", "truth"), SETS)
+def test_a_simulator_with_what_is_missing_stays_on_the_recording(
+    robot: RobotDescription, simulator: Simulator, forces: ForceSet, loads: np.ndarray, truth: dict[str, Any]
+):
+    """A share of it as the share says."""
+    motion = move(robot, **truth)
+    both = constant(robot, forces, 2 * loads)
+    step = jax.jit(lambda share, state, command: simulator.with_residual(both, share).step(state, command).state)
+    far = []
+    for share in (0.5, 0.0):
+        state = begin(simulator, motion)
+        for time in range(2, 42):
+            state = step(share, state, jnp.asarray(motion.command[time], jnp.float32))
+        far.append(np.abs(np.asarray(state.physics.qpos) - motion.qpos[42]).max())
+    assert far[0] < 1e-4 and far[1] > 5e-3
+    one, other = constant(robot, forces, loads), BoundForces(Push(), None)
+    seen = state.history, state.with_command(jnp.zeros(2))
+    for base in (one.plus(one), one.plus(other).plus(one)):
+        for ask, kind in ((base.model.joint_force, "joints"), (base.model.command_change, "commands")):
+            found = ask(base.params, *seen)
+            assert found is None if kind != forces else np.allclose(np.asarray(found), 2 * loads)
+
+
+class Push(ForceModel):
+    """A residual of a kind that knows of neither."""
+
+    @property
+    def name(self) -> str:
+        return "push"
+
+    def inputs(self, history: Any, commands: Any) -> Any:
+        return commands.ravel()
+
+    def fields(self, params: Any) -> dict:
+        return {}
+
+    def command(self, params: Any, commands: Any) -> Any:
+        return commands[-1:]
+
+    def wrench(self, params: Any, history: Any, commands: Any, key: Any = None) -> Any:
+        return jnp.ones((1, 6))
+
+
+def test_commands_stay_within_their_range(robot: RobotDescription, simulator: Simulator):
+    motion = move(robot)
+    bound = constant(robot, "commands", np.array([10.0, -10.0]))
+    step = jax.jit(lambda share, state, command: simulator.with_residual(bound, share).step(state, command))
+    start = begin(simulator, motion)
+    one, other = step(1.0, start, jnp.zeros(2)), step(0.0, start, jnp.array([1.0, -1.0]))
+    np.testing.assert_allclose(one.state.physics.qvel, other.state.physics.qvel, atol=1e-6)
+    np.testing.assert_array_equal(one.state.commands[-1], jnp.zeros(2))  # what was told is remembered
+
+
+@pytest.mark.parametrize(("forces", "loads", "truth"), SETS)
+def test_labels_and_scales_are_what_is_missing(
+    robot: RobotDescription, simulator: Simulator, forces: ForceSet, loads: np.ndarray, truth: dict[str, Any]
+):
+    motion = move(robot, **truth)
+    np.testing.assert_allclose(missing_loads(simulator, [motion], forces), np.abs(loads), rtol=0.1)
+    # With half of it in a base residual, half is missing.
+    base = simulator.with_residual(constant(robot, forces, loads / 2))
+    np.testing.assert_allclose(missing_loads(base, [motion], forces), np.abs(loads) / 2, rtol=0.15)
+    config = settle_scales(ForceNetworkConfig(forces=forces), simulator, [motion])
+    labels = supervised.ForceLabeller(Linearizer(simulator, forces=forces), SupervisedConfig(), config)(motion)
+    np.testing.assert_allclose(np.median(labels, axis=0), loads, rtol=0.1)
+    _, actions = supervised.examples(simulator, [motion], [labels], config)
+    np.testing.assert_allclose(np.median(actions, axis=0), np.sign(loads), rtol=0.2)
+
+
+def test_the_environment_rewards_the_missing_torque(robot: RobotDescription, simulator: Simulator):
+    motion = move(robot, torque=TORQUE)
+    env = EnvMimicEnv(simulator, [motion], EnvMimicConfig(forces="joints", start_noise=0.0))
+    scales = load_scales(env.config, robot)
+    assert env.action_size == 2 and scales.limit == pytest.approx(20)
+    assert env.config.force_cost == pytest.approx(0.05)
+    reset, step = jax.jit(env.reset), jax.jit(env.step)
+    distances = []
+    start = next(s for key in range(99) if tracking_state(s := reset(jax.random.key(key))).time < STEPS - 20)
+    for action in (TORQUE / scales.units, np.zeros(2)):
+        state = start
+        for _ in range(8):
+            state = step(state, jnp.asarray(action, jnp.float32))
+        tracking = tracking_state(state)
+        distances.append(np.abs(tracking.rollout.physics.qpos - env.reference.qpos[0, tracking.time]).max())
+    assert distances[0] < 0.02 * distances[1]
+
+
+def test_what_is_given_stays_and_ballus_are_its_own(robot: RobotDescription, simulator: Simulator):
+    given = ForceNetworkConfig(forces="wrench", force_scale=0.3, torque_scale=0.2, force_limit=0.9)
+    assert settle_scales(given, simulator, []) == given
+    ballu = load_robot()
+    settled = settle_scales(EnvMimicConfig(forces="wrench"), Simulator(ballu), [])
+    assert (settled.force_scale, settled.torque_scale) == (0.05, 0.005)
+    assert (settled.force_limit, settled.force_cost) == (1.0, 20.0)
+    text = describe_scales(settled, ballu)
+    assert "force on balloon x 0.05 N" in text and "torque on balloon z 0.005 N m" in text and "20 units" in text
+    with pytest.raises(ValueError, match="scales of the forces are open"):
+        load_scales(ForceNetworkConfig(forces="joints"), robot)
+
+
+def test_friction_at_a_joint_is_seen_at_that_joint(robot: RobotDescription, simulator: Simulator):
+    missing = missing_loads(simulator, [move(robot, friction=0.1)], "joints")
+    assert 0.03 < missing[0] < 0.11 and missing[1] < 0.2 * missing[0]
+
+
+def test_a_robot_without_joints_to_act_along_is_refused(robot: RobotDescription, tmp_path: Path):
+    content = json.loads(robot.file.read_text()) | {"force_joints": [], "model": str(robot.model)}
+    (tmp_path / "stiff.robot.json").write_text(json.dumps(content))
+    stiff = read_description(tmp_path / "stiff.robot.json")
+    with pytest.raises(InputError, match=r"--forces joints: arm has no hinge or slide.*force_joints"):
+        settle_scales(EnvMimicConfig(forces="joints"), Simulator(stiff), [])
+    content["force_joints"] = ["elbow"]
+    (tmp_path / "stiff.robot.json").write_text(json.dumps(content))
+    one = read_description(tmp_path / "stiff.robot.json")
+    assert num_loads(ForceNetworkConfig(forces="joints"), one) == 1
+    content["force_joints"] = ["wrist"]
+    (tmp_path / "stiff.robot.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="\"force_joints\" names 'wrist', no joint of the model"):
+        read_description(tmp_path / "stiff.robot.json")

@@ -1,0 +1,80 @@
+"""What was learned with one load or link, replayed with another: `evaluate --robot`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from servo_arm import identified, write_arm
+
+from ballu_mjx.cli import evaluate
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.residuals.fluid import FLUID_FILE, FluidCoefficients, FluidForces, terms_of
+from ballu_mjx.residuals.fluid_fit import FluidConfig
+from ballu_mjx.residuals.network import ForceNetworkConfig, num_inputs
+from ballu_mjx.residuals.run_config import describe_run
+from ballu_mjx.residuals.trained import TrainedResidual, write_observed
+from ballu_mjx.robots.description import RobotDescription, read_description
+from ballu_mjx.runs.folder import Run
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
+    return write_arm(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def run(robot: RobotDescription) -> Path:
+    """A run of fluid forces on the arm with identified actuators."""
+    folder, nothing = robot.file.parent / "run", np.zeros((len(terms_of("drag")), 6))
+    actuators = identified(robot, elbow_damping=0.3, shoulder_delay=0.02)
+    config = describe_run("fluid", {"fit": FluidConfig()}, {}, [], actuators, robot)
+    with Run(folder, config | {"residual": None}) as made:
+        write_observed(made, np.zeros((2, num_inputs(ForceNetworkConfig(), robot))))
+        made.write(FLUID_FILE, FluidCoefficients("drag", nothing, nothing).to_json())
+    return folder
+
+
+def altered(robot: RobotDescription, folder: Path, old: str, new: str, **keys: object) -> RobotDescription:
+    """The arm with another text in its model and other keys in its description."""
+    text = robot.model.read_text()
+    assert old in text
+    (folder / "other.xml").write_text(text.replace(old, new))
+    content = json.loads(robot.file.read_text()) | {"model": "other.xml", **keys}
+    (folder / "other.robot.json").write_text(json.dumps(content))
+    return read_description(folder / "other.robot.json")
+
+
+def test_another_load_takes_what_was_learned(robot: RobotDescription, run: Path, tmp_path: Path):
+    heavier = altered(robot, tmp_path, 'mass="0.15"', 'mass="0.4"', name="heavier arm")
+    with pytest.raises(InputError, match="is of the robot arm, not of heavier arm"):
+        TrainedResidual.load(run, heavier)
+    found = TrainedResidual.load(run, heavier, other_model=True)
+    assert isinstance(found.model, FluidForces) and found.model.robot is heavier
+    # What was identified holds for the new model too.
+    assert heavier.load_model(found.actuators).dof_damping[1] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "keys", "says"),
+    [
+        ('kp="6" kv="0.1" ctrlrange="-1 1"', 'kp="6" kv="0.1" ctrlrange="-2 2"', {}, "commands' ranges differ"),
+        ('name="tip"', 'name="tip"', {"control_timestep": 0.02}, "control time step differ"),
+        ('name="tip" pos', 'name="end" pos', {"tracked": "end"}, "tracked site differ"),
+        ('name="tip"', 'name="tip"', {"force_joints": ["elbow"]}, "joints that forces act along differ"),
+    ],
+)
+def test_a_robot_of_other_parts_is_refused(
+    robot: RobotDescription, run: Path, tmp_path: Path, old: str, new: str, keys: dict, says: str
+):
+    other = altered(robot, tmp_path, old, new, **keys)
+    with pytest.raises(InputError, match=f"cannot stand in for arm.*{says}") as refused:
+        TrainedResidual.load(run, other, other_model=True)
+    assert str(refused.value).count(". ") == 0
+
+
+def test_another_robot_needs_its_recordings(robot: RobotDescription, run: Path, capsys: pytest.CaptureFixture[str]):
+    assert evaluate.main([str(run), "--robot", str(robot.file)]) == 2
+    assert "--robot goes with --recordings" in capsys.readouterr().err
