@@ -130,7 +130,7 @@ def heading_observation(
     heading = now[layout.yaw] if turned and not anchored else jnp.zeros_like(now[layout.yaw])
     to_heading = heading_rotation(heading).T
 
-    def relative(frame: Float[Array, " features"]) -> Array:
+    def transformed(frame: Float[Array, " features"]) -> Array:
         parts = frame[layout.position], frame[layout.velocity], frame[layout.first_point :]
         vectors = jnp.concatenate(parts).reshape(-1, 3)
         is_position = jnp.tile(jnp.array([True, False]), len(vectors) // 2)
@@ -138,7 +138,7 @@ def heading_observation(
         roll, pitch, yaw = frame[layout.euler_angles]
         return jnp.concatenate([vectors.ravel(), jnp.stack([roll, pitch, wrap_angle(yaw - heading)])])
 
-    return jax.vmap(relative)(history).ravel()
+    return jax.vmap(transformed)(history).ravel()
 
 
 def heading_observation_names(names: Sequence[str]) -> list[str]:
