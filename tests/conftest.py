@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from typing import TypeVar
 
+import pytest
 from beartype import beartype
 from jaxtyping import install_import_hook
 
@@ -17,9 +18,16 @@ def typecheck(function: Function) -> Function:
     return function if function.__name__ == "__init__" else beartype(function)
 
 
-# A test's programs run for a moment, and compiling them is most of a test run. By XLA's older fusion and without most
-# optimizations a control step compiles in 4 s instead of 15. Commands that tests start inherit both.
+# Most tests run what they compile for a moment. By XLA's older fusion, here and in commands that tests start, and without
+# most optimizations, here alone, a control step compiles in 4 s instead of 15.
 os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}".strip()
-os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 runtime.prepare()
 install_import_hook("ballu_mjx", f"{__name__}.typecheck")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Before the test's fixtures: programs of tests marked `optimized` run long enough to be worth it."""
+    import jax  # not before `prepare`
+
+    jax.config.update("jax_disable_most_optimizations", item.get_closest_marker("optimized") is None)

@@ -26,6 +26,8 @@ from ballu_mjx.ballu.model import SIDES, ActuatorParameters, actuator_fields, su
 from ballu_mjx.ballu.sweep import Sweep
 from ballu_mjx.robots.model import assets, set_fields
 
+pytestmark = pytest.mark.optimized
+
 COMMANDS = np.linspace(0, 1, 20)
 HOLD = 60
 """Times a command."""
