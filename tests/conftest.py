@@ -18,8 +18,8 @@ def typecheck(function: Function) -> Function:
     return function if function.__name__ == "__init__" else beartype(function)
 
 
-# Most tests run what they compile for a moment. By XLA's older fusion, here and in commands that tests start, and without
-# most optimizations, here alone, a control step compiles in 4 s instead of 15.
+# Most tests run what they compile for a moment. By XLA's older fusion, here and in commands that tests start, and
+# without most optimizations, here alone, a control step compiles in 4 s instead of 15.
 os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}".strip()
 runtime.prepare()
 install_import_hook("ballu_mjx", f"{__name__}.typecheck")
