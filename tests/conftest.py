@@ -18,10 +18,24 @@ def typecheck(function: Function) -> Function:
     return function if function.__name__ == "__init__" else beartype(function)
 
 
-# Most tests run what they compile for a moment. By XLA's older fusion, here and in commands that tests start, and
-# without most optimizations, here alone, a control step compiles in 4 s instead of 15.
-os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}".strip()
-runtime.prepare()
+_OLDER_FUSION = "--xla_cpu_use_fusion_emitters=false"
+
+
+def compile_fast() -> None:
+    """Settle how this process compiles: by XLA's older fusion, and without most optimizations (see below). A control
+    step then compiles in 4 s instead of 15, and most tests run what they compile for a moment.
+
+    Commands that tests start compile as users' do, and leave in the cache what runs after the tests.
+    """
+    os.environ["XLA_FLAGS"] = f"{_OLDER_FUSION} {os.environ.get('XLA_FLAGS', '')}".strip()
+    runtime.prepare()
+    import jax  # not before `prepare`
+
+    jax.jit(lambda: 0)()  # reads the flags, once and for all
+    os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(_OLDER_FUSION, "").strip()
+
+
+compile_fast()
 install_import_hook("ballu_mjx", f"{__name__}.typecheck")
 
 
