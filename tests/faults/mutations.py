@@ -345,7 +345,10 @@ def options_fault(found: Sequence[Any]) -> str | None:
     """Every number finite, every count and size one."""
     for config in found:
         for field in dataclasses.fields(config):
-            value, kind = getattr(config, field.name), type(getattr(type(config)(), field.name))
+            value, default = getattr(config, field.name), getattr(type(config)(), field.name)
+            if value is None and default is None:
+                continue
+            kind = float if default is None else type(default)
             if type(value) is not kind and not (kind is float and type(value) is int):
                 return f"type of {field.name}"
             numbers = value if isinstance(value, tuple) else (value,)
