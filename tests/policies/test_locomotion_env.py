@@ -163,7 +163,7 @@ def test_residual_pushes_in_the_balloon_s_heading_and_only_so_hard():
     force = turn @ (UNIT * action)
     pushed = jax.jit(lambda wrench: simulator.step(state_at(qpos, zeros), jnp.zeros(2), wrench))
     expected = pushed(jnp.asarray([[*force, 0, 0, 0]], jnp.float32))
-    np.testing.assert_allclose(inner(state).rollout.physics.qvel, expected.qvel, atol=1e-5)
+    np.testing.assert_allclose(inner(state).rollout.physics.qvel, expected.qvel, atol=5e-5)  # another program
     assert np.abs(np.asarray(expected.qvel - pushed(jnp.zeros((1, 6))).qvel)).max() > 1e-3
     assert float(state.metrics["force"]) == pytest.approx(np.linalg.norm(force), rel=1e-5)
 
