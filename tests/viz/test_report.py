@@ -186,7 +186,7 @@ def test_options_and_names_are_shown_as_text(run: Path, page: Path):
     assert not [a for tag, a in elements if tag == "img" or "onerror" in a]
     content = report.collect(run)
     assert HOSTILE in dict(content.facts)["robot"]
-    assert dict(dict(content.options)["env"])["force_limit"] == "1.0"
+    assert dict(dict(content.options)["env"])["episode_seconds"] == "3.0"
 
 
 class Bomb:
