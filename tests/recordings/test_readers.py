@@ -418,6 +418,23 @@ def test_lerobot_datasets(tmp_path: Path, robot: RobotDescription, version: str)
         read_capture(path, room(tmp_path, robot, text.replace("episode = 0", "episode = 7")))
 
 
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_lerobot_datasets_are_read_as_another_reader_does(tmp_path: Path, robot: RobotDescription, version: str):
+    polars = pytest.importorskip("polars", reason="polars reads parquet independently of pyarrow")
+    path = write_lerobot(tmp_path, version, episodes=2)
+    frame = polars.read_parquet(sorted((path / "data").rglob("*.parquet")))
+    for episode in range(2):
+        rows_of_it = frame.filter(polars.col("episode_index") == episode)
+        state, action = (np.array(rows_of_it[name].to_list()) for name in ("observation.state", "action"))
+        text = LEROBOT + f"[clock]\nepisode = {episode}\n"
+        found = read_capture(path, room(tmp_path, robot, text, commands='arm = "action[0]"\npush = "action[1]"\n'))
+        assert found.commands is not None
+        np.testing.assert_array_equal(found.time, rows_of_it["timestamp"].to_numpy())
+        np.testing.assert_array_equal(found.bodies["hull"].position, state[:, :3])
+        np.testing.assert_array_equal(found.bodies["tip"].position, state[:, 7:])
+        np.testing.assert_allclose(found.commands.command, action, atol=1e-12)
+
+
 def test_lerobot_datasets_are_mapped_by_the_names_of_their_features(tmp_path: Path, robot: RobotDescription):
     path = write_lerobot(tmp_path)
     same(imported(tmp_path, path, robot), gaps=False)
