@@ -351,7 +351,7 @@ def options_fault(found: Sequence[Any]) -> str | None:
             kind = float if default is None else type(default)
             if type(value) is not kind and not (kind is float and type(value) is int):
                 return f"type of {field.name}"
-            numbers = value if isinstance(value, tuple) else (value,)
+            numbers: tuple[Any, ...] = value if isinstance(value, tuple) else (value,)
             if not all(isinstance(x, str | bool) or math.isfinite(x) for x in numbers):
                 return field.name
             if type(value) is int and kind is int and field.name != "seed" and value < 1:
