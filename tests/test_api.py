@@ -22,6 +22,8 @@ from ballu_mjx.recordings.recording import cut
 from ballu_mjx.runs.layout import RUN_FORMAT
 from ballu_mjx.runs.record import MemoryRecord
 
+pytestmark = pytest.mark.optimized  # it trains and identifies
+
 SIZES = bm.PPOConfig(
     num_timesteps=320, num_envs=16, batch_size=16, num_minibatches=2, unroll_length=5, num_updates_per_batch=1,
     policy_layers=(16,), value_layers=(16,),
