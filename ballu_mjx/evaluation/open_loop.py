@@ -96,6 +96,7 @@ def orientation_errors(
 
 
 def _quaternion(euler: Float[np.ndarray, "*states 3"]) -> Float[np.ndarray, "*states 4"]:
+    # SciPy's rotations raise where an angle is not finite; simulations that diverged have such states.
     halves = np.moveaxis(np.asarray(euler, np.float64), -1, 0) / 2
     (cr, cp, cy), (sr, sp, sy) = np.cos(halves), np.sin(halves)
     return np.stack(
