@@ -30,7 +30,8 @@ class StableBaselinesEnv(VecEnv):
     def reset(self) -> np.ndarray:
         """Start all episodes."""
         self._return[:], self._length[:] = 0.0, 0
-        seed, self._seeds = self._seeds[0], [None] * self.num_envs
+        seed = self._seeds[0]
+        self._reset_seeds()
         return self._env.reset(seed=seed)[0]
 
     def step_async(self, actions: np.ndarray) -> None:
