@@ -37,7 +37,7 @@ from ballu_mjx.residuals.scales import settle_scales
 from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.coordinates import translations
-from ballu_mjx.sim.force_model import FORCE_SETS
+from ballu_mjx.sim.force_model import FORCE_SETS, ForceSet
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout, euler_to_matrix, wrap_angle
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
@@ -48,6 +48,10 @@ class EnvMimicConfig(ForceNetworkConfig):
     """The residual-force task. Defaults of the reward are the paper's; the rest was chosen by ablation
     (docs/envmimic.md)."""
 
+    forces: ForceSet = "wrench"
+    """What the policy acts with: a force and a torque on the tracked body (wrench), a force there alone (force, the
+    paper's), forces there and at all measured points (multi), forces and torques along joints (joints), or changes of
+    the commands (commands)."""
     position_weight: float = 0.7
     """Weight of the position term (paper: 0.7)."""
     orientation_weight: float = 0.3
