@@ -63,6 +63,7 @@ PAPER = preset_values("paper")
 PAPER_REWARD = {"fine_position_weight": 0.0, "fine_orientation_weight": 0.0}
 ROWS: Mapping[str, Row] = {
     "defaults": Row(),
+    "a force without a torque": Row({"forces": "force"}),
     "paper's reward alone": Row(PAPER_REWARD),
     "critic blind to the error": Row({"critic_sees_error": False}),
     "1 N a unit of output": Row({"force_scale": 1.0}),

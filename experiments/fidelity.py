@@ -3,8 +3,8 @@
 #
 # Section "Improved Simulation Fidelity" of the paper, open loop: recorded commands are replayed from recorded states in
 # several simulators, on recordings that training never saw: vanilla, vanilla with identified actuators (vanilla+sysid),
-# either with EnvMimic's forces, and the second with what else pushes (a wrench on the balloon; forces at balloon, base
-# and feet) and with what the other methods learn: regression on the forces that explain the recordings (supervised;
+# either with EnvMimic's forces, and the second with what else pushes (a force alone on the balloon; forces at balloon,
+# base and feet) and with what the other methods learn: regression on the forces that explain recordings (supervised;
 # with all of its forces, as in the paper, and with the share of them that helps), gradients through the simulator
 # (analytic), the air's parameters (aerodynamic; all, or all but the lift), and networks for what the air leaves
 # (aerodynamic+analytic, aerodynamic+EnvMimic). Rows that isolate have the command delay without air, and the air
@@ -89,7 +89,7 @@ METHODS = {
     "nominal": Method("EnvMimic on nominal actuators", ("envmimic",), nominal=True),
     "identified": Method("EnvMimic", ("envmimic",)),
     "paper": Method("EnvMimic, the paper's preset", ("envmimic", "--preset", "paper")),
-    "wrench": Method("EnvMimic, wrench", ("envmimic", "--forces", "wrench")),
+    "force": Method("EnvMimic, a force alone", ("envmimic", "--forces", "force")),
     "multi": Method("EnvMimic, forces at balloon, base and feet", ("envmimic", "--forces", "multi")),
     "regression": Method("supervised, all of its forces", ("supervised", "--force-scales", "1")),
     "supervised": Method("supervised", ("supervised",)),

@@ -16,7 +16,7 @@ from ballu_mjx.robots.description import read_description
 from ballu_mjx.viz.viser_scene import serve
 
 SCRIPT = Path(__file__).parents[1] / "experiments" / "tethered_balloon" / "tethered_balloon.py"
-METHODS = ("envmimic", "envmimic-wrench", "envmimic-multi", "supervised", "analytic", "aerodynamic", "fluid")
+METHODS = ("envmimic", "envmimic-force", "envmimic-multi", "supervised", "analytic", "aerodynamic", "fluid")
 
 pytestmark = pytest.mark.slow
 

@@ -252,6 +252,7 @@ class Story:
             recordings = [self.recordings(task), *(self.trained_last(task, n) for n in range(2, number + 1))]
         identified = self.identified()
         fits = {"aerodynamic": self._air, "supervised": self._supervised, "analytic": self._analytic}
+        # The paper's force: policies exploited a wrench (docs/transfer.md).
         envmimic = functools.partial(self._envmimic, "wrench" if method == WRENCH else "force")
         options = fits.get(method or "", envmimic)()
 

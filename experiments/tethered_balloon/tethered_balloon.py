@@ -125,7 +125,7 @@ def record_all(description: RobotDescription, folder: Path, quick: bool) -> None
 # %%
 METHODS = {
     "envmimic": ["envmimic"],
-    "envmimic-wrench": ["envmimic", "--forces", "wrench"],
+    "envmimic-force": ["envmimic", "--forces", "force"],
     "envmimic-multi": ["envmimic", "--forces", "multi"],
     "supervised": ["supervised"],
     "analytic": ["analytic"],

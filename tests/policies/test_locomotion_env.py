@@ -20,8 +20,7 @@ from ballu_mjx.policies.locomotion_env import (
     make_setting,
 )
 from ballu_mjx.policies.tasks import TASKS, Step
-from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.residuals.network import NetworkForces, load_units
+from ballu_mjx.residuals.network import ForceNetworkConfig, NetworkForces, load_units
 from ballu_mjx.residuals.trained import MARGIN, TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.learner import Learner
@@ -32,7 +31,7 @@ from ballu_mjx.sim.step import state_at
 
 BALLU = load_robot()
 MODEL = BALLU.load_model()
-UNIT = load_units(EnvMimicConfig(), BALLU)[0]
+UNIT = load_units(ForceNetworkConfig(), BALLU)[0]
 """N."""
 INPUTS = 87
 """Of the residual: three steps of 27 features, and three commands."""
@@ -42,7 +41,7 @@ def make_residual(action: np.ndarray, width: float = 1e6) -> TrainedResidual:
     """A residual whose policy always answers `action`, and that has seen inputs within plus and minus `width`."""
     bound = np.full(INPUTS, width, np.float32)
     forces = NetworkForces(
-        EnvMimicConfig(),
+        ForceNetworkConfig(),
         load_robot(),
         infer=lambda params, seen: jnp.asarray(action, jnp.float32),
         sample=lambda params, seen, key: jnp.asarray(action, jnp.float32) + jax.random.normal(key, (3,)),
@@ -209,7 +208,7 @@ def test_one_program_serves_all_residuals_of_a_kind():
         inputs = np.random.default_rng(seed).normal(size=(50, INPUTS)).astype(np.float32)
         params = ppo.initial_policy(inputs, action, dataclasses.replace(network, seed=seed))
         seen = inputs.min(axis=0), inputs.max(axis=0)
-        learned = TrainedResidual(NetworkForces(EnvMimicConfig(), load_robot(), infer), params, seen, 0, actuators)
+        learned = TrainedResidual(NetworkForces(ForceNetworkConfig(), load_robot(), infer), params, seen, 0, actuators)
         env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(), actuators=actuators, residual=learned)
         learner = Learner(env, sizes)
         state = jax.eval_shape(learner._first, jax.random.PRNGKey(0), learner._contents)

@@ -16,7 +16,7 @@ from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, reward_terms, tracking_state
-from ballu_mjx.residuals.network import NetworkForces, load_units, network_input, world_loads
+from ballu_mjx.residuals.network import ForceNetworkConfig, NetworkForces, load_units, network_input, world_loads
 from ballu_mjx.rl.learner import Learner
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.registry import load_robot
@@ -121,17 +121,16 @@ def test_observation_and_force_turn_with_the_robot(still: Motion, seed: int):
     moved, _ = stack_motions(simulator, [dataclasses.replace(still, qpos=moved_qpos, qvel=moved_qvel)])
     here, there = reference.features[0, 10:13], moved.features[0, 10:13]
     np.testing.assert_allclose(heading_observation(here), heading_observation(there), atol=2e-4)
-    config, action = EnvMimicConfig(), jnp.array([1.0, -0.5, 0.3])
-    np.testing.assert_allclose(
-        turn.apply(world_loads(action, here[-1, 8], config, load_robot())),
-        world_loads(action, there[-1, 8], config, load_robot()),
-        atol=1e-5,
+    config, action = EnvMimicConfig(), jnp.array([1.0, -0.5, 0.3, 0.4, 0.2, -0.6])
+    loads, moved_loads = (
+        world_loads(action, history[-1, 8], config, load_robot()).reshape(2, 3) for history in (here, there)
     )
+    np.testing.assert_allclose(turn.apply(loads), moved_loads, atol=1e-5)
 
 
 def test_the_paper_s_state_and_force_are_the_room_s(still: Motion):
     """Without relative observation and heading frame: features as they are, forces whatever the heading."""
-    config = EnvMimicConfig(relative_observation=False, heading_frame=False, observe_command=False)
+    config = EnvMimicConfig(forces="force", relative_observation=False, heading_frame=False, observe_command=False)
     robot = load_robot()
     reference, _ = stack_motions(Simulator(robot), [still])
     history = np.array(reference.features[0, 5 : 5 + HISTORY])
@@ -152,10 +151,10 @@ def test_episodes_are_as_long_as_the_options_say(spread: float, lengths: set[int
     assert set(np.asarray(tracking_state(state).remaining).tolist()) == lengths
 
 
-def test_force_stays_within_its_limit():
+def test_force_and_torque_stay_within_their_limits():
     config = EnvMimicConfig()
-    force = world_loads(jnp.array([1e6, -1e6, 0.0]), jnp.zeros(()), config, load_robot())
-    np.testing.assert_allclose(force, [1.0, -1.0, 0.0])
+    loads = world_loads(jnp.array([1e6, -1e6, 0.0, 1e6, 0.0, -1e6]), jnp.zeros(()), config, load_robot())
+    np.testing.assert_allclose(loads, [1.0, -1.0, 0.0, 0.1, 0.0, -0.1], rtol=1e-6)
 
 
 def test_reset_starts_at_recorded_states_with_their_history(still: Motion, pushed: Motion):
@@ -194,7 +193,7 @@ def test_time_limits_truncate_and_divergence_terminates(still: Motion):
     state = jax.jit(env.reset)(jax.random.key(3))
     time, remaining = int(tracking_state(state).time), int(tracking_state(state).remaining)
     for elapsed in range(1, min(remaining, STEPS - time) + 1):
-        state = step(state, jnp.zeros(3))
+        state = step(state, jnp.zeros(env.action_size))
         over = float(elapsed == remaining or time + elapsed == STEPS)
         assert (float(state.done), float(state.info["truncation"])) == (over, over)
 
@@ -202,7 +201,7 @@ def test_time_limits_truncate_and_divergence_terminates(still: Motion):
     s = tracking_state(state)
     physics = s.rollout.physics._replace(qvel=s.rollout.physics.qvel.at[3].set(jnp.nan))
     broken = state.replace(pipeline_state=s._replace(rollout=s.rollout._replace(physics=physics)))
-    state = step(broken, jnp.zeros(3))
+    state = step(broken, jnp.zeros(env.action_size))
     assert (float(state.done), float(state.info["truncation"])) == (1.0, 0.0)
     assert float(state.metrics["diverged"]) == 1.0
     assert all(np.isfinite(x).all() for x in state.obs.values()) and np.isfinite(float(state.reward))
@@ -247,7 +246,7 @@ FORCE = np.array([0.04, 0.0, 0.02])
 @pytest.fixture(scope="module")
 def evaluator() -> OpenLoopEvaluator:
     """Of a recording without and a shorter one with `FORCE`; the policy's parameters are the force it gives."""
-    config = EnvMimicConfig()
+    config = ForceNetworkConfig()
     motions = [make_motion(np.zeros(3), "near-own", 60), make_motion(FORCE, "far-pushed", 50)]
     constant = NetworkForces(config, load_robot(), lambda params, _: params / load_units(config, load_robot()))
     return OpenLoopEvaluator(Simulator(load_robot()), motions, constant)
@@ -327,7 +326,7 @@ def test_one_program_serves_all_recordings_and_actuators(still: Motion, pushed: 
         evaluator = OpenLoopEvaluator(
             Simulator(load_robot(), model=model),
             motions,
-            NetworkForces(EnvMimicConfig(), load_robot(), lambda params, _: params),
+            NetworkForces(ForceNetworkConfig(), load_robot(), lambda params, _: params),
         )
         places = np.tile(np.array([0, 2], np.int32), (evaluator._size, 1))
         carry = evaluator._begin(places)
