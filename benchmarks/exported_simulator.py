@@ -31,9 +31,10 @@ from ballu_mjx.common.results import Cell, Table, write_results
 from ballu_mjx.policies.simulators import load_simulator
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.reconstruct import reconstruct
-from ballu_mjx.residuals.deploy.export import begin_rollout, export_simulator, improved_model, in_double
+from ballu_mjx.residuals.deploy.export import begin_rollout, export_simulator, in_double
 from ballu_mjx.residuals.deploy.residual import ImprovedSimulator
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.sim.c_model import improved_model
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState
 from ballu_mjx.viz.style import label_of
 

@@ -77,7 +77,7 @@ def forces(simulator: Simulator, residual: TrainedResidual, motion: Motion) -> F
 
     def at(time: jax.Array) -> jax.Array:
         history = jax.lax.dynamic_slice_in_dim(reference.features[0], time - HISTORY + 1, HISTORY)
-        return residual.wrench(history, commands_seen(reference.command[0], time))[0, :3]
+        return residual.bound.act(history, commands_seen(reference.command[0], time)).wrench[0, :3]
 
     return np.asarray(jax.jit(jax.vmap(at))(np.arange(HISTORY - 1, len(motion.command))))
 

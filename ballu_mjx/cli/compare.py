@@ -28,6 +28,14 @@ _UNTOLD = ("seed", "num_timesteps")
 """Options in which the runs of a row may differ: of the second, only the part that a run has done counts."""
 
 
+_MEAN_RATIO = "mean ratio"
+"""The score that checkpoints are chosen by, of the test recordings."""
+_NOT_SHARED = """\
+Figures of all rows: {shared}. "-" is not measured: the recordings of the rows are of other groups or lengths. A ratio
+compares a run with its own simulator without residual. It does not say which row's errors are smaller.
+`python -m ballu_mjx evaluate RUN --recordings ... --output RUN` measures runs of one robot on the same recordings."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Options(runtime.CommandOptions):
     """Compare runs of one task: a table and a plot, mean with 95 % interval over runs that differ in the seed alone."""
@@ -112,6 +120,7 @@ def figures(folder: Path) -> dict[str, float]:
         found["reward at the end"] = float(reward[at_end].mean())
     if path.exists():
         evaluation = read_evaluation(path)
+        found[_MEAN_RATIO] = evaluation.score
         for group in evaluation.groups:
             for quantity in ("position", "orientation"):
                 for horizon in evaluation.score_horizons(group):
@@ -123,22 +132,19 @@ def figures(folder: Path) -> dict[str, float]:
 
 
 def table(found: Mapping[str, Sequence[Mapping[str, float]]]) -> str:
-    """Markdown: rows by label, a column for each figure that all of their runs have.
-
-    **Raises** `InputError` where there is no such figure.
-    """
+    """Markdown: rows by label, a column for each figure, those that all runs have first."""
     everything = [figures for members in found.values() for figures in members]
-    names = [name for name in everything[0] if all(name in figures for figures in everything)]
-    if not names:
-        raise InputError(
-            "The runs have no figure in common: their recordings are of other groups or lengths; `python -m ballu_mjx "
-            "evaluate RUN --recordings ... --output RUN` measures them on the same."
-        )
+    names = list(dict.fromkeys(name for figures in everything for name in figures))
+    shared = [name for name in names if all(name in figures for figures in everything)]
+    names = shared + [name for name in names if name not in shared]
     lines = ["| | runs | " + " | ".join(names) + " |", "| --- | ---: |" + " ---: |" * len(names)]
     for label, members in found.items():
         cells = []
         for name in names:
-            values = [figures[name] for figures in members]
+            values = [figures[name] for figures in members if name in figures]
+            if len(values) < len(members):
+                cells.append("-")
+                continue
             broken = sum(map(np.isinf, values))
             if broken:
                 cells.append(f"diverged in {broken} of {len(values)}")
@@ -148,6 +154,8 @@ def table(found: Mapping[str, Sequence[Mapping[str, float]]]) -> str:
         lines.append(f"| {label} | {len(members)} | " + " | ".join(cells) + " |")
     if max(map(len, found.values())) > 1:
         lines += ["", f"± is half the {LEVEL:.0%} confidence interval of the mean over runs (Student's t)."]
+    if names != shared:
+        lines += ["", _NOT_SHARED.format(shared=", ".join(shared) or "none")]
     return "\n".join(lines)
 
 

@@ -310,7 +310,8 @@ def _map(options: Map) -> None:
     print("\n".join(describe_contents(contents)))
     files.write(options.output, text)
     guesses, empty = text.count("# a guess"), text.count("# choose ")
-    print(f"{options.output}: {guesses} guesses to check, {empty} places to complete; then `record import` takes it")
+    told = f"{guesses} {'guess' if guesses == 1 else 'guesses'} to check, {empty} {'place' if empty == 1 else 'places'}"
+    print(f"{options.output}: {told} to complete; then `record import` takes it")
 
 
 # ---- check ----

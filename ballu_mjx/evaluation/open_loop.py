@@ -307,7 +307,7 @@ class OpenLoopEvaluator:
 
         def step(rollout: RolloutState, time: Array) -> tuple[RolloutState, tuple]:
             after = simulator.step(rollout, reference.command[recording, time])
-            return after.state, (after.state.features, after.com, after.wrench[0, :3], after.state.physics.qpos)
+            return after.state, (after.state.features, after.com, after.action.wrench[0, :3], after.state.physics.qpos)
 
         return jax.lax.scan(step, rollout, start + jnp.arange(_CHUNK))
 

@@ -255,7 +255,7 @@ class LocomotionEnv(Env):
         drawn = key_force if self.config.sampled_residual else None
         simulator = self.simulator.with_fields(before.setting.fields | friction)
         simulator = simulator.with_drivetrain(before.setting.drivetrain)
-        after = simulator.step(before.rollout, command, wrench_scale=decay, key=drawn)
+        after = simulator.step(before.rollout, command, action_scale=decay, key=drawn)
 
         rollout, finite = after.state.keep_finite(before.rollout, before.rollout.features)
         com = jnp.where(finite, after.com, before.com)
@@ -267,7 +267,7 @@ class LocomotionEnv(Env):
         metrics = {
             "velocity_x": velocity[0],
             "velocity_y": velocity[1],
-            "force": jnp.linalg.norm(after.wrench[0, :3]),
+            "force": jnp.linalg.norm(after.action.wrench[0, :3]),
             "outside": jnp.asarray(excess > 0.0, jnp.float32),
             "excess": excess,
             "diverged": jnp.asarray(~finite, jnp.float32),

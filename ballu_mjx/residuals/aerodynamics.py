@@ -21,10 +21,10 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
-from ballu_mjx.residuals.body_motion import body_motion
+from ballu_mjx.residuals.body_motion import body_motion, smooth_speed
 from ballu_mjx.residuals.network import ForceNetworkConfig, network_input
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.sim.force_model import Fields, ForceModel
+from ballu_mjx.sim.force_model import Action, Commands, Fields, ForceModel, History
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.step import count_substeps
 
@@ -103,9 +103,7 @@ class Aerodynamics(ForceModel):
         """Return what a simulator improved by it is called."""
         return "aerodynamic"
 
-    def inputs(
-        self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]
-    ) -> Float[Array, " inputs"]:
+    def inputs(self, history: History, commands: Commands) -> Float[Array, " inputs"]:
         return network_input(history, commands, ForceNetworkConfig(), self._robot)
 
     def fields(self, params: AirParameters) -> Fields:
@@ -120,9 +118,7 @@ class Aerodynamics(ForceModel):
             "body_gravcomp": self._gravcomp.at[body].set(lift / (mass[body] * self._gravity)),
         }
 
-    def command(
-        self, params: AirParameters, commands: Float[Array, "steps commands"]
-    ) -> Float[Array, "parts commands"]:
+    def command(self, params: AirParameters, commands: Commands) -> Float[Array, "parts commands"]:
         """What has arrived by the start of each physics step, `delay` late.
 
         Not a mean of old and new command: an actuator that saturates would turn at once as fast as it can.
@@ -131,26 +127,18 @@ class Aerodynamics(ForceModel):
         age = jnp.ceil(late / self._control_timestep - _JUST)
         return commands[HISTORY - 1 - jnp.maximum(age, 0).astype(int)]
 
-    def wrench(
-        self,
-        params: AirParameters,
-        history: Float[Array, "steps features"],
-        commands: Float[Array, "steps commands"],
-        key: Array | None = None,
-    ) -> Float[Array, "1 6"]:
-        """Drag in still air, by the velocities in the middle of the coming control step, extrapolated from the last."""
+    def act(self, params: AirParameters, history: History, commands: Commands, key: Array | None = None) -> Action:
+        """Return the drag in still air, by the velocities in the middle of the coming control step."""
         del commands, key
         now, velocity, rate = body_motion(history, self._control_timestep)
-        speed = jnp.sqrt(jnp.sum(velocity**2) + _SLOW**2)
+        speed = smooth_speed(velocity)
         force = -(params.linear_drag + params.quadratic_drag * speed) * velocity
         torque = -params.turning_drag * rate
-        return jnp.concatenate([now @ force, now @ torque])[None]
+        return Action(jnp.concatenate([now @ force, now @ torque])[None])
 
 
 _JUST = 1e-3
 """Of a control step: a delay of just so many physics steps is over when they are."""
-_SLOW = 1e-3
-"""m/s; keeps the speed differentiable at rest."""
 
 
 def read_air_parameters(path: Path, robot: RobotDescription) -> AirParameters:

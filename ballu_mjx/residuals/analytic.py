@@ -87,7 +87,7 @@ def compile_rollout(
             seen = forces.inputs(state.history, state.with_command(command))
             loads = forces.loads(params, seen, state.features[ObservationLayout.yaw])
             does = FORCE_SETS[forces.config.forces].act(loads, forces.robot)
-            after = simulator.step(state, command, **does._asdict()).state
+            after = simulator.step(state, command, does).state
             return after, (ControlSteps(state, command, loads), after.features)
 
         return jax.lax.scan(step, *start_segment(window))[1]

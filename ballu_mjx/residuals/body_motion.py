@@ -26,3 +26,12 @@ def body_motion(
     velocity = now.T @ (1.5 * history[-1, layout.velocity] - 0.5 * history[-2, layout.velocity])
     turned = 2 * turn(before.T @ now) - turn(earlier.T @ before)
     return now, velocity, turned / control_timestep
+
+
+def smooth_speed(velocity: Float[Array, " 3"]) -> Float[Array, ""]:
+    """Return the speed (m/s), rounded off at rest, where the norm of a vector has no derivative."""
+    return jnp.sqrt(jnp.sum(velocity**2) + _SLOW**2)
+
+
+_SLOW = 1e-3
+"""m/s."""

@@ -236,7 +236,7 @@ class EnvMimicEnv(Env):
         recording, time = before.recording, before.time
         loads = world_loads(action, before.rollout.features[ObservationLayout.yaw], self.config, self.robot)
         command, does = self.reference.command[recording, time], FORCE_SETS[self.config.forces].act(loads, self.robot)
-        after = self.simulator.step(before.rollout, command, **does._asdict()).state
+        after = self.simulator.step(before.rollout, command, does).state
 
         target = self.reference.features[recording, time + 1]
         rollout, finite = after.keep_finite(before.rollout, target)

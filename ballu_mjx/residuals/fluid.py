@@ -22,10 +22,10 @@ from jaxtyping import Array, Bool, Float
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
-from ballu_mjx.residuals.body_motion import body_motion
+from ballu_mjx.residuals.body_motion import body_motion, smooth_speed
 from ballu_mjx.residuals.network import ForceNetworkConfig, network_input
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.sim.force_model import Fields, ForceModel
+from ballu_mjx.sim.force_model import Action, Commands, ForceModel, History
 
 FLUID_FORMAT = "ballu-fluid/1"
 FLUID_FILE = "fluid.json"
@@ -42,8 +42,6 @@ _GRAVITY = ("gx", "gy", "gz")
 _ODD = ("vy", "wx", "wz", "gy")
 """What changes its sign in the mirror image about the xz plane."""
 _ODD_AXES = np.array([False, True, False, True, False, True])
-_SLOW = 1e-3
-"""m/s; keeps the speed differentiable at rest."""
 
 
 class Term(NamedTuple):
@@ -111,43 +109,25 @@ class FluidForces(ForceModel):
         """Return what a simulator improved by it is called."""
         return "fluid"
 
-    def inputs(
-        self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]
-    ) -> Float[Array, " inputs"]:
+    def inputs(self, history: History, commands: Commands) -> Float[Array, " inputs"]:
         """Return what networks see, for the range of what was recorded."""
         return network_input(history, commands, ForceNetworkConfig(), self.robot)
 
-    def fields(self, params: Float[Array, "terms 6"]) -> Fields:
-        """Return no fields: the model stays as it is."""
-        del params
-        return {}
-
-    def command(
-        self, params: Float[Array, "terms 6"], commands: Float[Array, "steps commands"]
-    ) -> Float[Array, "1 commands"]:
-        """Return the command as it is."""
-        del params
-        return commands[-1:]
-
-    def values(self, history: Float[Array, "steps features"]) -> tuple[Float[Array, "3 3"], Float[Array, " terms"]]:
+    def values(self, history: History) -> tuple[Float[Array, "3 3"], Float[Array, " terms"]]:
         """Return the body's rotation (to the world), and what the terms are."""
         frame, velocity, rate = body_motion(history, self.robot.control_timestep)
-        speed = jnp.sqrt(jnp.sum(velocity**2) + _SLOW**2)
+        speed = smooth_speed(velocity)
         components = jnp.concatenate([velocity, rate, frame.T @ self._down, jnp.ones(1)])
         return frame, jnp.prod(components[self._places], axis=1) * speed**self._power
 
-    def wrench(
-        self,
-        params: Float[Array, "terms 6"],
-        history: Float[Array, "steps features"],
-        commands: Float[Array, "steps commands"],
-        key: Array | None = None,
-    ) -> Float[Array, "1 6"]:
+    def act(
+        self, params: Float[Array, "terms 6"], history: History, commands: Commands, key: Array | None = None
+    ) -> Action:
         """Return the wrench by the motion in the middle of the coming control step."""
         del commands, key
         frame, values = self.values(history)
         own = values @ params
-        return jnp.concatenate([frame @ own[:3], frame @ own[3:]])[None]
+        return Action(jnp.concatenate([frame @ own[:3], frame @ own[3:]])[None])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from ballu_mjx.recordings.reference import ReferenceMotions
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim import force_model
-from ballu_mjx.sim.force_model import FORCE_SETS, Action, Fields, ForceModel, ForceSet
+from ballu_mjx.sim.force_model import FORCE_SETS, Action, Commands, ForceModel, ForceSet, History
 from ballu_mjx.sim.observation import (
     HISTORY,
     ObservationLayout,
@@ -189,52 +189,12 @@ class NetworkForces(ForceModel):
     name: str = "envmimic"
     network: PPOConfig | None = None
 
-    def inputs(
-        self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]
-    ) -> Float[Array, " inputs"]:
-        """What the policy sees."""
+    def inputs(self, history: History, commands: Commands) -> Float[Array, " inputs"]:
+        """Return what the policy sees."""
         return network_input(history, commands, self.config, self.robot)
 
-    def fields(self, params: Any) -> Fields:
-        """None: forces are all there is."""
-        return {}
-
-    def command(self, params: Any, commands: Float[Array, "steps commands"]) -> Float[Array, "1 commands"]:
-        """The command as it is."""
-        return commands[-1:]
-
-    def wrench(
-        self,
-        params: Any,
-        history: Float[Array, "steps features"],
-        commands: Float[Array, "steps commands"],
-        key: Array | None = None,
-    ) -> Float[Array, "loaded 6"]:
-        """The policy's forces and torques, where they act."""
-        return self._act(params, history, commands, key).wrench
-
-    def joint_force(
-        self,
-        params: Any,
-        history: Float[Array, "steps features"],
-        commands: Float[Array, "steps commands"],
-        key: Array | None = None,
-    ) -> Float[Array, " nv"] | None:
-        """The policy's forces and torques along joints; None: it has others."""
-        return self._act(params, history, commands, key).joint_force
-
-    def command_change(
-        self,
-        params: Any,
-        history: Float[Array, "steps features"],
-        commands: Float[Array, "steps commands"],
-        key: Array | None = None,
-    ) -> Float[Array, " commands"] | None:
-        """The policy's changes of the command; None: it has none."""
-        return self._act(params, history, commands, key).command_change
-
-    def _act(self, params: Any, history: Array, commands: Array, key: Array | None) -> Action:
-        # Evaluated by each of the three methods: compiled, it is one evaluation.
+    def act(self, params: Any, history: History, commands: Commands, key: Array | None = None) -> Action:
+        """Return the policy's loads, where they act."""
         seen, yaw = self.inputs(history, commands), history[-1, ObservationLayout.yaw]
         if key is None or self.sample is None:
             loads = self.loads(params, seen, yaw)

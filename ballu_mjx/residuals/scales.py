@@ -26,6 +26,7 @@ from ballu_mjx.recordings.reference import ReferenceMotions, stack_motions
 from ballu_mjx.residuals.network import ForceNetworkConfig, load_scales
 from ballu_mjx.robots.adapter import ResidualScales
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.sim.c_model import improved_model
 from ballu_mjx.sim.force_model import FORCE_SETS, BoundForces, ForceSet, check_force_set, num_loads
 from ballu_mjx.sim.observation import HISTORY, commands_seen
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
@@ -105,7 +106,7 @@ def missing_loads(
     """Return the root mean square of the loads (N, N m, commands' units) that the model leaves unexplained in recorded
     motions, as it stands and with its base residual."""
     augmented = simulator.with_residual(None)
-    plain, robot, model = augmented.simulator, augmented.robot, _c_model(augmented)
+    plain, robot, model = augmented.simulator, augmented.robot, improved_model(augmented)
     every = max(sum(len(motion.command) for motion in motions) // _STATES, 1)
     window = max(round(_AVERAGED / robot.control_timestep), 1)
     reference, _ = stack_motions(plain, motions)
@@ -147,13 +148,6 @@ def _size(loads: Float[np.ndarray, "states loads"]) -> Float[np.ndarray, " loads
 
 def _rms(values: Float[np.ndarray, " loads"]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def _c_model(simulator: AugmentedSimulator) -> mujoco.MjModel:
-    """Return the simulator's model for C MuJoCo, with the base residual's fields."""
-    from ballu_mjx.residuals.deploy.export import improved_model  # brings the networks' export
-
-    return simulator.simulator.mj_model if simulator.residual is None else improved_model(simulator)
 
 
 def _step(
@@ -207,9 +201,9 @@ def _base_residual(
     def ask(time: Array) -> tuple[Array, Array, Array]:
         history = jax.lax.dynamic_slice_in_dim(reference.features[number], time - HISTORY + 1, HISTORY)
         seen = history, commands_seen(reference.command[number], time)
-        along, change = (ask(bound.params, *seen) for ask in (bound.model.joint_force, bound.model.command_change))
+        wrench, along, change = bound.act(*seen)
         command = bound.model.command(bound.params, seen[1]).mean(axis=0) + (0.0 if change is None else change)
-        return bound.model.wrench(bound.params, *seen), jnp.zeros(model.nv) if along is None else along, command
+        return wrench, jnp.zeros(model.nv) if along is None else along, command
 
     times = np.arange(HISTORY - 1, len(motion.command))
     wrenches, along, commands = map(np.asarray, jax.jit(jax.vmap(ask))(times))

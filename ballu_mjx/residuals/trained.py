@@ -20,7 +20,7 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 from ballu_mjx.runs.folder import read_config
 from ballu_mjx.runs.record import TrainingRecord
-from ballu_mjx.sim.force_model import BoundForces, ForceModel, SumOfForces
+from ballu_mjx.sim.force_model import BoundForces, Commands, ForceModel, History, SumOfForces
 from ballu_mjx.sim.simulator import AugmentedSimulator
 
 MARGIN = 0.1
@@ -108,18 +108,7 @@ class TrainedResidual:
         """Seconds by which commands are delayed on their way to the actuators."""
         return _latency(self.model, self.params)
 
-    def wrench(
-        self,
-        history: Float[Array, "steps features"],
-        commands: Float[Array, "steps commands"],
-        key: Array | None = None,
-    ) -> Float[Array, "loaded 6"]:
-        """Forces and torques over the coming control step; see `force_model.ForceModel.wrench`."""
-        return self.model.wrench(self.params, history, commands, key)
-
-    def out_of_range(
-        self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]
-    ) -> Float[Array, ""]:
+    def out_of_range(self, history: History, commands: Commands) -> Float[Array, ""]:
         """Return how far an observation lies outside of what the recordings showed.
 
         It is that of the worst entry, in widths of the entry's range, `MARGIN` taken off; 0 inside.

@@ -23,20 +23,42 @@ ForceSet = Literal["force", "wrench", "multi", "joints", "commands"]
 every measured point, forces and torques along joints, or changes of the commands. `FORCE_SETS` says all of each."""
 
 
+History = Float[Array, "steps features"]
+"""`observation.observe_features` of the last `HISTORY` control steps, the current one last."""
+Commands = Float[Array, "steps commands"]
+"""Commands (the actuators' own units) of the last control steps and the coming one, `HISTORY` in all."""
+
+
 class Action(NamedTuple):
     """What a residual does over a control step."""
 
     wrench: Float[Array, "loaded 6"]
-    """Force (N) and torque (N m), world frame; see `ForceModel.wrench`."""
+    """Force (N) and torque (N m), world frame: at the tracked body's centre of mass, and, if on more bodies than that,
+    at the robot's points, in order."""
     joint_force: Float[Array, " nv"] | None = None
-    """N m or N, along `mjx.Data.qvel`; None: none."""
+    """Generalized forces (N m or N, along `mjx.Data.qvel`); None: none."""
     command_change: Float[Array, " commands"] | None = None
-    """In the actuators' own units; None: none."""
+    """What is added to the coming command (the actuators' own units), whose sum stays within the commands' ranges;
+    None: nothing."""
+
+    @staticmethod
+    def none() -> Action:
+        """Return the action that does nothing."""
+        return Action(jnp.zeros((1, 6)))
 
     def scaled(self, share: Float[Array, ""] | float) -> Action:
         """Return a share of it."""
         joint, change = (None if part is None else share * part for part in self[1:])
         return Action(share * self.wrench, joint, change)
+
+    def plus(self, other: Action) -> Action:
+        """Return the sum of both, on as many bodies as the one that acts on more."""
+        most = max(len(self.wrench), len(other.wrench))
+        one, two = (jnp.pad(wrench, [(0, most - len(wrench)), (0, 0)]) for wrench in (self.wrench, other.wrench))
+        joint, change = (
+            b if a is None else a if b is None else a + b for a, b in zip(self[1:], other[1:], strict=True)
+        )
+        return Action(one + two, joint, change)
 
 
 class ForceSetKind(NamedTuple):
@@ -63,11 +85,8 @@ def _joint_names(robot: RobotDescription) -> list[str]:
 
 def _act_at_joints(loads: Float[Array, " loads"], robot: RobotDescription) -> Action:
     places = np.array([joint.place for joint in robot.force_joints.values()], int)
-    return Action(_nothing(), jnp.zeros(robot.directions, loads.dtype).at[places].set(loads))
-
-
-def _nothing() -> Float[Array, "1 6"]:
-    return jnp.zeros((1, 6))
+    force = jnp.zeros(robot.directions, loads.dtype).at[places].set(loads)
+    return Action.none()._replace(joint_force=force)
 
 
 FORCE_SETS: Mapping[ForceSet, ForceSetKind] = {
@@ -90,7 +109,7 @@ FORCE_SETS: Mapping[ForceSet, ForceSetKind] = {
     "commands": ForceSetKind(
         lambda robot: [f"change of command {command}, its units" for command in robot.commands],
         False,
-        lambda loads, robot: Action(_nothing(), None, loads),
+        lambda loads, robot: Action.none()._replace(command_change=loads),
     ),
 }
 """By name. All methods that learn a network take all of them."""
@@ -114,82 +133,40 @@ def check_force_set(forces: ForceSet, robot: RobotDescription) -> None:
         )
 
 
-def add_parts(one: Array | None, other: Array | None) -> Array | None:
-    """Return the sum of what may be missing."""
-    if one is None or other is None:
-        return other if one is None else one
-    return one + other
-
-
-def add_wrenches(one: Float[Array, "loaded 6"], other: Float[Array, "others 6"]) -> Float[Array, "bodies 6"]:
-    """Wrenches of two residuals, on as many bodies as the one that acts on more."""
-    most = max(len(one), len(other))
-    one, other = (jnp.pad(wrench, [(0, most - len(wrench)), (0, 0)]) for wrench in (one, other))
-    return one + other
-
-
 @runtime_checkable
 class ForceModel(Protocol):
     """A kind of residual. All methods are pure: they may be jitted, vmapped and differentiated.
 
-    `history` holds `observation.observe_features` of the last three control steps, the current one last; `commands`
-    those of the last two control steps and the coming one.
+    A kind inherits from this class, and writes `name`, `inputs`, and what else it changes.
     """
 
     @property
     def name(self) -> str:
-        """What a simulator improved by it is called."""
+        """Return what a simulator improved by it is called."""
         ...
 
-    def inputs(
-        self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]
-    ) -> Float[Array, " inputs"]:
-        """What it sees, independent of place and heading."""
+    def inputs(self, history: History, commands: Commands) -> Float[Array, " inputs"]:
+        """Return what it sees, independent of place and heading."""
         ...
 
     def fields(self, params: Any) -> Fields:
-        """Model fields to simulate with instead of the model's own."""
-        ...
+        """Return model fields to simulate with instead of the model's own. Default: none."""
+        del params
+        return {}
 
-    def command(self, params: Any, commands: Float[Array, "steps commands"]) -> Float[Array, "parts commands"]:
-        """What the actuators get over equal parts of the coming control step; a number of them that divides its physics
-        steps."""
-        ...
+    def command(self, params: Any, commands: Commands) -> Float[Array, "parts commands"]:
+        """Return what the actuators get over equal parts of the coming control step; a number of them that divides its
+        physics steps. Default: the coming command."""
+        del params
+        return commands[-1:]
 
-    def wrench(
-        self,
-        params: Any,
-        history: Float[Array, "steps features"],
-        commands: Float[Array, "steps commands"],
-        key: Array | None = None,
-    ) -> Float[Array, "loaded 6"]:
-        """Force (N) and torque (N m), world frame, over the coming control step: at the tracked body's centre of mass,
-        and, if on more bodies than that, at the robot's points, in order.
+    def act(self, params: Any, history: History, commands: Commands, key: Array | None = None) -> Action:
+        """Return what it does over the coming control step. Default: nothing.
 
         With `key`, drawn from the model's distribution, where it has one; without, the most likely.
         """
-        ...
-
-    def joint_force(
-        self,
-        params: Any,
-        history: Float[Array, "steps features"],
-        commands: Float[Array, "steps commands"],
-        key: Array | None = None,
-    ) -> Float[Array, " nv"] | None:
-        """Generalized forces (N m, N, along `mjx.Data.qvel`) over the coming control step; None: there are none."""
         del params, history, commands, key
-
-    def command_change(
-        self,
-        params: Any,
-        history: Float[Array, "steps features"],
-        commands: Float[Array, "steps commands"],
-        key: Array | None = None,
-    ) -> Float[Array, " commands"] | None:
-        """What is added to the coming command (the actuators' own units); None: nothing. The sum stays within the
-        commands' ranges."""
-        del params, history, commands, key
+        return Action.none()
 
 
 class BoundForces(NamedTuple):
@@ -209,6 +186,10 @@ class BoundForces(NamedTuple):
     def fields(self) -> Fields:
         """Model fields to simulate with; see `ForceModel.fields`."""
         return self.model.fields(self.params)
+
+    def act(self, history: History, commands: Commands, key: Array | None = None) -> Action:
+        """Return what it does over the coming control step; see `ForceModel.act`."""
+        return self.model.act(self.params, history, commands, key)
 
     def plus(self, further: BoundForces) -> BoundForces:
         """Return both residuals, acting together."""
@@ -244,9 +225,7 @@ class SumOfForces(ForceModel):
     def name(self) -> str:
         return "+".join(part.name for part in self.parts)
 
-    def inputs(
-        self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]
-    ) -> Float[Array, " inputs"]:
+    def inputs(self, history: History, commands: Commands) -> Float[Array, " inputs"]:
         return self.parts[1].inputs(history, commands)
 
     def fields(self, params: Any) -> Fields:
@@ -256,39 +235,10 @@ class SumOfForces(ForceModel):
             raise ValueError(f"Both residuals change {', '.join(shared)}.")
         return first | second
 
-    def command(self, params: Any, commands: Float[Array, "steps commands"]) -> Float[Array, "parts commands"]:
+    def command(self, params: Any, commands: Commands) -> Float[Array, "parts commands"]:
         changes = [part.command(own, commands) - commands[-1] for part, own in zip(self.parts, params, strict=True)]
         return commands[-1] + sum(changes)
 
-    def wrench(
-        self,
-        params: Any,
-        history: Float[Array, "steps features"],
-        commands: Float[Array, "steps commands"],
-        key: Array | None = None,
-    ) -> Float[Array, "loaded 6"]:
-        return add_wrenches(
-            *(part.wrench(own, history, commands, key) for part, own in zip(self.parts, params, strict=True))
-        )
-
-    def joint_force(
-        self,
-        params: Any,
-        history: Float[Array, "steps features"],
-        commands: Float[Array, "steps commands"],
-        key: Array | None = None,
-    ) -> Float[Array, " nv"] | None:
-        return add_parts(
-            *(part.joint_force(own, history, commands, key) for part, own in zip(self.parts, params, strict=True))
-        )
-
-    def command_change(
-        self,
-        params: Any,
-        history: Float[Array, "steps features"],
-        commands: Float[Array, "steps commands"],
-        key: Array | None = None,
-    ) -> Float[Array, " commands"] | None:
-        return add_parts(
-            *(part.command_change(own, history, commands, key) for part, own in zip(self.parts, params, strict=True))
-        )
+    def act(self, params: Any, history: History, commands: Commands, key: Array | None = None) -> Action:
+        first, second = (part.act(own, history, commands, key) for part, own in zip(self.parts, params, strict=True))
+        return first.plus(second)

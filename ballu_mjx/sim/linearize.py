@@ -103,14 +103,14 @@ class Linearizer:
 
         def after(moved: PhysicsState, inputs: Float[Array, " inputs"]) -> tuple[PhysicsState, Array]:
             loads = jnp.asarray(step.loads) + inputs[: self.loads]
-            does = FORCE_SETS[self._forces].act(loads, self.simulator.robot)._asdict()
+            does = FORCE_SETS[self._forces].act(loads, self.simulator.robot)
             torques = jnp.zeros(nv).at[self._joints].set(inputs[self.loads :])
             history = jnp.asarray(step.state.history)
             if self.simulator.residual is not None:  # which sees the moved state
                 history = history.at[-1].set(self.simulator.simulator.observe(moved)[0])
             state = jax.tree.map(jnp.asarray, step.state._replace(physics=moved, history=history))
             simulator = self.simulator.with_generalized_force(torques)
-            done = simulator.step(state, jnp.asarray(step.command), **does).state
+            done = simulator.step(state, jnp.asarray(step.command), does).state
             return done.physics, done.features
 
         # The step itself is the same for all directions, and simulated once for all.

@@ -27,7 +27,7 @@ from ballu_mjx.sim.drivetrain import (
     init_drivetrain,
     scan_drivetrain,
 )
-from ballu_mjx.sim.force_model import Action, BoundForces, HasForces, add_parts, add_wrenches
+from ballu_mjx.sim.force_model import Action, BoundForces, Commands, HasForces, History
 from ballu_mjx.sim.observation import observe_features
 from ballu_mjx.sim.sharding import chunks
 from ballu_mjx.sim.step import PhysicsState, control_step, count_substeps, load_state, make_data, put_model, state_at
@@ -248,10 +248,8 @@ class RolloutStep(NamedTuple):
     """After the step."""
     com: Float[Array, " 3"]
     """Centre of mass (m, world) after the step."""
-    wrench: Float[Array, "loaded 6"]
-    """Force (N) and torque (N m, world) that pushed over the step: on the tracked body, then at the points."""
-    joint_force: Float[Array, " nv"] | None = None
-    """Generalized forces (N m, N) of residuals over the step; None: there were none."""
+    action: Action
+    """What acted over the step: the residual, and what was beside it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -322,11 +320,9 @@ class AugmentedSimulator:
         self,
         state: RolloutState,
         command: Float[Array, " commands"],
+        further: Action | None = None,
         *,
-        wrench: Float[Array, "others 6"] | None = None,
-        joint_force: Float[Array, " nv"] | None = None,
-        command_change: Float[Array, " commands"] | None = None,
-        wrench_scale: Float[Array, ""] | float | None = None,
+        action_scale: Float[Array, ""] | float | None = None,
         key: Array | None = None,
     ) -> RolloutStep:
         """Advance by one control step: ask the residual, step drivetrain and physics, observe, shift the history.
@@ -337,44 +333,37 @@ class AugmentedSimulator:
 
         - `state`: where the simulation stands; the residual sees its history and commands.
         - `command`: of the coming control step, in the actuators' own units.
-        - `wrench`: further force (N) and torque (N m, world), on the tracked body and, if more, at the points.
-        - `joint_force`: further generalized forces (N m, N, along `mjx.Data.qvel`).
-        - `command_change`: what is further added to the command, within its range.
-        - `wrench_scale`: multiplies the residual's wrenches, joint forces and changes of the command, not its delays
-          and model fields.
-        - `key`: to draw the residual's wrenches; None: the most likely ones.
+        - `further`: what acts beside the residual.
+        - `action_scale`: multiplies what the residual does (`ForceModel.act`), not its delays and model fields.
+        - `key`: to draw what the residual does; None: the most likely.
         """
         commands = state.with_command(command)
         if self.residual is None:
-            sent, total = command, jnp.zeros((1, 6)) if wrench is None else wrench
+            sent, action = command, Action.none() if further is None else further
         else:
-            sent, own = self._ask(state.history, commands, key)
-            if wrench_scale is not None:
-                own = own.scaled(wrench_scale)
-            total = own.wrench if wrench is None else add_wrenches(wrench, own.wrench)
-            joint_force = add_parts(joint_force, own.joint_force)
-            command_change = add_parts(command_change, own.command_change)
-        if command_change is not None:
+            sent, action = self._ask(state.history, commands, key)
+            if action_scale is not None:
+                action = action.scaled(action_scale)
+            action = action if further is None else further.plus(action)
+        if action.command_change is not None:
             low, high = np.array(self.robot.command_ranges, np.float32).T
-            sent = jnp.clip(sent + command_change, low, high)
+            sent = jnp.clip(sent + action.command_change, low, high)
         drivetrain, ctrl = self.simulator.drive(state.drivetrain, sent)
-        physics = self.simulator.step(state.physics, ctrl, total, joint_force)
+        physics = self.simulator.step(state.physics, ctrl, action.wrench, action.joint_force)
         features, com = self.simulator.observe(physics)
         history = jnp.concatenate([state.history[1:], features[None]])
-        return RolloutStep(RolloutState(physics, history, commands[1:], drivetrain), com, total, joint_force)
+        return RolloutStep(RolloutState(physics, history, commands[1:], drivetrain), com, action)
 
     def _ask(
-        self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"], key: Array | None
+        self, history: History, commands: Commands, key: Array | None
     ) -> tuple[Float[Array, "*parts commands"], Action]:
         """Return the residual's commands before it changes them, and what it does."""
         assert self.residual is not None
-        model, params = self.residual.model, self.residual.params
-        seen = params, history, commands, key
-        does = Action(model.wrench(*seen), model.joint_force(*seen), model.command_change(*seen))
-        sent = model.command(params, commands)
+        action = self.residual.act(history, commands, key)
+        sent = self.residual.model.command(self.residual.params, commands)
         if self.scale is None:
-            return sent, does
-        return (1 - self.scale) * commands[-1] + self.scale * sent, does.scaled(self.scale)
+            return sent, action
+        return (1 - self.scale) * commands[-1] + self.scale * sent, action.scaled(self.scale)
 
 
 @functools.partial(jax.jit, static_argnames=("sites", "root"))

@@ -8,7 +8,6 @@ import pytest
 from scipy import stats
 
 from ballu_mjx.cli import compare
-from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, quotient
 from ballu_mjx.evaluation.statistics import t_interval
 from ballu_mjx.runs.folder import Run
@@ -116,5 +115,15 @@ def test_methods_and_robots_are_told_apart(tmp_path: Path):
     assert [row.label for row in compare.rows([one, fitted])] == ["task envmimic", "task fluid"]
     found = [compare.figures(folder) for folder in (one, fitted)]
     assert "near position, 5 s (ratio)" in compare.table({"envmimic": [found[0]], "fluid": [found[1]]})
-    with pytest.raises(InputError, match="no figure in common"):
-        compare.table({"envmimic": [{"near position, 5 s (ratio)": 0.5}], "fluid": [{"flight position, 5 s": 0.5}]})
+
+
+def test_rows_that_were_measured_on_other_recordings_say_what_is_missing():
+    near, flight = "near position, 5 s (ratio)", "flight position, 2 s (ratio)"
+    rows = {"ballu": [{"mean ratio": 0.4, near: 0.5}], "blimp": [{flight: 0.25, "mean ratio": 0.2}]}
+    header, _, one, other, *notes = compare.table(rows).splitlines()
+    assert header == f"| | runs | mean ratio | {near} | {flight} |"
+    assert one == "| ballu | 1 | 0.400 | 0.500 | - |" and other == "| blimp | 1 | 0.200 | - | 0.250 |"
+    assert "Figures of all rows: mean ratio." in notes[-1]
+    partly = compare.table({"ballu": [{near: 0.5}, {near: 0.7, "mean ratio": 0.2}]})
+    assert "0.600" in partly and "| - |" in partly and "0.200" not in partly
+    assert "not measured" not in compare.table({"ballu": [{near: 0.5}], "blimp": [{near: 0.7}]})

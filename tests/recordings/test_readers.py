@@ -414,8 +414,18 @@ def test_lerobot_datasets(tmp_path: Path, robot: RobotDescription, version: str)
     np.testing.assert_allclose(later.bodies["hull"].position, HULL.place + 0.01, atol=1e-6)
     with pytest.raises(InputError, match=r"holds 2 episodes, 0 to 1; say which by episode = ... under \[clock\]"):
         read_capture(path, room(tmp_path, robot, LEROBOT))
-    with pytest.raises(InputError, match="there is no episode 7; there are 2, 0 to 1"):
+    with pytest.raises(InputError, match="there is no episode 7; its episodes are 0 to 1, 2 in all"):
         read_capture(path, room(tmp_path, robot, text.replace("episode = 0", "episode = 7")))
+
+
+def test_the_first_mapping_of_several_episodes_names_one(tmp_path: Path, robot: RobotDescription):
+    path = write_lerobot(tmp_path, episodes=2)
+    same(imported(tmp_path, path, robot), gaps=False)
+    text = (tmp_path / "room.toml").read_text()
+    assert "episode = 0  # of 2" in text
+    (tmp_path / "room.toml").write_text(text.replace("episode = 0", "episode = 1"))
+    later = read_capture(path, read_mapping(tmp_path / "room.toml", robot))
+    np.testing.assert_allclose(later.bodies["tip"].position, TIP.place + 0.01, atol=1e-6)
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
@@ -706,7 +716,7 @@ def test_what_the_wizard_cannot_tell_is_left_empty_and_refused(
     text = path.read_text()
     path.write_text(text.replace("tip X", "beak X").replace("hull\ttip", "hull\tbeak"))
     run("map", path, "--output", tmp_path / "room.toml", "--robot", robot.file)
-    assert "1 places to complete" in capsys.readouterr().out
+    assert "1 place to complete" in capsys.readouterr().out
     assert 'body = ""  # choose from hull, beak' in (tmp_path / "room.toml").read_text()
     with pytest.raises(InputError, match=r'\[tip\] body: it is ""; write text there'):
         read_mapping(tmp_path / "room.toml", robot)

@@ -110,7 +110,7 @@ def test_no_air_is_the_nominal_model():
     for name, value in air.fields(none).items():
         np.testing.assert_allclose(value, getattr(MODEL, name), rtol=1e-6, atol=1e-8)
     seen = history(np.array([0.1, 0.2, 0.3]), np.array([0.3, -0.2, 0.1]), np.array([0.1, 0.2, 0.3]))
-    assert not np.any(air.wrench(none, seen, COMMANDS))
+    assert not np.any(air.act(none, seen, COMMANDS).wrench)
 
 
 def test_added_mass_weighs_nothing_and_lift_lifts():
@@ -156,7 +156,7 @@ def test_rounding_a_delay_moves_what_passes_for_it():
 def test_drag_opposes_the_motion_whatever_the_heading():
     air = Aerodynamics(load_robot(), MODEL)
     velocity, turning = np.array([0.4, -0.3, 0.2]), np.array([0.3, -0.5, 0.7])
-    level = np.asarray(air.wrench(AIR, history(np.zeros(3), velocity, turning), COMMANDS))[0]
+    level = np.asarray(air.act(AIR, history(np.zeros(3), velocity, turning), COMMANDS).wrench)[0]
     speed = np.linalg.norm(velocity)
     expected = -(np.array(AIR.linear_drag) + np.array(AIR.quadratic_drag) * speed) * velocity
     np.testing.assert_allclose(level[:3], expected, rtol=1e-4)
@@ -165,7 +165,7 @@ def test_drag_opposes_the_motion_whatever_the_heading():
     yaw = 2.0
     turned = np.asarray(heading_rotation(jnp.array(yaw)))
     seen = history(np.array([0.0, 0.0, yaw]), turned @ velocity, turning)
-    wrench = np.asarray(air.wrench(AIR, seen, COMMANDS))[0]
+    wrench = np.asarray(air.act(AIR, seen, COMMANDS).wrench)[0]
     np.testing.assert_allclose(wrench[:3], turned @ level[:3], rtol=1e-4)
     np.testing.assert_allclose(wrench[3:], turned @ level[3:], rtol=2e-2, atol=1e-6)
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from plain_push import PlainPush
 from rover import write_rover
 from servo_arm import TRUTH, identified, write_arm
 
@@ -22,7 +23,7 @@ from ballu_mjx.identification.actuators import read_actuators
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.aerodynamics import Aerodynamics, AirParameters
-from ballu_mjx.residuals.deploy.export import export_simulator, improved_model, rollout_in_double
+from ballu_mjx.residuals.deploy.export import export_simulator, rollout_in_double
 from ballu_mjx.residuals.deploy.residual import PARAMETERS_FILE, SETTINGS_FILE, ImprovedSimulator
 from ballu_mjx.residuals.fluid import FluidForces
 from ballu_mjx.residuals.network import (
@@ -41,7 +42,8 @@ from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.robots.mjcf import write_mjcf
 from ballu_mjx.robots.model import assets
 from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.sim.force_model import BoundForces, ForceModel, ForceSet
+from ballu_mjx.sim.c_model import improved_model
+from ballu_mjx.sim.force_model import BoundForces, ForceSet
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 BALLOON = Path(__file__).parents[2] / "experiments" / "tethered_balloon" / "balloon.robot.json"
@@ -288,26 +290,6 @@ def test_a_model_of_several_files_is_written_as_one(tmp_path: Path):
     assert {"model/dof_damping", "model/jnt_range", "model/body_mass"} <= set(exact)
 
 
-class Unknown(ForceModel):
-    """A residual of a kind that no export knows."""
-
-    @property
-    def name(self) -> str:
-        return "unknown"
-
-    def inputs(self, history: Any, commands: Any) -> Any:
-        return commands.ravel()
-
-    def fields(self, params: Any) -> dict:
-        return {}
-
-    def command(self, params: Any, commands: Any) -> Any:
-        return commands[-1:]
-
-    def wrench(self, params: Any, history: Any, commands: Any, key: Any = None) -> Any:
-        return jnp.zeros((1, 6))
-
-
 def test_what_cannot_be_exported_is_said_in_a_sentence(tmp_path: Path):
     robot = write_arm(tmp_path)
     plain, full = Simulator(robot), tmp_path / "full"
@@ -315,7 +297,7 @@ def test_what_cannot_be_exported_is_said_in_a_sentence(tmp_path: Path):
     (full / "notes.txt").write_text("keep")
     for simulator, place, words in (
         (plain, full, "not empty"),
-        (plain.with_residual(BoundForces(Unknown(), None)), tmp_path / "a", "kind that cannot be exported"),
+        (plain.with_residual(BoundForces(PlainPush(), 1.0)), tmp_path / "a", "kind that cannot be exported"),
         (plain.with_residual(network(robot, "force"), 0.5), tmp_path / "b", "scaled"),
     ):
         with pytest.raises(InputError, match=words):

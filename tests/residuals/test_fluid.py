@@ -101,7 +101,7 @@ def test_the_mirror_image_of_a_motion_gets_the_mirror_image_of_the_wrench(glider
     history = np.cumsum(rng.normal(size=(HISTORY, glider.features)) * 0.05, axis=0)
     flip = np.array([1, -1, 1, 1, -1, 1, -1, 1, -1])
     commands = jnp.zeros((HISTORY, 2))
-    one, other = (np.asarray(forces.wrench(params, jnp.asarray(x), commands))[0] for x in (history, history * flip))
+    one, other = (np.asarray(forces.act(params, jnp.asarray(x), commands).wrench)[0] for x in (history, history * flip))
     assert np.abs(one).max() > 0.01
     np.testing.assert_allclose(other, one * np.array([1, -1, 1, -1, 1, -1]), rtol=2e-3, atol=2e-4)
 
@@ -117,7 +117,7 @@ def test_the_wrench_turns_with_the_body_s_heading(glider: RobotDescription):
     turned[:, :3], turned[:, 3:6] = history[:, :3] @ frame.T, history[:, 3:6] @ frame.T
     turned[:, 8] += angle
     commands = jnp.zeros((HISTORY, 2))
-    one, other = (np.asarray(forces.wrench(params, jnp.asarray(x), commands))[0] for x in (history, turned))
+    one, other = (np.asarray(forces.act(params, jnp.asarray(x), commands).wrench)[0] for x in (history, turned))
     np.testing.assert_allclose(other.reshape(2, 3), one.reshape(2, 3) @ frame.T, rtol=2e-3, atol=2e-4)
 
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from plain_push import PlainPush
 from servo_arm import wandering, write_arm
 
 from ballu_mjx.common.errors import InputError
@@ -23,7 +24,7 @@ from ballu_mjx.residuals.scales import describe_scales, missing_loads, settle_sc
 from ballu_mjx.residuals.supervised import SupervisedConfig
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.sim.force_model import BoundForces, ForceModel, ForceSet
+from ballu_mjx.sim.force_model import BoundForces, ForceSet
 from ballu_mjx.sim.linearize import Linearizer
 from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import count_substeps, state_at
@@ -93,32 +94,12 @@ def test_a_simulator_with_what_is_missing_stays_on_the_recording(
             state = step(share, state, jnp.asarray(motion.command[time], jnp.float32))
         far.append(np.abs(np.asarray(state.physics.qpos) - motion.qpos[42]).max())
     assert far[0] < 1e-4 and far[1] > 5e-3
-    one, other = constant(robot, forces, loads), BoundForces(Push(), None)
+    one, other = constant(robot, forces, loads), BoundForces(PlainPush(), 1.0)
     seen = state.history, state.with_command(jnp.zeros(2))
     for base in (one.plus(one), one.plus(other).plus(one)):
-        for ask, kind in ((base.model.joint_force, "joints"), (base.model.command_change, "commands")):
-            found = ask(base.params, *seen)
+        action = base.act(*seen)
+        for found, kind in ((action.joint_force, "joints"), (action.command_change, "commands")):
             assert found is None if kind != forces else np.allclose(np.asarray(found), 2 * loads)
-
-
-class Push(ForceModel):
-    """A residual of a kind that knows of neither."""
-
-    @property
-    def name(self) -> str:
-        return "push"
-
-    def inputs(self, history: Any, commands: Any) -> Any:
-        return commands.ravel()
-
-    def fields(self, params: Any) -> dict:
-        return {}
-
-    def command(self, params: Any, commands: Any) -> Any:
-        return commands[-1:]
-
-    def wrench(self, params: Any, history: Any, commands: Any, key: Any = None) -> Any:
-        return jnp.ones((1, 6))
 
 
 def test_commands_stay_within_their_range(robot: RobotDescription, simulator: Simulator):

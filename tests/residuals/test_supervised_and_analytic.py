@@ -256,5 +256,5 @@ def test_a_run_is_read_as_its_kind(tmp_path: Path, start: ppo.Params):
     loaded = TrainedResidual.load(tmp_path, BALLU)
     assert (loaded.model.name, loaded.step) == ("supervised", 5)
     assert json.loads((tmp_path / "config.json").read_text())["task"] == "supervised"
-    wrench = loaded.wrench(jnp.zeros((HISTORY, 27)), jnp.zeros((HISTORY, 2)))
+    wrench = loaded.bound.act(jnp.zeros((HISTORY, 27)), jnp.zeros((HISTORY, 2))).wrench
     assert np.all(np.isfinite(wrench))

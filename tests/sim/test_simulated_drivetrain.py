@@ -24,7 +24,7 @@ from ballu_mjx.recordings.segments import cut_segments, start_segment
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, tracking_state
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.sim.drivetrain import DrivetrainParameters
-from ballu_mjx.sim.force_model import BoundForces, Fields, ForceModel
+from ballu_mjx.sim.force_model import BoundForces, ForceModel
 from ballu_mjx.sim.linearize import ControlSteps, Linearizer
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
@@ -112,14 +112,8 @@ class Scaled(ForceModel):
     def name(self) -> str:
         return "scaled"
 
-    def fields(self, params: Array) -> Fields:
-        return {}
-
     def command(self, params: Array, commands: Array) -> Array:
         return params * commands[-1:]
-
-    def wrench(self, params: Array, history: Array, commands: Array, key: Array | None = None) -> Array:
-        return jnp.zeros((1, 6))
 
     def inputs(self, history: Array, commands: Array) -> Array:
         return commands.ravel()

@@ -10,9 +10,10 @@ import mujoco
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
+from plain_push import PlainPush
 
 from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.sim.force_model import BoundForces, Fields, ForceModel
+from ballu_mjx.sim.force_model import Action, BoundForces, Fields, ForceModel
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState, state_at
@@ -40,9 +41,9 @@ class Springs(ForceModel):
     def command(self, params: Array, commands: Array) -> Array:
         return commands[-2:-1]
 
-    def wrench(self, params: Array, history: Array, commands: Array, key: Array | None = None) -> Array:
+    def act(self, params: Array, history: Array, commands: Array, key: Array | None = None) -> Action:
         pull = params * (history[0, LAYOUT.position] - history[-1, LAYOUT.position]) + 0.01 * commands.sum()
-        return jnp.concatenate([pull, jnp.zeros(3)])[None]
+        return Action(jnp.concatenate([pull, jnp.zeros(3)])[None])
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +65,7 @@ def by_hand(start: RolloutState, scale: Float[Array, ""]) -> tuple[PhysicsState,
     kind, commands = Springs(), jnp.concatenate([start.commands, COMMAND[None]])
     mass = jnp.asarray(SIMULATOR.mj_model.body_mass, jnp.float32)
     altered = SIMULATOR.with_fields({"body_mass": (1 - scale) * mass + scale * kind.fields(PARAMS)["body_mass"]})
-    wrench = scale * kind.wrench(PARAMS, start.history, commands)
+    wrench = scale * kind.act(PARAMS, start.history, commands).wrench
     command = (1 - scale) * COMMAND + scale * kind.command(PARAMS, commands)
     physics = altered.step(start.physics, command, wrench)
     features, com = altered.observe(physics)
@@ -85,7 +86,7 @@ def test_a_step_is_ask_step_observe_and_shift(start: RolloutState, scale: float)
     np.testing.assert_allclose(after.state.history[:-1], start.history[1:])
     np.testing.assert_allclose(after.state.features, features, atol=1e-5)
     np.testing.assert_allclose(after.com, com, atol=1e-6)
-    np.testing.assert_allclose(after.wrench, wrench, atol=1e-6)
+    np.testing.assert_allclose(after.action.wrench, wrench, atol=1e-6)
     np.testing.assert_array_equal(after.state.commands, jnp.stack([start.commands[1], COMMAND]))
     if scale == 1.0:
         whole = jax.jit(lambda state: SIMULATOR.with_residual(BoundForces(Springs(), PARAMS)).step(state, COMMAND))
@@ -97,28 +98,14 @@ def test_a_step_is_ask_step_observe_and_shift(start: RolloutState, scale: float)
 def test_further_wrenches_and_residuals_add_up(start: RolloutState):
     """Two residuals in a row, a scaled wrench and another one on the base: their sum pushes."""
 
-    class Push(Springs):
-        @property
-        def name(self) -> str:
-            return "push"
-
-        def fields(self, params: Array) -> Fields:
-            return {}
-
-        def command(self, params: Array, commands: Array) -> Array:
-            return commands[-1:]
-
-        def wrench(self, params: Array, history: Array, commands: Array, key: Array | None = None) -> Array:
-            return params * jnp.eye(1, 6)
-
     def both(simulator: Simulator | AugmentedSimulator) -> AugmentedSimulator:
-        return simulator.with_residual(BoundForces(Springs(), PARAMS)).with_residual(BoundForces(Push(), 0.02))
+        return simulator.with_residual(BoundForces(Springs(), PARAMS)).with_residual(BoundForces(PlainPush(), 0.02))
 
     more = jnp.zeros((2, 6)).at[1, 2].set(0.1)
-    after = jax.jit(lambda state: both(SIMULATOR).step(state, COMMAND, wrench=more, wrench_scale=0.5))(start)
-    own = Springs().wrench(PARAMS, start.history, start.with_command(COMMAND))
+    after = jax.jit(lambda state: both(SIMULATOR).step(state, COMMAND, Action(more), action_scale=0.5))(start)
+    own = Springs().act(PARAMS, start.history, start.with_command(COMMAND)).wrench
     expected = more.at[0].add(0.5 * (own[0] + 0.02 * jnp.eye(1, 6)[0]))
-    np.testing.assert_allclose(after.wrench, expected, atol=1e-6)
+    np.testing.assert_allclose(after.action.wrench, expected, atol=1e-6)
     altered = both(SIMULATOR)
     np.testing.assert_allclose(
         altered.simulator.model.body_mass[BODY], SIMULATOR.mj_model.body_mass[BODY] + 0.05 * PARAMS, rtol=1e-6

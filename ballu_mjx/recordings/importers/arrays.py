@@ -9,6 +9,7 @@ and 3 (several episodes a file). Its times are the feature `timestamp`, in s. Pa
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import zipfile
 from collections.abc import Mapping
@@ -180,14 +181,16 @@ def open_lerobot(path: Path, mapping: RoomMapping | None) -> Capture:
         notes.append(f"It {problem}; here is episode {min(present)}.")
     elif episode is not None and episode not in present:
         problem = f"there is no episode {episode}"
-        refuse(path, "", problem, f"there are {len(present)}, {min(present)} to {max(present)}")
+        refuse(path, "", problem, f"its episodes are {min(present)} to {max(present)}, {len(present)} in all")
     joined = {}
     for name, parts in arrays.items():
         if len({part.shape[1:] for part in parts}) == 1:
             joined[name] = np.concatenate(parts)
     labels = {f"{name}[{i}]": label for name, feature in features.items() for i, label in enumerate(_labels(feature))}
     notes.append("LeRobot states no units of angles: they may be degrees, radians or shares of a range.")
-    return _capture(path, "a LeRobot dataset", joined, _TIME if _TIME in joined else None, notes, labels)
+    capture = _capture(path, "a LeRobot dataset", joined, _TIME if _TIME in joined else None, notes, labels)
+    several = len(present) > 1 and episode is None
+    return dataclasses.replace(capture, episodes=sorted(present)) if several else capture
 
 
 def _numbers(column: Any, chosen: np.ndarray) -> np.ndarray | None:

@@ -103,6 +103,8 @@ class Capture:
     """Which column that is, where the format fixes it."""
     notes: Sequence[str] = ()
     """Sentences about what is in the file and not read, and what is not certain."""
+    episodes: Sequence[int] = ()
+    """Which episodes there are, where the mapping has to name one; this capture is of the first."""
 
 
 def list_capture(capture: Capture) -> Contents:
@@ -153,7 +155,8 @@ def list_capture(capture: Capture) -> Contents:
                 step=_step(series.values),
             )
         )
-    return Contents(capture.path, capture.program, items, rows=capture.clock is not None, notes=notes)
+    rows = capture.clock is not None
+    return Contents(capture.path, capture.program, items, rows=rows, notes=notes, episodes=capture.episodes)
 
 
 def _rate(time: np.ndarray) -> float | None:

@@ -51,6 +51,8 @@ class Contents:
     rows: bool = False
     """Whether columns hold a sample a row, and the times are a column."""
     notes: Sequence[str] = ()
+    episodes: Sequence[int] = ()
+    """Where a mapping has to name one; what is told here is of the first."""
 
 
 def printable(text: str) -> str:

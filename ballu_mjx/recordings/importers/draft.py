@@ -261,6 +261,7 @@ def _clock(contents: Contents, used: Sequence[Item]) -> list[str]:
         "[clock]",
         f"time = {json.dumps(item.name)}",
         f'time_unit = "{unit}"  # a guess: samples are {step:.4g} apart',
+        *([f"episode = {contents.episodes[0]}  # of {len(contents.episodes)}"] if contents.episodes else []),
         "",
     ]
 

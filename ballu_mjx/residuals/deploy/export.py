@@ -29,6 +29,7 @@ from ballu_mjx.rl.network_export import NetworkPort, OutputScale, check_onnx, ne
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.mjcf import write_mjcf
 from ballu_mjx.runs.folder import new_folder
+from ballu_mjx.sim.c_model import DERIVED_FIELDS, improved_model
 from ballu_mjx.sim.drivetrain import QUANTITIES
 from ballu_mjx.sim.force_model import BoundForces, ForceModel, SumOfForces
 from ballu_mjx.sim.observation import HISTORY
@@ -39,8 +40,6 @@ CHECK_SECONDS = 5.0
 """Length of the rollout that goes with a folder."""
 _SOURCE = "residual.py"
 _EXAMPLE = "example.py"
-_DERIVED = ("body_invweight0", "body_subtreemass", "dof_invweight0", "tendon_invweight0")
-"""Fields that C MuJoCo derives from the others."""
 _HOLD = 0.25
 """Seconds for which the check's rollout holds a command."""
 
@@ -104,7 +103,7 @@ def export_simulator(
         name.partition("/")[2]
         for name, value in exact.items()
         if name.startswith("model/")
-        and name.partition("/")[2] not in _DERIVED
+        and name.partition("/")[2] not in DERIVED_FIELDS
         and not np.allclose(getattr(written, name.partition("/")[2]), value, rtol=1e-4, atol=1e-7)
     )
     _write_json(place / standalone.SETTINGS_FILE, _settings(augmented, wanted, parts))
@@ -125,31 +124,6 @@ def export_simulator(
     text = _readme(augmented, parts, left_out, onnx=onnx, checked=deviation is not None)
     (place / "README.md").write_text(text, encoding="utf-8")
     return ExportedSimulator(place, deviation, left_out)
-
-
-def improved_model(simulator: AugmentedSimulator) -> mujoco.MjModel:
-    """Return the simulator's model for C MuJoCo: with identified actuators, and the residual's fields."""
-    plain = simulator.simulator
-    model = mujoco.MjModel.from_xml_path(str(simulator.robot.model))
-    for name in dir(model):  # a copy, but for what copies forget
-        value = None if name.startswith("_") else getattr(plain.mj_model, name, None)
-        if isinstance(value, np.ndarray) and value.dtype.kind == "f":
-            getattr(model, name)[...] = value
-    changed = False
-    for name in dir(plain.model):
-        own = None if name.startswith("_") or name in _DERIVED else getattr(model, name, None)
-        if not isinstance(own, np.ndarray) or own.dtype.kind != "f":
-            continue
-        now = np.asarray(getattr(plain.model, name))
-        if now.shape != own.shape or now.dtype.kind != "f":
-            continue
-        # In MJX's precision, so that what it only rounds stays as it is.
-        different = now != own.astype(now.dtype)
-        own[different] = now[different]
-        changed = changed or bool(different.any())
-    if changed:
-        mujoco.mj_setConst(model, mujoco.MjData(model))
-    return model
 
 
 # ---- the residual's parts ----

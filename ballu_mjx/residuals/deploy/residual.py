@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -115,8 +115,19 @@ def _turn(matrix: np.ndarray) -> np.ndarray:
 # ---- the residual's parts ----
 
 
+class Action(NamedTuple):
+    """What a part does over a control step."""
+
+    wrench: np.ndarray
+    """Forces and torques (N, N m; world), a row each: on the tracked body, then at the points where there are more."""
+    joint_force: np.ndarray | float = 0.0
+    """Forces and torques (N, N m) along the part's `joints`."""
+    command_change: np.ndarray | float = 0.0
+    """What is added to the command, in the actuators' own units."""
+
+
 class Part:
-    """A part of the residual. What it does not do has these answers."""
+    """A part of the residual. This one does nothing."""
 
     joints: Sequence[str] = ()
     """Joints that it acts along."""
@@ -125,20 +136,10 @@ class Part:
         """Return the command, as it is or late, for equal parts of the control step."""
         return commands[-1:]
 
-    def wrench(self, history: np.ndarray, commands: np.ndarray) -> np.ndarray:
-        """Return the wrenches (N, N m; world): on the tracked body, then at the points where there are more."""
+    def act(self, history: np.ndarray, commands: np.ndarray) -> Action:
+        """Return what it does over the coming control step."""
         del history, commands
-        return np.zeros((1, 6))
-
-    def joint_force(self, history: np.ndarray, commands: np.ndarray) -> np.ndarray:
-        """Return forces and torques (N, N m) along `joints`."""
-        del history, commands
-        return np.zeros(len(self.joints))
-
-    def command_change(self, history: np.ndarray, commands: np.ndarray) -> np.ndarray:
-        """Return what is added to the command."""
-        del history
-        return np.zeros(commands.shape[1])
+        return Action(np.zeros((1, 6)))
 
 
 class NetworkPart(Part):
@@ -152,27 +153,17 @@ class NetworkPart(Part):
         self._activation = {"swish": _swish, "tanh": np.tanh}[part["activation"]]
         self.joints = part["joints"]
 
-    def joint_force(self, history: np.ndarray, commands: np.ndarray) -> np.ndarray:
-        """Return forces and torques (N, N m) along `joints`."""
-        if self._part["forces"] != "joints":
-            return super().joint_force(history, commands)
-        return self.loads(network_input(history, commands, self._part))
-
-    def command_change(self, history: np.ndarray, commands: np.ndarray) -> np.ndarray:
-        """Return what is added to the command."""
-        if self._part["forces"] != "commands":
-            return super().command_change(history, commands)
-        return self.loads(network_input(history, commands, self._part))
-
-    def wrench(self, history: np.ndarray, commands: np.ndarray) -> np.ndarray:
-        """Return the wrenches (N, N m; world): on the tracked body, then at the points where there are more."""
-        part = self._part
-        if part["forces"] in ("joints", "commands"):
-            return super().wrench(history, commands)
-        loads = self.loads(network_input(history, commands, part)).reshape(-1, 3)
-        if part["heading_frame"]:
-            loads = loads @ heading_rotation(history[-1, YAW]).T
-        return loads.reshape(1, 6) if part["forces"] == "wrench" else np.pad(loads, [(0, 0), (0, 3)])
+    def act(self, history: np.ndarray, commands: np.ndarray) -> Action:
+        """Return the network's loads, where they act."""
+        forces, loads = self._part["forces"], self.loads(network_input(history, commands, self._part))
+        if forces == "joints":
+            return Action(np.zeros((1, 6)), joint_force=loads)
+        if forces == "commands":
+            return Action(np.zeros((1, 6)), command_change=loads)
+        vectors = loads.reshape(-1, 3)
+        if self._part["heading_frame"]:
+            vectors = vectors @ heading_rotation(history[-1, YAW]).T
+        return Action(vectors.reshape(1, 6) if forces == "wrench" else np.pad(vectors, [(0, 0), (0, 3)]))
 
     def loads(self, seen: np.ndarray) -> np.ndarray:
         """Return the loads (N, N m, commands' units), in the frame of what the network sees."""
@@ -206,13 +197,13 @@ class AerodynamicPart(Part):
         """Return what has arrived by the start of each physics step."""
         return commands[HISTORY - 1 - self._age]
 
-    def wrench(self, history: np.ndarray, commands: np.ndarray) -> np.ndarray:
+    def act(self, history: np.ndarray, commands: np.ndarray) -> Action:
         """Return the drag (N, N m; world) in still air."""
         del commands
         now, velocity, rate = body_motion(history, self._control_timestep)
         speed = np.sqrt(np.sum(velocity**2) + _SLOW**2)
         force = -(self._linear + self._quadratic * speed) * velocity
-        return np.concatenate([now @ force, now @ (-self._turning * rate)])[None]
+        return Action(np.concatenate([now @ force, now @ (-self._turning * rate)])[None])
 
 
 class FluidPart(Part):
@@ -226,7 +217,7 @@ class FluidPart(Part):
         self._power = np.array([term["power_of_speed"] for term in part["terms"]])
         self._coefficients = arrays["coefficients"]
 
-    def wrench(self, history: np.ndarray, commands: np.ndarray) -> np.ndarray:
+    def act(self, history: np.ndarray, commands: np.ndarray) -> Action:
         """Return the wrench (N, N m; world)."""
         del commands
         frame, velocity, rate = body_motion(history, self._control_timestep)
@@ -234,7 +225,7 @@ class FluidPart(Part):
         components = np.concatenate([velocity, rate, frame.T @ self._down])
         terms = np.array([np.prod(components[factors]) for factors in self._factors]) * speed**self._power
         own = terms @ self._coefficients
-        return np.concatenate([frame @ own[:3], frame @ own[3:]])[None]
+        return Action(np.concatenate([frame @ own[:3], frame @ own[3:]])[None])
 
 
 _PARTS = {"network": NetworkPart, "aerodynamic": AerodynamicPart, "fluid": FluidPart}
@@ -384,14 +375,13 @@ class ImprovedSimulator:
         self.wrench = np.zeros((1, 6))
         if self.residual:
             sent = self.command + sum(part.command(commands) - self.command for part in self.residual)
-            wrenches = [part.wrench(self._history, commands) for part in self.residual]
-            self.wrench = np.zeros((max(map(len, wrenches)), 6))
-            for wrench in wrenches:
-                self.wrench[: len(wrench)] += wrench
+            actions = [part.act(self._history, commands) for part in self.residual]
+            self.wrench = np.zeros((max(len(action.wrench) for action in actions), 6))
             self.joint_force[:] = 0.0
-            for places, part in zip(self._places, self.residual, strict=True):
-                self.joint_force[places] += part.joint_force(self._history, commands)
-            change = sum(part.command_change(self._history, commands) for part in self.residual)
+            for places, action in zip(self._places, actions, strict=True):
+                self.wrench[: len(action.wrench)] += action.wrench
+                self.joint_force[places] += action.joint_force
+            change = sum(action.command_change for action in actions)
             if np.any(change):
                 sent = np.clip(sent + change, *self._ranges)
         for ctrl in np.repeat(sent, self.substeps // len(sent), axis=0):

@@ -45,7 +45,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -60,7 +60,7 @@ from ballu_mjx.residuals.fluid_fit import FluidConfig
 from ballu_mjx.residuals.fluid_training import fit_fluid
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.runs.progress import PhaseProgress
-from ballu_mjx.sim.force_model import Fields, ForceModel
+from ballu_mjx.sim.force_model import Action, Commands, ForceModel, History
 from ballu_mjx.sim.simulator import Simulator
 
 HORIZONS = (1.0, 2.0, 5.0)
@@ -152,25 +152,11 @@ class PublishedAerodynamics(ForceModel):
     def name(self) -> str:
         return "published"
 
-    def inputs(self, history: Float[Array, "steps features"], commands: Float[Array, "steps commands"]) -> Array:
+    def inputs(self, history: History, commands: Commands) -> Array:
         del commands
         return history[-1]
 
-    def fields(self, params: Any) -> Fields:
-        del params
-        return {}
-
-    def command(self, params: Any, commands: Float[Array, "steps commands"]) -> Float[Array, "1 commands"]:
-        del params
-        return commands[-1:]
-
-    def wrench(
-        self,
-        params: Any,
-        history: Float[Array, "steps features"],
-        commands: Float[Array, "steps commands"],
-        key: Array | None = None,
-    ) -> Float[Array, "1 6"]:
+    def act(self, params: Any, history: History, commands: Commands, key: Array | None = None) -> Action:
         del params, commands, key
         frame, velocity, rate = body_motion(history, self._control_timestep)
         v, w = FLIP * velocity, FLIP * rate
@@ -192,7 +178,7 @@ class PublishedAerodynamics(ForceModel):
         force = FLIP * (wind @ (size * jnp.stack([-drag, side, -lift])))
         torque = FLIP * (wind @ (size * moments + self.damping * w))
         torque = torque - jnp.cross(self.centre, force)
-        return jnp.concatenate([frame @ force, frame @ torque])[None]
+        return Action(jnp.concatenate([frame @ force, frame @ torque])[None])
 
 
 # %% [markdown]

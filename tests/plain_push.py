@@ -1,0 +1,24 @@
+"""A residual of a kind of its own: a push, and nothing else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ballu_mjx.sim.force_model import Action, ForceModel
+
+
+class PlainPush(ForceModel):
+    """A force along x (N) on the tracked body, which is its parameter."""
+
+    @property
+    def name(self) -> str:
+        return "push"
+
+    def inputs(self, history: Array, commands: Array) -> Array:
+        return commands.ravel()
+
+    def act(self, params: Any, history: Array, commands: Array, key: Array | None = None) -> Action:
+        return Action(params * jnp.eye(1, 6))
