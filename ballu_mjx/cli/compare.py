@@ -31,8 +31,8 @@ _UNTOLD = ("seed", "num_timesteps")
 _MEAN_RATIO = "mean ratio"
 """The score that checkpoints are chosen by, of the test recordings."""
 _NOT_SHARED = """\
-Figures of all rows: {shared}. "-" is not measured: the recordings of the rows are of other groups or lengths. A ratio
-compares a run with its own simulator without residual. It does not say which row's errors are smaller.
+Figures of all rows: {shared}. "-" is not measured: the method has no reward, or the recordings are of other groups or
+lengths. A ratio compares a run with its own simulator without residual. It does not say which row's errors are smaller.
 `python -m ballu_mjx evaluate RUN --recordings ... --output RUN` measures runs of one robot on the same recordings."""
 
 

@@ -123,7 +123,7 @@ def test_rows_that_were_measured_on_other_recordings_say_what_is_missing():
     header, _, one, other, *notes = compare.table(rows).splitlines()
     assert header == f"| | runs | mean ratio | {near} | {flight} |"
     assert one == "| ballu | 1 | 0.400 | 0.500 | - |" and other == "| blimp | 1 | 0.200 | - | 0.250 |"
-    assert "Figures of all rows: mean ratio." in notes[-1]
+    assert "Figures of all rows: mean ratio." in "\n".join(notes)
     partly = compare.table({"ballu": [{near: 0.5}, {near: 0.7, "mean ratio": 0.2}]})
     assert "0.600" in partly and "| - |" in partly and "0.200" not in partly
     assert "not measured" not in compare.table({"ballu": [{near: 0.5}], "blimp": [{near: 0.7}]})

@@ -24,7 +24,7 @@ from ballu_mjx.cli import export as export_command
 from ballu_mjx.cli import train_policy
 from ballu_mjx.cli.export import PolicyOptions as Options
 from ballu_mjx.policies.deploy import controller, estimator, export
-from ballu_mjx.policies.deploy.check import PolicyCheck, Trial
+from ballu_mjx.policies.deploy.check import Agreement, PolicyCheck, Trial, check_policy
 from ballu_mjx.policies.deploy.controller import TIMEOUT, Controller, observation_names
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, locomotion_observation, num_observations
@@ -505,11 +505,55 @@ def test_check_runs_an_exported_policy_in_c_mujoco(
         assert words in error and error.count("\n") == 1, error
 
 
-def test_a_policy_that_does_otherwise_differs():
+def altered(source: Path, copy: Path, file: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> Path:
+    """A copy of an exported folder in which `change` replaces arrays of `file`."""
+    shutil.copytree(source, copy)
+    with np.load(copy / file) as archive:
+        stored: dict[str, Any] = {name: archive[name] for name in archive.files}
+    np.savez(copy / file, **stored | change(stored))
+    return copy
+
+
+def test_wrong_exports_differ(rover_policy: Path, tmp_path: Path):
+    """A weight, the order of observations and a scale are wrong in turn; and a constant of the simulator."""
+    right = check_policy(rover_policy, seconds=1.0)
+    assert right.agrees and "AGREES" in right.verdict()
+    assert right.agreement.compared == pytest.approx(1.0) and right.agreement.apart < 1e-6
+    wrong: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+        "weight": lambda stored: {"bias_2": stored["bias_2"] + 0.02},
+        "order": lambda stored: {"kernel_0": stored["kernel_0"][::-1]},
+        "scale": lambda stored: {"command_high": 1.01 * stored["command_high"]},
+    }
+    for name, change in wrong.items():
+        found = check_policy(altered(rover_policy, tmp_path / name, "weights.npz", change), seconds=1.0)
+        assert not found.agrees and "on the same observations" in found.verdict(), name
+    robot = Policy.load(json.loads((rover_policy / "policy.json").read_text())["run"]).robot
+    for gain, agrees in ((1.0, True), (1.02, False)):
+        model = robot.load_model()
+        model.actuator_gainprm *= gain
+        simulator = export_simulator(Simulator(robot, model=model), tmp_path / f"{gain}", check_seconds=0.0).folder
+        found = check_policy(rover_policy, simulator=simulator, seconds=1.0)
+        assert found.agrees == agrees, found.verdict()
+    assert "under the same commands" in found.verdict()
+
+
+def test_trials_that_rounding_parts_do_not_make_an_export_differ():
+    """Contacts magnify rounding: what decides is commands and states while they can be foretold."""
+    own, other = Trial("own", 0.01, (0.1, 0.2), 10.0), Trial("c", 0.02, (0.4, -0.2), -80.0)
+    found = PolicyCheck(Agreement(1e-6, 1.5, 2e-5, 9e-4), own, other, other, 24.0)
+    assert found.agrees
+    assert found.verdict().startswith("AGREES") and "only the first 1.50 s can be foretold" in found.verdict()
+    for worse in (Agreement(0.01, 1.5, 2e-5, 9e-4), Agreement(1e-6, 1.5, 0.02, 9e-4), Agreement(math.nan, 1, 0, 0)):
+        assert not dataclasses.replace(found, agreement=worse).agrees
+    assert Agreement(0.0, 1.0, 9e-6, 1e-9).problem() is None
+
+
+def test_trials_that_part_are_told():
     own = Trial("own", 0.3, (6.0, 0.5), 10.0)
     assert dataclasses.replace(own, displacement=(6.3, 0.3)).differs_from(own) is None
     assert "1.00 m" in str(dataclasses.replace(own, displacement=(5.0, 0.5)).differs_from(own))
     assert "mean reward is 0.200" in str(dataclasses.replace(own, reward=0.2).differs_from(own))
     assert Trial("c", math.nan, (math.nan, 0.0), 0.0).differs_from(own) is not None
-    found = PolicyCheck(own, dataclasses.replace(own, reward=0.2), own, 24.0)
-    assert not found.agrees and "DIFFERS" in found.table() and "mean reward" in found.verdict()
+    near = Agreement(0.0, 24.0, 0.0, 0.0)
+    found = PolicyCheck(near, own, own, dataclasses.replace(own, reward=0.2), 24.0)
+    assert found.agrees and "From frames, with estimator and rate limit, its mean reward is 0.200" in found.table()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,19 @@ from ballu_mjx.policies.deploy.controller import Controller
 from ballu_mjx.policies.deploy.export import POLICY_FILE, POLICY_FORMAT
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.policies.tasks import Step
-from ballu_mjx.residuals.deploy.export import export_simulator
+from ballu_mjx.residuals.deploy.export import export_simulator, rollout_in_double, rollout_positions
 from ballu_mjx.residuals.deploy.residual import YAW, ImprovedSimulator
-from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.c_model import improved_model
+from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 TOLERANCE = 0.1
-"""Of the distance or reward in the policy's own simulator, by which another may differ."""
+"""Of the distance or reward of a trial, by which another that does the same may differ."""
+COMMAND_TOLERANCE = 1e-3
+"""Of a command's range, by which the exported network may differ from the policy."""
+PREDICTABLE = 1e-3
+"""m. States are compared as long as single precision alone changes the place of the tracked site by less."""
+_ROUNDINGS, _LEAST_APART = 10.0, 1e-5
+"""C MuJoCo may be so many times as far from our simulator as single precision is, or so many m."""
 _LEAST_DISTANCE, _LEAST_SPEED = 0.1, 0.01
 """m and m/s that count as no difference."""
 _FRAME_INTERVAL = 0.005
@@ -49,16 +56,52 @@ class Trial:
         far = float(np.hypot(*other.displacement))
         apart = float(np.hypot(*np.subtract(self.displacement, other.displacement)))
         if not apart <= max(TOLERANCE * far, _LEAST_DISTANCE):
-            return f"it ends {apart:.2f} m from where it ends in its own simulator"
+            return f"it ends {apart:.2f} m from where it ends in {other.simulator}"
         if not abs(self.reward - other.reward) <= max(TOLERANCE * abs(other.reward), _LEAST_SPEED):
             return f"its mean reward is {self.reward:.3f}, not {other.reward:.3f}"
         return None
 
 
 @dataclasses.dataclass(frozen=True)
+class Agreement:
+    """How near the exported network and its simulator are to ours, along the trial in C MuJoCo."""
+
+    commands: float
+    """Largest difference of commands between network and policy on the same observations, over the commands' ranges."""
+    compared: float
+    """Seconds for which states are compared: until single precision alone moves the tracked site by `PREDICTABLE`."""
+    apart: float
+    """Distance (m) of the tracked site from where our simulator has it in double precision, under the same commands:
+    the largest within that time."""
+    rounding: float
+    """The same of our simulator in single precision."""
+
+    def problem(self) -> str | None:
+        """Return what differs; None: nothing."""
+        if not self.commands <= COMMAND_TOLERANCE:
+            return (
+                f"on the same observations its commands are up to {self.commands:.2%} of their range from the policy's"
+            )
+        if not self.apart <= max(_ROUNDINGS * self.rounding, _LEAST_APART):
+            return (
+                f"under the same commands the tracked site is {1000 * self.apart:.3g} mm from where its own simulator "
+                f"has it within {self.compared:.2f} s; rounding explains {1000 * self.rounding:.3g} mm"
+            )
+        return None
+
+    def __str__(self) -> str:
+        return (
+            f"Commands on the same observations: {self.commands:.2g} of their range apart at most.\n"
+            f"Tracked site under the same commands, over {self.compared:.2f} s: {1000 * self.apart:.2g} mm apart at "
+            f"most, in double precision; single precision alone: {1000 * self.rounding:.2g} mm."
+        )
+
+
+@dataclasses.dataclass(frozen=True)
 class PolicyCheck:
     """Trials of an exported policy; `own` is that in the simulator of its training."""
 
+    agreement: Agreement
     own: Trial
     network: Trial
     """In C MuJoCo, its network on exact features."""
@@ -71,8 +114,8 @@ class PolicyCheck:
 
     @property
     def agrees(self) -> bool:
-        """Whether the network does in C MuJoCo what it does in its own simulator."""
-        return self.network.differs_from(self.own) is None
+        """Whether network and simulator are those of the run."""
+        return self.agreement.problem() is None
 
     def table(self) -> str:
         """Return the trials side by side, and what follows."""
@@ -88,14 +131,20 @@ class PolicyCheck:
         widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
         lines = ["  ".join(f"{cell:>{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
         lines[0] = f"A trial of {self.seconds:g} s:\n{lines[0]}"
-        return "\n".join([*lines, *self.notes, self.verdict()])
+        return "\n".join([*lines, *self.notes, str(self.agreement), self.verdict()])
 
     def verdict(self) -> str:
-        """Return whether simulators agree, and what the controller changes, in two sentences."""
-        problem = self.network.differs_from(self.own)
-        said = "AGREES: in C MuJoCo the policy does what it does in its own simulator."
+        """Return whether network and simulator are those of the run, how far the trials are apart, and what the
+        controller changes, a sentence each."""
+        problem, apart = self.agreement.problem(), self.network.differs_from(self.own)
+        said = "AGREES: in C MuJoCo the policy is that of its run, and so is the simulator."
         if problem is not None:
-            said = f"DIFFERS: in C MuJoCo {problem}."
+            said = f"DIFFERS: {problem}."
+        elif apart is not None:
+            said += (
+                f" The trials part all the same: {apart}. The motion magnifies rounding, so only the first "
+                f"{self.agreement.compared:.2f} s can be foretold."
+            )
         changed = self.controller.differs_from(self.network)
         if changed is None:
             return f"{said} From frames, with estimator and rate limit, it does the same."
@@ -110,6 +159,9 @@ def check_policy(
     seconds: float | None = None,
 ) -> PolicyCheck:
     """Run an exported policy in C MuJoCo and in the simulator that it was trained in.
+
+    What decides whether they agree is commands on the same observations, and states under the same commands
+    (`Agreement`). How far trials get is told beside it: contacts make it depend on rounding.
 
     **Arguments**
 
@@ -137,9 +189,9 @@ def check_policy(
     _check_same(controller, policy, folder)
     seconds = policy.task.trial_seconds if seconds is None else seconds
     steps = max(round(seconds / policy.robot.control_timestep), 1)
+    own = Simulator(policy.robot, policy.actuators).with_residual(policy.trained_residual)
     with tempfile.TemporaryDirectory() as temporary:
         if simulator is None:
-            own = Simulator(policy.robot, policy.actuators).with_residual(policy.trained_residual)
             simulator = export_simulator(own, Path(temporary) / "simulator", check_seconds=0.0).folder
         there = _read_simulator(Path(simulator), policy)
     loop = policy.closed_loop()
@@ -154,14 +206,61 @@ def check_policy(
     )
     masses = policy.robot.load_model(policy.actuators).body_mass
     rest = policy, (qpos[0], qvel[0]), steps, masses
-    network = _run_trial("C MuJoCo", there, lambda frames: controller.act(there.features()), *rest)
+    seen = []
+
+    def act(frames: Frames) -> Any:
+        seen.append((there.data.qpos.copy(), there.data.qvel.copy(), controller.act(there.features())))
+        return seen[-1][-1]
+
+    network = _run_trial("C MuJoCo", there, act, *rest)
+    agreement = _compare(there, own, policy, *map(np.array, zip(*seen, strict=True)))
     from_frames = _run_trial("C MuJoCo, from frames", there, _from_frames(folder), *rest)
     notes = []
     if policy.config.sampled_residual:
         notes.append("Training drew the residual's forces; C MuJoCo takes the most likely ones.")
     if policy.config.residual_decay > 0:
         notes.append("Training let the residual fade outside of its data; C MuJoCo does not.")
-    return PolicyCheck(trial, network, from_frames, steps * policy.robot.control_timestep, tuple(notes))
+    return PolicyCheck(agreement, trial, network, from_frames, steps * policy.robot.control_timestep, tuple(notes))
+
+
+def _compare(
+    there: ImprovedSimulator,
+    own: AugmentedSimulator,
+    policy: Policy,
+    qpos: Float[np.ndarray, "steps nq"],
+    qvel: Float[np.ndarray, "steps nv"],
+    commands: Float[np.ndarray, "steps commands"],
+) -> Agreement:
+    """Compare along a trial in C MuJoCo: the states before its control steps, and their commands."""
+    low, high = np.array(policy.robot.command_ranges).T
+    features, _ = own.simulator.observe_all(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
+    act = policy.act()
+    expected = np.array([act(row) for row in np.asarray(features)])
+    model = improved_model(own)
+    exact = rollout_in_double(own, model, qpos[0], qvel[0], commands)
+    rounded = rollout_positions(own, *(x.astype(np.float32) for x in (qpos[0], qvel[0], commands)))
+    there.reset(qpos[0], qvel[0], commands[0])
+    found = [there.step(command).qpos.copy() for command in commands]
+    data, site = mujoco.MjData(model), model.site(policy.robot.tracked).id
+
+    def places(states: Sequence[np.ndarray] | np.ndarray) -> Float[np.ndarray, "steps 3"]:
+        rows = []
+        for state in states:
+            data.qpos[:] = state
+            mujoco.mj_kinematics(model, data)
+            rows.append(data.site_xpos[site].copy())
+        return np.array(rows)
+
+    exact_places = places(exact)
+    apart, rounding = (np.linalg.norm(places(x) - exact_places, axis=1) for x in (found, rounded))
+    unforetold = ~(rounding < PREDICTABLE)
+    count = max(int(unforetold.argmax()), 1) if unforetold.any() else len(rounding)
+    return Agreement(
+        float(np.max(np.abs(expected - commands) / (high - low))),
+        count * policy.robot.control_timestep,
+        float(np.max(apart[:count])),
+        float(np.max(rounding[:count])),
+    )
 
 
 Frames = list[tuple[float, dict[str, np.ndarray]]]

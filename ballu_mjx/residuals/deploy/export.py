@@ -307,17 +307,30 @@ def rollout_in_double(
     the first command.
     """
     with jax.enable_x64(True):
-        start, augmented = begin_rollout(in_double(simulator, model), qpos, qvel, commands[0])
+        return rollout_positions(in_double(simulator, model), qpos, qvel, commands)
 
-        @jax.jit
-        def run(start: RolloutState, commands: Any) -> Any:
-            def step(state: RolloutState, command: Any) -> tuple[RolloutState, Any]:
-                after = augmented.step(state, command).state
-                return after, after.physics.qpos
 
-            return jax.lax.scan(step, start, commands)[1]
+def rollout_positions(
+    simulator: AugmentedSimulator,
+    qpos: Float[np.ndarray, " nq"],
+    qvel: Float[np.ndarray, " nv"],
+    commands: Float[np.ndarray, "steps commands"],
+) -> Float[np.ndarray, "steps nq"]:
+    """Return the generalized positions after each control step, in the simulator's own precision.
 
-        return np.asarray(run(start, jnp.asarray(commands)))
+    The robot has been in the state for a while, under the first command.
+    """
+    start, augmented = begin_rollout(simulator, qpos, qvel, commands[0])
+
+    @jax.jit
+    def run(start: RolloutState, commands: Any) -> Any:
+        def step(state: RolloutState, command: Any) -> tuple[RolloutState, Any]:
+            after = augmented.step(state, command).state
+            return after, after.physics.qpos
+
+        return jax.lax.scan(step, start, commands)[1]
+
+    return np.asarray(run(start, jnp.asarray(commands)))
 
 
 def in_double(simulator: AugmentedSimulator, model: mujoco.MjModel) -> AugmentedSimulator:
