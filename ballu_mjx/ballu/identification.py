@@ -4,7 +4,7 @@ The legs hang from a base held still, so that each is identified by itself, both
 are the root of MJX's inverse dynamics at rest, differentiated as an implicit function: no derivative through a
 simulation to rest. They are where the search begins. What decides is the whole motion, simulated from the first command
 to the last and differentiated forwards, with what a command meets on its way: delay, backlash and dry friction
-(`Drivetrain`), under which no leg is ever quite at rest.
+(`LegDynamics`), under which no leg is ever quite at rest.
 
 All functions compute in double precision and are to be called inside `jax.enable_x64(True)`, but for `identify`, which
 sees to it itself. A leg's parameters are a vector in the order of `NAMES`; a pair of angles is (motor, knee).
@@ -27,13 +27,17 @@ from jaxtyping import Array, Bool, Float, Int
 from ballu_mjx.ballu.curves import curve_distances
 from ballu_mjx.ballu.leg_parameters import (
     DEGREE,
-    FIRST_DRIVETRAIN,
+    DYNAMICS_PRIOR,
+    FIRST_DYNAMICS,
+    FURTHER,
     LEG_PARAMETERS,
-    Drivetrain,
+    SIMPLE_DYNAMICS,
     IdentificationConfig,
+    LegDynamics,
     ParameterTransform,
     check_identification_config,
-    drivetrain,
+    dynamics_coordinates,
+    leg_dynamics,
     nominal_leg,
 )
 from ballu_mjx.ballu.model import SIDES, ActuatorParameters
@@ -85,7 +89,7 @@ class CompiledLeg:
     def __init__(self, space: ParameterTransform, batch: int, data: LegData, *, motion: bool) -> None:
         self.leg, self.batch = SuspendedLeg(), batch
         size, (legs, holds) = int(space.free.sum()), data.command.shape
-        every = size + len(FIRST_DRIVETRAIN)
+        every = size + len(FIRST_DYNAMICS)
 
         def settled(coordinates: Array, command: Array) -> tuple[Array, Array]:
             vectors, by_coordinates = jax.vmap(lambda y: (space.vector(y), jax.jacfwd(space.vector)(y)))(coordinates)
@@ -95,7 +99,7 @@ class CompiledLeg:
 
         def moving(coordinates: Array, command: Array) -> tuple[Array, Array]:
             def path(y: Array, command: Array) -> Array:
-                return self.leg.motion(space.vector(y[:size]), drivetrain(y[size:]), command, data.begins)
+                return self.leg.motion(space.vector(y[:size]), leg_dynamics(y[size:]), command, data.begins)
 
             directions = jnp.tile(jnp.eye(every), (legs, 1, 1))
             return along_directions(path, (coordinates,), (directions,), (command,))
@@ -122,7 +126,7 @@ class CompiledLeg:
     def motion(
         self, coordinates: Float[np.ndarray, "legs _"], commanded: Float[np.ndarray, "legs times"]
     ) -> tuple[Float[np.ndarray, "legs times 2"], Float[np.ndarray, "legs times 2 _"]]:
-        """Both legs' motion and its derivatives; coordinates end with those of `drivetrain`."""
+        """Both legs' motion and its derivatives; coordinates end with those of `leg_dynamics`."""
         value, jacobian = self._compiled[1](jnp.asarray(coordinates), jnp.asarray(commanded))
         return np.asarray(value), np.asarray(jacobian)
 
@@ -142,12 +146,13 @@ class Fit:
 
     vector: Float[np.ndarray, " parameters"]
     standard_errors: Float[np.ndarray, " parameters"]
-    """In the parameters' units, from the Jacobian and the scatter of the residuals taken as white noise; 0 for those
-    that were not free, and of the prior's size at most along open directions."""
+    """In the parameters' units, from the Jacobian, the scatter of the residuals, which err together over `_MEMORY`, and
+    what is known beforehand; 0 for those that were not free."""
     correlations: Float[np.ndarray, "free free"]
     directions: tuple[Direction, ...]
     """From the best to the least determined."""
-    drivetrain: Drivetrain | None
+    dynamics: LegDynamics | None
+    """None: the motion had no part in the fit."""
     residual: float
     """Root mean square (rad) of all residuals."""
     losses: Float[np.ndarray, " starts"]
@@ -165,20 +170,32 @@ class Identification:
 
     fits: tuple[Fit, Fit]
     settled: Float[np.ndarray, "holds 2 2"]
-    """Settled angles (rad) of the identified robot; (motor, knee), (left, right) last, as in `Sweep`."""
-    with_drivetrain: Float[np.ndarray, "holds 2 2"] | None
-    """What its motion comes to with the identified drivetrain."""
+    """Angles (rad) at which the identified robot is in balance, without friction and play; (motor, knee), (left, right)
+    last, as in `Sweep`."""
+    simulated: Float[np.ndarray, "holds 2 2"] | None
+    """What its simulated motion comes to; None where that was not fitted."""
     nominal_settled: Float[np.ndarray, "holds 2 2"]
     """The same as `settled`, of the nominal robot."""
+    free: tuple[str, ...]
+    """Parameters that were fitted: without `FURTHER`, where these explain no more than noise would."""
     config: IdentificationConfig
 
     @property
     def parameters(self) -> ActuatorParameters:
-        return ActuatorParameters(
-            *(jnp.asarray(row, jnp.float32) for row in np.stack([f.vector for f in self.fits], 1))
+        rows: dict[str, np.ndarray] = dict(
+            zip(LEG_PARAMETERS, np.stack([fit.vector for fit in self.fits], axis=1), strict=True)
         )
+        dynamics = [fit.dynamics for fit in self.fits if fit.dynamics is not None]
+        for name in LegDynamics._fields if dynamics else ():
+            rows[name] = np.maximum([getattr(each, name) for each in dynamics], 0.0)
+        return ActuatorParameters(**{name: jnp.asarray(row, jnp.float32) for name, row in rows.items()})
 
 
+_PATIENCE = 4
+_WORTH = 10.0
+"""F-statistic above which the further parameters are worth having."""
+_MEMORY = 0.2
+"""Seconds over which a model's errors go together."""
 Report = Callable[[str, int, int, float], None]
 """(stage, iteration, most iterations, the lowest loss among the searches)."""
 
@@ -191,7 +208,10 @@ def identify_legs(
     1. Settled angles alone, from several starts side by side, the best of many draws: searches that start with a servo
        that never saturates, say, end in a valley of their own.
     2. From the best of these, the whole motion.
-    3. Directions that the data leave open, if any, are drawn to the nominal values, and to nothing else.
+       Both are done twice, with the `FURTHER` parameters held at their nominal values and with all. The richer model is
+       kept where it explains what the simpler one leaves, by an F-test.
+    3. With the richer model, or where the data leave directions open: with what is known of robots beforehand, so that
+       what a sweep hardly shows stays near the nominal values.
     4. With `objective="hausdorff"`, the paper's distance between curves, from there.
 
     **Raises** `InputError` from `IdentificationConfig`'s check.
@@ -209,12 +229,17 @@ class Identifier:
     def __init__(self, config: IdentificationConfig, sweep: Sweep, report: Report) -> None:
         self.config = config
         data = leg_data(sweep)
+        self._kept = np.ones(0, bool)
         starts = min(config.starts, config.draws + 1)
         report("compiling", 0, 1, float("nan"))
         self.space = ParameterTransform(nominal_leg(), config)
         self.physics = CompiledLeg(self.space, starts * len(SIDES), data, motion=config.motion)
         report("compiling", 1, 1, float("nan"))
         self._starts, self._size = starts, int(self.space.free.sum())
+        further = np.isin(np.array(LEG_PARAMETERS)[self.space.free], FURTHER)
+        dynamic = np.isin(LegDynamics._fields, FURTHER) if config.motion else np.zeros(0, bool)
+        self._further = np.concatenate([further, dynamic])
+        """Which coordinates the simpler model holds."""
         self._squares = BatchedSolver(optx.LevenbergMarquardt(rtol=1e-5, atol=1e-5))
         self._shape = BatchedSolver(optx.LBFGS(rtol=1e-5, atol=1e-5))
 
@@ -227,29 +252,25 @@ class Identifier:
     def run(self, sweep: Sweep, report: Report) -> Identification:
         config, size, data = self.config, self._size, leg_data(sweep)
         legs = np.arange(len(SIDES))
-
-        draws = self.space.draw(config.seed, config.draws)
-        coordinates, leg = np.tile(draws, (len(legs), 1)), np.repeat(legs, len(draws))
-        report("draws", 0, 1, float("nan"))
-        losses = np.sum(self._settled_residuals(coordinates, leg, data)[0] ** 2, axis=1).reshape(len(legs), -1)
-        report("draws", 1, 1, float(losses.min()))
-        best = np.argsort(losses, axis=1)[:, : self._starts]
-        starts, leg = draws[best].reshape(-1, size), np.repeat(legs, self._starts)
-        found, ended = self._squares(
-            lambda y: self._settled_residuals(y, leg, data), starts, config.steps, partial(report, "settled angles")
-        )
-        ended = ended.reshape(len(legs), -1)
-        coordinates = found.reshape(len(legs), -1, size)[legs, np.argmin(ended, axis=1)]
-
-        if config.motion:
-            coordinates = np.concatenate([coordinates, np.zeros((len(legs), len(FIRST_DRIVETRAIN)))], axis=1)
-            coordinates, _ = self._squares(
-                lambda y: self._residuals(y, data), coordinates, config.steps, partial(report, "motion")
-            )
+        fitted = []
+        for kept in (~self._further, np.ones_like(self._further))[0 if self._further.any() else 1 :]:
+            self._kept = kept
+            fitted.append(self._search(data, report))
+        lost, left = fitted[0][1], fitted[-1][1]
+        more = max(len(SIDES) * int(self._further.sum()), 1)
+        gained = (lost - left) / max(left, 1e-300) * self._independent(data) / more
+        coordinates, _, found = fitted[-1] if gained > _WORTH else fitted[0]
+        self._kept = np.ones_like(self._further) if gained > _WORTH else ~self._further
+        leg = np.repeat(legs, self._starts)
+        ended = np.sum(self._settled_residuals(found, leg, data)[0] ** 2, axis=1).reshape(len(legs), -1)
         analyses = self._analyse(coordinates, data)
-        if any(direction.standard_error > 1 for a in analyses for direction in a.directions):
+        if self._kept.all() or any(direction.standard_error > 1 for a in analyses for direction in a.directions):
             coordinates, _ = self._squares(
-                lambda y: self._drawn(y, data, analyses), coordinates, config.steps, partial(report, "open directions")
+                lambda y: self._with_priors(y, data, analyses),
+                coordinates,
+                config.steps,
+                partial(report, "priors"),
+                _PATIENCE,
             )
             analyses = self._analyse(coordinates, data)
         if config.objective == "hausdorff":
@@ -274,7 +295,7 @@ class Identifier:
                 standard_errors=analysis.standard_errors,
                 correlations=analysis.correlations,
                 directions=analysis.directions,
-                drivetrain=Drivetrain(*map(float, drivetrain(jnp.asarray(coordinates[leg, size:]))))
+                dynamics=LegDynamics(*map(float, leg_dynamics(jnp.asarray(coordinates[leg, size:]))))
                 if config.motion
                 else None,
                 residual=analysis.scatter,
@@ -287,7 +308,44 @@ class Identifier:
         if config.motion:
             paths, _ = self.physics.motion(coordinates, data.commanded)
             moving = sweep.means(np.moveaxis(paths[:, data.counts], 0, -1))
-        return Identification((fits[0], fits[1]), after, moving, nominal, config)
+        names = np.array(LEG_PARAMETERS)[self.space.free][self._kept[:size]]
+        return Identification((fits[0], fits[1]), after, moving, nominal, tuple(map(str, names)), config)
+
+    def _search(self, data: LegData, report: Report) -> tuple[np.ndarray, float, np.ndarray]:
+        """Return coordinates of both legs, their sum of squares, and where the searches by settled angles ended; of the
+        parameters that are kept."""
+        config, size, legs = self.config, self._size, np.arange(len(SIDES))
+        draws = self.space.draw(config.seed, config.draws)
+        held = ~self._kept[:size]
+        draws[:, held] = draws[0, held]
+        coordinates, leg = np.tile(draws, (len(legs), 1)), np.repeat(legs, len(draws))
+        report("draws", 0, 1, float("nan"))
+        losses = np.sum(self._settled_residuals(coordinates, leg, data)[0] ** 2, axis=1).reshape(len(legs), -1)
+        report("draws", 1, 1, float(losses.min()))
+        best = np.argsort(losses, axis=1)[:, : self._starts]
+        starts, leg = draws[best].reshape(-1, size), np.repeat(legs, self._starts)
+        found, ended = self._squares(
+            lambda y: self._settled_residuals(y, leg, data),
+            starts,
+            config.steps,
+            partial(report, "settled angles"),
+            _PATIENCE,
+        )
+        ended = ended.reshape(len(legs), -1)
+        coordinates = found.reshape(len(legs), -1, size)[legs, np.argmin(ended, axis=1)]
+
+        if config.motion:
+            first = np.where(self._kept[size:], 0.0, dynamics_coordinates(SIMPLE_DYNAMICS))
+            coordinates = np.concatenate([coordinates, np.tile(first, (len(legs), 1))], axis=1)
+            coordinates, _ = self._squares(
+                lambda y: self._residuals(y, data), coordinates, config.steps, partial(report, "motion"), _PATIENCE
+            )
+        return coordinates, float(np.sum(self._residuals(coordinates, data)[0] ** 2)), found
+
+    def _independent(self, data: LegData) -> float:
+        """Return how many of the residuals err independently."""
+        values = data.motion[:, data.counts] if self.config.motion else data.settled
+        return values.size / self._together
 
     def _angles(
         self, coordinates: Float[np.ndarray, "n size"], command: Float[np.ndarray, "n holds"]
@@ -305,7 +363,7 @@ class Identifier:
         count = len(coordinates)
         return (
             (weights * (angles - data.settled[leg])).reshape(count, -1),
-            (weights[..., None] * slope).reshape(count, -1, self._size),
+            (weights[..., None] * slope).reshape(count, -1, self._size) * self._kept[: self._size],
         )
 
     def _residuals(
@@ -317,26 +375,33 @@ class Identifier:
             return self._settled_residuals(coordinates, np.arange(legs), data)
         paths, slopes = self.physics.motion(coordinates, data.commanded)
         values = (paths - data.motion)[:, data.counts]
-        return values.reshape(legs, -1), slopes[:, data.counts].reshape(legs, -1, slopes.shape[-1])
+        return values.reshape(legs, -1), slopes[:, data.counts].reshape(legs, -1, slopes.shape[-1]) * self._kept
 
-    def _drawn(
+    def _with_priors(
         self, coordinates: Float[np.ndarray, "legs size"], data: LegData, analyses: list[_Analysis]
     ) -> tuple[Float[np.ndarray, "legs residuals"], Float[np.ndarray, "legs residuals size"]]:
-        """All residuals over their scatter, then how far from nominal along open directions, in units of the prior."""
+        """All residuals over their scatter, each counted for its share that is independent of its neighbours; then
+        how far parameters are from nominal, in units of what robots differ by."""
         values, jacobians = self._residuals(coordinates, data)
         space, size = self.space, self._size
         rows, row_slopes = [], []
-        for y, analysis in zip(coordinates, analyses, strict=True):
-            directions = np.array([d.weights if d.standard_error > 1 else np.zeros(size) for d in analysis.directions])
+        for y in coordinates:
             vector, slope = self._parameters(y[:size])
-            directions = directions / space.prior[space.free]
-            rows.append(directions @ (vector - space.nominal)[space.free])
-            row_slopes.append(np.pad(directions @ slope, [(0, 0), (0, len(y) - size)]))
-        scatter = np.array([analysis.scatter for analysis in analyses])
+            own = y[size:] / DYNAMICS_PRIOR[: len(y) - size]
+            rows.append(np.concatenate([space.deviations(vector)[space.free], own]))
+            slope = np.concatenate([slope / space.units(vector)[space.free, None], np.zeros((len(own), size))])
+            beside = np.concatenate([np.zeros((size, len(own))), np.diag(1 / DYNAMICS_PRIOR[: len(own)])])
+            row_slopes.append(np.concatenate([slope, beside], axis=1) * self._kept)
+        scatter = np.array([analysis.scatter for analysis in analyses]) * np.sqrt(self._together)
         return (
             np.concatenate([values / scatter[:, None], np.array(rows)], axis=1),
             np.concatenate([jacobians / scatter[:, None, None], np.array(row_slopes)], axis=1),
         )
+
+    @property
+    def _together(self) -> float:
+        """How many samples err together."""
+        return _MEMORY / SAMPLE_TIMESTEP if self.config.motion else 1.0
 
     def _distance(
         self, coordinates: Float[np.ndarray, "n size"], leg: Int[np.ndarray, " n"], data: LegData
@@ -344,7 +409,9 @@ class Identifier:
         """The legs' parts of the paper's objective."""
         angles, slope = self._angles(coordinates, data.command[leg])
         values, gradients = self._curve_gradients(data.command[leg], angles, data.settled[leg])
-        return np.asarray(values)[:, None], np.einsum("nha,nhas->ns", gradients, slope)[:, None]
+        return np.asarray(values)[:, None], np.einsum("nha,nhas->ns", gradients, slope)[:, None] * self._kept[
+            : self._size
+        ]
 
     def _parameters(self, coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A leg's parameters, and the free ones' derivatives in the coordinates."""
@@ -356,20 +423,21 @@ class Identifier:
         results = []
         for y, value, jacobian in zip(coordinates, *self._residuals(coordinates, data), strict=True):
             scatter = float(np.sqrt(np.sum(value**2) / max(np.count_nonzero(value) - len(y), 1)))
-            prior = space.prior[space.free]
-            # In units of the prior, whatever the coordinates; the drivetrain, of which nobody knows anything, projected
-            # out.
-            known = jacobian[:, :size] / np.diag(self._parameters(y[:size])[1]) * prior / scatter
+            vector, slope = self._parameters(y[:size])
+            kept = self._kept[:size]
+            prior = space.units(vector)[space.free]
+            # In units of the prior, whatever the coordinates; the dynamics projected out.
+            spread = scatter * np.sqrt(self._together)
+            known = (jacobian[:, :size] / np.diag(slope) * prior / spread)[:, kept]
             unknown, singular, _ = np.linalg.svd(jacobian[:, size:], full_matrices=False)
             unknown = unknown[:, singular > 1e-9 * singular.max(initial=0.0)]
             known = known - unknown @ (unknown.T @ known)
             _, singular, right = np.linalg.svd(known, full_matrices=False)
             errors = 1 / np.maximum(singular, 1e-12)
-            variances = np.where(errors > 1, 1 / (1 + singular**2), errors**2)
-            covariance = right.T @ np.diag(variances) @ right
+            covariance = right.T @ np.diag(1 / (1 + singular**2)) @ right
             deviation = np.sqrt(np.diag(covariance))
             standard_errors = np.zeros(len(LEG_PARAMETERS))
-            standard_errors[space.free] = deviation * prior
+            standard_errors[np.flatnonzero(space.free)[kept]] = deviation * prior[kept]
             signed = [w * np.sign(w[np.argmax(np.abs(w))]) for w in right]
             directions = tuple(Direction(w, float(e)) for w, e in zip(signed, errors, strict=True))
             correlations = covariance / np.outer(deviation, deviation)

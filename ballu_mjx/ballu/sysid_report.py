@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -13,9 +14,7 @@ from ballu_mjx.ballu.identification import Direction, Identification
 from ballu_mjx.ballu.leg_parameters import (
     DEGREE,
     LEG_PARAMETERS,
-    Drivetrain,
-    IdentificationConfig,
-    free_parameters,
+    NOMINAL_DYNAMICS,
     nominal_leg,
 )
 from ballu_mjx.ballu.model import SIDES
@@ -32,12 +31,17 @@ _UNITS = {
     "default_knee_angle": ("deg", 1 / DEGREE),
     "torque_limit": ("N m", 1.0),
     "cable_slack": ("mm", 1e3),
+    "motor_travel": ("1", 1.0),
+    "cable_stiffness": ("N/m", 1.0),
+    "knee_spring_reference": ("deg", 1 / DEGREE),
 }
-_DRIVETRAIN_UNITS = {
+_DYNAMICS_UNITS = {
     "delay": ("s", 1.0),
     "motor_friction": ("N m", 1.0),
     "knee_friction": ("N m", 1.0),
     "backlash": ("deg", 1 / DEGREE),
+    "lag": ("s", 1.0),
+    "knee_damping": ("N m s/rad", 1.0),
 }
 
 
@@ -59,22 +63,23 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
             value = f"{fit.vector[index] * scale:.4g}"
             lines.append(f"{label:33}{nominal[index] * scale:>10.4g}{value:>12}{error:>16} {unit}")
     for side, fit in zip(SIDES, result.fits, strict=True):
-        for name, value in fit.drivetrain._asdict().items() if fit.drivetrain else ():
-            unit, scale = _DRIVETRAIN_UNITS[name]
+        for name, value in fit.dynamics._asdict().items() if fit.dynamics else ():
+            unit, scale = _DYNAMICS_UNITS[name]
             label = f"{name.replace('_', ' ')}, {side}"
-            lines.append(f"{label:33}{'':10}{value * scale:>12.4g}{'':16} {unit} (reported only)")
-    before, after = (mean_error(angles, sweep) for angles in (result.nominal_settled, result.settled))
+            before = NOMINAL_DYNAMICS.get(name, 0.0) * scale
+            lines.append(f"{label:33}{before:>10.4g}{value * scale:>12.4g}{'':16} {unit}")
+    simulated = result.settled if result.simulated is None else result.simulated
+    before, after = (mean_error(angles, sweep) for angles in (result.nominal_settled, simulated))
     lines += ["", f"Mean error of the settled angles: {before:.2f} deg before, {after:.2f} deg after."]
     if (creep := sweep.creep) is not None:
         lines.append(creep)
-    if result.with_drivetrain is not None:
+    if result.simulated is not None:
         scatter = ", ".join(
             f"{np.rad2deg(fit.residual):.2f} deg ({side})" for side, fit in zip(SIDES, result.fits, strict=True)
         )
         lines.append(
-            f"With delay, friction and backlash {mean_error(result.with_drivetrain, sweep):.2f} deg. Of the whole "
-            f"motion is left, root mean square: {scatter}; if that is more than your capture's noise, this model lacks "
-            "something."
+            f"Of the whole motion is left, root mean square: {scatter}; if that is more than your capture's noise, "
+            "this model lacks something."
         )
     with jax.enable_x64(True):
         for label, angles in (("before", result.nominal_settled), ("after", result.settled)):
@@ -84,20 +89,24 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
                 distances += np.asarray(curve_distances(sweep.command[:, side], *pair, result.config.degree))
             there, back = distances.sum(axis=1)
             lines.append(f"Curves {label}: Hausdorff distance {there:.4f} simulated to measured, {back:.4f} back.")
-    lines.append("Standard errors take the residuals for white noise; what the model lacks is none.")
+    if "motor_travel" not in result.free:
+        lines.append(
+            "Travel, cable stiffness, spring reference, lag and knee damping are nominal: the sweep asks for no more."
+        )
+    lines.append(
+        "Standard errors take residuals 0.2 s apart as independent, and hold what is known of robots beforehand."
+    )
     for side, fit in zip(SIDES, result.fits, strict=True):
         singular = ", ".join(f"{1 / d.standard_error:.3g}" for d in fit.directions)
         lines.append(f"Singular values, {side} (Jacobian over noise, in units of what robots differ by): {singular}")
-        lines += [
-            f"Left open, {side}, and held near nominal: {_in_words(d, result.config)}" for d in fit.open_directions
-        ]
+        lines += [f"Left open, {side}, and held near nominal: {_in_words(d, result.free)}" for d in fit.open_directions]
         weakest = fit.directions[-1]
         if not fit.open_directions:
             lines.append(
-                f"Least determined, {side}: {_in_words(weakest, result.config)}, to {weakest.standard_error:.0%} of "
+                f"Least determined, {side}: {_in_words(weakest, result.free)}, to {weakest.standard_error:.0%} of "
                 "what robots differ by."
             )
-        names = free_parameters(result.config)
+        names = result.free
         pairs = [(fit.correlations[i, j], i, j) for i in range(len(names)) for j in range(i)]
         strong = [f"{names[j]} with {names[i]} {r:+.2f}" for r, i, j in pairs if abs(r) > _STRONG]
         if strong:
@@ -115,18 +124,14 @@ def identification_details(result: Identification) -> dict[str, Any]:
             for index, name in enumerate(LEG_PARAMETERS)
         },
         "correlations": {
-            "parameters": list(free_parameters(result.config)),
+            "parameters": list(result.free),
             **{side: np.round(fit.correlations, 3).tolist() for side, fit in zip(SIDES, result.fits, strict=True)},
-        },
-        "drivetrain": {
-            name: [float(f"{getattr(fit.drivetrain, name):.4g}") if fit.drivetrain else None for fit in result.fits]
-            for name in Drivetrain._fields
         },
     }
 
 
-def _in_words(direction: Direction, config: IdentificationConfig) -> str:
+def _in_words(direction: Direction, names: Sequence[str]) -> str:
     """The parameters that make up most of a direction, with their signs."""
-    parts = [(w, n) for w, n in zip(direction.weights, free_parameters(config), strict=True) if abs(w) > 0.3]
+    parts = [(w, n) for w, n in zip(direction.weights, names, strict=True) if abs(w) > 0.3]
     ordered = sorted(parts, key=lambda part: -abs(part[0]))
     return " ".join(f"{w:+.2f} {name.replace('_', ' ')}" for w, name in ordered)

@@ -51,9 +51,9 @@ def same_parameters(one: ModelParameters | None, other: ModelParameters | None) 
     """Return whether two simulators have equal parameters (None: nominal)."""
     if one is None or other is None:
         return one is other
-    leaves = [jax.tree.leaves(each) for each in (one, other)]
-    return type(one) is type(other) and all(
-        np.array_equal(np.float32(a), np.float32(b)) for a, b in zip(*leaves, strict=True)
+    (leaves, kind), (others, other_kind) = (jax.tree.flatten(each) for each in (one, other))
+    return kind == other_kind and all(
+        np.array_equal(np.float32(a), np.float32(b)) for a, b in zip(leaves, others, strict=True)
     )
 
 
