@@ -13,8 +13,10 @@ from ballu_mjx.ballu.curves import curve_distances
 from ballu_mjx.ballu.identification import Direction, Identification
 from ballu_mjx.ballu.leg_parameters import (
     DEGREE,
+    FURTHER,
     LEG_PARAMETERS,
     NOMINAL_DYNAMICS,
+    LegDynamics,
     nominal_leg,
 )
 from ballu_mjx.ballu.model import SIDES
@@ -59,15 +61,20 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
         unit, scale = _UNITS[name]
         for side, fit in zip(SIDES, result.fits, strict=True):
             label = f"{name.replace('_', ' ')}, {side}"
-            error = f"{fit.standard_errors[index] * scale:.2g}" if fit.standard_errors[index] else "(held)"
             value = f"{fit.vector[index] * scale:.4g}"
+            error = f"{fit.standard_errors[index] * scale:.2g}{'' if name in result.fitted else ' (held)'}"
             lines.append(f"{label:33}{nominal[index] * scale:>10.4g}{value:>12}{error:>16} {unit}")
     for side, fit in zip(SIDES, result.fits, strict=True):
-        for name, value in fit.dynamics._asdict().items() if fit.dynamics else ():
+        if fit.dynamics is None or fit.dynamics_errors is None:
+            continue
+        for name, found, deviation in zip(LegDynamics._fields, fit.dynamics, fit.dynamics_errors, strict=True):
             unit, scale = _DYNAMICS_UNITS[name]
             label = f"{name.replace('_', ' ')}, {side}"
-            before = NOMINAL_DYNAMICS.get(name, 0.0) * scale
-            lines.append(f"{label:33}{before:>10.4g}{value * scale:>12.4g}{'':16} {unit}")
+            before = NOMINAL_DYNAMICS.get(name, 0.0)
+            held = result.keeps_simpler and name in FURTHER
+            value = f"{(before if held else found) * scale:.4g}"
+            error = "(held)" if held else f"{deviation * scale:.2g}"
+            lines.append(f"{label:33}{before * scale:>10.4g}{value:>12}{error:>16} {unit}")
     simulated = result.settled if result.simulated is None else result.simulated
     before, after = (mean_error(angles, sweep) for angles in (result.nominal_settled, simulated))
     lines += ["", f"Mean error of the settled angles: {before:.2f} deg before, {after:.2f} deg after."]
@@ -89,21 +96,26 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
                 distances += np.asarray(curve_distances(sweep.command[:, side], *pair, result.config.degree))
             there, back = distances.sum(axis=1)
             lines.append(f"Curves {label}: Hausdorff distance {there:.4f} simulated to measured, {back:.4f} back.")
-    if "motor_travel" not in result.free:
+    if (selection := result.selection) is not None:
+        reason = "so they are identified" if selection.richer else "so they stay nominal"
         lines.append(
-            "Travel, cable stiffness, spring reference, lag and knee damping are nominal: the sweep asks for no more."
+            "Travel, cable stiffness, spring reference, lag and knee damping explain "
+            f"{selection.effect:.1%} of what they leave (2 % wanted), F = {selection.statistic:.1f} (5 % level: "
+            f"{selection.threshold:.1f}), {reason}."
         )
     lines.append(
-        "Standard errors take residuals 0.2 s apart as independent, and hold what is known of robots beforehand."
+        "Standard errors take all parameters as unknown, these too, and hold what is known of robots beforehand."
     )
     for side, fit in zip(SIDES, result.fits, strict=True):
         singular = ", ".join(f"{1 / d.standard_error:.3g}" for d in fit.directions)
         lines.append(f"Singular values, {side} (Jacobian over noise, in units of what robots differ by): {singular}")
-        lines += [f"Left open, {side}, and held near nominal: {_in_words(d, result.free)}" for d in fit.open_directions]
+        lines += [
+            f"Left open, {side}, and held near nominal: {_in_words(d, result.fitted)}" for d in fit.open_directions
+        ]
         weakest = fit.directions[-1]
         if not fit.open_directions:
             lines.append(
-                f"Least determined, {side}: {_in_words(weakest, result.free)}, to {weakest.standard_error:.0%} of "
+                f"Least determined, {side}: {_in_words(weakest, result.fitted)}, to {weakest.standard_error:.0%} of "
                 "what robots differ by."
             )
         names = result.free
@@ -118,11 +130,13 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
 
 def identification_details(result: Identification) -> dict[str, Any]:
     """What stands beside the parameters in `actuators.json`."""
+    errors = {name: [fit.standard_errors[i] for fit in result.fits] for i, name in enumerate(LEG_PARAMETERS)}
+    dynamics = [fit.dynamics_errors for fit in result.fits if fit.dynamics_errors is not None]
+    for name in LegDynamics._fields if dynamics else ():
+        if not (result.keeps_simpler and name in FURTHER):
+            errors[name] = [getattr(each, name) for each in dynamics]
     return {
-        "standard_errors": {
-            name: [float(f"{fit.standard_errors[index]:.3g}") for fit in result.fits]
-            for index, name in enumerate(LEG_PARAMETERS)
-        },
+        "standard_errors": {name: [float(f"{x:.3g}") for x in pair] for name, pair in errors.items()},
         "correlations": {
             "parameters": list(result.free),
             **{side: np.round(fit.correlations, 3).tolist() for side, fit in zip(SIDES, result.fits, strict=True)},
