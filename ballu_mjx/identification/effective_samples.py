@@ -11,9 +11,10 @@ def integrated_autocorrelation_time(
 ) -> Float[np.ndarray, " channels"]:
     """Return the integrated autocorrelation time of each channel, in samples: n samples are worth n over it.
 
-    It is 1 + 2 sum(rho_k), with Geyer's initial positive sequence: correlations are added in pairs of lags as long as
-    the pairs are positive (Geyer, "Practical Markov chain Monte Carlo", Statistical Science 7, 1992). The errors' mean
-    is not taken off, so that a constant error correlates fully. Never below 1: errors that alternate are not credited.
+    It is 1 + 2 sum(rho_k), with Geyer's initial monotone sequence: correlations are added in pairs of lags as long as
+    the pairs are positive, and no pair counts for more than the one before (Geyer, "Practical Markov chain Monte
+    Carlo", Statistical Science 7, 1992). The errors' mean is not taken off, so that a constant error correlates fully.
+    Never below 1: errors that alternate are not credited.
 
     - `begins`: where a recording begins; errors of different recordings do not correlate.
     """
@@ -24,6 +25,6 @@ def integrated_autocorrelation_time(
         covariance[: len(part)] += np.fft.irfft(np.abs(spectrum) ** 2, axis=0)[: len(part)]
     even = count - count % 2
     pairs = covariance[:even:2] + covariance[1:even:2]
-    positive = np.cumprod(pairs > 0, axis=0)
-    correlated = np.sum(pairs * positive, axis=0) / np.maximum(covariance[0], np.finfo(float).tiny)
+    monotone = np.minimum.accumulate(np.maximum(pairs, 0.0), axis=0)
+    correlated = np.sum(monotone, axis=0) / np.maximum(covariance[0], np.finfo(float).tiny)
     return np.maximum(2 * correlated - 1, 1.0)

@@ -15,7 +15,9 @@ from scipy.spatial.distance import directed_hausdorff as scipy_directed_hausdorf
 from ballu_mjx.ballu.curves import curve_distances, directed_hausdorff, polynomial_curve
 from ballu_mjx.ballu.identification import CompiledLeg, Identifier, leg_data
 from ballu_mjx.ballu.leg_parameters import (
+    FURTHER,
     LEG_PARAMETERS,
+    NOMINAL_DYNAMICS,
     IdentificationConfig,
     LegDynamics,
     ParameterTransform,
@@ -275,6 +277,37 @@ def test_known_parameters_are_recovered_whatever_the_draws(noiseless: Sweep, ide
             assert fit.dynamics is not None
             assert list(fit.dynamics) == pytest.approx(list(TRAIN), rel=0.02)
             assert not fit.open_directions
+
+
+def test_the_richer_model_is_taken_where_a_robot_asks_for_it(noiseless: Sweep, identifier: Identifier) -> None:
+    identifier.config = IdentificationConfig(draws=32, steps=15)
+    found = identifier.run(noisy(noiseless, 0), lambda *_: None)
+    assert found.selection is not None and found.selection.richer
+    travel = np.asarray(found.parameters.motor_travel)
+    index = LEG_PARAMETERS.index("motor_travel")
+    errors = np.array([fit.standard_errors[index] for fit in found.fits])
+    assert np.all(np.abs(travel - [truth[index] for truth in TRUTH]) < 3 * errors)
+
+
+def test_the_simpler_model_stays_where_a_robot_has_no_more(physics: CompiledLeg, identifier: Identifier) -> None:
+    """Springs are then as well known as if nothing else could differ; their errors say what that rests on."""
+    plain = [np.where(np.isin(LEG_PARAMETERS, FURTHER), SPACE.nominal, truth) for truth in TRUTH]
+    dynamics = dynamics_coordinates(TRAIN._replace(lag=1e-4, knee_damping=NOMINAL_DYNAMICS["knee_damping"]))
+    y = np.concatenate([coordinates(*plain), np.tile(dynamics, (2, 1))], 1)
+    motion = physics.motion(y, DATA.commanded)[0][:, DATA.counts]
+    settled = rest(physics, *plain)[:, :, physics.leg.angles]
+    sweep = dataclasses.replace(blank(), settled=np.moveaxis(settled, 0, -1), motion=np.moveaxis(motion, 0, -1))
+    identifier.config = IdentificationConfig(draws=32, steps=15)
+    found = identifier.run(noisy(sweep, 0), lambda *_: None)
+    assert found.selection is not None and not found.selection.richer
+    assert found.selection.statistic > 0 and found.selection.effect > 0, "it has the simpler solution among its starts"
+    parameters = found.parameters
+    assert all(getattr(parameters, name) is None for name in FURTHER) and parameters.backlash is not None
+    spring, travel = (LEG_PARAMETERS.index(name) for name in ("knee_spring_stiffness", "motor_travel"))
+    for fit, truth in zip(found.fits, plain, strict=True):
+        assert fit.vector[spring] == pytest.approx(truth[spring], rel=0.1)
+        assert np.all(np.abs(fit.vector - truth) < 3 * fit.standard_errors + 1e-9)
+        assert fit.standard_errors[travel] > 0, "it may differ all the same"
 
 
 def test_standard_errors_are_honest(noiseless: Sweep, identifier: Identifier) -> None:
