@@ -55,6 +55,7 @@ from ballu_mjx.ballu.identification import Identification, Identifier
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
 from ballu_mjx.ballu.model import SIDES, suspend
 from ballu_mjx.ballu.sweep import Sweep, read_sweep
+from ballu_mjx.ballu.sysid_report import identification_details
 from ballu_mjx.identification.guard import HORIZONS, choose_actuators
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
@@ -128,6 +129,7 @@ def copy_numbers(full: mujoco.MjModel, held: mujoco.MjModel) -> None:
         held.qpos_spring[one.qposadr] = full.qpos_spring[other.qposadr]
     names = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "tendon_lengthspring", "tendon_stiffness")
     set_fields(held, {name: getattr(full, name) for name in (*names, "tendon_damping", "tendon_frictionloss")})
+    held.opt.iterations = full.opt.iterations
 
 
 def validation_commands() -> dict[str, Float[np.ndarray, "steps 2"]]:
@@ -184,6 +186,8 @@ def examine(seed: int, identify: Callable[[Sweep], Identification]) -> dict[str,
         "guard": {"ratio": guard.ratio, "takes": "identified" if guard.improves else "nominal"},
         "seconds": seconds,
         "parameters": actuators_to_json(actuators),
+        **identification_details(found),
+        "selection": None if found.selection is None else found.selection._asdict(),
         "scatter_deg": {side: float(np.rad2deg(fit.residual)) for fit, side in rows},
         "creep": sweep.creep,
     }

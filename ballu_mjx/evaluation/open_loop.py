@@ -144,9 +144,10 @@ class Evaluators:
 
 
 def nominal_model(simulator: Simulator) -> mujoco.MjModel:
-    """Return the nominal robot, with dry friction of no effect where the simulated one has any: both share a program,
-    and so their rows of constraints."""
+    """Return the nominal robot, with dry friction of no effect where the simulated one has any, and as many iterations
+    of the solver: both share a program, and so their rows of constraints."""
     model = simulator.robot.load_model()
+    model.opt.iterations = simulator.mj_model.opt.iterations
     for name in ("dof_frictionloss", "tendon_frictionloss"):
         field, rubbing = getattr(model, name), getattr(simulator.mj_model, name) > 0
         field[rubbing] = np.maximum(field[rubbing], LEAST_FRICTION)
