@@ -230,6 +230,8 @@ _SMALL_EFFECT = 0.02
 """Cohen's f^2 of a small effect (Cohen, "Statistical power analysis for the behavioral sciences", 1988). With
 thousands of samples, an F-test sees errors of the simulator's time step: hundredths of a degree, which the further
 parameters would take up at the price of wrong springs and gains."""
+_LEAST_SPREAD = 1e-9
+"""rad"""
 Report = Callable[[str, int, int, float], None]
 """(stage, iteration, most iterations, the lowest loss among the searches)."""
 
@@ -428,16 +430,17 @@ class Identifier:
         self, coordinates: Float[np.ndarray, "legs size"], data: LegData
     ) -> Float[np.ndarray, "legs residuals"]:
         """Return what each residual is divided by to count for what it is worth: scatter, times the root of the
-        integrated autocorrelation time."""
+        integrated autocorrelation time. Never 0: a model's own recording leaves nothing but rounding."""
         values, _ = self._residuals(coordinates, data, np.ones(coordinates.shape[1], bool))
         if not self.config.motion:
             count = max(values.shape[1] - coordinates.shape[1], 1)
-            return np.repeat(np.sqrt(np.sum(values**2, axis=1, keepdims=True) / count), values.shape[1], axis=1)
+            spread = np.sqrt(np.sum(values**2, axis=1, keepdims=True) / count)
+            return np.repeat(np.maximum(spread, _LEAST_SPREAD), values.shape[1], axis=1)
         begins = np.roll(data.begins, _AT_REST)[data.counts]
         paths = values.reshape(len(values), -1, 2)
         count = max(paths.shape[1] - coordinates.shape[1] / 2, 1)
         together = np.stack([integrated_autocorrelation_time(path, begins) for path in paths])
-        spread = np.sqrt(np.sum(paths**2, axis=1) / count * together)
+        spread = np.maximum(np.sqrt(np.sum(paths**2, axis=1) / count * together), _LEAST_SPREAD)
         return np.broadcast_to(spread[:, None], paths.shape).reshape(values.shape)
 
     def _angles(

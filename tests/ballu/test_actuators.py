@@ -7,11 +7,12 @@ import json
 from pathlib import Path
 
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 from ballu_mjx.ballu.actuators_file import actuators_to_json, read_actuators, write_actuators
-from ballu_mjx.ballu.model import SERVO_RANGE, ActuatorParameters, load_model
+from ballu_mjx.ballu.model import SERVO_RANGE, ActuatorParameters, load_model, standing_qpos
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.open_loop import nominal_model
 from ballu_mjx.residuals.aerodynamics_training import fit_aerodynamics
@@ -60,6 +61,29 @@ def test_the_file_gives_back_what_simulators_have(tmp_path: Path) -> None:
     targets = -model.actuator_gainprm[:, 0] / model.actuator_biasprm[:, 1]
     assert targets == pytest.approx(np.array([0.8, 0.95]) * SERVO_RANGE, rel=1e-5)
     assert model.tendon_stiffness == pytest.approx([1500.0, 2500.0])
+
+
+def test_sticking_joints_are_solved_for() -> None:
+    """Random commands for 2 s, against a solver that has converged."""
+    commands = np.random.default_rng(0).uniform(size=(8, 8, 2)).repeat(25, axis=1)
+
+    def walk(iterations: int | None) -> np.ndarray:
+        model = load_model(FOUND)
+        if iterations is not None:
+            model.opt.iterations, model.opt.tolerance = iterations, 0.0
+        ends = []
+        for run in commands:
+            data = mujoco.MjData(model)
+            data.qpos[:] = standing_qpos(model)
+            for command in run:
+                data.ctrl[:] = command
+                mujoco.mj_step(model, data)
+            ends.append(data.qpos[:3].copy())
+        return np.array(ends)
+
+    converged = walk(100)
+    off, nominal = (float(np.median(np.linalg.norm(walk(n) - converged, axis=1))) for n in (None, 3))
+    assert load_model().opt.iterations == 3 and off < 3e-4 < nominal
 
 
 def test_files_of_the_first_format_have_the_nominal_rest(tmp_path: Path) -> None:
