@@ -230,6 +230,8 @@ _SMALL_EFFECT = 0.02
 """Cohen's f^2 of a small effect (Cohen, "Statistical power analysis for the behavioral sciences", 1988). With
 thousands of samples, an F-test sees errors of the simulator's time step: hundredths of a degree, which the further
 parameters would take up at the price of wrong springs and gains."""
+_SHORT = 6
+"""Iterations after which one of two searches goes on."""
 _LEAST_SPREAD = 1e-9
 """rad"""
 Report = Callable[[str, int, int, float], None]
@@ -299,6 +301,10 @@ class Identifier:
             coordinates, richer_ends = self._search(data, every, report, simpler)
             spread = self._spread(coordinates, data)
             selection = self._select(simpler, coordinates, int(further.sum()), spread, data)
+            if selection.richer:
+                # The simpler search may have ended in a valley that the richer one left.
+                simpler = self._better(simpler, np.where(further, simpler, coordinates), data, ~further, report)
+                selection = self._select(simpler, coordinates, int(further.sum()), spread, data)
             if selection.richer:
                 ends = richer_ends
             else:
@@ -395,19 +401,46 @@ class Identifier:
         if not config.motion:
             return by_leg[legs, nearest], ends
         # Settled angles leave much open, and a servo far from its limit has no gradient by it. The motion says from
-        # which end to go on.
+        # which end to go on: where it begins nearest, or soon gets nearest.
         first = np.where(kept[size:], 0.0, dynamics_coordinates(SIMPLE_DYNAMICS))
         candidates = [np.concatenate([y, np.tile(first, (len(legs), 1))], axis=1) for y in np.moveaxis(by_leg, 1, 0)]
         candidates += [] if simpler is None else [simpler]
         losses = [np.sum(self._residuals(y, data, kept)[0] ** 2, axis=1) for y in candidates]
-        coordinates, _ = self._squares(
-            lambda y: self._residuals(y, data, kept),
-            np.stack(candidates)[np.argmin(losses, axis=0), legs],
-            config.steps,
-            partial(report, "motion"),
-            _PATIENCE,
+        first_choice = np.argmin(losses, axis=0)
+        coordinates = np.stack(candidates)[first_choice, legs]
+        if simpler is None and np.any(first_choice != nearest):
+            other = np.stack(candidates)[nearest, legs]
+            coordinates = self._better(coordinates, other, data, kept, report, _SHORT)
+        return self._follow(coordinates, data, kept, report, config.steps)[0], ends
+
+    def _follow(
+        self,
+        start: Float[np.ndarray, "legs size"],
+        data: LegData,
+        kept: Bool[np.ndarray, " size"],
+        report: Report,
+        steps: int,
+    ) -> tuple[Float[np.ndarray, "legs size"], Float[np.ndarray, " legs"]]:
+        """Return where a search by all residuals ends, and their sums of squares there."""
+        return self._squares(
+            lambda y: self._residuals(y, data, kept), start, steps, partial(report, "motion"), _PATIENCE
         )
-        return coordinates, ends
+
+    def _better(
+        self,
+        one: Float[np.ndarray, "legs size"],
+        other: Float[np.ndarray, "legs size"],
+        data: LegData,
+        kept: Bool[np.ndarray, " size"],
+        report: Report,
+        steps: int | None = None,
+    ) -> Float[np.ndarray, "legs size"]:
+        """Return for each leg the better end of searches from two starts."""
+        ends, losses = zip(
+            *(self._follow(start, data, kept, report, steps or self.config.steps) for start in (one, other)),
+            strict=True,
+        )
+        return np.stack(ends)[np.argmin(losses, axis=0), np.arange(len(one))]
 
     def _select(
         self,
