@@ -13,7 +13,7 @@ sees to it itself. A leg's parameters are a vector in the order of `NAMES`; a pa
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import NamedTuple
@@ -303,7 +303,9 @@ class Identifier:
             selection = self._select(simpler, coordinates, int(further.sum()), spread, data)
             if selection.richer:
                 # The simpler search may have ended in a valley that the richer one left.
-                simpler = self._better(simpler, np.where(further, simpler, coordinates), data, ~further, report)
+                again = np.where(further, simpler, coordinates)
+                again = self._follow(again, data, ~further, report, config.steps)
+                simpler = self._nearest([simpler, again], data, ~further)
                 selection = self._select(simpler, coordinates, int(further.sum()), spread, data)
             if selection.richer:
                 ends = richer_ends
@@ -405,13 +407,11 @@ class Identifier:
         first = np.where(kept[size:], 0.0, dynamics_coordinates(SIMPLE_DYNAMICS))
         candidates = [np.concatenate([y, np.tile(first, (len(legs), 1))], axis=1) for y in np.moveaxis(by_leg, 1, 0)]
         candidates += [] if simpler is None else [simpler]
-        losses = [np.sum(self._residuals(y, data, kept)[0] ** 2, axis=1) for y in candidates]
-        first_choice = np.argmin(losses, axis=0)
-        coordinates = np.stack(candidates)[first_choice, legs]
-        if simpler is None and np.any(first_choice != nearest):
-            other = np.stack(candidates)[nearest, legs]
-            coordinates = self._better(coordinates, other, data, kept, report, _SHORT)
-        return self._follow(coordinates, data, kept, report, config.steps)[0], ends
+        coordinates, by_settled = self._nearest(candidates, data, kept), np.stack(candidates)[nearest, legs]
+        if simpler is None and not np.array_equal(coordinates, by_settled):
+            both = [self._follow(y, data, kept, report, _SHORT) for y in (coordinates, by_settled)]
+            coordinates = self._nearest(both, data, kept)
+        return self._follow(coordinates, data, kept, report, config.steps), ends
 
     def _follow(
         self,
@@ -420,27 +420,22 @@ class Identifier:
         kept: Bool[np.ndarray, " size"],
         report: Report,
         steps: int,
-    ) -> tuple[Float[np.ndarray, "legs size"], Float[np.ndarray, " legs"]]:
-        """Return where a search by all residuals ends, and their sums of squares there."""
-        return self._squares(
-            lambda y: self._residuals(y, data, kept), start, steps, partial(report, "motion"), _PATIENCE
-        )
+    ) -> Float[np.ndarray, "legs size"]:
+        """Return where a search by all residuals ends."""
+        stage = "motion" if self.config.motion else "settled angles"
+        return self._squares(lambda y: self._residuals(y, data, kept), start, steps, partial(report, stage), _PATIENCE)[
+            0
+        ]
 
-    def _better(
+    def _nearest(
         self,
-        one: Float[np.ndarray, "legs size"],
-        other: Float[np.ndarray, "legs size"],
+        candidates: Sequence[Float[np.ndarray, "legs size"]],
         data: LegData,
         kept: Bool[np.ndarray, " size"],
-        report: Report,
-        steps: int | None = None,
     ) -> Float[np.ndarray, "legs size"]:
-        """Return for each leg the better end of searches from two starts."""
-        ends, losses = zip(
-            *(self._follow(start, data, kept, report, steps or self.config.steps) for start in (one, other)),
-            strict=True,
-        )
-        return np.stack(ends)[np.argmin(losses, axis=0), np.arange(len(one))]
+        """Return for each leg the candidate with the lowest sum of squares."""
+        losses = [np.sum(self._residuals(y, data, kept)[0] ** 2, axis=1) for y in candidates]
+        return np.stack(candidates)[np.argmin(losses, axis=0), np.arange(len(SIDES))]
 
     def _select(
         self,
