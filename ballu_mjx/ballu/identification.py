@@ -511,7 +511,7 @@ class Identifier:
         data: LegData,
         kept: Bool[np.ndarray, " size"],
         spread: Float[np.ndarray, "legs residuals"],
-    ) -> tuple[Float[np.ndarray, "legs residuals"], Float[np.ndarray, "legs residuals size"]]:
+    ) -> tuple[Float[np.ndarray, "legs rows"], Float[np.ndarray, "legs rows size"]]:
         """All residuals for what they are worth; then how far parameters are from nominal, in units of what robots
         differ by."""
         values, jacobians = self._residuals(coordinates, data, kept)
