@@ -408,7 +408,7 @@ class Identifier:
         candidates = [np.concatenate([y, np.tile(first, (len(legs), 1))], axis=1) for y in np.moveaxis(by_leg, 1, 0)]
         candidates += [] if simpler is None else [simpler]
         coordinates, by_settled = self._nearest(candidates, data, kept), np.stack(candidates)[nearest, legs]
-        if simpler is None and not np.array_equal(coordinates, by_settled):
+        if not np.array_equal(coordinates, by_settled):
             both = [self._follow(y, data, kept, report, _SHORT) for y in (coordinates, by_settled)]
             coordinates = self._nearest(both, data, kept)
         return self._follow(coordinates, data, kept, report, config.steps), ends
