@@ -10,19 +10,18 @@ precision. Positions are of the tracked site, angles of its body.
 from __future__ import annotations
 
 import argparse
+import functools
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ballu_mjx.common import runtime
 
 runtime.prepare()
 
 import jax
-import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Float
 
@@ -31,11 +30,10 @@ from ballu_mjx.common.results import Cell, Table, write_results
 from ballu_mjx.policies.simulators import load_simulator
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.reconstruct import reconstruct
-from ballu_mjx.residuals.deploy.export import begin_rollout, export_simulator, in_double
+from ballu_mjx.residuals.deploy.export import export_simulator, in_double, rollout_positions
 from ballu_mjx.residuals.deploy.residual import ImprovedSimulator
-from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.sim.c_model import improved_model
-from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState
+from ballu_mjx.sim.c_model import improved_model, site_poses
+from ballu_mjx.sim.simulator import AugmentedSimulator
 from ballu_mjx.viz.style import label_of
 
 PAIRS = (("exported", "double"), ("exported", "single"), ("single", "double"))
@@ -52,14 +50,8 @@ def rollouts(
 ) -> Float[np.ndarray, "runs steps nq"]:
     """Return generalized positions after each control step, in the precision that JAX is set to."""
 
-    def run(qpos: Any, qvel: Any, commands: Any) -> Any:
-        def step(state: RolloutState, command: Any) -> tuple[RolloutState, Any]:
-            after = simulator.step(state, command).state
-            return after, after.physics.qpos
-
-        return jax.lax.scan(step, begin_rollout(simulator, qpos, qvel, commands[0])[0], commands)[1]
-
-    return np.asarray(jax.jit(jax.vmap(run))(*map(jnp.asarray, (qpos, qvel, commands))))
+    run = jax.jit(jax.vmap(functools.partial(rollout_positions, simulator)))
+    return np.asarray(run(qpos, qvel, commands))
 
 
 def in_c(folder: Path, qpos: np.ndarray, qvel: np.ndarray, commands: np.ndarray) -> Float[np.ndarray, "runs steps nq"]:
@@ -69,17 +61,6 @@ def in_c(folder: Path, qpos: np.ndarray, qvel: np.ndarray, commands: np.ndarray)
         simulator.reset(start, speed, sent[0])
         runs.append([simulator.step(command).qpos.copy() for command in sent])
     return np.array(runs)
-
-
-def poses(robot: RobotDescription, model: mujoco.MjModel, qpos: Float[np.ndarray, "runs steps nq"]) -> Poses:
-    """Return where the tracked site is, and how it is turned."""
-    data, site = mujoco.MjData(model), model.site(robot.tracked).id
-    places, turns = np.zeros((*qpos.shape[:2], 3)), np.zeros((*qpos.shape[:2], 4))
-    for index in np.ndindex(*qpos.shape[:2]):
-        data.qpos[:] = qpos[index]
-        mujoco.mj_kinematics(model, data)
-        places[index], turns[index] = data.site_xpos[site], data.xquat[model.site_bodyid[site]]
-    return places, turns
 
 
 def apart(one: Poses, other: Poses) -> tuple[Float[np.ndarray, "runs steps"], Float[np.ndarray, "runs steps"]]:
@@ -131,7 +112,7 @@ def measure(run: Path, recordings: Sequence[Path], count: int, seconds: float) -
     found["single"] = rollouts(simulator, *single)
     with jax.enable_x64(True):
         found["double"] = rollouts(in_double(simulator, model), qpos, qvel, commands)
-    seen = {name: poses(robot, model, each) for name, each in found.items()}
+    seen = {name: site_poses(model, robot.tracked, each) for name, each in found.items()}
     differences = {(one, other): apart(seen[one], seen[other]) for one, other in PAIRS}
     ends = {pair: (distance[:, -1], angle[:, -1]) for pair, (distance, angle) in differences.items()}
     residual = "" if simulator.residual is None else f", {label_of(simulator.residual.model.name)}"

@@ -49,9 +49,6 @@ class EnvMimicConfig(ForceNetworkConfig):
     (docs/envmimic.md)."""
 
     forces: ForceSet = "wrench"
-    """What the policy acts with: a force and a torque on the tracked body (wrench), a force there alone (force, the
-    paper's), forces there and at all measured points (multi), forces and torques along joints (joints), or changes of
-    the commands (commands)."""
     position_weight: float = 0.7
     """Weight of the position term (paper: 0.7)."""
     orientation_weight: float = 0.3

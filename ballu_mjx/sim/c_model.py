@@ -1,9 +1,10 @@
-"""A simulator's model for C MuJoCo, with the numbers that the MJX simulator has changed."""
+"""A simulator's model for C MuJoCo, with the numbers that the MJX simulator has changed, and its sites."""
 
 from __future__ import annotations
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from ballu_mjx.sim.simulator import AugmentedSimulator
 
@@ -34,3 +35,17 @@ def improved_model(simulator: AugmentedSimulator) -> mujoco.MjModel:
     if changed:
         mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+def site_poses(
+    model: mujoco.MjModel, name: str, qpos: Float[np.ndarray, "*states nq"]
+) -> tuple[Float[np.ndarray, "*states 3"], Float[np.ndarray, "*states 4"]]:
+    """Return where a site is (m, world), and the quaternion of its body, by generalized positions."""
+    data, site = mujoco.MjData(model), model.site(name).id
+    states = qpos.shape[:-1]
+    positions, quaternions = np.zeros((*states, 3)), np.zeros((*states, 4))
+    for index in np.ndindex(*states):
+        data.qpos[:] = qpos[index]
+        mujoco.mj_kinematics(model, data)
+        positions[index], quaternions[index] = data.site_xpos[site], data.xquat[model.site_bodyid[site]]
+    return positions, quaternions

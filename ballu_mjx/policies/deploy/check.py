@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -21,7 +23,7 @@ from ballu_mjx.policies.policy import Policy
 from ballu_mjx.policies.tasks import Step
 from ballu_mjx.residuals.deploy.export import export_simulator, rollout_in_double, rollout_positions
 from ballu_mjx.residuals.deploy.residual import YAW, ImprovedSimulator
-from ballu_mjx.sim.c_model import improved_model
+from ballu_mjx.sim.c_model import improved_model, site_poses
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 TOLERANCE = 0.1
@@ -238,21 +240,12 @@ def _compare(
     expected = np.array([act(row) for row in np.asarray(features)])
     model = improved_model(own)
     exact = rollout_in_double(own, model, qpos[0], qvel[0], commands)
-    rounded = rollout_positions(own, *(x.astype(np.float32) for x in (qpos[0], qvel[0], commands)))
+    run = jax.jit(functools.partial(rollout_positions, own))
+    rounded = np.asarray(run(*(x.astype(np.float32) for x in (qpos[0], qvel[0], commands))))
     there.reset(qpos[0], qvel[0], commands[0])
-    found = [there.step(command).qpos.copy() for command in commands]
-    data, site = mujoco.MjData(model), model.site(policy.robot.tracked).id
-
-    def places(states: Sequence[np.ndarray] | np.ndarray) -> Float[np.ndarray, "steps 3"]:
-        rows = []
-        for state in states:
-            data.qpos[:] = state
-            mujoco.mj_kinematics(model, data)
-            rows.append(data.site_xpos[site].copy())
-        return np.array(rows)
-
-    exact_places = places(exact)
-    apart, rounding = (np.linalg.norm(places(x) - exact_places, axis=1) for x in (found, rounded))
+    found = np.array([there.step(command).qpos.copy() for command in commands])
+    places, _ = site_poses(model, policy.robot.tracked, np.stack([exact, found, rounded]))
+    apart, rounding = np.linalg.norm(places[1:] - places[0], axis=-1)
     unforetold = ~(rounding < PREDICTABLE)
     count = max(int(unforetold.argmax()), 1) if unforetold.any() else len(rounding)
     return Agreement(

@@ -6,6 +6,7 @@ The folder runs on NumPy and MuJoCo alone; `residual.py` in it is this package's
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import math
 import textwrap
@@ -17,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.standalone import standalone_source
@@ -29,7 +30,7 @@ from ballu_mjx.rl.network_export import NetworkPort, OutputScale, check_onnx, ne
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.mjcf import write_mjcf
 from ballu_mjx.runs.folder import new_folder
-from ballu_mjx.sim.c_model import DERIVED_FIELDS, improved_model
+from ballu_mjx.sim.c_model import DERIVED_FIELDS, improved_model, site_poses
 from ballu_mjx.sim.drivetrain import QUANTITIES
 from ballu_mjx.sim.force_model import BoundForces, ForceModel, SumOfForces
 from ballu_mjx.sim.observation import HISTORY
@@ -283,14 +284,7 @@ def _write_check(path: Path, simulator: AugmentedSimulator, model: mujoco.MjMode
     qpos = robot.adapter.initial_qpos(robot, model)
     commands = check_commands(robot, seconds)
     states = rollout_in_double(simulator, model, qpos, np.zeros(model.nv), commands)
-    data, site = mujoco.MjData(model), model.site(robot.tracked).id
-    positions, quaternions = [], []
-    for after in states:
-        data.qpos[:] = after
-        mujoco.mj_kinematics(model, data)
-        positions.append(data.site_xpos[site].copy())
-        quaternions.append(data.xquat[model.site_bodyid[site]].copy())
-    check = _Check(commands, qpos, np.zeros(model.nv), np.array(positions), np.array(quaternions))
+    check = _Check(commands, qpos, np.zeros(model.nv), *site_poses(model, robot.tracked, states))
     np.savez(path, **check._asdict())  # pyright: ignore[reportArgumentType]
 
 
@@ -307,30 +301,26 @@ def rollout_in_double(
     the first command.
     """
     with jax.enable_x64(True):
-        return rollout_positions(in_double(simulator, model), qpos, qvel, commands)
+        run = jax.jit(functools.partial(rollout_positions, in_double(simulator, model)))
+        return np.asarray(run(qpos, qvel, commands))
 
 
 def rollout_positions(
     simulator: AugmentedSimulator,
-    qpos: Float[np.ndarray, " nq"],
-    qvel: Float[np.ndarray, " nv"],
-    commands: Float[np.ndarray, "steps commands"],
-) -> Float[np.ndarray, "steps nq"]:
-    """Return the generalized positions after each control step, in the simulator's own precision.
+    qpos: Float[Array, " nq"],
+    qvel: Float[Array, " nv"],
+    commands: Float[Array, "steps commands"],
+) -> Float[Array, "steps nq"]:
+    """Return the generalized positions after each control step, in the precision of the simulator and its arguments.
 
-    The robot has been in the state for a while, under the first command.
+    The robot has been in the state for a while, under the first command. To be jitted, and vmapped over starts.
     """
-    start, augmented = begin_rollout(simulator, qpos, qvel, commands[0])
 
-    @jax.jit
-    def run(start: RolloutState, commands: Any) -> Any:
-        def step(state: RolloutState, command: Any) -> tuple[RolloutState, Any]:
-            after = augmented.step(state, command).state
-            return after, after.physics.qpos
+    def step(state: RolloutState, command: Array) -> tuple[RolloutState, Array]:
+        after = simulator.step(state, command).state
+        return after, after.physics.qpos
 
-        return jax.lax.scan(step, start, commands)[1]
-
-    return np.asarray(run(start, jnp.asarray(commands)))
+    return jax.lax.scan(step, _begin_rollout(simulator, qpos, qvel, commands[0]), commands)[1]
 
 
 def in_double(simulator: AugmentedSimulator, model: mujoco.MjModel) -> AugmentedSimulator:
@@ -345,18 +335,18 @@ def in_double(simulator: AugmentedSimulator, model: mujoco.MjModel) -> Augmented
     return AugmentedSimulator(plain, None if bound is None else BoundForces(bound.model, double(bound.params)))
 
 
-def begin_rollout(
+def _begin_rollout(
     simulator: AugmentedSimulator,
-    qpos: Float[np.ndarray, " nq"],
-    qvel: Float[np.ndarray, " nv"],
-    command: Float[np.ndarray, " commands"],
-) -> tuple[RolloutState, AugmentedSimulator]:
-    """Return the state of a robot that has been at a place under a command for a while; and the simulator."""
+    qpos: Float[Array, " nq"],
+    qvel: Float[Array, " nv"],
+    command: Float[Array, " commands"],
+) -> RolloutState:
+    """Return the state of a robot that has been at a place under a command for a while."""
     plain = simulator.simulator
-    physics, held = state_at(jnp.asarray(qpos), jnp.asarray(qvel)), jnp.asarray(command)
+    physics = state_at(qpos, qvel)
     features, _ = plain.observe(physics)
-    history, commands = jnp.tile(features, (HISTORY, 1)), jnp.tile(held, (HISTORY - 1, 1))
-    return RolloutState(physics, history, commands, plain.drivetrain_at_rest(held)), simulator
+    history, commands = jnp.tile(features, (HISTORY, 1)), jnp.tile(command, (HISTORY - 1, 1))
+    return RolloutState(physics, history, commands, plain.drivetrain_at_rest(command))
 
 
 # ---- texts ----
