@@ -36,7 +36,7 @@ ROBOT = read_description(FOLDER / "balloon.robot.json")
 SIMULATOR = Simulator(ROBOT)
 PUSH = np.array([0.02, -0.03, 0.015])
 """N, world."""
-CONFIG = EnvMimicConfig(force_scale=0.05, torque_scale=0.005, force_limit=1.0, force_cost=20.0)
+CONFIG = EnvMimicConfig(forces="force", force_scale=0.05, torque_scale=0.005, force_limit=1.0, force_cost=20.0)
 PRIORS = SupervisedConfig(force_spread=0.3, force_change=0.1, torque_spread=0.05)
 NETWORK = PPOConfig(policy_layers=(16,), value_layers=(4,))
 STEPS = 60

@@ -314,7 +314,7 @@ def test_places_that_are_not_the_model_s_are_refused(flight: tuple[Recording, np
 
 @pytest.fixture(scope="module")
 def env(motion: Motion) -> EnvMimicEnv:
-    config = EnvMimicConfig(start_noise=0.0, observation_noise=0.0)
+    config = EnvMimicConfig(forces="force", start_noise=0.0, observation_noise=0.0)
     return EnvMimicEnv(Simulator(DESCRIPTION), [motion], config)
 
 
@@ -355,7 +355,10 @@ def test_an_anchored_robot_sees_the_world(motion: Motion, env: EnvMimicEnv):
     assert len(changed) == HISTORY, "the yaw alone"
     np.testing.assert_allclose(np.sort(np.asarray(seen)[:3]), np.sort(np.asarray(history[0, :3])), atol=1e-6)
     force = world_loads(
-        jnp.array([1.0, 2.0, 3.0]), turned[-1, 8], EnvMimicConfig(force_scale=0.05, force_limit=1.0), DESCRIPTION
+        jnp.array([1.0, 2.0, 3.0]),
+        turned[-1, 8],
+        EnvMimicConfig(forces="force", force_scale=0.05, force_limit=1.0),
+        DESCRIPTION,
     )
     np.testing.assert_allclose(force, [0.05, 0.1, 0.15], atol=1e-6)
 
