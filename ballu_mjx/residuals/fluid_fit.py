@@ -31,7 +31,13 @@ from ballu_mjx.recordings.segments import (
     pseudo_huber,
     simulate_segment,
 )
-from ballu_mjx.residuals.fluid import TERM_SETS, FluidCoefficients, FluidForces, TermSet, mirrored, terms_of
+from ballu_mjx.residuals.fluid import TERM_SETS, FluidCoefficients, FluidForces, TermSet, terms_of
+from ballu_mjx.residuals.fluid_parametrization import (
+    PASSIVE_SETS,
+    FreeCoefficients,
+    Parametrization,
+    PassiveCoefficients,
+)
 from ballu_mjx.sim.force_model import BoundForces
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.sharding import chunks, shard_over_devices
@@ -44,8 +50,11 @@ class FluidConfig:
 
     terms: Literal["auto", TermSet] = "auto"
     """Which terms: linear (gravity's direction, velocities), drag (these times the speed), quadratic (products of two
-    velocities), cubic (of three, over the speed); each has those before it. auto fits all four, and takes the one with
+    velocities), cubic (of three, over the speed); each has those before it. auto fits every set, and takes the one with
     the lowest error on the validation recordings."""
+    passive: bool = True
+    """Whether the forces only take energy from the body, as those of still air or water do: simulations then stay
+    bounded far from the recordings too. There are then no cubic terms."""
     mirror: bool = True
     """Whether the forces are symmetric about the body's xz plane where the robot's description declares `mirror`."""
     window_seconds: tuple[float, ...] = (0.5, 1.0, 2.0)
@@ -67,6 +76,10 @@ def check_fluid_config(config: FluidConfig, control_timestep: float) -> None:
         raise InputError("--window-seconds names no length; give one or more, in seconds.")
     for seconds in config.window_seconds:
         check_segments(seconds, seconds, control_timestep)
+    if config.passive and config.terms == TERM_SETS[-1]:
+        raise InputError(
+            f"--terms {config.terms}: passive forces have no such terms; give --no-passive, or {PASSIVE_SETS[-1]}."
+        )
     for name in ("windows", "steps", "spread"):
         if not getattr(config, name) > 0:
             raise InputError(f"--{name} is {getattr(config, name)}: it must be above 0.")
@@ -105,18 +118,26 @@ def fit_fluid_forces(
     windows = _Windows(simulator, training, config)
     held_out = _Windows(simulator, validation, config, program=windows.program)
     symmetric = config.mirror and simulator.robot.mirror is not None
-    names: Sequence[TermSet] = TERM_SETS if config.terms == "auto" else (config.terms,)
+    every = PASSIVE_SETS if config.passive else TERM_SETS
+    names: Sequence[TermSet] = every if config.terms == "auto" else (config.terms,)
     prior = _priors(windows, config.spread)
+    centre = _centre(simulator)
     scores = {"none": held_out.score(np.zeros_like(prior))}
     best: tuple[float, FluidCoefficients] | None = None
     for name in names:
-        search = _Search(windows, name, prior, symmetric=symmetric)
+        coefficients = (
+            PassiveCoefficients(name, prior, centre, symmetric=symmetric)
+            if config.passive
+            else FreeCoefficients(name, prior, symmetric=symmetric)
+        )
+        search = _Search(windows, coefficients)
         vector = search.run(config, lambda *told, name=name: report(f"{name}, {told[0]}", *told[1:]))
-        scores[name] = held_out.score(search.table(vector))
+        table = coefficients.table(vector)
+        scores[name] = held_out.score(table)
         if best is None or scores[name] < best[0]:
             shown = slice(len(terms_of(name)))
-            errors = search.table(search.standard_errors(vector))
-            best = scores[name], FluidCoefficients(name, search.table(vector)[shown], errors[shown])
+            errors = search.standard_errors(vector)
+            best = scores[name], FluidCoefficients(name, table[shown], errors[shown])
     assert best is not None
     steps = windows.program.control_steps
     return FluidFit(best[1], scores, symmetric, windows.count, steps)
@@ -208,26 +229,14 @@ class _Windows:
 
 
 class _Search:
-    """The fit of one set of terms. A vector holds the coefficients that may differ from 0, in units of their priors."""
+    """The fit of one set of terms."""
 
-    def __init__(
-        self, windows: _Windows, name: TermSet, prior: Float[np.ndarray, "terms 6"], *, symmetric: bool
-    ) -> None:
-        self._windows, self._prior = windows, prior
-        terms = terms_of(TERM_SETS[-1])
-        self._free = mirrored(terms) if symmetric else np.ones(prior.shape, bool)
-        self._free[len(terms_of(name)) :] = False
-        self.size = int(self._free.sum())
-        self._directions = np.zeros((self.size, *prior.shape))
-        self._directions[np.arange(self.size), *np.argwhere(self._free).T] = prior[self._free]
-
-    def table(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, "terms 6"]:
-        """Return coefficients in SI units."""
-        return np.tensordot(vector, self._directions, 1)
+    def __init__(self, windows: _Windows, coefficients: Parametrization) -> None:
+        self._windows, self._coefficients = windows, coefficients
 
     def run(self, config: FluidConfig, report: Report) -> Float[np.ndarray, " size"]:
         """Return the vector that fits best."""
-        vector = np.zeros(self.size)
+        vector = self._coefficients.start
         solver = BatchedSolver(optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3))
         for seconds in config.window_seconds:
             windows = self._windows.shortened(seconds)
@@ -246,26 +255,29 @@ class _Search:
             vector = found[0]
         return vector
 
-    def standard_errors(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, " size"]:
-        """Return standard errors that hold for windows that err independently, in whatever way (sandwich)."""
-        params = self.table(vector)
-        errors, slopes = self._windows.errors(params), self._windows.slopes(params, self._directions)
+    def standard_errors(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, "terms 6"]:
+        """Return the table's standard errors, which hold for windows that err independently, in whatever way
+        (sandwich)."""
+        directions = self._coefficients.directions(vector)
+        params = self._coefficients.table(vector)
+        errors, slopes = self._windows.errors(params), self._windows.slopes(params, directions)
         weight = 1 / np.sqrt(1 + np.sum(errors**2, axis=1) / OUTLYING**2)
         scores = np.einsum("we,wes->ws", errors, slopes) * weight[:, None]
-        bread = np.linalg.inv(np.einsum("w,wes,wet->st", weight, slopes, slopes, optimize=True) + np.eye(self.size))
-        covariance = bread @ (scores.T @ scores + np.eye(self.size)) @ bread
-        return np.sqrt(np.diag(covariance))
+        prior = np.eye(len(vector))
+        bread = np.linalg.inv(np.einsum("w,wes,wet->st", weight, slopes, slopes, optimize=True) + prior)
+        covariance = bread @ (scores.T @ scores + prior) @ bread
+        return np.sqrt(np.einsum("sta,su,uta->ta", directions, covariance, directions, optimize=True))
 
     def _rows(
         self, vector: Float[np.ndarray, " size"], windows: _Windows
     ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows size"]]:
         """Return softened errors and the prior, and how they change."""
-        params = self.table(vector)
-        errors, slopes = windows.errors(params), windows.slopes(params, self._directions)
+        params = self._coefficients.table(vector)
+        errors, slopes = windows.errors(params), windows.slopes(params, self._coefficients.directions(vector))
         # Iteratively reweighted: the weight of a window is held where its slopes are taken.
         weight = (1 + np.sum(errors**2, axis=1)[:, None] / OUTLYING**2) ** -0.25
         values = np.concatenate([(weight * errors).ravel(), vector])
-        return values, np.concatenate([(weight[..., None] * slopes).reshape(-1, self.size), np.eye(self.size)])
+        return values, np.concatenate([(weight[..., None] * slopes).reshape(-1, len(vector)), np.eye(len(vector))])
 
 
 def _priors(windows: _Windows, spread: float) -> Float[np.ndarray, "terms 6"]:
@@ -282,6 +294,13 @@ _BATCH = 1024
 """Simulations side by side."""
 _LEAST = 1e-3
 """Of the largest typical term: smaller ones count as so large, so that no coefficient may grow without limit."""
+
+
+def _centre(simulator: Simulator) -> Float[np.ndarray, " 3"]:
+    """Return the tracked body's centre of mass from the tracked site, in the body's axes (m)."""
+    model = simulator.mj_model
+    site = model.site(simulator.robot.tracked)
+    return model.body_ipos[model.site_bodyid[site.id]] - site.pos
 
 
 def _whole_body(simulator: Simulator) -> tuple[float, float]:
