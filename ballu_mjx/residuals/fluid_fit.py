@@ -61,7 +61,7 @@ class FluidConfig:
     """Lengths of the windows, s, one for each stage."""
     windows: int = 200
     """Most windows of a stage."""
-    steps: int = 6
+    steps: int = 12
     """Most iterations of Levenberg-Marquardt in a stage."""
     spread: float = 1.0
     """Standard deviation of the prior on each term's typical effect, as an acceleration (m/s^2, rad/s^2)."""
@@ -118,23 +118,26 @@ def fit_fluid_forces(
     windows = _Windows(simulator, training, config)
     held_out = _Windows(simulator, validation, config, program=windows.program)
     symmetric = config.mirror and simulator.robot.mirror is not None
-    every = PASSIVE_SETS if config.passive else TERM_SETS
-    names: Sequence[TermSet] = every if config.terms == "auto" else (config.terms,)
+    sets = PASSIVE_SETS if config.passive else TERM_SETS
+    chain = sets if config.terms == "auto" else sets[: sets.index(config.terms) + 1]
     prior = _priors(windows, config.spread)
     centre = _centre(simulator)
     scores = {"none": held_out.score(np.zeros_like(prior))}
     best: tuple[float, FluidCoefficients] | None = None
-    for name in names:
+    vector = np.zeros(0)
+    for name in chain:
         coefficients = (
             PassiveCoefficients(name, prior, centre, symmetric=symmetric)
             if config.passive
             else FreeCoefficients(name, prior, symmetric=symmetric)
         )
         search = _Search(windows, coefficients)
-        vector = search.run(config, lambda *told, name=name: report(f"{name}, {told[0]}", *told[1:]))
+        # From the set before, whose entries come first.
+        start = np.concatenate([vector, coefficients.start[len(vector) :]])
+        vector = search.run(start, config, lambda *told, name=name: report(f"{name}, {told[0]}", *told[1:]))
         table = coefficients.table(vector)
         scores[name] = held_out.score(table)
-        if best is None or scores[name] < best[0]:
+        if config.terms in ("auto", name) and (best is None or scores[name] < best[0]):
             shown = slice(len(terms_of(name)))
             errors = search.standard_errors(vector)
             best = scores[name], FluidCoefficients(name, table[shown], errors[shown])
@@ -234,9 +237,9 @@ class _Search:
     def __init__(self, windows: _Windows, coefficients: Parametrization) -> None:
         self._windows, self._coefficients = windows, coefficients
 
-    def run(self, config: FluidConfig, report: Report) -> Float[np.ndarray, " size"]:
+    def run(self, start: Float[np.ndarray, " size"], config: FluidConfig, report: Report) -> Float[np.ndarray, " size"]:
         """Return the vector that fits best."""
-        vector = self._coefficients.start
+        vector = start
         solver = BatchedSolver(optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3))
         for seconds in config.window_seconds:
             windows = self._windows.shortened(seconds)
@@ -250,7 +253,7 @@ class _Search:
                 vector[None],
                 config.steps,
                 lambda *told, seconds=seconds: report(f"windows of {seconds:g} s", *told),
-                patience=3,
+                patience=_PATIENCE,
             )
             vector = found[0]
         return vector
@@ -290,6 +293,8 @@ def _priors(windows: _Windows, spread: float) -> Float[np.ndarray, "terms 6"]:
     return force / np.maximum(typical, _LEAST * typical.max())[:, None]
 
 
+_PATIENCE = 5
+"""Iterations without gain, such as those that only shorten the next step, after which a stage ends."""
 _BATCH = 1024
 """Simulations side by side."""
 _LEAST = 1e-3

@@ -6,9 +6,9 @@ leaves it as it is, at every velocity. With the motion x = (v, w) of the tracked
     wrench = -(A + |v| B) x + Q(x, x) + gravity's part
 
 where A and B have positive semidefinite symmetric parts: drag and damping. Their skew parts are the lift of a cambered
-body, and couplings that do no work. Q has x . Q(x, x) = 0: lift and moments over angle of attack and sideslip. The part
-of gravity is a wrong weight and a wrong centre of mass. Simulations under such forces stay bounded far from the recordings.
-The wrench acts at the centre of mass: coefficients are shifted there.
+body, and couplings that do no work. Q has x . Q(x, x) = 0: lift and moments over angle of attack and sideslip. The
+part of gravity is a wrong weight and a wrong centre of mass. Simulations under such forces stay bounded far from the
+recordings. The wrench acts at the centre of mass: coefficients are shifted there.
 """
 
 from __future__ import annotations

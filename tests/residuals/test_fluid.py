@@ -3,26 +3,33 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from robot_files import write_robot
+from scipy import optimize
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.residuals.deploy.export import rollout_positions
 from ballu_mjx.residuals.fluid import (
     AXES,
     FluidCoefficients,
     FluidForces,
+    TermSet,
     mirrored,
     read_fluid,
     terms_of,
 )
 from ballu_mjx.residuals.fluid_fit import FluidConfig, FluidFit, check_fluid_config, fit_fluid_forces
+from ballu_mjx.residuals.fluid_parametrization import PASSIVE_SETS, PassiveCoefficients
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.sim.force_model import BoundForces
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.simulator import Simulator
 
@@ -89,6 +96,57 @@ def test_known_air_is_found_in_flights_of_another_simulator(fit: FluidFit):
     assert abs(lift + LIFT) < 0.25 * LIFT
 
 
+def power(coefficients: np.ndarray, centre: np.ndarray, seed: int) -> np.ndarray:
+    """What the wrench gives a body at random motions (W), about its centre of mass; without gravity's part."""
+    terms, rng = terms_of("cubic"), np.random.default_rng(seed)
+    found = []
+    for motion in rng.normal(size=(500, 6)) * rng.choice([0.1, 1.0, 10.0], (500, 1)):
+        size = np.linalg.norm(motion[:3])
+        seen = dict(zip(["vx", "vy", "vz", "wx", "wy", "wz"], motion, strict=True))
+        values = [np.prod([seen.get(factor, 0.0) for factor in term.factors]) * size**term.power for term in terms]
+        wrench = np.array(values) @ coefficients
+        velocity = motion[:3] + np.cross(motion[3:], centre)
+        found.append((wrench[:3] @ velocity + wrench[3:] @ motion[3:]) / np.linalg.norm(motion) ** 3)
+    return np.array(found)
+
+
+@pytest.mark.parametrize("symmetric", [False, True])
+@pytest.mark.parametrize("name", PASSIVE_SETS)
+def test_passive_coefficients_never_give_energy(name: TermSet, symmetric: bool):
+    rng, terms = np.random.default_rng(5), terms_of("cubic")
+    prior, centre = rng.uniform(0.1, 3.0, (len(terms), 6)), np.array([-0.04, 0.0 if symmetric else 0.02, 0.01])
+    passive = PassiveCoefficients(name, prior, centre, symmetric=symmetric)
+    vector = rng.normal(size=len(passive.start))
+    table = passive.table(vector)
+    assert power(table, centre, 6).max() < 1e-9
+    assert power(table, centre + 5.0, 6).max() > 1e-3, "about another point it would"
+    assert not symmetric or np.all(table[~mirrored(terms)] == 0)
+    step = 1e-6 * np.eye(len(vector))
+    differences = [(passive.table(vector + each) - passive.table(vector - each)) / 2e-6 for each in step]
+    np.testing.assert_allclose(passive.directions(vector), differences, atol=1e-7)
+
+
+def test_any_wrench_that_is_linear_and_takes_energy_is_passive():
+    """Nothing but what gives energy is excluded: some vector stands for any damping matrix."""
+    rng = np.random.default_rng(7)
+    root, skew = rng.normal(size=(2, 6, 6))
+    wanted = -(root @ root.T + skew - skew.T)
+    passive = PassiveCoefficients("linear", np.ones((len(terms_of("cubic")), 6)), np.zeros(3), symmetric=False)
+    found = optimize.least_squares(lambda vector: (passive.table(vector)[3:9].T - wanted).ravel(), passive.start)
+    assert np.abs(found.fun).max() < 1e-6
+
+
+def test_a_glider_that_the_recordings_never_showed_stays_bounded(glider: RobotDescription, fit: FluidFit):
+    """Ten times as fast as any recorded flight, and tumbling."""
+    simulator = Simulator(glider)
+    forces = FluidForces(glider, simulator.mj_model, fit.coefficients.term_set)
+    improved = simulator.with_residual(BoundForces(forces, jnp.asarray(fit.coefficients.values, jnp.float32)))
+    qpos, qvel = jnp.asarray(simulator.mj_model.qpos0, jnp.float32), jnp.array([3.0, -2.0, 2.0, 3.0, -3.0, 3.0])
+    path = np.asarray(jax.jit(partial(rollout_positions, improved))(qpos, qvel, jnp.zeros((100, 2))))
+    speed = np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1) / glider.control_timestep
+    assert speed.max() < 1.2 * np.linalg.norm(qvel[:3]) and speed[-1] < 0.2 * speed[0]
+
+
 def test_held_out_flights_are_predicted(fit: FluidFit):
     assert fit.symmetric
     assert fit.scores["quadratic"] < 0.15 * fit.scores["none"]
@@ -142,7 +200,12 @@ def test_a_file_gives_back_what_was_written_and_damaged_ones_are_refused(fit: Fl
 
 @pytest.mark.parametrize(
     ("change", "option"),
-    [({"window_seconds": ()}, "window-seconds"), ({"window_seconds": (0.01,)}, "window"), ({"steps": 0}, "steps")],
+    [
+        ({"window_seconds": ()}, "window-seconds"),
+        ({"window_seconds": (0.01,)}, "window"),
+        ({"steps": 0}, "steps"),
+        ({"terms": "cubic"}, "no-passive"),
+    ],
 )
 def test_options_out_of_range_are_named(change: dict, option: str):
     with pytest.raises(InputError, match=option):
