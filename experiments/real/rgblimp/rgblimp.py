@@ -39,6 +39,7 @@ import _setup
 _setup.prepare()
 
 import argparse
+import dataclasses
 import lzma
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -50,6 +51,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.common.results import Table
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion
@@ -186,7 +188,11 @@ class PublishedAerodynamics(ForceModel):
 
 
 # %%
-def end_errors(evaluator: OpenLoopEvaluator, replay: Replay) -> dict[float, tuple[float, float, int, int]]:
+Found = Mapping[float, tuple[float, float, int, int]]
+"""By horizon (s): position (m), yaw (deg), starts, diverged ones."""
+
+
+def end_errors(evaluator: OpenLoopEvaluator, replay: Replay) -> Found:
     """Return position (m) and yaw error (deg) at each horizon's end, root mean square, starts, and diverged ones."""
     found = {}
     for horizon in HORIZONS:
@@ -207,7 +213,7 @@ def end_errors(evaluator: OpenLoopEvaluator, replay: Replay) -> dict[float, tupl
 
 def neighbour_errors(
     training: Sequence[Motion], test: Sequence[Motion], control_timestep: float, neighbours: int = 20
-) -> dict[float, tuple[float, float, int, int]]:
+) -> Found:
     """Return the errors of the mean displacement of the most similar recorded moments, in the heading frame.
 
     Moments are compared by roll, pitch, velocity and angular velocity in the body, and commands.
@@ -248,19 +254,22 @@ def _moments(motion: Motion, steps: int, every: int) -> tuple[np.ndarray, np.nda
     return np.column_stack([state, motion.command[here]]) / _LIKE, np.column_stack([moved, turned])
 
 
-def table(rows: Mapping[str, Mapping[str, Mapping[float, tuple[float, float, int, int]]]]) -> str:
-    """Return all errors as Markdown; `rows` by method and group."""
-    heads = [f"{group}, {horizon:g} s" for group in TEST for horizon in HORIZONS]
-    lines = [f"| method | {' | '.join(heads)} |", f"| --- |{' --- |' * len(heads)}"]
-    for method, groups in rows.items():
-        cells = []
-        for group in TEST:
-            for horizon in HORIZONS:
-                far, turned, starts, lost = groups[group][horizon]
-                diverged = f" ({lost} of {starts} diverged)" if lost else ""
-                cells.append(f"{far:.3f} m, {turned:.1f} deg{diverged}")
-        lines.append(f"| {method} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+def tables(rows: Mapping[str, Mapping[str, Found]]) -> dict[str, Table]:
+    """Return a table of position and one of yaw errors; `rows` by method and group."""
+    heads = [f"{group}: {', '.join(f'{horizon:g}' for horizon in HORIZONS)} s" for group in TEST]
+
+    def cell(found: Found, place: int, form: str) -> str:
+        lost, starts = found[HORIZONS[-1]][3], found[HORIZONS[-1]][2]
+        numbers = ", ".join("-" if f[3] == f[2] else format(f[place], form) for f in found.values())
+        return numbers + (f" ({lost} of {starts} diverged)" if lost else "")
+
+    return {
+        name: Table(
+            (f"{name} ({unit})", *heads),
+            tuple((method, *(cell(groups[g], place, form) for g in TEST)) for method, groups in rows.items()),
+        )
+        for place, (name, unit, form) in enumerate([("position", "m", ".3f"), ("yaw", "deg", ".1f")])
+    }
 
 
 # %% [markdown]
@@ -273,6 +282,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder with the public files or recordings of them")
     parser.add_argument("--output", type=Path, default=Path("runs/rgblimp"), help="folder for results (runs/rgblimp)")
     parser.add_argument("--quick", action="store_true", help="few flights and steps; the numbers mean little")
+    parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     options = parser.parse_args()
     robot = read_description(FOLDER / "rgblimp.robot.json")
     few = slice(0, 2) if options.quick else slice(None)
@@ -280,14 +290,16 @@ def main() -> None:
     training, validation = (load(options.data, each[few], robot, made) for each in (TRAINING, VALIDATION))
     test = {group: load(options.data, numbers[few], robot, made) for group, numbers in TEST.items()}
     simulator = Simulator(robot)
-    quick = {"window_seconds": (0.5,), "windows": 10, "steps": 2}
-    full = {"window_seconds": (0.5, 2.0), "windows": 150, "steps": 5}
+    config = FluidConfig(window_seconds=(0.5, 2.0), windows=150, steps=15)
+    if options.quick:
+        config = FluidConfig(terms="linear", window_seconds=(0.5,), windows=10, steps=2)
     residuals: dict[str, tuple[ForceModel, Any]] = {
         "published model": (PublishedAerodynamics(robot.control_timestep), jnp.zeros(0))
     }
-    for name, terms in (("linear terms", "linear"), ("fluid forces", "linear" if options.quick else "auto")):
-        config = FluidConfig(terms=terms, **(quick if options.quick else full))  # pyright: ignore[reportArgumentType]
-        found = fit_fluid(simulator, training, validation, config, progress=PhaseProgress())
+    for name, passive in (("fluid", True), ("fluid, `--no-passive`", False)):
+        found = fit_fluid(
+            simulator, training, validation, dataclasses.replace(config, passive=passive), progress=PhaseProgress()
+        )
         print(f"\n{name}\n{found.report}\n", flush=True)
         residuals[name] = found.model, found.params
     rows: dict[str, dict[str, Any]] = {"no air": {}}
@@ -302,7 +314,7 @@ def main() -> None:
     rows["nearest moments"] = {
         group: neighbour_errors(training, motions, robot.control_timestep) for group, motions in test.items()
     }
-    _setup.write_table(table(rows), options.output)
+    _setup.write_tables(tables(rows), options.output, options.results, {})
 
 
 if __name__ == "__main__":
