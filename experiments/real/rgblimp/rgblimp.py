@@ -290,7 +290,7 @@ def main() -> None:
     training, validation = (load(options.data, each[few], robot, made) for each in (TRAINING, VALIDATION))
     test = {group: load(options.data, numbers[few], robot, made) for group, numbers in TEST.items()}
     simulator = Simulator(robot)
-    config = FluidConfig(window_seconds=(0.5, 2.0), windows=150, steps=15)
+    config = FluidConfig(window_seconds=(0.5, 2.0), windows=150)
     if options.quick:
         config = FluidConfig(terms="linear", window_seconds=(0.5,), windows=10, steps=2)
     residuals: dict[str, tuple[ForceModel, Any]] = {
