@@ -60,7 +60,7 @@ def test_a_method_s_run_is_served_by_every_command(
     assert "flight-test-0" in (run / "report.html").read_text(encoding="utf-8")
 
     takes = view.load(run)
-    assert [take.name for take in takes] == ["flight-test-0"]
+    assert [take.name for take in takes] == ["flight-test-0", "turned-test-0"]
     server = serve(0)
     try:
         player = view.Player(server, takes)
