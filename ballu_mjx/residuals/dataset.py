@@ -42,7 +42,7 @@ class RecordingsData(loggers.LoggingOptions):
     """Recordings for the final table. Without this option, where --recordings are your own: those for validation."""
     robot: str | None = None
     """Whose recordings these are: the name of a robot that comes with the package, or the file of a description
-    (docs/own_robot.md). Without this option: ballu; with --resume, where there is that: the run's."""
+    (docs/own_robot.md). Without this option: the robot of --resume or --residual, where given, or else ballu."""
     actuators: Path = AUTO
     """File of identified actuators (`train sysid` writes it), or the word nominal, or auto: of actuators.json beside
     the recordings or in the folder above, if it names their robot, and nominal ones, those that replay the validation
