@@ -261,7 +261,7 @@ def figure(found: Mapping[str, Sequence[Evaluation]], path: Path) -> None:
 # %%
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="A residual for a tethered balloon in wind.")
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=["envmimic"], help="how residuals are learned")
+    parser.add_argument("--methods", nargs="*", choices=METHODS, default=["envmimic"], help="how residuals are learned")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="seeds of the trainings")
     parser.add_argument("--output", type=Path, default=Path("runs/tethered-balloon"), help="folder of all that is made")
     parser.add_argument("--quick", action="store_true", help="one seed, for seconds; the numbers mean little")
