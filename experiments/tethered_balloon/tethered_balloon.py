@@ -280,7 +280,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     reached = [h for h in HORIZONS if any(h in each.position for each in next(iter(found.values()))[0].vanilla)]
     figure(found, options.output / "errors.png")
     tables = {f"horizon-{horizon:g}": comparison(found, horizon) for horizon in reached}
-    _setup.write_tables(tables, options.output, options.results, {"training": seeds})
+    _setup.write_tables(tables, options.output, options.results, {"training": seeds} if options.methods else {})
 
 
 if __name__ == "__main__":
