@@ -31,7 +31,7 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.cli import train
-from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, read_evaluation
+from ballu_mjx.evaluation.errors import HORIZONS, Errors, Evaluation, read_evaluation
 from ballu_mjx.recordings.csv_format import write_recording
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription, read_description

@@ -512,7 +512,7 @@ def formats(work: Path) -> list[Format]:
 def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
     """The files of a run's folder."""
     from ballu_mjx.cli import compare, train_envmimic
-    from ballu_mjx.evaluation.errors_table import Errors, Evaluation, read_evaluation
+    from ballu_mjx.evaluation.errors import Errors, Evaluation, read_evaluation
     from ballu_mjx.recordings.csv_format import list_bundled
     from ballu_mjx.residuals.envmimic import EnvMimicConfig, check_envmimic_config
     from ballu_mjx.residuals.run_config import describe_run, find_recordings, run_actuators, run_residual
