@@ -13,7 +13,7 @@ import numpy as np
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.recordings.groups import group_of
-from ballu_mjx.robots.description import HORIZON_RANGE
+from ballu_mjx.robots.description_fields import HORIZON_RANGE
 
 HORIZONS = (1.0, 2.0, 5.0, 10.0, 20.0)
 """Seconds over which errors are taken, where neither robot nor recordings ask for others."""
