@@ -142,7 +142,7 @@ def _run(options: Import | Map | Check | Simulate | _Example) -> int:
     elif isinstance(options, Simulate):
         _simulate(options)
     else:
-        from ballu_mjx.recordings.importers.mapping import example_mapping
+        from ballu_mjx.recordings.importers.example_mapping import example_mapping
         from ballu_mjx.robots.registry import load_robot
 
         print(example_mapping(load_robot(options.robot)), end="")

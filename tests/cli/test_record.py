@@ -17,7 +17,7 @@ from ballu_mjx.ballu.gaits import GAITS
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.cli import record
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_recording
-from ballu_mjx.recordings.importers.mapping import example_mapping
+from ballu_mjx.recordings.importers.example_mapping import example_mapping
 from ballu_mjx.recordings.recording import Recording, cut
 from ballu_mjx.recordings.summary import find_gaps
 from ballu_mjx.robots.registry import load_robot

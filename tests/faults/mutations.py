@@ -411,7 +411,8 @@ def formats(work: Path) -> list[Format]:
     from ballu_mjx.evaluation import transfer
     from ballu_mjx.identification.actuators import ACTUATORS_FILE
     from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_recording
-    from ballu_mjx.recordings.importers.mapping import example_mapping, read_mapping
+    from ballu_mjx.recordings.importers.example_mapping import example_mapping
+    from ballu_mjx.recordings.importers.mapping import read_mapping
     from ballu_mjx.recordings.recording import cut
     from ballu_mjx.residuals.aerodynamics import AERODYNAMICS_FILE, AERODYNAMICS_FORMAT, read_air_parameters
     from ballu_mjx.residuals.trained import _read_observed
