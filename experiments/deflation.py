@@ -29,14 +29,14 @@ _setup.prepare()
 import fidelity
 import numpy as np
 
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.ballu.model import load_model
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.cli import train_aerodynamics
-from ballu_mjx.evaluation.errors_table import Evaluation, base_name
+from ballu_mjx.evaluation.errors import Evaluation, base_name
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
-from ballu_mjx.recordings.csv_format import read_recording, write_recording
+from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
@@ -52,17 +52,7 @@ from ballu_mjx.sim.simulator import Simulator
 # %%
 def recorded(job: dataset.Job, virtual: VirtualRobot, trial: int, folder: Path) -> Recording:
     """Some commands on a robot, in a draught of their own; recorded into `folder`."""
-    taken = virtual_robot.record(
-        virtual,
-        virtual_robot.draw_trial(trial),
-        virtual_robot.open_loop(job.commands),
-        len(job.commands) * CONTROL_TIMESTEP,
-        job.name,
-        job.notes,
-    )
-    path = folder / job.split / f"{job.name}.csv.gz"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_recording(taken, path, load_robot())
+    path = dataset.record_job(dataclasses.replace(job, trial=trial), virtual, folder)
     return read_recording(path, load_robot())  # which fills the gaps of hidden markers
 
 

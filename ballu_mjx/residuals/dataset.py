@@ -10,7 +10,7 @@ from pathlib import Path
 import mujoco
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.evaluation.errors_table import shortest_recording
+from ballu_mjx.evaluation.errors import shortest_recording
 from ballu_mjx.identification.actuators import AUTO, NOMINAL, find_actuators, read_actuators
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.groups import group_of

@@ -119,9 +119,8 @@ def fresh_jobs(seed: int, each: int = 6) -> list[Job]:
     ]
 
 
-def record_job(job: Job, robot_seed: int, output: Path) -> Path:
+def record_job(job: Job, robot: virtual_robot.VirtualRobot, output: Path) -> Path:
     """Record one job on a virtual robot, and write it below the folder of its split."""
-    robot = virtual_robot.draw_robot(robot_seed)
     recording = virtual_robot.record(
         robot,
         virtual_robot.draw_trial(job.trial),
@@ -158,5 +157,6 @@ def record_jobs(wanted: Sequence[Job], robot_seed: int, folder: Path) -> list[Pa
     """Record several jobs on all cores, and return their files in the same order."""
     if not wanted:
         return []
+    robot = virtual_robot.draw_robot(robot_seed)
     with multiprocessing.get_context("spawn").Pool() as pool:
-        return pool.starmap(record_job, [(job, robot_seed, folder) for job in wanted])
+        return pool.starmap(record_job, [(job, robot, folder) for job in wanted])
