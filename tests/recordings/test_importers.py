@@ -778,7 +778,12 @@ def test_json_is_read_alike(tmp_path: Path):
         ('robot = "r"', 'robot = "r"\n[axes]\nup = "-z"', ["[axes]", "left-handed"]),
         ('robot = "r"', 'robot = "r"\n[axes]\nup = "y"', ["[axes]", "same way"]),
         ('robot = "r"', 'robot = "r"\n[units]\nlength = "inch"', ["[units] length", "m, cm, mm"]),
-        ('robot = "r"', 'robot = "r"\n[units]\ntime = "ms"', ["[units] time", "time_unit", "[clock]"]),
+        ('robot = "r"', 'robot = "r"\n[units]\ntime = "min"', ["[units] time", "s, ms"]),
+        (
+            'robot = "r"',
+            'robot = "r"\n[units]\ntime = "ms"\n[clock]\ntime_unit = "ms"',
+            ["[clock] time_unit", "[units]", "leave"],
+        ),
         ('robot = "r"', 'robot = "r"\n[clock]\nepisode = -1', ["[clock] episode", "-1"]),
         ('robot = "r"', 'robot = "r"\nkind = "loose"', ["key kind", "free, suspended"]),
         ('robot = "r"', 'robot = "r"\nrate = 0', ["key rate", "positive"]),
@@ -799,6 +804,11 @@ def test_broken_mappings_are_refused(tmp_path: Path, old: str, new: str, said: l
     assert str(refusal.value).startswith(str(tmp_path / "room.toml"))
     for part in said:
         assert part in str(refusal.value)
+
+
+def test_a_mapping_of_an_earlier_version_has_the_unit_of_times_under_units(tmp_path: Path):
+    (tmp_path / "room.toml").write_text('robot = "r"\n[units]\ntime = "ms"\n' + BODIES)
+    assert read_mapping(tmp_path / "room.toml", ROBOT).clock.time_unit == "ms"
 
 
 VALUES = st.recursive(

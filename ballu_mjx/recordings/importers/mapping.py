@@ -148,10 +148,9 @@ def read_mapping(path: Path, robot: RobotDescription) -> RoomMapping:
     units = top.keys("units")
     length = units.choice("length", LENGTHS, None)
     angle = units.choice("angle", ANGLES, None)
-    if "time" in units.values:
-        units.bad("time", 'the unit of times is time_unit = "..." under [clock]')
+    time = units.choice("time", TIMES, None)  # where mappings before `[clock]` have it
     units.finish()
-    clock = _clock(top.keys("clock"))
+    clock = _clock(top.keys("clock"), time)
     sources = {role: _source(top.keys(role), role) for role in roles if role in content}
     for role in roles:
         if role not in sources and kind == "free":
@@ -342,11 +341,14 @@ def _joint(keys: _Keys, *, slides: bool) -> Joint:
     return Joint(column, sign, zero, slides)
 
 
-def _clock(keys: _Keys) -> Clock:
+def _clock(keys: _Keys, unit: str | None) -> Clock:
+    """Return the table `[clock]`; `unit` is that of `[units]`, None where it says none."""
+    if unit is not None and "time_unit" in keys.values:
+        keys.bad("time_unit", "time under [units] says the same; leave that one out")
     episode = keys.get("episode")
     if episode is not None and (isinstance(episode, bool) or not isinstance(episode, int) or not 0 <= episode < 2**31):
         keys.bad("episode", "write its number, such as 0")
-    clock = Clock(keys.optional_text("time"), keys.choice("time_unit", TIMES, "s") or "s", episode)
+    clock = Clock(keys.optional_text("time"), keys.choice("time_unit", TIMES, unit or "s") or "s", episode)
     keys.finish()
     return clock
 
