@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ballu_mjx.common.errors import InputError
-    from ballu_mjx.evaluation.errors_table import Evaluation
+    from ballu_mjx.evaluation.errors import Evaluation
     from ballu_mjx.evaluation.open_loop import evaluate
     from ballu_mjx.identification.actuators import identify_actuators
     from ballu_mjx.identification.guard import choose_actuators
@@ -56,7 +56,7 @@ _MODULES = {
     "AnalyticConfig": "residuals.analytic",
     "AugmentedSimulator": "sim.simulator",
     "EnvMimicConfig": "residuals.envmimic",
-    "Evaluation": "evaluation.errors_table",
+    "Evaluation": "evaluation.errors",
     "IdentifiedActuators": "robots.adapter",
     "InputError": "common.errors",
     "LocomotionConfig": "policies.locomotion_env",

@@ -115,7 +115,7 @@ def timeline(rows: list[dict[str, Any]], marks: dict[str, float], imported: floa
 def vanilla_ratio(folder: str) -> float:
     """A run's best validation error as a share of vanilla's, over its error as a share of its base's."""
     runtime.prepare()
-    from ballu_mjx.evaluation.errors_table import Evaluation
+    from ballu_mjx.evaluation.errors import Evaluation
     from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
     from ballu_mjx.recordings.csv_format import read_recording
     from ballu_mjx.recordings.reconstruct import reconstruct

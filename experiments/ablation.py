@@ -31,7 +31,7 @@ import numpy as np
 
 from ballu_mjx.ballu.actuators_file import read_actuators
 from ballu_mjx.ballu.virtual import dataset
-from ballu_mjx.evaluation.errors_table import SCORE_HORIZONS
+from ballu_mjx.evaluation.errors import SCORE_HORIZONS
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording

@@ -34,7 +34,7 @@ from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.cli import train_aerodynamics
-from ballu_mjx.evaluation.errors_table import Evaluation, base_name
+from ballu_mjx.evaluation.errors import Evaluation, base_name
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion

@@ -37,7 +37,7 @@ import numpy as np
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.common.results import Cell, Table
-from ballu_mjx.evaluation.errors_table import (
+from ballu_mjx.evaluation.errors import (
     SCORE_HORIZONS,
     Errors,
     Evaluation,

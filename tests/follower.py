@@ -13,13 +13,15 @@ from ballu_mjx.rl.ppo import Params
 
 
 class Follower(Env):
-    """A point mass pushed along a line, rewarded for staying at a place drawn at the start."""
+    """A point mass pushed along a line, rewarded for staying at a place drawn at the start. Like a robot without
+    joints, it has an array without entries in its state."""
 
     limit = 10
 
     def reset(self, rng: jax.Array) -> State:
         goal = jax.random.uniform(rng, (), minval=-1.0, maxval=1.0)
         physics = {"position": jnp.zeros(()), "velocity": jnp.zeros(()), "goal": goal, "time": jnp.zeros((), jnp.int32)}
+        physics["joints"] = jnp.zeros(0)
         zero = jnp.zeros(())
         return State(
             physics,  # pyright: ignore

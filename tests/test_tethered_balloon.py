@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ballu_mjx.cli import compare, evaluate, export, report, view
-from ballu_mjx.evaluation.errors_table import read_evaluation
+from ballu_mjx.evaluation.errors import read_evaluation
 from ballu_mjx.robots.description import read_description
 from ballu_mjx.viz.viser_scene import serve
 
@@ -60,7 +60,7 @@ def test_a_method_s_run_is_served_by_every_command(
     assert "flight-test-0" in (run / "report.html").read_text(encoding="utf-8")
 
     takes = view.load(run)
-    assert [take.name for take in takes] == ["flight-test-0"]
+    assert [take.name for take in takes] == ["flight-test-0", "turned-test-0"]
     server = serve(0)
     try:
         player = view.Player(server, takes)

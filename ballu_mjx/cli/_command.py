@@ -14,6 +14,7 @@ import tyro
 
 from ballu_mjx.cli._help import arranged, asks_for_help
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
 from ballu_mjx.residuals.run_config import run_robot
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.rl.resume_point import ResumePoint, find_resume_point
@@ -133,15 +134,21 @@ def run_command(commands: Mapping[str, TrainCommand], arguments: Sequence[str] |
         return stopped.status
 
 
-def load_chosen_robot(robot: str | None, resume: Path | None = None, task: str | None = None) -> RobotDescription:
-    """Return the robot of the option --robot (None: the default one), or that of the run of a `task` that goes on.
+def load_chosen_robot(
+    robot: str | None, resume: Path | None = None, task: str | None = None, residual: Path | None = None
+) -> RobotDescription:
+    """Return the robot of the option --robot, or that of the run of a `task` that goes on.
 
-    **Raises** `InputError` where there is no such robot, or both are given.
+    Without both it is the robot of the run of a `residual`, if there is one, and else the default one.
+
+    **Raises** `InputError` where there is no such robot, or both --robot and --resume are given.
     """
     if resume is not None and task is not None:
         if robot is not None:
             raise InputError("--robot does not go with --resume, which keeps the robot; leave one out.")
         return run_robot(read_config(resume, task), resume)
+    if robot is None and residual is not None:
+        return run_robot(read_config(residual, *RESIDUAL_TASKS), residual)
     found = load_robot(DEFAULT_ROBOT if robot is None else robot)
     check_simulates(found)
     return found

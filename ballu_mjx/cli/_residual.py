@@ -132,7 +132,7 @@ def prepare(
 
     **Raises** `InputError` for recordings, actuators or a base residual that cannot be used, naming them.
     """
-    robot = load_chosen_robot(data.robot, resume, task)
+    robot = load_chosen_robot(data.robot, resume, task, base)
     residual = None if base is None else TrainedResidual.load(base, robot)
     dataset = ResidualDataset.read(data, robot, resume)
     if residual is not None:

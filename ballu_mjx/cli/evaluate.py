@@ -18,7 +18,7 @@ from ballu_mjx.common import files, runtime
 from ballu_mjx.common.errors import InputError
 
 if TYPE_CHECKING:
-    from ballu_mjx.evaluation.errors_table import Errors
+    from ballu_mjx.evaluation.errors import Errors
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +105,7 @@ def _evaluate(options: Options) -> None:
 
 def noise_floor(floor: Sequence[Errors], errors: Sequence[Errors]) -> str:
     """For the terminal: by group and horizon, what noise alone makes of a simulator's errors, and what these are."""
-    from ballu_mjx.evaluation.errors_table import mean_by_group
+    from ballu_mjx.evaluation.errors import mean_by_group
 
     lines = [
         "Of these errors, those that the noise of motion capture (0.5 mm, 0.3 deg) in the starting states makes:",

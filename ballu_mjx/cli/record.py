@@ -142,7 +142,7 @@ def _run(options: Import | Map | Check | Simulate | _Example) -> int:
     elif isinstance(options, Simulate):
         _simulate(options)
     else:
-        from ballu_mjx.recordings.importers.mapping import example_mapping
+        from ballu_mjx.recordings.importers.example_mapping import example_mapping
         from ballu_mjx.robots.registry import load_robot
 
         print(example_mapping(load_robot(options.robot)), end="")
@@ -259,6 +259,7 @@ _ALIGNMENT_ERROR = 0.05
 def _write(options: Import, robot: RobotDescription, recording: Recording) -> None:
     """Write, and read back what was written: the format's own reader judges it."""
     from ballu_mjx.recordings.csv_format import read_recording, sidecar_path, write_recording
+    from ballu_mjx.recordings.summary import held_sites
 
     options.output.parent.mkdir(parents=True, exist_ok=True)
     write_recording(recording, options.output, robot)
@@ -272,7 +273,7 @@ def _write(options: Import, robot: RobotDescription, recording: Recording) -> No
         ) from error
     duration = read.time[-1] - read.time[0]
     filled = sum(read.interpolated.values())
-    held = "".join(f"; {count} samples of {sites} were held, not seen" for sites, count in _held(read))
+    held = "".join(f"; {count} samples of {sites} were held, not seen" for sites, count in held_sites(read))
     print(f"{options.output}: {duration:.2f} s, {filled} cells filled in when read{held}; `record check` tells more")
 
 
@@ -319,6 +320,7 @@ def _map(options: Map) -> None:
 
 def _check(options: Check) -> int:
     from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+    from ballu_mjx.recordings.summary import find_gaps, summarize_recording
     from ballu_mjx.robots.registry import load_robot
     from ballu_mjx.viz.recording import draw_recording
 
@@ -336,97 +338,13 @@ def _check(options: Check) -> int:
             print(error, file=sys.stderr)
             broken += 1
             continue
-        gaps = missing(path)
-        print(report(path, recording, robot, gaps))
+        gaps = find_gaps(path)
+        print(summarize_recording(path, recording, robot, gaps))
         if options.output is not None:
             figure = options.output / f"{recording.name}.png"
             draw_recording(figure, recording, robot, gaps)
             print(f"  drawn in {figure}")
     return 2 if broken else 0
-
-
-def missing(path: Path) -> dict[str, list[tuple[float, float]]]:
-    """Drop-outs by column of the recording's CSV: first and last time (s) without a sample."""
-    from ballu_mjx.recordings.importers.table import Table
-
-    table = Table(path)
-    time = table.column("time")
-    found: dict[str, list[tuple[float, float]]] = {}
-    for name in table.header:
-        edges = np.diff(np.concatenate([[0], np.isnan(table.column(name)), [0]]))
-        starts, ends = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0) - 1
-        if len(starts):
-            found[name] = [(float(time[a]), float(time[b])) for a, b in zip(starts, ends, strict=True)]
-    return found
-
-
-def report(
-    path: Path, recording: Recording, robot: RobotDescription, gaps: dict[str, list[tuple[float, float]]]
-) -> str:
-    """What a recording holds, in lines."""
-    time = recording.time
-    steps = np.diff(time)
-    step = float(np.median(steps))
-    jitter = 1e3 * float(np.sqrt(np.mean((steps - step) ** 2)))
-    lines = [
-        f"{path}: {recording.kind}, {recording.robot}",
-        f"  {time[-1] - time[0]:.2f} s, {len(time)} samples, {1 / step:.4g} Hz, jitter {jitter:.2f} ms, "
-        f"longest step {1e3 * steps.max():.3g} ms",
-    ]
-    if any(recording.trimmed):
-        lines.append(f"  rows left out, for something is not seen there: {recording.trimmed[0]} at the start, "
-                     f"{recording.trimmed[1]} at the end")  # fmt: skip
-    groups: dict[tuple[tuple[float, float], ...], list[str]] = {}
-    for name, spans in gaps.items():
-        groups.setdefault(tuple(spans), []).append(name)
-    for spans, names in groups.items():
-        lengths = [b - a + step for a, b in spans]
-        shown = names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
-        told = f"{len(spans)} drop-outs, {sum(lengths):.2f} s in all, the longest {max(lengths):.2f} s"
-        lines.append(f"  {shown}: " + (told if len(spans) > 1 else f"1 drop-out of {lengths[0]:.2f} s"))
-    for sites, count in _held(recording):
-        lines.append(f"  {sites}: {count} samples repeat the one before to the last digit; taken as not seen")
-    if not gaps and not recording.held:
-        lines.append("  no drop-outs")
-    for label, value in _ranges(recording, robot):
-        low, high = value.min(axis=0), value.max(axis=0)
-        lines.append(f"  {label}: " + ", ".join(f"{a:.3f} to {b:.3f}" for a, b in zip(low, high, strict=True)))
-    for name, command in zip(robot.commands, recording.command.T, strict=True):
-        changes = int((np.diff(command) != 0).sum())
-        held = (time[-1] - time[0]) / (changes + 1)
-        lines.append(
-            f"  command_{name}: {command.min():.2f} to {command.max():.2f}, mean {command.mean():.2f}, "
-            f"{changes} changes, held for {held:.2f} s on average"
-        )
-    return "\n".join(lines)
-
-
-def _held(recording: Recording) -> list[tuple[str, int]]:
-    """Sites that were held alike, and for how many samples."""
-    alike: dict[int, list[str]] = {}
-    for site, count in recording.held.items():
-        alike.setdefault(count, []).append(site)
-    return [(", ".join(sites), count) for count, sites in alike.items()]
-
-
-def _ranges(recording: Recording, robot: RobotDescription) -> list[tuple[str, np.ndarray]]:
-    """Columns by what they are called in a report; orientations are unwound."""
-    from scipy.spatial.transform import Rotation
-
-    def degrees(quaternion: np.ndarray) -> np.ndarray:
-        angles = Rotation.from_quat(quaternion, scalar_first=True).as_euler("ZYX", degrees=True)
-        return np.unwrap(angles, axis=0, period=360.0)
-
-    places = {robot.tracked: recording.tracked_position, **recording.points}
-    turns = {robot.tracked: recording.tracked_quaternion, **recording.orientations}
-    values = []
-    for site in (robot.tracked, *robot.points):
-        if (place := places.get(site)) is not None:
-            values.append((f"{site} x, y, z (m)", place))
-        if (quaternion := turns.get(site)) is not None:
-            values.append((f"{site} yaw, pitch, roll (deg)", degrees(quaternion)))
-    values += [(f"{joint} (rad or m)", angle[:, None]) for joint, angle in recording.joint_angles.items()]
-    return values
 
 
 # ---- simulate ----
@@ -435,6 +353,7 @@ def _ranges(recording: Recording, robot: RobotDescription) -> list[tuple[str, np
 def _simulate(options: Simulate) -> None:
     from ballu_mjx.ballu.virtual import robot as virtual_robot
     from ballu_mjx.recordings.csv_format import read_recording, recording_name, write_recording
+    from ballu_mjx.recordings.summary import find_gaps, summarize_recording
     from ballu_mjx.robots.registry import load_robot
 
     _check_output(options.output)
@@ -463,7 +382,8 @@ def _simulate(options: Simulate) -> None:
         )
     options.output.parent.mkdir(parents=True, exist_ok=True)
     write_recording(result, options.output, robot, decimals=4)
-    print(report(options.output, read_recording(options.output, robot), robot, missing(options.output)))
+    recording, gaps = read_recording(options.output, robot), find_gaps(options.output)
+    print(summarize_recording(options.output, recording, robot, gaps))
 
 
 def _commands(options: Simulate, robot: RobotDescription) -> tuple[Float[np.ndarray, "steps 2"], str]:

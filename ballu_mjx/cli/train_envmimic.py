@@ -50,7 +50,7 @@ def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
     distributed.join(data)
     if data.preset is not None and data.resume is not None:
         raise InputError("--preset does not go with --resume, which keeps the run's options; leave one out.")
-    robot = load_chosen_robot(data.robot, data.resume, "envmimic")
+    robot = load_chosen_robot(data.robot, data.resume, "envmimic", data.residual)
     check_envmimic_options(env, ppo, data.validate_every, robot.control_timestep)
     check_force_set(env.forces, robot)
     start = start_from("envmimic", data, ppo)

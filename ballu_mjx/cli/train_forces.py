@@ -7,14 +7,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ballu_mjx.cli._command import TrainCommand
+from ballu_mjx.cli._command import TrainCommand, load_chosen_robot
 from ballu_mjx.cli._residual import Prepared, settle, train_residual
 from ballu_mjx.residuals.analytic import AnalyticConfig, check_analytic_config
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.force_fitting import fit_analytic, fit_supervised, network_sections
 from ballu_mjx.residuals.supervised import SupervisedConfig, check_supervised_config
 from ballu_mjx.residuals.trained import TrainedResidual
-from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
 from ballu_mjx.runs.metrics import read_column
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import TrainingRecord
@@ -54,7 +53,7 @@ def train_supervised(data: ForcesData, fit: SupervisedConfig) -> int:
 
 def train_analytic(data: ForcesData, fit: AnalyticConfig) -> int:
     """Read and check everything, learn, evaluate; returns the exit status."""
-    check_analytic_config(fit, load_robot(data.robot or DEFAULT_ROBOT).control_timestep)
+    check_analytic_config(fit, load_chosen_robot(data.robot, residual=data.residual).control_timestep)
     return _train("analytic", data, fit, fit_analytic)
 
 
@@ -87,7 +86,7 @@ def _train(
         print(f"Best checkpoint: gradient step {residual.step:,}. ", end="")
 
     env, network = network_sections(data.forces, fit.seed)
-    check_force_set(data.forces, load_robot(data.robot or DEFAULT_ROBOT))
+    check_force_set(data.forces, load_chosen_robot(data.robot, residual=data.residual))
 
     def sections(prepared: Prepared) -> Mapping[str, Any]:
         nonlocal env

@@ -51,7 +51,7 @@ class Data(loggers.LoggingOptions, distributed.DistributedOptions):
 
     robot: str | None = None
     """Whose policy this is: the name of a robot that comes with the package, or the file of a description
-    (docs/own_robot.md). Without this option: ballu; with --resume: the run's."""
+    (docs/own_robot.md). Without this option: the robot of --resume or --residual, or else ballu."""
     actuators: Path = AUTO
     """File of identified actuators (`train sysid` writes it), or the word nominal, or auto: the residual's if there is
     one, else nominal."""
@@ -75,7 +75,7 @@ def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
     distributed.join(data)
     loggers.check(data.wandb)
     start = start_from(task.name, data, ppo)
-    robot = load_chosen_robot(data.robot, data.resume, task.name)
+    robot = load_chosen_robot(data.robot, data.resume, task.name, data.residual)
     check_task(task, robot)
     check_policy_options(env, ppo, data.keep_every, robot)
     identified, where = _parts(task, data, robot)

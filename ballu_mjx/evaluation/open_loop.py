@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
 from ballu_mjx.common.rotations import quaternion_conjugate, quaternion_product
-from ballu_mjx.evaluation.errors_table import (
+from ballu_mjx.evaluation.errors import (
     Errors,
     Evaluation,
     base_name,

@@ -66,7 +66,7 @@ class Transfer:
     """Robot (m, paper, Table II)."""
     yaw_error: float
     """Final yaw in simulation less the robot's (deg, signed, paper, Table II); full turns count. Errors of yaw in
-    `errors_table` are wrapped to 180 deg instead."""
+    `errors` are wrapped to 180 deg instead."""
     yaw_change: float
     """Robot (deg, paper, Table II); full turns count."""
     sim_x_distance: float

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.evaluation.errors_table import shortest_recording
+from ballu_mjx.evaluation.errors import shortest_recording
 from ballu_mjx.identification.actuators import AUTO, NOMINAL, find_actuators, read_actuators
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.groups import group_of
@@ -41,7 +41,7 @@ class RecordingsData(loggers.LoggingOptions):
     """Recordings for the final table. Without this option, where --recordings are your own: those for validation."""
     robot: str | None = None
     """Whose recordings these are: the name of a robot that comes with the package, or the file of a description
-    (docs/own_robot.md). Without this option: ballu; with --resume, where there is that: the run's."""
+    (docs/own_robot.md). Without this option: the robot of --resume or --residual, where given, or else ballu."""
     actuators: Path = AUTO
     """File of identified actuators (`train sysid` writes it), or the word nominal, or auto: of actuators.json beside
     the recordings or in the folder above, if it names their robot, and nominal ones, those that replay the validation

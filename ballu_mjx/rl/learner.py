@@ -161,7 +161,9 @@ class Learner:
         for path, leaf in jax.tree.leaves_with_path(shapes):
             name = _name(path)
             found = stored.get(name)
-            fits[name] = found is not None and (found.shape, found.dtype) == (leaf.shape, leaf.dtype)
+            fits[name] = 0 in leaf.shape or (
+                found is not None and (found.shape, found.dtype) == (leaf.shape, leaf.dtype)
+            )
             if name.split(".")[0] in ("environments", "key"):
                 drawn.add(name)
         for name in fits.keys() - drawn:
@@ -172,6 +174,8 @@ class Learner:
 
         def choose(path: Any, leaf: Any) -> Any:
             name = _name(path)
+            if 0 in leaf.shape:
+                return np.zeros(leaf.shape, leaf.dtype)
             return leaf if name in drawn and not whole else np.array(stored[name])
 
         template = shapes if whole else self.init(_seed(self._config, steps))
@@ -379,8 +383,10 @@ def params(state: TrainingState) -> Params:
 
 
 def stored(state: TrainingState) -> dict[str, np.ndarray]:
-    """All of `state`, copied to the host, for `Learner.resume`; all processes must ask for it."""
-    return {_name(path): distributed.on_host(leaf) for path, leaf in jax.tree.leaves_with_path(state)}
+    """All of `state`, copied to the host, for `Learner.resume`; all processes must ask for it. Arrays without entries
+    are left out, which checkpoints cannot hold."""
+    arrays = {_name(path): distributed.on_host(leaf) for path, leaf in jax.tree.leaves_with_path(state)}
+    return {name: array for name, array in arrays.items() if array.size}
 
 
 def with_learning_rate(stored: Stored, rate: float) -> dict[str, np.ndarray]:

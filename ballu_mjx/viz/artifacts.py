@@ -13,7 +13,7 @@ from ballu_mjx.common import files
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, write_rollouts
 
 if TYPE_CHECKING:
-    from ballu_mjx.evaluation.errors_table import Evaluation
+    from ballu_mjx.evaluation.errors import Evaluation
     from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
 
 

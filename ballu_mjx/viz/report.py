@@ -21,7 +21,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, read_rollouts
 
 if TYPE_CHECKING:
-    from ballu_mjx.evaluation.errors_table import Errors
+    from ballu_mjx.evaluation.errors import Errors
 
 
 REPORT_FILE = "report.html"
@@ -183,7 +183,7 @@ def _add_evaluation(content: Content, folder: Path, prefix: str = "") -> None:
     path = folder / "evaluation.json"
     if not path.is_file():
         return
-    from ballu_mjx.evaluation.errors_table import read_evaluation
+    from ballu_mjx.evaluation.errors import read_evaluation
     from ballu_mjx.viz.style import label_of
 
     found = read_evaluation(path)
@@ -233,7 +233,7 @@ def _add_identification(content: Content, folder: Path) -> None:
 
 def _horizons(title: str, names: tuple[str, str], without: Errors, mimic: Errors, angle: str) -> Table:
     """One recording's errors by horizon: mean over the starts, without and with the residual, and their ratio."""
-    from ballu_mjx.evaluation.errors_table import quotient
+    from ballu_mjx.evaluation.errors import quotient
 
     header = ["horizon (s)"]
     shown = [each for each in _QUANTITIES if getattr(without, each[0])]

@@ -4,10 +4,12 @@
 # Not a biped: a balloon on a tether of two rods, with two propellers. Its model (`balloon.xml`) knows no air. The
 # "real" one flies in wind, with the drag of MuJoCo's ellipsoid fluid model and gusts that come and go. From recordings
 # of it, in the project's format, the project's own command learns the forces that its simulator lacks; all that it is
-# told of the robot stands in `balloon.robot.json`. The table gives errors on recordings that training never saw.
+# told of the robot stands in `balloon.robot.json`. The table gives errors on recordings that training never saw: in the
+# wind of the training recordings, and in another wind. A rival is the best constant wrench: a steady wind pushes much
+# the same all the time.
 #
-# `python experiments/tethered_balloon/tethered_balloon.py` takes some minutes a seed on two cores. `--quick` shows
-# that it works. `--method` learns by another residual method than EnvMimic.
+# `python experiments/tethered_balloon/tethered_balloon.py` takes some minutes a method and seed on two cores. `--quick`
+# shows that it works. `--methods` names residual methods.
 
 # %%
 from __future__ import annotations
@@ -15,7 +17,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 FOLDER = Path("experiments/tethered_balloon") if "ipykernel" in sys.modules else Path(__file__).parent
@@ -25,17 +27,24 @@ import _setup
 
 _setup.prepare()
 
+import collect_runs
+import jax.numpy as jnp
 import mujoco
 import numpy as np
+from _constant_wrench import fit_constant_wrench
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.cli import train
-from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation, read_evaluation
-from ballu_mjx.recordings.csv_format import write_recording
+from ballu_mjx.common.results import Cell, Table
+from ballu_mjx.evaluation.errors import Evaluation, read_evaluation
+from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
+from ballu_mjx.recordings.csv_format import list_recordings, read_recording, write_recording
+from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.runs.checkpoints import list_checkpoints
+from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.viz.style import colour_of, label_of
 
 DESCRIPTION = FOLDER / "balloon.robot.json"
@@ -46,6 +55,8 @@ DESCRIPTION = FOLDER / "balloon.robot.json"
 # %%
 WIND = np.array([0.6, 0.3, 0.0])
 """Mean wind, m/s."""
+OTHER_WIND = np.array([-0.2, 0.5, 0.0])
+"""Mean wind (m/s) of test flights that training has no example of."""
 GUSTS = 0.1
 """Standard deviation of the wind's strength, as a part of it; gusts last some 4 s."""
 RATE = 100
@@ -69,8 +80,8 @@ def commands(rng: np.random.Generator, steps: int) -> np.ndarray:
     return np.stack([np.repeat(levels[:, side], lengths[:, side])[:steps] for side in range(2)], axis=1)
 
 
-def record(description: RobotDescription, name: str, seconds: float, seed: int) -> Recording:
-    """A flight in today's wind, after half a minute in which it has found its place there."""
+def record(description: RobotDescription, name: str, seconds: float, seed: int, wind: np.ndarray) -> Recording:
+    """A flight in a wind, after half a minute in which it has found its place there."""
     rng = np.random.default_rng(seed)
     model = real(description)
     data = mujoco.MjData(model)
@@ -82,7 +93,7 @@ def record(description: RobotDescription, name: str, seconds: float, seed: int) 
     places, turns = [], []
     for row in range(before + steps):
         gust = decay * gust + np.sqrt(1 - decay**2) * GUSTS * rng.normal()
-        model.opt.wind[:] = (1 + gust) * WIND
+        model.opt.wind[:] = (1 + gust) * wind
         data.ctrl[:] = sent[row]
         if row >= before:
             mujoco.mj_kinematics(model, data)
@@ -96,7 +107,7 @@ def record(description: RobotDescription, name: str, seconds: float, seed: int) 
         name=name,
         kind="free",
         robot="tethered-balloon-0",
-        notes=f"Simulated; wind {WIND.tolist()} m/s.",
+        notes=f"Simulated; wind {wind.tolist()} m/s.",
         time=np.arange(steps) / RATE,
         command=sent[before:],
         tracked_position=seen[:, 0],
@@ -110,13 +121,20 @@ FLIGHTS = {"training": (6, 20.0), "validation": (2, 12.0), "test": (3, 22.0)}
 QUICK_FLIGHTS = {use: (1, 6.0) for use in FLIGHTS}
 
 
+GROUPS = {"flight": "the same wind", "turned": "another wind"}
+"""What the first words of recordings' names mean."""
+
+
 def record_all(description: RobotDescription, folder: Path, quick: bool) -> None:
-    """Recordings for training, validation and test."""
+    """Recordings for training, validation and test; those for test in both winds."""
     for number_of_use, (use, (count, seconds)) in enumerate((QUICK_FLIGHTS if quick else FLIGHTS).items()):
         (folder / use).mkdir(parents=True, exist_ok=True)
-        for number in range(count):
-            flight = record(description, f"flight-{use}-{number}", seconds, 100 * number_of_use + number)
-            write_recording(flight, folder / use / f"{flight.name}.csv.gz", description)
+        winds = {"flight": WIND, **({"turned": OTHER_WIND} if use == "test" else {})}
+        for number_of_wind, (group, wind) in enumerate(winds.items()):
+            for number in range(count):
+                seed = 1000 * number_of_wind + 100 * number_of_use + number
+                flight = record(description, f"{group}-{use}-{number}", seconds, seed, wind)
+                write_recording(flight, folder / use / f"{flight.name}.csv.gz", description)
 
 
 # %% [markdown]
@@ -134,6 +152,14 @@ METHODS = {
 }
 """Beginnings of the commands, by method."""
 _FEW = ["--num-timesteps", "4000", "--num-envs", "16", "--batch-size", "16", "--num-minibatches", "4"]
+LABELS = {"envmimic-force": "EnvMimic, a force alone", "envmimic-multi": "EnvMimic, forces at balloon and knot"}
+SEEDED = ("envmimic", "supervised", "analytic")
+"""Subcommands that draw random numbers."""
+STYLES = {name: {"color": colour_of(name)} for name in ("vanilla",)} | {
+    label_of(name): {"color": colour_of(name)}
+    for name in ("envmimic", "supervised", "analytic", "aerodynamic", "fluid")
+}
+"""The project's colours, by label."""
 QUICK = {
     "envmimic": _FEW,
     "supervised": ["--updates", "50"],
@@ -153,7 +179,7 @@ def arguments_of(recordings: Path, run: Path, method: str, seed: int, quick: boo
     options = ["--robot", str(DESCRIPTION), "--output", str(run)]
     for option, use in (("recordings", "training"), ("validation", "validation"), ("test", "test")):
         options += [f"--{option}", str(recordings / use)]
-    if command[0] in ("envmimic", "supervised", "analytic"):  # the others draw nothing
+    if command[0] in SEEDED:
         options += ["--seed", str(seed)]
     return [*command, *options, *(QUICK[command[0]] if quick else [])]
 
@@ -167,67 +193,94 @@ def learn(recordings: Path, run: Path, method: str, seed: int, quick: bool) -> E
     return read_evaluation(run / "evaluation.json")
 
 
-def errors(found: tuple[Errors, ...], quantity: str, horizon: float) -> float:
-    """Mean over recordings of the RMSE (m or deg) over a horizon (s)."""
-    return float(np.mean([getattr(each, quantity)[horizon][0] for each in found if horizon in each.position]))
+def constant_wrench(description: RobotDescription, recordings: Path) -> Evaluation:
+    """The evaluation of the rival that has no more than six numbers."""
+    simulator = Simulator(description)
+    motions = {
+        use: [
+            reconstruct(read_recording(path, description), description) for path in list_recordings([recordings / use])
+        ]
+        for use in ("training", "test")
+    }
+    model, params = fit_constant_wrench(simulator, motions["training"])
+    print(f"Constant wrench: {np.round(params, 4).tolist()} N, N m.")
+    return OpenLoopEvaluator(simulator, motions["test"], model)(jnp.asarray(params, jnp.float32))
 
 
 # %% [markdown]
 # ## Table and figure
 
+# %%
+HORIZONS = (1.0, 5.0, 20.0)
+"""s, of the table."""
+
+
+def comparison(found: Mapping[str, Sequence[Evaluation]], horizon: float) -> Table:
+    """Return vanilla's errors after a horizon (s), and what each simulator leaves of them; a value a seed."""
+    first = next(iter(found.values()))[0]
+    columns = [(group, quantity) for group in GROUPS for quantity in ("position", "orientation")]
+    without = {column: collect_runs.group_mean(first.vanilla, *column, horizon) for column in columns}
+    forms = {"position": (".3f", "m"), "orientation": (".1f", "deg")}
+    rows: list[tuple[Cell | str, ...]] = [
+        ("vanilla", *(Cell((without[column],), *forms[column[1]]) for column in columns))
+    ]
+    for label, runs in found.items():
+        left = [
+            [collect_runs.group_mean(run.residual, *column, horizon) / without[column] for run in runs]
+            for column in columns
+        ]
+        rows.append((label, *(Cell(tuple(values)) for values in left)))
+    return Table((f"{horizon:g} s", *(f"{GROUPS[group]}: {q}" for group, q in columns)), tuple(rows))
+
+
+def figure(found: Mapping[str, Sequence[Evaluation]], path: Path) -> None:
+    """Draw position errors over the horizon, mean and range over seeds, a panel a wind."""
+    drawing = Figure(figsize=(9.0, 3.8), layout="constrained")
+    first = next(iter(found.values()))[0]
+    for axis, group in zip(drawing.subplots(1, len(GROUPS), sharey=True), GROUPS, strict=True):
+        horizons = sorted({h for each in first.vanilla if each.group == group for h in each.position})
+        curves = {
+            "vanilla": [first.vanilla],
+            **{label: [run.residual for run in runs] for label, runs in found.items()},
+        }
+        for label, sides in curves.items():
+            values = np.array(
+                [[collect_runs.group_mean(side, group, "position", h) for h in horizons] for side in sides]
+            )
+            (line,) = axis.plot(horizons, values.mean(axis=0), marker="o", label=label, **STYLES.get(label, {}))
+            axis.fill_between(horizons, values.min(0), values.max(0), color=line.get_color(), alpha=0.2, linewidth=0)
+        axis.set(title=GROUPS[group], xlabel="horizon (s)", xscale="log", ylim=(0, None))
+        axis.set_xticks(horizons, [f"{horizon:g}" for horizon in horizons])
+        axis.minorticks_off()
+        axis.grid(alpha=0.3)
+    drawing.axes[0].set_ylabel("position RMSE (m)")
+    drawing.axes[0].legend()
+    drawing.savefig(path, dpi=120)
+
 
 # %%
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="A residual for a tethered balloon in wind.")
-    parser.add_argument("--method", choices=METHODS, default="envmimic", help="how the residual is learned")
+    parser.add_argument("--methods", nargs="*", choices=METHODS, default=["envmimic"], help="how residuals are learned")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="seeds of the trainings")
     parser.add_argument("--output", type=Path, default=Path("runs/tethered-balloon"), help="folder of all that is made")
     parser.add_argument("--quick", action="store_true", help="one seed, for seconds; the numbers mean little")
+    parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     options = parser.parse_args(arguments)
 
     description = read_description(DESCRIPTION)
     recordings = options.output / "recordings"
     record_all(description, recordings, options.quick)
     seeds = options.seeds[:1] if options.quick else options.seeds
-    method = options.method
-    found = [learn(recordings, options.output / f"{method}-{seed}", method, seed, options.quick) for seed in seeds]
-    name = METHODS[method][0]
-
-    horizons = [h for h in HORIZONS if any(h in each.position for each in found[0].vanilla)]
-    lines = [
-        f"| horizon (s) | vanilla: m, deg | {label_of(name)}: m, deg | left of vanilla's: position | yaw |",
-        "| ---: | --- | --- | --- | --- |",
-    ]
-    curves: dict[str, list[list[float]]] = {"vanilla": [], name: []}
-    for horizon in horizons:
-        absolute, left = [], []
-        for quantity in ("position", "orientation"):
-            without = errors(found[0].vanilla, quantity, horizon)
-            each = [errors(result.residual, quantity, horizon) for result in found]
-            absolute.append((without, float(np.mean(each))))
-            low, mean, high = np.array([np.min(each), np.mean(each), np.max(each)]) / without
-            left.append(f"{mean:.2f} [{low:.2f}, {high:.2f}]")
-            if quantity == "position":
-                curves["vanilla"].append([without])
-                curves[name].append(each)
-        (place, place_with), (yaw, yaw_with) = absolute
-        lines.append(
-            f"| {horizon:g} | {place:.3f}, {yaw:.1f} | {place_with:.3f}, {yaw_with:.1f} | {' | '.join(left)} |"
-        )
-    text = "\n".join(lines)
-    figure = Figure(figsize=(6.0, 4.0), layout="constrained")
-    axis = figure.subplots()
-    for name, values in curves.items():
-        mean, low, high = (reduce(np.array(values), axis=1) for reduce in (np.mean, np.min, np.max))
-        axis.plot(horizons, mean, color=colour_of(name), marker="o", label=label_of(name))
-        axis.fill_between(horizons, low, high, color=colour_of(name), alpha=0.2, linewidth=0)
-    axis.set(xlabel="horizon (s)", ylabel="position RMSE (m)", xscale="log", ylim=(0, None))
-    axis.set_xticks(horizons, [f"{horizon:g}" for horizon in horizons])
-    axis.minorticks_off()
-    axis.grid(alpha=0.3)
-    axis.legend()
-    figure.savefig(options.output / "errors.png", dpi=120)
-    _setup.write_table(text, options.output)
+    found = {"best constant wrench": [constant_wrench(description, recordings)]}
+    for method in options.methods:
+        own = seeds if METHODS[method][0] in SEEDED else seeds[:1]
+        runs = [learn(recordings, options.output / f"{method}-{seed}", method, seed, options.quick) for seed in own]
+        found[LABELS.get(method, label_of(METHODS[method][0]))] = runs
+    reached = [h for h in HORIZONS if any(h in each.position for each in next(iter(found.values()))[0].vanilla)]
+    figure(found, options.output / "errors.png")
+    tables = {f"horizon-{horizon:g}": comparison(found, horizon) for horizon in reached}
+    _setup.write_tables(tables, options.output, options.results, {"training": seeds} if options.methods else {})
 
 
 if __name__ == "__main__":

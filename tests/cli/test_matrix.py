@@ -14,7 +14,7 @@ import pytest
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
 from ballu_mjx.cli import train_policy, view
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation
+from ballu_mjx.evaluation.errors import HORIZONS, Errors, Evaluation
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, num_observations
 from ballu_mjx.recordings.csv_format import list_bundled

@@ -17,8 +17,9 @@ from ballu_mjx.ballu.gaits import GAITS
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.cli import record
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_recording
-from ballu_mjx.recordings.importers.mapping import example_mapping
+from ballu_mjx.recordings.importers.example_mapping import example_mapping
 from ballu_mjx.recordings.recording import Recording, cut
+from ballu_mjx.recordings.summary import find_gaps
 from ballu_mjx.robots.registry import load_robot
 
 ROLES = ("balloon", "base", "foot_left", "foot_right")
@@ -187,7 +188,7 @@ def test_check_counts_what_is_missing(tmp_path: Path, recorded: Recording, capsy
     base[100:112] = base[500:503] = np.nan
     hidden = dataclasses.replace(recorded, points={**recorded.points, "base": base})
     write_recording(hidden, tmp_path / "walk.csv", load_robot())
-    gaps = record.missing(tmp_path / "walk.csv")
+    gaps = find_gaps(tmp_path / "walk.csv")
     assert gaps == {f"base_{axis}": [(1.0, 1.11), (5.0, 5.02)] for axis in "xyz"}
     assert record.main(["check", str(tmp_path), "--output", str(tmp_path / "figures")]) == 0
     said = capsys.readouterr().out

@@ -411,7 +411,8 @@ def formats(work: Path) -> list[Format]:
     from ballu_mjx.evaluation import transfer
     from ballu_mjx.identification.actuators import ACTUATORS_FILE
     from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_recording
-    from ballu_mjx.recordings.importers.mapping import example_mapping, read_mapping
+    from ballu_mjx.recordings.importers.example_mapping import example_mapping
+    from ballu_mjx.recordings.importers.mapping import read_mapping
     from ballu_mjx.recordings.recording import cut
     from ballu_mjx.residuals.aerodynamics import AERODYNAMICS_FILE, AERODYNAMICS_FORMAT, read_air_parameters
     from ballu_mjx.residuals.trained import _read_observed
@@ -512,7 +513,7 @@ def formats(work: Path) -> list[Format]:
 def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
     """The files of a run's folder."""
     from ballu_mjx.cli import compare, train_envmimic
-    from ballu_mjx.evaluation.errors_table import Errors, Evaluation, read_evaluation
+    from ballu_mjx.evaluation.errors import Errors, Evaluation, read_evaluation
     from ballu_mjx.recordings.csv_format import list_bundled
     from ballu_mjx.residuals.envmimic import EnvMimicConfig, check_envmimic_config
     from ballu_mjx.residuals.run_config import describe_run, find_recordings, run_actuators, run_residual

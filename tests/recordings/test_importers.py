@@ -24,7 +24,8 @@ from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.importers.c3d import read_c3d
 from ballu_mjx.recordings.importers.c3d_file import C3DError, read_c3d_points
 from ballu_mjx.recordings.importers.capture import read_commands, select
-from ballu_mjx.recordings.importers.mapping import Commands, RoomMapping, Source, example_mapping, read_mapping
+from ballu_mjx.recordings.importers.example_mapping import example_mapping
+from ballu_mjx.recordings.importers.mapping import Commands, RoomMapping, Source, read_mapping
 from ballu_mjx.recordings.importers.placement import place, with_commands
 from ballu_mjx.recordings.importers.table import open_table
 from ballu_mjx.recordings.importers.trajectories import rigid_body

@@ -359,6 +359,16 @@ def test_qualisys_markers(tmp_path: Path, robot: RobotDescription):
     same(imported(tmp_path, write_qualisys_markers(tmp_path), robot, {line: line + geometry + " #"}), gaps=True)
 
 
+def test_markers_of_other_names_are_taken_for_the_one_body(tmp_path: Path, robot: RobotDescription):
+    """All but the point's marker are: the mapping says that this is a guess, and the import takes it."""
+    write_log(tmp_path)
+    path = write_qualisys_markers(tmp_path)
+    path.write_text(path.read_text().replace("hull", "rig"))
+    line = 'markers = ["rig1", "rig2", "rig3", "rig4"]'
+    guessed = f"{line}  # a guess: keep three or more that sit on the body"
+    same(imported(tmp_path, path, robot, {guessed: f"{line}\ngeometry = {list(CORNERS.values())}"}), gaps=True)
+
+
 def test_archives(tmp_path: Path, robot: RobotDescription):
     same(imported(tmp_path, write_npz(tmp_path), robot), gaps=True)
 

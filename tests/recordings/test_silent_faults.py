@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.cli.record import report
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.recordings.summary import summarize_recording
 from ballu_mjx.robots.description import RobotDescription, read_description
 
 _MODEL = """
@@ -85,7 +85,7 @@ def test_held_poses_are_filled_in_as_gaps(robot: RobotDescription, seed: int, st
     gaps["nose"][start : start + count] = np.nan
     expected = through_a_file(dataclasses.replace(whole, points=gaps), robot)
     np.testing.assert_allclose(found.points["nose"], expected.points["nose"], atol=2e-5)
-    told = report(Path("flight.csv"), found, robot, {})
+    told = summarize_recording(Path("flight.csv"), found, robot, {})
     assert f"hull, nose: {count} samples repeat the one before" in told and "no drop-outs" not in told
 
 

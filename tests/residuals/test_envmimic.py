@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, ActuatorParameters, load_model, standing_qpos
-from ballu_mjx.evaluation.errors_table import Errors, Evaluation, mean_by_group
+from ballu_mjx.evaluation.errors import Errors, Evaluation, mean_by_group
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions

@@ -380,5 +380,7 @@ def test_envmimic_runs_from_files_to_an_evaluation(tmp_path: Path, capsys: pytes
     capsys.readouterr()
     assert evaluate.main([str(tmp_path / "run")]) == 0
     assert f"{stored['residual'][0]['position']['5.0'][0]:.3f}" in capsys.readouterr().out
-    assert train.main(["walk", "--residual", str(tmp_path / "run")]) == 2
+    assert train.main(["walk", "--robot", "ballu", "--residual", str(tmp_path / "run")]) == 2
     assert "is of the robot tethered balloon, not of BALLU" in capsys.readouterr().err
+    assert train.main(["walk", "--residual", str(tmp_path / "run")]) == 2  # whose robot is known
+    assert "needs a free-floating robot; tethered balloon is anchored" in capsys.readouterr().err

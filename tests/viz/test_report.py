@@ -26,7 +26,7 @@ from PIL import Image
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.cli import train_envmimic, train_policy, view
 from ballu_mjx.cli.report import main
-from ballu_mjx.evaluation.errors_table import HORIZONS, Errors, Evaluation
+from ballu_mjx.evaluation.errors import HORIZONS, Errors, Evaluation
 from ballu_mjx.evaluation.transfer import Transfer, walking_table
 from ballu_mjx.policies import pipeline_layout
 from ballu_mjx.policies.locomotion_env import LocomotionConfig

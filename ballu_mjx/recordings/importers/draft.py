@@ -122,6 +122,12 @@ def _role(contents: Contents, role: str, roles: Sequence[str], tracked: str) -> 
         return _Part([f"markers = [{names}]  # its axes are the capture's in the first whole sample"], items=cluster)
     if (part := _from_columns(contents, role, tracked, alone=len(roles) == 1)) is not None:
         return part
+    if role == tracked and not bodies:
+        points = [_match(point, markers) for point in roles if point != tracked]
+        left = [item for item in markers if item not in points]
+        if len(left) >= 3:
+            names = ", ".join(json.dumps(item.name) for item in left)
+            return _Part([f"markers = [{names}]  # a guess: keep three or more that sit on the body"], items=left)
     choice = bodies if role == tracked and bodies else [*bodies, *markers]
     if not choice and _columns(contents):
         lines = [f'position = ["", "", ""]  # choose from {_names(_columns(contents))}']

@@ -9,7 +9,6 @@ import dataclasses
 import functools
 import json
 import math
-import textwrap
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +23,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.standalone import standalone_source
 from ballu_mjx.residuals.aerodynamics import Aerodynamics, air_parameters_to_json
 from ballu_mjx.residuals.deploy import residual as standalone
+from ballu_mjx.residuals.deploy.folder_texts import example_program, folder_readme
 from ballu_mjx.residuals.fluid import FluidForces
 from ballu_mjx.residuals.network import NetworkForces, load_names, load_scales, network_input_names
 from ballu_mjx.rl.network_export import NetworkPort, OutputScale, check_onnx, network_arrays, onnx_model
@@ -111,7 +111,7 @@ def export_simulator(
     arrays = {f"part_{i}/{name}": value for i, part in enumerate(parts) for name, value in part.arrays.items()}
     np.savez(place / standalone.PARAMETERS_FILE, **exact, **arrays)  # pyright: ignore[reportArgumentType]
     (place / _SOURCE).write_text(standalone_source(__package__ or "", _SOURCE), encoding="utf-8")
-    (place / _EXAMPLE).write_text(_EXAMPLE_TEXT.format(name=robot.name), encoding="utf-8")
+    (place / _EXAMPLE).write_text(example_program(robot.name), encoding="utf-8")
     names = dict.fromkeys(part.settings["name"] for part in networks)
     for number, part in enumerate(networks):
         stem = part.settings["name"] if len(names) == len(networks) else f"{part.settings['name']}-{number + 1}"
@@ -122,7 +122,8 @@ def export_simulator(
         _write_check(place / standalone.CHECK_FILE, augmented, wanted, check_seconds)
         distances, angles, _ = standalone.deviations(place)
         deviation = float(distances.max()), float(angles.max())
-    text = _readme(augmented, parts, left_out, onnx=onnx, checked=deviation is not None)
+    settings = [part.settings for part in parts]
+    text = folder_readme(augmented, settings, left_out, onnx=onnx, checked=deviation is not None)
     (place / "README.md").write_text(text, encoding="utf-8")
     return ExportedSimulator(place, deviation, left_out)
 
@@ -347,92 +348,3 @@ def _begin_rollout(
     features, _ = plain.observe(physics)
     history, commands = jnp.tile(features, (HISTORY, 1)), jnp.tile(command, (HISTORY - 1, 1))
     return RolloutState(physics, history, commands, plain.drivetrain_at_rest(command))
-
-
-# ---- texts ----
-
-_EXAMPLE_TEXT = '''"""A control loop in the improved simulator of {name}: random commands for 5 s."""
-
-from pathlib import Path
-
-import numpy as np
-from residual import ImprovedSimulator
-
-simulator = ImprovedSimulator(Path(__file__).resolve().parent)
-low, high = np.array([[command["low"], command["high"]] for command in simulator.settings["commands"]]).T
-rng = np.random.default_rng(0)
-simulator.reset()
-for step in range(round(5 / simulator.control_timestep)):
-    if step % 10 == 0:
-        command = low + (high - low) * rng.uniform(size=len(low))
-        data = simulator.step(command)
-        x, y, z = data.site(simulator.names[0]).xpos
-        print(f"{{data.time:5.2f}} s  {{simulator.names[0]}} at {{x:.3f}} {{y:.3f}} {{z:.3f}} m")
-    else:
-        simulator.step(command)
-'''
-
-
-def _readme(
-    simulator: AugmentedSimulator, parts: list[ExportedPart], left_out: tuple[str, ...], *, onnx: bool, checked: bool
-) -> str:
-    robot, plain = simulator.robot, simulator.simulator
-    names = " + ".join(part.settings["name"] for part in parts) or "none"
-    option = plain.mj_model.opt
-    lines = [
-        f"# {robot.name}, an improved simulator for C MuJoCo",
-        f"Residual: {names}. Identified actuators: {'no' if simulator.actuators is None else 'yes'}. Drivetrain: "
-        f"{'no' if plain.drivetrain is None else 'yes'}.",
-        "The folder needs Python 3.10, NumPy and MuJoCo. It was written for MuJoCo "
-        f"{mujoco.__version__}; the solver of another version may differ in the last digits.",
-        "| file | content |\n| --- | --- |\n"
-        "| `identified.xml` | the model, with the values of identified actuators and of the residual; numbers have six "
-        "digits |\n"
-        "| `simulator.json` | names, ranges, time steps, the drivetrain, and the residual's settings |\n"
-        "| `parameters.npz` | the residual's arrays, and the model's fields in all digits |\n"
-        "| `residual.py` | `ImprovedSimulator`, which applies drivetrain and residual |\n"
-        "| `example.py` | a control loop |\n"
-        + ("| `check.npz` | a rollout of the simulator that was exported |\n" if checked else "")
-        + ("| `*.onnx` | the networks, from what they see to the loads that they push with |\n" if onnx else ""),
-        "```python\n"
-        "from residual import ImprovedSimulator\n\n"
-        "simulator = ImprovedSimulator(folder)\n"
-        "simulator.reset(qpos, qvel)               # without arguments: the initial pose, at rest\n"
-        f"data = simulator.step([{', '.join(robot.commands)}])  # mujoco.MjData after a control step\n"
-        "```",
-    ]
-    if checked:
-        lines.append(
-            "`python residual.py` compares a rollout with the simulator that was exported, in double precision."
-        )
-    ranges = "; ".join(
-        f"`{name}` from {low:g} to {high:g}"
-        for name, (low, high) in zip(robot.commands, robot.command_ranges, strict=True)
-    )
-    lines += [
-        f"A control step is {robot.control_timestep:g} s: {plain.substeps} physics steps of {option.timestep:g} s. The "
-        f"solver makes at most {option.iterations} iterations, as in training.",
-        f"Commands are in the actuators' own units: {ranges}.",
-        "`ImprovedSimulator(folder, model)` takes a scene of your own that holds the robot, with the same names of "
-        "sites and actuators. It sets `ctrl` of the robot's actuators, and `xfrc_applied` of the bodies and "
-        "`qfrc_applied` of the joints that the residual pushes.",
-    ]
-    if left_out:
-        lines.append(f"MJCF cannot hold these fields; `parameters.npz` does: {', '.join(left_out)}.")
-    for part in parts:
-        if part.settings["kind"] == "network":
-            seen = "\n".join(f"{i}. {name}" for i, name in enumerate(part.settings["inputs"]))
-            pushed = ", ".join(part.settings["outputs"])
-            frame = f"the heading frame of {robot.tracked}" if part.settings["heading_frame"] else "the world's axes"
-            lines.append(f"## What the network {part.settings['name']} sees")
-            lines.append(
-                f"Vectors are in {frame}."
-                + (
-                    f" x and y of positions are from {robot.tracked} now; z is above the floor."
-                    if part.settings["relative_observation"]
-                    else ""
-                )
-                + f" It pushes with: {pushed}."
-            )
-            lines.append(seen)
-    return "\n\n".join(textwrap.dedent(line) for line in lines) + "\n"

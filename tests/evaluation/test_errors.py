@@ -1,4 +1,4 @@
-"""The table of errors: what simulations that break down do to scores, bounds, table and file."""
+"""Errors over horizons: what simulations that break down do to scores, bounds, table and file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.evaluation.errors_table import (
+from ballu_mjx.evaluation.errors import (
     HORIZONS,
     Errors,
     Evaluation,

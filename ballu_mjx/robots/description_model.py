@@ -1,0 +1,152 @@
+"""The MJCF model of a robot description: it is read, and found to have the sites, joints and actuators named there."""
+
+from __future__ import annotations
+
+import hashlib
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+
+import mujoco
+
+from ballu_mjx.robots.description_fields import is_name, refuse, said, shown
+
+
+def read_model(path: Path, place: Path) -> mujoco.MjModel:
+    """Return the model at `place`, which a description at `path` names; **raises** `InputError` where it is none."""
+    mend = "give an MJCF file, relative to the description"
+    try:
+        there = place.is_file()
+    except (OSError, ValueError):  # a name that no file can have
+        there = False
+    if not there:
+        refuse(path, f'"model" is {shown(place.name)}, where there is no file', mend)
+    try:
+        return mujoco.MjModel.from_xml_path(str(place))
+    except (ValueError, mujoco.FatalError) as error:
+        refuse(path, f'"model" is {shown(place.name)}, which MuJoCo cannot read ({said(error)})', mend)
+
+
+def checksum(path: Path, place: Path) -> str:
+    """Return the SHA-256 of a description and of all files of its model."""
+    parts = [path, place, *_named_files(place)]
+    return hashlib.sha256(b"\0".join(part.read_bytes() for part in parts)).hexdigest()
+
+
+def _named_files(place: Path) -> list[Path]:
+    """Return the files that an MJCF file names, at any depth, but for itself.
+
+    MuJoCo looks for an asset in its compiler's folders and beside the file that names it, whichever it finds first. All
+    that it could find belong to the model.
+    """
+    found = [Path(name) for name in mujoco.mju_getXMLDependencies(str(place))]
+    spec = mujoco.MjSpec.from_file(str(place))
+    assets = [
+        name
+        for asset in (*spec.meshes, *spec.hfields, *spec.textures, *spec.skins)
+        for name in (asset.file, *getattr(asset, "cubefiles", ()))
+        if name
+    ]
+    texts = [file.parent for file in found if file.suffix == ".xml"]
+    folders = {folder / sub for folder in (place.parent, *texts) for sub in ("", spec.meshdir, spec.texturedir)}
+    found += [folder / name for folder in folders for name in assets]
+    return sorted({file.resolve() for file in found if file.is_file()} - {place.resolve()})
+
+
+def check_joints(path: Path, model: mujoco.MjModel, control_timestep: float) -> None:
+    """**Raises** `InputError` where joints are of a kind that no robot may have, or time steps do not divide."""
+    kinds = mujoco.mjtJoint
+    if not model.njnt:
+        refuse(path, '"model" has no joints', "give a robot that moves")
+    for index, kind in enumerate(model.jnt_type):
+        if kind == kinds.mjJNT_BALL or (kind == kinds.mjJNT_FREE and index > 0):
+            if kind == kinds.mjJNT_BALL:
+                called = "a ball joint"
+            else:
+                later = model.jnt_type[0] != kinds.mjJNT_FREE
+                called = "a free joint that is not the first joint" if later else "a second free joint"
+            mend = "make it of hinges and slides; one free joint may come first"
+            refuse(path, f'"model" has {called}, {shown(model.joint(index).name)}', mend)
+    count = control_timestep / model.opt.timestep
+    if abs(count - round(count)) > 1e-6 or count < 1:
+        problem = f'"model" has a time step of {model.opt.timestep:g} s'
+        refuse(path, problem, f"it must divide the control step of {control_timestep:g} s")
+
+
+def free_joints(model: mujoco.MjModel, held: tuple[str, ...]) -> list[str]:
+    """Return the hinges and slides that have names fit for recordings and are not held."""
+    names = (model.joint(index).name for index in range(model.njnt) if model.jnt_type[index] in _ONE_DIRECTION)
+    return [name for name in names if is_name(name) and name not in held]
+
+
+_ONE_DIRECTION = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+def check_sites(path: Path, model: mujoco.MjModel, tracked: str, points: tuple[str, ...]) -> None:
+    """**Raises** `InputError` where a site is missing, does not move, or is of another robot."""
+    linked, roots = _linked_roots(model), []
+    for key, site in (("tracked", tracked), *(("points", point) for point in points)):
+        body = model.site_bodyid[find_part(path, model, mujoco.mjtObj.mjOBJ_SITE, key, site)]
+        roots.append(linked[int(model.body_rootid[body])])
+        if model.body_weldid[body] == 0:
+            refuse(path, f'"{key}" names {shown(site)}, a site that does not move', "name sites of the robot only")
+        if roots[-1] != roots[0]:
+            problem = f'"{key}" names {shown(site)}, which is of another robot than {tracked}'
+            fix = "give sites below one body of the world, or close the loop between them by an equality"
+            refuse(path, problem, fix)
+
+
+def _linked_roots(model: mujoco.MjModel) -> dict[int, int]:
+    """By body of the world: one that stands for it and all that equalities (closed loops) link it with."""
+    linked = {int(root): int(root) for root in model.body_rootid}
+    for number in range(model.neq):
+        ends = [int(model.eq_obj1id[number]), int(model.eq_obj2id[number])]
+        if int(model.eq_type[number]) not in (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)):
+            continue
+        if model.eq_objtype[number] == mujoco.mjtObj.mjOBJ_SITE:
+            ends = [int(model.site_bodyid[site]) for site in ends]
+        one, other = (linked[int(model.body_rootid[body])] for body in ends)
+        if 0 not in (one, other):
+            linked = {root: one if stand_in == other else stand_in for root, stand_in in linked.items()}
+    return linked
+
+
+def check_actuators(
+    path: Path, model: mujoco.MjModel, driven: Mapping[str, tuple[str, tuple[float, float] | None]]
+) -> tuple[tuple[float, float], ...]:
+    """Return the range of each command; **raises** `InputError` where the model's actuators are not those named."""
+    own = [model.actuator(index).name for index in range(model.nu)]
+    named = [name for name, _ in driven.values()]
+    if named != own:
+        problem = f'"commands" has the actuators {shown(named)}'
+        refuse(path, problem, f"name the model's, all in its order: {textwrap.shorten(', '.join(own), 200) or 'none'}")
+    if model.na:
+        refuse(path, '"model" has actuators with states of their own', "give actuators without activation")
+    ranges = []
+    for index, (name, given) in enumerate(driven.values()):
+        if given is None and not model.actuator_ctrllimited[index]:
+            fix = f'give it one, or write {{"actuator": "{name}", "range": [low, high]}} in "commands"'
+            refuse(path, f"the model's actuator {shown(name)} has no ctrlrange", fix)
+        low, high = given or map(float, model.actuator_ctrlrange[index])
+        if not low < high:
+            refuse(path, f"the range of {shown(name)} is {low:g} to {high:g}", "give the smaller number first")
+        ranges.append((low, high))
+    return tuple(ranges)
+
+
+def check_keyframe(path: Path, model: mujoco.MjModel, name: str) -> None:
+    """**Raises** `InputError` where the model has no keyframe of that name."""
+    if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name) < 0:
+        own = ", ".join(model.key(index).name for index in range(model.nkey)) or "none"
+        refuse(path, f'"keyframe" is {shown(name)}, no keyframe of the model', f"there are {own}")
+
+
+def find_part(path: Path, model: mujoco.MjModel, kind: mujoco.mjtObj, key: str, name: str) -> int:
+    """Return the index of a site or joint that a key names; **raises** `InputError` where the model has none."""
+    index = mujoco.mj_name2id(model, kind, name)
+    if index < 0:
+        what = "site" if kind == mujoco.mjtObj.mjOBJ_SITE else "joint"
+        count, named = (model.nsite, model.site) if what == "site" else (model.njnt, model.joint)
+        own = ", ".join(named(number).name for number in range(count)) or "none"
+        refuse(path, f'"{key}" names {shown(name)}, no {what} of the model', f"there are {textwrap.shorten(own, 200)}")
+    return int(index)

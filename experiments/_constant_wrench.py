@@ -1,0 +1,71 @@
+"""A rival for residuals: the one force and torque that explain recordings best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy import optimize
+
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.segments import count_lost, cut_segments, simulate_segment
+from ballu_mjx.sim.force_model import Action, BoundForces, Commands, ForceModel, History
+from ballu_mjx.sim.observation import ObservationLayout, world_rotation
+from ballu_mjx.sim.simulator import Simulator
+
+WINDOW = 2.0
+"""Seconds that each simulation of the fit lasts."""
+
+
+class ConstantWrench(ForceModel):
+    """A force (N) and a torque (N m) on the tracked body: constant in the world's frame, or in the heading frame of a
+    robot that may go anywhere. Its parameters are the six numbers."""
+
+    def __init__(self, *, anchored: bool) -> None:
+        self._anchored = anchored
+
+    @property
+    def name(self) -> str:
+        """Return what a simulator improved by it is called."""
+        return "constant wrench"
+
+    def inputs(self, history: History, commands: Commands) -> Float[Array, " inputs"]:
+        """Return what it depends on: nothing, so that something must stand here."""
+        del commands
+        return history[-1]
+
+    def act(self, params: Any, history: History, commands: Commands, key: Array | None = None) -> Action:
+        """Return the wrench."""
+        del commands, key
+        turn = world_rotation(history[-1, ObservationLayout.yaw], self._anchored)
+        return Action((params.reshape(2, 3) @ turn.T).reshape(1, 6))
+
+
+def fit_constant_wrench(
+    simulator: Simulator, motions: Sequence[Motion]
+) -> tuple[ConstantWrench, Float[np.ndarray, " 6"]]:
+    """Return the constant wrench with which windows of the motions end nearest to what was recorded, by least squares
+    through the simulation.
+
+    **Raises** `InputError` where no motion is as long as a window.
+    """
+    model = ConstantWrench(anchored=simulator.robot.anchored)
+    windows = cut_segments(simulator, motions, WINDOW, WINDOW)
+
+    def errors(params: Array) -> Array:
+        improved = simulator.with_residual(BoundForces(model, params))
+        return jax.vmap(lambda window: simulate_segment(improved, window).ravel())(windows)
+
+    values, slopes = jax.jit(errors), jax.jit(jax.jacfwd(errors))
+    found = optimize.least_squares(
+        lambda x: count_lost(np.asarray(values(jnp.asarray(x, jnp.float32)), np.float64)).ravel(),
+        np.zeros(6),
+        lambda x: np.nan_to_num(np.asarray(slopes(jnp.asarray(x, jnp.float32)), np.float64)).reshape(-1, 6),  # pyright: ignore[reportArgumentType]
+        loss="soft_l1",
+        x_scale="jac",
+    )
+    return model, np.asarray(found.x)
