@@ -40,6 +40,7 @@ from ballu_mjx.ballu.model import SIDES, ActuatorParameters
 from ballu_mjx.ballu.suspended_leg import SuspendedLeg
 from ballu_mjx.ballu.sweep import SAMPLE_TIMESTEP, Sweep
 from ballu_mjx.identification.batched_solver import BatchedSolver, along_directions
+from ballu_mjx.identification.parameters import Direction
 
 
 class LegData(NamedTuple):
@@ -125,15 +126,6 @@ class CompiledLeg:
         """Both legs' motion and its derivatives; coordinates end with those of `drivetrain`."""
         value, jacobian = self._compiled[1](jnp.asarray(coordinates), jnp.asarray(commanded))
         return np.asarray(value), np.asarray(jacobian)
-
-
-class Direction(NamedTuple):
-    """A combination of a leg's parameters, in units of what robots differ by (`RANGES`)."""
-
-    weights: Float[np.ndarray, " free"]
-    """Unit vector; entries in the order of the free parameters."""
-    standard_error: float
-    """Of the combination: below 1, the data know more than is known without them."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

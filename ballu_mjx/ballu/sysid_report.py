@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.ballu.curves import curve_distances
-from ballu_mjx.ballu.identification import Direction, Identification
+from ballu_mjx.ballu.identification import Identification
 from ballu_mjx.ballu.leg_parameters import (
     DEGREE,
     LEG_PARAMETERS,
@@ -20,6 +20,7 @@ from ballu_mjx.ballu.leg_parameters import (
 )
 from ballu_mjx.ballu.model import SIDES
 from ballu_mjx.ballu.sweep import Sweep
+from ballu_mjx.identification.parameters import Direction
 
 _STRONG = 0.9
 """Correlations beyond this are named."""

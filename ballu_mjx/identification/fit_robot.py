@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.batched_solver import BatchedSolver
-from ballu_mjx.identification.parameters import IdentifiedParameters, ParameterSet
+from ballu_mjx.identification.parameters import Direction, IdentifiedParameters, ParameterSet
 from ballu_mjx.identification.residuals import MeasuredMotion, Simulated, Windows, WindowSimulator, cut_windows
 
 
@@ -62,15 +62,6 @@ def check_fit_config(config: FitConfig) -> None:
             raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name)}: it must be above 0.")
     if config.seed < 0:
         raise InputError(f"--seed is {config.seed}: it must be 0 or more; 0 is the nearest.")
-
-
-class Direction(NamedTuple):
-    """A combination of parameters, each in units of its prior spread."""
-
-    weights: Float[np.ndarray, " parameters"]
-    """Unit vector."""
-    standard_error: float
-    """Of the combination, by the data alone: above 1 they say less than is known without them."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

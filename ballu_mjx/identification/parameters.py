@@ -19,6 +19,15 @@ from ballu_mjx.identification.body_deformation import UNDEFORMED, deform_body
 from ballu_mjx.sim.drivetrain import DrivetrainParameters, count_slots, identity_drivetrain
 
 
+class Direction(NamedTuple):
+    """A combination of parameters, each in units of its prior spread: of what robots differ by."""
+
+    weights: Float[np.ndarray, " parameters"]
+    """Unit vector, in the order of the free parameters."""
+    standard_error: float
+    """Of the combination, by the data alone: above 1 they say less than is known without them."""
+
+
 class FieldTarget(NamedTuple):
     """An entry of a model field, set to the parameter's value times a factor."""
 
