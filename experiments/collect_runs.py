@@ -19,7 +19,7 @@ import _setup
 _setup.prepare()
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from ballu_mjx.cli.compare import rows as rows_of_runs
 from ballu_mjx.common import provenance
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table, write_results
-from ballu_mjx.evaluation.errors import SCORE_HORIZONS, Errors, Evaluation, read_evaluation
+from ballu_mjx.evaluation.errors import SCORE_HORIZONS, Errors, Evaluation, quotient, read_evaluation
 from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
 from ballu_mjx.runs.folder import read_config
 from ballu_mjx.viz.style import label_of
@@ -97,6 +97,26 @@ def errors_table(runs: Sequence[Evaluation], horizons: Sequence[float] | None = 
 def group_mean(side: Sequence[Errors], group: str, quantity: str, horizon: float) -> float:
     """Return a simulator's mean error (m or deg) over a group's recordings."""
     return float(np.mean([getattr(errors, quantity)[horizon][0] for errors in side if errors.group == group]))
+
+
+def remaining_errors(
+    vanilla: Sequence[Errors],
+    simulators: Mapping[str, Sequence[Sequence[Errors]]],
+    columns: Sequence[tuple[str, str]],
+    horizon: float,
+) -> dict[str, list[Cell]]:
+    """Return vanilla's errors over a horizon (s), and what each simulator leaves of them, a value a seed.
+
+    `columns` are groups and quantities; `simulators` holds all seeds' errors by label.
+    """
+    whole = {column: group_mean(vanilla, *column, horizon) for column in columns}
+    rows = {"vanilla": [Cell((whole[column],), *_FORMS[column[1]]) for column in columns]}
+    for label, runs in simulators.items():
+        rows[label] = [
+            Cell(tuple(quotient(group_mean(run, *column, horizon), whole[column]) for run in runs))
+            for column in columns
+        ]
+    return rows
 
 
 def recordings_table(runs: Sequence[Evaluation]) -> Table:

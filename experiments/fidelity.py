@@ -42,7 +42,6 @@ from ballu_mjx.evaluation.errors import (
     SCORE_HORIZONS,
     Errors,
     Evaluation,
-    quotient,
     read_evaluation,
 )
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
@@ -226,16 +225,10 @@ def comparison(rows: Rows, effort: Mapping[str, tuple[Cell, Cell]], horizon: flo
     columns = [(group, quantity) for group in groups_of(rows) for quantity in ("position", "orientation")]
     called = {"position": "position", "orientation": "yaw"}
     head = [called[q] if group == OTHER else f"{group}: {called[q]}" for group, q in columns]
-    whole = {column: collect_runs.group_mean(rows["vanilla"][0], *column, horizon) for column in columns}
-    first = [Cell((whole[c],), *((".3f", "m") if c[1] == "position" else (".1f", "deg"))) for c in columns]
-    made: list[tuple[Cell | str, ...]] = [("vanilla", *first, "", "")]
-    for row, runs in list(rows.items())[1:]:
-        left = [
-            Cell(tuple(quotient(collect_runs.group_mean(run, *column, horizon), whole[column]) for run in runs))
-            for column in columns
-        ]
-        made.append((row, *left, *effort.get(row, ("", ""))))
-    return Table((f"{horizon:g} s", *head, "learning (s)", "thousand control steps"), tuple(made))
+    others = {label: runs for label, runs in rows.items() if label != "vanilla"}
+    cells = collect_runs.remaining_errors(rows["vanilla"][0], others, columns, horizon)
+    made = tuple((label, *left, *effort.get(label, ("", ""))) for label, left in cells.items())
+    return Table((f"{horizon:g} s", *head, "learning (s)", "thousand control steps"), made)
 
 
 def final_yaw(rows: Rows) -> Table:

@@ -14,6 +14,7 @@ from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.force_fitting import fit_analytic, fit_supervised, network_sections
 from ballu_mjx.residuals.supervised import SupervisedConfig, check_supervised_config
 from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.metrics import read_column
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import TrainingRecord
@@ -48,13 +49,18 @@ class ForcesData(RecordingsData):
 def train_supervised(data: ForcesData, fit: SupervisedConfig) -> int:
     """Read and check everything, label, regress, evaluate; returns the exit status."""
     check_supervised_config(fit)
-    return _train("supervised", data, fit, fit_supervised)
+    return _train("supervised", data, fit, fit_supervised, _robot(data))
 
 
 def train_analytic(data: ForcesData, fit: AnalyticConfig) -> int:
     """Read and check everything, learn, evaluate; returns the exit status."""
-    check_analytic_config(fit, load_chosen_robot(data.robot, residual=data.residual).control_timestep)
-    return _train("analytic", data, fit, fit_analytic)
+    robot = _robot(data)
+    check_analytic_config(fit, robot.control_timestep)
+    return _train("analytic", data, fit, fit_analytic, robot)
+
+
+def _robot(data: ForcesData) -> RobotDescription:
+    return load_chosen_robot(data.robot, residual=data.residual)
 
 
 def _train(
@@ -62,6 +68,7 @@ def _train(
     data: ForcesData,
     fit: SupervisedConfig | AnalyticConfig,
     method: Callable[..., TrainedResidual],
+    robot: RobotDescription,
 ) -> int:
     def learn(prepared: Prepared, run: TrainingRecord) -> TrainedResidual:
         return method(
@@ -86,7 +93,7 @@ def _train(
         print(f"Best checkpoint: gradient step {residual.step:,}. ", end="")
 
     env, network = network_sections(data.forces, fit.seed)
-    check_force_set(data.forces, load_chosen_robot(data.robot, residual=data.residual))
+    check_force_set(data.forces, robot)
 
     def sections(prepared: Prepared) -> Mapping[str, Any]:
         nonlocal env

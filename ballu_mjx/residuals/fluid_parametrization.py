@@ -35,10 +35,8 @@ _START = 0.3
 class Parametrization(Protocol):
     """A set of terms as a vector whose entries have standard normal priors."""
 
-    @property
-    def start(self) -> Float[np.ndarray, " size"]:
-        """Return where a search starts."""
-        ...
+    start: Float[np.ndarray, " size"]
+    """Where a search starts."""
 
     def table(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, "terms 6"]:
         """Return coefficients of all terms of the largest set (SI units)."""
@@ -59,11 +57,7 @@ class FreeCoefficients:
         free[len(terms_of(name)) :] = False
         self._directions = np.zeros((int(free.sum()), *prior.shape))
         self._directions[np.arange(len(self._directions)), *np.argwhere(free).T] = prior[free]
-
-    @property
-    def start(self) -> Float[np.ndarray, " size"]:
-        """Return zeros: no forces."""
-        return np.zeros(len(self._directions))
+        self.start = np.zeros(len(self._directions))
 
     def table(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, "terms 6"]:
         """Return coefficients of all terms of the largest set (SI units)."""
@@ -108,12 +102,7 @@ class PassiveCoefficients:
             return jnp.concatenate([force, torque + force @ lever], axis=1)
 
         self._table, self._slopes = jax.jit(table), jax.jit(jax.jacfwd(table))
-        self._start = np.concatenate([part.start for part in parts])
-
-    @property
-    def start(self) -> Float[np.ndarray, " size"]:
-        """Return a little damping: without any it has no derivative."""
-        return self._start.copy()
+        self.start = np.concatenate([part.start for part in parts])
 
     def table(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, "terms 6"]:
         """Return coefficients of all terms of the largest set (SI units)."""

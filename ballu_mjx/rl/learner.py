@@ -157,13 +157,15 @@ class Learner:
         **Raises** `ValueError` naming what is missing or has another shape in the rest of it.
         """
         shapes = jax.eval_shape(self._first, jax.random.PRNGKey(0), self._contents)
+        leaves = jax.tree.leaves_with_path(shapes)
+        stored = {_name(path): np.zeros(leaf.shape, leaf.dtype) for path, leaf in leaves if 0 in leaf.shape} | dict(
+            stored
+        )
         fits, drawn = {}, set()
-        for path, leaf in jax.tree.leaves_with_path(shapes):
+        for path, leaf in leaves:
             name = _name(path)
             found = stored.get(name)
-            fits[name] = 0 in leaf.shape or (
-                found is not None and (found.shape, found.dtype) == (leaf.shape, leaf.dtype)
-            )
+            fits[name] = found is not None and (found.shape, found.dtype) == (leaf.shape, leaf.dtype)
             if name.split(".")[0] in ("environments", "key"):
                 drawn.add(name)
         for name in fits.keys() - drawn:
@@ -174,8 +176,6 @@ class Learner:
 
         def choose(path: Any, leaf: Any) -> Any:
             name = _name(path)
-            if 0 in leaf.shape:
-                return np.zeros(leaf.shape, leaf.dtype)
             return leaf if name in drawn and not whole else np.array(stored[name])
 
         template = shapes if whole else self.init(_seed(self._config, steps))

@@ -36,7 +36,7 @@ from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.cli import train
-from ballu_mjx.common.results import Cell, Table
+from ballu_mjx.common.results import Table
 from ballu_mjx.evaluation.errors import Evaluation, read_evaluation
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording, write_recording
@@ -155,9 +155,9 @@ _FEW = ["--num-timesteps", "4000", "--num-envs", "16", "--batch-size", "16", "--
 LABELS = {"envmimic-force": "EnvMimic, a force alone", "envmimic-multi": "EnvMimic, forces at balloon and knot"}
 SEEDED = ("envmimic", "supervised", "analytic")
 """Subcommands that draw random numbers."""
-STYLES = {name: {"color": colour_of(name)} for name in ("vanilla",)} | {
-    label_of(name): {"color": colour_of(name)}
-    for name in ("envmimic", "supervised", "analytic", "aerodynamic", "fluid")
+COLOURS = {
+    label_of(name): colour_of(name)
+    for name in ("vanilla", "envmimic", "supervised", "analytic", "aerodynamic", "fluid")
 }
 """The project's colours, by label."""
 QUICK = {
@@ -219,18 +219,10 @@ def comparison(found: Mapping[str, Sequence[Evaluation]], horizon: float) -> Tab
     """Return vanilla's errors after a horizon (s), and what each simulator leaves of them; a value a seed."""
     first = next(iter(found.values()))[0]
     columns = [(group, quantity) for group in GROUPS for quantity in ("position", "orientation")]
-    without = {column: collect_runs.group_mean(first.vanilla, *column, horizon) for column in columns}
-    forms = {"position": (".3f", "m"), "orientation": (".1f", "deg")}
-    rows: list[tuple[Cell | str, ...]] = [
-        ("vanilla", *(Cell((without[column],), *forms[column[1]]) for column in columns))
-    ]
-    for label, runs in found.items():
-        left = [
-            [collect_runs.group_mean(run.residual, *column, horizon) / without[column] for run in runs]
-            for column in columns
-        ]
-        rows.append((label, *(Cell(tuple(values)) for values in left)))
-    return Table((f"{horizon:g} s", *(f"{GROUPS[group]}: {q}" for group, q in columns)), tuple(rows))
+    simulators = {label: [run.residual for run in runs] for label, runs in found.items()}
+    rows = collect_runs.remaining_errors(first.vanilla, simulators, columns, horizon)
+    head = (f"{horizon:g} s", *(f"{GROUPS[group]}: {quantity}" for group, quantity in columns))
+    return Table(head, tuple((label, *cells) for label, cells in rows.items()))
 
 
 def figure(found: Mapping[str, Sequence[Evaluation]], path: Path) -> None:
@@ -247,7 +239,7 @@ def figure(found: Mapping[str, Sequence[Evaluation]], path: Path) -> None:
             values = np.array(
                 [[collect_runs.group_mean(side, group, "position", h) for h in horizons] for side in sides]
             )
-            (line,) = axis.plot(horizons, values.mean(axis=0), marker="o", label=label, **STYLES.get(label, {}))
+            (line,) = axis.plot(horizons, values.mean(axis=0), marker="o", label=label, color=COLOURS.get(label))
             axis.fill_between(horizons, values.min(0), values.max(0), color=line.get_color(), alpha=0.2, linewidth=0)
         axis.set(title=GROUPS[group], xlabel="horizon (s)", xscale="log", ylim=(0, None))
         axis.set_xticks(horizons, [f"{horizon:g}" for horizon in horizons])

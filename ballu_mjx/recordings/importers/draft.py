@@ -118,21 +118,24 @@ def _role(contents: Contents, role: str, roles: Sequence[str], tracked: str) -> 
         item for item in markers if _plain(item.name).startswith(_plain(role)) or _plain(role) in _last(item.name)
     ]
     if role == tracked and len(cluster) >= 3:
-        names = ", ".join(json.dumps(item.name) for item in cluster)
-        return _Part([f"markers = [{names}]  # its axes are the capture's in the first whole sample"], items=cluster)
+        return _markers(cluster, "its axes are the capture's in the first whole sample")
     if (part := _from_columns(contents, role, tracked, alone=len(roles) == 1)) is not None:
         return part
     if role == tracked and not bodies:
         points = [_match(point, markers) for point in roles if point != tracked]
         left = [item for item in markers if item not in points]
         if len(left) >= 3:
-            names = ", ".join(json.dumps(item.name) for item in left)
-            return _Part([f"markers = [{names}]  # a guess: keep three or more that sit on the body"], items=left)
+            return _markers(left, "a guess: keep three or more that sit on the body")
     choice = bodies if role == tracked and bodies else [*bodies, *markers]
     if not choice and _columns(contents):
         lines = [f'position = ["", "", ""]  # choose from {_names(_columns(contents))}']
         return _Part(lines + (_turn_lines(contents, None) if role == tracked else []), empty=True)
     return _Part([f'body = ""  # choose from {_names(choice)}'])
+
+
+def _markers(items: Sequence[Item], comment: str) -> _Part:
+    names = ", ".join(json.dumps(item.name) for item in items)
+    return _Part([f"markers = [{names}]  # {comment}"], items=items)
 
 
 def _names(items: Sequence[Item]) -> str:
