@@ -426,7 +426,14 @@ def measure(quick: bool) -> list[Row]:
     comparisons = []
     for beyond in (True,) if quick else (False, True):
         # As many starts as by default: the compiled program's size depends on them.
-        config = IdentificationConfig(motion=False, torque_limit=beyond, cable_slack=beyond)
+        config = IdentificationConfig(
+            motion=False,
+            torque_limit=beyond,
+            cable_slack=beyond,
+            motor_travel=False,
+            cable_stiffness=False,
+            knee_spring_reference=False,
+        )
         if quick:
             config = dataclasses.replace(config, draws=15, steps=8)
         space = ParameterTransform(nominal_leg(), config)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.robots.model import ModelParameters, assets
 from ballu_mjx.robots.model import load_model as load_model_file
+from ballu_mjx.sim.drivetrain import DrivetrainParameters, identity_drivetrain
 
 SIDES = ("left", "right")
 JOINTS = ("neck", "hip_left", "knee_left", "motor_left", "hip_right", "knee_right", "motor_right")
@@ -72,6 +73,15 @@ class ActuatorParameters:
     - `cable_slack` (m): what is left of the cable's rest length, `tendon_lengthspring[:, 1]`, with the motor at 0 and
       the knee at its stop. Not among the paper's eight either: without it, a cable that bends the knee late passes for
       one that stretches, under torques up to three times the robot's.
+
+    Beyond these, None leaves what the model has:
+
+    - `motor_travel` (1): share of 90 deg that a command of 1 asks for, in `actuator_gainprm`.
+    - `cable_stiffness` (N/m): `tendon_stiffness`.
+    - `knee_spring_reference` (rad): the knee's angle at which its spring would be at rest, `qpos_spring`.
+    - `knee_damping` (N m s/rad): `dof_damping`; `knee_friction`, `motor_friction` (N m): `dof_frictionloss`.
+    - `delay` (s), `lag` (s) and `backlash` (rad, of the motor's target) are the commands' drivetrain, which no model
+      has and simulators add: `drivetrain()`.
     """
 
     knee_spring_stiffness: Float[Array, " sides"]
@@ -80,10 +90,27 @@ class ActuatorParameters:
     default_knee_angle: Float[Array, " sides"]
     torque_limit: Float[Array, " sides"]
     cable_slack: Float[Array, " sides"]
+    motor_travel: Float[Array, " sides"] | None = None
+    cable_stiffness: Float[Array, " sides"] | None = None
+    knee_spring_reference: Float[Array, " sides"] | None = None
+    knee_damping: Float[Array, " sides"] | None = None
+    knee_friction: Float[Array, " sides"] | None = None
+    motor_friction: Float[Array, " sides"] | None = None
+    delay: Float[Array, " sides"] | None = None
+    lag: Float[Array, " sides"] | None = None
+    backlash: Float[Array, " sides"] | None = None
 
     def fields(self, model: mujoco.MjModel) -> dict[str, Array]:
         """Return `actuator_fields` of `model` for these parameters."""
         return actuator_fields(model, self)
+
+    def drivetrain(self) -> DrivetrainParameters:
+        """Return the drivetrain of all commands; the identity's where nothing else is known."""
+        found = identity_drivetrain(len(self.motor_gain))
+        known = {name: getattr(self, name) for name in ("delay", "lag") if getattr(self, name) is not None}
+        if self.backlash is not None:
+            known["backlash"] = self.backlash / (_travel(self) * SERVO_RANGE)
+        return found._replace(**known)
 
     @staticmethod
     def nominal(model: mujoco.MjModel) -> ActuatorParameters:
@@ -98,6 +125,10 @@ class ActuatorParameters:
             default_knee_angle=jnp.asarray(model.jnt_range[knees, 0], jnp.float32),
             torque_limit=jnp.asarray(model.actuator_forcerange[servos, 1], jnp.float32),
             cable_slack=jnp.asarray(model.tendon_lengthspring[_cable_ids(model), 1] - taut, jnp.float32),
+            motor_travel=jnp.asarray(model.actuator_gainprm[servos, 0] / (gain * SERVO_RANGE), jnp.float32),
+            cable_stiffness=jnp.asarray(model.tendon_stiffness[_cable_ids(model)], jnp.float32),
+            knee_spring_reference=jnp.asarray(model.qpos_spring[model.jnt_qposadr[knees]], jnp.float32),
+            knee_damping=jnp.asarray(model.dof_damping[model.jnt_dofadr[knees]], jnp.float32),
         )
 
 
@@ -127,11 +158,12 @@ def actuator_fields(model: mujoco.MjModel, parameters: ActuatorParameters) -> di
     """Model fields that carry `parameters`, by name; for `mjx.Model.replace` or, as NumPy, for an `MjModel`."""
     knees, servos = _knee_ids(model), _servo_ids(model)
     gain = parameters.motor_gain
+    reach = gain * SERVO_RANGE * _travel(parameters)
     rest = cable_length(model, parameters.default_knee_angle, jnp.zeros_like(gain)) + parameters.cable_slack
-    return {
+    fields = {
         "jnt_stiffness": jnp.asarray(model.jnt_stiffness).at[knees].set(parameters.knee_spring_stiffness),
         "jnt_range": jnp.asarray(model.jnt_range).at[knees, 0].set(parameters.default_knee_angle),
-        "actuator_gainprm": jnp.asarray(model.actuator_gainprm).at[servos, 0].set(gain * SERVO_RANGE),
+        "actuator_gainprm": jnp.asarray(model.actuator_gainprm).at[servos, 0].set(reach),
         "actuator_biasprm": jnp.asarray(model.actuator_biasprm)
         .at[servos, 0]
         .set(gain * parameters.default_motor_angle)
@@ -142,6 +174,25 @@ def actuator_fields(model: mujoco.MjModel, parameters: ActuatorParameters) -> di
         .set(parameters.torque_limit[:, None] * jnp.array([-1.0, 1.0])),
         "tendon_lengthspring": jnp.asarray(model.tendon_lengthspring).at[_cable_ids(model), 1].set(rest),
     }
+    if parameters.cable_stiffness is not None:
+        stiffness = jnp.asarray(model.tendon_stiffness).at[_cable_ids(model)].set(parameters.cable_stiffness)
+        fields["tendon_stiffness"] = stiffness
+    if parameters.knee_spring_reference is not None:
+        reference = jnp.asarray(model.qpos_spring).at[model.jnt_qposadr[knees]].set(parameters.knee_spring_reference)
+        fields["qpos_spring"] = reference
+    dofs = {"knee": model.jnt_dofadr[knees], "motor": model.jnt_dofadr[_motor_ids(model)]}
+    if parameters.knee_damping is not None:
+        fields["dof_damping"] = jnp.asarray(model.dof_damping).at[dofs["knee"]].set(parameters.knee_damping)
+    for joint, friction in (("knee", parameters.knee_friction), ("motor", parameters.motor_friction)):
+        if friction is not None:
+            own = fields.get("dof_frictionloss", jnp.asarray(model.dof_frictionloss))
+            fields["dof_frictionloss"] = own.at[dofs[joint]].set(friction)
+    return fields
+
+
+def _travel(parameters: ActuatorParameters) -> Float[Array, " sides"]:
+    gain = parameters.motor_gain
+    return jnp.ones_like(gain) if parameters.motor_travel is None else parameters.motor_travel
 
 
 def buoyancy_ratio(model: mujoco.MjModel) -> float:
@@ -172,6 +223,10 @@ def _sides(model: mujoco.MjModel) -> tuple[str, ...]:
 
 def _knee_ids(model: mujoco.MjModel) -> np.ndarray:
     return np.array([model.joint(f"knee_{side}").id for side in _sides(model)])
+
+
+def _motor_ids(model: mujoco.MjModel) -> np.ndarray:
+    return np.array([model.joint(f"motor_{side}").id for side in _sides(model)])
 
 
 def _servo_ids(model: mujoco.MjModel) -> np.ndarray:

@@ -41,7 +41,7 @@ from ballu_mjx.sim.step import (
 )
 
 CABLES = [f"cable_{side}" for side in SIDES]
-FIELDS = [field.name for field in dataclasses.fields(ActuatorParameters)]
+FIELDS = [f.name for f in dataclasses.fields(ActuatorParameters) if f.default is dataclasses.MISSING]
 
 
 def tight_model() -> mujoco.MjModel:

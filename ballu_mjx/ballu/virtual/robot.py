@@ -90,8 +90,9 @@ class VirtualRobot:
     @property
     def actuators(self) -> ActuatorParameters:
         """What identification of its actuators can hope to find."""
-        names = [field.name for field in dataclasses.fields(ActuatorParameters)]
-        return ActuatorParameters(**{name: jnp.array(getattr(self, name)) for name in names})
+        names = {field.name for field in dataclasses.fields(self)}
+        own = [f.name for f in dataclasses.fields(ActuatorParameters) if f.default is dataclasses.MISSING]
+        return ActuatorParameters(**{name: jnp.array(getattr(self, name)) for name in own if name in names})
 
 
 @dataclasses.dataclass(frozen=True)
