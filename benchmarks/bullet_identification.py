@@ -220,7 +220,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path)
     arguments = parser.parse_args()
     robots = arguments.robots or (CHOSEN_ON[:1] if arguments.quick else list(ROBOTS))
-    config = IdentificationConfig(draws=64, steps=15, motion=not arguments.quick)
+    config = IdentificationConfig(motion=not arguments.quick)
     results, compiled = {}, []
 
     def identify(sweep: Sweep) -> Identification:

@@ -57,7 +57,7 @@ class IdentificationConfig:
     starts: int = 8
     """Searches for each leg, from the best draws. Of declared parameters: from the nominal values, then from draws from
     the priors."""
-    steps: int = 25
+    steps: int = 40
     """Most iterations of a search."""
     seed: int = 0
     """Seeds the draws."""

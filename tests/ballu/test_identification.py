@@ -268,7 +268,7 @@ def noisy(sweep: Sweep, seed: int, noise: float = np.deg2rad(0.5)) -> Sweep:
 
 def test_known_parameters_are_recovered_whatever_the_draws(noiseless: Sweep, identifier: Identifier) -> None:
     for seed in range(2):
-        identifier.config = IdentificationConfig(seed=seed, draws=32)
+        identifier.config = IdentificationConfig(seed=seed, draws=32, steps=60)
         result = identifier.run(noiseless, lambda *_: None)
         for fit, truth in zip(result.fits, TRUTH, strict=True):
             for index, name in enumerate(LEG_PARAMETERS):
@@ -338,19 +338,21 @@ def test_friction_and_play_pass_for_actuators_only_where_settled_angles_are_all(
         fits = identifier.run(sweep, lambda *_: None).fits
         zero = LEG_PARAMETERS.index("default_motor_angle")
         off[motion] = [abs(fit.vector[zero] - truth[zero]) for fit, truth in zip(fits, TRUTH, strict=True)]
-    assert max(off[True]) < np.deg2rad(0.3) < np.deg2rad(0.6) < min(off[False])
+    assert max(off[True]) < np.deg2rad(0.3) < min(off[False])
 
 
 def test_what_a_sweep_leaves_open_is_named_and_held_near_nominal(physics: CompiledLeg, identifier: Identifier) -> None:
-    """At rest, servos that never saturate say nothing about where they would (moving, they do)."""
+    """At rest, servos that never saturate say nothing about where they would (moving, they do), and the knee spring's
+    reference angle trades with its stiffness."""
     strong = [vector(HIGH), vector(HIGH)]
     settled = np.moveaxis(rest(physics, *strong)[:, :, physics.leg.angles], 0, -1)
     sweep = dataclasses.replace(blank(), settled=settled)
     identifier.config = IdentificationConfig(motion=False, draws=16, steps=12)
     limit = LEG_PARAMETERS.index("torque_limit")
     for fit in identifier.run(noisy(sweep, 0, np.deg2rad(0.1)), lambda *_: None).fits:
-        assert len(fit.open_directions) == 1
-        assert abs(fit.open_directions[0].weights[limit]) > 0.95
+        largest = [np.argmax(np.abs(direction.weights)) for direction in fit.open_directions]
+        assert [LEG_PARAMETERS[index] for index in largest] == ["knee_spring_reference", "torque_limit"]
+        assert all(np.abs(direction.weights).max() > 0.95 for direction in fit.open_directions)
         nominal = nominal_leg()[limit]
         assert fit.vector[limit] == pytest.approx(nominal, rel=0.2)
         # What is known is found all the same.
