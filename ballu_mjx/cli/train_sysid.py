@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from ballu_mjx.ballu import plots as ballu_plots
-from ballu_mjx.ballu.leg_identification import IdentifiedLegs
+from ballu_mjx.ballu.identified_legs import IdentifiedLegs
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig, check_identification_config
 from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, written_to
 from ballu_mjx.common import files
