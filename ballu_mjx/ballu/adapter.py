@@ -123,9 +123,9 @@ class Ballu(RobotAdapter, RecordingHooks):
         levels: int | None = None,
         progress: IdentificationProgress | None = None,
     ) -> IdentifiedActuators:
-        """Return what `leg_identification.identify_from_sweep` returns."""
+        """Return what `identified_legs.identify_from_sweep` returns."""
         del robot
-        from ballu_mjx.ballu.leg_identification import identify_from_sweep  # Optimistix: slow to import
+        from ballu_mjx.ballu.identified_legs import identify_from_sweep  # Optimistix: slow to import
 
         return identify_from_sweep(recordings, config, levels, progress)
 

@@ -153,6 +153,16 @@ def list_bundled(split: Split) -> list[Path]:
     return list_recordings([assets() / "recordings" / split])
 
 
+def check_new(path: Path) -> None:
+    """Refuse a name that is none of a recording's, or taken, and a folder that cannot be written to.
+
+    **Raises** `InputError` with the fix."""
+    for each in (path, sidecar_path(path)):
+        if each.exists():
+            raise InputError(f"{each}: stands there already; delete it, or give another --output.")
+    files.check_folder(path.parent)
+
+
 def recording_name(path: Path) -> str:
     """The name of the recording in a file: the file's, without its ending."""
     return path.name.removesuffix(".gz").removesuffix(".csv")

@@ -29,9 +29,8 @@ from ballu_mjx.ballu.model import (
 )
 from ballu_mjx.robots.model import set_fields, with_fields
 from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.contact_solver import _newton_step, _solve
 from ballu_mjx.sim.step import (
-    _newton_step,
-    _solve,
     control_step,
     count_substeps,
     load_state,

@@ -111,12 +111,7 @@ def list_capture(capture: Capture) -> Contents:
     """Return what `capture` holds. What cannot be read is told in the notes."""
     items: list[Item] = []
     notes = list(capture.notes)
-    for name in capture.bodies:
-        try:
-            stream = capture.bodies[name]
-        except InputError as error:
-            notes.append(str(error))
-            continue
+    for name, stream in _readable(capture.bodies, notes):
         turns = stream.quaternion is not None or stream.angles is not None
         seen = ~np.isnan(stream.position).any(axis=1)
         items.append(
@@ -133,12 +128,7 @@ def list_capture(capture: Capture) -> Contents:
                 high=float(stream.position[seen].max()) if seen.any() else None,
             )
         )
-    for name in capture.columns:
-        try:
-            series = capture.columns[name]
-        except InputError as error:
-            notes.append(str(error))
-            continue
+    for name, series in _readable(capture.columns, notes):
         seen = series.values[~np.isnan(series.values)]
         items.append(
             Item(
@@ -157,6 +147,17 @@ def list_capture(capture: Capture) -> Contents:
         )
     rows = capture.clock is not None
     return Contents(capture.path, capture.program, items, rows=rows, notes=notes, episodes=capture.episodes)
+
+
+def _readable(values: Mapping[str, _Value], notes: list[str]) -> Iterator[tuple[str, _Value]]:
+    """Yield what can be read, by name; what is wrong with the rest is added to `notes`."""
+    for name in values:
+        try:
+            value = values[name]
+        except InputError as error:
+            notes.append(str(error))
+            continue
+        yield name, value
 
 
 def _rate(time: np.ndarray) -> float | None:
