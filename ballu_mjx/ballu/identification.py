@@ -175,7 +175,7 @@ class Selection(NamedTuple):
     @property
     def richer(self) -> bool:
         """Whether the richer model is kept: what it explains is neither chance nor negligible."""
-        return self.statistic > self.threshold and self.effect > _SMALL_EFFECT
+        return self.statistic > self.threshold and self.effect > _LEAST_EFFECT
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -219,10 +219,10 @@ class Identification:
 _PATIENCE = 4
 _LEVEL = 0.05
 """Of the F-test."""
-_SMALL_EFFECT = 0.02
-"""Cohen's f^2 of a small effect (Cohen, "Statistical power analysis for the behavioral sciences", 1988). With
-thousands of samples, an F-test sees errors of the simulator's time step: hundredths of a degree, which the further
-parameters would take up at the price of wrong springs and gains."""
+_LEAST_EFFECT = 0.15
+"""Cohen's f^2 of a medium effect (Cohen, "Statistical power analysis for the behavioral sciences", 1988). With thousands
+of samples, an F-test sees errors of the simulator's time step: hundredths of a degree, which the further parameters
+would take up at the price of wrong springs and gains."""
 _FIRST_DAMPING = 5 * DEGREE
 """Unit of angles in a search, which starts with Levenberg's damping at 1. In radians, weak directions are damped for
 dozens of iterations."""
