@@ -8,21 +8,21 @@ actuators:
   (`identification.guard`), on gaits (near) and on what is none (far);
 - what `--actuators auto` takes, by the guard's replay of further recordings.
 
-Choices are made on robots 0 and 1. All five take about twenty minutes on two cores.
+Choices are made on robots 0 and 1. All five take about an hour on two cores.
 
     python benchmarks/bullet_identification.py
     python benchmarks/bullet_identification.py --robots 0 1
     python benchmarks/bullet_identification.py --quick             # one robot, settled angles alone
-    python benchmarks/bullet_identification.py --output FOLDER     # FOLDER/bullet_identification.json too
+    python benchmarks/bullet_identification.py --output FOLDER     # robots that stand there already are not repeated
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import subprocess
+import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +46,7 @@ from bullet_family import (
     sweep_commands,
     walking_commands,
 )
-from common import described, machine, write
+from common import described, write
 from jaxtyping import Float
 
 from ballu_mjx.ballu.actuators_file import actuators_to_json
@@ -56,6 +56,9 @@ from ballu_mjx.ballu.leg_parameters import IdentificationConfig
 from ballu_mjx.ballu.model import SIDES, suspend
 from ballu_mjx.ballu.sweep import Sweep, read_sweep
 from ballu_mjx.ballu.sysid_report import identification_details
+from ballu_mjx.common import provenance
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.common.results import Table, write_results
 from ballu_mjx.identification.guard import HORIZONS, choose_actuators
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
@@ -69,8 +72,6 @@ SECONDS = 20.0
 ANGLES = [f"{kind}_{side}" for kind in ("motor", "knee") for side in SIDES]
 SETTLED = 50
 """Samples at the end of a hold whose mean is its settled angle."""
-TARGETS = {"settled": 0.25, "position": 0.6}
-"""Largest identified over nominal error."""
 
 
 def suspended_model() -> mujoco.MjModel:
@@ -191,37 +192,57 @@ def examine(seed: int, identify: Callable[[Sweep], Identification]) -> dict[str,
         "scatter_deg": {side: float(np.rad2deg(fit.residual)) for fit, side in rows},
         "creep": sweep.creep,
     }
-    print(table({seed: result}), flush=True)
+    print(table({seed: result}).to_markdown(), flush=True)
     return result
 
 
-def table(results: Mapping[int, Mapping[str, Any]]) -> str:
-    """Return errors and ratios to nominal as a Markdown table."""
-    lines = [
-        "| robot | error of | nominal | identified | ratio | target |",
-        "| --- | --- | ---: | ---: | ---: | ---: |",
-    ]
-    for seed, result in results.items():
-        rows = [("settled angles (deg)", result["settled_deg"], TARGETS["settled"])]
-        rows += [(f"position, {name} (m)", row, TARGETS["position"]) for name, row in result["open_loop_m"].items()]
-        for name, row, target in rows:
-            nominal, identified = row["nominal"], row["identified"]
-            cells = f"{nominal:.3f} | {identified:.3f} | {identified / nominal:.2f} | {target:g}"
-            lines.append(f"| {seed} | {name} | {cells} |")
-        guard = result["guard"]
-        lines.append(f"| {seed} | what `auto` takes: {guard['takes']} | | | {guard['ratio']:.2f} | |")
-    return "\n".join(lines)
+def table(results: Mapping[int, Mapping[str, Any]]) -> Table:
+    """Return errors of nominal and identified actuators, with their ratio in brackets."""
+
+    def compared(row: Mapping[str, float], form: str) -> str:
+        nominal, identified = row["nominal"], row["identified"]
+        return f"{nominal:{form}} -> {identified:{form}} ({identified / nominal:.2f})"
+
+    groups = list(next(iter(results.values()))["open_loop_m"])
+    heads = ("robot", "settled angles (deg)", *(f"{group} (m)" for group in groups), "guard's ratio, and choice")
+    return Table(
+        heads,
+        tuple(
+            (
+                str(seed),
+                compared(result["settled_deg"], ".2f"),
+                *(compared(result["open_loop_m"][group], ".3f") for group in groups),
+                f"{result['guard']['ratio']:.2f}, {result['guard']['takes']}",
+            )
+            for seed, result in results.items()
+        ),
+    )
+
+
+def read_earlier(path: Path, robots: Sequence[int], commit: str) -> dict[str, Any]:
+    """Return what an interrupted run left, to go on from.
+
+    **Raises** `InputError` where robots are missing and the code has changed since.
+    """
+    if not path.exists():
+        return {"commit": commit, "robots": {}}
+    earlier = json.loads(path.read_text(encoding="utf-8"))
+    earlier["robots"] = {int(seed): result for seed, result in earlier["robots"].items()}
+    if earlier["commit"] != commit and not set(robots) <= set(earlier["robots"]):
+        raise InputError(f"{path} is of commit {earlier['commit']}, and this is {commit}; give an empty folder.")
+    return earlier
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", type=int, nargs="+", default=None, choices=list(ROBOTS))
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--output", type=Path)
+    parser.add_argument("--output", type=Path, default=Path("runs/bench-bullet_identification"))
+    parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()
     robots = arguments.robots or (CHOSEN_ON[:1] if arguments.quick else list(ROBOTS))
     config = IdentificationConfig(motion=not arguments.quick)
-    results, compiled = {}, []
+    compiled: list[Identifier] = []
 
     def identify(sweep: Sweep) -> Identification:
         with jax.enable_x64(True):
@@ -229,13 +250,20 @@ def main() -> None:
                 compiled.append(Identifier(config, sweep, silent))
             return compiled[0].run(sweep, silent)
 
-    git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
-    commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
+    path = arguments.output / "bullet_identification.json"
+    earlier = read_earlier(path, robots, provenance.source_commit() or "")
     for seed in robots:
-        results[seed] = examine(seed, identify)
-        if arguments.output:
-            write(arguments.output, "bullet_identification", {"commit": commit, "robots": results})
-    print(f"\n{described(machine())}; JAX {jax.__version__}, MuJoCo {mujoco.__version__}\n{table(results)}")
+        if seed not in earlier["robots"]:
+            earlier["robots"][seed] = examine(seed, identify)
+            write(arguments.output, "bullet_identification", {key: earlier[key] for key in ("commit", "robots")})
+    found = table({seed: earlier["robots"][seed] for seed in robots})
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    print(f"\n{described(stored['machine'])}; commit {stored['commit']}\n{found.to_markdown()}")
+    if arguments.results is not None:
+        about = {key: value for key, value in stored["machine"].items() if key not in ("versions", "load")}
+        measured = {"commit": stored["commit"], "machine": about, "versions": stored["machine"]["versions"]}
+        data = f"Development data: choices were made on robots {' and '.join(map(str, CHOSEN_ON))}"
+        write_results(arguments.results, {"errors": found}, data, seeds={"robots": robots}, measured=measured)
 
 
 def silent(stage: str, iteration: int, steps: int, value: float) -> None:
