@@ -703,20 +703,81 @@ def test_a_folder_of_no_format_is_refused(tmp_path: Path):
         find_reader(tmp_path)
 
 
-def test_a_table_and_its_log_have_clocks_of_their_own(tmp_path: Path, robot: RobotDescription):
-    write_table(tmp_path)
-    text = (tmp_path / "trial.csv").read_text().replace("time,", "%time,", 1).replace("arm_cmd,push_cmd", "a,b", 1)
-    (tmp_path / "trial.csv").write_text(text)
-    write_log(tmp_path, 12.0)
-    columns = COLUMNS.replace("tip_pos[0]", "tip_x").replace("tip_pos[1]", "tip_y").replace("tip_pos[2]", "tip_z")
-    for old, new in (("hull_pos[0]", "hull_x"), ("hull_pos[1]", "hull_y"), ("hull_pos[2]", "hull_z"),
-                     ("hull_quat[0]", "hull_qw"), ("hull_quat[1]", "hull_qx"), ("hull_quat[2]", "hull_qy"),
-                     ("hull_quat[3]", "hull_qz")):  # fmt: skip
-        columns = columns.replace(old, new)
-    room(tmp_path, robot, columns + '[clock]\ntime = "%time"\ntime_unit = "ms"\n')
+def write_two_clocks(folder: Path, table: str, log: str) -> None:
+    """The capture as a table in ms and the commands as a log in s, 12 s later, with the columns of times so named."""
+    names = [table, *(f"hull_{axis}" for axis in range(3)), *(f"turn_{part}" for part in range(4))]
+    columns = [1e3 * TIME, *HULL.place.T, *HULL.turn.as_quat(scalar_first=True).T, *TIP.place.T]
+    header = ",".join([*names, *(f"tip_{axis}" for axis in range(3))])
+    (folder / "trial.csv").write_text(f"{header}\n{rows(columns, ',', 7, lost=[])}")
+    text = write_log(folder, 12.0).read_text()
+    (folder / "log.csv").write_text(text.replace("time,", f"{log},", 1))
+
+
+TWO_CLOCKS = """[units]
+length = "m"
+[hull]
+position = ["hull_0", "hull_1", "hull_2"]
+orientation = ["turn_0", "turn_1", "turn_2", "turn_3"]
+rotation = "quaternion"
+[tip]
+position = ["tip_0", "tip_1", "tip_2"]
+[clock]
+time_unit = "ms"
+"""
+
+
+@pytest.mark.parametrize(
+    ("table", "log", "clock", "commands"),
+    [
+        ("stamp", "sent", 'time = "stamp"\n', 'time = "sent"\n'),
+        ("%time", "time", 'time = "%time"\n', ""),
+        # One key for both files: a sign of a comment before a header's name is no part of it.
+        ("%time", "time", "", 'time = "%time"\n'),
+        ("%time", "time", "", 'time = "time"\n'),
+        ("t", "# t", "", 'time = "t"\n'),
+        ("stamp", "%stamp", "", 'time = "stamp"\n'),
+    ],
+)
+def test_a_table_and_its_log_have_clocks_of_their_own(
+    tmp_path: Path, robot: RobotDescription, table: str, log: str, clock: str, commands: str
+):
+    write_two_clocks(tmp_path, table, log)
+    room(tmp_path, robot, TWO_CLOCKS + clock, commands)
     line = ["import", tmp_path / "trial.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "out.csv"]
     run(*line, "--robot", robot.file, "--commands", tmp_path / "log.csv", "--offset=-12")
-    same(read_recording(tmp_path / "out.csv", robot), gaps=True)
+    same(read_recording(tmp_path / "out.csv", robot), gaps=False)
+
+
+def test_a_column_s_own_name_goes_before_one_without_its_sign(tmp_path: Path, robot: RobotDescription):
+    """A table may have both: `time` within the trial, and `%time` of the day."""
+    write_two_clocks(tmp_path, "%time", "time")
+    lines = (tmp_path / "trial.csv").read_text().splitlines()
+    body = [f"{1e6 + 5 * row},{line}" for row, line in enumerate(lines[1:])]
+    (tmp_path / "trial.csv").write_text("\n".join(["time," + lines[0], *body]))
+    found = read_capture(tmp_path / "trial.csv", room(tmp_path, robot, TWO_CLOCKS + 'time = "%time"\n'))
+    np.testing.assert_allclose(found.time, TIME, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("commands", "said"),
+    [
+        # The name is the table's: the log's is missing, and where a table's own name stands is told.
+        ('time = "stamp"\n', ["log.csv: there is no column 'stamp' of times", "under [commands]", "[clock]"]),
+        # The name is the log's: the table's is missing.
+        ('time = "sent"\n', ["trial.csv: there is no column 'sent' of times", "under [clock]"]),
+    ],
+)
+def test_one_name_for_two_clocks_is_told_which_key_the_other_has(
+    tmp_path: Path, robot: RobotDescription, capsys: pytest.CaptureFixture[str], commands: str, said: list[str]
+):
+    write_two_clocks(tmp_path, "stamp", "sent")
+    room(tmp_path, robot, TWO_CLOCKS, commands)
+    line = ["import", tmp_path / "trial.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "out.csv"]
+    line += ["--robot", robot.file, "--commands", tmp_path / "log.csv", "--offset=-12"]
+    assert record.main([str(each) for each in line]) == 2
+    told = capsys.readouterr().err
+    for part in said:
+        assert part in told, told
 
 
 def test_what_the_wizard_cannot_tell_is_left_empty_and_refused(
