@@ -239,7 +239,7 @@ def _check_header(path: Path, groups: Sequence[ColumnGroup], header: list[str]) 
             fix = (
                 f"rename it to {close[0]} or delete it"
                 if close
-                else "the robot's description does not have it, delete it"
+                else "the robot's description does not have it, delete it or give its own robot (--robot)"
             )
             refuse_recording(
                 path, "unknown column", fix, column=_shorten(name) if name else f"{i + 1} (no name)", row=-1
