@@ -340,6 +340,17 @@ def test_motive(tmp_path: Path, robot: RobotDescription, version: str, unit: str
     same(imported(tmp_path, write_motive(tmp_path, version, unit), robot), gaps=True)
 
 
+@pytest.mark.parametrize("columns", [0, 3])
+def test_motive_saved_again_by_a_spreadsheet(tmp_path: Path, robot: RobotDescription, columns: int):
+    """Such a program pads every row to the widest, or beyond it."""
+    path = write_motive(tmp_path)
+    lines = [line.split(",") for line in path.read_text().splitlines()]
+    width = columns + max(map(len, lines))
+    path.write_text("\n".join(",".join(cells + [""] * (width - len(cells))) for cells in lines))
+    write_log(tmp_path)
+    same(imported(tmp_path, path, robot), gaps=True)
+
+
 def test_motive_tells_measured_markers_from_expected_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run("map", write_motive(tmp_path))
     said = capsys.readouterr().out
@@ -471,6 +482,12 @@ def tum_text() -> str:
     return "# timestamp tx ty tz qx qy qz qw\n" + rows(columns, " ", 7, lost=[])
 
 
+def write_tum(folder: Path) -> Path:
+    path = folder / "pose.txt"
+    path.write_text(tum_text())
+    return path
+
+
 def euroc_text() -> str:
     header = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v [m]\n"
     numbers = np.hstack([HULL.place, HULL.turn.as_quat(scalar_first=True), 0 * HULL.place[:, :1]])
@@ -586,6 +603,7 @@ def cut_bytes(path: Path) -> None:
             ["holds 189 of the 300 frames that its header states", "cut off"],
         ),
         (write_qualisys_bodies, None, COLUMNS, ["a Qualisys TSV, which has bodies", 'body = "..."', "hull, tip"]),
+        (write_tum, None, COLUMNS, ["a TUM trajectory, which has bodies", 'body = "..."', "there are pose"]),
         (write_qualisys_bodies, replaced("Rot[4]\t", "", 1), NAMED, ["the row has more cells than the header"]),
         (write_qualisys_bodies, replaced("DATA_INCLUDED\t6D", "DATA_INCLUDED\t2D"), NAMED, ["DATA_INCLUDED is '2D'"]),
         (
@@ -641,6 +659,12 @@ def cut_bytes(path: Path) -> None:
             lambda path: path.write_text("1,2,3\n4,5,6\n"),
             NAMED,
             ["line 1: it holds numbers where the names"],
+        ),
+        (
+            write_table,  # `ros2 topic echo --csv`: seconds and nanoseconds apart, a frame's name, no header
+            lambda path: path.write_text("".join(f"17,{i}0000000,map,0.1,0.2,1.5,0,0,0,1\n" for i in range(50))),
+            COLUMNS,
+            ["line 1: it holds numbers where the names", "above the numbers"],
         ),
     ],
 )
