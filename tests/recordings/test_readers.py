@@ -340,6 +340,17 @@ def test_motive(tmp_path: Path, robot: RobotDescription, version: str, unit: str
     same(imported(tmp_path, write_motive(tmp_path, version, unit), robot), gaps=True)
 
 
+@pytest.mark.parametrize("columns", [0, 3])
+def test_motive_saved_again_by_a_spreadsheet(tmp_path: Path, robot: RobotDescription, columns: int):
+    """Such a program pads every row to the widest, or beyond it."""
+    path = write_motive(tmp_path)
+    lines = [line.split(",") for line in path.read_text().splitlines()]
+    width = columns + max(map(len, lines))
+    path.write_text("\n".join(",".join(cells + [""] * (width - len(cells))) for cells in lines))
+    write_log(tmp_path)
+    same(imported(tmp_path, path, robot), gaps=True)
+
+
 def test_motive_tells_measured_markers_from_expected_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run("map", write_motive(tmp_path))
     said = capsys.readouterr().out
@@ -471,6 +482,12 @@ def tum_text() -> str:
     return "# timestamp tx ty tz qx qy qz qw\n" + rows(columns, " ", 7, lost=[])
 
 
+def write_tum(folder: Path) -> Path:
+    path = folder / "pose.txt"
+    path.write_text(tum_text())
+    return path
+
+
 def euroc_text() -> str:
     header = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v [m]\n"
     numbers = np.hstack([HULL.place, HULL.turn.as_quat(scalar_first=True), 0 * HULL.place[:, :1]])
@@ -586,6 +603,7 @@ def cut_bytes(path: Path) -> None:
             ["holds 189 of the 300 frames that its header states", "cut off"],
         ),
         (write_qualisys_bodies, None, COLUMNS, ["a Qualisys TSV, which has bodies", 'body = "..."', "hull, tip"]),
+        (write_tum, None, COLUMNS, ["a TUM trajectory, which has bodies", 'body = "..."', "there are pose"]),
         (write_qualisys_bodies, replaced("Rot[4]\t", "", 1), NAMED, ["the row has more cells than the header"]),
         (write_qualisys_bodies, replaced("DATA_INCLUDED\t6D", "DATA_INCLUDED\t2D"), NAMED, ["DATA_INCLUDED is '2D'"]),
         (
@@ -641,6 +659,12 @@ def cut_bytes(path: Path) -> None:
             lambda path: path.write_text("1,2,3\n4,5,6\n"),
             NAMED,
             ["line 1: it holds numbers where the names"],
+        ),
+        (
+            write_table,  # `ros2 topic echo --csv`: seconds and nanoseconds apart, a frame's name, no header
+            lambda path: path.write_text("".join(f"17,{i}0000000,map,0.1,0.2,1.5,0,0,0,1\n" for i in range(50))),
+            COLUMNS,
+            ["line 1: it holds numbers where the names", "above the numbers"],
         ),
     ],
 )
@@ -703,20 +727,81 @@ def test_a_folder_of_no_format_is_refused(tmp_path: Path):
         find_reader(tmp_path)
 
 
-def test_a_table_and_its_log_have_clocks_of_their_own(tmp_path: Path, robot: RobotDescription):
-    write_table(tmp_path)
-    text = (tmp_path / "trial.csv").read_text().replace("time,", "%time,", 1).replace("arm_cmd,push_cmd", "a,b", 1)
-    (tmp_path / "trial.csv").write_text(text)
-    write_log(tmp_path, 12.0)
-    columns = COLUMNS.replace("tip_pos[0]", "tip_x").replace("tip_pos[1]", "tip_y").replace("tip_pos[2]", "tip_z")
-    for old, new in (("hull_pos[0]", "hull_x"), ("hull_pos[1]", "hull_y"), ("hull_pos[2]", "hull_z"),
-                     ("hull_quat[0]", "hull_qw"), ("hull_quat[1]", "hull_qx"), ("hull_quat[2]", "hull_qy"),
-                     ("hull_quat[3]", "hull_qz")):  # fmt: skip
-        columns = columns.replace(old, new)
-    room(tmp_path, robot, columns + '[clock]\ntime = "%time"\ntime_unit = "ms"\n')
+def write_two_clocks(folder: Path, table: str, log: str) -> None:
+    """The capture as a table in ms and the commands as a log in s, 12 s later, with the columns of times so named."""
+    names = [table, *(f"hull_{axis}" for axis in range(3)), *(f"turn_{part}" for part in range(4))]
+    columns = [1e3 * TIME, *HULL.place.T, *HULL.turn.as_quat(scalar_first=True).T, *TIP.place.T]
+    header = ",".join([*names, *(f"tip_{axis}" for axis in range(3))])
+    (folder / "trial.csv").write_text(f"{header}\n{rows(columns, ',', 7, lost=[])}")
+    text = write_log(folder, 12.0).read_text()
+    (folder / "log.csv").write_text(text.replace("time,", f"{log},", 1))
+
+
+TWO_CLOCKS = """[units]
+length = "m"
+[hull]
+position = ["hull_0", "hull_1", "hull_2"]
+orientation = ["turn_0", "turn_1", "turn_2", "turn_3"]
+rotation = "quaternion"
+[tip]
+position = ["tip_0", "tip_1", "tip_2"]
+[clock]
+time_unit = "ms"
+"""
+
+
+@pytest.mark.parametrize(
+    ("table", "log", "clock", "commands"),
+    [
+        ("stamp", "sent", 'time = "stamp"\n', 'time = "sent"\n'),
+        ("%time", "time", 'time = "%time"\n', ""),
+        # One key for both files: a sign of a comment before a header's name is no part of it.
+        ("%time", "time", "", 'time = "%time"\n'),
+        ("%time", "time", "", 'time = "time"\n'),
+        ("t", "# t", "", 'time = "t"\n'),
+        ("stamp", "%stamp", "", 'time = "stamp"\n'),
+    ],
+)
+def test_a_table_and_its_log_have_clocks_of_their_own(
+    tmp_path: Path, robot: RobotDescription, table: str, log: str, clock: str, commands: str
+):
+    write_two_clocks(tmp_path, table, log)
+    room(tmp_path, robot, TWO_CLOCKS + clock, commands)
     line = ["import", tmp_path / "trial.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "out.csv"]
     run(*line, "--robot", robot.file, "--commands", tmp_path / "log.csv", "--offset=-12")
-    same(read_recording(tmp_path / "out.csv", robot), gaps=True)
+    same(read_recording(tmp_path / "out.csv", robot), gaps=False)
+
+
+def test_a_column_s_own_name_goes_before_one_without_its_sign(tmp_path: Path, robot: RobotDescription):
+    """A table may have both: `time` within the trial, and `%time` of the day."""
+    write_two_clocks(tmp_path, "%time", "time")
+    lines = (tmp_path / "trial.csv").read_text().splitlines()
+    body = [f"{1e6 + 5 * row},{line}" for row, line in enumerate(lines[1:])]
+    (tmp_path / "trial.csv").write_text("\n".join(["time," + lines[0], *body]))
+    found = read_capture(tmp_path / "trial.csv", room(tmp_path, robot, TWO_CLOCKS + 'time = "%time"\n'))
+    np.testing.assert_allclose(found.time, TIME, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("commands", "said"),
+    [
+        # The name is the table's: the log's is missing, and where a table's own name stands is told.
+        ('time = "stamp"\n', ["log.csv: there is no column 'stamp' of times", "under [commands]", "[clock]"]),
+        # The name is the log's: the table's is missing.
+        ('time = "sent"\n', ["trial.csv: there is no column 'sent' of times", "under [clock]"]),
+    ],
+)
+def test_one_name_for_two_clocks_is_told_which_key_the_other_has(
+    tmp_path: Path, robot: RobotDescription, capsys: pytest.CaptureFixture[str], commands: str, said: list[str]
+):
+    write_two_clocks(tmp_path, "stamp", "sent")
+    room(tmp_path, robot, TWO_CLOCKS, commands)
+    line = ["import", tmp_path / "trial.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "out.csv"]
+    line += ["--robot", robot.file, "--commands", tmp_path / "log.csv", "--offset=-12"]
+    assert record.main([str(each) for each in line]) == 2
+    told = capsys.readouterr().err
+    for part in said:
+        assert part in told, told
 
 
 def test_what_the_wizard_cannot_tell_is_left_empty_and_refused(
