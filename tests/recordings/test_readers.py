@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import sys
 import typing
@@ -12,6 +11,29 @@ from typing import Any
 
 import numpy as np
 import pytest
+from capture_files import (
+    COMMAND,
+    CORNERS,
+    HIDDEN,
+    HULL,
+    RATE,
+    SAMPLES,
+    START,
+    TIME,
+    TIP,
+    Y_UP,
+    euroc_text,
+    in_line,
+    replaced,
+    rows,
+    tum_text,
+    write_motive,
+    write_npz,
+    write_qualisys_bodies,
+    write_qualisys_markers,
+    write_table,
+    write_tum,
+)
 from rover import write_rover
 from scipy.spatial.transform import Rotation
 
@@ -23,145 +45,13 @@ from ballu_mjx.recordings.importers.readers import READERS, find_reader, read_ca
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
 
-SAMPLES, RATE = 300, 100.0
-TIME = np.arange(SAMPLES) / RATE
-HIDDEN = slice(60, 71)
-"""Samples in which the hull is not seen, where a format has a way to say so."""
-Y_UP = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""From Motive's axes (y up) to the format's, for a robot that looks along z."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Pose:
-    place: np.ndarray
-    turn: Rotation
-
-
-def motion() -> tuple[Pose, Pose, np.ndarray]:
-    """Hull, tip and commands: from the origin, looking along x, and about all axes."""
-    wave = np.stack([np.sin((1.3 + 0.4 * i) * TIME) for i in range(6)], axis=1)
-    place = wave[:, :3] * [0.5, 0.3, 0.05] + [0.0, 0.0, 0.25]
-    turn = Rotation.from_rotvec(0.6 * wave[:, 3:])
-    tip = Pose(place + turn.apply([0.35, 0.0, 0.05]), turn)
-    command = np.stack([0.1 + 0.4 * wave[:, 0], 5 + 4 * wave[:, 1]], axis=1)
-    return Pose(place, turn), tip, command
-
-
-HULL, TIP, COMMAND = motion()
-
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
     return write_rover(tmp_path_factory.mktemp("rover"))
 
 
-# ---- the formats, as their vendors lay them out ----
-
-
-def rows(columns: list[np.ndarray], delimiter: str, decimals: int, *, lost: list[int], first: str = "") -> str:
-    """Lines of numbers; `lost` columns are empty in the hidden samples."""
-    lines = []
-    for i, row in enumerate(np.column_stack(columns)):
-        cells = [f"{x:.{decimals}f}" for x in row]
-        if HIDDEN.start <= i < HIDDEN.stop:
-            for column in lost:
-                cells[column] = ""
-        lines.append(delimiter.join(([f"{i}"] if first else []) + cells))
-    return "\n".join(lines) + "\n"
-
-
-def write_motive(folder: Path, version: str = "1.23", unit: str = "Meters") -> Path:
-    """https://docs.optitrack.com, "Data Export: CSV", and public takes of versions 1.22 to 1.25."""
-    scale = {"Meters": 1.0, "Millimeters": 1e3}[unit]
-    hull = Rotation.from_matrix(Y_UP.T) * HULL.turn * Rotation.from_matrix(Y_UP)
-    top = f"Format Version,{version},Take Name,trial 1,Take Notes,,Capture Frame Rate,{RATE:.6f},Export Frame Rate,"
-    top += f"{RATE:.6f},Capture Start Time,2023-06-02 12.09.45.344 PM,Total Frames in Take,{SAMPLES},Rotation Type,"
-    top += f"Quaternion,Length Units,{unit},Coordinate Space,Global"
-    kinds = ["Rigid Body"] * 8 + ["Rigid Body Marker"] * 3 + ["Marker"] * 3
-    names = ["hull"] * 8 + ["hull:Marker 001"] * 3 + ["tip"] * 3
-    ids = ["506381AA"] * 8 + ["506381AB"] * 3 + ["0"] * 3
-    parts = ["Rotation"] * 4 + ["Position"] * 3 + ["Mean Marker Error"] + ["Position"] * 6
-    axes = [*"XYZW", *"XYZ", "", *"XYZ", *"XYZ"]
-    heads = [["", "Type", *kinds], ["", "Name", *names], ["", "ID", *ids]]
-    if version == "1.25":
-        heads.append(["", "Parent", *[""] * len(kinds)])
-    heads += [["", "", *parts], ["Frame", "Time (Seconds)", *axes]]
-    place, tip = scale * HULL.place @ Y_UP, scale * TIP.place @ Y_UP
-    columns = [TIME, *hull.as_quat().T, *place.T, np.full(SAMPLES, 3e-4), *(place + 1).T, *tip.T]
-    body = rows(columns, ",", 6, lost=[*range(1, 9)], first="frame")
-    path = folder / "take.csv"
-    path.write_text("\n".join([top, "", *(",".join(row) for row in heads)]) + "\n" + body)
-    return path
-
-
-def qualisys_header(included: str, names: list[str]) -> str:
-    kind, key = ("MARKERS", "MARKER_NAMES") if included == "3D" else ("BODIES", "BODY_NAMES")
-    keys = [f"NO_OF_FRAMES\t{SAMPLES}", "NO_OF_CAMERAS\t8", f"NO_OF_{kind}\t{len(names)}", f"FREQUENCY\t{RATE:g}"]
-    keys += [
-        "NO_OF_ANALOG\t0",
-        "ANALOG_FREQUENCY\t0",
-        "DESCRIPTION\t--",
-        "TIME_STAMP\t2022-06-03, 10:47:36.627\t9424.4",
-    ]
-    return "\n".join([*keys, f"DATA_INCLUDED\t{included}", "\t".join([key, *names])]) + "\n"
-
-
-def write_qualisys_bodies(folder: Path) -> Path:
-    """6DOF data: as https://github.com/shiplab/dt_cv has it; the matrix stands column after column."""
-    angles = ["X", "Y", "Z", "Roll", "Pitch", "Yaw", "Residual", *(f"Rot[{i}]" for i in range(9))]
-    names = [
-        "Frame",
-        "Time",
-        *(f"{name} {part}" if part == "X" else part for name in ("hull", "tip") for part in angles),
-    ]
-    columns = [np.arange(SAMPLES) + 1, TIME]
-    for pose in (HULL, TIP):
-        matrix = pose.turn.as_matrix().transpose(0, 2, 1).reshape(-1, 9)
-        columns += [*(1e3 * pose.place.T), *pose.turn.as_euler("XYZ", degrees=True).T, np.ones(SAMPLES), *matrix.T]
-    body = rows(columns, "\t", 5, lost=[]).split("\n")
-    for i in range(HIDDEN.start, HIDDEN.stop):
-        cells = body[i].split("\t")
-        body[i] = "\t".join([*cells[:2], *["0.00000"] * 16, *cells[18:]])
-    # Frames are whole numbers, and every row ends in a tab.
-    body = [f"{int(float(line.split(chr(9))[0]))}\t{line.partition(chr(9))[2]}\t" if line else line for line in body]
-    text = qualisys_header("6D", ["hull", "tip"]) + "\t".join(names) + "\t\n" + "\n".join(body)
-    path = folder / "trial.tsv"
-    path.write_bytes(text.replace("\n", "\r\n").encode())
-    return path
-
-
-CORNERS = {"hull1": [0.1, 0, 0], "hull2": [-0.1, 0.1, 0], "hull3": [-0.1, -0.1, 0], "hull4": [0, 0, 0.1]}
-
-
-def write_qualisys_markers(folder: Path) -> Path:
-    names = [*CORNERS, "tip"]
-    places = [HULL.place + HULL.turn.apply(corner) for corner in CORNERS.values()] + [TIP.place]
-    header = "\t".join(["Frame", "Time", *(f"{name} {axis}" for name in names for axis in "XYZ")])
-    body = rows([TIME, *(1e3 * np.hstack(places).T)], "\t", 3, lost=[*range(1, 7)], first="frame")
-    path = folder / "trial.tsv"
-    path.write_text(qualisys_header("3D", names) + header + "\n" + body)
-    return path
-
-
-def write_npz(folder: Path) -> Path:
-    place = HULL.place.copy()
-    place[HIDDEN] = np.nan
-    path = folder / "trial.npz"
-    np.savez(
-        path, time=TIME, hull_pos=place, hull_quat=HULL.turn.as_quat(scalar_first=True), tip_pos=TIP.place,
-        command_arm=COMMAND[:, 0], command_push=COMMAND[:, 1], note=np.array("first try"),
-    )  # fmt: skip
-    return path
-
-
-def write_table(folder: Path) -> Path:
-    """What others write by hand: milliseconds, comments, a comma at the end of each row."""
-    names = "time,hull_x,hull_y,hull_z,hull_qx,hull_qy,hull_qz,hull_qw,tip_x,tip_y,tip_z,arm_cmd,push_cmd,"
-    columns = [1e3 * TIME, *HULL.place.T, *HULL.turn.as_quat().T, *TIP.place.T, *COMMAND.T]
-    body = rows(columns, ",", 7, lost=[*range(1, 8)]).replace("\n", ",\n")
-    path = folder / "trial.csv"
-    path.write_text(f"# exported on a Tuesday, by hand\n{names}\n{body}")
-    return path
+# ---- the formats that need packages ----
 
 
 def ros_messages(store: Any) -> Any:
@@ -203,8 +93,8 @@ def ros_messages(store: Any) -> Any:
         )
 
 
-START, LATE = 1_700_000_000 * 10**9, 3_000_000
-"""ns: when it began, and how long messages take to be recorded."""
+LATE = 3_000_000
+"""ns: how long messages take to be recorded."""
 
 
 def write_bag(folder: Path, kind: str = "ros2") -> Path:
@@ -358,6 +248,18 @@ def test_motive_tells_measured_markers_from_expected_ones(tmp_path: Path, capsys
     assert "96.3 % seen" in said and 'up = "y"' in said
 
 
+def test_a_body_is_read_and_the_marker_of_its_name_is_not(tmp_path: Path, robot: RobotDescription):
+    """As in takes of skeletons, where the label of a marker may be a bone's name."""
+    path = write_motive(tmp_path)
+    path.write_text(path.read_text().replace("tip,tip,tip", "hull,hull,hull"))
+    contents = find_reader(path).list(path)
+    assert [(item.name, item.kind) for item in contents.items] == [("hull", "body")]
+    assert any("Markers that share their names with bodies are not read: hull." in note for note in contents.notes)
+    found = read_capture(path, room(tmp_path, robot, NAMED.replace('"tip"', '"hull"'), commands=NO_COMMANDS))
+    seen = np.r_[0 : HIDDEN.start, HIDDEN.stop : SAMPLES]
+    np.testing.assert_allclose(found.bodies["hull"].position[seen], (HULL.place @ Y_UP)[seen], atol=1e-6)
+
+
 def test_qualisys_bodies(tmp_path: Path, robot: RobotDescription):
     write_log(tmp_path)
     same(imported(tmp_path, write_qualisys_bodies(tmp_path), robot), gaps=True)
@@ -477,24 +379,6 @@ def test_lerobot_datasets_are_mapped_by_the_names_of_their_features(tmp_path: Pa
 # ---- files of one body ----
 
 
-def tum_text() -> str:
-    columns = [TIME + 1.7e9, *HULL.place.T, *HULL.turn.as_quat().T]
-    return "# timestamp tx ty tz qx qy qz qw\n" + rows(columns, " ", 7, lost=[])
-
-
-def write_tum(folder: Path) -> Path:
-    path = folder / "pose.txt"
-    path.write_text(tum_text())
-    return path
-
-
-def euroc_text() -> str:
-    header = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v [m]\n"
-    numbers = np.hstack([HULL.place, HULL.turn.as_quat(scalar_first=True), 0 * HULL.place[:, :1]])
-    lines = [f"{START + i * 10**7}," + ",".join(f"{x:.7f}" for x in row) for i, row in enumerate(numbers)]
-    return header + "\n".join(lines) + "\n"
-
-
 @pytest.mark.parametrize("name, text", [("pose.txt", tum_text()), ("data.csv", euroc_text())])
 def test_trajectories_of_one_body(tmp_path: Path, robot: RobotDescription, name: str, text: str):
     (tmp_path / name).write_text(text)
@@ -538,26 +422,6 @@ position = ["observation.state[7]", "observation.state[8]", "observation.state[9
 
 
 # ---- damage ----
-
-
-def replaced(old: str, new: str, count: int = -1) -> Callable[[Path], None]:
-    def damage(path: Path) -> None:
-        text = path.read_text()
-        assert old in text
-        path.write_text(text.replace(old, new, count))
-
-    return damage
-
-
-def in_line(number: int, cell: int, text: str, delimiter: str = ",") -> Callable[[Path], None]:
-    def damage(path: Path) -> None:
-        lines = path.read_text().split("\n")
-        cells = lines[number - 1].split(delimiter)
-        cells[cell] = text
-        lines[number - 1] = delimiter.join(cells)
-        path.write_text("\n".join(lines))
-
-    return damage
 
 
 def cut_text(path: Path) -> None:
