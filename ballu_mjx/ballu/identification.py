@@ -220,9 +220,9 @@ _PATIENCE = 4
 _LEVEL = 0.05
 """Of the F-test."""
 _LEAST_EFFECT = 0.15
-"""Cohen's f^2 of a medium effect (Cohen, "Statistical power analysis for the behavioral sciences", 1988). With thousands
-of samples, an F-test sees errors of the simulator's time step: hundredths of a degree, which the further parameters
-would take up at the price of wrong springs and gains."""
+"""Cohen's f^2 of a medium effect (Cohen, "Statistical power analysis for the behavioral sciences", 1988). With
+thousands of samples, an F-test sees errors of the simulator's time step: hundredths of a degree, which the further
+parameters would take up at the price of wrong springs and gains."""
 _FIRST_DAMPING = 5 * DEGREE
 """Unit of angles in a search, which starts with Levenberg's damping at 1. In radians, weak directions are damped for
 dozens of iterations."""
