@@ -226,6 +226,9 @@ parameters would take up at the price of wrong springs and gains."""
 _FIRST_DAMPING = 5 * DEGREE
 """Unit of angles in a search, which starts with Levenberg's damping at 1. In radians, weak directions are damped for
 dozens of iterations."""
+_INSIDE = 4.0
+"""Largest coordinate that a search of the motion starts from: 2 % of the bounds' span inside them. A slack that settled
+angles put at its bound has next to no slope left, and would stay there."""
 _SHORT = 6
 """Iterations after which one of two searches goes on."""
 _LEAST_SPREAD = 1e-9
@@ -405,6 +408,7 @@ class Identifier:
         by_leg = ends.reshape(len(legs), -1, size)
         if not config.motion:
             return by_leg[legs, nearest], ends
+        by_leg = np.clip(by_leg, -_INSIDE, _INSIDE)
         # Settled angles leave much open, and a servo far from its limit has no gradient by it. The motion says from
         # which end to go on: where it begins nearest, or soon gets nearest.
         first = np.where(kept[size:], 0.0, dynamics_coordinates(SIMPLE_DYNAMICS))
