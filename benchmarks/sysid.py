@@ -48,10 +48,11 @@ import scipy.optimize
 from jaxtyping import Float
 from mujoco import rollout
 
+from ballu_mjx.ballu.actuators import ActuatorParameters, actuator_fields
 from ballu_mjx.ballu.curves import curve_distances
 from ballu_mjx.ballu.identification import Identification, Identifier
 from ballu_mjx.ballu.leg_parameters import LEG_PARAMETERS, IdentificationConfig, ParameterTransform, nominal_leg
-from ballu_mjx.ballu.model import SIDES, ActuatorParameters, actuator_fields, load_suspended_leg, suspend
+from ballu_mjx.ballu.model import SIDES, load_suspended_leg, suspend
 from ballu_mjx.ballu.sweep import Sweep, read_sweep
 from ballu_mjx.ballu.sysid_report import mean_error
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording

@@ -19,7 +19,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ballu_mjx.ballu.model import CABLE_SLACK, ActuatorParameters
+from ballu_mjx.ballu.actuators import CABLE_SLACK, ActuatorParameters
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 

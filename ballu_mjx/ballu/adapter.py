@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.ballu import actuators_file, leg_response, reconstruct, recordings
+from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.ballu.features import foot_positions
 from ballu_mjx.ballu.gait import count_steps
-from ballu_mjx.ballu.model import JOINTS, SIDES, ActuatorParameters, standing_qpos
+from ballu_mjx.ballu.model import JOINTS, SIDES, standing_qpos
 from ballu_mjx.ballu.sweep import LEVELS, read_sweep
 from ballu_mjx.recordings.hooks import RecordingHooks
 from ballu_mjx.recordings.inverse_kinematics import KinematicFit

@@ -26,6 +26,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 from scipy.stats import f as f_distribution
 
+from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.ballu.curves import curve_distances
 from ballu_mjx.ballu.leg_parameters import (
     DEGREE,
@@ -42,7 +43,7 @@ from ballu_mjx.ballu.leg_parameters import (
     leg_dynamics,
     nominal_leg,
 )
-from ballu_mjx.ballu.model import SIDES, ActuatorParameters
+from ballu_mjx.ballu.model import SIDES
 from ballu_mjx.ballu.suspended_leg import SuspendedLeg
 from ballu_mjx.ballu.sweep import SAMPLE_TIMESTEP, Sweep
 from ballu_mjx.identification.batched_solver import BatchedSolver, Evaluate, along_directions

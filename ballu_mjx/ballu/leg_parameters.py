@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ballu_mjx.ballu.model import SIDES, ActuatorParameters, load_suspended_leg
+from ballu_mjx.ballu.actuators import ActuatorParameters
+from ballu_mjx.ballu.model import SIDES, load_suspended_leg
 from ballu_mjx.common.errors import InputError
 
 LEG_PARAMETERS = (

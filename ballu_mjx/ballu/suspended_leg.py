@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
+from ballu_mjx.ballu.actuators import ActuatorParameters, actuator_fields
 from ballu_mjx.ballu.leg_parameters import FIRST_DYNAMICS, LEG_PARAMETERS, LegDynamics
-from ballu_mjx.ballu.model import SIDES, ActuatorParameters, actuator_fields, load_suspended_leg
+from ballu_mjx.ballu.model import SIDES, load_suspended_leg
 from ballu_mjx.ballu.sweep import SAMPLE_TIMESTEP
 from ballu_mjx.identification.batched_solver import along_directions
 from ballu_mjx.robots.model import with_fields

@@ -11,8 +11,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from ballu_mjx.ballu.actuators import SERVO_RANGE, ActuatorParameters
 from ballu_mjx.ballu.actuators_file import actuators_to_json, read_actuators, write_actuators
-from ballu_mjx.ballu.model import SERVO_RANGE, ActuatorParameters, load_model, standing_qpos
+from ballu_mjx.ballu.model import load_model, standing_qpos
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.open_loop import nominal_model
 from ballu_mjx.residuals.aerodynamics_training import fit_aerodynamics

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import directed_hausdorff as scipy_directed_hausdorff
 
+from ballu_mjx.ballu.actuators import ActuatorParameters, actuator_fields
 from ballu_mjx.ballu.curves import curve_distances, directed_hausdorff, polynomial_curve
 from ballu_mjx.ballu.identification import CompiledLeg, Identifier, leg_data
 from ballu_mjx.ballu.leg_parameters import (
@@ -24,7 +25,7 @@ from ballu_mjx.ballu.leg_parameters import (
     dynamics_coordinates,
     nominal_leg,
 )
-from ballu_mjx.ballu.model import SIDES, ActuatorParameters, actuator_fields, suspend
+from ballu_mjx.ballu.model import SIDES, suspend
 from ballu_mjx.ballu.sweep import Sweep
 from ballu_mjx.robots.model import assets, set_fields
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP, ActuatorParameters, load_model, standing_qpos
+from ballu_mjx.ballu.actuators import ActuatorParameters
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.evaluation.errors import Errors, Evaluation, mean_by_group
 from ballu_mjx.evaluation.errors_file import evaluation_to_json
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator

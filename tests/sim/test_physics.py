@@ -14,19 +14,8 @@ from jaxtyping import Array, Float
 from mujoco import mjx
 from mujoco.mjx._src.solver import Context
 
-from ballu_mjx.ballu.model import (
-    CABLE_SLACK,
-    CONTROL_TIMESTEP,
-    KNEES,
-    MOTORS,
-    SIDES,
-    ActuatorParameters,
-    actuator_fields,
-    buoyancy_ratio,
-    cable_length,
-    load_model,
-    standing_qpos,
-)
+from ballu_mjx.ballu.actuators import CABLE_SLACK, ActuatorParameters, actuator_fields, cable_length
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, KNEES, MOTORS, SIDES, buoyancy_ratio, load_model, standing_qpos
 from ballu_mjx.robots.model import set_fields, with_fields
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.contact_solver import _newton_step, _solve

@@ -20,17 +20,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu.model import (
-    CABLE_SLACK,
-    CONTROL_TIMESTEP,
-    SERVO_RANGE,
-    SIDES,
-    ActuatorParameters,
-    actuator_fields,
-    load_model,
-    standing_qpos,
-    suspend,
-)
+from ballu_mjx.ballu.actuators import CABLE_SLACK, SERVO_RANGE, ActuatorParameters, actuator_fields
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model, standing_qpos, suspend
 from ballu_mjx.ballu.recordings import make_recording
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.recording import Recording
