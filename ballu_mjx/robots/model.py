@@ -66,9 +66,12 @@ def same_parameters(one: ModelParameters | None, other: ModelParameters | None) 
     """Return whether two simulators have equal parameters (None: nominal)."""
     if one is None or other is None:
         return one is other
-    (leaves, kind), (others, other_kind) = (jax.tree.flatten(each) for each in (one, other))
-    return kind == other_kind and all(
-        np.array_equal(np.float32(a), np.float32(b)) for a, b in zip(leaves, others, strict=True)
+    if type(one) is not type(other):
+        return False
+    # By path: a parameter that is None in one of them has no leaf there.
+    leaves, others = (dict(jax.tree_util.tree_leaves_with_path(each)) for each in (one, other))
+    return leaves.keys() == others.keys() and all(
+        np.array_equal(np.float32(leaf), np.float32(others[path])) for path, leaf in leaves.items()
     )
 
 
