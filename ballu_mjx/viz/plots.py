@@ -86,7 +86,7 @@ def fit_curve(
     best_step: int,
 ) -> None:
     """Losses by name and the validation error, called `label`, against gradient steps, in the simulator's colour."""
-    figure, upper, lower = _over_validation(validation, simulator, "no force", best_step)
+    figure, upper, lower = _over_validation(validation, simulator, "no force", float(best_step))
     for (name, curve), style in zip(losses.items(), ("-", "--"), strict=False):
         upper.plot(*curve, color=colour_of(simulator), linestyle=style, label=name)
     upper.set_ylabel("loss")
