@@ -47,11 +47,10 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from _constant_wrench import fit_constant_wrench
 from jaxtyping import Array
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-
-from _constant_wrench import fit_constant_wrench
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table
