@@ -15,17 +15,14 @@ Limits and contacts are Bullet's: hard, where MuJoCo's give a little.
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 import pybullet  # pyright: ignore[reportMissingImports]
+from bullet_world import open_world
 from jaxtyping import Float
-from pybullet_utils.bullet_client import BulletClient  # pyright: ignore[reportMissingImports]
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES
@@ -79,16 +76,7 @@ class Robot:
         stays where `reset` puts it."""
         self.model, self.timestep = model, timestep
         self.substeps = round(CONTROL_TIMESTEP / timestep)
-        self._world: Any = BulletClient(pybullet.DIRECT)
-        self._world.setGravity(*model.opt.gravity)
-        self._world.setPhysicsEngineParameter(fixedTimeStep=timestep, numSubSteps=1)
-        floor = self._world.createMultiBody(0.0, self._world.createCollisionShape(pybullet.GEOM_PLANE))
-        # Bullet multiplies the two surfaces' coefficients; the model's foot decides alone.
-        self._world.changeDynamics(floor, -1, lateralFriction=1.0)
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "ballu.urdf"
-            path.write_text(urdf(model))
-            self._body = self._world.loadURDF(str(path), useFixedBase=held, flags=pybullet.URDF_MAINTAIN_LINK_ORDER)
+        self._world, self._body = open_world(urdf(model), model.opt.gravity, timestep, held=held)
         count = self._world.getNumJoints(self._body)
         infos = [self._world.getJointInfo(self._body, index) for index in range(count)]
         self._joint = {info[1].decode(): info[0] for info in infos}

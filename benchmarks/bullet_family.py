@@ -18,15 +18,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import tempfile
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pybullet  # pyright: ignore[reportMissingImports]
+from bullet_world import open_world
 from jaxtyping import Float
-from pybullet_utils.bullet_client import BulletClient  # pyright: ignore[reportMissingImports]
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.ballu.gaits import Gait, telegraph, waves
@@ -230,15 +228,7 @@ class World:
 
     def __init__(self, robot: BulletRobot, *, held: bool = False) -> None:
         self.robot = robot
-        self._world: Any = BulletClient(pybullet.DIRECT)
-        self._world.setGravity(0.0, 0.0, -GRAVITY)
-        self._world.setPhysicsEngineParameter(fixedTimeStep=TIMESTEP, numSubSteps=1)
-        floor = self._world.createMultiBody(0.0, self._world.createCollisionShape(pybullet.GEOM_PLANE))
-        self._world.changeDynamics(floor, -1, lateralFriction=1.0)  # Bullet multiplies both surfaces' coefficients
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "ballu.urdf"
-            path.write_text(urdf(robot))
-            self._body = self._world.loadURDF(str(path), useFixedBase=held, flags=pybullet.URDF_MAINTAIN_LINK_ORDER)
+        self._world, self._body = open_world(urdf(robot), (0.0, 0.0, -GRAVITY), TIMESTEP, held=held)
         infos = [self._world.getJointInfo(self._body, index) for index in range(self._world.getNumJoints(self._body))]
         self._links = {info[12].decode(): info[0] for info in infos}
         self._knees = [self._links[f"tibia_{side}"] for side in SIDES]

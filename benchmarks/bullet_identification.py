@@ -1,26 +1,28 @@
 """Does identification help on robots that the package's model class does not contain?
 
-For each robot of `bullet_family`: a sweep is recorded, and identified by BALLU's own method (shipped) and by declared
-parameters (general, `IDENTIFY`). Compared, with nominal actuators:
+For each robot of `bullet_family` a sweep is recorded and identified as `train sysid` does. Compared with nominal
+actuators:
 
 - settled angles: mean absolute error (deg) of motors and knees on commands that no fit saw, by the simulator itself;
 - free walking: position RMSE (m) of open-loop replays from recorded states over 1 s and 5 s, drivetrain included
-  (`identification.guard`), on gaits (near) and on what is none (far).
+  (`identification.guard`), on gaits (near) and on what is none (far);
+- what `--actuators auto` takes, by the guard's replay of further recordings.
 
-Bounds and priors of `IDENTIFY` are of the nominal robot alone. Choices are made on robots 0 and 1.
+Choices are made on robots 0 and 1. All five take about an hour on two cores.
 
+    python benchmarks/bullet_identification.py
     python benchmarks/bullet_identification.py --robots 0 1
-    python benchmarks/bullet_identification.py --quick             # one robot, short fits
-    python benchmarks/bullet_identification.py --output FOLDER     # FOLDER/bullet_identification.json too
+    python benchmarks/bullet_identification.py --quick             # one robot, settled angles alone
+    python benchmarks/bullet_identification.py --output FOLDER     # robots that stand there already are not repeated
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import subprocess
+import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,55 +46,32 @@ from bullet_family import (
     sweep_commands,
     walking_commands,
 )
-from common import described, machine, write
+from common import described, write
 from jaxtyping import Float
 
+from ballu_mjx.ballu.actuators_file import actuators_to_json
+from ballu_mjx.ballu.gaits import Gait
+from ballu_mjx.ballu.identification import Identification, Identifier
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
 from ballu_mjx.ballu.model import SIDES, suspend
 from ballu_mjx.ballu.sweep import Sweep, read_sweep
-from ballu_mjx.ballu.sysid_report import mean_error
-from ballu_mjx.identification.actuators import identify_actuators
-from ballu_mjx.identification.declarations import declared_parameters
-from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, fit_robot
+from ballu_mjx.ballu.sysid_report import identification_details
+from ballu_mjx.common import provenance
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.common.results import Table, write_results
 from ballu_mjx.identification.guard import HORIZONS, choose_actuators
-from ballu_mjx.identification.parameters import IdentifiedParameters, ParameterSet
-from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, measure
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
-from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, assets, set_fields
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.drivetrain import count_slots, drivetrain_of, filter_commands
 
 SECONDS = 20.0
 """Of each walking recording."""
+ANGLES = [f"{kind}_{side}" for kind in ("motor", "knee") for side in SIDES]
 SETTLED = 50
 """Samples at the end of a hold whose mean is its settled angle."""
-_DEGREE = float(np.pi / 180)
-
-
-def leg_entries(side: str) -> list[dict[str, Any]]:
-    """Return what is identified of a leg. Nothing is tied: legs differ."""
-    knee, servo, cable = {"joint": f"knee_{side}"}, {"actuator": f"servo_{side}"}, {"tendon": f"cable_{side}"}
-    command = {"command": side}
-    return [
-        {**knee, "field": "stiffness", "prior": 0.005},
-        {**knee, "field": "damping", "bounds": [1e-4, 0.1], "prior": 0.01},
-        {**knee, "field": "jnt_range", "index": 0, "bounds": [20 * _DEGREE, 35 * _DEGREE], "prior": 3 * _DEGREE,
-         "name": f"knee_stop_{side}", "unit": "rad"},
-        {**servo, "field": "forcerange", "bounds": [0.02, 0.34], "prior": 0.03},
-        {**cable, "field": "springlength", "bounds": [0.3326, 0.3386], "prior": 1e-3},
-        {**cable, "field": "stiffness", "bounds": [200.0, 8000.0], "prior": 1000.0},
-        {**command, "field": "scale", "bounds": [0.5, 1.3], "prior": 0.15},
-        {**command, "field": "offset", "bounds": [-0.15, 0.15], "prior": 0.05},
-        {**command, "field": "delay", "bounds": [0.0, 0.12], "prior": 0.03},
-        {**command, "field": "backlash", "bounds": [0.0, 0.15], "prior": 0.03},
-        {**command, "field": "lag", "bounds": [0.0, 0.15], "prior": 0.03},
-    ]  # fmt: skip
-
-
-IDENTIFY = tuple(entry for side in SIDES for entry in leg_entries(side))
 
 
 def suspended_model() -> mujoco.MjModel:
@@ -101,41 +80,6 @@ def suspended_model() -> mujoco.MjModel:
     suspend(spec)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     return spec.compile()
-
-
-def measured_sweep(recording: Recording, robot: RobotDescription, model: mujoco.MjModel) -> MeasuredMotion:
-    """Return a sweep with the hips, which are not recorded, where the legs' weight takes them at rest."""
-    hips = hanging_hips(model, recording)
-    complete = dataclasses.replace(recording, joint_angles={**recording.joint_angles, **hips})
-    found = measure(complete, robot, model, SamplingConfig())
-    position, velocity = found.position_noise.copy(), found.velocity_noise.copy()
-    for side in SIDES:
-        dof = model.joint(f"hip_{side}").dofadr[0]
-        position[dof], velocity[dof] = _HIP_NOISE
-    return dataclasses.replace(found, position_noise=position, velocity_noise=velocity)
-
-
-_HIP_NOISE = 5 * _DEGREE, 0.5
-"""rad, rad/s: legs swing about where they would rest."""
-
-
-def hanging_hips(model: mujoco.MjModel, recording: Recording) -> dict[str, Float[np.ndarray, " T"]]:
-    """Return the hips' angles (rad) at which a leg's centre of mass is below its hip."""
-    data, found = mujoco.MjData(model), {}
-    for side in SIDES:
-        knees = np.linspace(0.2, 1.9, 60)
-        angles = np.zeros(len(knees))
-        knee = model.joint(f"knee_{side}").qposadr[0]
-        body = model.body(f"femur_{side}").id
-        for number, angle in enumerate(knees):
-            data.qpos[:] = 0.0
-            data.qpos[knee] = angle
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_comPos(model, data)
-            x, _, z = data.subtree_com[body] - data.xanchor[model.joint(f"hip_{side}").id]
-            angles[number] = -np.arctan2(-x, -z)
-        found[f"hip_{side}"] = np.interp(recording.joint_angles[f"knee_{side}"], knees, angles)
-    return found
 
 
 def settled(
@@ -153,8 +97,7 @@ def settled(
         slots = count_slots(float(np.max(drivetrain.delay)), model.opt.timestep)
         commands = np.asarray(filter_commands(drivetrain, jnp.asarray(commands), model.opt.timestep, slots))
     data = mujoco.MjData(model)
-    angles = [f"{kind}_{side}" for kind in ("motor", "knee") for side in SIDES]
-    places = [model.joint(name).qposadr[0] for name in angles]
+    places = [model.joint(name).qposadr[0] for name in ANGLES]
     data.ctrl[:] = commands[0]
     for kind in ("hip", "knee"):
         for side in SIDES:
@@ -166,7 +109,12 @@ def settled(
         data.ctrl[:] = command
         mujoco.mj_step(model, data)
         seen.append(data.qpos[places].copy())
-    holds = np.array(seen)[::every].reshape(-1, round(SWEEP_HOLD / CAPTURE_TIMESTEP), 2, 2)
+    return hold_means(np.array(seen)[::every])
+
+
+def hold_means(angles: Float[np.ndarray, "samples 4"]) -> Float[np.ndarray, "holds 2 2"]:
+    """Return the means of `ANGLES` at the end of each hold; some joints still creep there."""
+    holds = angles.reshape(-1, round(SWEEP_HOLD / CAPTURE_TIMESTEP), 2, 2)
     return holds[:, -SETTLED:].mean(axis=1)
 
 
@@ -182,22 +130,22 @@ def copy_numbers(full: mujoco.MjModel, held: mujoco.MjModel) -> None:
         held.qpos_spring[one.qposadr] = full.qpos_spring[other.qposadr]
     names = ("actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "tendon_lengthspring", "tendon_stiffness")
     set_fields(held, {name: getattr(full, name) for name in (*names, "tendon_damping", "tendon_frictionloss")})
+    held.opt.iterations = full.opt.iterations
+
+
+def validation_commands() -> dict[str, Float[np.ndarray, "steps 2"]]:
+    """Return commands by recording, for the guard."""
+    steps = round(SECONDS / load_robot().control_timestep)
+    rng = np.random.default_rng(46)
+    held = np.repeat(np.round(rng.uniform(size=(steps // 12 + 1, 2)), 4), 12, axis=0)[:steps]
+    return {"near-3": Gait(1.3, 0.5, (0.5, 0.5), (0.8, 0.8)).commands(SECONDS), "far-3": held}
 
 
 def walking(recordings: Mapping[str, Recording], actuators: ModelParameters | None) -> list[Motion]:
     """Return recorded states, with the motors where these actuators take them, drivetrain included."""
     robot = load_robot()
-    model, drivetrain, found = robot.load_model(actuators), drivetrain_of(actuators), []
-    for recording in recordings.values():
-        driven = recording
-        if drivetrain is not None:
-            slots = count_slots(float(np.max(drivetrain.delay)), CAPTURE_TIMESTEP)
-            ctrl = filter_commands(drivetrain, jnp.asarray(recording.command), CAPTURE_TIMESTEP, slots)
-            driven = dataclasses.replace(recording, command=np.asarray(ctrl, float))
-        motion = reconstruct(driven, robot, model)
-        own = recording.command[:: round(robot.control_timestep / CAPTURE_TIMESTEP)][: len(motion.command)]
-        found.append(dataclasses.replace(motion, command=own))
-    return found
+    model, drivetrain = robot.load_model(actuators), drivetrain_of(actuators)
+    return [reconstruct(recording, robot, model, drivetrain=drivetrain) for recording in recordings.values()]
 
 
 def open_loop(recordings: Mapping[str, Recording], actuators: ModelParameters) -> dict[str, dict[str, float]]:
@@ -211,82 +159,115 @@ def open_loop(recordings: Mapping[str, Recording], actuators: ModelParameters) -
     }
 
 
-def fit_general(sweep: Recording, model: mujoco.MjModel, *, quick: bool) -> tuple[RobotFit, IdentifiedParameters]:
-    """Identify `IDENTIFY` from a sweep, and return the values also as the free robot's."""
-    robot = dataclasses.replace(load_robot(), identify=IDENTIFY)
-    held = declared_parameters(robot, model)
-    config = FitConfig(window_seconds=SWEEP_HOLD, starts=1, steps=5 if quick else 15)
-    fit = fit_robot(held, [measured_sweep(sweep, robot, model)], None, config)
-    free: ParameterSet = declared_parameters(robot, robot.load_model())
-    assert free.names == held.names
-    return fit, IdentifiedParameters(jnp.asarray(fit.values), free)
+def record(seed: int, commands: Mapping[str, Float[np.ndarray, "steps 2"]]) -> dict[str, Recording]:
+    """Return free recordings by name."""
+    return {name: record_walking(draw(seed), own, name, seed) for name, own in commands.items()}
 
 
-def examine(seed: int, *, quick: bool) -> dict[str, Any]:
+def examine(seed: int, identify: Callable[[Sweep], Identification]) -> dict[str, Any]:
     """Return all numbers of one robot."""
-    bullet, model, robot = draw(seed), suspended_model(), load_robot()
-    sweep = record_sweep(bullet, sweep_commands(), "sweep", seed)
+    bullet, model = draw(seed), suspended_model()
+    sweep = read_sweep({Path("sweep.csv"): record_sweep(bullet, sweep_commands(), "sweep", seed)})
     held_out = record_sweep(bullet, held_out_commands(seed), "held-out", seed + 100)
-    recordings = {
-        name: record_walking(bullet, commands, name, seed) for name, commands in walking_commands(SECONDS).items()
+    truth = hold_means(np.stack([held_out.joint_angles[name] for name in ANGLES], axis=1))
+    began = time.perf_counter()
+    found = identify(sweep)
+    seconds = time.perf_counter() - began
+    actuators = found.parameters
+    errors = {
+        name: float(np.rad2deg(np.mean(np.abs(settled(held_out, parameters, model) - truth))))
+        for name, parameters in (("nominal", None), ("identified", actuators))
     }
-    truth: Sweep = read_sweep({Path("held-out.csv"): held_out}, levels=10)
-    errors = {"nominal": mean_error(settled(held_out, None, model), truth)}
-    ways: dict[str, Any] = {}
-    began = time.perf_counter()
-    general, parameters = fit_general(sweep, model, quick=quick)
-    errors["general"] = mean_error(settled(held_out, parameters, model), truth)
-    seconds = {"general": time.perf_counter() - began}
-    ways["general"] = open_loop(recordings, parameters)
-    print(f"{bullet.name}: settled {errors}; general {ways['general']}", flush=True)
-    began = time.perf_counter()
-    config = IdentificationConfig(starts=2, draws=16, motion=not quick)
-    shipped = identify_actuators([sweep], robot, config).parameters
-    seconds["shipped"] = time.perf_counter() - began
-    errors["shipped"] = mean_error(settled(held_out, shipped, model), truth)
-    ways["shipped"] = open_loop(recordings, shipped)
-    print(f"{bullet.name}: settled {errors}; shipped {ways['shipped']}", flush=True)
-    rows = zip(general.parameters.names, general.values, general.standard_errors, strict=True)
-    return {
+    guard = choose_actuators(load_robot(), actuators, walking(record(seed, validation_commands()), actuators))
+    rows = zip(found.fits, SIDES, strict=True)
+    result = {
         "robot": dataclasses.asdict(bullet),
         "settled_deg": errors,
-        "open_loop_m": ways,
+        "open_loop_m": open_loop(record(seed, walking_commands(SECONDS)), actuators),
+        "guard": {"ratio": guard.ratio, "takes": "identified" if guard.improves else "nominal"},
         "seconds": seconds,
-        "parameters": {name: {"value": float(v), "standard_error": float(e)} for name, v, e in rows},
-        "at_bounds": list(general.at_bounds),
-        "creep": read_sweep({Path("sweep.csv"): sweep}).creep,
+        "parameters": actuators_to_json(actuators),
+        **identification_details(found),
+        "selection": None if found.selection is None else found.selection._asdict(),
+        "scatter_deg": {side: float(np.rad2deg(fit.residual)) for fit, side in rows},
+        "creep": sweep.creep,
     }
+    print(table({seed: result}).to_markdown(), flush=True)
+    return result
 
 
-def table(results: Mapping[int, Mapping[str, Any]]) -> str:
-    """Return errors and ratios to nominal as text."""
-    lines = [f"{'robot':8}{'quantity':24}{'nominal':>10}{'shipped':>10}{'general':>10}{'ratio':>8}{'target':>8}"]
-    for seed, result in results.items():
-        errors = result["settled_deg"]
-        rows = [("settled angles (deg)", errors["nominal"], errors["shipped"], errors["general"], 0.25)]
-        for name, general in result["open_loop_m"]["general"].items():
-            shipped = result["open_loop_m"]["shipped"][name]["identified"]
-            rows.append((f"position {name} (m)", general["nominal"], shipped, general["identified"], 0.6))
-        for name, nominal, shipped, general, target in rows:
-            cells = f"{nominal:>10.3f}{shipped:>10.3f}{general:>10.3f}{general / nominal:>8.2f}{target:>8.2f}"
-            lines.append(f"{seed:<8}{name:24}{cells}")
-    return "\n".join(lines)
+def table(results: Mapping[int, Mapping[str, Any]]) -> Table:
+    """Return errors of nominal and identified actuators, with their ratio in brackets."""
+
+    def compared(row: Mapping[str, float], form: str) -> str:
+        nominal, identified = row["nominal"], row["identified"]
+        return f"{nominal:{form}} -> {identified:{form}} ({identified / nominal:.2f})"
+
+    groups = list(next(iter(results.values()))["open_loop_m"])
+    heads = ("robot", "settled angles (deg)", *(f"{group} (m)" for group in groups), "guard's ratio, and choice")
+    return Table(
+        heads,
+        tuple(
+            (
+                str(seed),
+                compared(result["settled_deg"], ".2f"),
+                *(compared(result["open_loop_m"][group], ".3f") for group in groups),
+                f"{result['guard']['ratio']:.2f}, {result['guard']['takes']}",
+            )
+            for seed, result in results.items()
+        ),
+    )
+
+
+def read_earlier(path: Path, robots: Sequence[int], commit: str) -> dict[str, Any]:
+    """Return what an interrupted run left, to go on from.
+
+    **Raises** `InputError` where robots are missing and the code has changed since.
+    """
+    if not path.exists():
+        return {"commit": commit, "robots": {}}
+    earlier = json.loads(path.read_text(encoding="utf-8"))
+    earlier["robots"] = {int(seed): result for seed, result in earlier["robots"].items()}
+    if earlier["commit"] != commit and not set(robots) <= set(earlier["robots"]):
+        raise InputError(f"{path} is of commit {earlier['commit']}, and this is {commit}; give an empty folder.")
+    return earlier
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", type=int, nargs="+", default=None, choices=list(ROBOTS))
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--output", type=Path)
+    parser.add_argument("--output", type=Path, default=Path("runs/bench-bullet_identification"))
+    parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()
     robots = arguments.robots or (CHOSEN_ON[:1] if arguments.quick else list(ROBOTS))
-    results = {}
+    config = IdentificationConfig(motion=not arguments.quick)
+    compiled: list[Identifier] = []
+
+    def identify(sweep: Sweep) -> Identification:
+        with jax.enable_x64(True):
+            if not compiled:  # one program serves all sweeps of a size
+                compiled.append(Identifier(config, sweep, silent))
+            return compiled[0].run(sweep, silent)
+
+    path = arguments.output / "bullet_identification.json"
+    earlier = read_earlier(path, robots, provenance.source_commit() or "")
     for seed in robots:
-        results[seed] = examine(seed, quick=arguments.quick)
-        said = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
-        if arguments.output:
-            write(arguments.output, "bullet_identification", {"commit": said.stdout.strip(), "robots": results})
-    print(f"\n{described(machine())}; JAX {jax.__version__}, MuJoCo {mujoco.__version__}\n{table(results)}")
+        if seed not in earlier["robots"]:
+            earlier["robots"][seed] = examine(seed, identify)
+            write(arguments.output, "bullet_identification", {key: earlier[key] for key in ("commit", "robots")})
+    found = table({seed: earlier["robots"][seed] for seed in robots})
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    print(f"\n{described(stored['machine'])}; commit {stored['commit']}\n{found.to_markdown()}")
+    if arguments.results is not None:
+        about = {key: value for key, value in stored["machine"].items() if key not in ("versions", "load")}
+        measured = {"commit": stored["commit"], "machine": about, "versions": stored["machine"]["versions"]}
+        data = f"Development data: choices were made on robots {' and '.join(map(str, CHOSEN_ON))}"
+        write_results(arguments.results, {"errors": found}, data, seeds={"robots": robots}, measured=measured)
+
+
+def silent(stage: str, iteration: int, steps: int, value: float) -> None:
+    """No report."""
 
 
 if __name__ == "__main__":

@@ -1,18 +1,21 @@
 """Is each public C3D file read exactly as an independent reader does, or refused with a true sentence?
 
-The files are the sample collections of three projects, fetched from their repositories (some hold C3D files in their
-history alone, and some large ones behind Git LFS):
+The files are the sample collections of these projects, in all versions that their repositories' histories hold:
 
     git clone https://github.com/Biomechanical-ToolKit/BTKData
+    git clone https://github.com/pyomeca/ezc3d
     git clone https://github.com/pyomeca/ezc3d-testFiles
     git clone https://github.com/kineticstoolkit/kineticstoolkit
+    git clone https://github.com/EmbodiedCognition/py-c3d
 
     pip install ezc3d c3d
     python benchmarks/c3d_collections.py --data FOLDER-WITH-THE-CLONES
 
+Clones may be bare. What a clone lacks (a partial one, or a file behind Git LFS) is listed as not to be had.
+
 The independent readers are ezc3d (https://github.com/pyomeca/ezc3d) and py-c3d (`c3d` on PyPI). Places are compared of
 all points in all frames; a point with a negative residual, or at exactly 0, counts as not seen in all readers. Files of
-the same content are compared once.
+the same content are compared once, and counted in the first collection by name.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ import hashlib
 import io
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +37,8 @@ from ballu_mjx.recordings.importers.c3d_file import C3DError, read_c3d_points
 
 ROUNDING = 2e-7
 """Of the largest coordinate: single precision."""
+_LFS = b"version https://git-lfs"
+"""Begins what stands in for a file behind Git LFS."""
 LONGEST = 120.0
 """s, for another reader."""
 _BEGIN = """
@@ -73,24 +79,53 @@ place, residual = every[:3], every[3]
 class Compared:
     """One file."""
 
-    path: Path
+    name: str
     ours: str
     """"equal", "DIFFERENT", "read alone", or "refused: " and the sentence."""
     others: dict[str, str]
 
 
-def compare(path: Path) -> Compared:
+def collect(clone: Path) -> tuple[dict[str, bytes], list[str]]:
+    """Return the C3D files in all versions of a clone, by path and version, and the paths of those that it lacks."""
+    git = ["git", f"--git-dir={clone / '.git' if (clone / '.git').exists() else clone}"]
+    # Names and versions alone: rename detection would read the files, which a partial clone lacks.
+    line = [*git, "log", "--all", "-m", "--root", "--raw", "--no-renames", "--no-abbrev", "--format=", "-z"]
+    listed = subprocess.run([*line, "--", ":(icase)*.c3d"], capture_output=True, check=True).stdout
+    fields = listed.decode(errors="replace").split("\0")
+    changes = [*zip(fields[::2], fields[1::2], strict=False)]
+    versions = {change.split()[3]: path for change, path in reversed(changes)}  # by its newest path
+    found: dict[str, bytes] = {}
+    lacking: list[str] = []
+    for version, path in versions.items():
+        if not version.strip("0"):
+            continue  # deleted there
+        read = subprocess.run([*git, "cat-file", "blob", version], capture_output=True, check=False)
+        if read.returncode or read.stdout.startswith(_LFS):
+            lacking.append(path)
+        else:
+            found[f"{path}@{version[:8]}"] = read.stdout
+    return found, lacking
+
+
+def compare(name: str, content: bytes) -> Compared:
     """Return what the readers make of a file."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "file.c3d"
+        path.write_bytes(content)
+        return _compare(name, path)
+
+
+def _compare(name: str, path: Path) -> Compared:
     others = {name: _read(script, path) for name, script in READERS.items()}
     shown = {name: value if isinstance(value, str) else f"{value.shape[2]} frames" for name, value in others.items()}
     try:
         place = read_c3d_points(path.read_bytes()).position
     except C3DError as error:
-        return Compared(path, f"refused: {error.problem}; {error.fix}", shown)
+        return Compared(name, f"refused: {error.problem}; {error.fix}", shown)
     verdicts = {name: _verdict(place, value) for name, value in others.items()}
     read = [verdict for verdict in verdicts.values() if verdict in ("equal", "different")]
     ours = "read alone" if not read else "equal" if "equal" in read else "DIFFERENT"
-    return Compared(path, ours, verdicts)
+    return Compared(name, ours, verdicts)
 
 
 def _read(script: str, path: Path) -> np.ndarray | str:
@@ -117,19 +152,24 @@ def _verdict(ours: np.ndarray, theirs: np.ndarray | str) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True, help="folder that holds the files, at any depth")
+    parser.add_argument("--data", type=Path, required=True, help="folder with the clones")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     options = parser.parse_args()
-    folder: Path = options.data
-    found: dict[str, Path] = {}
-    for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() == ".c3d" and path.is_file():
-            found.setdefault(hashlib.sha256(path.read_bytes()).hexdigest(), path)
-    results = [compare(path) for path in found.values()]
-    for each in results:
-        others = "; ".join(f"{name}: {said}" for name, said in each.others.items())
-        print(f"{each.path.relative_to(folder)} | {each.ours} | {others}")
-    table = count_table(results, [each.path.relative_to(folder).parts[0] for each in results])
+    compared: set[str] = set()
+    results: list[Compared] = []
+    collections_of: list[str] = []
+    for clone in sorted(path for path in options.data.iterdir() if path.is_dir()):
+        found, lacking = collect(clone)
+        for name, content in sorted(found.items()):
+            digest = hashlib.sha256(content).hexdigest()
+            if digest not in compared:
+                compared.add(digest)
+                results.append(compare(name, content))
+                collections_of.append(clone.name)
+                others = "; ".join(f"{reader}: {said}" for reader, said in results[-1].others.items())
+                print(f"{clone.name}/{name} | {results[-1].ours} | {others}", flush=True)
+        print(f"{clone.name}: {len(found)} files; not to be had: {', '.join(sorted(set(lacking))) or 'none'}")
+    table = count_table(results, collections_of)
     print(f"\n{table.to_markdown()}")
     if options.results is not None:
         write_results(options.results, {"collections": table}, "Public files", packages=("ballu-mjx", "ezc3d", "c3d"))

@@ -23,7 +23,7 @@ import jax
 import numpy as np
 
 from ballu_mjx.ballu.identification import Fit, Identifier, leg_data
-from ballu_mjx.ballu.leg_parameters import LEG_PARAMETERS, Drivetrain, IdentificationConfig, drivetrain_coordinates
+from ballu_mjx.ballu.leg_parameters import LEG_PARAMETERS, IdentificationConfig, LegDynamics, dynamics_coordinates
 from ballu_mjx.ballu.model import SIDES
 from ballu_mjx.ballu.sweep import Sweep, read_sweep
 from ballu_mjx.ballu.virtual import robot as virtual_robot
@@ -31,9 +31,11 @@ from ballu_mjx.ballu.virtual import robot as virtual_robot
 NOISE = float(np.deg2rad(0.5))
 SAMPLES, TIMES, LEVELS = 30, 60, 20
 """Of a hold: samples of its mean, and of its motion; and holds."""
-TRAIN = Drivetrain(delay=0.043, motor_friction=3e-3, knee_friction=8e-4, backlash=float(np.deg2rad(2.0)))
-CHANGES = ([1.3, 0.7, 0.05, 0.06, 0.75, 1.2e-3], [0.8, 1.2, -0.08, -0.03, 0.6, 2e-4])
-"""Left and right: times the nominal parameters; angles (rad) and slack (m) added."""
+DYNAMICS = LegDynamics(
+    delay=0.043, motor_friction=3e-3, knee_friction=8e-4, backlash=float(np.deg2rad(2.0)), lag=0.02, knee_damping=4e-3
+)
+CHANGES = ([1.3, 0.7, 0.05, 0.06, 0.75, 1.2e-3, -0.15, 0.8, 0.03], [0.8, 1.2, -0.08, -0.03, 0.6, 2e-4, 0.0, 1.3, 0.0])
+"""Left and right: times the nominal parameters; angles (rad), slack (m) and travel added."""
 WIDTHS = (14, 14, 15, 20, 16)
 RATIOS = ("knee_spring_stiffness", "motor_gain", "torque_limit")
 
@@ -47,8 +49,8 @@ def simulate(identifier: Identifier, vectors: np.ndarray) -> Sweep:
     physics, data = identifier.physics, leg_data(blank())
     y = np.stack([identifier.space.coordinates(vector) for vector in vectors])
     qpos, _ = physics.settled(y, data.command)
-    train = np.tile(drivetrain_coordinates(TRAIN), (len(SIDES), 1))
-    motion, _ = physics.motion(np.concatenate([y, train], axis=1), data.commanded)
+    dynamics = np.tile(dynamics_coordinates(DYNAMICS), (len(SIDES), 1))
+    motion, _ = physics.motion(np.concatenate([y, dynamics], axis=1), data.commanded)
     return dataclasses.replace(
         blank(),
         settled=np.moveaxis(qpos[:, :, physics.leg.angles], 0, -1),
@@ -111,6 +113,14 @@ def of_virtual_robots(robots: int) -> None:
         "as it is": IdentificationConfig(),
         "settled angles alone": IdentificationConfig(motion=False),
         "and no slack": IdentificationConfig(motion=False, cable_slack=False),
+        "the paper's eight": IdentificationConfig(
+            motion=False,
+            cable_slack=False,
+            torque_limit=False,
+            motor_travel=False,
+            cable_stiffness=False,
+            knee_spring_reference=False,
+        ),
     }
     for way, config in ways.items():
         print(f"\nVirtual robots, {way}: identified over true, (left, right)")

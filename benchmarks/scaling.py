@@ -77,7 +77,7 @@ def measure(environments: int, episode_seconds: float | None, recordings: int | 
     from ballu_mjx.recordings.csv_format import list_bundled, read_recording
     from ballu_mjx.recordings.reconstruct import reconstruct
     from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
-    from ballu_mjx.rl import learner, ppo
+    from ballu_mjx.rl import learner, ppo, training_state
 
     model = load_model()
     paths = list_bundled("training")
@@ -93,7 +93,7 @@ def measure(environments: int, episode_seconds: float | None, recordings: int | 
     sizes = dataclasses.replace(sizes, num_timesteps=(repeats + 1) * each)
     rates: list[float] = []
 
-    def note(step: int, state: learner.TrainingState, metrics: dict[str, float]) -> None:
+    def note(step: int, state: training_state.TrainingState, metrics: dict[str, float]) -> None:
         if metrics:
             rates.append(metrics["steps_per_second"])
 

@@ -30,7 +30,7 @@ from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
-from ballu_mjx.rl import learner, ppo, training_env
+from ballu_mjx.rl import learner, ppo, training_env, training_state
 from ballu_mjx.sim.step import count_substeps
 
 
@@ -38,7 +38,7 @@ def training_rates(env: EnvMimicEnv, config: ppo.PPOConfig) -> list[float]:
     """Control steps per second of each training step but the first, which compiles."""
     rates: list[float] = []
 
-    def note(step: int, state: learner.TrainingState, metrics: dict[str, float]) -> None:
+    def note(step: int, state: training_state.TrainingState, metrics: dict[str, float]) -> None:
         if metrics:
             rates.append(metrics["steps_per_second"])
 

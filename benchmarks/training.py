@@ -86,12 +86,12 @@ def train_ours(launched: float, seed: int, steps: int, target: float, config: di
     from ballu_mjx.policies.locomotion_env import LocomotionConfig
     from ballu_mjx.policies.policy import environment_of
     from ballu_mjx.policies.tasks import TASKS
-    from ballu_mjx.rl import learner, ppo
+    from ballu_mjx.rl import learner, ppo, training_state
     from ballu_mjx.robots.registry import load_robot
 
     curve: Curve = []
 
-    def note(step: int, state: learner.TrainingState, metrics: dict[str, float]) -> None:
+    def note(step: int, state: training_state.TrainingState, metrics: dict[str, float]) -> None:
         if metrics:
             curve.append((time.time() - launched, step, metrics["reward"]))
             if seconds_to(curve, target) is not None:

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 from scipy import optimize
 
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.recordings.segments import count_lost, cut_segments, simulate_segment
+from ballu_mjx.recordings.segment_errors import count_lost
+from ballu_mjx.recordings.segments import cut_segments, simulate_segment
 from ballu_mjx.sim.force_model import Action, BoundForces, Commands, ForceModel, History
 from ballu_mjx.sim.observation import ObservationLayout, world_rotation
 from ballu_mjx.sim.simulator import Simulator

@@ -40,7 +40,7 @@ from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.residuals.network import NetworkForces
 from ballu_mjx.residuals.presets import preset_values
-from ballu_mjx.rl import learner, ppo
+from ballu_mjx.rl import learner, ppo, training_state
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.model import assets
 from ballu_mjx.robots.registry import load_robot
@@ -110,12 +110,12 @@ def train(
     history: list[dict[str, Any]] = []
     due = sizes.validate_every
 
-    def look(step: int, state: learner.TrainingState, metrics: dict[str, float]) -> None:
+    def look(step: int, state: training_state.TrainingState, metrics: dict[str, float]) -> None:
         nonlocal due
         if step < due and step < last:
             return
         due = step + sizes.validate_every
-        result = evaluator(learner.params(state))
+        result = evaluator(training_state.params(state))
         ratios = {
             f"{group} {quantity} {horizon:g}": result.ratio(group, quantity, horizon)
             for group in result.groups

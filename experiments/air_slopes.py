@@ -33,7 +33,8 @@ from jaxtyping import Array, Float
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.recordings.reconstruct import reconstruct
-from ballu_mjx.recordings.segments import Segments, pseudo_huber
+from ballu_mjx.recordings.segment_errors import pseudo_huber
+from ballu_mjx.recordings.segments import Segments
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirWindows
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.robots.registry import load_robot

@@ -38,12 +38,8 @@ from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.common.results import Cell, Table
-from ballu_mjx.evaluation.errors import (
-    SCORE_HORIZONS,
-    Errors,
-    Evaluation,
-    read_evaluation,
-)
+from ballu_mjx.evaluation.errors import SCORE_HORIZONS, Errors, Evaluation
+from ballu_mjx.evaluation.errors_file import read_evaluation
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording

@@ -26,7 +26,8 @@ _setup.prepare()
 
 import numpy as np
 
-from ballu_mjx.ballu.model import CABLE_SLACK, ActuatorParameters, load_model
+from ballu_mjx.ballu.actuators import CABLE_SLACK, ActuatorParameters
+from ballu_mjx.ballu.model import load_model
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.ballu.virtual.trials import run_trials

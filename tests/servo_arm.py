@@ -4,6 +4,7 @@ arm does not have."""
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax
@@ -76,10 +77,17 @@ def wandering(seed: int, steps: int, hold: int = 5) -> Float[np.ndarray, "steps 
 
 
 def true_path(
-    robot: RobotDescription, parameters: IdentifiedParameters, commands: Float[np.ndarray, "steps 2"]
+    robot: RobotDescription,
+    parameters: IdentifiedParameters,
+    commands: Float[np.ndarray, "steps 2"],
+    friction: float = 0.0,
 ) -> tuple[Float[np.ndarray, "physics 2"], Float[np.ndarray, "physics 2"]]:
-    """Return qpos and qvel after each physics step of C MuJoCo, from the rest pose, 10 physics steps to a command."""
+    """Return qpos and qvel after each physics step of C MuJoCo, from the rest pose, 10 physics steps to a command.
+
+    `friction`: how far (rad) dry friction, which the arm's model lacks, can hold each joint off its target.
+    """
     model = robot.load_model(parameters)
+    model.dof_frictionloss[:] = friction * -model.actuator_biasprm[:, 1]
     model.opt.iterations, model.opt.tolerance = 50, 0
     timestep = float(model.opt.timestep)
     with jax.enable_x64(True):
@@ -95,11 +103,24 @@ def true_path(
     return np.array(qpos), np.array(qvel)
 
 
-def record_arm(folder: Path, robot: RobotDescription, name: str, seed: int, kind: str = "free") -> Path:
-    """Write a recording of 6 s of the true arm at 100 Hz, with 0.2 deg of noise; suspended ones hold joints alone."""
+def record_arm(
+    folder: Path,
+    robot: RobotDescription,
+    name: str,
+    seed: int,
+    kind: str = "free",
+    *,
+    truth: Mapping[str, float] = TRUTH,
+    noise: float = 0.2,
+    friction: float = 0.0,
+) -> Path:
+    """Write a recording of 6 s of the true arm at 100 Hz, with noise (deg); suspended ones hold joints alone.
+
+    `friction` is that of `true_path`, in deg.
+    """
     seconds, free = 6.0, kind == "free"
     commands = wandering(seed, round(seconds / 0.05), hold=8)
-    qpos, _ = true_path(robot, identified(robot, **TRUTH), commands)
+    qpos, _ = true_path(robot, identified(robot, **truth), commands, np.deg2rad(friction))
     qpos = np.concatenate([np.zeros((1, 2)), qpos[:-1]])[::2]
     rng = np.random.default_rng(seed)
     places = "tip_x,tip_y,tip_z,tip_qw,tip_qx,tip_qy,tip_qz," if free else ""
@@ -107,7 +128,7 @@ def record_arm(folder: Path, robot: RobotDescription, name: str, seed: int, kind
     for sample, angles in enumerate(qpos):
         half, turn = angles[0] / 2, angles[0]
         tip = (-0.2 * np.sin(turn), 0, 1 - 0.2 * np.cos(turn), np.cos(half), 0, np.sin(half), 0)
-        measured = angles + np.deg2rad(0.2) * rng.normal(size=2)
+        measured = angles + np.deg2rad(noise) * rng.normal(size=2)
         cells = (sample * 0.01, *commands[sample // 5], *(tip if free else ()), *measured)
         rows.append(",".join(f"{cell:.6f}" for cell in cells))
     path = folder / f"{name}.csv"

@@ -20,6 +20,8 @@ FOLDERS = ("", "ballu_mjx", "ballu_mjx/recordings/importers", "ballu_mjx/policie
 """Where the pages' paths begin."""
 TO_BE_WRITTEN = {"gp.py", "gp_training.py", "train_gp.py", "test_gp.py", "stroll.py", "trc.py"}
 """Files of CONTRIBUTING's worked examples."""
+PLACE = re.compile(r"((?:`[\w.]+`(?:,| and)?\s+)+)in\s+`([\w/]+\.py)`")
+"""Functions and classes, and the file that a page says they are in."""
 COMMAND = re.compile(r"(?:ballu_mjx[ .]|`)((?:train|record|export) [\w-]+|evaluate|report|view|compare)\b([^`\n#;]*)")
 """A command, and what follows it, in a page's code."""
 WRITTEN = {"example.py"}
@@ -48,6 +50,35 @@ def test_files_that_the_pages_name_are_there():
             if not there and Path(path).name not in TO_BE_WRITTEN | WRITTEN:
                 missing.add(f"{page.relative_to(ROOT)}: {path}")
     assert not missing
+
+
+def defined(path: Path) -> set[str]:
+    """Return what a file defines: functions, classes, constants, and members of classes as `Class.member`."""
+
+    def names(body: list[ast.stmt]) -> set[str]:
+        found = set()
+        for node in body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                found.add(node.name)
+            if isinstance(node, ast.ClassDef):
+                found |= {f"{node.name}.{member}" for member in names(node.body)}
+            if isinstance(node, ast.Assign):
+                found |= {target.id for target in node.targets if isinstance(target, ast.Name)}
+        return found
+
+    return names(ast.parse(path.read_text(encoding="utf-8")).body)
+
+
+def test_what_the_theory_says_is_in_a_file_is_defined_there():
+    text = (ROOT / "docs" / "theory.md").read_text(encoding="utf-8")
+    missing = set()
+    for names, file in PLACE.findall(text):
+        there = defined(ROOT / "ballu_mjx" / file)
+        missing |= {f"{name} in {file}" for name in re.findall(r"`([\w.]+)`", names) if name not in there}
+    assert not missing
+    sections = text.split("\n## ")[1:]
+    without = [s.splitlines()[0] for s in sections if "$$" in s and not PLACE.search(s.partition("$$")[0])]
+    assert not without, "a shown equation, and before it no name of what computes it"
 
 
 def test_commands_and_options_that_the_pages_name_are_there():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ballu_mjx.cli import compare, evaluate, export, report, view
-from ballu_mjx.evaluation.errors import read_evaluation
+from ballu_mjx.evaluation.errors_file import read_evaluation
 from ballu_mjx.robots.description import read_description
 from ballu_mjx.viz.viser_scene import serve
 

@@ -1,9 +1,9 @@
-"""Files of identified actuators, format `ballu-actuators/1`: what `train sysid` writes and `--actuators` reads.
+"""Files of identified actuators, format `ballu-actuators/2`: what `train sysid` writes and `--actuators` reads.
 
-JSON with the keys `format`; `robot`, the name that its recordings carry; `parameters`, each field of
-`model.ActuatorParameters` as [left, right] in SI units and radians (`cable_slack` may be missing: nominal); and
-optionally `standard_errors` alike, `drivetrain` (delay, friction and backlash, which no simulator takes from here; null
-where unknown), `source` (the recordings) and whatever else the user wants to keep there.
+JSON with the keys `format`; `robot`, the name that its recordings carry; `parameters`, fields of
+`model.ActuatorParameters` as [left, right] in SI units and radians; and optionally `standard_errors` alike, `source`
+(the recordings) and whatever else the user wants to keep there. `cable_slack` and the fields that may be None may be
+missing: the nominal robot's. Files of `ballu-actuators/1` have no more than the first six fields.
 """
 
 from __future__ import annotations
@@ -19,18 +19,25 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ballu_mjx.ballu.model import CABLE_SLACK, ActuatorParameters
+from ballu_mjx.ballu.actuators import CABLE_SLACK, ActuatorParameters
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 
-ACTUATORS_FORMAT = "ballu-actuators/1"
+ACTUATORS_FORMAT = "ballu-actuators/2"
+_READ = ("ballu-actuators/1", ACTUATORS_FORMAT)
 _FIELDS = tuple(field.name for field in dataclasses.fields(ActuatorParameters))
-_POSITIVE = ("knee_spring_stiffness", "motor_gain", "torque_limit")
+_OPTIONAL = tuple(f.name for f in dataclasses.fields(ActuatorParameters) if f.default is None)
+_POSITIVE = ("knee_spring_stiffness", "motor_gain", "torque_limit", "motor_travel", "cable_stiffness")
+_NOT_NEGATIVE = ("knee_damping", "knee_friction", "motor_friction", "delay", "lag", "backlash")
 _LARGEST_ANGLE = math.pi
 _LARGEST_SLACK = 0.05
 """m: more than a motor arm of 16 mm can take up."""
 _SMALLEST, _LARGEST = 1e-9, 1e3
 """Springs, gains and torques beyond this are no robot's of 0.3 kg."""
+_LARGEST_STIFFNESS = 1e6
+"""N/m, of a cable."""
+_LONGEST_DELAY = 1.0
+"""s"""
 
 
 def write_actuators(path: Path, robot: str, parameters: ActuatorParameters, more: Mapping[str, Any]) -> None:
@@ -47,7 +54,7 @@ def read_actuators(path: Path) -> tuple[str, ActuatorParameters]:
     if not path.exists():
         raise InputError(f"{path}: there is no such file; `python -m ballu_mjx.train sysid` writes one.")
     content = files.read_json(path, "restore it or identify again")
-    if content.get("format") != ACTUATORS_FORMAT:
+    if content.get("format") not in _READ:
         raise InputError(f'{path}: "format" is not "{ACTUATORS_FORMAT}"; give a file that `train sysid` wrote.')
     if not isinstance(content.get("robot"), str) or not content["robot"].strip():
         raise InputError(f'{path}: "robot" must be the name that the robot\'s recordings carry.')
@@ -58,7 +65,8 @@ def read_actuators(path: Path) -> tuple[str, ActuatorParameters]:
 
 def actuators_to_json(parameters: ActuatorParameters) -> dict[str, list[float]]:
     """Pairs [left, right] by name."""
-    return {name: [float(f"{x:.6g}") for x in np.asarray(getattr(parameters, name))] for name in _FIELDS}
+    known = {name: getattr(parameters, name) for name in _FIELDS}
+    return {name: [float(f"{x:.6g}") for x in np.asarray(v)] for name, v in known.items() if v is not None}
 
 
 def actuators_from_json(values: Mapping[str, Any], path: Path) -> ActuatorParameters:
@@ -66,20 +74,27 @@ def actuators_from_json(values: Mapping[str, Any], path: Path) -> ActuatorParame
 
     **Raises** `InputError` naming `path`, the parameter and the mend.
     """
-    pairs = []
+    pairs = {}
     for name in _FIELDS:
+        if name in _OPTIONAL and name not in values:
+            continue
         pair = values.get(name, [CABLE_SLACK] * 2 if name == "cable_slack" else None)
         if not (isinstance(pair, list) and len(pair) == 2 and all(is_number(x) for x in pair)):
             raise InputError(f"{path}: {name} must be two numbers, [left, right]; it is {reprlib.repr(pair)}.")
-        if name in _POSITIVE and not _SMALLEST <= min(pair) <= max(pair) <= _LARGEST:
+        most = _LARGEST_STIFFNESS if name == "cable_stiffness" else _LARGEST
+        if name in _POSITIVE and not _SMALLEST <= min(pair) <= max(pair) <= most:
             raise InputError(f"{path}: {name} is {pair}; it must be greater than 0, and in SI units.")
         if name == "cable_slack" and not 0 <= min(pair) <= max(pair) <= _LARGEST_SLACK:
             raise InputError(f"{path}: {name} is {pair}; it must be 0 or more, in metres.")
+        if name in _NOT_NEGATIVE and min(pair) < 0:
+            raise InputError(f"{path}: {name} is {pair}; it must be 0 or more, in SI units.")
+        if name in ("delay", "lag") and max(pair) > _LONGEST_DELAY:
+            raise InputError(f"{path}: {name} is {pair}: give it in seconds.")
         if name not in _POSITIVE and max(map(abs, pair)) > _LARGEST_ANGLE:
             raise InputError(f"{path}: {name} is {pair}: give it in radians, not degrees.")
-        pairs.append(jnp.array(pair, jnp.float32))
+        pairs[name] = jnp.array(pair, jnp.float32)
     unknown = set(values) - set(_FIELDS)
     if unknown:
         name = reprlib.repr(sorted(unknown)[0])
         raise InputError(f"{path}: there is no parameter {name}; there are {', '.join(_FIELDS)}.")
-    return ActuatorParameters(*pairs)
+    return ActuatorParameters(**pairs)

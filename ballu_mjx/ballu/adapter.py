@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.ballu import actuators_file, leg_response, reconstruct, recordings
+from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.ballu.features import foot_positions
 from ballu_mjx.ballu.gait import count_steps
-from ballu_mjx.ballu.model import JOINTS, SIDES, ActuatorParameters, standing_qpos
+from ballu_mjx.ballu.model import JOINTS, SIDES, standing_qpos
 from ballu_mjx.ballu.sweep import LEVELS, read_sweep
 from ballu_mjx.recordings.hooks import RecordingHooks
 from ballu_mjx.recordings.inverse_kinematics import KinematicFit
@@ -123,9 +124,9 @@ class Ballu(RobotAdapter, RecordingHooks):
         levels: int | None = None,
         progress: IdentificationProgress | None = None,
     ) -> IdentifiedActuators:
-        """Return what `leg_identification.identify_from_sweep` returns."""
+        """Return what `identified_legs.identify_from_sweep` returns."""
         del robot
-        from ballu_mjx.ballu.leg_identification import identify_from_sweep  # Optimistix: slow to import
+        from ballu_mjx.ballu.identified_legs import identify_from_sweep  # Optimistix: slow to import
 
         return identify_from_sweep(recordings, config, levels, progress)
 

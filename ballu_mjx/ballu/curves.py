@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ballu_mjx.ballu.model import SERVO_RANGE
+from ballu_mjx.ballu.actuators import SERVO_RANGE
 
 CURVE_SAMPLES = 200
 """Points at which the curves are compared (paper)."""

@@ -10,11 +10,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ballu_mjx.ballu.model import SIDES, ActuatorParameters, load_suspended_leg
+from ballu_mjx.ballu.actuators import ActuatorParameters
+from ballu_mjx.ballu.model import SIDES, load_suspended_leg
 from ballu_mjx.common.errors import InputError
 
-LEG_PARAMETERS = tuple(field.name for field in dataclasses.fields(ActuatorParameters))
-"""A leg's parameters, in the order of a vector."""
+LEG_PARAMETERS = (
+    "knee_spring_stiffness",
+    "motor_gain",
+    "default_motor_angle",
+    "default_knee_angle",
+    "torque_limit",
+    "cable_slack",
+    "motor_travel",
+    "cable_stiffness",
+    "knee_spring_reference",
+)
+"""A leg's parameters that settled angles depend on, in the order of a vector."""
 DEGREE = float(np.pi / 180)
 
 
@@ -27,9 +38,16 @@ class IdentificationConfig:
     stiffer than the robot's."""
     cable_slack: bool = True
     """Identify the cables' slack too. Without it, springs and servos come out up to three times too strong."""
+    motor_travel: bool = True
+    """Identify what share of 90 deg a command of 1 asks for. Without it, a short travel passes for stiff springs, play
+    and friction."""
+    cable_stiffness: bool = True
+    """Identify the cables' stiffness too."""
+    knee_spring_reference: bool = True
+    """Identify where the knees' springs would be at rest, and with it how far they are preloaded, too."""
     motion: bool = True
-    """Learn from the whole motion, not from settled angles alone; delay, backlash and dry friction are then further
-    unknowns."""
+    """Learn from the whole motion, not from settled angles alone; delay, lag, backlash, dry friction and the knee's
+    damping are then further unknowns."""
     objective: Literal["pointwise", "hausdorff"] = "pointwise"
     """`pointwise`: least squares over all angles (Levenberg-Marquardt). `hausdorff`: the paper's distance between
     curves (L-BFGS), started from the pointwise solution; motion has no part in it."""
@@ -40,7 +58,7 @@ class IdentificationConfig:
     starts: int = 8
     """Searches for each leg, from the best draws. Of declared parameters: from the nominal values, then from draws from
     the priors."""
-    steps: int = 25
+    steps: int = 40
     """Most iterations of a search."""
     seed: int = 0
     """Seeds the draws."""
@@ -52,24 +70,26 @@ class ParameterRange(NamedTuple):
     factor: float | None
     """Bounds are the nominal value divided and multiplied by this; or else:"""
     reach: tuple[float, float]
-    """Bounds are the nominal value less and plus these (rad, or m)."""
+    """Bounds are the nominal value less and plus these."""
     prior: float
-    """How much robots differ (standard deviation): relative to the nominal value, or rad, or m."""
+    """How much robots differ (standard deviation): of the logarithm where there is a factor, else of the value."""
 
 
 RANGES: dict[str, ParameterRange] = {
     "knee_spring_stiffness": ParameterRange(4.0, (0.0, 0.0), 0.3),
-    "motor_gain": ParameterRange(4.0, (0.0, 0.0), 0.3),
+    "motor_gain": ParameterRange(16.0, (0.0, 0.0), 0.7),
     "default_motor_angle": ParameterRange(None, (20 * DEGREE, 20 * DEGREE), 5 * DEGREE),
     "default_knee_angle": ParameterRange(None, (15 * DEGREE, 15 * DEGREE), 3 * DEGREE),
     "torque_limit": ParameterRange(4.0, (0.0, 0.0), 0.3),
     "cable_slack": ParameterRange(None, (9e-5, 5e-3), 5e-4),
+    "motor_travel": ParameterRange(None, (0.5, 0.3), 0.15),
+    "cable_stiffness": ParameterRange(4.0, (0.0, 0.0), 0.5),
+    "knee_spring_reference": ParameterRange(None, (15 * DEGREE, 15 * DEGREE), 3 * DEGREE),
 }
 
 
-class Drivetrain(NamedTuple):
-    """What a command meets on its way to the joints, and what the simulators leave out: identified with the parameters,
-    so that it does not pass for them, and reported."""
+class LegDynamics(NamedTuple):
+    """What only the motion shows of a leg: what a command meets on its way to the joints, and what brakes these."""
 
     delay: Any
     """Seconds from a command to the servo's target."""
@@ -78,28 +98,42 @@ class Drivetrain(NamedTuple):
     knee_friction: Any
     """Dry friction (N m)."""
     backlash: Any
-    """Width (rad) of the play between command and motor arm."""
+    """Width (rad) of the play between the motor's target and its arm."""
+    lag: Any
+    """Time constant (s) with which the motor's target follows the command."""
+    knee_damping: Any
+    """Viscous friction (N m s/rad)."""
 
 
-FIRST_DRIVETRAIN = Drivetrain(0.03, 2e-3, 5e-4, 1 * DEGREE)
+FIRST_DYNAMICS = LegDynamics(0.03, 2e-3, 5e-4, 1 * DEGREE, 0.01, 2e-3)
 """Where the search begins."""
 
 
-def drivetrain_coordinates(values: Drivetrain) -> Float[np.ndarray, " 4"]:
+DYNAMICS_PRIOR = np.array([3.0, 1.0, 1.0, 1.0, 2.0, 2.0])
+"""How much robots differ (standard deviation) in the coordinates of the dynamics, about where the search begins."""
+SIMPLE_DYNAMICS = FIRST_DYNAMICS._replace(lag=1e-4, knee_damping=1e-3)
+"""The same of the simpler model: no lag to speak of, and the nominal damping."""
+FURTHER = ("motor_travel", "cable_stiffness", "knee_spring_reference", "lag", "knee_damping")
+"""Parameters that are fitted only where a sweep asks for them: each trades against others within a weak direction."""
+
+
+def dynamics_coordinates(values: LegDynamics) -> Float[np.ndarray, " 6"]:
     """Unbounded coordinates: of the delay linear, of the others logarithms; 0 where the search begins."""
-    others = np.log(np.array(values[1:]) / np.array(FIRST_DRIVETRAIN[1:]))
-    return np.array([(values.delay - FIRST_DRIVETRAIN.delay) / DELAY_UNIT, *others])
+    others = np.log(np.array(values[1:]) / np.array(FIRST_DYNAMICS[1:]))
+    return np.array([(values.delay - FIRST_DYNAMICS.delay) / DELAY_UNIT, *others])
 
 
-def drivetrain(coordinates: Float[Array, " 4"]) -> Drivetrain:
-    """The inverse of `drivetrain_coordinates`."""
+def leg_dynamics(coordinates: Float[Array, " 6"]) -> LegDynamics:
+    """The inverse of `dynamics_coordinates`."""
     delay, *others = coordinates
-    return Drivetrain(
-        FIRST_DRIVETRAIN.delay + DELAY_UNIT * delay,
-        *(f * jnp.exp(x) for f, x in zip(FIRST_DRIVETRAIN[1:], others, strict=True)),
+    return LegDynamics(
+        FIRST_DYNAMICS.delay + DELAY_UNIT * delay,
+        *(f * jnp.exp(x) for f, x in zip(FIRST_DYNAMICS[1:], others, strict=True)),
     )
 
 
+NOMINAL_DYNAMICS = {"knee_damping": 1e-3}
+"""The nominal robot's; the others are 0."""
 DELAY_UNIT = 0.01
 """Seconds of delay that a coordinate of 1 stands for."""
 
@@ -119,8 +153,8 @@ class ParameterTransform:
         self.nominal = nominal
         self.relative = np.array([r.factor is not None for r in ranges])
         self.lower, self.upper = nominal / factors - below, nominal * factors + above
-        self.prior = np.array([r.prior for r in ranges]) * np.where(self.relative, nominal, 1.0)
-        """Standard deviation of each parameter among robots, in its units."""
+        self.prior = np.array([r.prior for r in ranges])
+        """Standard deviation of each parameter among robots: of its logarithm where it is relative."""
         self.free = np.isin(LEG_PARAMETERS, free_parameters(config))
 
     def vector(self, coordinates: Float[Array, " free"]) -> Float[Array, " parameters"]:
@@ -139,6 +173,15 @@ class ParameterTransform:
         span = np.where(self.relative, logs[2] - logs[1], 1.0)
         share = np.where(self.relative, (logs[0] - logs[1]) / span, share)[self.free]
         return np.log(share / (1 - share))
+
+    def deviations(self, vector: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " parameters"]:
+        """Return how far parameters are from nominal, in standard deviations among robots."""
+        logarithms = np.log(np.where(self.relative, vector / np.where(self.relative, self.nominal, 1.0), 1.0))
+        return np.where(self.relative, logarithms, vector - self.nominal) / self.prior
+
+    def units(self, vector: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " parameters"]:
+        """Return one standard deviation among robots at these values, in the parameters' units."""
+        return self.prior * np.where(self.relative, vector, 1.0)
 
     def draw(self, seed: int, count: int) -> Float[np.ndarray, "draws free"]:
         """Coordinates: of the nominal values, then of uniform draws from the middle half of the bounds' span."""

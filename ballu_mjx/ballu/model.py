@@ -1,4 +1,4 @@
-"""BALLU's legs: names, and the actuator parameters that identification and randomization change.
+"""BALLU's model: the names in it, the whole robot and a suspended leg.
 
 Frames: world z up; the robot's x forward, y left. SI units and radians throughout. Arrays with a pair of entries
 are ordered (left, right).
@@ -6,13 +6,9 @@ are ordered (left, right).
 
 from __future__ import annotations
 
-import dataclasses
-
-import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from ballu_mjx.robots.model import ModelParameters, assets
 from ballu_mjx.robots.model import load_model as load_model_file
@@ -24,10 +20,6 @@ HIPS, KNEES, MOTORS = (slice(1, None, 3), slice(2, None, 3), slice(3, None, 3))
 """Places of the left and right hip, knee and motor within `JOINTS`."""
 CONTROL_TIMESTEP = 0.05
 """Seconds between two commands (20 Hz)."""
-CABLE_SLACK = 1e-4
-"""The nominal robot's slack of the cable (m) with the motor at 0 and the knee at its stop."""
-SERVO_RANGE = np.pi / 2
-"""Motor angle (rad) that a command of 1 asks for."""
 
 
 def load_model(actuators: ModelParameters | None = None) -> mujoco.MjModel:
@@ -55,95 +47,6 @@ def load_suspended_leg(side: str) -> mujoco.MjModel:
     return spec.compile()
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class ActuatorParameters:
-    """What differs from one servo, cable and knee to the next, each as (left, right), or for one leg alone: the first
-    four are the paper's eight free parameters (section "System Identification").
-
-    What each moves in the model:
-
-    - `knee_spring_stiffness` (N m/rad): `jnt_stiffness` of the knees; the spring's zero, -45 deg, stays.
-    - `motor_gain` (N m/rad): the servo's position gain, in `actuator_gainprm` and `actuator_biasprm`.
-    - `default_motor_angle` (rad): the motor angle that command 0 asks for, `actuator_biasprm[:, 0]`.
-    - `default_knee_angle` (rad): the knee's stop, `jnt_range[:, 0]`; the cable's rest length follows it.
-    - `torque_limit` (N m): where the servo saturates, `actuator_forcerange`. Not among the paper's eight, by which a
-      servo weaker than nominal can be told only by a spring stiffer than the robot's.
-    - `cable_slack` (m): what is left of the cable's rest length, `tendon_lengthspring[:, 1]`, with the motor at 0 and
-      the knee at its stop. Not among the paper's eight either: without it, a cable that bends the knee late passes for
-      one that stretches, under torques up to three times the robot's.
-    """
-
-    knee_spring_stiffness: Float[Array, " sides"]
-    motor_gain: Float[Array, " sides"]
-    default_motor_angle: Float[Array, " sides"]
-    default_knee_angle: Float[Array, " sides"]
-    torque_limit: Float[Array, " sides"]
-    cable_slack: Float[Array, " sides"]
-
-    def fields(self, model: mujoco.MjModel) -> dict[str, Array]:
-        """Return `actuator_fields` of `model` for these parameters."""
-        return actuator_fields(model, self)
-
-    @staticmethod
-    def nominal(model: mujoco.MjModel) -> ActuatorParameters:
-        """The values that stand in `model`."""
-        knees, servos = _knee_ids(model), _servo_ids(model)
-        gain = -model.actuator_biasprm[servos, 1]
-        taut = cable_length(model, model.jnt_range[knees, 0], np.zeros(len(knees)))
-        return ActuatorParameters(
-            knee_spring_stiffness=jnp.asarray(model.jnt_stiffness[knees], jnp.float32),
-            motor_gain=jnp.asarray(gain, jnp.float32),
-            default_motor_angle=jnp.asarray(model.actuator_biasprm[servos, 0] / gain, jnp.float32),
-            default_knee_angle=jnp.asarray(model.jnt_range[knees, 0], jnp.float32),
-            torque_limit=jnp.asarray(model.actuator_forcerange[servos, 1], jnp.float32),
-            cable_slack=jnp.asarray(model.tendon_lengthspring[_cable_ids(model), 1] - taut, jnp.float32),
-        )
-
-
-def cable_length(
-    model: mujoco.MjModel, knee: Float[Array | np.ndarray, " sides"], motor: Float[Array | np.ndarray, " sides"]
-) -> Float[Array, " sides"]:
-    """Distance (m) between the cable's ends at the given knee and motor angles (rad).
-
-    The same planar geometry as the model's spatial tendon, written out because the rest length must be known, and
-    differentiable, before any state is.
-    """
-    knee, motor = jnp.asarray(knee), jnp.asarray(motor)
-    lengths = []
-    for i, side in enumerate(_sides(model)):
-        anchor = model.site(f"cable_femur_{side}").pos - model.body(f"tibia_{side}").pos
-        arm = model.body(f"arm_{side}").pos
-        radius = model.site(f"cable_arm_{side}").pos[2]
-        x = arm[0] - radius * jnp.sin(motor[i])
-        z = arm[2] + radius * jnp.cos(motor[i])
-        dx = jnp.cos(knee[i]) * x + jnp.sin(knee[i]) * z - anchor[0]
-        dz = -jnp.sin(knee[i]) * x + jnp.cos(knee[i]) * z - anchor[2]
-        lengths.append(jnp.sqrt(dx**2 + dz**2 + (arm[1] - anchor[1]) ** 2))
-    return jnp.stack(lengths)
-
-
-def actuator_fields(model: mujoco.MjModel, parameters: ActuatorParameters) -> dict[str, Array]:
-    """Model fields that carry `parameters`, by name; for `mjx.Model.replace` or, as NumPy, for an `MjModel`."""
-    knees, servos = _knee_ids(model), _servo_ids(model)
-    gain = parameters.motor_gain
-    rest = cable_length(model, parameters.default_knee_angle, jnp.zeros_like(gain)) + parameters.cable_slack
-    return {
-        "jnt_stiffness": jnp.asarray(model.jnt_stiffness).at[knees].set(parameters.knee_spring_stiffness),
-        "jnt_range": jnp.asarray(model.jnt_range).at[knees, 0].set(parameters.default_knee_angle),
-        "actuator_gainprm": jnp.asarray(model.actuator_gainprm).at[servos, 0].set(gain * SERVO_RANGE),
-        "actuator_biasprm": jnp.asarray(model.actuator_biasprm)
-        .at[servos, 0]
-        .set(gain * parameters.default_motor_angle)
-        .at[servos, 1]
-        .set(-gain),
-        "actuator_forcerange": jnp.asarray(model.actuator_forcerange)
-        .at[servos]
-        .set(parameters.torque_limit[:, None] * jnp.array([-1.0, 1.0])),
-        "tendon_lengthspring": jnp.asarray(model.tendon_lengthspring).at[_cable_ids(model), 1].set(rest),
-    }
-
-
 def buoyancy_ratio(model: mujoco.MjModel) -> float:
     """Lift over the whole robot's weight, as it stands in `model`."""
     balloon = model.body("balloon").id
@@ -155,7 +58,7 @@ def standing_qpos(model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:
     qpos = model.qpos0.copy()
     hinges = qpos[7:]
     hinges[HIPS] = np.deg2rad(-14.0)
-    hinges[KNEES] = model.jnt_range[_knee_ids(model), 0]
+    hinges[KNEES] = model.jnt_range[knee_ids(model), 0]
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
@@ -165,18 +68,11 @@ def standing_qpos(model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:
     return qpos
 
 
-def _sides(model: mujoco.MjModel) -> tuple[str, ...]:
+def leg_sides(model: mujoco.MjModel) -> tuple[str, ...]:
     """The legs that `model` has."""
     return tuple(side for side in SIDES if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, f"knee_{side}") >= 0)
 
 
-def _knee_ids(model: mujoco.MjModel) -> np.ndarray:
-    return np.array([model.joint(f"knee_{side}").id for side in _sides(model)])
-
-
-def _servo_ids(model: mujoco.MjModel) -> np.ndarray:
-    return np.array([model.actuator(f"servo_{side}").id for side in _sides(model)])
-
-
-def _cable_ids(model: mujoco.MjModel) -> np.ndarray:
-    return np.array([model.tendon(f"cable_{side}").id for side in _sides(model)])
+def knee_ids(model: mujoco.MjModel) -> np.ndarray:
+    """Places of the knees among the model's joints, left and right."""
+    return np.array([model.joint(f"knee_{side}").id for side in leg_sides(model)])

@@ -122,8 +122,8 @@ def actuator_curves(path: Path, sweep: Sweep, result: Identification) -> None:
             for name, angles in simulations.items():
                 curve = np.rad2deg(angles[order, row, column])
                 axis.plot(command, curve, color=colour_of(name), label=label_of(name), linewidth=1.5)
-            if result.with_drivetrain is not None:
-                curve = np.rad2deg(result.with_drivetrain[order, row, column])
+            if result.simulated is not None:
+                curve = np.rad2deg(result.simulated[order, row, column])
                 label = f"{label_of('vanilla+sysid')}, with friction and backlash"
                 axis.plot(command, curve, ":", color=colour_of("vanilla+sysid"), label=label, linewidth=1.5)
             measured = np.rad2deg(sweep.settled[order, row, column])

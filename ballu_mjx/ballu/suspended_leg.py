@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from functools import partial
 
 import jax
@@ -11,18 +12,20 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
-from ballu_mjx.ballu.leg_parameters import FIRST_DRIVETRAIN, LEG_PARAMETERS, Drivetrain
-from ballu_mjx.ballu.model import SERVO_RANGE, SIDES, ActuatorParameters, actuator_fields, load_suspended_leg
+from ballu_mjx.ballu.actuators import ActuatorParameters, actuator_fields
+from ballu_mjx.ballu.leg_parameters import FIRST_DYNAMICS, LEG_PARAMETERS, LegDynamics
+from ballu_mjx.ballu.model import SIDES, load_suspended_leg
 from ballu_mjx.ballu.sweep import SAMPLE_TIMESTEP
 from ballu_mjx.identification.batched_solver import along_directions
 from ballu_mjx.robots.model import with_fields
+from ballu_mjx.sim.drivetrain import DrivetrainState, init_drivetrain, step_drivetrain
 from ballu_mjx.sim.step import PhysicsState, make_data, physics_step, put_model, state_at
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 
 
 def leg_actuators(vector: Float[Array, " parameters"]) -> ActuatorParameters:
     """Of a model with one leg."""
-    return ActuatorParameters(*vector[:, None])
+    return ActuatorParameters(**dict(zip(LEG_PARAMETERS, vector[:, None], strict=True)))
 
 
 class SuspendedLeg:
@@ -41,8 +44,8 @@ class SuspendedLeg:
         self._data = make_data(self.model)
         rubbing = copy.copy(self.model)
         rubbing.dof_frictionloss[self._dofs] = (
-            FIRST_DRIVETRAIN.motor_friction,
-            FIRST_DRIVETRAIN.knee_friction,
+            FIRST_DYNAMICS.motor_friction,
+            FIRST_DYNAMICS.knee_friction,
         )  # MJX leaves out those of 0
         self._rubbing = put_model(rubbing)
         self._rubbing_data = make_data(rubbing)
@@ -64,7 +67,7 @@ class SuspendedLeg:
     def motion(
         self,
         vector: Float[Array, " parameters"],
-        drivetrain: Drivetrain,
+        dynamics: LegDynamics,
         command: Float[Array, " times"],
         begins: Bool[np.ndarray, " times"],
     ) -> Float[Array, "times 2"]:
@@ -77,33 +80,34 @@ class SuspendedLeg:
 
         Differentiable forwards.
         """
-        inner = round(SAMPLE_TIMESTEP / float(self.model.opt.timestep))
+        timestep = float(self.model.opt.timestep)
+        inner = round(SAMPLE_TIMESTEP / timestep)
 
-        def path(vector: Array, drivetrain: Drivetrain, command: Array) -> Array:
-            friction = jnp.zeros(self.model.nv)
-            friction = friction.at[self._dofs].set(jnp.stack([drivetrain.motor_friction, drivetrain.knee_friction]))
-            fields = actuator_fields(self.model, leg_actuators(vector)) | {"dof_frictionloss": friction}
-            model = with_fields(self._rubbing, fields)
+        def path(vector: Array, dynamics: LegDynamics, command: Array) -> Array:
+            own = {name: getattr(dynamics, name)[None] for name in ("knee_friction", "motor_friction", "knee_damping")}
+            parameters = dataclasses.replace(leg_actuators(vector), **own, backlash=dynamics.backlash[None])
+            model = with_fields(self._rubbing, actuator_fields(self.model, parameters))
             start = state_at(self._default_qpos(vector), jnp.zeros(self.model.nv))
-            half = drivetrain.backlash / 2 / SERVO_RANGE
+            drivetrain = parameters.drivetrain()._replace(lag=dynamics.lag[None])
 
             def step(
-                carry: tuple[PhysicsState, Array], now: tuple[Array, Array]
-            ) -> tuple[tuple[PhysicsState, Array], Array]:
-                (state, play), (command, begins) = carry, now
-                state = jax.tree.map(partial(jnp.where, begins), start, state)
-                play = jnp.where(begins, command, jnp.clip(play, command - half, command + half))
-                held = self._rubbing_data.replace(ctrl=play[None])  # pyright: ignore
+                carry: tuple[PhysicsState, DrivetrainState], now: tuple[Array, Array]
+            ) -> tuple[tuple[PhysicsState, DrivetrainState], Array]:
+                (state, driven), (command, begins) = carry, now
+                at_rest = init_drivetrain(drivetrain, command[None], 2)
+                state, driven = jax.tree.map(partial(jnp.where, begins), (start, at_rest), (state, driven))
                 for _ in range(inner):
-                    state = physics_step(model, held, state)
-                return (state, play), state.qpos[self.angles]
+                    driven, ctrl = step_drivetrain(drivetrain, driven, command[None], timestep)
+                    state = physics_step(model, self._rubbing_data.replace(ctrl=ctrl), state)  # pyright: ignore
+                return (state, driven), state.qpos[self.angles]
 
-            after = jax.lax.scan(step, (start, command[0]), (command, jnp.asarray(begins)))[1]
+            first = init_drivetrain(drivetrain, command[:1], 2)
+            after = jax.lax.scan(step, (start, first), (command, jnp.asarray(begins)))[1]
             return jnp.concatenate([start.qpos[self.angles][None], after[:-1]])
 
-        moved = vmap_with_trailing_batch(path)(vector, drivetrain, command)
+        moved = vmap_with_trailing_batch(path)(vector, dynamics, command)
         times = SAMPLE_TIMESTEP * jnp.arange(len(begins))
-        return jax.vmap(lambda column: jnp.interp(times - drivetrain.delay, times, column), 1, 1)(moved)
+        return jax.vmap(lambda column: jnp.interp(times - dynamics.delay, times, column), 1, 1)(moved)
 
     def _residual_torque(
         self, qpos: Float[Array, " nq"], vector: Float[Array, " parameters"], command: Float[Array, ""]
@@ -177,7 +181,7 @@ class SuspendedLeg:
 
 _RELAXATION_TIMESTEP = 0.05
 _RELAXATION_STEPS = 150
-_RELAXATION_DAMPING = {"hip": 0.1, "knee": 0.03, "motor": 0.05}
+_RELAXATION_DAMPING = {"hip": 0.1, "knee": 0.12, "motor": 0.2}
 """N m s/rad: more than half the time step times the stiffness of each joint, which keeps such long steps stable."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -12,10 +13,10 @@ from ballu_mjx.ballu.curves import curve_distances
 from ballu_mjx.ballu.identification import Identification
 from ballu_mjx.ballu.leg_parameters import (
     DEGREE,
+    FURTHER,
     LEG_PARAMETERS,
-    Drivetrain,
-    IdentificationConfig,
-    free_parameters,
+    NOMINAL_DYNAMICS,
+    LegDynamics,
     nominal_leg,
 )
 from ballu_mjx.ballu.model import SIDES
@@ -33,12 +34,17 @@ _UNITS = {
     "default_knee_angle": ("deg", 1 / DEGREE),
     "torque_limit": ("N m", 1.0),
     "cable_slack": ("mm", 1e3),
+    "motor_travel": ("1", 1.0),
+    "cable_stiffness": ("N/m", 1.0),
+    "knee_spring_reference": ("deg", 1 / DEGREE),
 }
-_DRIVETRAIN_UNITS = {
+_DYNAMICS_UNITS = {
     "delay": ("s", 1.0),
     "motor_friction": ("N m", 1.0),
     "knee_friction": ("N m", 1.0),
     "backlash": ("deg", 1 / DEGREE),
+    "lag": ("s", 1.0),
+    "knee_damping": ("N m s/rad", 1.0),
 }
 
 
@@ -56,26 +62,32 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
         unit, scale = _UNITS[name]
         for side, fit in zip(SIDES, result.fits, strict=True):
             label = f"{name.replace('_', ' ')}, {side}"
-            error = f"{fit.standard_errors[index] * scale:.2g}" if fit.standard_errors[index] else "(held)"
             value = f"{fit.vector[index] * scale:.4g}"
+            error = f"{fit.standard_errors[index] * scale:.2g}{'' if name in result.fitted else ' (held)'}"
             lines.append(f"{label:33}{nominal[index] * scale:>10.4g}{value:>12}{error:>16} {unit}")
     for side, fit in zip(SIDES, result.fits, strict=True):
-        for name, value in fit.drivetrain._asdict().items() if fit.drivetrain else ():
-            unit, scale = _DRIVETRAIN_UNITS[name]
+        if fit.dynamics is None or fit.dynamics_errors is None:
+            continue
+        for name, found, deviation in zip(LegDynamics._fields, fit.dynamics, fit.dynamics_errors, strict=True):
+            unit, scale = _DYNAMICS_UNITS[name]
             label = f"{name.replace('_', ' ')}, {side}"
-            lines.append(f"{label:33}{'':10}{value * scale:>12.4g}{'':16} {unit} (reported only)")
-    before, after = (mean_error(angles, sweep) for angles in (result.nominal_settled, result.settled))
+            before = NOMINAL_DYNAMICS.get(name, 0.0)
+            held = result.keeps_simpler and name in FURTHER
+            value = f"{(before if held else found) * scale:.4g}"
+            error = "(held)" if held else f"{deviation * scale:.2g}"
+            lines.append(f"{label:33}{before * scale:>10.4g}{value:>12}{error:>16} {unit}")
+    simulated = result.settled if result.simulated is None else result.simulated
+    before, after = (mean_error(angles, sweep) for angles in (result.nominal_settled, simulated))
     lines += ["", f"Mean error of the settled angles: {before:.2f} deg before, {after:.2f} deg after."]
     if (creep := sweep.creep) is not None:
         lines.append(creep)
-    if result.with_drivetrain is not None:
+    if result.simulated is not None:
         scatter = ", ".join(
             f"{np.rad2deg(fit.residual):.2f} deg ({side})" for side, fit in zip(SIDES, result.fits, strict=True)
         )
         lines.append(
-            f"With delay, friction and backlash {mean_error(result.with_drivetrain, sweep):.2f} deg. Of the whole "
-            f"motion is left, root mean square: {scatter}; if that is more than your capture's noise, this model lacks "
-            "something."
+            f"Of the whole motion is left, root mean square: {scatter}; if that is more than your capture's noise, "
+            "this model lacks something."
         )
     with jax.enable_x64(True):
         for label, angles in (("before", result.nominal_settled), ("after", result.settled)):
@@ -85,20 +97,29 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
                 distances += np.asarray(curve_distances(sweep.command[:, side], *pair, result.config.degree))
             there, back = distances.sum(axis=1)
             lines.append(f"Curves {label}: Hausdorff distance {there:.4f} simulated to measured, {back:.4f} back.")
-    lines.append("Standard errors take the residuals for white noise; what the model lacks is none.")
+    if (selection := result.selection) is not None:
+        reason = "so they are identified" if selection.richer else "so they stay nominal"
+        lines.append(
+            "Travel, cable stiffness, spring reference, lag and knee damping explain "
+            f"{selection.effect:.1%} of what they leave (2 % wanted), F = {selection.statistic:.1f} (5 % level: "
+            f"{selection.threshold:.1f}), {reason}."
+        )
+    lines.append(
+        "Standard errors take all parameters as unknown, these too, and hold what is known of robots beforehand."
+    )
     for side, fit in zip(SIDES, result.fits, strict=True):
         singular = ", ".join(f"{1 / d.standard_error:.3g}" for d in fit.directions)
         lines.append(f"Singular values, {side} (Jacobian over noise, in units of what robots differ by): {singular}")
         lines += [
-            f"Left open, {side}, and held near nominal: {_in_words(d, result.config)}" for d in fit.open_directions
+            f"Left open, {side}, and held near nominal: {_in_words(d, result.fitted)}" for d in fit.open_directions
         ]
         weakest = fit.directions[-1]
         if not fit.open_directions:
             lines.append(
-                f"Least determined, {side}: {_in_words(weakest, result.config)}, to {weakest.standard_error:.0%} of "
+                f"Least determined, {side}: {_in_words(weakest, result.fitted)}, to {weakest.standard_error:.0%} of "
                 "what robots differ by."
             )
-        names = free_parameters(result.config)
+        names = result.free
         pairs = [(fit.correlations[i, j], i, j) for i in range(len(names)) for j in range(i)]
         strong = [f"{names[j]} with {names[i]} {r:+.2f}" for r, i, j in pairs if abs(r) > _STRONG]
         if strong:
@@ -110,24 +131,22 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
 
 def identification_details(result: Identification) -> dict[str, Any]:
     """What stands beside the parameters in `actuators.json`."""
+    errors = {name: [fit.standard_errors[i] for fit in result.fits] for i, name in enumerate(LEG_PARAMETERS)}
+    dynamics = [fit.dynamics_errors for fit in result.fits if fit.dynamics_errors is not None]
+    for name in LegDynamics._fields if dynamics else ():
+        if not (result.keeps_simpler and name in FURTHER):
+            errors[name] = [getattr(each, name) for each in dynamics]
     return {
-        "standard_errors": {
-            name: [float(f"{fit.standard_errors[index]:.3g}") for fit in result.fits]
-            for index, name in enumerate(LEG_PARAMETERS)
-        },
+        "standard_errors": {name: [float(f"{x:.3g}") for x in pair] for name, pair in errors.items()},
         "correlations": {
-            "parameters": list(free_parameters(result.config)),
+            "parameters": list(result.free),
             **{side: np.round(fit.correlations, 3).tolist() for side, fit in zip(SIDES, result.fits, strict=True)},
-        },
-        "drivetrain": {
-            name: [float(f"{getattr(fit.drivetrain, name):.4g}") if fit.drivetrain else None for fit in result.fits]
-            for name in Drivetrain._fields
         },
     }
 
 
-def _in_words(direction: Direction, config: IdentificationConfig) -> str:
+def _in_words(direction: Direction, names: Sequence[str]) -> str:
     """The parameters that make up most of a direction, with their signs."""
-    parts = [(w, n) for w, n in zip(direction.weights, free_parameters(config), strict=True) if abs(w) > 0.3]
+    parts = [(w, n) for w, n in zip(direction.weights, names, strict=True) if abs(w) > 0.3]
     ordered = sorted(parts, key=lambda part: -abs(part[0]))
     return " ".join(f"{w:+.2f} {name.replace('_', ' ')}" for w, name in ordered)

@@ -143,7 +143,7 @@ def prepare(
     if first:
         _announce(dataset, folder, data.quick)
     simulator = Simulator(robot, dataset.identified)
-    motions = dataset.reconstruct(simulator.mj_model)
+    motions = dataset.reconstruct(simulator)
     if resume is None:
         check_stability(robot, motions["training"], None)
     if dataset.identified is not None and resume is None:
@@ -154,7 +154,7 @@ def prepare(
             if first:
                 print("Nominal actuators are taken; --actuators FILE takes the identified ones.", flush=True)
             dataset, simulator = dataset.with_actuators(None, "nominal"), Simulator(robot)
-            motions = dataset.reconstruct(simulator.mj_model)
+            motions = dataset.reconstruct(simulator)
     return Prepared(task, folder, dataset, motions, simulator, residual, base, Evaluators(simulator))
 
 

@@ -99,7 +99,7 @@ def figures(folder: Path) -> dict[str, float]:
 
     **Raises** `InputError` where the run has not trained yet, or its evaluation is damaged.
     """
-    from ballu_mjx.evaluation.errors import read_evaluation
+    from ballu_mjx.evaluation.errors_file import read_evaluation
     from ballu_mjx.policies.tasks import TASKS
     from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
     from ballu_mjx.runs.folder import read_config

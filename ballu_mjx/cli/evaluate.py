@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -87,8 +88,8 @@ def _evaluate(options: Options) -> None:
         print(f"The {which} checkpoint of {options.run}: step {loaded.step:,}.", flush=True)
     print("Compiling: half a minute the first time ...", flush=True)
     simulator = Simulator(robot, loaded.actuators)
-    model = simulator.mj_model
-    motions = [reconstruct(recording, robot, model) for recording in recordings]
+    restore = partial(reconstruct, robot=robot, model=simulator.mj_model, drivetrain=simulator.drivetrain)
+    motions = [restore(recording) for recording in recordings]
     evaluator = Evaluators(simulator).of(loaded.model, motions)
     result = (
         evaluator(loaded.params)
@@ -98,7 +99,7 @@ def _evaluate(options: Options) -> None:
     print(result.table())
     if options.noise_floor:
         shaken = [add_capture_noise(recording, seed=number) for number, recording in enumerate(recordings)]
-        floor = evaluator.of_starts([reconstruct(each, robot, model) for each in shaken], loaded.params)
+        floor = evaluator.of_starts([restore(each) for each in shaken], loaded.params)
         print(f"\n{noise_floor(floor, result.residual)}")
 
 

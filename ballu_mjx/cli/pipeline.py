@@ -13,8 +13,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -132,6 +133,16 @@ def _again(number: int) -> str:
     return SimulatorVariant(ROUNDS, round=number).name
 
 
+class _Job(NamedTuple):
+    """A recording to be made on the robot."""
+
+    use: str
+    """Its folder: training or validation."""
+    name: str
+    controller: CaptureController
+    seconds: float
+
+
 class Story:
     """The stages of one seed. Each method makes its stage, and the ones before, unless they are there."""
 
@@ -194,52 +205,61 @@ class Story:
         times each): those of the last checkpoints of two trainings, without and with domain randomization."""
         settings = ("vanilla+dr",) if self.options.quick else ("vanilla", "vanilla+dr")
         sources = [self.policy(task, setting) for setting in settings]
-        takes, seconds = self.options.takes, 6.0 if self.options.quick else 20.0
 
-        def make(folder: Path) -> None:
+        def jobs(seconds: float) -> Iterator[_Job]:
             sequences = [commands for source in sources for commands in self._actions(source, seconds + 5.0)]
-            jobs = []
             for index, commands in enumerate(sequences):
                 # The last of the randomized training's sequences validates, a little longer than the others.
                 use = "validation" if index == len(sequences) - 1 else "training"
                 played = commands if use == "validation" else commands[: round(seconds / CONTROL_TIMESTEP)]
-                for take in range(takes):
-                    jobs.append((use, f"actions-{index}-take-{take + 1}", played))
-            for number, (use, name, commands) in enumerate(jobs):
-                controller, length = virtual_robot.open_loop(commands), len(commands) * CONTROL_TIMESTEP
-                draw, notes = _draw(self.seed, task, "recordings", number), f"Actions of a vanilla policy for {task}."
-                self._record(folder / use, name, controller, length, draw, notes)
-                print(f"Recorded {name} ({use}), {number + 1} of {len(jobs)}", flush=True)
+                for take in range(self.options.takes):
+                    name, length = f"actions-{index}-take-{take + 1}", len(played) * CONTROL_TIMESTEP
+                    yield _Job(use, name, virtual_robot.open_loop(played), length)
 
-        options = {"robot": self.options.robot_seed, "seed": self.seed, "takes": takes, "seconds": seconds}
-        return cached_stage(self._own / f"recordings-{task}", options, sources, make)
+        notes = f"Actions of a vanilla policy for {task}."
+        return self._recorded(f"recordings-{task}", sources, task, "recordings", jobs, notes)
 
     def trained_last(self, task: str, number: int) -> Path:
         """The robot's motion under the policies of the round before, in closed loop: those of the last checkpoints,
         each several times; and the last one's once more, a little longer, which validates."""
         source = self.policy(task, _again(number - 1))
-        takes, seconds = self.options.takes, 6.0 if self.options.quick else 20.0
+
+        def jobs(seconds: float) -> Iterator[_Job]:
+            policies = {step: weights(Policy.load(source, step)) for step in _last_steps(source)}
+            takes = [("training", step, take, seconds) for step in policies for take in range(self.options.takes)]
+            takes.append(("validation", max(policies), self.options.takes, seconds + 5.0))
+            for use, step, take, length in takes:
+                name = f"round-{number}-policy-{step}-take-{take + 1}"
+                yield _Job(use, name, ExportedPolicy(policies[step]), length)
+
+        notes = f"A policy for {task}, closed loop."
+        return self._recorded(f"recordings-{task}-{number}", [source], task, f"round {number}", jobs, notes)
+
+    def _recorded(
+        self,
+        stage: str,
+        sources: Sequence[Path],
+        task: str,
+        draws: str,
+        jobs: Callable[[float], Iterable[_Job]],
+        notes: str,
+    ) -> Path:
+        """Record what `jobs` gives for a length (s) of training recordings; `draws` tells its circumstances from those
+        of other stages."""
+        seconds = 6.0 if self.options.quick else 20.0
 
         def make(folder: Path) -> None:
-            policies = {step: weights(Policy.load(source, step)) for step in _last_steps(source)}
-            jobs = [("training", step, take, seconds) for step in policies for take in range(takes)]
-            jobs.append(("validation", max(policies), takes, seconds + 5.0))
-            for job, (use, step, take, length) in enumerate(jobs):
-                name = f"round-{number}-policy-{step}-take-{take + 1}"
-                controller = ExportedPolicy(policies[step])
-                draw, notes = _draw(self.seed, task, f"round {number}", job), f"A policy for {task}, closed loop."
-                self._record(folder / use, name, controller, length, draw, notes)
-                print(f"Recorded {name} ({use}), {job + 1} of {len(jobs)}", flush=True)
+            listed = list(jobs(seconds))
+            for number, job in enumerate(listed):
+                trial = virtual_robot.draw_trial(_draw(self.seed, task, draws, number))
+                recording = virtual_robot.record(self._robot, trial, job.controller, job.seconds, job.name, notes)
+                where = folder / job.use
+                where.mkdir(exist_ok=True)
+                write_recording(recording, where / f"{job.name}.csv.gz", load_robot(), decimals=_DECIMALS)
+                print(f"Recorded {job.name} ({job.use}), {number + 1} of {len(listed)}", flush=True)
 
-        options = {"robot": self.options.robot_seed, "seed": self.seed, "takes": takes, "seconds": seconds}
-        return cached_stage(self._own / f"recordings-{task}-{number}", options, [source], make)
-
-    def _record(
-        self, folder: Path, name: str, controller: CaptureController, seconds: float, draw: int, notes: str
-    ) -> None:
-        recording = virtual_robot.record(self._robot, virtual_robot.draw_trial(draw), controller, seconds, name, notes)
-        folder.mkdir(exist_ok=True)
-        write_recording(recording, folder / f"{name}.csv.gz", load_robot(), decimals=_DECIMALS)
+        made = {"robot": self.options.robot_seed, "seed": self.seed, "takes": self.options.takes, "seconds": seconds}
+        return cached_stage(self._own / stage, made, sources, make)
 
     def residual(self, task: str, setting: str) -> Path:
         """The run of a setting's residual, learned from the recordings of the task, those of all rounds up to its

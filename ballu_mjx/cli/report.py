@@ -14,7 +14,8 @@ from ballu_mjx.cli._help import parse_options
 from ballu_mjx.common import files, runtime
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.viz import video
-from ballu_mjx.viz.report import REPORT_FILE, collect, render
+from ballu_mjx.viz.report import REPORT_FILE, render
+from ballu_mjx.viz.report_content import collect
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from ballu_mjx.ballu import plots as ballu_plots
-from ballu_mjx.ballu.leg_identification import IdentifiedLegs
+from ballu_mjx.ballu.identified_legs import IdentifiedLegs
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig, check_identification_config
 from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, written_to
 from ballu_mjx.common import files
@@ -34,7 +34,8 @@ from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import Run, new_folder
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.viz import identification_plots
-from ballu_mjx.viz.report import IDENTIFICATION_FILE, REPORT_FILE, collect, render
+from ballu_mjx.viz.report import REPORT_FILE, render
+from ballu_mjx.viz.report_content import IDENTIFICATION_FILE, collect
 
 QUICK: Mapping[str, Any] = {"motion": False, "starts": 4}
 """Defaults of `IdentificationConfig` under `--quick`, for BALLU's legs."""

@@ -87,7 +87,7 @@ def load(source: Path, robot: str = "ballu") -> list[StoredRollout]:
     **Raises** `InputError` where it is neither, or holds no replay.
     """
     if source.is_dir():
-        from ballu_mjx.viz.report import collect
+        from ballu_mjx.viz.report_content import collect
 
         takes = collect(source).takes
         return takes or read_rollouts(source / ROLLOUT_FILE)

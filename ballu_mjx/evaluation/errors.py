@@ -1,19 +1,12 @@
-"""Errors of simulators over horizons: as data, as JSON, and the score that choices are made by."""
+"""Errors of simulators over horizons, and the score that choices are made by."""
 
 from __future__ import annotations
 
 import dataclasses
-import reprlib
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, Literal, get_args
+from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
-
-from ballu_mjx.common import files
-from ballu_mjx.common.errors import InputError, is_number
-from ballu_mjx.recordings.groups import group_of
-from ballu_mjx.robots.description_fields import HORIZON_RANGE
 
 HORIZONS = (1.0, 2.0, 5.0, 10.0, 20.0)
 """Seconds over which errors are taken, where neither robot nor recordings ask for others."""
@@ -25,10 +18,10 @@ Angle = Literal["yaw", "orientation"]
 """What errors of orientation are of: yaw, of upright robots, or the whole rotation."""
 _LEAST = 1e-5
 """m or deg: an error below is that of single precision."""
-
-
-_LARGEST = 1e6
+LARGEST = 1e6
 """m or deg: whoever is farther off has diverged."""
+WHOLE = ("mean_com_error", "final_orientation_error", "mean_force")
+"""Errors of which a recording has one, over its whole length."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +93,7 @@ def shortest_recording(declared: Sequence[float]) -> float:
 
 def has_diverged(error: float) -> bool:
     """Return whether an error (m or deg) is that of a simulation that broke down."""
-    return not abs(error) < _LARGEST
+    return not abs(error) < LARGEST
 
 
 def base_name(identified: bool) -> str:
@@ -202,114 +195,6 @@ class Evaluation:
         """Return what a quantity is called: errors of orientation by what they are of."""
         return self.angle if quantity == "orientation" else quantity
 
-    def to_json(self) -> dict[str, Any]:
-        """Return all figures, as plain lists and numbers; null for what is infinite."""
-        worst, place = self.excess()
-        return {
-            "base": self.base,
-            "name": self.name,
-            "angle": self.angle,
-            "score": _finite(self.score),
-            "worst_beyond_bound": {"relative": _finite(worst), "where": place},
-            "nominal": [_errors_to_json(errors) for errors in self.nominal],
-            "vanilla": [_errors_to_json(errors) for errors in self.vanilla],
-            "residual": [_errors_to_json(errors) for errors in self.residual],
-        }
-
-    @staticmethod
-    def from_json(content: Mapping[str, Any]) -> Evaluation:
-        """Return the inverse of `to_json`.
-
-        **Raises** `ValueError`, `TypeError`, `KeyError` or `AttributeError` for what is none.
-        """
-
-        def number(value: Any) -> float:
-            if value is None:
-                return np.inf
-            if not is_number(value):
-                raise ValueError(f"{reprlib.repr(value)} is no number")
-            return float(value)
-
-        def text(value: Any) -> str:
-            if not isinstance(value, str):
-                raise ValueError(f"{reprlib.repr(value)} is no text")
-            return value
-
-        def by_horizon(values: Any) -> dict[float, tuple[Any, Any]]:
-            found = {float(horizon[:8]): (first, second) for horizon, (first, second) in values.items()}
-            check(found)
-            return found
-
-        def check(horizons: Mapping[float, Any]) -> None:
-            low, high = HORIZON_RANGE
-            if not all(low <= horizon <= high for horizon in horizons):
-                raise ValueError(f"errors are taken over {low:g} to {high:g} s, not {reprlib.repr(list(horizons))}")
-
-        def medians(values: Any) -> dict[str, dict[float, float]]:
-            found = {text(name): {float(h[:8]): number(x) for h, x in each.items()} for name, each in values.items()}
-            for each in found.values():
-                check(each)
-                if not all(0 <= x for x in each.values()):
-                    raise ValueError("medians of errors are 0 or more")
-            return found
-
-        def steps(value: Any) -> tuple[int, int] | None:
-            if value is None:
-                return None
-            start, later = value
-            if not type(start) is type(later) is int:
-                raise ValueError("a start that diverged is named by two numbers of control steps")
-            return start, later
-
-        def table(values: Any) -> dict[float, tuple[float, float]]:
-            found = {horizon: (number(mean), number(spread)) for horizon, (mean, spread) in by_horizon(values).items()}
-            if not all(0 <= error < _LARGEST or error == np.inf for error, _ in found.values()) or not all(
-                0 <= spread < np.inf for _, spread in found.values()
-            ):
-                raise ValueError("errors and their spreads are 0 or more")
-            return found
-
-        def counts(values: Any) -> dict[float, tuple[int, int]]:
-            found = by_horizon(values)
-            if not all(type(some) is type(starts) is int and 0 <= some <= starts for some, starts in found.values()):
-                raise ValueError("starts that diverged are a number of them, of how many")
-            return found
-
-        def errors(row: Any) -> Errors:
-            found = Errors(
-                recording=text(row["recording"]),
-                group=text(row["group"]),
-                position=table(row["position"]),
-                orientation=table(row["orientation"]),
-                mean_com_error=number(row["mean_com_error"]),
-                final_orientation_error=number(row["final_orientation_error"]),
-                mean_force=number(row["mean_force"]),
-                diverged=counts(row["diverged"]),
-                points=table(row["points"]),
-                joints=table(row["joints"]),
-                medians=medians(row["medians"]),
-                first_diverged=steps(row["first_diverged"]),
-            )
-            if found.group != group_of(found.recording):
-                raise ValueError(f"{reprlib.repr(found.recording)} is not of the group {reprlib.repr(found.group)}")
-            if not found.position or found.position.keys() != found.orientation.keys():
-                raise ValueError(f"{reprlib.repr(found.recording)} has not the same horizons for both")
-            for horizon in found.position:
-                some, starts = found.diverged.get(horizon, (0, 0))
-                lost = some == starts > 0
-                if any(np.isinf(quantity[horizon][0]) != lost for quantity in (found.position, found.orientation)):
-                    raise ValueError(f"{reprlib.repr(found.recording)} has no error at {horizon:g} s, or one too many")
-            return found
-
-        nominal, without, mimic = (tuple(map(errors, content[which])) for which in ("nominal", "vanilla", "residual"))
-        compared = [[_compared(e) for e in side] for side in (without, mimic, *([nominal] if nominal else []))]
-        if not without or any(side != compared[0] for side in compared):
-            raise ValueError("there are not the same recordings and horizons without the residual and with it")
-        angle = content["angle"]
-        if angle not in get_args(Angle):
-            raise ValueError(f"{reprlib.repr(angle)} is none of {', '.join(get_args(Angle))}")
-        return Evaluation(without, mimic, text(content["base"]), text(content["name"]), nominal, angle)
-
 
 def share_diverged(errors: Errors, horizon: float) -> str:
     """Return in words how many starts diverged before a horizon (s) that some did."""
@@ -320,37 +205,6 @@ def share_diverged(errors: Errors, horizon: float) -> str:
 def reached_horizons(errors: Sequence[Errors], group: str) -> list[float]:
     """Return the horizons (s) that recordings of a group are long enough for, in order."""
     return sorted({horizon for e in errors if e.group == group for horizon in e.position})
-
-
-def _errors_to_json(errors: Errors) -> dict[str, Any]:
-    found = dataclasses.asdict(errors)
-    for quantity in ("position", "orientation", "points", "joints"):
-        found[quantity] = {horizon: [_finite(x) for x in pair] for horizon, pair in found[quantity].items()}
-    found["medians"] = {name: {h: _finite(x) for h, x in each.items()} for name, each in errors.medians.items()}
-    return found | {name: _finite(found[name]) for name in _WHOLE}
-
-
-def _finite(value: float | int) -> float | int | None:
-    return value if np.isfinite(value) else None
-
-
-def _compared(errors: Errors) -> tuple[str, str, set[float]]:
-    return errors.recording, errors.group, set(errors.position)
-
-
-def read_evaluation(path: Path) -> Evaluation:
-    """Return the evaluation in a file, `evaluation.json` of a run, say.
-
-    **Raises** `InputError` where it is none.
-    """
-    mend = f"`python -m ballu_mjx evaluate {path.parent} --output {path.parent}` writes it again"
-    content = files.read_json(path, mend)
-    try:
-        return Evaluation.from_json(content)
-    except KeyError as error:
-        raise InputError(f"{path}: is no evaluation ({error} is missing); {mend}.") from error
-    except (ValueError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: is no evaluation ({error}); {mend}.") from error
 
 
 def mean_by_group(errors: Sequence[Errors]) -> tuple[Errors, ...]:
@@ -370,7 +224,7 @@ def _mean(errors: Sequence[Errors]) -> Errors:
     position = over("position")
     counts = {h: [e.diverged[h] for e in errors if h in e.diverged] for h in position}
     diverged = {h: (sum(some for some, _ in each), sum(of for _, of in each)) for h, each in counts.items() if each}
-    com, turn, force = (_mean_of_finite([getattr(e, name) for e in errors]) for name in _WHOLE)
+    com, turn, force = (_mean_of_finite([getattr(e, name) for e in errors]) for name in WHOLE)
     medians = {
         name: {h: group_median(errors, group, name, h) for h in position if any(h in e.medians[name] for e in errors)}
         for name in errors[0].medians
@@ -390,9 +244,6 @@ def _mean(errors: Sequence[Errors]) -> Errors:
         medians,
         soonest,
     )
-
-
-_WHOLE = ("mean_com_error", "final_orientation_error", "mean_force")
 
 
 def group_mean(errors: Sequence[Errors], group: str, quantity: str, horizon: float, place: int = 0) -> float:

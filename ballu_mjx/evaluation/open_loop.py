@@ -28,6 +28,7 @@ from ballu_mjx.evaluation.errors import (
     median_of_starts,
     summarize_starts,
 )
+from ballu_mjx.identification.parameters import LEAST_FRICTION
 from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, pad_to_bucket, stack_motions
@@ -142,6 +143,17 @@ class Evaluators:
         return made
 
 
+def nominal_model(simulator: Simulator) -> mujoco.MjModel:
+    """Return the nominal robot, with dry friction of no effect where the simulated one has any, and as many iterations
+    of the solver: both share a program, and so their rows of constraints."""
+    model = simulator.robot.load_model()
+    model.opt.iterations = simulator.mj_model.opt.iterations
+    for name in ("dof_frictionloss", "tendon_frictionloss"):
+        field, rubbing = getattr(model, name), getattr(simulator.mj_model, name) > 0
+        field[rubbing] = np.maximum(field[rubbing], LEAST_FRICTION)
+    return model
+
+
 class OpenLoopEvaluator:
     """Replays a set of recordings; one compiled program for any parameters of the residual, any recordings and
     actuators."""
@@ -204,7 +216,7 @@ class OpenLoopEvaluator:
         """
         fixed = self._fixed
         if nominal:
-            model = jax.device_get(Simulator(self.robot).model)
+            model = jax.device_get(Simulator(self.robot, model=nominal_model(self._simulator)).model)
             unchanged = None if self._simulator.drivetrain is None else identity_drivetrain(len(self.robot.commands))
             fixed = jax.device_put((model, jax.device_get(unchanged), self._reference), self._everywhere)
         params = jax.device_get(params)  # they may live on one device; the batch is spread over all

@@ -18,7 +18,7 @@ from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.parameters import BodyTarget, FieldTarget, IdentifiedParameters
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.robots.model import set_fields
+from ballu_mjx.robots.model import raise_iterations, set_fields
 
 IDENTIFIED_FORMAT = "ballu-identified/1"
 
@@ -92,7 +92,9 @@ def identified_xml(robot: RobotDescription, identified: IdentifiedParameters) ->
     with jax.enable_x64(True):
         fields = {k: np.asarray(v) for k, v in identified.declared.fields(model, identified.values).items()}
     set_fields(model, fields)
+    raise_iterations(model)
     spec = mujoco.MjSpec.from_file(str(robot.model))
+    spec.option.iterations = model.opt.iterations
     targets = [target for parameter in identified.declared.parameters for target in parameter.targets]
     for target in targets:
         if isinstance(target, FieldTarget):

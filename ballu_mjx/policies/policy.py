@@ -45,7 +45,7 @@ class Policy:
     - `task`, `config`, `robot`, `actuators` (None: nominal), `residual` (or its run's folder; None: none): its
       simulator.
     - `network`: options of its networks.
-    - `params`: what `learner.params` gave.
+    - `params`: what `training_state.params` gave.
     - `infer`: (parameters, observation) to action.
     - `step`: control steps of training behind it.
     """

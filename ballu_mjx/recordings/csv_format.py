@@ -153,6 +153,16 @@ def list_bundled(split: Split) -> list[Path]:
     return list_recordings([assets() / "recordings" / split])
 
 
+def check_new(path: Path) -> None:
+    """Refuse a name that is none of a recording's, or taken, and a folder that cannot be written to.
+
+    **Raises** `InputError` with the fix."""
+    for each in (path, sidecar_path(path)):
+        if each.exists():
+            raise InputError(f"{each}: stands there already; delete it, or give another --output.")
+    files.check_folder(path.parent)
+
+
 def recording_name(path: Path) -> str:
     """The name of the recording in a file: the file's, without its ending."""
     return path.name.removesuffix(".gz").removesuffix(".csv")
@@ -233,6 +243,7 @@ def _check_header(path: Path, groups: Sequence[ColumnGroup], header: list[str]) 
         refuse_recording(
             path, "the header has no commas", "save it with commas between cells and points in numbers", row=-1
         )
+    foreign = sum(name not in known for name in header) > 1
     for i, name in enumerate(header):
         if name not in known:
             close = difflib.get_close_matches(name[:40].lower(), known, 1)
@@ -241,6 +252,8 @@ def _check_header(path: Path, groups: Sequence[ColumnGroup], header: list[str]) 
                 if close
                 else "the robot's description does not have it, delete it"
             )
+            if foreign:
+                fix += ", or give the recording's own robot (--robot)"
             refuse_recording(
                 path, "unknown column", fix, column=_shorten(name) if name else f"{i + 1} (no name)", row=-1
             )

@@ -11,8 +11,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Float
@@ -33,6 +35,7 @@ from ballu_mjx.recordings.kinematic_tree import KinematicTree
 from ballu_mjx.recordings.motion import MeasurementGrid, Motion, ReconstructionParameters
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.sim.drivetrain import DrivetrainParameters, count_slots, filter_commands
 
 _STOP_GIVE = {False: float(np.deg2rad(0.5)), True: 5e-4}
 """How far beyond its range a hinge (rad) or a slide (m) may be: stops are soft, and springs hold joints inside."""
@@ -47,6 +50,7 @@ def reconstruct(
     robot: RobotDescription,
     model: mujoco.MjModel | None = None,
     parameters: ReconstructionParameters | None = None,
+    drivetrain: DrivetrainParameters | None = None,
 ) -> Motion:
     """Return states and commands at the control rate from a free recording.
 
@@ -55,6 +59,8 @@ def reconstruct(
     - `recording`: as `csv_format.read_recording` gives it: no missing values.
     - `model`: the robot to be simulated from these states, with its identified actuators, say; None: the nominal one.
     - `parameters`: noise and filters; the defaults suit motion capture of 0.5 mm and 0.3 deg.
+    - `drivetrain`: what commands meet on their way to that robot's actuators; joints that follow from commands follow
+      from what arrives.
 
     **Raises** `InputError` where measurements leave a joint open, or do not fit the model; `ValueError` for a suspended
     recording, and for one shorter than two control steps.
@@ -67,7 +73,7 @@ def reconstruct(
     # A semi-implicit integrator's velocity is the mean over the time step that led to the position.
     qvel -= np.gradient(qvel, grid.step, axis=0) * simulated.opt.timestep / 2
     _keep_ranges(simulated, qpos)
-    qpos, qvel = hooks.complete_joints(simulated, grid, qpos, qvel)
+    qpos, qvel = hooks.complete_joints(simulated, _driven(grid, drivetrain), qpos, qvel)
     states = slice(None, None, grid.samples_per_step)
     edges = np.arange(len(qpos[states])) * robot.control_timestep
     return Motion(
@@ -82,6 +88,15 @@ def reconstruct(
         joints=tuple(recording.joint_angles),
         uncertainty=fit.uncertainty,
     )
+
+
+def _driven(grid: MeasurementGrid, drivetrain: DrivetrainParameters | None) -> MeasurementGrid:
+    """Return the measurements with the commands as they arrive at the actuators."""
+    if drivetrain is None:
+        return grid
+    slots = count_slots(float(np.max(drivetrain.delay)), grid.step)
+    arrived = filter_commands(drivetrain, jnp.asarray(grid.command, jnp.float32), grid.step, slots)
+    return dataclasses.replace(grid, command=np.asarray(arrived, float))
 
 
 def resample(recording: Recording, model: mujoco.MjModel, robot: RobotDescription) -> MeasurementGrid:

@@ -24,15 +24,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.recordings.segments import (
-    OUTLYING,
-    Segments,
-    check_segments,
-    count_lost,
-    cut_segments,
-    pseudo_huber,
-    simulate_segment,
-)
+from ballu_mjx.recordings.segment_errors import OUTLYING, count_lost, pseudo_huber
+from ballu_mjx.recordings.segments import Segments, check_segments, cut_segments, simulate_segment
 from ballu_mjx.residuals.aerodynamics import (
     AIR_PARAMETERS,
     SIGNED_AIR_PARAMETERS,

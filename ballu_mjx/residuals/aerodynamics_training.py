@@ -7,6 +7,8 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.aerodynamics import (
@@ -45,7 +47,8 @@ def fit_aerodynamics(
     - `motions`: what the simulator is to follow.
     - `config`: how to identify; None: the defaults.
     - `fixed_from`: an earlier result, whose parameters are kept but for those that are `free`; None: none are kept.
-    - `free`: names of the parameters to identify.
+    - `free`: names of the parameters to identify. Where the simulator's drivetrain has a delay, the delay is known and
+      not among them.
     - `run`: takes measurements and files, in a folder say; None: memory.
     - `progress`: is told of every evaluation.
 
@@ -54,8 +57,10 @@ def fit_aerodynamics(
     """
     config = config or AirConfig()
     check_air_config(config, simulator.control_timestep)
+    if has_delay(simulator):
+        free = [name for name in free if name != "delay"]
     if not free:
-        raise InputError(f"--free names no parameter; there are {', '.join(AIR_PARAMETERS)}.")
+        raise InputError(f"--free names no parameter that is unknown; there are {', '.join(AIR_PARAMETERS)}.")
     if fixed_from is not None and not same_parameters(fixed_from.actuators, simulator.actuators):
         raise InputError("The earlier residual belongs to other actuators than the simulator's; take the same.")
     if fixed_from is not None and not isinstance(fixed_from.model, Aerodynamics):
@@ -75,6 +80,11 @@ def fit_aerodynamics(
     record.write(AERODYNAMICS_FILE, json.dumps(air_details(found), indent=2) + "\n")
     model = Aerodynamics(simulator.robot, simulator.mj_model)
     return fitted_residual(simulator, motions, model, found.parameters, record, air_table(found))
+
+
+def has_delay(simulator: Simulator) -> bool:
+    """Return whether the simulator's drivetrain delays commands."""
+    return simulator.drivetrain is not None and bool(np.max(simulator.drivetrain.delay) > 0)
 
 
 def air_details(found: AirFit) -> dict[str, Any]:

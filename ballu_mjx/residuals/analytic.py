@@ -20,7 +20,8 @@ import optax
 from jaxtyping import Array, Float
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.recordings.segments import Segments, check_segments, pseudo_huber, segment_errors, start_segment
+from ballu_mjx.recordings.segment_errors import pseudo_huber, segment_errors
+from ballu_mjx.recordings.segments import Segments, check_segments, start_segment
 from ballu_mjx.residuals.envmimic import start_spread
 from ballu_mjx.residuals.network import NetworkForces, square_newtons
 from ballu_mjx.robots.description import RobotDescription

@@ -7,8 +7,6 @@ import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import mujoco
-
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.errors import shortest_recording
 from ballu_mjx.identification.actuators import AUTO, NOMINAL, find_actuators, read_actuators
@@ -23,6 +21,7 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, same_parameters
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import read_config
+from ballu_mjx.sim.simulator import Simulator
 
 USES: tuple[Split, ...] = ("training", "validation", "test")
 QUICK_RECORDINGS = 2
@@ -124,15 +123,18 @@ class ResidualDataset:
         first, second = ({path.resolve() for path in self.files[use]} for use in (one, other))
         return first == second
 
-    def reconstruct(self, model: mujoco.MjModel) -> dict[str, list[Motion]]:
-        """Return states at the control rate, by use; uses of the same files share a list."""
+    def reconstruct(self, simulator: Simulator) -> dict[str, list[Motion]]:
+        """Return states of the simulator's robot at the control rate, by use; uses of the same files share a list."""
         motions: dict[str, list[Motion]] = {}
         for use in USES:
             same = next((other for other in motions if self.files[other] == self.files[use]), None)
             if same is not None:
                 motions[use] = motions[same]
             else:
-                motions[use] = [reconstruct(each, self.robot, model) for each in self.recordings[use]]
+                motions[use] = [
+                    reconstruct(each, self.robot, simulator.mj_model, drivetrain=simulator.drivetrain)
+                    for each in self.recordings[use]
+                ]
         return motions
 
 

@@ -1,4 +1,4 @@
-"""The loop that learns: PPO out of Brax's parts, in one program that is compiled once, and all its state in one tree.
+"""The loop that learns: PPO out of Brax's parts, in one program that is compiled once.
 
 `brax.training.agents.ppo.train` does the same sums on the same random numbers (a test holds the two side by side), but
 keeps the optimizer and the environments to itself. Here they are in a `TrainingState`, which can be written to disk at
@@ -11,9 +11,9 @@ import dataclasses
 import functools
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.flatten_util
@@ -29,43 +29,17 @@ from brax.training.agents.ppo.losses import PPONetworkParams, compute_ppo_loss
 from brax.training.agents.ppo.optimizer import adaptive_kl_learning_rate
 from brax.training.types import Transition, UInt64
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Int, UInt32
+from jaxtyping import Array, UInt32
 
-from ballu_mjx.rl import distributed, ppo
-from ballu_mjx.rl.ppo import Normalizer, Params, PPOConfig
+from ballu_mjx.rl import ppo
+from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.rl.training_env import MEASURED, wrap_for_training
-
-
-class TrainingState(NamedTuple):
-    """All that a training step hands to the next, on the devices: environments spread over them, the rest on each.
-
-    - `networks`: policy and value function as they learn.
-    - `averaged`: the policy that is handed out (see `PPOConfig.averaging`), in the shape of `networks.policy`.
-    - `averaged_steps`: training steps in that average, the starting point not counted.
-    - `optimizer`: optax's; Adam's moments, and the learning rate where it has got to.
-    - `normalizer`: running statistics of the observations, by name.
-    - `environments`: every environment's state, leaves of shape (num_envs, ...), with the keys of its resets.
-    - `key`: all randomness of the training steps to come.
-    - `steps`: control steps done, all environments together.
-    """
-
-    networks: PPONetworkParams
-    averaged: Any
-    averaged_steps: Int[Array, ""]
-    optimizer: optax.OptState
-    normalizer: RunningStatisticsState
-    environments: State
-    key: UInt32[Array, 2]
-    steps: UInt64
-
+from ballu_mjx.rl.training_state import Stored, TrainingState, array_name, to_uint64, with_own_memory
 
 Callback = Callable[[int, TrainingState, dict[str, float]], None]
 """(control steps done, the state, means since the last call: empty before the first training step).
 
 The next training step reuses the state's memory: take `params` or `stored` of it before returning."""
-
-Stored = Mapping[str, np.ndarray]
-"""A `TrainingState` on the host: its arrays by their place in it."""
 
 _AXIS = "devices"
 _MAX_CALLS = 400
@@ -158,12 +132,12 @@ class Learner:
         """
         shapes = jax.eval_shape(self._first, jax.random.PRNGKey(0), self._contents)
         leaves = jax.tree.leaves_with_path(shapes)
-        stored = {_name(path): np.zeros(leaf.shape, leaf.dtype) for path, leaf in leaves if 0 in leaf.shape} | dict(
-            stored
-        )
+        stored = {
+            array_name(path): np.zeros(leaf.shape, leaf.dtype) for path, leaf in leaves if 0 in leaf.shape
+        } | dict(stored)
         fits, drawn = {}, set()
         for path, leaf in leaves:
-            name = _name(path)
+            name = array_name(path)
             found = stored.get(name)
             fits[name] = found is not None and (found.shape, found.dtype) == (leaf.shape, leaf.dtype)
             if name.split(".")[0] in ("environments", "key"):
@@ -175,7 +149,7 @@ class Learner:
         steps = int(UInt64(hi=stored["steps.hi"], lo=stored["steps.lo"]))  # pyright: ignore[reportCallIssue]
 
         def choose(path: Any, leaf: Any) -> Any:
-            name = _name(path)
+            name = array_name(path)
             return leaf if name in drawn and not whole else np.array(stored[name])
 
         template = shapes if whole else self.init(_seed(self._config, steps))
@@ -187,13 +161,15 @@ class Learner:
         known = params.normalizer
         normalizer = dataclasses.replace(
             state.normalizer,
-            count=_uint64(int(known.count)),
+            count=to_uint64(int(known.count)),
             mean=known.mean,
             std=known.std,
             summed_variance=known.summed_variance,
         )
         networks = PPONetworkParams(policy=params.policy, value=params.value)  # pyright: ignore[reportCallIssue]
-        filled = state._replace(networks=networks, averaged=params.policy, normalizer=normalizer, steps=_uint64(steps))
+        filled = state._replace(
+            networks=networks, averaged=params.policy, normalizer=normalizer, steps=to_uint64(steps)
+        )
 
         def placeable(x: Any, like: Array) -> Any:
             return x if isinstance(x, jax.Array) else np.array(x, like.dtype)
@@ -216,7 +192,7 @@ class Learner:
             policy=self._networks.policy_network.init(key_policy),  # pyright: ignore[reportCallIssue]
             value=self._networks.value_network.init(key_value),  # pyright: ignore[reportCallIssue]
         )
-        return _with_own_memory(
+        return with_own_memory(
             TrainingState(
                 networks=networks,
                 averaged=networks.policy,
@@ -225,7 +201,7 @@ class Learner:
                 normalizer=running_statistics.init_state(self._observation),
                 environments=self._reset(jax.random.split(key_environments, self._config.num_envs), contents),
                 key=key,
-                steps=_uint64(0),
+                steps=to_uint64(0),
             )
         )
 
@@ -263,7 +239,7 @@ class Learner:
             key=key,
             steps=state.steps + self.steps_each,
         )
-        return _with_own_memory(after), jax.lax.pmean(jax.tree.map(jnp.mean, measured | losses), _AXIS)
+        return with_own_memory(after), jax.lax.pmean(jax.tree.map(jnp.mean, measured | losses), _AXIS)
 
     def _collect(self, env: Wrapper, state: TrainingState, key: Array) -> tuple[State, Transition, dict[str, Array]]:
         """Environments one unroll or several on, the pieces of experience, leaves (pieces, unroll_length, ...), and
@@ -372,47 +348,6 @@ def total_timesteps(config: PPOConfig, first_step: int = 0) -> int:
     """Control steps done when `train` ends, gone on from `first_step`: `num_timesteps` rounded up."""
     per_call, calls = _schedule(config, first_step)
     return first_step + calls * per_call * _step_size(config)
-
-
-def params(state: TrainingState) -> Params:
-    """What `state` has learned so far, with the averaged policy, copied to the host."""
-    statistics = state.normalizer
-    count = np.array(int(statistics.count), np.float32)  # pyright: ignore[reportArgumentType]
-    moments = _copied((statistics.mean, statistics.std, statistics.summed_variance))
-    return Params(Normalizer(count, *moments), *_copied((state.averaged, state.networks.value)))
-
-
-def stored(state: TrainingState) -> dict[str, np.ndarray]:
-    """All of `state`, copied to the host, for `Learner.resume`; all processes must ask for it. Arrays without entries
-    are left out, which checkpoints cannot hold."""
-    arrays = {_name(path): distributed.on_host(leaf) for path, leaf in jax.tree.leaves_with_path(state)}
-    return {name: array for name, array in arrays.items() if array.size}
-
-
-def with_learning_rate(stored: Stored, rate: float) -> dict[str, np.ndarray]:
-    """`stored` with another learning rate to go on with."""
-    name = next(name for name in stored if name.endswith("hyperparams.learning_rate"))
-    return {**stored, name: np.full_like(stored[name], rate)}
-
-
-def _with_own_memory(state: TrainingState) -> TrainingState:
-    """`state` as the compiled step takes it: no two arrays the same one (memory given away twice), and no type that
-    only Python's numbers have (a second program)."""
-    return jax.tree.map(lambda x: jnp.array(x, jnp.asarray(x).dtype, copy=True), state)
-
-
-def _copied(tree: Any) -> Any:
-    """On the host, in memory of its own."""
-    return jax.tree.map(np.array, tree)
-
-
-def _name(path: Any) -> str:
-    return jax.tree_util.keystr(path, simple=True, separator=".")
-
-
-def _uint64(count: int) -> UInt64:
-    high, low = divmod(count, 2**32)
-    return UInt64(hi=high, lo=low)  # pyright: ignore[reportCallIssue]
 
 
 def _seed(config: PPOConfig, steps: int) -> int:

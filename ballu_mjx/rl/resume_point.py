@@ -11,9 +11,10 @@ from typing import Any
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.rl import learner, ppo
-from ballu_mjx.rl.learner import Learner, TrainingState
+from ballu_mjx.rl import ppo, training_state
+from ballu_mjx.rl.learner import Learner
 from ballu_mjx.rl.ppo import Params, PPOConfig
+from ballu_mjx.rl.training_state import TrainingState
 from ballu_mjx.runs.checkpoints import Checkpoint, last_checkpoint, list_checkpoints
 from ballu_mjx.runs.folder import read_config, typed_config
 from ballu_mjx.runs.metrics import read_metrics
@@ -76,7 +77,7 @@ class ResumePoint:
             tell(f"{self.folder}: {anew}: an older version kept parameters alone.")
         else:
             if ppo_config.learning_rate != before["learning_rate"]:
-                stored = learner.with_learning_rate(stored, ppo_config.learning_rate)
+                stored = training_state.with_learning_rate(stored, ppo_config.learning_rate)
             same = all(before[name] == made_with[name] for name in ("seed", "environments"))
             try:
                 state, whole = new.resume(stored, environments=same)

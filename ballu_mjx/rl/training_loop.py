@@ -15,10 +15,10 @@ from typing import Any
 from brax.envs.base import Env
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.rl import distributed, learner, ppo
-from ballu_mjx.rl.learner import TrainingState
+from ballu_mjx.rl import distributed, learner, ppo, training_state
 from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.rl.resume_point import ResumePoint, training_facts
+from ballu_mjx.rl.training_state import TrainingState
 from ballu_mjx.rl.watchdog import Watchdog
 from ballu_mjx.runs.progress import Progress
 from ballu_mjx.runs.record import TrainingRecord
@@ -136,12 +136,12 @@ class TrainingLoop:
     def _keep(self, step: int, state: TrainingState) -> None:
         self._due = step
         began = time.perf_counter()
-        measured = self._validated = self._validation.measure(learner.params(state))
+        measured = self._validated = self._validation.measure(training_state.params(state))
         self._log(step, {self._validation.name: measured, "validation_seconds": time.perf_counter() - began})
         self._save(step, state, -measured if self._validation.greatest else measured)
 
     def _save(self, step: int, state: TrainingState, score: float | None) -> None:
-        params, training = ppo.as_tree(learner.params(state)), learner.stored(state)
+        params, training = ppo.as_tree(training_state.params(state)), training_state.stored(state)
         notes = {**self._made_with, "due": self._due}
         if self._run is not None:
             self._run.save(step, params, score, training=training, notes=notes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,6 +32,15 @@ def checksum(path: Path, place: Path) -> str:
     """Return the SHA-256 of a description and of all files of its model."""
     parts = [path, place, *_named_files(place)]
     return hashlib.sha256(b"\0".join(part.read_bytes() for part in parts)).hexdigest()
+
+
+def file_checksums(path: Path, place: Path) -> dict[str, str]:
+    """Return the SHA-256 of each of these files, by its path relative to the description's folder."""
+    folder = path.resolve().parent
+    return {
+        Path(os.path.relpath(part.resolve(), folder)).as_posix(): hashlib.sha256(part.read_bytes()).hexdigest()
+        for part in (path, place, *_named_files(place))
+    }
 
 
 def _named_files(place: Path) -> list[Path]:

@@ -58,6 +58,7 @@ def write_mjcf(file: Path, wanted: mujoco.MjModel, folder: Path, name: str) -> d
 
 def _write_fields(spec: mujoco.MjSpec, wanted: mujoco.MjModel) -> None:
     base = spec.compile()
+    spec.option.iterations = wanted.opt.iterations
     for field, (kind, own) in _ELEMENTS.items():
         old, new = (getattr(model, field) for model in (base, wanted))
         parts = {part.id: part for part in getattr(spec, kind)}

@@ -33,13 +33,28 @@ def assets() -> Path:
 
 
 def load_model(file: Path, parameters: ModelParameters | None = None) -> mujoco.MjModel:
-    """Return the model in an MJCF file, nominal or with identified parameters and the constants that follow."""
+    """Return the model in an MJCF file, nominal or with identified parameters and the constants that follow.
+
+    With identified dry friction the solver makes at least `FRICTION_ITERATIONS`.
+    """
     model = mujoco.MjModel.from_xml_path(str(file))
     if parameters is not None:
         set_fields(model, parameters.fields(model))
+        raise_iterations(model)
         # Contacts, limits and friction are as soft as the inertia matrix at the reference pose says.
         mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+FRICTION_ITERATIONS = 6
+"""Each joint with dry friction is one more constraint that sticks or slips. BALLU's 3 iterations, enough without, leave
+its base 3 mm off after 2 s (median of 16 walks; with 4 iterations 0.3 mm, with 6 0.02 mm)."""
+
+
+def raise_iterations(model: mujoco.MjModel) -> None:
+    """Let the solver make `FRICTION_ITERATIONS` or more where a model has dry friction, in place."""
+    if np.any(model.dof_frictionloss > 0) or np.any(model.tendon_frictionloss > 0):
+        model.opt.iterations = max(model.opt.iterations, FRICTION_ITERATIONS)
 
 
 def bare_parameters(parameters: ModelParameters | None) -> ModelParameters | None:
@@ -51,9 +66,12 @@ def same_parameters(one: ModelParameters | None, other: ModelParameters | None) 
     """Return whether two simulators have equal parameters (None: nominal)."""
     if one is None or other is None:
         return one is other
-    leaves = [jax.tree.leaves(each) for each in (one, other)]
-    return type(one) is type(other) and all(
-        np.array_equal(np.float32(a), np.float32(b)) for a, b in zip(*leaves, strict=True)
+    if type(one) is not type(other):
+        return False
+    # By path: a parameter that is None in one of them has no leaf there.
+    leaves, others = (dict(jax.tree_util.tree_leaves_with_path(each)) for each in (one, other))
+    return leaves.keys() == others.keys() and all(
+        np.array_equal(np.float32(leaf), np.float32(others[path])) for path, leaf in leaves.items()
     )
 
 

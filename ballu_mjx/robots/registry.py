@@ -6,9 +6,11 @@ import contextlib
 import functools
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.robots.description import RobotDescription, read_description
+from ballu_mjx.robots.description_model import file_checksums
 from ballu_mjx.robots.model import assets
 
 DEFAULT_ROBOT = "ballu"
@@ -17,6 +19,8 @@ BUNDLED = "bundled:"
 """Begins the path of a file that comes with the package."""
 _ENDING = ".robot.json"
 _LONGEST_PATH = 300
+_MOST_NAMED = 3
+"""Files that have changed, in a message."""
 
 
 def load_robot(robot: str | Path = DEFAULT_ROBOT) -> RobotDescription:
@@ -38,12 +42,14 @@ def _bundled(name: str) -> RobotDescription:
     return read_description(assets() / f"{name}{_ENDING}")
 
 
-def describe_robot(robot: RobotDescription) -> dict[str, str]:
-    """Return what files say of the robot that they are of: path of its description, and hash."""
-    return {"path": portable_path(robot.file, assets()), "sha256": robot.sha256}
+def describe_robot(robot: RobotDescription) -> dict[str, Any]:
+    """Return what files say of the robot that they are of: path of its description, and hashes of all and of each
+    file."""
+    files = file_checksums(robot.file, robot.model)
+    return {"path": portable_path(robot.file, assets()), "sha256": robot.sha256, "files": files}
 
 
-def find_robot(described: Mapping[str, str], named_in: Path) -> RobotDescription:
+def find_robot(described: Mapping[str, Any], named_in: Path) -> RobotDescription:
     """Return the robot that `describe_robot` described in the file `named_in`.
 
     **Raises** `InputError` where its description is gone, has changed, or its model has.
@@ -61,8 +67,19 @@ def find_robot(described: Mapping[str, str], named_in: Path) -> RobotDescription
     found = read_description(path)
     if found.sha256 != described["sha256"]:
         problem = f"the robot description, or its model, has changed since {named_in} was written"
-        raise InputError(f"{path}: {problem}; restore it.")
+        raise InputError(f"{path}: {problem}{_name_changes(described.get('files'), found)}; restore it.")
     return found
+
+
+def _name_changes(stored: Any, robot: RobotDescription) -> str:
+    """Which files differ from what `describe_robot` stored of them; nothing where it stored none."""
+    if not isinstance(stored, Mapping):
+        return ""
+    now = file_checksums(robot.file, robot.model)
+    names = sorted(str(name) for name in stored.keys() | now.keys() if stored.get(name) != now.get(name))
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    shown = ", ".join(names[:_MOST_NAMED])[:_LONGEST_PATH]
+    return f" ({shown}{more})" if names else ""
 
 
 def portable_path(path: Path, bundled: Path) -> str:

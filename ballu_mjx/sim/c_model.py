@@ -20,6 +20,7 @@ def improved_model(simulator: AugmentedSimulator) -> mujoco.MjModel:
         value = None if name.startswith("_") else getattr(plain.mj_model, name, None)
         if isinstance(value, np.ndarray) and value.dtype.kind == "f":
             getattr(model, name)[...] = value
+    model.opt.iterations = plain.mj_model.opt.iterations
     changed = False
     for name in dir(plain.model):
         own = None if name.startswith("_") or name in DERIVED_FIELDS else getattr(model, name, None)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ballu_mjx.common import files
+from ballu_mjx.evaluation.errors_file import evaluation_to_json
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, write_rollouts
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ def write_evaluation(evaluator: OpenLoopEvaluator, params: Any, folder: Path) ->
     vanilla, residual = (evaluator.errors(replays[name]) for name in names)
     result = evaluator.compared(vanilla, residual, evaluator.nominal_errors(params))
     files.write(folder / "evaluation.txt", result.table() + "\n")
-    files.write(folder / "evaluation.json", json.dumps(result.to_json(), indent=2) + "\n")
+    files.write(folder / "evaluation.json", json.dumps(evaluation_to_json(result), indent=2) + "\n")
     draw_tracking(evaluator, replays, folder / "tracking.png")
     write_rollouts(folder / ROLLOUT_FILE, stored_rollouts(evaluator, replays))
     return result

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ballu_mjx.viz.style import colour_of, label_of, save_figure, unwrapped
@@ -67,19 +68,12 @@ def learning_curve(
     best_step: int | None = None,
 ) -> None:
     """Mean reward per control step, and the validation error as a ratio to vanilla's, against control steps."""
-    figure = Figure(figsize=(7.0, 6.0), layout="constrained")
-    upper, lower = figure.subplots(2, 1, sharex=True)
+    best = None if best_step is None else best_step / 1e6
+    figure, upper, lower = _over_validation((validation_steps / 1e6, validation_error), "envmimic", "vanilla", best)
     upper.plot(steps / 1e6, reward, color=colour_of("envmimic"))
     upper.set_ylabel("reward per control step")
-    lower.plot(validation_steps / 1e6, validation_error, color=colour_of("envmimic"), marker="o", markersize=4)
-    lower.axhline(1.0, color=colour_of("vanilla"), linestyle="--", label="vanilla")
-    if best_step is not None:
-        lower.axvline(best_step / 1e6, color="grey", linestyle=":", label="best checkpoint")
     lower.set_ylabel("validation error (ratio to vanilla)")
     lower.set_xlabel("control steps (millions)")
-    lower.legend()
-    for axis in (upper, lower):
-        axis.grid(alpha=0.3)
     save_figure(figure, path)
 
 
@@ -92,20 +86,31 @@ def fit_curve(
     best_step: int,
 ) -> None:
     """Losses by name and the validation error, called `label`, against gradient steps, in the simulator's colour."""
-    figure = Figure(figsize=(7.0, 6.0), layout="constrained")
-    upper, lower = figure.subplots(2, 1, sharex=True)
+    figure, upper, lower = _over_validation(validation, simulator, "no force", best_step)
     for (name, curve), style in zip(losses.items(), ("-", "--"), strict=False):
         upper.plot(*curve, color=colour_of(simulator), linestyle=style, label=name)
-    lower.plot(*validation, color=colour_of(simulator), marker="o", markersize=4)
-    lower.axhline(1.0, color=colour_of("vanilla"), linestyle="--", label="no force")
-    lower.axvline(best_step, color="grey", linestyle=":", label="best checkpoint")
     upper.set_ylabel("loss")
+    upper.legend()
     lower.set_ylabel(label)
     lower.set_xlabel("gradient steps")
-    for axis in (upper, lower):
-        axis.legend()
-        axis.grid(alpha=0.3)
     save_figure(figure, path)
+
+
+def _over_validation(
+    validation: tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]], simulator: str, base: str, best: float | None
+) -> tuple[Figure, Axes, Axes]:
+    """Return a figure of two panels. The lower one has the validation error as a ratio to that of what is called
+    `base`, and where the best checkpoint is; the upper one is empty."""
+    figure = Figure(figsize=(7.0, 6.0), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    lower.plot(*validation, color=colour_of(simulator), marker="o", markersize=4)
+    lower.axhline(1.0, color=colour_of("vanilla"), linestyle="--", label=base)
+    if best is not None:
+        lower.axvline(best, color="grey", linestyle=":", label="best checkpoint")
+    lower.legend()
+    for axis in (upper, lower):
+        axis.grid(alpha=0.3)
+    return figure, upper, lower
 
 
 def compared(path: Path, panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]]]) -> None:

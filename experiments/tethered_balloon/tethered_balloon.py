@@ -37,7 +37,8 @@ from scipy.spatial.transform import Rotation
 
 from ballu_mjx.cli import train
 from ballu_mjx.common.results import Table
-from ballu_mjx.evaluation.errors import Evaluation, read_evaluation
+from ballu_mjx.evaluation.errors import Evaluation
+from ballu_mjx.evaluation.errors_file import read_evaluation
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording, write_recording
 from ballu_mjx.recordings.reconstruct import reconstruct

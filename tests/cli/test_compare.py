@@ -9,6 +9,7 @@ from scipy import stats
 
 from ballu_mjx.cli import compare
 from ballu_mjx.evaluation.errors import HORIZONS, Errors, Evaluation, quotient
+from ballu_mjx.evaluation.errors_file import evaluation_to_json
 from ballu_mjx.evaluation.statistics import t_interval
 from ballu_mjx.runs.folder import Run
 from ballu_mjx.runs.layout import RUN_FORMAT
@@ -39,7 +40,7 @@ def write(folder: Path, seed: int, scale: float, reward: float, task: str = "env
         Errors(e.recording, e.group, {h: (v / 2, s) for h, (v, s) in e.position.items()}, e.orientation, 0, 0, 0)
         for e in errors
     ]
-    content = Evaluation(tuple(errors), tuple(half)).to_json()
+    content = evaluation_to_json(Evaluation(tuple(errors), tuple(half)))
     (folder / "evaluation.json").write_text(json.dumps(content))
     return folder
 

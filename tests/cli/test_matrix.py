@@ -15,6 +15,7 @@ from ballu_mjx.ballu.leg_parameters import IdentificationConfig
 from ballu_mjx.cli import train_policy, view
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.errors import HORIZONS, Errors, Evaluation
+from ballu_mjx.evaluation.errors_file import evaluation_to_json
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, num_observations
 from ballu_mjx.recordings.csv_format import list_bundled
@@ -95,7 +96,7 @@ def write_run(folder: Path, task: str, base: Path | None = None) -> Path:
     if task in RESIDUAL_TASKS:
         each = {horizon: (1.0, 0.1) for horizon in HORIZONS}
         found = (Errors("near-1", "near", each, each, 1.0, 1.0, 0.0),)
-        (folder / "evaluation.json").write_text(json.dumps(Evaluation(found, found, name=task).to_json()))
+        (folder / "evaluation.json").write_text(json.dumps(evaluation_to_json(Evaluation(found, found, name=task))))
     return folder
 
 

@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ballu_mjx.ballu.actuators import CABLE_SLACK, ActuatorParameters
 from ballu_mjx.ballu.actuators_file import read_actuators
-from ballu_mjx.ballu.model import CABLE_SLACK, ActuatorParameters
 from ballu_mjx.ballu.sweep import read_sweep
 from ballu_mjx.cli import evaluate, train, train_envmimic
 from ballu_mjx.identification.actuators import ACTUATORS_FILE

@@ -20,9 +20,9 @@ from ballu_mjx.evaluation.errors import (
     choose_horizons,
     mean_by_group,
     quotient,
-    read_evaluation,
     summarize_starts,
 )
+from ballu_mjx.evaluation.errors_file import evaluation_from_json, evaluation_to_json, read_evaluation
 from ballu_mjx.evaluation.open_loop import orientation_errors
 from ballu_mjx.recordings.groups import group_of
 
@@ -78,7 +78,7 @@ def test_table_and_file_count_what_diverged_and_hold_no_nan(tmp_path: Path) -> N
     assert "near-1, 5 s: analytic diverged in 2 of 2 starts" in table
     assert "near-1, 2 s: analytic diverged in 1 of 2 starts" in table
     assert "vanilla diverged" not in table and "± is the standard deviation over starts" in table
-    text = json.dumps(result.to_json())
+    text = json.dumps(evaluation_to_json(result))
     for word in ("nan", "inf"):
         assert word not in table.lower() and word not in text.lower()
     (tmp_path / "evaluation.json").write_text(text)
@@ -93,7 +93,7 @@ def test_a_group_s_means_keep_the_count() -> None:
 
 
 def without(row: str) -> dict[str, Any]:
-    content = Evaluation((SOUND,), (SOUND,)).to_json()
+    content = evaluation_to_json(Evaluation((SOUND,), (SOUND,)))
     for errors in content["vanilla"] + content["residual"]:
         errors.pop(row)
     return content
@@ -104,10 +104,12 @@ def without(row: str) -> dict[str, Any]:
     [
         without("diverged"),  # as before divergence was counted
         without("orientation"),
-        Evaluation((SOUND,), (SOUND,)).to_json() | {"vanilla": []},
-        Evaluation((SOUND,), (errors("near-2", [[0.1]]),)).to_json(),
-        Evaluation((dataclasses.replace(SOUND, group="far"),), (dataclasses.replace(SOUND, group="far"),)).to_json(),
-        Evaluation((SOUND,), (dataclasses.replace(SOUND, diverged={1.0: (3, 2)}),)).to_json(),
+        evaluation_to_json(Evaluation((SOUND,), (SOUND,))) | {"vanilla": []},
+        evaluation_to_json(Evaluation((SOUND,), (errors("near-2", [[0.1]]),))),
+        evaluation_to_json(
+            Evaluation((dataclasses.replace(SOUND, group="far"),), (dataclasses.replace(SOUND, group="far"),))
+        ),
+        evaluation_to_json(Evaluation((SOUND,), (dataclasses.replace(SOUND, diverged={1.0: (3, 2)}),))),
     ],
 )
 def test_what_is_no_evaluation_is_refused_with_the_command_that_makes_it(
@@ -132,7 +134,7 @@ def test_nominal_vanilla_stands_beside_vanilla_with_identified_actuators() -> No
     header = next(line for line in result.table().splitlines() if "(s)" in line)
     assert header.split("|")[1].split() == ["vanilla", "vanilla+sysid", "analytic", "ratio"]
     assert "0.900 ± 0.000" in result.table()
-    assert Evaluation.from_json(json.loads(json.dumps(result.to_json()))) == result
+    assert evaluation_from_json(json.loads(json.dumps(evaluation_to_json(result)))) == result
     assert result.ratio("near", "position", 1.0) == pytest.approx(0.1 / 0.2), "ratios are to the base"
 
 
@@ -166,4 +168,4 @@ def test_medians_and_the_share_of_finite_starts_are_told() -> None:
     assert (
         "orientation RMSE (deg)" in table and "yaw" not in table and "nan" not in table and "inf" not in table.split()
     )
-    assert Evaluation.from_json(json.loads(json.dumps(result.to_json()))) == result
+    assert evaluation_from_json(json.loads(json.dumps(evaluation_to_json(result)))) == result

@@ -513,7 +513,8 @@ def formats(work: Path) -> list[Format]:
 def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
     """The files of a run's folder."""
     from ballu_mjx.cli import compare, train_envmimic
-    from ballu_mjx.evaluation.errors import Errors, Evaluation, read_evaluation
+    from ballu_mjx.evaluation.errors import Errors, Evaluation
+    from ballu_mjx.evaluation.errors_file import evaluation_to_json, read_evaluation
     from ballu_mjx.recordings.csv_format import list_bundled
     from ballu_mjx.residuals.envmimic import EnvMimicConfig, check_envmimic_config
     from ballu_mjx.residuals.run_config import describe_run, find_recordings, run_actuators, run_residual
@@ -524,7 +525,7 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
     from ballu_mjx.runs.folder import Run, read_config, typed_config
     from ballu_mjx.runs.metrics import read_metrics
     from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, read_rollouts, write_rollouts
-    from ballu_mjx.viz import report
+    from ballu_mjx.viz import report_content
 
     def errors(scale: float) -> tuple[Errors, ...]:
         table = {horizon: (scale * horizon, 0.1) for horizon in (1.0, 5.0, 10.0)}
@@ -544,7 +545,7 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
                 run.log(step, {"validation_error": 1.0 - step / 1000})
                 run.log(step, {"reward": 1.0 + step / 1000, "seconds": step / 7, "loss": math.nan})
                 run.save(step, {"w": np.arange(5.0)}, 1.0 - step / 1000, training={"step": np.array(step)})
-        (folder / "evaluation.json").write_text(json.dumps(Evaluation(errors(1.0), errors(0.5)).to_json()))
+        (folder / "evaluation.json").write_text(json.dumps(evaluation_to_json(Evaluation(errors(1.0), errors(0.5)))))
         takes = [
             StoredRollout(
                 name=name,
@@ -575,18 +576,18 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
         run_actuators(config, folder, load_robot())
         run_residual(config, folder)
         find_recordings(config, "training", folder)
-        report.collect(folder)
+        report_content.collect(folder)
         compare.rows([folder])
         compare.figures(folder)
         return found
 
     def metrics_of(folder: Path) -> Any:
         rows = read_metrics(folder)
-        report.collect(folder)
+        report_content.collect(folder)
         return rows
 
     def evaluation_of(folder: Path) -> Any:
-        report.collect(folder)
+        report_content.collect(folder)
         return read_evaluation(folder / "evaluation.json")
 
     found = []

@@ -22,7 +22,7 @@ from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.checkpoints import file_checksums, last_checkpoint, record_checksum, restore_checkpoint
 from ballu_mjx.runs.folder import Run
 from ballu_mjx.runs.layout import RUN_FORMAT
-from ballu_mjx.viz import report
+from ballu_mjx.viz import report_content
 
 
 def test_damaged_files_are_refused_by_name_or_keep_their_format_s_promises():
@@ -94,7 +94,7 @@ def read_all(folder: Path) -> None:
     for read in (
         lambda: last_checkpoint(folder, training=True),
         lambda: restore_checkpoint(folder, "best"),
-        lambda: report.collect(folder),
+        lambda: report_content.collect(folder),
         lambda: compare.figures(folder),
         lambda: go_on(folder),
     ):

@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.ballu.features import foot_positions
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP, KNEES, MOTORS, ActuatorParameters, standing_qpos
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, KNEES, MOTORS, standing_qpos
 from ballu_mjx.policies.closed_loop import ClosedLoop
 from ballu_mjx.policies.locomotion_env import (
     LocomotionConfig,

@@ -7,13 +7,14 @@ import functools
 import json
 import struct
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from c3d_writer import DEC, INTEL, MIPS, c3d_bytes
+from capture_files import ROTATIONS, vicon_section
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -79,50 +80,7 @@ def captured(
     return found | {"balloon": (position, rotation)}
 
 
-ROTATIONS: Mapping[str, Callable[[Rotation], np.ndarray]] = {
-    "helical": lambda r: r.as_rotvec(),
-    "XYZ": lambda r: r.as_euler("XYZ"),
-    "quaternion": lambda r: r.as_quat(),
-}
-
-
-def section(
-    title: str,
-    bodies: Mapping[str, tuple[np.ndarray, Rotation]],
-    *,
-    prefix: str = "ballu:",
-    rotation: str | None = "helical",
-    angle: str = "deg",
-    length: str = "mm",
-    delimiter: str = ",",
-    first: int = 1,
-) -> str:
-    """One section in Vicon's layout, some samples hidden; markers where `rotation` is None."""
-    components = [*{None: (), "quaternion": ("RX", "RY", "RZ", "RW")}.get(rotation, ("RX", "RY", "RZ"))]
-    components += ["TX", "TY", "TZ"] if rotation else ["X", "Y", "Z"]
-    turns = ["" if rotation == "quaternion" else angle] * (len(components) - 3)
-    names, cells = ["", ""], []
-    for role, (position, turned) in bodies.items():
-        names += [f"{prefix}{role}", *[""] * (len(components) - 1)]
-        values = [position * {"mm": 1e3, "cm": 1e2, "m": 1.0}[length]]
-        if rotation:
-            scale = 180 / np.pi if angle == "deg" and rotation != "quaternion" else 1.0
-            values.insert(0, ROTATIONS[rotation](turned) * scale)
-        text = [[f"{x:.7g}" for x in row] for row in np.hstack(values)]
-        if role in ("balloon", "foot_left"):
-            text[HIDDEN] = [[""] * len(components)] * len(text[HIDDEN])
-        cells.append(text)
-    rows = [
-        [title],
-        ["100"],
-        names,
-        ["Frame", "Sub Frame", *components * len(bodies)],
-        ["", "", *[*turns, length, length, length] * len(bodies)],
-    ]
-    samples = zip(*cells, strict=True)
-    rows += [[str(first + i), "0", *(cell for body in row for cell in body)] for i, row in enumerate(samples)]
-    return "".join(delimiter.join(row) + "\n" for row in rows)
-
+section = functools.partial(vicon_section, prefix="ballu:", lost=("balloon", "foot_left"), hidden=HIDDEN)
 
 EVENTS = "Events\n100\nSubject,Context,Name,Time (s),Description\nballu,Left,Foot Strike,1.2,The heel strikes\n"
 DEVICES = (

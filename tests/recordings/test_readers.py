@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import sys
 import typing
@@ -12,6 +11,29 @@ from typing import Any
 
 import numpy as np
 import pytest
+from capture_files import (
+    COMMAND,
+    CORNERS,
+    HIDDEN,
+    HULL,
+    RATE,
+    SAMPLES,
+    START,
+    TIME,
+    TIP,
+    Y_UP,
+    euroc_text,
+    in_line,
+    replaced,
+    rows,
+    tum_text,
+    write_motive,
+    write_npz,
+    write_qualisys_bodies,
+    write_qualisys_markers,
+    write_table,
+    write_tum,
+)
 from rover import write_rover
 from scipy.spatial.transform import Rotation
 
@@ -23,145 +45,13 @@ from ballu_mjx.recordings.importers.readers import READERS, find_reader, read_ca
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
 
-SAMPLES, RATE = 300, 100.0
-TIME = np.arange(SAMPLES) / RATE
-HIDDEN = slice(60, 71)
-"""Samples in which the hull is not seen, where a format has a way to say so."""
-Y_UP = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""From Motive's axes (y up) to the format's, for a robot that looks along z."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Pose:
-    place: np.ndarray
-    turn: Rotation
-
-
-def motion() -> tuple[Pose, Pose, np.ndarray]:
-    """Hull, tip and commands: from the origin, looking along x, and about all axes."""
-    wave = np.stack([np.sin((1.3 + 0.4 * i) * TIME) for i in range(6)], axis=1)
-    place = wave[:, :3] * [0.5, 0.3, 0.05] + [0.0, 0.0, 0.25]
-    turn = Rotation.from_rotvec(0.6 * wave[:, 3:])
-    tip = Pose(place + turn.apply([0.35, 0.0, 0.05]), turn)
-    command = np.stack([0.1 + 0.4 * wave[:, 0], 5 + 4 * wave[:, 1]], axis=1)
-    return Pose(place, turn), tip, command
-
-
-HULL, TIP, COMMAND = motion()
-
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
     return write_rover(tmp_path_factory.mktemp("rover"))
 
 
-# ---- the formats, as their vendors lay them out ----
-
-
-def rows(columns: list[np.ndarray], delimiter: str, decimals: int, *, lost: list[int], first: str = "") -> str:
-    """Lines of numbers; `lost` columns are empty in the hidden samples."""
-    lines = []
-    for i, row in enumerate(np.column_stack(columns)):
-        cells = [f"{x:.{decimals}f}" for x in row]
-        if HIDDEN.start <= i < HIDDEN.stop:
-            for column in lost:
-                cells[column] = ""
-        lines.append(delimiter.join(([f"{i}"] if first else []) + cells))
-    return "\n".join(lines) + "\n"
-
-
-def write_motive(folder: Path, version: str = "1.23", unit: str = "Meters") -> Path:
-    """https://docs.optitrack.com, "Data Export: CSV", and public takes of versions 1.22 to 1.25."""
-    scale = {"Meters": 1.0, "Millimeters": 1e3}[unit]
-    hull = Rotation.from_matrix(Y_UP.T) * HULL.turn * Rotation.from_matrix(Y_UP)
-    top = f"Format Version,{version},Take Name,trial 1,Take Notes,,Capture Frame Rate,{RATE:.6f},Export Frame Rate,"
-    top += f"{RATE:.6f},Capture Start Time,2023-06-02 12.09.45.344 PM,Total Frames in Take,{SAMPLES},Rotation Type,"
-    top += f"Quaternion,Length Units,{unit},Coordinate Space,Global"
-    kinds = ["Rigid Body"] * 8 + ["Rigid Body Marker"] * 3 + ["Marker"] * 3
-    names = ["hull"] * 8 + ["hull:Marker 001"] * 3 + ["tip"] * 3
-    ids = ["506381AA"] * 8 + ["506381AB"] * 3 + ["0"] * 3
-    parts = ["Rotation"] * 4 + ["Position"] * 3 + ["Mean Marker Error"] + ["Position"] * 6
-    axes = [*"XYZW", *"XYZ", "", *"XYZ", *"XYZ"]
-    heads = [["", "Type", *kinds], ["", "Name", *names], ["", "ID", *ids]]
-    if version == "1.25":
-        heads.append(["", "Parent", *[""] * len(kinds)])
-    heads += [["", "", *parts], ["Frame", "Time (Seconds)", *axes]]
-    place, tip = scale * HULL.place @ Y_UP, scale * TIP.place @ Y_UP
-    columns = [TIME, *hull.as_quat().T, *place.T, np.full(SAMPLES, 3e-4), *(place + 1).T, *tip.T]
-    body = rows(columns, ",", 6, lost=[*range(1, 9)], first="frame")
-    path = folder / "take.csv"
-    path.write_text("\n".join([top, "", *(",".join(row) for row in heads)]) + "\n" + body)
-    return path
-
-
-def qualisys_header(included: str, names: list[str]) -> str:
-    kind, key = ("MARKERS", "MARKER_NAMES") if included == "3D" else ("BODIES", "BODY_NAMES")
-    keys = [f"NO_OF_FRAMES\t{SAMPLES}", "NO_OF_CAMERAS\t8", f"NO_OF_{kind}\t{len(names)}", f"FREQUENCY\t{RATE:g}"]
-    keys += [
-        "NO_OF_ANALOG\t0",
-        "ANALOG_FREQUENCY\t0",
-        "DESCRIPTION\t--",
-        "TIME_STAMP\t2022-06-03, 10:47:36.627\t9424.4",
-    ]
-    return "\n".join([*keys, f"DATA_INCLUDED\t{included}", "\t".join([key, *names])]) + "\n"
-
-
-def write_qualisys_bodies(folder: Path) -> Path:
-    """6DOF data: as https://github.com/shiplab/dt_cv has it; the matrix stands column after column."""
-    angles = ["X", "Y", "Z", "Roll", "Pitch", "Yaw", "Residual", *(f"Rot[{i}]" for i in range(9))]
-    names = [
-        "Frame",
-        "Time",
-        *(f"{name} {part}" if part == "X" else part for name in ("hull", "tip") for part in angles),
-    ]
-    columns = [np.arange(SAMPLES) + 1, TIME]
-    for pose in (HULL, TIP):
-        matrix = pose.turn.as_matrix().transpose(0, 2, 1).reshape(-1, 9)
-        columns += [*(1e3 * pose.place.T), *pose.turn.as_euler("XYZ", degrees=True).T, np.ones(SAMPLES), *matrix.T]
-    body = rows(columns, "\t", 5, lost=[]).split("\n")
-    for i in range(HIDDEN.start, HIDDEN.stop):
-        cells = body[i].split("\t")
-        body[i] = "\t".join([*cells[:2], *["0.00000"] * 16, *cells[18:]])
-    # Frames are whole numbers, and every row ends in a tab.
-    body = [f"{int(float(line.split(chr(9))[0]))}\t{line.partition(chr(9))[2]}\t" if line else line for line in body]
-    text = qualisys_header("6D", ["hull", "tip"]) + "\t".join(names) + "\t\n" + "\n".join(body)
-    path = folder / "trial.tsv"
-    path.write_bytes(text.replace("\n", "\r\n").encode())
-    return path
-
-
-CORNERS = {"hull1": [0.1, 0, 0], "hull2": [-0.1, 0.1, 0], "hull3": [-0.1, -0.1, 0], "hull4": [0, 0, 0.1]}
-
-
-def write_qualisys_markers(folder: Path) -> Path:
-    names = [*CORNERS, "tip"]
-    places = [HULL.place + HULL.turn.apply(corner) for corner in CORNERS.values()] + [TIP.place]
-    header = "\t".join(["Frame", "Time", *(f"{name} {axis}" for name in names for axis in "XYZ")])
-    body = rows([TIME, *(1e3 * np.hstack(places).T)], "\t", 3, lost=[*range(1, 7)], first="frame")
-    path = folder / "trial.tsv"
-    path.write_text(qualisys_header("3D", names) + header + "\n" + body)
-    return path
-
-
-def write_npz(folder: Path) -> Path:
-    place = HULL.place.copy()
-    place[HIDDEN] = np.nan
-    path = folder / "trial.npz"
-    np.savez(
-        path, time=TIME, hull_pos=place, hull_quat=HULL.turn.as_quat(scalar_first=True), tip_pos=TIP.place,
-        command_arm=COMMAND[:, 0], command_push=COMMAND[:, 1], note=np.array("first try"),
-    )  # fmt: skip
-    return path
-
-
-def write_table(folder: Path) -> Path:
-    """What others write by hand: milliseconds, comments, a comma at the end of each row."""
-    names = "time,hull_x,hull_y,hull_z,hull_qx,hull_qy,hull_qz,hull_qw,tip_x,tip_y,tip_z,arm_cmd,push_cmd,"
-    columns = [1e3 * TIME, *HULL.place.T, *HULL.turn.as_quat().T, *TIP.place.T, *COMMAND.T]
-    body = rows(columns, ",", 7, lost=[*range(1, 8)]).replace("\n", ",\n")
-    path = folder / "trial.csv"
-    path.write_text(f"# exported on a Tuesday, by hand\n{names}\n{body}")
-    return path
+# ---- the formats that need packages ----
 
 
 def ros_messages(store: Any) -> Any:
@@ -203,8 +93,8 @@ def ros_messages(store: Any) -> Any:
         )
 
 
-START, LATE = 1_700_000_000 * 10**9, 3_000_000
-"""ns: when it began, and how long messages take to be recorded."""
+LATE = 3_000_000
+"""ns: how long messages take to be recorded."""
 
 
 def write_bag(folder: Path, kind: str = "ros2") -> Path:
@@ -340,11 +230,34 @@ def test_motive(tmp_path: Path, robot: RobotDescription, version: str, unit: str
     same(imported(tmp_path, write_motive(tmp_path, version, unit), robot), gaps=True)
 
 
+@pytest.mark.parametrize("columns", [0, 3])
+def test_motive_saved_again_by_a_spreadsheet(tmp_path: Path, robot: RobotDescription, columns: int):
+    """Such a program pads every row to the widest, or beyond it."""
+    path = write_motive(tmp_path)
+    lines = [line.split(",") for line in path.read_text().splitlines()]
+    width = columns + max(map(len, lines))
+    path.write_text("\n".join(",".join(cells + [""] * (width - len(cells))) for cells in lines))
+    write_log(tmp_path)
+    same(imported(tmp_path, path, robot), gaps=True)
+
+
 def test_motive_tells_measured_markers_from_expected_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run("map", write_motive(tmp_path))
     said = capsys.readouterr().out
     assert "Expected places of markers are not measured, and are not read: hull:Marker 001." in said
     assert "96.3 % seen" in said and 'up = "y"' in said
+
+
+def test_a_body_is_read_and_the_marker_of_its_name_is_not(tmp_path: Path, robot: RobotDescription):
+    """As in takes of skeletons, where the label of a marker may be a bone's name."""
+    path = write_motive(tmp_path)
+    path.write_text(path.read_text().replace("tip,tip,tip", "hull,hull,hull"))
+    contents = find_reader(path).list(path)
+    assert [(item.name, item.kind) for item in contents.items] == [("hull", "body")]
+    assert any("Markers that share their names with bodies are not read: hull." in note for note in contents.notes)
+    found = read_capture(path, room(tmp_path, robot, NAMED.replace('"tip"', '"hull"'), commands=NO_COMMANDS))
+    seen = np.r_[0 : HIDDEN.start, HIDDEN.stop : SAMPLES]
+    np.testing.assert_allclose(found.bodies["hull"].position[seen], (HULL.place @ Y_UP)[seen], atol=1e-6)
 
 
 def test_qualisys_bodies(tmp_path: Path, robot: RobotDescription):
@@ -466,18 +379,6 @@ def test_lerobot_datasets_are_mapped_by_the_names_of_their_features(tmp_path: Pa
 # ---- files of one body ----
 
 
-def tum_text() -> str:
-    columns = [TIME + 1.7e9, *HULL.place.T, *HULL.turn.as_quat().T]
-    return "# timestamp tx ty tz qx qy qz qw\n" + rows(columns, " ", 7, lost=[])
-
-
-def euroc_text() -> str:
-    header = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v [m]\n"
-    numbers = np.hstack([HULL.place, HULL.turn.as_quat(scalar_first=True), 0 * HULL.place[:, :1]])
-    lines = [f"{START + i * 10**7}," + ",".join(f"{x:.7f}" for x in row) for i, row in enumerate(numbers)]
-    return header + "\n".join(lines) + "\n"
-
-
 @pytest.mark.parametrize("name, text", [("pose.txt", tum_text()), ("data.csv", euroc_text())])
 def test_trajectories_of_one_body(tmp_path: Path, robot: RobotDescription, name: str, text: str):
     (tmp_path / name).write_text(text)
@@ -523,26 +424,6 @@ position = ["observation.state[7]", "observation.state[8]", "observation.state[9
 # ---- damage ----
 
 
-def replaced(old: str, new: str, count: int = -1) -> Callable[[Path], None]:
-    def damage(path: Path) -> None:
-        text = path.read_text()
-        assert old in text
-        path.write_text(text.replace(old, new, count))
-
-    return damage
-
-
-def in_line(number: int, cell: int, text: str, delimiter: str = ",") -> Callable[[Path], None]:
-    def damage(path: Path) -> None:
-        lines = path.read_text().split("\n")
-        cells = lines[number - 1].split(delimiter)
-        cells[cell] = text
-        lines[number - 1] = delimiter.join(cells)
-        path.write_text("\n".join(lines))
-
-    return damage
-
-
 def cut_text(path: Path) -> None:
     text = path.read_text()
     path.write_text(text[: int(len(text) * 0.7)].rpartition("\n")[0] + "\n99,")
@@ -586,6 +467,7 @@ def cut_bytes(path: Path) -> None:
             ["holds 189 of the 300 frames that its header states", "cut off"],
         ),
         (write_qualisys_bodies, None, COLUMNS, ["a Qualisys TSV, which has bodies", 'body = "..."', "hull, tip"]),
+        (write_tum, None, COLUMNS, ["a TUM trajectory, which has bodies", 'body = "..."', "there are pose"]),
         (write_qualisys_bodies, replaced("Rot[4]\t", "", 1), NAMED, ["the row has more cells than the header"]),
         (write_qualisys_bodies, replaced("DATA_INCLUDED\t6D", "DATA_INCLUDED\t2D"), NAMED, ["DATA_INCLUDED is '2D'"]),
         (
@@ -641,6 +523,12 @@ def cut_bytes(path: Path) -> None:
             lambda path: path.write_text("1,2,3\n4,5,6\n"),
             NAMED,
             ["line 1: it holds numbers where the names"],
+        ),
+        (
+            write_table,  # `ros2 topic echo --csv`: seconds and nanoseconds apart, a frame's name, no header
+            lambda path: path.write_text("".join(f"17,{i}0000000,map,0.1,0.2,1.5,0,0,0,1\n" for i in range(50))),
+            COLUMNS,
+            ["line 1: it holds numbers where the names", "above the numbers"],
         ),
     ],
 )
@@ -703,20 +591,81 @@ def test_a_folder_of_no_format_is_refused(tmp_path: Path):
         find_reader(tmp_path)
 
 
-def test_a_table_and_its_log_have_clocks_of_their_own(tmp_path: Path, robot: RobotDescription):
-    write_table(tmp_path)
-    text = (tmp_path / "trial.csv").read_text().replace("time,", "%time,", 1).replace("arm_cmd,push_cmd", "a,b", 1)
-    (tmp_path / "trial.csv").write_text(text)
-    write_log(tmp_path, 12.0)
-    columns = COLUMNS.replace("tip_pos[0]", "tip_x").replace("tip_pos[1]", "tip_y").replace("tip_pos[2]", "tip_z")
-    for old, new in (("hull_pos[0]", "hull_x"), ("hull_pos[1]", "hull_y"), ("hull_pos[2]", "hull_z"),
-                     ("hull_quat[0]", "hull_qw"), ("hull_quat[1]", "hull_qx"), ("hull_quat[2]", "hull_qy"),
-                     ("hull_quat[3]", "hull_qz")):  # fmt: skip
-        columns = columns.replace(old, new)
-    room(tmp_path, robot, columns + '[clock]\ntime = "%time"\ntime_unit = "ms"\n')
+def write_two_clocks(folder: Path, table: str, log: str) -> None:
+    """The capture as a table in ms and the commands as a log in s, 12 s later, with the columns of times so named."""
+    names = [table, *(f"hull_{axis}" for axis in range(3)), *(f"turn_{part}" for part in range(4))]
+    columns = [1e3 * TIME, *HULL.place.T, *HULL.turn.as_quat(scalar_first=True).T, *TIP.place.T]
+    header = ",".join([*names, *(f"tip_{axis}" for axis in range(3))])
+    (folder / "trial.csv").write_text(f"{header}\n{rows(columns, ',', 7, lost=[])}")
+    text = write_log(folder, 12.0).read_text()
+    (folder / "log.csv").write_text(text.replace("time,", f"{log},", 1))
+
+
+TWO_CLOCKS = """[units]
+length = "m"
+[hull]
+position = ["hull_0", "hull_1", "hull_2"]
+orientation = ["turn_0", "turn_1", "turn_2", "turn_3"]
+rotation = "quaternion"
+[tip]
+position = ["tip_0", "tip_1", "tip_2"]
+[clock]
+time_unit = "ms"
+"""
+
+
+@pytest.mark.parametrize(
+    ("table", "log", "clock", "commands"),
+    [
+        ("stamp", "sent", 'time = "stamp"\n', 'time = "sent"\n'),
+        ("%time", "time", 'time = "%time"\n', ""),
+        # One key for both files: a sign of a comment before a header's name is no part of it.
+        ("%time", "time", "", 'time = "%time"\n'),
+        ("%time", "time", "", 'time = "time"\n'),
+        ("t", "# t", "", 'time = "t"\n'),
+        ("stamp", "%stamp", "", 'time = "stamp"\n'),
+    ],
+)
+def test_a_table_and_its_log_have_clocks_of_their_own(
+    tmp_path: Path, robot: RobotDescription, table: str, log: str, clock: str, commands: str
+):
+    write_two_clocks(tmp_path, table, log)
+    room(tmp_path, robot, TWO_CLOCKS + clock, commands)
     line = ["import", tmp_path / "trial.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "out.csv"]
     run(*line, "--robot", robot.file, "--commands", tmp_path / "log.csv", "--offset=-12")
-    same(read_recording(tmp_path / "out.csv", robot), gaps=True)
+    same(read_recording(tmp_path / "out.csv", robot), gaps=False)
+
+
+def test_a_column_s_own_name_goes_before_one_without_its_sign(tmp_path: Path, robot: RobotDescription):
+    """A table may have both: `time` within the trial, and `%time` of the day."""
+    write_two_clocks(tmp_path, "%time", "time")
+    lines = (tmp_path / "trial.csv").read_text().splitlines()
+    body = [f"{1e6 + 5 * row},{line}" for row, line in enumerate(lines[1:])]
+    (tmp_path / "trial.csv").write_text("\n".join(["time," + lines[0], *body]))
+    found = read_capture(tmp_path / "trial.csv", room(tmp_path, robot, TWO_CLOCKS + 'time = "%time"\n'))
+    np.testing.assert_allclose(found.time, TIME, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("commands", "said"),
+    [
+        # The name is the table's: the log's is missing, and where a table's own name stands is told.
+        ('time = "stamp"\n', ["log.csv: there is no column 'stamp' of times", "under [commands]", "[clock]"]),
+        # The name is the log's: the table's is missing.
+        ('time = "sent"\n', ["trial.csv: there is no column 'sent' of times", "under [clock]"]),
+    ],
+)
+def test_one_name_for_two_clocks_is_told_which_key_the_other_has(
+    tmp_path: Path, robot: RobotDescription, capsys: pytest.CaptureFixture[str], commands: str, said: list[str]
+):
+    write_two_clocks(tmp_path, "stamp", "sent")
+    room(tmp_path, robot, TWO_CLOCKS, commands)
+    line = ["import", tmp_path / "trial.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "out.csv"]
+    line += ["--robot", robot.file, "--commands", tmp_path / "log.csv", "--offset=-12"]
+    assert record.main([str(each) for each in line]) == 2
+    told = capsys.readouterr().err
+    for part in said:
+        assert part in told, told
 
 
 def test_what_the_wizard_cannot_tell_is_left_empty_and_refused(

@@ -155,4 +155,5 @@ def test_check_and_import_take_the_robot(tmp_path: Path, capsys: pytest.CaptureF
     assert "command_turn: -11.50 to -11.50" in said
     assert (tmp_path / "figures" / "take.png").stat().st_size > 2e4
     assert record.main(["check", str(tmp_path / "out")]) == 2
-    assert "unknown column" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "unknown column" in said and "--robot" in said

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP, ActuatorParameters, load_model, standing_qpos
+from ballu_mjx.ballu.actuators import ActuatorParameters
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.evaluation.errors import Errors, Evaluation, mean_by_group
+from ballu_mjx.evaluation.errors_file import evaluation_to_json
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
@@ -270,7 +272,7 @@ def test_a_residual_that_breaks_the_simulation_down_is_counted_and_never_average
         assert some == starts > 0 and errors.position[1.0] == (np.inf, 0.0) and errors.mean_com_error == np.inf
     assert not any(errors.num_diverged(1.0) for errors in result.vanilla)
     assert result.excess()[0] == result.score == np.inf
-    assert "diverged" in result.table() and "nan" not in result.table() + json.dumps(result.to_json()).lower()
+    assert "diverged" in result.table() and "nan" not in result.table() + json.dumps(evaluation_to_json(result)).lower()
 
 
 def test_the_nominal_robot_stands_beside_the_one_with_identified_actuators(evaluator: OpenLoopEvaluator):

@@ -12,7 +12,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP, ActuatorParameters, load_model, standing_qpos
+from ballu_mjx.ballu.actuators import ActuatorParameters
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions

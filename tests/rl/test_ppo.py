@@ -16,7 +16,7 @@ from brax.training.agents.ppo.losses import compute_gae
 from follower import Follower, physics
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.rl import learner, ppo, training_env
+from ballu_mjx.rl import learner, ppo, training_env, training_state
 from ballu_mjx.rl.learner import Learner
 
 SMALL = ppo.PPOConfig(
@@ -41,10 +41,10 @@ def trained() -> tuple[dict[str, np.ndarray], Calls]:
     """All of the last state, and what every call brought."""
     calls: Calls = []
     last, metrics = learner.train(
-        Follower(), SMALL, lambda step, state, metrics: calls.append((step, learner.params(state), metrics))
+        Follower(), SMALL, lambda step, state, metrics: calls.append((step, training_state.params(state), metrics))
     )
     assert metrics == calls[-1][2]
-    return learner.stored(last), calls
+    return training_state.stored(last), calls
 
 
 def test_orthogonal_hidden_layers_keep_lengths():
@@ -133,7 +133,7 @@ def test_learns_what_brax_s_own_loop_learns():
         normalize_observations=True,
     )
     state, metrics = learner.train(Follower(), dataclasses.replace(config, num_timesteps=steps * size))
-    ours = learner.params(state)
+    ours = training_state.params(state)
     statistics, policy, value = jax.device_get(params)
     # The two are compiled differently, which may cost the last digits.
     close: Any = {"rtol": 1e-3, "atol": 2e-5}
@@ -156,10 +156,10 @@ def short() -> Learner:
     return Learner(Follower(), SMALL)
 
 
-def after(learned: Learner, state: learner.TrainingState, steps: int) -> dict[str, np.ndarray]:
+def after(learned: Learner, state: training_state.TrainingState, steps: int) -> dict[str, np.ndarray]:
     for _ in range(steps):
         state, _ = learned.step(state)
-    return learner.stored(state)
+    return training_state.stored(state)
 
 
 def test_going_on_from_a_stored_state_is_as_if_never_stopped(short):
@@ -179,7 +179,9 @@ def test_the_policy_that_is_handed_out_is_an_average(short):
         latest = jax.device_get(state.networks.policy)
         average = latest if average is None else jax.tree.map(lambda a, b: a + (b - a) / count, average, latest)  # noqa: B023
         jax.tree.map(
-            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), learner.params(state).policy, average
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6),
+            training_state.params(state).policy,
+            average,
         )
     assert not np.array_equal(*(jax.tree.leaves(x)[1] for x in (average, latest)))
 
@@ -188,9 +190,9 @@ def test_the_training_step_is_compiled_once(short):
     state = short.init(0)
     for _ in range(3):
         state, _ = short.step(state)
-    state, _ = short.resume(learner.stored(state))
+    state, _ = short.resume(training_state.stored(state))
     short.step(state)
-    state = short.init_from(learner.params(short.init(1)), 100)
+    state = short.init_from(training_state.params(short.init(1)), 100)
     short.step(state)
     assert short._step._cache_size() == 1
 
@@ -208,7 +210,7 @@ def test_one_device_compiles_the_training_step_once_too(monkeypatch: pytest.Monk
 
 def test_copies_of_a_state_outlive_it(short):
     state = short.init(0)
-    copies = learner.stored(state), learner.params(state)
+    copies = training_state.stored(state), training_state.params(state)
     before = jax.tree.map(np.copy, copies)
     for _ in range(2):
         state, _ = short.step(state)
@@ -218,8 +220,8 @@ def test_copies_of_a_state_outlive_it(short):
 def test_with_other_environments_the_optimizer_goes_on(short):
     stored = after(short, short.init(0), 2)
     fewer = Learner(Follower(), dataclasses.replace(SMALL, num_envs=32))
-    state, whole = fewer.resume(learner.with_learning_rate(stored, 0.125))
-    kept = learner.stored(state)
+    state, whole = fewer.resume(training_state.with_learning_rate(stored, 0.125))
+    kept = training_state.stored(state)
     assert not whole
     assert kept["environments.reward"].shape == (32,)
     (rate,) = {float(value) for name, value in kept.items() if name.endswith("hyperparams.learning_rate")}
@@ -240,14 +242,14 @@ def test_training_goes_on_from_parameters_alone(trained):
     state, metrics = learner.train(
         Follower(),
         dataclasses.replace(SMALL, num_timesteps=2660),
-        lambda step, state, metrics: steps.append((step, learner.params(state))),
+        lambda step, state, metrics: steps.append((step, training_state.params(state))),
         start=lambda new: new.init_from(params, 100),
     )
     assert [step for step, _ in steps] == [100, 2660]
     for kept, given in zip(jax.tree.leaves(steps[0][1]), jax.tree.leaves(params), strict=True):
         np.testing.assert_array_equal(kept, given)
     assert metrics["reward"] > 0.9 * calls[-1][2]["reward"]
-    assert learner.params(state).normalizer.count == params.normalizer.count + 2560
+    assert training_state.params(state).normalizer.count == params.normalizer.count + 2560
 
 
 def test_long_trainings_call_less_often_and_go_on_in_the_same_rhythm():

@@ -22,11 +22,12 @@ from follower import Follower, weight
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.rl import learner, ppo
-from ballu_mjx.rl.learner import Learner, TrainingState
+from ballu_mjx.rl import ppo, training_state
+from ballu_mjx.rl.learner import Learner
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.rl.resume_point import ResumePoint, find_resume_point, training_facts
 from ballu_mjx.rl.training_loop import TrainingLoop, Validation
+from ballu_mjx.rl.training_state import TrainingState
 from ballu_mjx.rl.watchdog import Watchdog
 from ballu_mjx.runs.checkpoints import last_checkpoint, list_checkpoints, restore_checkpoint
 from ballu_mjx.runs.folder import Run, new_folder
@@ -146,7 +147,7 @@ def small() -> Learner:
 
 def saved(folder: Path, state: TrainingState, config: dict[str, Any], step: int = 160) -> Path:
     with Run(folder, config) as run:
-        tree, training = ppo.as_tree(learner.params(state)), learner.stored(state)
+        tree, training = ppo.as_tree(training_state.params(state)), training_state.stored(state)
         run.save(step, tree, -1.0, training=training, notes=training_facts(config))
     return folder
 
@@ -160,8 +161,8 @@ def test_a_run_goes_on_with_its_whole_state(tmp_path, small):
     start = resumed(saved(tmp_path / "run", before, content(env={"friction": (1.0, 2.0)})), CONFIG)
     said: list[str] = []
     again = start.state(small, CONFIG, training_facts(content(env={"friction": [1.0, 2.0]})), said.append)
-    for name, value in learner.stored(before).items():
-        np.testing.assert_array_equal(learner.stored(again)[name], value)
+    for name, value in training_state.stored(before).items():
+        np.testing.assert_array_equal(training_state.stored(again)[name], value)
     assert start.step == 160 and start.notice is None and said == []
 
 
@@ -174,10 +175,12 @@ def test_changed_options_start_the_environments_anew(tmp_path, small, ppo_change
     start = resumed(saved(tmp_path / "run", before, content()), CONFIG)
     changed = dataclasses.replace(CONFIG, learning_rate=0.5, **ppo_change)
     told: list[str] = []
-    again = learner.stored(start.state(small, changed, training_facts(content(changed, **sections)), told.append))
+    again = training_state.stored(
+        start.state(small, changed, training_facts(content(changed, **sections)), told.append)
+    )
     (said,) = told
     assert "the environments start anew, for the options changed; the optimizer goes on" in said
-    stored = learner.stored(before)
+    stored = training_state.stored(before)
     assert np.array_equal(again["optimizer.1.count"], stored["optimizer.1.count"])
     assert again["optimizer.1.hyperparams.learning_rate"] == 0.5
     goal = "environments.pipeline_state.goal"
@@ -187,7 +190,7 @@ def test_changed_options_start_the_environments_anew(tmp_path, small, ppo_change
 def test_a_run_of_an_older_version_goes_on_from_its_parameters(tmp_path, small):
     before = small.init(5)
     folder = tmp_path / "run"
-    params = learner.params(before)
+    params = training_state.params(before)
     with Run(folder, content()):
         pass
     options = ocp.CheckpointManagerOptions(enable_async_checkpointing=False)
@@ -197,13 +200,13 @@ def test_a_run_of_an_older_version_goes_on_from_its_parameters(tmp_path, small):
     (folder / "config.json").write_text(json.dumps(config | {"format": "ballu-run/1"}))
     start = resumed(folder, CONFIG)
     told: list[str] = []
-    again = learner.params(start.state(small, CONFIG, training_facts(content()), told.append))
+    again = training_state.params(start.state(small, CONFIG, training_facts(content()), told.append))
     assert "an older version kept parameters alone" in told[0]
     assert start.step == 160
-    for name, value in learner.stored(before).items():
+    for name, value in training_state.stored(before).items():
         if name.startswith("networks"):
             np.testing.assert_array_equal(
-                learner.stored(start.state(small, CONFIG, training_facts(content()), told.append))[name], value
+                training_state.stored(start.state(small, CONFIG, training_facts(content()), told.append))[name], value
             )
     np.testing.assert_array_equal(again.normalizer.mean["state"], params.normalizer.mean["state"])
     with Run(folder, content(), resumed_at=160) as run:

@@ -3,6 +3,7 @@
 import dataclasses
 import gzip
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -27,7 +28,7 @@ from ballu_mjx.residuals.network import load_units, world_loads
 from ballu_mjx.residuals.run_config import describe_recording, find_recordings, run_robot
 from ballu_mjx.robots.description import read_description
 from ballu_mjx.robots.model import assets
-from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.robots.registry import describe_robot, load_robot
 from ballu_mjx.sim.observation import HISTORY, heading_observation
 from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.sim.step import count_substeps
@@ -204,14 +205,19 @@ def split_model(tmp_path: Path) -> Path:
     ],
 )
 def test_a_change_of_any_file_of_the_model_is_noticed(split_model: Path, name: str, old: str, new: str) -> None:
-    stored = {"robot_description": {"path": str(split_model), "sha256": read_description(split_model).sha256}}
+    # Through JSON, as in a run's folder. Runs of earlier versions have one hash of all files alone.
+    described = json.loads(json.dumps(describe_robot(read_description(split_model))))
+    stored, earlier = ({"robot_description": each} for each in (described, {**described, "files": None}))
     run_robot(stored, split_model.parent)
     changed = split_model.parent / name
     text = changed.read_text()
     assert old in text
     changed.write_text(text.replace(old, new))
-    with pytest.raises(InputError, match="the robot description, or its model, has changed since .* was written"):
+    problem = "the robot description, or its model, has changed since .* was written"
+    with pytest.raises(InputError, match=rf"{problem} \({re.escape(name)}\); restore it"):
         run_robot(stored, split_model.parent)
+    with pytest.raises(InputError, match=f"{problem}; restore it"):
+        run_robot(earlier, split_model.parent)
     changed.write_text(text)
     run_robot(stored, split_model.parent)
 

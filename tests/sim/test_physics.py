@@ -14,24 +14,12 @@ from jaxtyping import Array, Float
 from mujoco import mjx
 from mujoco.mjx._src.solver import Context
 
-from ballu_mjx.ballu.model import (
-    CABLE_SLACK,
-    CONTROL_TIMESTEP,
-    KNEES,
-    MOTORS,
-    SIDES,
-    ActuatorParameters,
-    actuator_fields,
-    buoyancy_ratio,
-    cable_length,
-    load_model,
-    standing_qpos,
-)
+from ballu_mjx.ballu.actuators import CABLE_SLACK, ActuatorParameters, actuator_fields, cable_length
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, KNEES, MOTORS, SIDES, buoyancy_ratio, load_model, standing_qpos
 from ballu_mjx.robots.model import set_fields, with_fields
 from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.contact_solver import _newton_step, _solve
 from ballu_mjx.sim.step import (
-    _newton_step,
-    _solve,
     control_step,
     count_substeps,
     load_state,
@@ -41,7 +29,7 @@ from ballu_mjx.sim.step import (
 )
 
 CABLES = [f"cable_{side}" for side in SIDES]
-FIELDS = [field.name for field in dataclasses.fields(ActuatorParameters)]
+FIELDS = [f.name for f in dataclasses.fields(ActuatorParameters) if f.default is dataclasses.MISSING]
 
 
 def tight_model() -> mujoco.MjModel:

@@ -27,6 +27,7 @@ from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.cli import train_envmimic, train_policy, view
 from ballu_mjx.cli.report import main
 from ballu_mjx.evaluation.errors import HORIZONS, Errors, Evaluation
+from ballu_mjx.evaluation.errors_file import evaluation_to_json
 from ballu_mjx.evaluation.transfer import Transfer, walking_table
 from ballu_mjx.policies import pipeline_layout
 from ballu_mjx.policies.locomotion_env import LocomotionConfig
@@ -39,7 +40,7 @@ from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.folder import Run
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, read_rollouts, write_rollouts
-from ballu_mjx.viz import report, robot_meshes, video, viser_scene
+from ballu_mjx.viz import report, report_content, robot_meshes, video, viser_scene
 from ballu_mjx.viz.style import colour_of
 
 LARGEST_PAGE = 10e6
@@ -94,7 +95,7 @@ def write_run(folder: Path, takes: list[StoredRollout]) -> Path:
             run.log(step, {"reward": 1.0 + step / 1000, "validation_error": 1.0 - step / 1000})
     without, mimic = (tuple(errors(t.name, 10 * i + k) for i, t in enumerate(takes)) for k in range(2))
     evaluation = Evaluation(without, mimic)
-    (folder / "evaluation.json").write_text(json.dumps(evaluation.to_json()))
+    (folder / "evaluation.json").write_text(json.dumps(evaluation_to_json(evaluation)))
     (folder / "evaluation.txt").write_text(evaluation.table())
     write_rollouts(folder / ROLLOUT_FILE, takes)
     return folder
@@ -164,7 +165,7 @@ def test_numbers_are_those_of_the_evaluation(run: Path, page: Path):
 
 
 def test_curves_and_plots_are_those_of_the_run(run: Path):
-    content = report.collect(run)
+    content = report_content.collect(run)
     assert [(curve.title, *curve.values) for curve in content.curves] == [
         ("reward per control step", "envmimic"),
         ("validation error (ratio to vanilla)", "envmimic"),
@@ -184,7 +185,7 @@ def test_curves_and_plots_are_those_of_the_run(run: Path):
 def test_options_and_names_are_shown_as_text(run: Path, page: Path):
     elements = Elements(page.read_text()).elements
     assert not [a for tag, a in elements if tag == "img" or "onerror" in a]
-    content = report.collect(run)
+    content = report_content.collect(run)
     assert HOSTILE in dict(content.facts)["robot"]
     assert dict(dict(content.options)["env"])["episode_seconds"] == "3.0"
 
@@ -291,7 +292,7 @@ def test_story_shows_its_tables_and_policies_over_each_other(tmp_path: Path):
     write_run(tmp_path / "seed-0" / "envmimic-walk", [take("actions-1", 21)])
     write_run(tmp_path / "seed-0" / "envmimic-walk-2", [take("actions-1", 22)])
 
-    content = report.collect(tmp_path)
+    content = report_content.collect(tmp_path)
     assert [(t.name, list(t.qpos), len(t.time)) for t in content.takes] == [
         ("policies: walk, seed-0", ["vanilla+dr", "envmimic", "envmimic-2"], 25),
         ("EnvMimic: walk, seed-0: actions-1", ["recording", "vanilla", "envmimic"], 21),

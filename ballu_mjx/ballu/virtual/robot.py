@@ -20,17 +20,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.ballu.model import (
-    CABLE_SLACK,
-    CONTROL_TIMESTEP,
-    SERVO_RANGE,
-    SIDES,
-    ActuatorParameters,
-    actuator_fields,
-    load_model,
-    standing_qpos,
-    suspend,
-)
+from ballu_mjx.ballu.actuators import CABLE_SLACK, SERVO_RANGE, ActuatorParameters, actuator_fields
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model, standing_qpos, suspend
 from ballu_mjx.ballu.recordings import make_recording
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.recording import Recording
@@ -90,8 +81,9 @@ class VirtualRobot:
     @property
     def actuators(self) -> ActuatorParameters:
         """What identification of its actuators can hope to find."""
-        names = [field.name for field in dataclasses.fields(ActuatorParameters)]
-        return ActuatorParameters(**{name: jnp.array(getattr(self, name)) for name in names})
+        names = {field.name for field in dataclasses.fields(self)}
+        own = [f.name for f in dataclasses.fields(ActuatorParameters) if f.default is dataclasses.MISSING]
+        return ActuatorParameters(**{name: jnp.array(getattr(self, name)) for name in own if name in names})
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from jaxtyping import Float
 from ballu_mjx.ballu import plots as ballu_plots
 from ballu_mjx.ballu.features import foot_positions
 from ballu_mjx.ballu.gait import count_steps
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import TrialConditions, VirtualRobot
 from ballu_mjx.evaluation.transfer import Trajectory, Transfer, compare_trajectories
@@ -75,9 +76,10 @@ def run_trials(
         recordings.append(read_recording(path, load_robot()))  # reading fills the gaps
         tell(f"{policy.task.name}, {setting}: {name} of {len(draws)} done")
 
-    model = load_model(policy.actuators)
-    motions = [reconstruct(recording, load_robot(), model) for recording in recordings]
-    reference, com = stack_motions(Simulator(load_robot(), model=model), motions)
+    simulator = Simulator(load_robot(), policy.actuators)
+    restore = partial(reconstruct, robot=simulator.robot, model=simulator.mj_model, drivetrain=simulator.drivetrain)
+    motions = [restore(recording) for recording in recordings]
+    reference, com = stack_motions(simulator, motions)
     starts = [np.stack([getattr(motion, name)[0] for motion in motions]) for name in ("qpos", "qvel")]
     rollout = (loop or policy.closed_loop())(policy.params, starts[0], starts[1], len(motions[0].command))
     recorded = np.asarray(com), np.asarray(reference.features)

@@ -30,6 +30,8 @@ from ballu_mjx.recordings.importers.trajectories import (
 
 _COMMAND_TOLERANCE = 0.005
 """Of a command's range: values that exceed it by at most this share are measurement noise and are clipped."""
+_COMMENT_SIGNS = "#% "
+"""Before the first name of a header, as `rostopic echo -p` writes it: "%time"."""
 _LONGEST_BRIDGE = 2.5
 """Sample spacings: streams at other times are interpolated over shorter steps only, the rest was not seen."""
 
@@ -111,12 +113,7 @@ def list_capture(capture: Capture) -> Contents:
     """Return what `capture` holds. What cannot be read is told in the notes."""
     items: list[Item] = []
     notes = list(capture.notes)
-    for name in capture.bodies:
-        try:
-            stream = capture.bodies[name]
-        except InputError as error:
-            notes.append(str(error))
-            continue
+    for name, stream in _readable(capture.bodies, notes):
         turns = stream.quaternion is not None or stream.angles is not None
         seen = ~np.isnan(stream.position).any(axis=1)
         items.append(
@@ -133,12 +130,7 @@ def list_capture(capture: Capture) -> Contents:
                 high=float(stream.position[seen].max()) if seen.any() else None,
             )
         )
-    for name in capture.columns:
-        try:
-            series = capture.columns[name]
-        except InputError as error:
-            notes.append(str(error))
-            continue
+    for name, series in _readable(capture.columns, notes):
         seen = series.values[~np.isnan(series.values)]
         items.append(
             Item(
@@ -157,6 +149,17 @@ def list_capture(capture: Capture) -> Contents:
         )
     rows = capture.clock is not None
     return Contents(capture.path, capture.program, items, rows=rows, notes=notes, episodes=capture.episodes)
+
+
+def _readable(values: Mapping[str, _Value], notes: list[str]) -> Iterator[tuple[str, _Value]]:
+    """Yield what can be read, by name; what is wrong with the rest is added to `notes`."""
+    for name in values:
+        try:
+            value = values[name]
+        except InputError as error:
+            notes.append(str(error))
+            continue
+        yield name, value
 
 
 def _rate(time: np.ndarray) -> float | None:
@@ -190,7 +193,7 @@ def select(capture: Capture, mapping: RoomMapping) -> Trajectories:
     bodies = {role: _on_clock(stream, time) for role, stream in picked.items()}
     angles = {name: _values_on_clock(each, values, time) for name, (each, values) in joints.items()}
     commands = None
-    if any(name in capture.columns for name in mapping.commands.columns.values()):
+    if any(_find_column(capture, name) is not None for name in mapping.commands.columns.values()):
         commands = CommandLog(*_commands(capture, mapping.commands, mapping, log=False))
     return Trajectories(capture.path, time, bodies, angles, commands)
 
@@ -253,7 +256,9 @@ def _from_columns(capture: Capture, mapping: RoomMapping, source: Source) -> Str
     assert source.rotation is not None
     unit = 1.0 if source.rotation == "quaternion" else _unit(capture, mapping, parts[3][1], ANGLES, "angle")
     place = f"columns {source.orientation[0]} to {source.orientation[-1]}"
-    return Stream(time, position, to_quaternion(capture.path, place, values[:, 3:], source.rotation, unit))
+    mend = f"export unit quaternions, or mend the order of the columns in {mapping.path}"
+    quaternion = to_quaternion(capture.path, place, values[:, 3:], source.rotation, unit, mend=mend)
+    return Stream(time, position, quaternion)
 
 
 def _joint(capture: Capture, mapping: RoomMapping, joint: Joint) -> tuple[np.ndarray, np.ndarray]:
@@ -273,16 +278,25 @@ def _unit(capture: Capture, mapping: RoomMapping, series: Series, known: Mapping
     return known[unit]
 
 
+def _find_column(capture: Capture, name: str) -> str | None:
+    """The column that `name` means: itself, or the one that differs by a sign of a comment; None: there is none."""
+    if name in capture.columns:
+        return name
+    bare = name.lstrip(_COMMENT_SIGNS)
+    return next((column for column in capture.columns if bare and column.lstrip(_COMMENT_SIGNS) == bare), None)
+
+
 def _look_up(capture: Capture, name: str, mapping: RoomMapping | None) -> Series:
-    if name not in capture.columns and not capture.columns:
+    column = _find_column(capture, name)
+    if column is not None:
+        return capture.columns[column]
+    if not capture.columns:
         bodies = suggest("", capture.bodies)
         problem = f"it is {capture.program}, which has bodies and markers in place of columns such as {shorten(name)!r}"
         refuse(capture.path, "", problem, f'write body = "..." in the mapping, {bodies}')
-    if name not in capture.columns:
-        where = "the mapping" if mapping is None else mapping.path
-        hint = suggest(name, capture.columns).rstrip("?")
-        refuse(capture.path, "", f"there is no column {shorten(name)!r}", f"fix {where}, {hint}")
-    return capture.columns[name]
+    where = "the mapping" if mapping is None else mapping.path
+    hint = suggest(name, capture.columns).rstrip("?")
+    refuse(capture.path, "", f"there is no column {shorten(name)!r}", f"fix {where}, {hint}")
 
 
 def _column(capture: Capture, mapping: RoomMapping, name: str) -> tuple[np.ndarray, Series]:
@@ -292,13 +306,27 @@ def _column(capture: Capture, mapping: RoomMapping, name: str) -> tuple[np.ndarr
 
 
 def _rows_clock(capture: Capture, mapping: RoomMapping) -> np.ndarray:
-    column = mapping.clock.time or capture.time_column or mapping.commands.time
-    if capture.clock is not None and column in capture.columns:
+    name = mapping.clock.time or capture.time_column or mapping.commands.time
+    column = _find_column(capture, name)
+    if capture.clock is not None and column is not None:
         return capture.clock(column, mapping.clock.time_unit)
     if mapping.rate is not None:
         return np.arange(capture.rows) / mapping.rate
-    fix = f'write time = "..." under [clock] in {mapping.path}, {suggest(column, capture.columns)}'.rstrip("?")
-    refuse(capture.path, "", f"there is no column {shorten(column)!r} of times", f"{fix}; or rate = ... (Hz)")
+    fix = f'write time = "..." under [clock] in {mapping.path}, {suggest(name, capture.columns)}'.rstrip("?")
+    refuse(capture.path, "", f"there is no column {shorten(name)!r} of times", f"{fix}; or rate = ... (Hz)")
+
+
+def _log_clock(capture: Capture, columns: Commands, mapping: RoomMapping | None) -> np.ndarray:
+    """Times of a log whose columns hold a sample a row."""
+    column = _find_column(capture, columns.time)
+    if column is None:
+        where = "the mapping" if mapping is None else mapping.path
+        fix = f'write time = "..." under [commands] in {where}, {suggest(columns.time, capture.columns)}'.rstrip("?")
+        if mapping is not None and mapping.clock.time is None:
+            fix += "; a captured file's own column of times stands under [clock]"
+        refuse(capture.path, "", f"there is no column {shorten(columns.time)!r} of times", fix)
+    assert capture.clock is not None
+    return capture.clock(column, columns.time_unit)
 
 
 # ---- commands ----
@@ -313,9 +341,7 @@ def _commands(
     for each in series.values():
         if each.time is None and rows is None:
             if log:
-                _look_up(capture, columns.time, mapping)
-                assert capture.clock is not None
-                rows = capture.clock(columns.time, columns.time_unit)
+                rows = _log_clock(capture, columns, mapping)
             else:
                 assert mapping is not None
                 rows = _rows_clock(capture, mapping)

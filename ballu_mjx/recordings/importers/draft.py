@@ -112,7 +112,8 @@ def _role(contents: Contents, role: str, roles: Sequence[str], tracked: str) -> 
         if found.section is not None:
             lines.append(f"section = {json.dumps(found.section)}")
         if found.rotation is not None:
-            lines.append(f'rotation = "{found.rotation}"  # a guess: the file does not say')
+            comment = '# a guess: the file does not say. "helical": a rotation vector, "XYZ": Euler angles'
+            lines.append(f'rotation = "{found.rotation}"  {comment}')
         return _Part(lines, items=[found])
     cluster = [
         item for item in markers if _plain(item.name).startswith(_plain(role)) or _plain(role) in _last(item.name)

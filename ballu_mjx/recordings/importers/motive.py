@@ -14,6 +14,7 @@ Motive's own axes have y up. Quaternions are x, y, z, w: the body's frame in the
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -35,9 +36,12 @@ _MEND = "export again, with header"
 
 
 def recognise_motive(path: Path, start: str) -> bool:
-    """Whether the file that begins with `start` is one."""
+    """Whether the file that begins with `start` is one, or the rest of one whose first lines were lost."""
     del path
-    return start.lstrip("\ufeff\n\r").startswith(("Format Version", '"Format Version"'))
+    if start.lstrip("\ufeff\n\r").startswith(("Format Version", '"Format Version"')):
+        return True
+    lines = start.splitlines()[:_FIRST_ROWS]
+    return any(line.startswith("Frame") and "Position" in above for above, line in itertools.pairwise(lines))
 
 
 def open_motive(path: Path, mapping: RoomMapping | None) -> Capture:
@@ -49,6 +53,8 @@ def open_motive(path: Path, mapping: RoomMapping | None) -> Capture:
     lines = read_text(path).splitlines()
     delimiter = max(",;\t", key=next((line for line in lines if line.strip()), "").count)
     top = split_cells(next((line for line in lines if line.strip()), ""), delimiter)
+    if top[0] != "Format Version":
+        refuse(path, "line 1", "the line that begins with Format Version, and states the units, is missing", _MEND)
     header = next(
         (
             i
@@ -88,14 +94,23 @@ def open_motive(path: Path, mapping: RoomMapping | None) -> Capture:
             group[components[i], axes[i]] = i
     bodies: dict[str, Stream] = {}
     notes = ["Motive's axes have y up unless the export settings say otherwise."]
-    for (kind, name), group in groups.items():
-        if kind not in (*_BODIES, *_MARKERS) or any(("Position", axis) not in group for axis in _AXES):
+    hidden = []
+    # Bodies before markers: in a skeleton's export, labels of markers may be names of bones too.
+    for (kind, name), group in sorted(groups.items(), key=lambda item: item[0][0] in _MARKERS):
+        if kind not in (*_BODIES, *_MARKERS):
             continue
+        lacking = [axis for axis in _AXES if ("Position", axis) not in group]
+        if lacking:
+            problem = f"{shorten(name)!r} has no column Position {', '.join(lacking)}"
+            refuse(path, f"line {header + 1}", problem, _MEND)
         if kind == "bone" and local:
             notes.append(f"{shorten(name)!r} is in its parent's frame (Coordinate Space Local), and is not read.")
             continue
+        if name in bodies and kind in _MARKERS:
+            hidden.append(name)
+            continue
         if name in bodies:
-            problem = f"{shorten(name)!r} is the name of an asset and of a marker"
+            problem = f"{shorten(name)!r} is the name of two bodies"
             refuse(path, f"line {header + 1}", problem, "rename one and export again")
         position = table[:, [group["Position", axis] for axis in _AXES]] * unit
         bodies[name] = Stream(time, position)
@@ -112,11 +127,16 @@ def open_motive(path: Path, mapping: RoomMapping | None) -> Capture:
             bodies[name] = Stream(time, position, quaternion)
         else:
             bodies[name] = Stream(time, position, angles=values * ANGLES["deg"])
+    if hidden:
+        notes.append(f"Markers that share their names with bodies are not read: {_first_of(hidden)}.")
     expected = [name for (kind, name), _ in groups.items() if kind in _EXPECTED and name not in bodies]
     if expected:
-        shown = ", ".join(shorten(name) for name in expected[:4]) + (", ..." if len(expected) > 4 else "")
-        notes.append(f"Expected places of markers are not measured, and are not read: {shown}.")
+        notes.append(f"Expected places of markers are not measured, and are not read: {_first_of(expected)}.")
     return Capture(path, _PROGRAM, bodies, notes=notes)
+
+
+def _first_of(names: Sequence[str]) -> str:
+    return ", ".join(shorten(name) for name in names[:4]) + (", ..." if len(names) > 4 else "")
 
 
 def _header_rows(

@@ -16,21 +16,26 @@ from ballu_mjx.common.files import read_text
 from ballu_mjx.recordings.importers.capture import Capture, Stream
 from ballu_mjx.recordings.importers.mapping import RoomMapping
 from ballu_mjx.recordings.importers.text import check_times, parse_number, read_numbers, split_cells
-from ballu_mjx.recordings.importers.trajectories import LENGTHS, TIMES, refuse, to_quaternion
+from ballu_mjx.recordings.importers.trajectories import LENGTHS, TIMES, refuse, shorten, to_quaternion
 
 BODY = "pose"
 """What mappings call the one body of these files."""
 _TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _EUROC = ("timestamp", "x", "y", "z", "qw", "qx", "qy", "qz")
 _MEND = "sort the lines by time, and delete repeated ones"
+_FIRST_POSES = 5
+"""By which the format is known, though one of them may be damaged."""
+_SHORTEST_STEP = 1e-5
+"""s between samples; where they are closer, the times are in another unit than ns."""
 
 
 def recognise_tum(path: Path, start: str) -> bool:
-    """Whether the first line that is no comment is one of eight numbers between blanks."""
+    """Whether the first lines that are no comments begin with numbers, and one has eight of them between blanks."""
     del path
-    line = next((line for line in start.splitlines() if line.strip() and not line.startswith("#")), "")
-    cells = line.split()
-    return len(cells) == len(_TUM) and all(parse_number(cell) is not None for cell in cells)
+    lines = [line.split() for line in start.splitlines() if line.strip() and not line.startswith("#")][:_FIRST_POSES]
+    if not lines or parse_number(lines[0][0]) is None:
+        return False
+    return any(len(cells) == len(_TUM) and all(parse_number(cell) is not None for cell in cells) for cells in lines)
 
 
 def open_tum(path: Path, mapping: RoomMapping | None) -> Capture:
@@ -63,12 +68,24 @@ def open_euroc(path: Path, mapping: RoomMapping | None) -> Capture:
     """
     lines = read_text(path).splitlines()
     header = split_cells(lines[0], ",") if lines else []
-    if len(header) < len(_EUROC) or "q" not in header[4].lower() or "w" not in header[4].lower():
+    names = [cell.partition("[")[0].strip().lower() for cell in header[: len(_EUROC)]]
+    ends = [name[-1:] for name in names[1:]]
+    if ends != [name[-1] for name in _EUROC[1:]] or not all("q" in name for name in names[4:]):
         problem = "the header is not #timestamp, position x, y, z, quaternion w, x, y, z"
         refuse(path, "line 1", problem, "give EuRoC's ground truth; another table needs a header without #")
+    for cell in header[1:4]:
+        unit = cell.partition("[")[2].rstrip("] ")
+        if unit not in ("", "m") and (mapping is None or mapping.length is None):
+            problem = f"EuRoC's positions are in m, and the header has {shorten(cell)!r}"
+            refuse(path, "line 1", problem, 'give m, or write length = "..." under [units] in the mapping')
     columns = [*_EUROC, *header[len(_EUROC) :]]
     table = read_numbers(path, lines, 1, columns, ",", unlimited=[0, *range(len(_EUROC), len(columns))])
-    return _pose(path, "an EuRoC CSV", table, table[:, 0] * TIMES["ns"], 1, [4, 5, 6, 7], mapping)
+    time = table[:, 0] * TIMES["ns"]
+    capture = _pose(path, "an EuRoC CSV", table, time, 1, [4, 5, 6, 7], mapping)
+    if len(time) > 1 and (step := float(np.median(np.diff(time)))) < _SHORTEST_STEP:
+        problem = f"the timestamps are {step / TIMES['ns']:.3g} apart, and EuRoC's are in ns"
+        refuse(path, "column timestamp", problem, "write them in ns")
+    return capture
 
 
 def _pose(

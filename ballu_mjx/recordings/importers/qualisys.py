@@ -30,6 +30,8 @@ from ballu_mjx.recordings.importers.trajectories import LENGTHS, refuse, shorten
 _PROGRAM = "a Qualisys TSV"
 _KEYS = ("FILE_VERSION", "NO_OF_FRAMES")
 """A file begins with one of these."""
+_FIRST_ROWS = 20
+"""Among which the header's keys stand."""
 _NAMES = {"3D": "MARKER_NAMES", "6D": "BODY_NAMES"}
 _ROTATION = tuple(f"Rot[{i}]" for i in range(9))
 _BODY_COLUMNS = ("X", "Y", "Z", "Roll", "Pitch", "Yaw", "Residual", *_ROTATION)
@@ -38,9 +40,10 @@ _TOLERANCE = 0.02
 
 
 def recognise_qualisys(path: Path, start: str) -> bool:
-    """Whether the file that begins with `start` is one."""
+    """Whether the file that begins with `start` is one, or the rest of one whose first lines were lost."""
     del path
-    return start.lstrip("\ufeff").startswith(_KEYS)
+    keys = {line.partition("\t")[0] for line in start.lstrip("\ufeff").splitlines()[:_FIRST_ROWS]}
+    return start.lstrip("\ufeff").startswith(_KEYS) or "DATA_INCLUDED" in keys
 
 
 def open_qualisys(path: Path, mapping: RoomMapping | None) -> Capture:
@@ -70,8 +73,12 @@ def open_qualisys(path: Path, mapping: RoomMapping | None) -> Capture:
         refuse(path, place, f"{shorten(doubled)!r} stands there twice", "give them different names and export again")
     columns, samples, leading = _columns(path, lines, first, included, names)
     table = read_numbers(path, lines, samples, columns, "\t")
-    stated = parse_number(keys.get("NO_OF_FRAMES", [""])[0])
-    if stated is not None and len(table) < stated:
+    frames = keys.get("NO_OF_FRAMES", [""])[0]
+    stated = parse_number(frames)
+    if stated is None:
+        problem = f"NO_OF_FRAMES is {shorten(frames)!r}, so that it is not known whether all frames are there"
+        refuse(path, f"line {places.get('NO_OF_FRAMES', 1)}", problem, "export again with the TSV header")
+    if len(table) < stated:
         problem = f"holds {len(table)} of the {stated:g} frames that its header states"
         refuse(path, "", problem, "the file was cut off; copy or export it again")
     if "Frame" in leading:
@@ -81,8 +88,8 @@ def open_qualisys(path: Path, mapping: RoomMapping | None) -> Capture:
         check_times(path, time, samples, "export again, or write rate = ... in the mapping")
     else:
         rate = _rate(path, places.get("FREQUENCY", 1), keys.get("FREQUENCY", [""])[0], mapping)
-        frames = table[:, leading.index("Frame")] if "Frame" in leading else np.arange(len(table))
-        time = (frames - frames[0]) / rate
+        counted = table[:, leading.index("Frame")] if "Frame" in leading else np.arange(len(table))
+        time = (counted - counted[0]) / rate
     unit = LENGTHS["mm"] if mapping is None or mapping.length is None else LENGTHS[mapping.length]
     index = {name: i for i, name in enumerate(columns)}
     bodies = {

@@ -62,11 +62,14 @@ def read_numbers(
             problem = f"the row ends before {shorten(names[len(cells)])!r}"
             refuse(path, place, problem, "the file was cut off; copy or export it again")
         if any(cells[len(names) :]):
+            if delimiter is None:
+                refuse(path, place, f"the row has more than {len(names)} numbers", "delete what is not meant")
             refuse(path, place, "the row has more cells than the header", "export with points in numbers, not commas")
         for column, cell in enumerate(cells[: len(names)]):
             value = math.nan if cell.lower() in _MISSING else parse_number(cell)
             if value is None or (abs(value) > largest and column not in unlimited):
-                mend = "leave the cell empty if the sample is missing, and write points in numbers"
+                missing = "write nan" if delimiter is None else "leave the cell empty"
+                mend = f"{missing} if the sample is missing, and write points in numbers"
                 problem = f"{shorten(cell)!r} is not a number that can be meant"
                 refuse(path, f"{place}, {shorten(names[column])}", problem, mend)
             table[number - first, column] = value

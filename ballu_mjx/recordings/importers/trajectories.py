@@ -108,6 +108,8 @@ def to_quaternion(
     rotation: str,
     unit: float,
     frames: Int[np.ndarray, " T"] | None = None,
+    *,
+    mend: str = "export unit quaternions again",
 ) -> Float[np.ndarray, "T 4"]:
     """Unit quaternions (w, x, y, z) from a file's columns; NaN where any of the columns is.
 
@@ -118,6 +120,7 @@ def to_quaternion(
       in SciPy's notation: "XYZ" about the body's own axes in turn, "xyz" about the capture's, and so on.
     - `unit`: radians in a unit of the columns; not for quaternions.
     - `frames`: the file's own numbers of the samples, for messages; None: it has none.
+    - `mend`: what to do about quaternions that are none.
 
     **Raises** `InputError` for quaternions that are none, and angles that are too large to be meant.
     """
@@ -135,7 +138,7 @@ def to_quaternion(
         if bad.any():
             row = int(bad.argmax())
             problem = f"the quaternion of {called(row)} has length {length[row]:.3g} instead of 1"
-            refuse(path, place, problem, "export unit quaternions, or mend the order of the columns in the mapping")
+            refuse(path, place, problem, mend)
         quaternion[seen] = values[seen] / length[seen, None]
         return quaternion
     angles = values * unit

@@ -86,13 +86,19 @@ _Values = Callable[[_Group, Sequence[str]], Float[np.ndarray, "T n"]]
 
 
 def recognise_vicon(path: Path, start: str) -> bool:
-    """Whether the first line with text has one cell alone, as a section's title does, and a section follows."""
+    """Whether a section begins among the first rows: by a title alone in its line, or by its components."""
     del path
     rows = [_cells(line, ",") for line in start.replace(";", ",").replace("\t", ",").splitlines()]
     rows = [row for row in rows if any(row)]
+    if any(_begins_components(row) for row in rows[:_SEARCHED_ROWS]):
+        return True
     if not rows or any(rows[0][1:]) or parse_number(rows[0][0]) is not None:
         return False
     return rows[0][0] in _TITLES or any(row[0] == "Frame" for row in rows[:_SEARCHED_ROWS])
+
+
+def _begins_components(cells: Sequence[str]) -> bool:
+    return list(cells[:2]) in (["Frame", "Sub Frame"], ["Frame", "SubFrame"])
 
 
 def list_vicon(path: Path) -> Contents:
@@ -133,8 +139,9 @@ def read_vicon(path: Path, mapping: RoomMapping) -> Trajectories:
     """
     lines = read_text(path).splitlines()
     delimiter = _delimiter(path, lines)
-    groups = _groups(_sections(path, lines, delimiter))
-    wanted = {role: _wanted(path, mapping.path, source, groups) for role, source in mapping.sources.items()}
+    sections = _sections(path, lines, delimiter)
+    groups = _groups(sections)
+    wanted = {role: _wanted(path, mapping.path, source, groups, sections) for role, source in mapping.sources.items()}
     if not wanted:
         refuse(mapping.path, "", "it asks for no body of a Vicon file", "say what its sites are, or give a table")
     used = list({id(g.section): g.section for gs in wanted.values() for g in gs}.values())
@@ -195,7 +202,7 @@ def _sections(path: Path, lines: Sequence[str], delimiter: str) -> list[_Section
 def _section(path: Path, lines: Sequence[str], delimiter: str, start: int, end: int) -> _Section | None:
     title = _cells(lines[start], delimiter)
     components = _cells(lines[start + 3], delimiter) if end - start >= _HEADER_ROWS else []
-    laid_out = components[:1] == ["Frame"] and components[1:2] in (["Sub Frame"], ["SubFrame"])
+    laid_out = _begins_components(components)
     if not laid_out and not any(title[1:]) and parse_number(title[0]) is None and title[0] not in _USED:
         return None
     place = f"line {start + 1}"
@@ -212,7 +219,11 @@ def _section(path: Path, lines: Sequence[str], delimiter: str, start: int, end: 
         refuse(path, f"line {start + 2}", problem, "export again; the rate stands alone below the title")
     if not laid_out:
         problem = f"the row of components begins with {shorten(delimiter.join(components[:2]))!r}"
-        refuse(path, f"line {start + 4}", problem, "export again; it begins with Frame, Sub Frame")
+        mend = "export again; it begins with Frame, Sub Frame, and title, rate and names stand above it"
+        refuse(path, f"line {start + 4}", problem, mend)
+    if parse_number(units[0]) is not None:
+        mend = "export again; the units stand between components and samples"
+        refuse(path, f"line {start + 5}", "it holds numbers where the units should stand", mend)
     while components and not components[-1]:
         components.pop()
     width = len(components)
@@ -242,12 +253,15 @@ def _groups(sections: Sequence[_Section]) -> dict[str, list[_Group]]:
     return groups
 
 
-def _wanted(path: Path, mapping: Path, source: Source, groups: Mapping[str, list[_Group]]) -> list[_Group]:
+def _wanted(
+    path: Path, mapping: Path, source: Source, groups: Mapping[str, list[_Group]], sections: Sequence[_Section]
+) -> list[_Group]:
     if source.position:
         mend = 'a Vicon file has bodies and markers by name, write body = "..." there'
         refuse(path, "", f"{mapping} gives [{source.role}] by columns", mend)
     found = []
     for name in source.markers or (source.body or "",):
+        _check_position(path, name, groups, sections)
         full = find(path, name, groups, "body or marker", mapping)
         candidates = [g for g in groups[full] if source.section in (None, g.section.title)]
         if not candidates:
@@ -264,6 +278,21 @@ def _wanted(path: Path, mapping: Path, source: Source, groups: Mapping[str, list
             refuse(path, f"line {chosen.section.first - 1}", problem, "give bodies different names and export again")
         found.append(chosen)
     return found
+
+
+def _check_position(path: Path, name: str, groups: Mapping[str, list[_Group]], sections: Sequence[_Section]) -> None:
+    """Refuse a name that stands over some of a position's components: it is there, and yet no body or marker."""
+    for section in sections:
+        if section.title not in _USED or name in {part for full in groups for part in (full, full.rpartition(":")[2])}:
+            continue
+        here = [
+            component
+            for full, component in zip(section.names[2:], section.components[2:], strict=True)
+            if name in (full, full.rpartition(":")[2])
+        ]
+        if here:
+            problem = f"{shorten(name)!r} has the components {', '.join(shorten(c) for c in here[:8])}"
+            refuse(path, f"line {section.first - 1}", f"{problem}, and no whole position", "export TX, TY, TZ again")
 
 
 def _read(
@@ -341,10 +370,13 @@ def _body(
     values: _Values,
     frames: Int[np.ndarray, " T"],
 ) -> Body:
-    if not set(_ROTATION) <= set(group.columns):
+    turns = [component for component in _ROTATION if component in group.columns]
+    if not turns:
         return Body(position)
     name = shorten(group.section.names[next(iter(group.columns.values()))])
     place = f"section {group.section.title}, {name}"
+    if len(turns) < len(_ROTATION):
+        refuse(path, place, f"of RX, RY, RZ it has {' and '.join(turns)} alone", "export again")
     rotation, unit = source.rotation, 1.0
     if "RW" in group.columns:
         if rotation not in (None, "quaternion"):
