@@ -20,8 +20,9 @@
 # These test flights have been reported before: they are development data. Other flights of the data set are left for a
 # final check, and this script does not read them.
 #
-# Rivals are the nominal model without air, the published aerodynamic model, and the mean motion of the nearest recorded
-# moments. Errors are those at the end of a horizon, root mean square over starts in every second.
+# Rivals are the nominal model without air, the constant wrench that explains the training flights best, the published
+# aerodynamic model, and the mean motion of the nearest recorded moments. Errors are those at the end of a horizon, root
+# mean square over starts in every second.
 #
 # `python experiments/real/rgblimp/rgblimp.py --data FOLDER`; `--quick` shows that it works.
 
@@ -46,12 +47,13 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from _constant_wrench import fit_constant_wrench
 from jaxtyping import Array
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.common.results import Table
+from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion
@@ -64,6 +66,7 @@ from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.sim.force_model import Action, Commands, ForceModel, History
 from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.viz import plots
 
 HORIZONS = (1.0, 2.0, 5.0)
 """s."""
@@ -76,6 +79,10 @@ TEST: Mapping[str, tuple[int, ...]] = {
 }
 FLIP = np.array([1.0, -1.0, -1.0])
 """North, east, down to forward, left, up; its own inverse."""
+SHORT = ("no air", "published model", "fluid", "nearest moments")
+"""Rows of the short table."""
+SHOWN = 20.0
+"""Seconds of the figure."""
 FULL_THRUST, FIRST_PLACE, TRAVEL = 0.07, 0.0647, 0.05
 """Of the commands: N, m, m."""
 
@@ -263,13 +270,52 @@ def tables(rows: Mapping[str, Mapping[str, Found]]) -> dict[str, Table]:
         numbers = ", ".join("-" if f[3] == f[2] else format(f[place], form) for f in found.values())
         return numbers + (f" ({lost} of {starts} diverged)" if lost else "")
 
-    return {
+    units = [("position", "m", ".3f"), ("yaw", "deg", ".1f")]
+    short = Table(
+        ("after 5 s", *(f"{group}: {name} ({unit})" for group in TEST for name, unit, _ in units)),
+        tuple(
+            (
+                method,
+                *(
+                    Cell((groups[group][HORIZONS[-1]][place],), form.replace("3f", "2f"))
+                    for group in TEST
+                    for place, (_, _, form) in enumerate(units)
+                ),
+            )
+            for method, groups in rows.items()
+            if method in SHORT
+        ),
+    )
+    return {"short": short} | {
         name: Table(
             (f"{name} ({unit})", *heads),
             tuple((method, *(cell(groups[g], place, form) for g in TEST)) for method, groups in rows.items()),
         )
-        for place, (name, unit, form) in enumerate([("position", "m", ".3f"), ("yaw", "deg", ".1f")])
+        for place, (name, unit, form) in enumerate(units)
     }
+
+
+def draw(
+    path: Path,
+    simulator: Simulator,
+    residuals: Mapping[str, tuple[ForceModel, Any]],
+    test: Mapping[str, Sequence[Motion]],
+) -> None:
+    """Draw the first flight of each group, and what simulators make of it from its first state on."""
+    steps = round(SHOWN / simulator.control_timestep)
+    panels = []
+    for group, motions in test.items():
+        runs = {}
+        evaluator = OpenLoopEvaluator(simulator, motions[:1], next(iter(residuals.values()))[0])
+        position, yaw = evaluator.recorded(0)
+        count = min(steps, len(position))
+        for name, (model, params) in residuals.items():
+            replay = OpenLoopEvaluator(simulator, motions[:1], model).replay(params)
+            runs[name] = np.column_stack([replay.position[0, :count, :2], replay.yaw[0, :count]])
+        recorded = np.column_stack([position[:count, :2], yaw[:count]])
+        time = np.arange(count) * simulator.control_timestep
+        panels.append(plots.TrackingPanel(f"{group}: {motions[0].name}", time, recorded, runs))
+    plots.tracking(path, panels)
 
 
 # %% [markdown]
@@ -283,6 +329,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("runs/rgblimp"), help="folder for results (runs/rgblimp)")
     parser.add_argument("--quick", action="store_true", help="few flights and steps; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
+    parser.add_argument("--figure", type=Path, help="PNG file to draw three test flights to")
     options = parser.parse_args()
     robot = read_description(FOLDER / "rgblimp.robot.json")
     few = slice(0, 2) if options.quick else slice(None)
@@ -302,6 +349,9 @@ def main() -> None:
         )
         print(f"\n{name}\n{found.report}\n", flush=True)
         residuals[name] = found.model, found.params
+    if options.figure is not None:
+        draw(options.figure, simulator, {name: residuals[name] for name in ("published model", "fluid")}, test)
+    residuals["constant wrench"] = fit_constant_wrench(simulator, training)
     rows: dict[str, dict[str, Any]] = {"no air": {}}
     for name, (model, params) in residuals.items():
         rows[name] = {}
