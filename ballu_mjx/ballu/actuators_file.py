@@ -1,9 +1,9 @@
 """Files of identified actuators, format `ballu-actuators/2`: what `train sysid` writes and `--actuators` reads.
 
 JSON with the keys `format`; `robot`, the name that its recordings carry; `parameters`, fields of
-`actuators.ActuatorParameters` as [left, right] in SI units and radians; and optionally `standard_errors` alike, `source`
-(the recordings) and whatever else the user wants to keep there. `cable_slack` and the fields that may be None may be
-missing: the nominal robot's. Files of `ballu-actuators/1` have no more than the first six fields.
+`actuators.ActuatorParameters` as [left, right] in SI units and radians; and optionally `standard_errors` alike,
+`source` (the recordings) and whatever else the user wants to keep there. `cable_slack` and the fields that may be None
+may be missing: the nominal robot's. Files of `ballu-actuators/1` have no more than the first six fields.
 """
 
 from __future__ import annotations
