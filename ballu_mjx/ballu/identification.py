@@ -220,8 +220,8 @@ class Identification:
 _PATIENCE = 4
 _LEVEL = 0.05
 """Of the F-test."""
-_LEAST_EFFECT = 0.15
-"""Cohen's f^2 of a medium effect (Cohen, "Statistical power analysis for the behavioral sciences", 1988). With
+_LEAST_EFFECT = 0.02
+"""Cohen's f^2 of a small effect (Cohen, "Statistical power analysis for the behavioral sciences", 1988). With
 thousands of samples, an F-test sees errors of the simulator's time step: hundredths of a degree, which the further
 parameters would take up at the price of wrong springs and gains."""
 _FIRST_DAMPING = 5 * DEGREE
