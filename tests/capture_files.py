@@ -36,6 +36,31 @@ def motion() -> tuple[Pose, Pose, np.ndarray]:
 HULL, TIP, COMMAND = motion()
 START = 1_700_000_000 * 10**9
 """ns: when it began, in formats whose times count from 1970."""
+NAMED = '[hull]\nbody = "hull"\n[tip]\nbody = "tip"\n'
+"""A mapping of bodies by name."""
+TABLE = """[units]
+length = "m"
+[clock]
+time = "time"
+time_unit = "ms"
+[hull]
+position = ["hull_x", "hull_y", "hull_z"]
+orientation = ["hull_qw", "hull_qx", "hull_qy", "hull_qz"]
+rotation = "quaternion"
+[tip]
+position = ["tip_x", "tip_y", "tip_z"]
+"""
+"""Of the columns of `write_table`."""
+ARCHIVE = """[units]
+length = "m"
+[hull]
+position = ["hull_pos[0]", "hull_pos[1]", "hull_pos[2]"]
+orientation = ["hull_quat[0]", "hull_quat[1]", "hull_quat[2]", "hull_quat[3]"]
+rotation = "quaternion"
+[tip]
+position = ["tip_pos[0]", "tip_pos[1]", "tip_pos[2]"]
+"""
+"""Of the arrays of `write_npz`."""
 
 
 # ---- the formats ----

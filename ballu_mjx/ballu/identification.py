@@ -6,8 +6,9 @@ simulation to rest. They are where the search begins. What decides is the whole 
 to the last and differentiated forwards, with what a command meets on its way: delay, backlash and dry friction
 (`LegDynamics`), under which no leg is ever quite at rest.
 
-All functions compute in double precision and are to be called inside `jax.enable_x64(True)`, but for `identify`, which
-sees to it itself. A leg's parameters are a vector in the order of `NAMES`; a pair of angles is (motor, knee).
+All functions compute in double precision and are to be called inside `jax.enable_x64(True)`, but for `identify_legs`,
+which sees to it itself. A leg's parameters are a vector in the order of `LEG_PARAMETERS`; a pair of angles is (motor,
+knee).
 """
 
 from __future__ import annotations

@@ -111,7 +111,9 @@ FIRST_DYNAMICS = LegDynamics(0.03, 2e-3, 5e-4, 1 * DEGREE, 0.01, 2e-3)
 
 DYNAMICS_PRIOR = np.array([3.0, 1.0, 1.0, 1.0, 2.0, 2.0])
 """How much robots differ (standard deviation) in the coordinates of the dynamics, about where the search begins."""
-SIMPLE_DYNAMICS = FIRST_DYNAMICS._replace(lag=1e-4, knee_damping=1e-3)
+NOMINAL_DYNAMICS = {"knee_damping": 1e-3}
+"""The nominal robot's; the others are 0."""
+SIMPLE_DYNAMICS = FIRST_DYNAMICS._replace(lag=1e-4, **NOMINAL_DYNAMICS)
 """The same of the simpler model: no lag to speak of, and the nominal damping."""
 FURTHER = ("motor_travel", "cable_stiffness", "knee_spring_reference", "lag", "knee_damping")
 """Parameters that are fitted only where a sweep asks for them: each trades against others within a weak direction."""
@@ -132,8 +134,6 @@ def leg_dynamics(coordinates: Float[Array, " 6"]) -> LegDynamics:
     )
 
 
-NOMINAL_DYNAMICS = {"knee_damping": 1e-3}
-"""The nominal robot's; the others are 0."""
 DELAY_UNIT = 0.01
 """Seconds of delay that a coordinate of 1 stands for."""
 

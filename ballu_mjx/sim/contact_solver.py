@@ -30,8 +30,8 @@ def _solve(model: mjx.Model, data: mjx.Data) -> _Solution:
 def _derivative(along: DirectionalDerivative, found: _Solution) -> _Solution:
     """That of the solver's iterations while they are on their way; once they have arrived, that of the place.
 
-    A line search with nothing left to find divides rounding errors by rounding errors, and a robot at rest, at which
-    the solver stops where it starts, would have the derivative of the step before.
+    A line search with nothing left to find divides rounding errors by rounding errors. At a robot at rest the solver
+    stops where it starts, and would have the derivative of the step before.
     """
     (_, step), (at_place, _) = along(functools.partial(_newton_step, found))
     arrived = jnp.linalg.norm(step) < _ARRIVED

@@ -13,7 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 from capture_files import (
+    ARCHIVE,
     HIDDEN,
+    NAMED,
+    TABLE,
     Damage,
     in_line,
     replaced,
@@ -38,31 +41,9 @@ from ballu_mjx.recordings.importers.placement import place
 from ballu_mjx.recordings.importers.readers import read_capture
 from ballu_mjx.robots.description import RobotDescription
 
-NAMED = '[hull]\nbody = "hull"\n[tip]\nbody = "tip"\n'
 POSE = '[hull]\nbody = "pose"\n[tip]\nbody = "pose"\n'
 MARKERS = '[hull]\nmarkers = ["hull1", "hull2", "hull3"]\n[tip]\nbody = "tip"\n'
 TURNED = '[hull]\nbody = "hull"\nrotation = "helical"\n[tip]\nbody = "tip"\nrotation = "helical"\n'
-TABLE = """[units]
-length = "m"
-[clock]
-time = "time"
-time_unit = "ms"
-[hull]
-position = ["hull_x", "hull_y", "hull_z"]
-orientation = ["hull_qw", "hull_qx", "hull_qy", "hull_qz"]
-rotation = "quaternion"
-[tip]
-position = ["tip_x", "tip_y", "tip_z"]
-"""
-ARCHIVE = """[units]
-length = "m"
-[hull]
-position = ["hull_pos[0]", "hull_pos[1]", "hull_pos[2]"]
-orientation = ["hull_quat[0]", "hull_quat[1]", "hull_quat[2]", "hull_quat[3]"]
-rotation = "quaternion"
-[tip]
-position = ["tip_pos[0]", "tip_pos[1]", "tip_pos[2]"]
-"""
 
 
 def write_quaternions(folder: Path) -> Path:

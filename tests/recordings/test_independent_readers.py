@@ -17,9 +17,12 @@ import mujoco
 import numpy as np
 import pytest
 from capture_files import (
+    ARCHIVE,
     CORNERS,
     HIDDEN,
+    NAMED,
     RATE,
+    TABLE,
     write_euroc,
     write_motive,
     write_nexus,
@@ -37,7 +40,6 @@ from ballu_mjx.recordings.importers.readers import read_capture
 from ballu_mjx.recordings.importers.trajectories import Body, Trajectories
 from ballu_mjx.robots.description import RobotDescription
 
-NAMED = '[hull]\nbody = "hull"\n[tip]\nbody = "tip"\n'
 POSE = '[hull]\nbody = "pose"\n[tip]\nbody = "pose"\n'
 NO_COMMANDS = '[commands]\narm = "none"\npush = "none"\n'
 
@@ -220,20 +222,7 @@ def test_trajectories_of_one_body(tmp_path: Path, robot: RobotDescription, write
 def test_tables(tmp_path: Path, robot: RobotDescription):
     polars = pytest.importorskip("polars", reason="polars reads tables independently")
     path = write_table(tmp_path)
-    text = """
-[units]
-length = "m"
-[clock]
-time = "time"
-time_unit = "ms"
-[hull]
-position = ["hull_x", "hull_y", "hull_z"]
-orientation = ["hull_qw", "hull_qx", "hull_qy", "hull_qz"]
-rotation = "quaternion"
-[tip]
-position = ["tip_x", "tip_y", "tip_z"]
-"""
-    found = ours(path, robot, text, '[commands]\narm = "arm_cmd"\npush = "push_cmd"\n')
+    found = ours(path, robot, TABLE, '[commands]\narm = "arm_cmd"\npush = "push_cmd"\n')
     frame = polars.read_csv(path, comment_prefix="#", infer_schema_length=None)
 
     def of(*names: str) -> np.ndarray:
@@ -259,17 +248,7 @@ def array_of(content: bytes) -> np.ndarray:
 
 def test_archives(tmp_path: Path, robot: RobotDescription):
     path = write_npz(tmp_path)
-    text = """
-[units]
-length = "m"
-[hull]
-position = ["hull_pos[0]", "hull_pos[1]", "hull_pos[2]"]
-orientation = ["hull_quat[0]", "hull_quat[1]", "hull_quat[2]", "hull_quat[3]"]
-rotation = "quaternion"
-[tip]
-position = ["tip_pos[0]", "tip_pos[1]", "tip_pos[2]"]
-"""
-    found = ours(path, robot, text, '[commands]\narm = "command_arm"\npush = "command_push"\n')
+    found = ours(path, robot, ARCHIVE, '[commands]\narm = "command_arm"\npush = "command_push"\n')
     with zipfile.ZipFile(path) as archive:
         arrays = {name: array_of(archive.read(f"{name}.npy")) for name in
                   ("time", "hull_pos", "hull_quat", "tip_pos", "command_arm", "command_push")}  # fmt: skip

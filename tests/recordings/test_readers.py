@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from capture_files import (
+    ARCHIVE,
     COMMAND,
     CORNERS,
     HIDDEN,
     HULL,
+    NAMED,
     RATE,
     SAMPLES,
     START,
@@ -398,18 +400,8 @@ def room(folder: Path, robot: RobotDescription, text: str, commands: str = "", *
     return read_mapping(folder / "room.toml", robot)
 
 
-NAMED = '[hull]\nbody = "hull"\n[tip]\nbody = "tip"\n'
 BAG = '[hull]\nbody = "/mocap/hull"\n[tip]\nbody = "/mocap/tip"\n'
 NO_COMMANDS = 'arm = "none"\npush = "none"\n'
-COLUMNS = """[units]
-length = "m"
-[hull]
-position = ["hull_pos[0]", "hull_pos[1]", "hull_pos[2]"]
-orientation = ["hull_quat[0]", "hull_quat[1]", "hull_quat[2]", "hull_quat[3]"]
-rotation = "quaternion"
-[tip]
-position = ["tip_pos[0]", "tip_pos[1]", "tip_pos[2]"]
-"""
 LEROBOT = """[units]
 length = "m"
 [hull]
@@ -466,8 +458,8 @@ def cut_bytes(path: Path) -> None:
             NAMED,
             ["holds 189 of the 300 frames that its header states", "cut off"],
         ),
-        (write_qualisys_bodies, None, COLUMNS, ["a Qualisys TSV, which has bodies", 'body = "..."', "hull, tip"]),
-        (write_tum, None, COLUMNS, ["a TUM trajectory, which has bodies", 'body = "..."', "there are pose"]),
+        (write_qualisys_bodies, None, ARCHIVE, ["a Qualisys TSV, which has bodies", 'body = "..."', "hull, tip"]),
+        (write_tum, None, ARCHIVE, ["a TUM trajectory, which has bodies", 'body = "..."', "there are pose"]),
         (write_qualisys_bodies, replaced("Rot[4]\t", "", 1), NAMED, ["the row has more cells than the header"]),
         (write_qualisys_bodies, replaced("DATA_INCLUDED\t6D", "DATA_INCLUDED\t2D"), NAMED, ["DATA_INCLUDED is '2D'"]),
         (
@@ -483,24 +475,24 @@ def cut_bytes(path: Path) -> None:
             NAMED,
             ["'hull'", "twice"],
         ),
-        (write_npz, cut_bytes, COLUMNS, ["not a whole .npz archive"]),
+        (write_npz, cut_bytes, ARCHIVE, ["not a whole .npz archive"]),
         (
             write_npz,
             None,
-            COLUMNS.replace("tip_pos[0]", "tip_pos[3]"),
+            ARCHIVE.replace("tip_pos[0]", "tip_pos[3]"),
             ["there is no column 'tip_pos[3]'", "room.toml"],
         ),
-        (write_npz, None, COLUMNS.replace('length = "m"', ""), ["[units]", "the length of trial.npz's columns"]),
+        (write_npz, None, ARCHIVE.replace('length = "m"', ""), ["[units]", "the length of trial.npz's columns"]),
         (
             write_npz,
             lambda path: np.savez(path, time=-TIME, hull_pos=HULL.place),
-            COLUMNS.partition("[hull]")[0] + NAMED,
+            ARCHIVE.partition("[hull]")[0] + NAMED,
             ["it has columns, write position"],
         ),
         (
             write_npz,
             lambda path: np.savez(path, x=np.array([{}], object)),
-            COLUMNS,
+            ARCHIVE,
             ["no array with a number a sample"],
         ),
         (write_bag, None, BAG.replace("/mocap/tip", "/mocap/top"), ["no body or marker '/mocap/top'"]),
@@ -527,7 +519,7 @@ def cut_bytes(path: Path) -> None:
         (
             write_table,  # `ros2 topic echo --csv`: seconds and nanoseconds apart, a frame's name, no header
             lambda path: path.write_text("".join(f"17,{i}0000000,map,0.1,0.2,1.5,0,0,0,1\n" for i in range(50))),
-            COLUMNS,
+            ARCHIVE,
             ["line 1: it holds numbers where the names", "above the numbers"],
         ),
     ],
