@@ -37,7 +37,7 @@ class WindowConfig:
     outlying: float = 3.0
     """Differences beyond so many times their scatter count less (pseudo-Huber loss)."""
     start_spread: float = 1.0
-    """How uncertain starting states are, in units of the measurements' noise."""
+    """How uncertain starting states are, in units of the measurements' noise; 0: they are as measured."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +50,8 @@ class FitConfig(WindowConfig):
     """Most iterations of a search."""
     seed: int = 0
     """Seeds the draws."""
+    reweigh: bool = True
+    """Weigh channels by the scatter that is left; without, by the measurements' noise alone, and in one search."""
 
 
 def check_fit_config(config: FitConfig) -> None:
@@ -57,9 +59,11 @@ def check_fit_config(config: FitConfig) -> None:
 
     **Raises** `InputError` naming the option.
     """
-    for name in ("window_seconds", "interval_seconds", "starts", "steps", "outlying", "start_spread"):
+    for name in ("window_seconds", "interval_seconds", "starts", "steps", "outlying"):
         if getattr(config, name) is not None and getattr(config, name) <= 0:
             raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name)}: it must be above 0.")
+    if config.start_spread < 0:
+        raise InputError(f"--start-spread is {config.start_spread}: it must be 0 or more; 0 takes states as measured.")
     if config.seed < 0:
         raise InputError(f"--seed is {config.seed}: it must be 0 or more; 0 is the nearest.")
 
@@ -183,6 +187,7 @@ def fit_robot(
     config: FitConfig | None = None,
     report: Report | None = None,
     on_data_check: Callable[[Visibility], None] | None = None,
+    on_evaluation: Callable[[Float[np.ndarray, " parameters"]], None] | None = None,
 ) -> RobotFit:
     """Fit parameters to recorded motions.
 
@@ -194,7 +199,8 @@ def fit_robot(
     **Arguments**
 
     - `validation`: motions that the fit does not see; None: every fourth window is held out.
-    - `report`: is told of every iteration, `on_data_check` of what the first step finds.
+    - `report`: is told of every iteration, `on_data_check` of what the first step finds, `on_evaluation` of the values
+      that a search has tried.
 
     **Raises** `InputError` for options out of range, and where no recording is as long as a window.
     """
@@ -220,9 +226,10 @@ def fit_robot(
         report("data check", 1, 1, float("nan"))
         if on_data_check is not None:
             on_data_check(visibility)
-        objective.rescale(objective.simulator.differences(parameters.nominal))
+        if config.reweigh:
+            objective.rescale(objective.simulator.differences(parameters.nominal))
         solver = BatchedSolver(optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6))
-        search = _Search(objective, config.starts)
+        search = _Search(objective, config.starts, on_evaluation=on_evaluation)
         found, losses = solver(
             search,
             parameters.draw(config.seed, config.starts),
@@ -231,12 +238,15 @@ def fit_robot(
             _PATIENCE,
         )
         best = int(np.argmin(losses))
-        objective.rescale(search.residuals[best])
-        again = _Search(objective, 1, search.start[best])
-        found, _ = solver(again, found[best][None], config.steps, partial(report, "refinement"), _PATIENCE)
-        objective.rescale(again.residuals[0])
-        values = np.asarray(parameters.vector(found[0]), float)
-        analysis = _analyse(objective, values, again.start[0])
+        coordinates, start, left = found[best], search.start[best], search.residuals[best]
+        if config.reweigh:
+            objective.rescale(left)
+            again = _Search(objective, 1, start, on_evaluation)
+            found, _ = solver(again, coordinates[None], config.steps, partial(report, "refinement"), _PATIENCE)
+            coordinates, start, left = found[0], again.start[0], again.residuals[0]
+            objective.rescale(left)
+        values = np.asarray(parameters.vector(coordinates), float)
+        analysis = _analyse(objective, values, start)
         pair = [_held_out(simulator, point) for point in (parameters.nominal, values)]
     return RobotFit(
         parameters=parameters,
@@ -247,7 +257,7 @@ def fit_robot(
         directions=analysis.directions,
         unseen=visibility.unseen,
         at_bounds=parameters.at_bounds(values),
-        scatter=objective.scale,
+        scatter=_scatter(left),
         losses=np.sort(losses),
         nominal=pair[0],
         identified=pair[1],
@@ -301,7 +311,11 @@ class _Objective:
 
     def rescale(self, differences: Float[np.ndarray, "windows samples channels"]) -> None:
         """Weigh channels by their robust scatter, and none by less than its noise."""
-        self.scale = np.maximum(1.0, _NORMAL * np.median(np.abs(differences), axis=(0, 1)))
+        self.scale = _scatter(differences)
+
+    def measured_start(self) -> Float[np.ndarray, "windows start"]:
+        """Return starting states that are not moved; without columns where they are known."""
+        return np.zeros((self.simulator.count, self.simulator.channels if self.config.start_spread else 0))
 
     def __call__(
         self, values: Float[np.ndarray, " parameters"], start: Float[np.ndarray, "windows start"]
@@ -309,14 +323,16 @@ class _Objective:
         simulated = self.simulator.linearize(values, start)
         soft, steepness = soften(simulated.values / self.scale, self.config.outlying)
         weight = (steepness / self.scale)[..., None]
-        windows = len(soft)
+        windows, moving = start.shape
         flat = lambda x: x.reshape(windows, -1, *x.shape[3:])  # noqa: E731
-        channels = self.simulator.channels
-        own = np.tile(np.eye(channels) / self.config.start_spread, (windows, 1, 1))
+        slopes, residuals = flat(weight * simulated.by_parameters), flat(soft)
+        if not moving:
+            none = np.zeros((windows, 0, slopes.shape[-1]))
+            return _Reduced(values=residuals, slopes=slopes, start=start, start_slopes=none), simulated
+        own = np.tile(np.eye(moving) / self.config.start_spread, (windows, 1, 1))
         by_start = np.concatenate([flat(weight * simulated.by_start), own], axis=1)
-        slopes = flat(weight * simulated.by_parameters)
-        slopes = np.concatenate([slopes, np.zeros((windows, channels, slopes.shape[-1]))], axis=1)
-        residuals = np.concatenate([flat(soft), start / self.config.start_spread], axis=1)
+        slopes = np.concatenate([slopes, np.zeros((windows, moving, slopes.shape[-1]))], axis=1)
+        residuals = np.concatenate([residuals, start / self.config.start_spread], axis=1)
         q, r = np.linalg.qr(by_start)
         turned = np.swapaxes(q, 1, 2)
         along, along_slopes = turned @ residuals[..., None], turned @ slopes
@@ -327,6 +343,11 @@ class _Objective:
             start_slopes=-np.linalg.solve(r, along_slopes),
         )
         return reduced, simulated
+
+
+def _scatter(differences: Float[np.ndarray, "windows samples channels"]) -> Float[np.ndarray, " channels"]:
+    """Return each channel's robust standard deviation, in units of its noise; none is below it."""
+    return np.maximum(1.0, _NORMAL * np.median(np.abs(differences), axis=(0, 1)))
 
 
 _NORMAL = 1.4826
@@ -346,11 +367,14 @@ class _Search:
     of each search, and moved along with its parameters."""
 
     def __init__(
-        self, objective: _Objective, searches: int, start: Float[np.ndarray, "windows start"] | None = None
+        self,
+        objective: _Objective,
+        searches: int,
+        start: Float[np.ndarray, "windows start"] | None = None,
+        on_evaluation: Callable[[Float[np.ndarray, " parameters"]], None] | None = None,
     ) -> None:
-        simulator = objective.simulator
-        self.objective = objective
-        begin = np.zeros((simulator.count, simulator.channels)) if start is None else start
+        self.objective, self.on_evaluation = objective, on_evaluation
+        begin = objective.measured_start() if start is None else start
         self.start = [begin] * searches
         self.residuals = [np.zeros((0, 0, 0))] * searches
         """Differences at the best point so far, in units of noise."""
@@ -372,6 +396,8 @@ class _Search:
             step = reduced.start + reduced.start_slopes @ (values - at) - start
             start = start + np.clip(step / 2.0 ** self._refused[number], -_FAR, _FAR)
         reduced, simulated = self.objective(values, start)
+        if self.on_evaluation is not None:
+            self.on_evaluation(values)
         prior = (values - parameters.nominal) / parameters.prior
         loss = reduced.loss + float(prior @ prior)
         if best is None or loss < best[0]:
@@ -426,9 +452,9 @@ _SLIGHT = 1e-9
 
 
 def _visibility(objective: _Objective, config: FitConfig) -> Visibility:
-    parameters, simulator = objective.parameters, objective.simulator
+    parameters = objective.parameters
     unit = np.where(np.isfinite(parameters.prior), parameters.prior, (parameters.upper - parameters.lower) / 2)
-    start = np.zeros((simulator.count, simulator.channels))
+    start = objective.measured_start()
     signal = np.zeros(len(parameters))
     for coordinates in parameters.draw(config.seed, _DRAWS):
         reduced, _ = objective(np.asarray(parameters.vector(coordinates), float), start)

@@ -23,7 +23,6 @@ from mujoco import mjx
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.rotations import quaternion_conjugate, quaternion_integrate, quaternion_product
-from ballu_mjx.identification.batched_solver import along_directions
 from ballu_mjx.identification.parameters import LEAST_FRICTION, ParameterSet
 from ballu_mjx.recordings.filters import interpolate, mean_command, savitzky_golay
 from ballu_mjx.recordings.motion import Motion, ReconstructionParameters
@@ -32,9 +31,9 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import with_fields
 from ballu_mjx.sim.derived_constants import ReferencePose, with_derived_constants
 from ballu_mjx.sim.drivetrain import filter_commands
-from ballu_mjx.sim.sharding import chunks
+from ballu_mjx.sim.sharding import chunks, shard_over_devices
 from ballu_mjx.sim.step import PhysicsState, make_data, physics_step, put_model, state_at
-from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
+from ballu_mjx.sim.vmap_last import nested_vmap, vmap_with_trailing_batch
 
 
 def check_sampling_config(config: SamplingConfig) -> None:
@@ -275,8 +274,9 @@ class WindowSimulator:
             np.array([noise[m] for m in windows.motion]),
             *(value[windows.motion] for value in own_values),
         )
-        self._values = jax.jit(jax.vmap(self._path))
-        self._linear = jax.jit(partial(along_directions, self._path))
+        self._values = shard_over_devices(self._path, shared=0)
+        over = partial(nested_vmap, inner=len(parameters) + self.channels)
+        self._linear = shard_over_devices(self._linearized, shared=0, over=over)
         self._ctrl = jax.jit(self._filtered)
         self._ctrl_slopes = jax.jit(self._filtered_slopes)
 
@@ -300,7 +300,7 @@ class WindowSimulator:
         for rows, kept in self._chunks(_CHUNK):
             vectors = np.tile(values, (len(rows), 1))
             part = self._values(vectors, start[rows], ctrl[rows], *(x[rows] for x in self._held))
-            found.append(np.asarray(part)[:kept])
+            found.append(part[:kept])
         return np.concatenate(found)
 
     def linearize(
@@ -308,28 +308,41 @@ class WindowSimulator:
     ) -> Simulated:
         """Return the differences and their derivatives, taken forwards through the simulation.
 
-        Windows that diverge have no finite derivatives; theirs are 0, and their differences a large number.
+        `start` without columns: windows start as measured, and nothing is derived by that. Windows that diverge have no
+        finite derivatives; theirs are 0, and their differences a large number.
         """
-        size, channels = len(self.parameters), self.channels
+        size, directions = len(self.parameters), len(self.parameters) + start.shape[1]
+        start = start if start.shape[1] else np.zeros((self.count, self.channels))
         ctrl, slopes = self._ctrl_slopes(jnp.asarray(values))
         ctrl, slopes = self._of_windows(np.asarray(ctrl)), self._of_windows(np.asarray(slopes))
-        every = np.eye(size + channels)
         found = []
-        for rows, kept in self._chunks(max(1, _CHUNK // (size + channels))):
-            by_ctrl = np.zeros((len(rows), size + channels, ctrl.shape[1]))
+        for rows, kept in self._chunks(max(1, _CHUNK // directions)):
+            by_ctrl = np.zeros((len(rows), directions, ctrl.shape[1]))
             by_ctrl[:, np.flatnonzero(self.parameters.in_drivetrain)] = np.moveaxis(slopes[rows], -1, 1)
-            points = np.tile(values, (len(rows), 1)), start[rows], ctrl[rows]
-            directions = (
-                np.tile(every[:, :size], (len(rows), 1, 1)),
-                np.tile(every[:, size:], (len(rows), 1, 1)),
-                by_ctrl,
-            )
-            held = tuple(x[rows] for x in self._held)
-            found.append([np.asarray(x)[:kept] for x in self._linear(points, directions, held)])
+            points = np.tile(values, (len(rows), 1)), start[rows], ctrl[rows], by_ctrl
+            found.append([x[:kept] for x in self._linear(*points, *(x[rows] for x in self._held))])
         value, jacobian = (np.concatenate(parts) for parts in zip(*found, strict=True))
         lost = ~(np.isfinite(value).all(axis=(1, 2)) & np.isfinite(jacobian).all(axis=(1, 2, 3)))
         value[lost], jacobian[lost] = _LOST, 0.0
         return Simulated(value, jacobian[..., :size], jacobian[..., size:])
+
+    def _linearized(
+        self,
+        values: Float[Array, " parameters"],
+        start: Float[Array, " start"],
+        ctrl: Float[Array, " ctrl"],
+        by_ctrl: Float[Array, "directions ctrl"],
+        *held: Array,
+    ) -> tuple[Float[Array, "samples channels"], Float[Array, "samples channels directions"]]:
+        """One window's differences, and how they change by the parameters and, where there are more directions, by the
+        starting state. The window itself is the same for all directions, and simulated once for all."""
+        units = jnp.eye(len(values) + len(start))[: len(by_ctrl)]
+
+        def along(*moves: Array) -> tuple[Array, Array]:
+            return jax.jvp(lambda *point: self._path(*point, *held), (values, start, ctrl), moves)
+
+        found, changes = jax.vmap(along)(units[:, : len(values)], units[:, len(values) :], by_ctrl)
+        return found[0], jnp.moveaxis(changes, 0, -1)
 
     def _path(
         self,

@@ -165,6 +165,26 @@ def test_derivatives_are_those_of_differences(motions: list[MeasuredMotion], par
         np.testing.assert_allclose(found.by_start[..., 0], change / 2e-4, atol=0.02)
 
 
+def test_with_states_as_measured_the_best_point_tried_is_found(motions: list[MeasuredMotion], parameters: ParameterSet):
+    tried: list[np.ndarray] = []
+    config = FitConfig(window_seconds=1.0, starts=1, start_spread=0.0, reweigh=False)
+    fit = fit_robot(parameters, motions[:2], motions[2:], config, on_evaluation=tried.append)
+    with jax.enable_x64(True):
+        simulator = WindowSimulator(parameters, motions[:2], cut_windows(motions[:2], 1.0))
+        # Channels count by the measurements' noise alone, and starting states do not move.
+        losses = [
+            np.sum(soften(simulator.differences(values), config.outlying)[0] ** 2)
+            + np.sum(((values - parameters.nominal) / parameters.prior) ** 2)
+            for values in (fit.values, *tried)
+        ]
+        free = simulator.linearize(fit.values, np.zeros((simulator.count, simulator.channels)))
+        held = simulator.linearize(fit.values, np.zeros((simulator.count, 0)))
+    np.testing.assert_allclose(losses[0], min(losses), rtol=1e-9)
+    assert losses[0] < 0.5 * losses[1]
+    assert held.by_start.size == 0
+    np.testing.assert_allclose(held.by_parameters, free.by_parameters, atol=1e-9)
+
+
 def test_a_motion_of_another_load_is_simulated_with_its_own(motions: list[MeasuredMotion], parameters: ParameterSet):
     spec = mujoco.MjSpec.from_string(MODEL)
     spec.body("arm").mass = 0.9
