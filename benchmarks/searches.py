@@ -1,0 +1,151 @@
+"""What the benchmarks of identification share: other ways to search, timed, and how two ways compare."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib.metadata
+import io
+import re
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import scipy.optimize
+from common import cores
+from jaxtyping import Bool, Float
+
+THREADS = len(cores())
+DIFFERENCE = 1e-6
+"""Finite difference, as a share of the span between the bounds."""
+
+Trace = list[tuple[float, float]]
+"""Seconds since the start, and the lowest objective so far."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Search:
+    """One way with one set of parameters, judged."""
+
+    way: str
+    parameters: int
+    seconds: float
+    compile_seconds: float | None
+    objective: float
+    trace: Trace
+    """Empty where the objective is known at the end only."""
+
+    def reached(self, objective: float) -> float:
+        """Return the seconds until the objective was no larger; inf where it never was."""
+        if self.trace:
+            return next((seconds for seconds, value in self.trace if value <= objective), np.inf)
+        return self.seconds if self.objective <= objective else np.inf
+
+
+CLOSE = 1e-3
+"""Of an objective: the judge is more exact than the searches are."""
+
+
+def compare(one: Sequence[Search], other: Search) -> str:
+    """Say how much sooner the first way, of which there are variants, or the other gets to the same objective."""
+    best = min(one, key=lambda row: row.objective)
+    target = max(best.objective, other.objective) * (1 + CLOSE)
+    ours_at, row = min(((r.reached(target), r) for r in one), key=lambda pair: pair[0])
+    compiled = ours_at + (row.compile_seconds or 0.0)
+    there = other.reached(target)
+    ends = "the lower of the two" if best.objective < other.objective else "the higher of the two"
+    how = f"{there / ours_at:.2g} times sooner" if ours_at < there else f"{ours_at / there:.2g} times later"
+    return (
+        f"{other.parameters} parameters: ours ends at {best.objective:.6f} ({ends}), {other.way} at "
+        f"{other.objective:.6f}. {target:.6f} is reached by {row.way} in {ours_at:.2f} s ({compiled:.0f} s with "
+        f"compiling), by {other.way} in {there:.2f} s: ours {how}."
+    )
+
+
+def lowest_so_far(trace: Trace) -> Trace:
+    values = np.minimum.accumulate([value for _, value in trace])
+    return [(seconds, float(value)) for (seconds, _), value in zip(trace, values, strict=True)]
+
+
+class Shares:
+    """Values as shares of the span between their bounds, of the logarithm where the search is over that: units that
+    differ by a factor of 30 would make a search worse."""
+
+    def __init__(
+        self,
+        lower: Float[np.ndarray, " size"],
+        upper: Float[np.ndarray, " size"],
+        logarithmic: Bool[np.ndarray, " size"],
+    ) -> None:
+        self._logarithmic = logarithmic
+        self._low, self._high = self._scaled(lower), self._scaled(upper)
+
+    def values(self, shares: Float[np.ndarray, "*batch size"]) -> Float[np.ndarray, "*batch size"]:
+        scaled = self._low + shares * (self._high - self._low)
+        return np.where(self._logarithmic, np.exp(np.where(self._logarithmic, scaled, 0.0)), scaled)
+
+    def of(self, values: Float[np.ndarray, "*batch size"]) -> Float[np.ndarray, "*batch size"]:
+        return (self._scaled(values) - self._low) / (self._high - self._low)
+
+    def _scaled(self, values: np.ndarray) -> np.ndarray:
+        return np.where(self._logarithmic, np.log(np.where(self._logarithmic, values, 1.0)), values)
+
+
+def lbfgsb(
+    function: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray, iterations: int
+) -> tuple[np.ndarray, float, Trace]:
+    """scipy's L-BFGS-B within 0 and 1, of a function that returns value and gradient: place, seconds, trace."""
+    trace: Trace = []
+
+    def noting(shares: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = function(shares)
+        trace.append((time.perf_counter() - began, value))
+        return value, gradient
+
+    function(start)  # compiles
+    began = time.perf_counter()
+    bounds, options = [(0.0, 1.0)] * len(start), {"maxiter": iterations}
+    found = scipy.optimize.minimize(noting, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return found.x, time.perf_counter() - began, lowest_so_far(trace)
+
+
+def missing_for_toolbox() -> list[str]:
+    """Distributions that `mujoco.sysid` needs and that are not installed, if it cannot be used for want of them."""
+    from mujoco import sysid
+
+    if hasattr(sysid, "optimize"):
+        return []
+    missing = []
+    for requirement in importlib.metadata.requires("mujoco") or []:
+        name = re.split(r"[^\w.-]", requirement)[0]
+        if 'extra == "sysid"' in requirement:
+            try:
+                importlib.metadata.version(name)
+            except importlib.metadata.PackageNotFoundError:
+                missing.append(name)
+    return missing or ["mujoco.sysid itself"]
+
+
+def optimize_by_toolbox(
+    parameters: Any, residual: Callable[..., Any], iterations: int
+) -> tuple[np.ndarray, float, list[tuple[float, np.ndarray]]]:
+    """`mujoco.sysid.optimize`, its own optimizer: place, seconds, and the places that it visited, with their time."""
+    from mujoco import sysid
+
+    visited: list[tuple[float, np.ndarray]] = []
+
+    def noting(x: np.ndarray, parameters: Any, **options: Any) -> Any:
+        result = residual(x, parameters, **options)
+        if x.ndim == 1 or x.shape[1] == 1:
+            visited.append((time.perf_counter() - began, x.ravel().copy()))
+        return result
+
+    residual(parameters.as_vector(), parameters.copy())  # compiles
+    began = time.perf_counter()
+    # Parameters in their own units: the toolbox's advice for those is to scale by the Jacobian.
+    with contextlib.redirect_stdout(io.StringIO()):
+        found, _ = sysid.optimize(
+            initial_params=parameters, residual_fn=noting, verbose=False, max_iters=iterations, x_scale="jac"
+        )
+    return found.as_vector(), time.perf_counter() - began, visited
