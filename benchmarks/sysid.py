@@ -18,19 +18,15 @@ over every fourth hold after a fit to the others.
     python benchmarks/sysid.py
     python benchmarks/sysid.py --quick           # twelve parameters, fewer draws and iterations, nothing left out
     python benchmarks/sysid.py --output FOLDER   # numbers and traces as FOLDER/sysid.json too
+    python benchmarks/sysid.py --results FILE    # the table, as `docs/render.py` takes it
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import copy
 import dataclasses
-import importlib.metadata
-import io
 import json
-import os
-import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -44,9 +40,20 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-import scipy.optimize
 from jaxtyping import Float
 from mujoco import rollout
+from searches import (
+    DIFFERENCE,
+    THREADS,
+    Search,
+    Shares,
+    Trace,
+    compare,
+    lbfgsb,
+    lowest_so_far,
+    missing_for_toolbox,
+    optimize_by_toolbox,
+)
 
 from ballu_mjx.ballu.actuators import ActuatorParameters, actuator_fields
 from ballu_mjx.ballu.curves import curve_distances
@@ -55,12 +62,12 @@ from ballu_mjx.ballu.leg_parameters import LEG_PARAMETERS, IdentificationConfig,
 from ballu_mjx.ballu.model import SIDES, load_suspended_leg, suspend
 from ballu_mjx.ballu.sweep import Sweep, read_sweep
 from ballu_mjx.ballu.sysid_report import mean_error
+from ballu_mjx.common.results import Cell, Table, write_results
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.model import assets, set_fields
 from ballu_mjx.robots.registry import load_robot
 
-THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 LEFT_OUT_EVERY = 4
 DEGREE = IdentificationConfig().degree
 OBJECTIVES = ("pointwise", "hausdorff")
@@ -70,31 +77,21 @@ DAMPING = {"hip": 0.12, "knee": 0.01, "motor": 0.0114}
 SEARCH_STEPS, JUDGE_STEPS = 500, 3000
 """Steps of the robot's own time step until settled, to 1e-3 rad at worst, and to rounding. A longer time step would
 soften the knee's stop and so move the angles."""
-DIFFERENCE = 1e-6
-"""Finite difference, as a share of the span between the bounds."""
 
 Vectors = Float[np.ndarray, "2 parameters"]
 """Parameters of both legs, in the order of `NAMES`."""
-Trace = list[tuple[float, float]]
-"""Seconds since the start, and the lowest objective so far (as the method itself settles the legs)."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
-    """One way with one set of parameters, judged."""
+class Row(Search):
+    """One way with one set of parameters, judged; its trace is as the method itself settles the legs."""
 
-    way: str
-    parameters: int
-    seconds: float
-    compile_seconds: float | None
-    objective: float
     backward: float
     """The same from measured to simulated."""
     error: float
     error_left_out: float | None
     """deg."""
     vectors: list[list[float]]
-    trace: Trace
 
 
 class Legs:
@@ -162,11 +159,6 @@ def distances(data: Sweep) -> Callable[[Float[np.ndarray, "n holds 2 2"]], Float
     return lambda angles: np.asarray(compiled(angles))
 
 
-def _lowest_so_far(trace: Trace) -> Trace:
-    values = np.minimum.accumulate([value for _, value in trace])
-    return [(seconds, float(value)) for (seconds, _), value in zip(trace, values, strict=True)]
-
-
 # ---- ours ----
 
 
@@ -199,18 +191,14 @@ def ours(
 def papers_way(data: Sweep, space: ParameterTransform, iterations: int) -> tuple[Vectors, float, Trace]:
     """L-BFGS-B over C MuJoCo: vectors, seconds, trace.
 
-    Coordinates are shares of the span between the bounds, of the logarithm where ours is: units that differ by a factor
-    of 30 would make the search worse.
+    Coordinates are shares of the span between the bounds.
     """
     legs, judge, free = Legs(SEARCH_STEPS), distances(data), np.flatnonzero(space.free)
-    low, high = (
-        np.where(space.relative, np.log(np.where(space.relative, x, 1)), x) for x in (space.lower, space.upper)
-    )
+    span = Shares(*(np.tile(x[free], len(SIDES)) for x in (space.lower, space.upper, space.relative)))
 
     def vectors(shares: np.ndarray) -> Vectors:
         pair = np.tile(space.nominal, (len(SIDES), 1))
-        values = low[free] + shares.reshape(len(SIDES), -1) * (high - low)[free]
-        pair[:, free] = np.where(space.relative[free], np.exp(values), values)
+        pair[:, free] = span.values(shares).reshape(len(SIDES), -1)
         return pair
 
     def parts(shares: np.ndarray) -> Float[np.ndarray, "n 2"]:
@@ -221,48 +209,20 @@ def papers_way(data: Sweep, space: ParameterTransform, iterations: int) -> tuple
             alone[:, leg, :, :, 1 - leg] = data.settled[:, :, 1 - leg]
         return judge(alone.reshape(-1, *angles.shape[1:]))[:, 0].reshape(len(shares), -1)
 
-    trace: Trace = []
-
     def function(shares: np.ndarray) -> tuple[float, np.ndarray]:
         steps = np.where(shares.reshape(len(SIDES), -1) + DIFFERENCE > 1, -DIFFERENCE, DIFFERENCE)
         moves = np.stack(
             [np.zeros_like(steps)] + [np.where(np.arange(len(free)) == i, steps, 0) for i in range(len(free))]
         )
         values = parts(shares + moves.reshape(len(moves), -1))
-        trace.append((time.perf_counter() - began, float(values[0].sum())))
         return float(values[0].sum()), ((values[1:] - values[0]) / steps.T).T.ravel()
 
-    nominal = np.where(space.relative, np.log(np.where(space.relative, space.nominal, 1)), space.nominal)
-    start = np.tile(((nominal - low) / np.where(high > low, high - low, 1))[free], len(SIDES))
-    began = time.perf_counter()
-    function(start)  # compiles
-    trace.clear()
-    began = time.perf_counter()
-    options = {"maxiter": iterations}
-    found = scipy.optimize.minimize(
-        function, start, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(start), options=options
-    )
-    return vectors(found.x), time.perf_counter() - began, _lowest_so_far(trace)
+    start = span.of(np.tile(space.nominal[free], len(SIDES)))
+    shares, seconds, trace = lbfgsb(function, start, iterations)
+    return vectors(shares), seconds, trace
 
 
 # ---- MuJoCo's toolbox ----
-
-
-def missing_for_toolbox() -> list[str]:
-    """Distributions that `mujoco.sysid` needs and that are not installed, if it cannot be used for want of them."""
-    from mujoco import sysid
-
-    if hasattr(sysid, "optimize"):
-        return []
-    missing = []
-    for requirement in importlib.metadata.requires("mujoco") or []:
-        name = re.split(r"[^\w.-]", requirement)[0]
-        if 'extra == "sysid"' in requirement:
-            try:
-                importlib.metadata.version(name)
-            except importlib.metadata.PackageNotFoundError:
-                missing.append(name)
-    return missing or ["mujoco.sysid itself"]
 
 
 def _toolbox_spec() -> mujoco.MjSpec:
@@ -319,55 +279,45 @@ def toolbox(
         sysid.TimeSeries.from_names(seconds[ends][kept], data.settled[kept].reshape(len(kept), -1), model),
     )
     residual = sysid.build_residual_fn(models_sequences=[sequences], build_model=build, n_threads=THREADS)
-    visited: list[tuple[float, np.ndarray]] = []
-
-    def noting(x: np.ndarray, parameters: Any, **options: Any) -> Any:
-        result = residual(x, parameters, **options)
-        if x.ndim == 1 or x.shape[1] == 1:
-            visited.append((time.perf_counter() - began, x.ravel().copy()))
-        return result
-
     parameters = sysid.ParameterDict()
     for index in free:
         low, high = (np.full(len(SIDES), bound[index]) for bound in (space.lower, space.upper))
         parameters.add(sysid.Parameter(LEG_PARAMETERS[index], np.full(len(SIDES), space.nominal[index]), low, high))
-    fields(as_vectors(parameters.as_vector()).T)  # compiles
-    began = time.perf_counter()
-    # Parameters in their own units: the toolbox's advice for those is to scale by the Jacobian.
-    with contextlib.redirect_stdout(io.StringIO()):
-        found, _ = sysid.optimize(
-            initial_params=parameters, residual_fn=noting, verbose=False, max_iters=iterations, x_scale="jac"
-        )
-    elapsed = time.perf_counter() - began
+    found, elapsed, visited = optimize_by_toolbox(parameters, residual, iterations)
     fitted = data.settled_without(np.setdiff1d(np.arange(len(data.command)), kept).tolist())
     angles = Legs(SEARCH_STEPS).settled(np.stack([as_vectors(x) for _, x in visited]), fitted.command)
     trace = [(when, float(value)) for (when, _), value in zip(visited, distances(fitted)(angles)[:, 0], strict=True)]
-    return as_vectors(found.as_vector()), elapsed, _lowest_so_far(trace)
+    return as_vectors(found), elapsed, lowest_so_far(trace)
 
 
 # ---- comparison ----
 
 
-def _reached(row: Row, objective: float) -> float:
-    """Seconds until the row's objective was no larger; ours are known at the end only."""
-    if row.trace:
-        return next((seconds for seconds, value in row.trace if value <= objective), row.seconds)
-    return row.seconds
-
-
-def compare(one: list[Row], other: Row) -> str:
-    """How much sooner the first way, of which there are variants, or the other gets to the same objective."""
-    best = min(one, key=lambda row: row.objective)
-    target = max(best.objective, other.objective) * (1 + 1e-3)  # the judge settles further than the searches do
-    ours_at, row = min((_reached(r, target), r) for r in one if r.objective <= target)
-    compiled = ours_at + (row.compile_seconds or 0.0)
-    there = _reached(other, target)
-    ends = "the lower of the two" if best.objective < other.objective else "the higher of the two"
-    how = f"{there / ours_at:.2g} times sooner" if ours_at < there else f"{ours_at / there:.2g} times later"
-    return (
-        f"{other.parameters} parameters: ours ends at {best.objective:.4f} ({ends}), {other.way} at "
-        f"{other.objective:.4f}. {target:.4f} is reached by {row.way} in {ours_at:.1f} s ({compiled:.0f} s with "
-        f"compiling), by {other.way} in {there:.1f} s: ours {how}."
+def table(rows: list[Row]) -> Table:
+    """Return the rows as `docs/render.py` takes them."""
+    heads = (
+        "way",
+        "parameters",
+        "time (s)",
+        "compiling (s)",
+        "Hausdorff distance",
+        "mean error (deg)",
+        "of commands left out (deg)",
+    )
+    return Table(
+        heads,
+        tuple(
+            (
+                row.way,
+                str(row.parameters or ""),
+                Cell((row.seconds,), ".1f") if row.parameters else "",
+                "" if row.compile_seconds is None else Cell((row.compile_seconds,), ".0f"),
+                Cell((row.objective,), ".4f"),
+                Cell((row.error,), ".2f"),
+                "" if row.error_left_out is None else Cell((row.error_left_out,), ".2f"),
+            )
+            for row in rows
+        ),
     )
 
 
@@ -375,6 +325,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="twelve parameters only, fewer draws and iterations")
     parser.add_argument("--output", type=Path, help="folder for sysid.json")
+    parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()
     with jax.enable_x64(True):
         rows = measure(arguments.quick)
@@ -382,6 +333,8 @@ def main() -> None:
         arguments.output.mkdir(parents=True, exist_ok=True)
         path = arguments.output / "sysid.json"
         path.write_text(json.dumps([dataclasses.asdict(row) for row in rows], indent=1) + "\n")
+    if arguments.results is not None:
+        write_results(arguments.results, {"ways": table(rows)}, "The bundled sweep, of a virtual robot")
 
 
 def measure(quick: bool) -> list[Row]:
@@ -416,7 +369,7 @@ def measure(quick: bool) -> list[Row]:
         if held is not None:
             unseen = mean_error(judge.settled(held[None], left_out.command)[0], left_out)
         error = mean_error(angles[0], whole)
-        row = Row(way, free, seconds, compiling, float(there), float(back), error, unseen, vectors.tolist(), trace)
+        row = Row(way, free, seconds, compiling, float(there), trace, float(back), error, unseen, vectors.tolist())
         rows.append(row)
         shown = "" if compiling is None else f"{compiling:.0f} s"
         numbers = f"{there:>11.4f}{back:>9.4f}{error:>7.2f} deg" + ("" if unseen is None else f"{unseen:>7.2f} deg")

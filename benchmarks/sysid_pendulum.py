@@ -6,13 +6,14 @@ priors, and the same residuals: positions and velocities at every sample over `W
 objective is their root mean square.
 
 - ours: `fit_robot`, Levenberg-Marquardt with exact derivatives through MJX, one start.
-- `mujoco.sysid` (`pip install "mujoco[sysid]"`): its own optimizer and finite differences. Windows and columns go through
-  one `rollout`.
+- `mujoco.sysid` (`pip install "mujoco[sysid]"`): its own optimizer and finite differences. Windows and columns go
+  through one `rollout`.
 - scipy's L-BFGS-B, finite differences by C MuJoCo's `rollout`, all columns at once, on all cores.
 
 One judge for all: C MuJoCo, the solver run to its end. It is taken of every point that a search visited, after the
-search. The time is that of the search. Compiling stands apart: it is what JAX says that it traced, lowered and compiled.
-`fit_robot` also checks the data before the search and finds standard errors after it; its whole call stands beside.
+search. The time is that of the search. Compiling stands apart: it is what JAX says that it traced, lowered and
+compiled. `fit_robot` also checks the data before the search and finds standard errors after it; its whole call stands
+beside.
 
     python benchmarks/sysid_pendulum.py --data FOLDER
     python benchmarks/sysid_pendulum.py --data FOLDER --quick     # one recording, few iterations
@@ -42,6 +43,7 @@ import numpy as np
 from jaxtyping import Float
 from mujoco import rollout
 from searches import (
+    CLOSE,
     DIFFERENCE,
     THREADS,
     Search,
@@ -148,10 +150,10 @@ class CompileClock:
         self._spans: list[tuple[float, float]] = []
         jax.monitoring.register_event_duration_secs_listener(self._note)
 
-    def _note(self, event: str, seconds: float, **_: Any) -> None:
+    def _note(self, event: str, duration_secs: float, **_: str | int) -> None:
         if event.startswith("/jax/core/compile/"):
             now = time.perf_counter()
-            self._spans.append((now - seconds, now))
+            self._spans.append((now - duration_secs, now))
 
     def between(self, begin: float, end: float) -> float:
         total = 0.0
