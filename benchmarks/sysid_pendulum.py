@@ -47,7 +47,6 @@ from searches import (
     DIFFERENCE,
     THREADS,
     Search,
-    Shares,
     Trace,
     compare,
     lbfgsb,
@@ -206,17 +205,16 @@ def judged(judge: WindowRollouts, visited: Sequence[tuple[float, np.ndarray]]) -
 def finite_differences(
     parameters: ParameterSet, simulator: WindowRollouts, judge: WindowRollouts, start: np.ndarray, iterations: int
 ) -> Found:
-    logarithmic = np.array([parameter.logarithmic for parameter in parameters.parameters])
-    shares, size = Shares(parameters.lower, parameters.upper, logarithmic), len(parameters)
+    size = len(parameters)
 
     def function(place: np.ndarray) -> tuple[float, np.ndarray]:
         steps = np.where(place + DIFFERENCE > 1, -DIFFERENCE, DIFFERENCE)
         places = place + np.concatenate([np.zeros((1, size)), np.diag(steps)])
-        values = simulator.objectives(shares.values(places))
+        values = simulator.objectives(parameters.at_shares(places))
         return float(values[0]), (values[1:] - values[0]) / steps
 
-    place, seconds, trace = lbfgsb(function, shares.of(start), iterations)
-    values = shares.values(place)
+    place, seconds, trace = lbfgsb(function, parameters.shares(start), iterations)
+    values = parameters.at_shares(place)
     return Found("L-BFGS-B", size, seconds, None, float(judge.objectives(values[None])[0]), trace, values)
 
 
@@ -329,7 +327,7 @@ def main() -> None:
     clock, missing = CompileClock(), missing_for_toolbox()
     with jax.enable_x64(True):
         windows = cut_windows(training, SECONDS)
-        start = np.asarray(parameters.vector(parameters.draw(0, 1)[0]))
+        (start,) = parameters.draw(0, 1)
         simulator, judge = (WindowRollouts(parameters, training, windows, exact=exact) for exact in (False, True))
         validation = WindowRollouts(parameters, held_out, cut_windows(held_out, SECONDS, 0.2), exact=True)
         print(f"{THREADS} threads, {len(windows.first)} windows; start {judge.objectives(start[None])[0]:.5f}")

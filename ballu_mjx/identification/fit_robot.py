@@ -17,11 +17,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Float, Int
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.identification.batched_solver import BatchedSolver
+from ballu_mjx.identification.bounded_solver import bounded_least_squares
 from ballu_mjx.identification.parameters import Direction, IdentifiedParameters, ParameterSet
 from ballu_mjx.identification.residuals import MeasuredMotion, Simulated, Windows, WindowSimulator, cut_windows
 
@@ -228,25 +227,27 @@ def fit_robot(
             on_data_check(visibility)
         if config.reweigh:
             objective.rescale(objective.simulator.differences(parameters.nominal))
-        solver = BatchedSolver(optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6))
-        search = _Search(objective, config.starts, on_evaluation=on_evaluation)
-        found, losses = solver(
-            search,
-            parameters.draw(config.seed, config.starts),
-            config.steps,
-            partial(report, "search"),
-            _PATIENCE,
-        )
-        best = int(np.argmin(losses))
-        coordinates, start, left = found[best], search.start[best], search.residuals[best]
+        searches, lowest = [], np.inf
+
+        def told(stage: str, before: int, whole: int, iteration: int, steps: int, value: float) -> None:
+            report(stage, before + iteration, whole, min(value, lowest))
+
+        for number, begin in enumerate(parameters.draw(config.seed, config.starts)):
+            search, before = _Search(objective, objective.measured_start(), on_evaluation), number * config.steps
+            tell = partial(told, "search", before, config.starts * config.steps)
+            found, loss = bounded_least_squares(search, parameters.shares(begin), config.steps, tell, _PATIENCE)
+            lowest = min(lowest, loss)
+            searches.append((loss, found, search))
+        losses = np.array([loss for loss, _, _ in searches])
+        _, shares, best = searches[int(np.argmin(losses))]
         if config.reweigh:
-            objective.rescale(left)
-            again = _Search(objective, 1, start, on_evaluation)
-            found, _ = solver(again, coordinates[None], config.steps, partial(report, "refinement"), _PATIENCE)
-            coordinates, start, left = found[0], again.start[0], again.residuals[0]
-            objective.rescale(left)
-        values = np.asarray(parameters.vector(coordinates), float)
-        analysis = _analyse(objective, values, start)
+            objective.rescale(best.residuals)
+            best, lowest = _Search(objective, best.start, on_evaluation), np.inf
+            tell = partial(told, "refinement", 0, config.steps)
+            shares, _ = bounded_least_squares(best, shares, config.steps, tell, _PATIENCE)
+            objective.rescale(best.residuals)
+        values = parameters.at_shares(shares)
+        analysis = _analyse(objective, values, best.start)
         pair = [_held_out(simulator, point) for point in (parameters.nominal, values)]
     return RobotFit(
         parameters=parameters,
@@ -257,7 +258,7 @@ def fit_robot(
         directions=analysis.directions,
         unseen=visibility.unseen,
         at_bounds=parameters.at_bounds(values),
-        scatter=_scatter(left),
+        scatter=_scatter(best.residuals),
         losses=np.sort(losses),
         nominal=pair[0],
         identified=pair[1],
@@ -362,53 +363,42 @@ def soften(values: Float[np.ndarray, "*shape"], outlying: float) -> tuple[np.nda
 
 
 class _Search:
-    """What a `BatchedSolver` evaluates: residuals and Jacobians at several points, compressed to as many rows as there
-    are parameters (and one), which keep all sums of squares. Starting states are remembered from the best point so far
-    of each search, and moved along with its parameters."""
+    """What the solver evaluates: residuals and their Jacobian by the parameters' shares, compressed to as many rows as
+    there are parameters (and one), which keep all sums of squares. Starting states are remembered from the best point
+    so far, and moved along with the parameters."""
 
     def __init__(
         self,
         objective: _Objective,
-        searches: int,
-        start: Float[np.ndarray, "windows start"] | None = None,
-        on_evaluation: Callable[[Float[np.ndarray, " parameters"]], None] | None = None,
+        start: Float[np.ndarray, "windows start"],
+        on_evaluation: Callable[[Float[np.ndarray, " parameters"]], None] | None,
     ) -> None:
-        self.objective, self.on_evaluation = objective, on_evaluation
-        begin = objective.measured_start() if start is None else start
-        self.start = [begin] * searches
-        self.residuals = [np.zeros((0, 0, 0))] * searches
+        self.objective, self.start, self.on_evaluation = objective, start, on_evaluation
+        self.residuals = np.zeros((0, 0, 0))
         """Differences at the best point so far, in units of noise."""
-        self._best: list[tuple[float, np.ndarray, _Reduced] | None] = [None] * searches
-        self._refused = [0] * searches
+        self._best: tuple[float, np.ndarray, _Reduced] | None = None
+        self._refused = 0
 
-    def __call__(self, coordinates: Float[np.ndarray, "searches _"]) -> tuple[np.ndarray, np.ndarray]:
-        rows = [self._one(number, y) for number, y in enumerate(coordinates)]
-        values, slopes = zip(*rows, strict=True)
-        return np.stack(values), np.stack(slopes)
-
-    def _one(self, number: int, coordinates: Float[np.ndarray, " _"]) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, shares: Float[np.ndarray, " parameters"]) -> tuple[np.ndarray, np.ndarray]:
         parameters = self.objective.parameters
-        values = np.asarray(parameters.vector(coordinates), float)
-        by_coordinates = np.asarray(jax.jacfwd(parameters.vector)(jnp.asarray(coordinates)))
-        start, best = self.start[number], self._best[number]
-        if best is not None:
-            _, at, reduced = best
+        values, start = parameters.at_shares(shares), self.start
+        if self._best is not None:
+            _, at, reduced = self._best
             step = reduced.start + reduced.start_slopes @ (values - at) - start
-            start = start + np.clip(step / 2.0 ** self._refused[number], -_FAR, _FAR)
+            start = start + np.clip(step / 2.0**self._refused, -_FAR, _FAR)
         reduced, simulated = self.objective(values, start)
         if self.on_evaluation is not None:
             self.on_evaluation(values)
         prior = (values - parameters.nominal) / parameters.prior
         loss = reduced.loss + float(prior @ prior)
-        if best is None or loss < best[0]:
-            self._best[number], self._refused[number] = (loss, values, reduced), 0
-            self.start[number], self.residuals[number] = start, simulated.values
+        if self._best is None or loss < self._best[0]:
+            self._best, self._refused = (loss, values, reduced), 0
+            self.start, self.residuals = start, simulated.values
         else:  # starting states may be what went too far
-            self._refused[number] += 1
+            self._refused += 1
         slopes = np.concatenate([reduced.slopes.reshape(-1, len(values)), np.diag(1 / parameters.prior)])
-        table = np.concatenate(
-            [slopes @ by_coordinates, np.concatenate([reduced.values.ravel(), prior])[:, None]], axis=1
-        )
+        slopes = slopes * parameters.by_shares(values)
+        table = np.concatenate([slopes, np.concatenate([reduced.values.ravel(), prior])[:, None]], axis=1)
         triangle = np.asarray(np.linalg.qr(table, mode="r"))
         return triangle[:, -1], triangle[:, :-1]
 
@@ -456,8 +446,8 @@ def _visibility(objective: _Objective, config: FitConfig) -> Visibility:
     unit = np.where(np.isfinite(parameters.prior), parameters.prior, (parameters.upper - parameters.lower) / 2)
     start = objective.measured_start()
     signal = np.zeros(len(parameters))
-    for coordinates in parameters.draw(config.seed, _DRAWS):
-        reduced, _ = objective(np.asarray(parameters.vector(coordinates), float), start)
+    for values in parameters.draw(config.seed, _DRAWS):
+        reduced, _ = objective(values, start)
         signal = np.maximum(signal, np.sqrt(np.sum((reduced.slopes * unit) ** 2, axis=(0, 1))))
     return Visibility(parameters.names, signal)
 

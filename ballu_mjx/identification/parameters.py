@@ -1,5 +1,5 @@
-"""Parameters that recordings may identify: what they set in a model or a drivetrain, and the unbounded coordinates that
-they are searched in. `identification.declarations` makes them from a robot description.
+"""Parameters that recordings may identify: what they set in a model or a drivetrain, and the bounds that they are
+searched within. `identification.declarations` makes them from a robot description.
 """
 
 from __future__ import annotations
@@ -80,10 +80,7 @@ class Parameter:
 
 
 class ParameterSet:
-    """Parameters of a model, as a vector in their units or as unbounded coordinates.
-
-    A coordinate runs through a logistic function from the lower to the upper bound, of the value or of its logarithm.
-    """
+    """Parameters of a model, as a vector in their units or as shares of the way from the lower to the upper bound."""
 
     def __init__(self, parameters: Sequence[Parameter], commands: int) -> None:
         self.parameters = tuple(parameters)
@@ -99,31 +96,35 @@ class ParameterSet:
     def __len__(self) -> int:
         return len(self.parameters)
 
-    def vector(self, coordinates: Float[Array | np.ndarray, " parameters"]) -> Float[Array, " parameters"]:
-        """Return the values at unbounded coordinates."""
-        scaled = self._low + jax.nn.sigmoid(coordinates) * (self._high - self._low)
-        return jnp.where(self._logarithmic, jnp.exp(jnp.where(self._logarithmic, scaled, 0.0)), scaled)
+    def shares(self, values: Float[np.ndarray, "*batch parameters"]) -> Float[np.ndarray, "*batch parameters"]:
+        """Return where values lie between their bounds, 0 to 1; logarithms where the search runs over those."""
+        return (self._scaled(values) - self._low) / (self._high - self._low)
 
-    def coordinates(self, values: Float[np.ndarray, "*batch parameters"]) -> Float[np.ndarray, "*batch parameters"]:
-        """Return unbounded coordinates of values; those on or near a bound are taken a little inside."""
-        share = (self._scaled(np.clip(values, self.lower, self.upper)) - self._low) / (self._high - self._low)
-        share = np.clip(share, _INSIDE, 1 - _INSIDE)
-        return np.log(share / (1 - share))
+    def at_shares(self, shares: Float[np.ndarray, "*batch parameters"]) -> Float[np.ndarray, "*batch parameters"]:
+        """Return the values there."""
+        scaled = self._low + shares * (self._high - self._low)
+        return np.where(self._logarithmic, np.exp(np.where(self._logarithmic, scaled, 0.0)), scaled)
+
+    def by_shares(self, values: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " parameters"]:
+        """Return how values change by their shares."""
+        return (self._high - self._low) * np.where(self._logarithmic, values, 1.0)
 
     def draw(self, seed: int, count: int) -> Float[np.ndarray, "count parameters"]:
-        """Return coordinates: first of the nominal values, then of draws from the priors within the bounds."""
+        """Return the nominal values, then draws from the priors within the bounds; what lies on or near a bound is
+        taken a little inside."""
         rng = np.random.default_rng(seed)
         spread = np.where(np.isfinite(self.prior), self.prior, 0.0)
         values = self.nominal + spread * rng.normal(size=(max(count - 1, 0), len(self)))
-        uniform = self._low + rng.uniform(size=values.shape) * (self._high - self._low)
-        uniform = np.where(self._logarithmic, np.exp(np.where(self._logarithmic, uniform, 0.0)), uniform)
+        uniform = self.at_shares(rng.uniform(size=values.shape))
         outside = (values < self.lower) | (values > self.upper) | ~np.isfinite(self.prior)
-        return self.coordinates(np.concatenate([self.nominal[None], np.where(outside, uniform, values)])[:count])
+        begins = np.concatenate([self.nominal[None], np.where(outside, uniform, values)])[:count]
+        return self.at_shares(np.clip(self.shares(begins), _INSIDE, 1 - _INSIDE))
 
     def at_bounds(self, values: Float[np.ndarray, " parameters"]) -> tuple[str, ...]:
         """Return the names of the parameters that lie on a bound, to one part in a hundred of what lies between."""
-        share = (self._scaled(values) - self._low) / (self._high - self._low)
-        return tuple(name for name, s in zip(self.names, share, strict=True) if s < _AT_BOUND or s > 1 - _AT_BOUND)
+        return tuple(
+            name for name, s in zip(self.names, self.shares(values), strict=True) if s < _AT_BOUND or s > 1 - _AT_BOUND
+        )
 
     def fields(
         self, model: mujoco.MjModel | mjx.Model, values: Float[Array | np.ndarray, " parameters"]
@@ -141,7 +142,8 @@ class ParameterSet:
                     field = found.get(target.field, jnp.asarray(getattr(model, target.field)))
                     entry = value * target.factor
                     if target.field in ("dof_frictionloss", "tendon_frictionloss"):
-                        entry = jnp.maximum(entry, LEAST_FRICTION)
+                        # Not `maximum`: at a bound of 0 a search must see that friction does something.
+                        entry = entry + jax.lax.stop_gradient(jnp.maximum(LEAST_FRICTION - entry, 0.0))
                     found[target.field] = field.at[target.index].set(entry)
                 elif isinstance(target, BodyTarget):
                     deformed.setdefault(target.body, {})[target.place] = value * target.factor

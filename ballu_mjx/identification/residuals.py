@@ -407,9 +407,10 @@ class WindowSimulator:
         self, values: Float[Array, " parameters"]
     ) -> tuple[Float[Array, "motions steps commands"], Float[Array, "motions steps commands drivetrain"]]:
         units = jnp.eye(len(self.parameters))[np.flatnonzero(self.parameters.in_drivetrain)]
-        along = jax.vmap(lambda unit: jax.jvp(self._filtered, (values,), (unit,))[1], out_axes=-1)
-        shape = (*self._commands.shape, 0)
-        return self._filtered(values), along(units) if len(units) else jnp.zeros(shape)
+        if not len(units):
+            return self._filtered(values), jnp.zeros((*self._commands.shape, 0))
+        along = jax.vmap(lambda unit: jax.jvp(self._filtered, (values,), (unit,)), out_axes=(None, -1))
+        return along(units)
 
     def _of_windows(self, ctrl: Float[np.ndarray, "motions steps ..."]) -> Float[np.ndarray, "windows ctrl ..."]:
         """Cut what is of all motions' physics steps into windows, steps and commands in one axis."""

@@ -107,15 +107,15 @@ def test_ties_set_all_their_targets(tmp_path: Path):
     np.testing.assert_allclose(fields["jnt_stiffness"], [4.0, 6.0], rtol=1e-6)
 
 
-def test_a_coordinate_runs_from_bound_to_bound(tmp_path: Path):
+def test_shares_run_from_bound_to_bound(tmp_path: Path):
     parameters, _ = arm(tmp_path, *EVERYTHING)
-    with jax.enable_x64(True):
-        low, high = (parameters.vector(np.full(len(parameters), far)) for far in (-40.0, 40.0))
-        np.testing.assert_allclose(low, parameters.lower, atol=1e-12)
-        np.testing.assert_allclose(high, parameters.upper, rtol=1e-12)
-        drawn = parameters.draw(0, 20)
-        values = np.array([parameters.vector(y) for y in drawn])
-        np.testing.assert_allclose(parameters.coordinates(values), drawn, atol=1e-6)
+    for share, bound in ((0.0, parameters.lower), (1.0, parameters.upper)):
+        np.testing.assert_allclose(parameters.at_shares(np.full(len(parameters), share)), bound, atol=1e-12)
+    values = parameters.draw(0, 20)
+    shares = parameters.shares(values)
+    np.testing.assert_allclose(parameters.at_shares(shares), values, rtol=1e-9)
+    change = (parameters.at_shares(shares + 1e-6) - parameters.at_shares(shares - 1e-6)) / 2e-6
+    np.testing.assert_allclose([parameters.by_shares(each) for each in values], change, rtol=1e-6)
     assert (values > parameters.lower).all() and (values < parameters.upper).all()
     # The first is nominal, but for what would begin on a bound.
     inside = (parameters.nominal > parameters.lower) & (parameters.nominal < parameters.upper)

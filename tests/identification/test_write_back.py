@@ -18,7 +18,7 @@ from ballu_mjx.robots.model import set_fields
 
 def identified(folder: Path, *entries: dict) -> tuple[RobotDescription, IdentifiedParameters]:
     parameters, _ = arm(folder, *entries)
-    values = np.array(parameters.vector(parameters.draw(3, 2)[1]), np.float32)
+    values = parameters.draw(3, 2)[1].astype(np.float32)
     return read_description(folder / "arm.robot.json"), IdentifiedParameters(jnp.asarray(values), parameters)
 
 
