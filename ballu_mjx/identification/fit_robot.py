@@ -396,10 +396,12 @@ class _Search:
             self.start, self.residuals = start, simulated.values
         else:  # starting states may be what went too far
             self._refused += 1
-        slopes = np.concatenate([reduced.slopes.reshape(-1, len(values)), np.diag(1 / parameters.prior)])
-        slopes = slopes * parameters.by_shares(values)
-        table = np.concatenate([slopes, np.concatenate([reduced.values.ravel(), prior])[:, None]], axis=1)
-        triangle = np.asarray(np.linalg.qr(table, mode="r"))
+        # Window by window first: one tall table is left to many threads of LAPACK, and takes a hundred times as long.
+        table = np.concatenate([reduced.slopes, reduced.values[..., None]], axis=2)
+        windows = np.asarray(np.linalg.qr(table, mode="r")).reshape(-1, len(values) + 1)
+        own = np.concatenate([np.diag(1 / parameters.prior), prior[:, None]], axis=1)
+        triangle = np.asarray(np.linalg.qr(np.concatenate([windows, own]), mode="r"))
+        triangle[:, :-1] *= parameters.by_shares(values)
         return triangle[:, -1], triangle[:, :-1]
 
 
