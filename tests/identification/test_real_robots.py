@@ -27,7 +27,7 @@ def vector(parameters: ParameterSet, **values: float) -> np.ndarray:
 
 
 def test_both_descriptions_declare_what_their_models_have():
-    assert len(declared("double_pendulum")) == 7
+    assert len(declared("double_pendulum")) == 9
     assert len(declared("go1")) == 5
 
 

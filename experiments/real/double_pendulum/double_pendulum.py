@@ -8,8 +8,9 @@
 # `pos_meas2` (rad); `command_shoulder`, `command_elbow` are `tau_con / 20 + 0.5`. Places of `middle` and `tip` follow
 # by forward kinematics.
 #
-# Masses, lengths and inertias of the model are the published ones. Six recordings train, two choose nothing but show
-# whether identification helps (validation), two are the test. The published friction is replayed beside.
+# Masses, lengths and inertias of the model are the published ones. Motors may be stronger or weaker than they say. Six
+# recordings train, two chose what is declared and show whether identification helps (validation), two are the test. The
+# published friction is replayed beside.
 #
 # `python experiments/real/double_pendulum/double_pendulum.py --data FOLDER`; `--quick` shows that it works.
 
