@@ -25,7 +25,7 @@ from ballu_mjx.recordings.segments import Segments, check_segments, start_segmen
 from ballu_mjx.residuals.envmimic import start_spread
 from ballu_mjx.residuals.network import NetworkForces, square_newtons
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.sim.force_model import FORCE_SETS
+from ballu_mjx.sim.force_sets import FORCE_SETS
 from ballu_mjx.sim.linearize import ControlSteps, Linearized, Linearizer
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.sharding import shard_over_devices

@@ -27,7 +27,7 @@ from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.network import ForceNetworkConfig, force_frame, load_scales, load_units, recorded_inputs
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.coordinates import translations
-from ballu_mjx.sim.force_model import FORCE_SETS
+from ballu_mjx.sim.force_sets import FORCE_SETS
 from ballu_mjx.sim.linearize import ControlSteps, Linearizer
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.simulator import RolloutState, Simulator

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ballu_mjx.sim.coordinates import compress, expand, has_free_joint
-from ballu_mjx.sim.force_model import FORCE_SETS, ForceSet, num_loads
+from ballu_mjx.sim.force_sets import FORCE_SETS, ForceSet, num_loads
 from ballu_mjx.sim.sharding import chunks, shard_over_devices
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState
