@@ -1,7 +1,7 @@
 """Residual forces by the gradient of the tracking error through the simulation.
 
 Windows of the recordings are simulated with the network's forces, and every control step of them is linearized
-(`linearization`). Backpropagation through these derivatives, in time order, is backpropagation through the accurate
+(`sim.linearize`). Backpropagation through these derivatives, in time order, is backpropagation through the accurate
 simulator, contacts included; and for small changes of the forces the linearized windows go on standing in for it, so
 that one simulation serves some gradient steps. Then other windows are simulated and linearized.
 """
