@@ -72,7 +72,7 @@ def lift(buoyancy: float) -> float:
 # %%
 def errors_table(results: Mapping[str, Evaluation]) -> Table:
     """Return errors over 5 s, by group; cells have one value a recording."""
-    groups = next(iter(results.values())).groups
+    groups = sorted(next(iter(results.values())).groups, reverse=True)  # near before far
     forms = {"position": ".3f", "orientation": ".1f"}
     columns = [f"{group}: {called}" for group in groups for called in ("position (m)", "yaw (deg)")]
     rows = []
