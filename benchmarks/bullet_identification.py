@@ -10,8 +10,12 @@ actuators:
 
 Choices are made on robots 0 and 1. All five take about an hour on two cores.
 
+`--true-legs` identifies nothing, and replays walks with the robots' true legs and drivetrains, as far as the package's
+model has them. What is left then is air, contact and the form of the mechanism, which no sweep shows. It takes minutes.
+
     python benchmarks/bullet_identification.py
     python benchmarks/bullet_identification.py --robots 0 1
+    python benchmarks/bullet_identification.py --true-legs
     python benchmarks/bullet_identification.py --quick             # one robot, settled angles alone
     python benchmarks/bullet_identification.py --output FOLDER     # robots that stand there already are not repeated
 """
@@ -35,10 +39,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from bullet_family import (
+    ARM_LENGTH,
     CAPTURE_TIMESTEP,
     CHOSEN_ON,
     ROBOTS,
+    SPRING_PRELOAD,
     SWEEP_HOLD,
+    BulletRobot,
     draw,
     held_out_commands,
     record_sweep,
@@ -49,6 +56,7 @@ from bullet_family import (
 from common import described, write
 from jaxtyping import Float
 
+from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.ballu.actuators_file import actuators_to_json
 from ballu_mjx.ballu.gaits import Gait
 from ballu_mjx.ballu.identification import Identification, Identifier
@@ -159,6 +167,32 @@ def open_loop(recordings: Mapping[str, Recording], actuators: ModelParameters) -
     }
 
 
+def true_actuators(robot: BulletRobot) -> ActuatorParameters:
+    """Return the robot's own numbers in the package's form.
+
+    An arm's yielding is one over the servo's gain. A cable's limit has no counterpart: nearest is the servo torque that
+    pulls as hard at the arm's full length.
+    """
+    values = {
+        "knee_spring_stiffness": robot.spring_stiffness,
+        "motor_gain": 1 / np.array(robot.arm_yield),
+        "default_motor_angle": robot.arm_zero,
+        "default_knee_angle": robot.knee_stop,
+        "torque_limit": ARM_LENGTH * np.array(robot.cable_limit),
+        "cable_slack": robot.cable_slack,
+        "motor_travel": robot.arm_travel,
+        "cable_stiffness": robot.cable_stiffness,
+        "knee_spring_reference": np.array(robot.knee_stop) - SPRING_PRELOAD,
+        "knee_damping": robot.knee_damping,
+        "knee_friction": (0.0, 0.0),
+        "motor_friction": (0.0, 0.0),
+        "delay": (robot.delay, robot.delay),
+        "lag": robot.arm_lag,
+        "backlash": robot.play,
+    }
+    return ActuatorParameters(**{name: jnp.asarray(pair, jnp.float32) for name, pair in values.items()})
+
+
 def record(seed: int, commands: Mapping[str, Float[np.ndarray, "steps 2"]]) -> dict[str, Recording]:
     """Return free recordings by name."""
     return {name: record_walking(draw(seed), own, name, seed) for name, own in commands.items()}
@@ -219,6 +253,18 @@ def table(results: Mapping[int, Mapping[str, Any]]) -> Table:
     )
 
 
+def true_legs_table(robots: Sequence[int]) -> Table:
+    """Return walking errors (m) of nominal and of true legs, with their ratio in brackets."""
+    errors = {seed: open_loop(record(seed, walking_commands(SECONDS)), true_actuators(draw(seed))) for seed in robots}
+    groups = list(next(iter(errors.values())))
+    made = []
+    for seed, rows in errors.items():
+        cells = (f"{rows[g]['nominal']:.3f} -> {rows[g]['identified']:.3f}" for g in groups)
+        ratios = (f"{rows[g]['identified'] / rows[g]['nominal']:.2f}" for g in groups)
+        made.append((str(seed), *(f"{cell} ({ratio})" for cell, ratio in zip(cells, ratios, strict=True))))
+    return Table(("robot", *(f"{group} (m)" for group in groups)), tuple(made))
+
+
 def read_earlier(path: Path, robots: Sequence[int], commit: str) -> dict[str, Any]:
     """Return what an interrupted run left, to go on from.
 
@@ -237,10 +283,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--robots", type=int, nargs="+", default=None, choices=list(ROBOTS))
     parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--true-legs", action="store_true")
     parser.add_argument("--output", type=Path, default=Path("runs/bench-bullet_identification"))
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()
     robots = arguments.robots or (CHOSEN_ON[:1] if arguments.quick else list(ROBOTS))
+    if arguments.true_legs:
+        found = true_legs_table(robots)
+        print(found.to_markdown())
+        if arguments.results is not None:
+            write_results(arguments.results, {"walking": found}, "Made data", seeds={"robots": robots})
+        return
     config = IdentificationConfig(motion=not arguments.quick)
     compiled: list[Identifier] = []
 

@@ -2,10 +2,11 @@
 
 A servo arm (`tests/servo_arm.py`) whose true parameters are drawn from their priors is recorded with 0.5 deg of noise
 and 1 deg of dry friction, which no parameter can express. `fit_robot` identifies it. How often does the truth lie
-within two standard errors: of the sandwich, which hold under misfit, and of white noise, which do not?
+within two standard errors: of the sandwich, which count residuals that go together, and of white noise?
 
     python benchmarks/coverage.py                    # 50 draws
     python benchmarks/coverage.py --draws 4
+    python benchmarks/coverage.py --friction 0       # nothing is left out
     python benchmarks/coverage.py --output FOLDER    # FOLDER/coverage.json too
 """
 
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ runtime.prepare()
 import numpy as np
 from common import described, machine, write
 
+from ballu_mjx.common.results import Table, write_results
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.declared import measure_recording
 from ballu_mjx.identification.fit_robot import FitConfig, fit_robot
@@ -37,6 +40,7 @@ from servo_arm import record_arm, write_arm  # pyright: ignore[reportMissingImpo
 
 DRAWS, NOISE, FRICTION = 50, 0.5, 1.0
 """Draws; deg."""
+KINDS = ("robust", "white")
 RECORDINGS = 3
 """For the fit, of 6 s each; one more is held out."""
 ZERO_SPREADS = {"shoulder_delay": 0.02, "shoulder_backlash": 0.05}
@@ -56,13 +60,15 @@ def draw_truth(parameters: ParameterSet, seed: int) -> dict[str, float]:
     return truth
 
 
-def examine(robot: RobotDescription, parameters: ParameterSet, folder: Path, seed: int) -> dict[str, Any]:
+def examine(
+    robot: RobotDescription, parameters: ParameterSet, folder: Path, seed: int, friction: float
+) -> dict[str, Any]:
     """Return a draw's truth, what was found, and both standard errors."""
     truth, model = draw_truth(parameters, seed), robot.load_model()
     sampling = SamplingConfig(angle_noise=float(np.deg2rad(NOISE)))
     motions = []
     for number in range(RECORDINGS + 1):
-        options = {"truth": truth, "noise": NOISE, "friction": FRICTION}
+        options = {"truth": truth, "noise": NOISE, "friction": friction}
         path = record_arm(folder, robot, f"draw-{seed}-{number}", 100 * seed + number, "suspended", **options)
         motions.append(measure_recording(read_recording(path, robot), robot, model, sampling))
     fit = fit_robot(parameters, motions[:-1], motions[-1:], FitConfig(starts=1))
@@ -73,27 +79,27 @@ def examine(robot: RobotDescription, parameters: ParameterSet, folder: Path, see
     }
 
 
-def table(draws: list[dict[str, Any]]) -> str:
-    """Return shares within two standard errors as text."""
-    lines = [f"{'parameter':20}{'robust':>8}{'white':>8}{'rms error':>12}{'median robust':>15}"]
-    shares = []
+def coverage_table(draws: Sequence[Mapping[str, Mapping[str, float]]]) -> Table:
+    """Return shares of draws within two standard errors, beside the mean error and both standard errors."""
+    made, shares = [], []
     for name in draws[0]:
         rows = [draw[name] for draw in draws]
         off = np.array([row["found"] - row["truth"] for row in rows])
-        within = [np.mean(np.abs(off) < 2 * np.array([row[kind] for row in rows])) for kind in ("robust", "white")]
+        within = [float(np.mean(np.abs(off) < 2 * np.array([row[kind] for row in rows]))) for kind in KINDS]
         shares.append(within)
-        median = np.median([row["robust"] for row in rows])
-        rms = np.sqrt(np.mean(off**2))
-        lines.append(f"{name:20}{within[0]:>8.0%}{within[1]:>8.0%}{rms:>12.3g}{median:>15.3g}")
-    robust, white = np.mean(shares, axis=0)
-    lines.append(f"{'all':20}{robust:>8.0%}{white:>8.0%}")
-    return "\n".join(lines)
+        errors = (f"{np.median([row[kind] for row in rows]):.2g}" for kind in KINDS)
+        made.append((name, *(f"{share:.0%}" for share in within), f"{np.mean(off):.2g}", *errors))
+    made.append(("all", *(f"{share:.0%}" for share in np.mean(shares, axis=0)), "", "", ""))
+    heads = ("within two standard errors", "robust", "white noise", "mean error", "robust error", "white-noise error")
+    return Table(heads, tuple(made))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=DRAWS)
+    parser.add_argument("--friction", type=float, default=FRICTION, help="dry friction that no parameter has (deg)")
     parser.add_argument("--output", type=Path)
+    parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()
     draws = []
     with tempfile.TemporaryDirectory() as name:
@@ -101,11 +107,15 @@ def main() -> None:
         robot = write_arm(folder)
         parameters = declared_parameters(robot, robot.load_model())
         for seed in range(arguments.draws):
-            draws.append(examine(robot, parameters, folder, seed))
+            draws.append(examine(robot, parameters, folder, seed, arguments.friction))
             print(f"draw {seed + 1} of {arguments.draws}", flush=True)
-    print(f"{described(machine())}; {NOISE:g} deg of noise, {FRICTION:g} deg of friction\n{table(draws)}")
+    found = coverage_table(draws)
+    print(f"{described(machine())}; {NOISE:g} deg of noise, {arguments.friction:g} deg of friction")
+    print(found.to_markdown())
     if arguments.output:
-        write(arguments.output, "coverage", {"noise_deg": NOISE, "friction_deg": FRICTION, "draws": draws})
+        write(arguments.output, "coverage", {"noise_deg": NOISE, "friction_deg": arguments.friction, "draws": draws})
+    if arguments.results:
+        write_results(arguments.results, {"coverage": found}, "Made data", seeds={"draws": range(arguments.draws)})
 
 
 if __name__ == "__main__":

@@ -19,6 +19,8 @@ _OUTSIDE = {
 _LINKED = ("CITATION.cff", "LICENSE")
 """No pages, but linked to from the README."""
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
+_SHORT_CODE = re.compile(r"<code>([^<]{1,24})</code>")
+"""Code in which a browser would break lines behind the hyphens of an option."""
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -40,9 +42,11 @@ def on_page_markdown(markdown: str, **_: object) -> str:
 
 
 def on_page_content(html: str, **_: object) -> str:
-    """LaTeX to MathML."""
+    """LaTeX to MathML. Wide formulas scroll by themselves, and short code is kept in one piece."""
 
     def formula(found: re.Match[str]) -> str:
-        return convert(unescape(found[2]), display="block" if found[1] == "div" else "inline")
+        if found[1] == "div":
+            return f'<div class="formula">{convert(unescape(found[2]), display="block")}</div>'
+        return convert(unescape(found[2]), display="inline")
 
-    return _FORMULA.sub(formula, html)
+    return _SHORT_CODE.sub(r'<code class="short">\1</code>', _FORMULA.sub(formula, html))

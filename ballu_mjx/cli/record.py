@@ -166,7 +166,16 @@ def _import(options: Import) -> None:
     recording, cut = with_commands(options.commands or options.file, recording, time, command)
     if max(cut) > 0:
         print(f"cut off, for there are no commands: {cut[0]:.2f} s at the start, {cut[1]:.2f} s at the end")
+    if options.commands is not None and (changes := _changes(command)) > 0 and _changes(recording.command) == 0:
+        print(
+            f"{options.commands}: the commands change {changes} times, and never within the capture; check time_unit "
+            f"under [commands] in {options.mapping}, and --offset."
+        )
     _write(options, robot, recording)
+
+
+def _changes(command: Float[np.ndarray, "N commands"]) -> int:
+    return int(np.any(np.diff(command, axis=0) != 0, axis=1).sum())
 
 
 def _offset(

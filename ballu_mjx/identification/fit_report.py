@@ -105,6 +105,11 @@ def _held_out_table(fit: RobotFit, model: mujoco.MjModel, window_seconds: float,
     verdict = "better" if fit.improves else "WORSE"
     scores = f"{fit.identified.score:.3g} and {fit.nominal.score:.3g} times the noise"
     lines.append(f"Identified values replay them {verdict} than nominal ones: errors are {scores}.")
+    if fit.identified.score > _MUCH:
+        lines.append(
+            f"More than {_MUCH:g} times the noise: the model may lack a force. Values can make up for it, and their "
+            "intervals do not count that."
+        )
     return lines
 
 

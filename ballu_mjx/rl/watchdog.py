@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -58,10 +59,15 @@ class Watchdog:
             return (
                 f"No training step has finished for {minutes}: a first compilation takes one or two, more where other "
                 "work keeps the machine busy. If nothing comes of it, end the process and try fewer --num-envs, "
-                "or delete the cache of compiled programs."
+                f"or delete the cache of compiled programs{_cache()}."
             )
         return (
             f"No training step has finished for {minutes}, since step {self._step:,}: look whether the machine sleeps, "
             "has run out of memory or does other work. If it does not go on, end the process, and go on with "
             f"--resume {self._folder}: what is saved stays."
         )
+
+
+def _cache() -> str:
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")  # `runtime.prepare` sets it
+    return f", {folder}" if folder else ""

@@ -91,6 +91,7 @@ def parameter_intervals(
     axis.errorbar(values, place, xerr=1.96 * white, color=colour, **thick)
     axis.axvline(0.0, color=colour_of("vanilla"), linestyle="--", label="nominal")
     axis.set_yticks(place, names)
+    axis.set_ylim(-0.6, len(names) - 0.4)
     axis.set_xlabel("identified less nominal, in standard deviations among robots")
     axis.grid(alpha=0.3)
     axis.legend(fontsize="small")

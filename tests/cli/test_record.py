@@ -101,6 +101,19 @@ def test_a_trial_cropped_at_its_start_keeps_its_commands(
     assert "12.88 s, from frame 213, 2.12 s of the trial" in capsys.readouterr().out
 
 
+def test_a_log_in_milliseconds_that_is_read_as_seconds_is_told(room: Path, capsys: pytest.CaptureFixture[str]):
+    """Its first command then lasts longer than the whole capture."""
+    lines = (room / "log.csv").read_text().splitlines()
+    held = [(float(t) - 512.25, rest) for t, rest in (line.split(",", 1) for line in lines[1:])]
+    (room / "log.csv").write_text("\n".join([lines[0], *(f"{1e3 * t:.1f},{rest}" for t, rest in held[::20])]) + "\n")
+    assert record.main([*LINE, "--offset", "0"]) == 0
+    said = capsys.readouterr().out
+    assert "log.csv: the commands change 15 times, and never within the capture; check time_unit" in said
+    (room / "room.toml").write_text(ROOM.replace('time = "t"', 'time = "t"\ntime_unit = "ms"'))
+    assert record.main([*LINE[:-1], "out/again.csv", "--offset", "0"]) == 0
+    assert "never within the capture" not in capsys.readouterr().out
+
+
 def test_import_finds_the_offset_and_says_how_sure_it_is(room: Path, capsys: pytest.CaptureFixture[str]):
     assert record.main(LINE) == 0
     said = capsys.readouterr().out

@@ -13,6 +13,7 @@ from robot_files import write_robot
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.declarations import declared_parameters
+from ballu_mjx.identification.fit_report import fit_table
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, check_data, fit_robot, replay, soften
 from ballu_mjx.identification.parameters import ParameterSet
 from ballu_mjx.identification.residuals import (
@@ -129,6 +130,14 @@ def test_held_out_windows_say_that_it_helps(fit: RobotFit):
     np.testing.assert_allclose(fit.best.values, fit.values)
     # What is left is the noise of the angles.
     np.testing.assert_allclose(fit.scatter[0], 1.0, atol=0.15)
+
+
+def test_held_out_errors_far_above_the_noise_are_doubted(fit: RobotFit, tmp_path: Path):
+    doubt, model = "the model may lack a force", robot(tmp_path)[2]
+    assert doubt not in fit_table(fit, model, 1.0, "validation recordings")
+    lacking = dataclasses.replace(fit, identified=fit.nominal)
+    assert lacking.identified.score > 2
+    assert doubt in fit_table(lacking, model, 1.0, "validation recordings")
 
 
 def test_worse_than_nominal_is_said_and_not_taken(fit: RobotFit):

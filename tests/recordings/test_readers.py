@@ -697,3 +697,34 @@ def test_a_table_without_telling_names_asks_for_places_alone(tmp_path: Path, rob
     line = ["import", tmp_path / "x.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "out.csv"]
     run(*line, "--robot", robot.file)
     same(read_recording(tmp_path / "out.csv", robot), gaps=False)
+
+
+@pytest.mark.parametrize("clock, scale, unit", [("t_ms", 1e3, "ms"), ("Time [us]", 1e6, "us"), ("stamp (s)", 1.0, "s")])
+def test_a_clock_with_its_unit_in_its_name_is_found(
+    tmp_path: Path, robot: RobotDescription, clock: str, scale: float, unit: str
+):
+    names = f"{clock},arm,push,hull_x,hull_y,hull_z,hull_qw,hull_qx,hull_qy,hull_qz,tip_x,tip_y,tip_z"
+    values = np.column_stack([scale * TIME, COMMAND, HULL.place, HULL.turn.as_quat(scalar_first=True), TIP.place])
+    np.savetxt(tmp_path / "x.csv", values, "%.6f", ",", header=names, comments="")
+    same(imported(tmp_path, tmp_path / "x.csv", robot), gaps=False)
+    assert f'time_unit = "{unit}"' in (tmp_path / "room.toml").read_text()
+
+
+def test_a_column_that_rises_under_another_name_is_offered_as_the_time(tmp_path: Path, robot: RobotDescription):
+    values = np.column_stack([TIME, HULL.place])
+    np.savetxt(tmp_path / "x.csv", values, "%.6f", ",", header="elapsed,hull_x,hull_y,hull_z", comments="")
+    run("map", tmp_path / "x.csv", "--output", tmp_path / "room.toml", "--robot", robot.file)
+    line = "rate = 100.0  # Hz; a guess. If one of these is the time, name it under [clock]: elapsed"
+    assert line in (tmp_path / "room.toml").read_text().splitlines()
+
+
+def test_a_point_s_orientation_is_mapped_where_the_robot_may_have_one(tmp_path: Path):
+    names = [
+        "time",
+        *(f"{site}_{axis}" for site in ("balloon", "base") for axis in ("x", "y", "z", "qw", "qx", "qy", "qz")),
+    ]
+    values = np.column_stack([TIME, *[HULL.place, HULL.turn.as_quat(scalar_first=True)] * 2])
+    np.savetxt(tmp_path / "x.csv", values, "%.6f", ",", header=",".join(names), comments="")
+    run("map", tmp_path / "x.csv", "--output", tmp_path / "room.toml")
+    text = (tmp_path / "room.toml").read_text()
+    assert 'orientation = ["base_qw", "base_qx", "base_qy", "base_qz"]' in text

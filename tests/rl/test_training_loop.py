@@ -251,6 +251,7 @@ def test_the_user_is_told_once_of_each_standstill_and_of_compiling_in_other_word
 ) -> None:
     now = [1000.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "compiled/here")
     told: list[str] = []
     watchdog = Watchdog(Path("runs/walk"), told.append, limit=300.0)
 
@@ -262,6 +263,7 @@ def test_the_user_is_told_once_of_each_standstill_and_of_compiling_in_other_word
     assert not told_at(1299.0)
     (compiling,) = told_at(1300.0)
     assert "a first compilation takes" in compiling and "--num-envs" in compiling
+    assert compiling.endswith("the cache of compiled programs, compiled/here.")
     assert len(told_at(1900.0)) == 1, "said again"
     for step in range(20, 120, 20):  # goes on for longer than the limit
         now[0] += 200.0

@@ -12,6 +12,7 @@ from ballu_mjx.recordings.importers.trajectories import TIMES
 from ballu_mjx.robots.description import RobotDescription
 
 _CLOCKS = ("time", "timestamp", "t", "stamp", "times", "timesec", "seconds", "sec", "clock", "ms", "ns", "us")
+_TIME_UNITS = ("s", "ms", "us", "ns", "sec", "secs", "seconds", "msec", "usec", "nsec")
 _COMMANDS = ("command", "cmd", "action", "ctrl", "control", "target")
 _UP = "OptiTrack Motive"
 """Programs whose own axes have y up."""
@@ -40,7 +41,7 @@ def draft_mapping(contents: Contents, robot: RobotDescription) -> str:
     What is guessed has a comment that says so. What is not found stands there empty, with what there is to choose from.
     """
     roles = (robot.tracked, *robot.points)
-    parts = {role: _role(contents, role, roles, robot.tracked) for role in roles}
+    parts = {role: _role(contents, role, roles, robot) for role in roles}
     joints = {joint: found for joint in robot.joints if (found := _match(joint, _columns(contents))) is not None}
     joints = {joint: item for joint, item in joints.items() if item.name not in parts[robot.tracked].columns}
     taken = {name for part in parts.values() for name in part.columns}
@@ -100,7 +101,8 @@ def _columns(contents: Contents) -> list[Item]:
 # ---- sites ----
 
 
-def _role(contents: Contents, role: str, roles: Sequence[str], tracked: str) -> _Part:
+def _role(contents: Contents, role: str, roles: Sequence[str], robot: RobotDescription) -> _Part:
+    tracked = robot.tracked
     bodies = [item for item in contents.items if item.kind == "body"]
     markers = [item for item in contents.items if item.kind == "marker"]
     found = _match(role, bodies if role == tracked else [*bodies, *markers])
@@ -120,7 +122,7 @@ def _role(contents: Contents, role: str, roles: Sequence[str], tracked: str) -> 
     ]
     if role == tracked and len(cluster) >= 3:
         return _markers(cluster, "its axes are the capture's in the first whole sample")
-    if (part := _from_columns(contents, role, tracked, alone=len(roles) == 1)) is not None:
+    if (part := _from_columns(contents, role, robot, alone=len(roles) == 1)) is not None:
         return part
     if role == tracked and not bodies:
         points = [_match(point, markers) for point in roles if point != tracked]
@@ -177,7 +179,7 @@ def _stems(names: Sequence[str]) -> tuple[dict[str, list[str]], dict[str, list[s
     return places, turns
 
 
-def _from_columns(contents: Contents, role: str, tracked: str, *, alone: bool) -> _Part | None:
+def _from_columns(contents: Contents, role: str, robot: RobotDescription, *, alone: bool) -> _Part | None:
     items = {item.called: item for item in _columns(contents)}
     places, turns = _stems(list(items))
 
@@ -194,8 +196,9 @@ def _from_columns(contents: Contents, role: str, tracked: str, *, alone: bool) -
     found = [items[name] for name in places[place]]
     chosen = [item.name for item in found]
     lines = [f"position = {json.dumps(chosen)}"]
-    if role == tracked:
-        lines += _turn_lines(contents, choose(turns))
+    turn = choose(turns)
+    if role == robot.tracked or (role in robot.oriented_points and turn is not None):
+        lines += _turn_lines(contents, turn)
     return _Part(lines, chosen, found)
 
 
@@ -245,14 +248,26 @@ def _largest(items: Sequence[Item]) -> float:
 
 def _time_item(contents: Contents) -> Item | None:
     rising = [item for item in _columns(contents) if item.step is not None]
-    named = [item for item in rising if _plain(item.name) in _CLOCKS or _plain(item.name).startswith("time")]
+    named = [item for item in rising if _is_clock(item.name)]
     return (named or [None])[0]
 
 
+def _is_clock(name: str) -> bool:
+    """Whether a column is called like a clock: `time`, `timestamp_ns`, `t_ms`, `Stamp [us]`."""
+    words = [word for word in re.split(r"[^a-z0-9]+", name.lower()) if word]
+    if len(words) > 1 and words[-1] in _TIME_UNITS:
+        words = words[:-1]
+    called = "".join(words)
+    return called in _CLOCKS or called.startswith("time")
+
+
 def _rate_line(contents: Contents) -> list[str]:
-    if contents.rows and _time_item(contents) is None:
-        return ["rate = 100.0  # Hz; a guess: no column rises as a clock does"]
-    return []
+    if not contents.rows or _time_item(contents) is not None:
+        return []
+    rising = [item for item in _columns(contents) if item.step is not None]
+    if rising:
+        return [f"rate = 100.0  # Hz; a guess. If one of these is the time, name it under [clock]: {_names(rising)}"]
+    return ["rate = 100.0  # Hz; a guess: no column rises as a clock does"]
 
 
 def _clock(contents: Contents, used: Sequence[Item]) -> list[str]:
