@@ -1,6 +1,6 @@
 """How good and how fast is identification on a real robot? Three ways on recordings of a double pendulum, in one run.
 
-The recordings, the model and the seven parameters are those of `experiments/real/double_pendulum/`. All three ways have
+The recordings, the model and the parameters are those of `experiments/real/double_pendulum/`. All three ways have
 the same windows, starting states as measured, bounds and first point (nominal, and a little inside its bounds), no
 priors, and the same residuals: positions and velocities at every sample over `WEIGHTS`, softened (pseudo-Huber). The
 objective is their root mean square.
