@@ -66,7 +66,7 @@ def test_windows_in_c_mujoco_are_those_of_the_fit():
         position_noise=np.ones(2),
         velocity_noise=np.ones(2),
     )
-    values = np.array([0.2, 0.15, 0.01, 0.02, 0.004, 0.003, 0.0137])
+    values = 1.05 * np.array([parameter.nominal for parameter in parameters.parameters]) + 0.003
     vectors = np.stack([values, 1.1 * values])
     with jax.enable_x64(True):
         windows = cut_windows([motion], 0.2)
