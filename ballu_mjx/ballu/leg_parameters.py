@@ -43,7 +43,7 @@ class IdentificationConfig:
     and friction."""
     cable_stiffness: bool = True
     """Identify the cables' stiffness too."""
-    knee_spring_reference: bool = True
+    knee_spring_reference: bool = False
     """Identify where the knees' springs would be at rest, and with it how far they are preloaded, too."""
     motion: bool = True
     """Learn from the whole motion, not from settled angles alone; delay, lag, backlash, dry friction and the knee's
