@@ -8,6 +8,9 @@ actuators:
   (`identification.guard`), on gaits (near) and on what is none (far);
 - what `--actuators auto` takes, by the guard's replay of further recordings.
 
+Walks are also replayed with the robot's true legs and drivetrain, as far as the package's model has them: what is left
+then is air, contact and the form of the mechanism, which no sweep shows.
+
 Choices are made on robots 0 and 1. All five take about an hour on two cores.
 
     python benchmarks/bullet_identification.py
@@ -35,10 +38,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from bullet_family import (
+    ARM_LENGTH,
     CAPTURE_TIMESTEP,
     CHOSEN_ON,
     ROBOTS,
+    SPRING_PRELOAD,
     SWEEP_HOLD,
+    BulletRobot,
     draw,
     held_out_commands,
     record_sweep,
@@ -49,6 +55,7 @@ from bullet_family import (
 from common import described, write
 from jaxtyping import Float
 
+from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.ballu.actuators_file import actuators_to_json
 from ballu_mjx.ballu.gaits import Gait
 from ballu_mjx.ballu.identification import Identification, Identifier
@@ -159,6 +166,32 @@ def open_loop(recordings: Mapping[str, Recording], actuators: ModelParameters) -
     }
 
 
+def true_actuators(robot: BulletRobot) -> ActuatorParameters:
+    """Return the robot's own numbers in the package's form.
+
+    An arm's yielding is one over the servo's gain. A cable's limit has no counterpart: nearest is the servo torque that
+    pulls as hard at the arm's full length.
+    """
+    values = {
+        "knee_spring_stiffness": robot.spring_stiffness,
+        "motor_gain": 1 / np.array(robot.arm_yield),
+        "default_motor_angle": robot.arm_zero,
+        "default_knee_angle": robot.knee_stop,
+        "torque_limit": ARM_LENGTH * np.array(robot.cable_limit),
+        "cable_slack": robot.cable_slack,
+        "motor_travel": robot.arm_travel,
+        "cable_stiffness": robot.cable_stiffness,
+        "knee_spring_reference": np.array(robot.knee_stop) - SPRING_PRELOAD,
+        "knee_damping": robot.knee_damping,
+        "knee_friction": (0.0, 0.0),
+        "motor_friction": (0.0, 0.0),
+        "delay": (robot.delay, robot.delay),
+        "lag": robot.arm_lag,
+        "backlash": robot.play,
+    }
+    return ActuatorParameters(**{name: jnp.asarray(pair, jnp.float32) for name, pair in values.items()})
+
+
 def record(seed: int, commands: Mapping[str, Float[np.ndarray, "steps 2"]]) -> dict[str, Recording]:
     """Return free recordings by name."""
     return {name: record_walking(draw(seed), own, name, seed) for name, own in commands.items()}
@@ -178,12 +211,14 @@ def examine(seed: int, identify: Callable[[Sweep], Identification]) -> dict[str,
         name: float(np.rad2deg(np.mean(np.abs(settled(held_out, parameters, model) - truth))))
         for name, parameters in (("nominal", None), ("identified", actuators))
     }
+    walks = record(seed, walking_commands(SECONDS))
     guard = choose_actuators(load_robot(), actuators, walking(record(seed, validation_commands()), actuators))
     rows = zip(found.fits, SIDES, strict=True)
     result = {
         "robot": dataclasses.asdict(bullet),
         "settled_deg": errors,
-        "open_loop_m": open_loop(record(seed, walking_commands(SECONDS)), actuators),
+        "open_loop_m": open_loop(walks, actuators),
+        "true_legs_m": open_loop(walks, true_actuators(bullet)),
         "guard": {"ratio": guard.ratio, "takes": "identified" if guard.improves else "nominal"},
         "seconds": seconds,
         "parameters": actuators_to_json(actuators),
@@ -192,11 +227,12 @@ def examine(seed: int, identify: Callable[[Sweep], Identification]) -> dict[str,
         "scatter_deg": {side: float(np.rad2deg(fit.residual)) for fit, side in rows},
         "creep": sweep.creep,
     }
-    print(table({seed: result}).to_markdown(), flush=True)
+    for made in (errors_table, legs_table):
+        print(made({seed: result}).to_markdown(), flush=True)
     return result
 
 
-def table(results: Mapping[int, Mapping[str, Any]]) -> Table:
+def errors_table(results: Mapping[int, Mapping[str, Any]]) -> Table:
     """Return errors of nominal and identified actuators, with their ratio in brackets."""
 
     def compared(row: Mapping[str, float], form: str) -> str:
@@ -217,6 +253,17 @@ def table(results: Mapping[int, Mapping[str, Any]]) -> Table:
             for seed, result in results.items()
         ),
     )
+
+
+def legs_table(results: Mapping[int, Mapping[str, Any]]) -> Table:
+    """Return walking errors over nominal's, of identified legs and of the robot's own."""
+    groups = list(next(iter(results.values()))["open_loop_m"])
+    made = []
+    for seed, result in results.items():
+        for kind, name in (("open_loop_m", "identified"), ("true_legs_m", "true")):
+            rows = result[kind]
+            made.append((str(seed), name, *(f"{rows[g]['identified'] / rows[g]['nominal']:.2f}" for g in groups)))
+    return Table(("robot", "legs", *groups), tuple(made))
 
 
 def read_earlier(path: Path, robots: Sequence[int], commit: str) -> dict[str, Any]:
@@ -256,14 +303,17 @@ def main() -> None:
         if seed not in earlier["robots"]:
             earlier["robots"][seed] = examine(seed, identify)
             write(arguments.output, "bullet_identification", {key: earlier[key] for key in ("commit", "robots")})
-    found = table({seed: earlier["robots"][seed] for seed in robots})
+    chosen = {seed: earlier["robots"][seed] for seed in robots}
+    found = {"errors": errors_table(chosen), "legs": legs_table(chosen)}
     stored = json.loads(path.read_text(encoding="utf-8"))
-    print(f"\n{described(stored['machine'])}; commit {stored['commit']}\n{found.to_markdown()}")
+    print(
+        f"\n{described(stored['machine'])}; commit {stored['commit']}\n{found['errors'].to_markdown()}\n\n{found['legs'].to_markdown()}"
+    )
     if arguments.results is not None:
         about = {key: value for key, value in stored["machine"].items() if key not in ("versions", "load")}
         measured = {"commit": stored["commit"], "machine": about, "versions": stored["machine"]["versions"]}
         data = f"Development data: choices were made on robots {' and '.join(map(str, CHOSEN_ON))}"
-        write_results(arguments.results, {"errors": found}, data, seeds={"robots": robots}, measured=measured)
+        write_results(arguments.results, found, data, seeds={"robots": robots}, measured=measured)
 
 
 def silent(stage: str, iteration: int, steps: int, value: float) -> None:
