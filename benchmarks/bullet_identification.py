@@ -306,9 +306,8 @@ def main() -> None:
     chosen = {seed: earlier["robots"][seed] for seed in robots}
     found = {"errors": errors_table(chosen), "legs": legs_table(chosen)}
     stored = json.loads(path.read_text(encoding="utf-8"))
-    print(
-        f"\n{described(stored['machine'])}; commit {stored['commit']}\n{found['errors'].to_markdown()}\n\n{found['legs'].to_markdown()}"
-    )
+    print(f"\n{described(stored['machine'])}; commit {stored['commit']}")
+    print("\n\n".join(each.to_markdown() for each in found.values()))
     if arguments.results is not None:
         about = {key: value for key, value in stored["machine"].items() if key not in ("versions", "load")}
         measured = {"commit": stored["commit"], "machine": about, "versions": stored["machine"]["versions"]}
