@@ -76,7 +76,7 @@ class ParameterRange(NamedTuple):
 
 
 RANGES: dict[str, ParameterRange] = {
-    "knee_spring_stiffness": ParameterRange(4.0, (0.0, 0.0), 0.3),
+    "knee_spring_stiffness": ParameterRange(4.0, (0.0, 0.0), 0.1),
     "motor_gain": ParameterRange(16.0, (0.0, 0.0), 0.7),
     "default_motor_angle": ParameterRange(None, (20 * DEGREE, 20 * DEGREE), 5 * DEGREE),
     "default_knee_angle": ParameterRange(None, (15 * DEGREE, 15 * DEGREE), 3 * DEGREE),
