@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from ballu_mjx.policies.deploy.check import check_policy
     from ballu_mjx.policies.environments.brax_env import brax_env
     from ballu_mjx.policies.environments.gym_env import gym_env, gym_vector_env
+    from ballu_mjx.policies.load_simulator import load_simulator
     from ballu_mjx.policies.locomotion_env import LocomotionConfig
     from ballu_mjx.policies.policy import Policy
-    from ballu_mjx.policies.simulators import load_simulator
     from ballu_mjx.policies.training import locomotion_ppo, train_policy
     from ballu_mjx.recordings.load import load_recordings
     from ballu_mjx.recordings.motion import Motion
@@ -86,7 +86,7 @@ _MODULES = {
     "identify_actuators": "identification.actuators",
     "load_recordings": "recordings.load",
     "load_robot": "robots.registry",
-    "load_simulator": "policies.simulators",
+    "load_simulator": "policies.load_simulator",
     "locomotion_ppo": "policies.training",
     "reconstruct": "recordings.reconstruct",
     "train_envmimic": "residuals.envmimic_training",

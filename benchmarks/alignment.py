@@ -15,7 +15,7 @@ runtime.prepare()
 import numpy as np
 
 from ballu_mjx.ballu import gaits
-from ballu_mjx.ballu.leg_response import measured_response, nominal_response
+from ballu_mjx.ballu.leg_alignment import measured_response, nominal_response
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.cli.record import LEAST_CONFIDENCE, Import
 from ballu_mjx.recordings.clock_alignment import align

@@ -27,7 +27,7 @@ from jaxtyping import Float
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table, write_results
-from ballu_mjx.policies.simulators import load_simulator
+from ballu_mjx.policies.load_simulator import load_simulator
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.deploy.export import export_simulator, in_double, rollout_positions

@@ -31,7 +31,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table, write_results
 from ballu_mjx.evaluation.errors import SCORE_HORIZONS, Errors, Evaluation, quotient
 from ballu_mjx.evaluation.errors_file import read_evaluation
-from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
+from ballu_mjx.residuals.registry import RESIDUAL_TASKS
 from ballu_mjx.runs.folder import read_config
 from ballu_mjx.viz.style import label_of
 

@@ -121,11 +121,6 @@ def load(folder: Path) -> Evaluation:
     return read_evaluation(folder / "evaluation.json")
 
 
-def seconds(folder: Path) -> float:
-    """Wall time that a run learned for, its validations included, reading and compiling for them not."""
-    return float(read_column(folder, "seconds")[1][-1])
-
-
 def simulated(folder: Path) -> float:
     """Control steps that a run simulated to learn, validations left out; a derivative along one direction counts as one
     more."""
@@ -215,7 +210,7 @@ def groups_of(rows: Rows) -> list[str]:
     return sorted({errors.group for errors in rows["vanilla"][0]}, reverse=True)
 
 
-def comparison(rows: Rows, effort: Mapping[str, tuple[Cell, Cell]], horizon: float) -> Table:
+def comparison(rows: Rows, effort: Mapping[str, Cell], horizon: float) -> Table:
     """Return what simulators leave of vanilla's RMSE over `horizon` s, and `effort`, what learning took. In vanilla's
     row stand its errors themselves."""
     columns = [(group, quantity) for group in groups_of(rows) for quantity in ("position", "orientation")]
@@ -223,8 +218,8 @@ def comparison(rows: Rows, effort: Mapping[str, tuple[Cell, Cell]], horizon: flo
     head = [called[q] if group == OTHER else f"{group}: {called[q]}" for group, q in columns]
     others = {label: runs for label, runs in rows.items() if label != "vanilla"}
     cells = collect_runs.remaining_errors(rows["vanilla"][0], others, columns, horizon)
-    made = tuple((label, *left, *effort.get(label, ("", ""))) for label, left in cells.items())
-    return Table((f"{horizon:g} s", *head, "learning (s)", "thousand control steps"), made)
+    made = tuple((label, *left, effort.get(label, "")) for label, left in cells.items())
+    return Table((f"{horizon:g} s", *head, "thousand control steps"), made)
 
 
 def final_yaw(rows: Rows) -> Table:
@@ -352,10 +347,7 @@ def main() -> None:
     recorded = record(options.robot, options.output)
     folders = learn(options, recorded)
     effort = {
-        METHODS[name].label: (
-            Cell(tuple(seconds(folder) for folder in members), ".0f", spread=False),
-            Cell(tuple(simulated(folder) / 1e3 for folder in members), ",.0f", spread=False),
-        )
+        METHODS[name].label: Cell(tuple(simulated(folder) / 1e3 for folder in members), ",.0f", spread=False)
         for name, members in folders.items()
     }
     each = 1 if options.quick else 6

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.ballu import actuators_file, leg_response, reconstruct, recordings
+from ballu_mjx.ballu import actuators_file, leg_alignment, reconstruct, recordings
 from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.ballu.features import foot_positions
 from ballu_mjx.ballu.gait import count_steps
@@ -199,5 +199,5 @@ class Ballu(RobotAdapter, RecordingHooks):
     def response(
         self, recording: Recording, time: Float[np.ndarray, " N"], command: Float[np.ndarray, "N 2"]
     ) -> tuple[Float[np.ndarray, "T 2"], Float[np.ndarray, " n"], Float[np.ndarray, "n 2"]] | None:
-        """Return how far each leg is bent, and would be by `leg_response.nominal_response`."""
-        return leg_response.response(recording, time, command)
+        """Return how far each leg is bent, and would be by `leg_alignment.nominal_response`."""
+        return leg_alignment.response(recording, time, command)

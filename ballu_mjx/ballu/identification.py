@@ -89,7 +89,7 @@ _DRIFT = 0.05 * DEGREE
 
 
 class CompiledLeg:
-    """The two programs that hold MJX, compiled side by side: values and Jacobians in a `Space`'s coordinates, for
+    """The two MJX programs, compiled side by side: values and Jacobians in a `ParameterTransform`'s coordinates, for
     batches of fixed sizes. The second, of the motion, only where it is wanted."""
 
     def __init__(self, space: ParameterTransform, batch: int, data: LegData, *, motion: bool) -> None:

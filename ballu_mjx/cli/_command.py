@@ -14,7 +14,7 @@ import tyro
 
 from ballu_mjx.cli._help import arranged, asks_for_help
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
+from ballu_mjx.residuals.registry import RESIDUAL_TASKS
 from ballu_mjx.residuals.run_config import run_robot
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.rl.resume_point import ResumePoint, find_resume_point

@@ -71,7 +71,7 @@ def rows(folders: Sequence[Path]) -> list[Row]:
     **Raises** `InputError` where one is no run, or the tasks differ.
     """
     from ballu_mjx.policies.tasks import TASKS
-    from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
+    from ballu_mjx.residuals.registry import RESIDUAL_TASKS
     from ballu_mjx.runs.folder import read_config
 
     if len({folder.resolve() for folder in folders}) < len(folders):
@@ -101,7 +101,7 @@ def figures(folder: Path) -> dict[str, float]:
     """
     from ballu_mjx.evaluation.errors_file import read_evaluation
     from ballu_mjx.policies.tasks import TASKS
-    from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
+    from ballu_mjx.residuals.registry import RESIDUAL_TASKS
     from ballu_mjx.runs.folder import read_config
     from ballu_mjx.runs.metrics import read_column
 
@@ -223,7 +223,7 @@ def _options(config: Mapping[str, Any]) -> dict[str, str]:
 
 def _kind(config: Mapping[str, Any]) -> str:
     """What runs may be compared: residuals of whatever kind, and policies of one task."""
-    from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
+    from ballu_mjx.residuals.registry import RESIDUAL_TASKS
 
     return "residual" if config["task"] in RESIDUAL_TASKS else config["task"]
 

@@ -55,11 +55,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _evaluate(options: Options) -> None:
     from ballu_mjx.evaluation.open_loop import Evaluators
+    from ballu_mjx.recordings.capture_noise import add_capture_noise
     from ballu_mjx.recordings.csv_format import list_recordings, read_recording
-    from ballu_mjx.recordings.motion import add_capture_noise
     from ballu_mjx.recordings.reconstruct import reconstruct
     from ballu_mjx.residuals.dataset import check_recording
-    from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
+    from ballu_mjx.residuals.registry import RESIDUAL_TASKS
     from ballu_mjx.residuals.run_config import find_recordings, run_robot
     from ballu_mjx.residuals.trained import TrainedResidual
     from ballu_mjx.robots.description import check_simulates

@@ -77,7 +77,7 @@ def _run(options: PolicyOptions | SimulatorOptions | CheckOptions) -> int:
 
 
 def _simulator(options: SimulatorOptions) -> int:
-    from ballu_mjx.policies.simulators import load_simulator
+    from ballu_mjx.policies.load_simulator import load_simulator
     from ballu_mjx.residuals.deploy.export import export_simulator
 
     if not 0 <= options.check_seconds <= 60:

@@ -58,7 +58,7 @@ from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.checkpoints import list_checkpoints
 from ballu_mjx.runs.layout import KEPT
-from ballu_mjx.sim.force_model import ForceSet
+from ballu_mjx.sim.force_sets import ForceSet
 
 _DECIMALS = 4
 

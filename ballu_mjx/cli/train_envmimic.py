@@ -21,7 +21,7 @@ from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.runs.folder import read_config
 from ballu_mjx.runs.progress import Progress
 from ballu_mjx.runs.record import TrainingRecord
-from ballu_mjx.sim.force_model import check_force_set
+from ballu_mjx.sim.force_sets import check_force_set
 from ballu_mjx.viz import artifacts
 
 QUICK: Mapping[str, Any] = {"num_timesteps": 120_000, "num_envs": 256, "batch_size": 128}

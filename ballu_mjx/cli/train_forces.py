@@ -18,7 +18,7 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.metrics import read_column
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import TrainingRecord
-from ballu_mjx.sim.force_model import ForceSet, check_force_set
+from ballu_mjx.sim.force_sets import ForceSet, check_force_set
 from ballu_mjx.viz import plots
 
 QUICK: Mapping[str, Mapping[str, Any]] = {

@@ -326,7 +326,7 @@ class OpenLoopEvaluator:
     def of_starts(self, motions: Sequence[Motion], params: Any) -> tuple[Errors, ...]:
         """Return how far the simulator with the residual is from itself when it starts from the states of `motions`.
 
-        `motions` are the same recordings, reconstructed otherwise, such as after `motion.add_capture_noise`. A
+        `motions` are the same recordings, reconstructed otherwise, such as after `capture_noise.add_capture_noise`. A
         simulator cannot be expected to be much nearer to what was recorded."""
         return self.errors(self.on(motions).replay(params), self.replay(params))
 

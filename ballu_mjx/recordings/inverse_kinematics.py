@@ -1,6 +1,6 @@
-"""Inverse kinematics: damped least squares over all joints, for all samples of a recording at once.
+"""Inverse kinematics: a recording's poses, checked for joints that nothing shows and for measurements that fit no pose.
 
-`pose_solver` fits poses to measurements, `posture_search` finds where it begins.
+`posture_search` finds where `pose_solver` begins, which fits the poses to the measurements.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Damped least squares over all joints: the poses nearest to a guess that fit what was measured, many at once.
+"""The least squares of inverse kinematics: poses near a guess that fit what was measured, many at once.
 
 Joints keep their ranges, unless no pose within them fits. A closed loop (a model's `connect` or `joint` equality) is a
 measurement like others.

@@ -226,7 +226,7 @@ def _soften(
 ) -> tuple[Float[np.ndarray, "windows entries"], Float[np.ndarray, "windows entries directions"]]:
     """Scale errors (and their derivatives), window by window.
 
-    The sum of squares becomes `segments.pseudo_huber` of each window's whole error."""
+    The sum of squares becomes `segment_errors.pseudo_huber` of each window's whole error."""
     squared = np.sum(errors**2, axis=1)[:, None] + 1e-12
     loss = pseudo_huber(squared)
     factor = np.sqrt(loss / squared)

@@ -1,7 +1,7 @@
 """Residual forces by the gradient of the tracking error through the simulation.
 
 Windows of the recordings are simulated with the network's forces, and every control step of them is linearized
-(`linearization`). Backpropagation through these derivatives, in time order, is backpropagation through the accurate
+(`sim.linearize`). Backpropagation through these derivatives, in time order, is backpropagation through the accurate
 simulator, contacts included; and for small changes of the forces the linearized windows go on standing in for it, so
 that one simulation serves some gradient steps. Then other windows are simulated and linearized.
 """
@@ -25,7 +25,7 @@ from ballu_mjx.recordings.segments import Segments, check_segments, start_segmen
 from ballu_mjx.residuals.envmimic import start_spread
 from ballu_mjx.residuals.network import NetworkForces, square_newtons
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.sim.force_model import FORCE_SETS
+from ballu_mjx.sim.force_sets import FORCE_SETS
 from ballu_mjx.sim.linearize import ControlSteps, Linearized, Linearizer
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.sharding import shard_over_devices

@@ -37,7 +37,7 @@ from ballu_mjx.residuals.scales import settle_scales
 from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.coordinates import translations
-from ballu_mjx.sim.force_model import FORCE_SETS, ForceSet
+from ballu_mjx.sim.force_sets import FORCE_SETS, ForceSet
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout, euler_to_matrix, wrap_angle
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import state_at

@@ -187,7 +187,7 @@ class _Windows:
         self.count, self.steps = np.shape(self.segments.features)[:2]
 
     def errors(self, params: Float[np.ndarray, "terms 6"]) -> Float[np.ndarray, "windows entries"]:
-        """Return the errors of all windows, in expected errors (`segments.count_lost`)."""
+        """Return the errors of all windows, in expected errors (`segment_errors.count_lost`)."""
         self.program.control_steps += self.count * self.steps
         found = [self.program.errors(np.float32(params), self._chosen(rows)) for rows, _ in chunks(self.count, _BATCH)]
         return count_lost(np.concatenate(found).astype(np.float64)[: self.count])

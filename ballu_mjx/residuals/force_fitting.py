@@ -28,7 +28,8 @@ from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
-from ballu_mjx.sim.force_model import FORCE_SETS, ForceSet, add_to_base
+from ballu_mjx.sim.force_model import add_to_base
+from ballu_mjx.sim.force_sets import FORCE_SETS, ForceSet
 from ballu_mjx.sim.linearize import Linearizer
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 

@@ -14,8 +14,9 @@ from jaxtyping import Array, Float
 from ballu_mjx.recordings.reference import ReferenceMotions
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.sim import force_model
-from ballu_mjx.sim.force_model import FORCE_SETS, Action, Commands, ForceModel, ForceSet, History
+from ballu_mjx.sim import force_sets
+from ballu_mjx.sim.force_model import Action, Commands, ForceModel, History
+from ballu_mjx.sim.force_sets import FORCE_SETS, ForceSet
 from ballu_mjx.sim.observation import (
     HISTORY,
     ObservationLayout,
@@ -99,7 +100,7 @@ def num_inputs(config: ForceNetworkConfig, robot: RobotDescription) -> int:
 
 def num_loads(config: ForceNetworkConfig, robot: RobotDescription) -> int:
     """Return the size of an action."""
-    return force_model.num_loads(config.forces, robot)
+    return force_sets.num_loads(config.forces, robot)
 
 
 class LoadScales(NamedTuple):

@@ -27,7 +27,8 @@ from ballu_mjx.residuals.network import ForceNetworkConfig, load_scales
 from ballu_mjx.robots.adapter import ResidualScales
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.c_model import improved_model
-from ballu_mjx.sim.force_model import FORCE_SETS, BoundForces, ForceSet, check_force_set, num_loads
+from ballu_mjx.sim.force_model import BoundForces
+from ballu_mjx.sim.force_sets import FORCE_SETS, ForceSet, check_force_set, num_loads
 from ballu_mjx.sim.observation import HISTORY, commands_seen
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 

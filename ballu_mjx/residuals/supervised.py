@@ -27,8 +27,8 @@ from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.network import ForceNetworkConfig, force_frame, load_scales, load_units, recorded_inputs
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.coordinates import translations
-from ballu_mjx.sim.force_model import FORCE_SETS
-from ballu_mjx.sim.linearize import ControlSteps, Linearizer
+from ballu_mjx.sim.force_sets import FORCE_SETS
+from ballu_mjx.sim.linearize import ControlSteps, Linearizer, step_defects
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
@@ -149,11 +149,7 @@ class ForceLabeller:
         rollout = RolloutState(states, jnp.asarray(history), jnp.asarray(commands[:, :past]), drivetrain)
         loads = np.zeros((count, self._linearize.loads))
         linear = self._linearize(ControlSteps(rollout, commands[:, past], loads))
-        defect = np.zeros((count, 2 * self._model.nv))
-        for step in range(count):
-            recorded, after = motion.qpos[step + 1], np.asarray(linear.qpos[step], np.float64)
-            mujoco.mj_differentiatePos(self._model, defect[step, : self._model.nv], 1.0, recorded, after)
-        defect[:, self._model.nv :] = linear.qvel - motion.qvel[1:]
+        defect = step_defects(self._model, linear, motion.qpos[1:], motion.qvel[1:])
         return self._explain(np.asarray(linear.state, np.float64), defect)
 
     def _explain(

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.residuals.aerodynamics import AirParameters
-from ballu_mjx.residuals.kinds import KINDS, RESIDUAL_TASKS, StoredRun
+from ballu_mjx.residuals.registry import KINDS, RESIDUAL_TASKS, StoredRun
 from ballu_mjx.residuals.run_config import check_stands_in, run_actuators, run_residual, run_robot
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters

@@ -14,11 +14,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
 from ballu_mjx.sim.coordinates import compress, expand, has_free_joint
-from ballu_mjx.sim.force_model import FORCE_SETS, ForceSet, num_loads
+from ballu_mjx.sim.force_sets import FORCE_SETS, ForceSet, num_loads
 from ballu_mjx.sim.sharding import chunks, shard_over_devices
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState
@@ -118,3 +119,17 @@ class Linearizer:
         positions = jax.vmap(lambda qpos, rate: compress(qpos, rate, self._free))(state.qpos, change.qpos)
         moved = jnp.concatenate([positions, change.qvel], axis=1)
         return state.qpos[0], state.qvel[0], features[0], moved, seen
+
+
+def step_defects(
+    model: mujoco.MjModel,
+    steps: Linearized,
+    qpos: Float[np.ndarray, "steps nq"],
+    qvel: Float[np.ndarray, "steps nv"],
+) -> Float[np.ndarray, "steps 2*nv"]:
+    """Return how far each control step ends from a motion's states after it, along the state's directions."""
+    defect = np.zeros((len(qpos), 2 * model.nv))
+    for own, recorded, after in zip(defect, qpos, np.asarray(steps.qpos, np.float64), strict=True):
+        mujoco.mj_differentiatePos(model, own[: model.nv], 1.0, recorded, after)
+    defect[:, model.nv :] = steps.qvel - qvel
+    return defect

@@ -98,7 +98,7 @@ def collect(folder: Path) -> Content:
 
 def _run(folder: Path) -> Content:
     from ballu_mjx.policies.tasks import TASKS
-    from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
+    from ballu_mjx.residuals.registry import RESIDUAL_TASKS
     from ballu_mjx.runs.folder import read_config
 
     config = read_config(folder, *RESIDUAL_TASKS, "sysid", *TASKS)

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model, standing_qpos
 from ballu_mjx.ballu.reconstruct import BASE_PITCH, _servo_chunk, complete_joints
 from ballu_mjx.ballu.recordings import make_recording
+from ballu_mjx.recordings.capture_noise import add_capture_noise
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
-from ballu_mjx.recordings.motion import MeasurementGrid, Motion, ReconstructionParameters, add_capture_noise
+from ballu_mjx.recordings.motion import MeasurementGrid, Motion, ReconstructionParameters
 from ballu_mjx.recordings.reconstruct import differentiate, reconstruct
 from ballu_mjx.recordings.recording import Recording, cut
 from ballu_mjx.robots.registry import load_robot
@@ -99,8 +100,8 @@ def seen_without_base(truth: Truth) -> Motion:
 
 
 def test_as_much_noise_again_errs_as_much_again(truth: Truth):
-    """What `noisier` recordings are reconstructed to is off from the original's states by as much as these from the
-    truth: a simulator's error by its starting states can be had without the truth."""
+    """States of a recording with noise added are off from the original's by as much as these from the truth: a
+    simulator's error by its starting states can be had without the truth."""
     seen = capture(truth)
     once = reconstruct(seen, load_robot(), MODEL).qpos
     again = [reconstruct(add_capture_noise(seen, seed=seed), load_robot(), MODEL).qpos for seed in (1, 2)]

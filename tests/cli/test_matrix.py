@@ -29,8 +29,8 @@ from ballu_mjx.residuals.aerodynamics_fit import AirConfig
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.fluid import FLUID_FILE, FluidCoefficients, terms_of
 from ballu_mjx.residuals.fluid_fit import FluidConfig
-from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
 from ballu_mjx.residuals.network import num_inputs, num_loads
+from ballu_mjx.residuals.registry import RESIDUAL_TASKS
 from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.residuals.trained import TrainedResidual, write_observed
 from ballu_mjx.rl import ppo

@@ -16,8 +16,8 @@ import ballu_mjx.environments as environments
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.environments.batch import LocomotionBatch, make_environment
 from ballu_mjx.policies.environments.brax_env import brax_env
+from ballu_mjx.policies.load_simulator import load_simulator
 from ballu_mjx.policies.locomotion_env import LocomotionConfig, locomotion_state
-from ballu_mjx.policies.simulators import load_simulator
 from ballu_mjx.policies.tasks import TASKS, Task
 from ballu_mjx.residuals.fluid import FLUID_FILE, FluidCoefficients, terms_of
 from ballu_mjx.residuals.fluid_fit import FluidConfig

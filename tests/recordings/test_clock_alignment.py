@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ballu_mjx.ballu import gaits
-from ballu_mjx.ballu.leg_response import measured_response, nominal_response
+from ballu_mjx.ballu.leg_alignment import measured_response, nominal_response
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.cli.record import LEAST_CONFIDENCE
 from ballu_mjx.recordings.clock_alignment import align

@@ -43,7 +43,8 @@ from ballu_mjx.robots.mjcf import write_mjcf
 from ballu_mjx.robots.model import assets
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.c_model import improved_model
-from ballu_mjx.sim.force_model import BoundForces, ForceSet
+from ballu_mjx.sim.force_model import BoundForces
+from ballu_mjx.sim.force_sets import ForceSet
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 BALLOON = Path(__file__).parents[2] / "experiments" / "tethered_balloon" / "balloon.robot.json"

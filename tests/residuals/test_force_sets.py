@@ -24,7 +24,8 @@ from ballu_mjx.residuals.scales import describe_scales, missing_loads, settle_sc
 from ballu_mjx.residuals.supervised import SupervisedConfig
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.sim.force_model import BoundForces, ForceSet
+from ballu_mjx.sim.force_model import BoundForces
+from ballu_mjx.sim.force_sets import ForceSet
 from ballu_mjx.sim.linearize import Linearizer
 from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import count_substeps, state_at

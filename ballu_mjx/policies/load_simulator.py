@@ -1,4 +1,4 @@
-"""The simulator of a run, of whatever task: for whoever trains, exports or compares in it next."""
+"""The simulator of a run of whatever task, for whoever trains, exports or compares in it next."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.actuators import ACTUATORS_FILE, read_actuators
 from ballu_mjx.policies.policy import check_belongs
 from ballu_mjx.policies.tasks import TASKS
-from ballu_mjx.residuals.kinds import RESIDUAL_TASKS
+from ballu_mjx.residuals.registry import RESIDUAL_TASKS
 from ballu_mjx.residuals.run_config import run_actuators, run_residual, run_robot
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot

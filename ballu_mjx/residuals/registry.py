@@ -1,4 +1,4 @@
-"""The kinds of residual, each said once: what a run of it leaves, and how that is read.
+"""The kinds of residual by name, each said once: what a run of it leaves, and how that is read.
 
 A new kind is a class with the interface `sim.force_model.ForceModel`, a function that loads it from a run's folder, and
 an entry in `KINDS`.

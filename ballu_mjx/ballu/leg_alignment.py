@@ -1,4 +1,5 @@
-"""What the legs do on commands: measured, and as the nominal robot would; for `alignment`."""
+"""What the legs do on commands, measured and as the nominal robot would: `recordings.clock_alignment` finds the offset
+of the clocks at which the two agree."""
 
 from __future__ import annotations
 
