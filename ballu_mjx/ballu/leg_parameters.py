@@ -44,7 +44,8 @@ class IdentificationConfig:
     cable_stiffness: bool = True
     """Identify the cables' stiffness too."""
     knee_spring_reference: bool = False
-    """Identify where the knees' springs would be at rest, and with it how far they are preloaded, too."""
+    """Identify where the knees' springs would be at rest, and with it how far they are preloaded, too. Held by default:
+    the design says where that is, and in a sweep it trades with the springs' stiffness."""
     motion: bool = True
     """Learn from the whole motion, not from settled angles alone; delay, lag, backlash, dry friction and the knee's
     damping are then further unknowns."""
@@ -75,6 +76,7 @@ class ParameterRange(NamedTuple):
     """How much robots differ (standard deviation): of the logarithm where there is a factor, else of the value."""
 
 
+# Makers of springs quote 10 % on the rate (Lee Spring, "Engineering Notes and Tolerances").
 RANGES: dict[str, ParameterRange] = {
     "knee_spring_stiffness": ParameterRange(4.0, (0.0, 0.0), 0.1),
     "motor_gain": ParameterRange(16.0, (0.0, 0.0), 0.7),
