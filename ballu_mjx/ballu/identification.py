@@ -420,7 +420,12 @@ class Identifier:
         if not np.array_equal(coordinates, by_settled):
             both = [self._follow(y, data, kept, report, _SHORT) for y in (coordinates, by_settled)]
             coordinates = self._nearest(both, data, kept)
-        return self._follow(coordinates, data, kept, report, config.steps), ends
+        ended = self._follow(coordinates, data, kept, report, config.steps)
+        # Stiction, lag and play can stand in for each other, and a slack at its bound has no slope: once more, with the
+        # dynamics back where they began and what stands at a bound back at its nominal value.
+        inside = np.where(np.abs(ended[:, :size]) > _INSIDE, draws[0], ended[:, :size])
+        again = np.concatenate([inside, np.tile(first, (len(legs), 1))], axis=1)
+        return self._nearest([ended, self._follow(again, data, kept, report, config.steps)], data, kept), ends
 
     def _follow(
         self,
