@@ -330,7 +330,7 @@ class Identifier:
             coordinates, _ = self._squares(
                 lambda y: self._with_priors(y, data, kept, spread),
                 coordinates,
-                config.steps,
+                2 * config.steps,  # along the weakest directions, which the data alone left open
                 partial(report, "priors"),
                 _PATIENCE,
             )
