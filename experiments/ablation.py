@@ -27,10 +27,10 @@ import _setup
 _setup.prepare()
 
 import jax
-import numpy as np
 
 from ballu_mjx.ballu.actuators_file import read_actuators
 from ballu_mjx.ballu.virtual import dataset
+from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.errors import SCORE_HORIZONS
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
@@ -129,25 +129,21 @@ def train(
 
 
 # %% [markdown]
-# ## Table: mean over seeds, with the lowest and the highest
+# ## Table: one value a seed
 
 
 # %%
-def table(results: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> str:
-    """Markdown: at the best validation, as the main job chooses it, and the score at the end of training."""
+def table(results: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> Table:
+    """At the best validation, as the main job chooses it, and the score at the end of training."""
     names = list(next(iter(results.values()))[0][0]["ratios"])
-    lines = ["| | seeds | best score | last score | " + " | ".join(f"{name} s" for name in names) + " |"]
-    lines.append("| --- " * (4 + len(names)) + "|")
+    rows = []
     for label, histories in results.items():
         best = [min(history, key=lambda entry: entry["score"]) for history in histories]
-        cells = [_spread([entry["score"] for entry in best]), _spread([history[-1]["score"] for history in histories])]
-        cells += [f"{np.mean([entry['ratios'][name] for entry in best]):.2f}" for name in names]
-        lines.append(f"| {label} | {len(histories)} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
-def _spread(values: Sequence[float]) -> str:
-    return f"{np.mean(values):.2f} ({min(values):.2f} to {max(values):.2f})"
+        scores = (best, [history[-1] for history in histories])
+        cells = [Cell(tuple(entry["score"] for entry in entries)) for entries in scores]
+        cells += [Cell(tuple(entry["ratios"][name] for entry in best), spread=False) for name in names]
+        rows.append((label, Cell((len(histories),), ".0f"), *cells))
+    return Table(("", "seeds", "best score", "last score", *(f"{name} s" for name in names)), tuple(rows))
 
 
 # %% [markdown]
@@ -163,6 +159,7 @@ def main() -> None:
     parser.add_argument("--fresh", type=int, default=7, help="seed of the recordings to measure on")
     parser.add_argument("--output", type=Path, default=Path("runs/ablation"), help="folder of the results")
     parser.add_argument("--quick", action="store_true", help="two rows, trained for seconds; the numbers mean nothing")
+    parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     options = parser.parse_args()
 
     training = list_bundled("training")
@@ -191,8 +188,8 @@ def main() -> None:
                 seconds = time.perf_counter() - started
                 print(f"{label}, seed {seed}: {history[-1]['score']:.2f} ({seconds:.0f} s)", flush=True)
             results.setdefault(label, []).append(json.loads(path.read_text())["validations"])
-    text = table(results)
-    _setup.write_table(text, options.output)
+    used = {"training": seeds, "recordings": [options.fresh]}
+    _setup.write_tables({"options": table(results)}, options.output, options.results, used)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,8 @@
 #
 # The air is identified beside legs that have neither dry friction nor backlash and slack; the robot's have both. Here
 # the bundled robot's training gaits are recorded anew on robots without one or both of these, and the air identified
-# from each: what it finds beside the truth that no robot's legs change.
+# from each: what it finds beside the truth that no robot's legs change. Of the robot with all of its legs, a second
+# table has all sixteen numbers.
 #
 # `python experiments/air_bias.py` takes about ten minutes on one core; `--quick` takes three gaits of two robots.
 
@@ -22,15 +23,18 @@ import _setup
 _setup.prepare()
 
 import deflation
+import numpy as np
 
 from ballu_mjx.ballu.actuators_file import read_actuators
 from ballu_mjx.ballu.model import buoyancy_ratio, load_model
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.cli import train_aerodynamics
+from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.recordings.reconstruct import reconstruct
-from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
+from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, identify_air
 from ballu_mjx.robots.model import assets
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.simulator import Simulator
@@ -38,8 +42,9 @@ from ballu_mjx.sim.simulator import Simulator
 NONE = (0.0, 0.0)
 FRICTION = {"knee_friction": NONE, "motor_friction": NONE}
 PLAY = {"backlash": NONE, "cable_slack": NONE}
+WHOLE = "all of its legs"
 ROBOTS = {
-    "all of its legs": {},
+    WHOLE: {},
     "no dry friction": FRICTION,
     "no backlash or slack": PLAY,
     "neither": FRICTION | PLAY,
@@ -47,20 +52,89 @@ ROBOTS = {
 """What is another, of the virtual robot."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Quantity:
+    """How a parameter of the air is shown."""
+
+    label: str
+    form: str
+    scale: float = 1.0
+    """From SI units to those of the label."""
+    axes: str = ""
+    """Of a vector."""
+
+
+QUANTITIES = {
+    "added_mass": Quantity("added mass (kg)", ".3f"),
+    "added_inertia": Quantity("added inertia (kg m^2)", ".4f"),
+    "lift": Quantity("lift beyond the model's (mN)", ".1f", 1e3),
+    "centre": Quantity("centre of mass and lift (mm)", ".1f", 1e3, "xyz"),
+    "delay": Quantity("delay of commands (ms)", ".0f", 1e3),
+    "linear_drag": Quantity("linear drag (N s/m)", ".3f", axes="xyz"),
+    "quadratic_drag": Quantity("quadratic drag (N s^2/m^2)", ".2f", axes="xyz"),
+    "turning_drag": Quantity("drag on turning (N m s)", ".4f", axes="xyz"),
+}
+BIASED = ("lift", "added_mass", "added_inertia", "delay")
+"""What the legs might pass for."""
+
+
+# %% [markdown]
+# ## Tables
+
+
+# %%
+def truth(robot: VirtualRobot, model_buoyancy: float) -> dict[str, tuple[float, ...]]:
+    """Parameters of the robot's air that it has itself; its drag has another form."""
+    return {
+        "added_mass": (robot.added_mass,),
+        "added_inertia": (robot.added_inertia,),
+        "lift": (deflation.lift(robot.buoyancy - model_buoyancy),),
+        "centre": robot.balloon_offset,
+        "delay": (robot.latency,),
+    }
+
+
+def identified_table(fit: AirFit, true: dict[str, tuple[float, ...]]) -> Table:
+    """Return all parameters with their standard errors, beside the true ones."""
+    rows = []
+    for name, quantity in QUANTITIES.items():
+        found, errors = (np.ravel(getattr(of, name)) * quantity.scale for of in (fit.parameters, fit.standard_errors))
+        for place, (value, error) in enumerate(zip(found.tolist(), errors.tolist(), strict=True)):
+            label = quantity.label + (f", {quantity.axes[place]}" if quantity.axes else "")
+            own = Cell((quantity.scale * true[name][place],), quantity.form) if name in true else ""
+            rows.append((label, Cell((value,), quantity.form, standard_error=error), own))
+    return Table(("", "identified (standard error)", "the virtual robot's"), tuple(rows))
+
+
+def legs_table(fits: dict[str, AirFit], true: dict[str, tuple[float, ...]]) -> Table:
+    """Return what was found on each robot."""
+    shown = [(name, QUANTITIES[name]) for name in BIASED]
+    own = [Cell((quantity.scale * true[name][0],), quantity.form) for name, quantity in shown]
+    rows: list[tuple[Cell | str, ...]] = [("truth", *own, "")]
+    for robot, fit in fits.items():
+        cells = []
+        for name, quantity in shown:
+            found, error = (quantity.scale * float(getattr(of, name)) for of in (fit.parameters, fit.standard_errors))
+            cells.append(Cell((found,), quantity.form, standard_error=error))
+        rows.append((robot, *cells, Cell((fit.cost[1],), ".0f")))
+    return Table(("robot", *(quantity.label for _, quantity in shown), "cost"), tuple(rows))
+
+
+# %% [markdown]
+# ## All of it
+
+
+# %%
 def main() -> None:
     parser = argparse.ArgumentParser(description="What the legs lack, found as air.")
     parser.add_argument("--output", type=Path, default=Path("runs/air-bias"), help="folder of recordings and table")
     parser.add_argument("--quick", action="store_true", help="three gaits of two robots; the numbers mean little")
+    parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     options = parser.parse_args()
 
     model = load_model(read_actuators(assets() / "recordings" / ACTUATORS_FILE)[1])
-    full = virtual_robot.draw_robot(0)
-    lift = deflation.lift(full.buoyancy - buoyancy_ratio(model))
-    lines = [
-        "| robot | lift (mN) | added mass (kg) | added inertia (kg m^2) | delay (ms) | cost |",
-        "| --- | ---: | ---: | ---: | ---: | ---: |",
-        f"| truth | {lift * 1e3:.0f} | {full.added_mass:.3f} | {full.added_inertia:.4f} | {full.latency * 1e3:.0f} | |",
-    ]
+    full = virtual_robot.draw_robot(dataset.ROBOT_SEED)
+    fits: dict[str, AirFit] = {}
     config = AirConfig(**train_aerodynamics.QUICK) if options.quick else AirConfig()
     training = [job for job in dataset.jobs() if job.split == "training"][: 3 if options.quick else None]
     for name, changes in list(ROBOTS.items())[: 2 if options.quick else None]:
@@ -68,17 +142,12 @@ def main() -> None:
         folder = options.output / name.replace(" ", "-")
         gaits = [deflation.recorded(job, legs, 2000 + number, folder) for number, job in enumerate(training)]
         motions = [reconstruct(gait, load_robot(), model) for gait in gaits]
-        fit = identify_air(Simulator(load_robot(), model=model), motions, config)
-        air, error = fit.parameters, fit.standard_errors
-        lines.append(
-            f"| {name} | {float(air.lift) * 1e3:.0f} ({float(error.lift) * 1e3:.0f}) | "
-            f"{float(air.added_mass):.3f} ({float(error.added_mass):.3f}) | "
-            f"{float(air.added_inertia):.4f} ({float(error.added_inertia):.4f}) | "
-            f"{float(air.delay) * 1e3:.0f} ({float(error.delay) * 1e3:.0f}) | {fit.cost[1]:.0f} |"
-        )
-        print(lines[-1], flush=True)
-    _setup.write_table("\n".join(lines), options.output)
-    print(f"\nIn brackets standard errors. Written to {options.output}.")
+        fits[name] = identify_air(Simulator(load_robot(), model=model), motions, config)
+        print(f"{name}: cost {fits[name].cost[1]:.0f}", flush=True)
+    true = truth(full, buoyancy_ratio(model))
+    tables = {"identified": identified_table(fits[WHOLE], true), "legs": legs_table(fits, true)}
+    _setup.write_tables(tables, options.output, options.results, {"robot": [dataset.ROBOT_SEED]})
+    print(f"\nIn parentheses standard errors. Written to {options.output}.")
 
 
 if __name__ == "__main__":

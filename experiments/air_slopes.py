@@ -32,6 +32,7 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.segment_errors import pseudo_huber
 from ballu_mjx.recordings.segments import Segments
@@ -103,12 +104,13 @@ def main() -> None:
     parser.add_argument("--air", type=Path, required=True, help="run of `train aerodynamic`, before the loss")
     parser.add_argument("--output", type=Path, default=Path("runs/air-slopes"), help="folder of the table and figure")
     parser.add_argument("--quick", action="store_true", help="windows of half a second alone")
+    parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     options = parser.parse_args()
 
     known = TrainedResidual.load(options.air, load_robot())
     simulator = Simulator(load_robot(), known.actuators)
     model = simulator.mj_model
-    full = virtual_robot.draw_robot(0)
+    full = virtual_robot.draw_robot(dataset.ROBOT_SEED)
     deflated = dataclasses.replace(full, buoyancy=full.buoyancy * (1 - LOSS))
     lost = deflation.lift(LOSS * full.buoyancy)
     gait = next(job for job in dataset.jobs() if job.split == "training")
@@ -120,10 +122,8 @@ def main() -> None:
     vector, unravel = ravel_pytree(dataclasses.replace(known.params, delay=jax.numpy.float32(delay)))
     lift = int(unravel(jax.numpy.arange(len(vector), dtype=vector.dtype)).lift)
 
-    lines = [
-        "| window (s) | " + " | ".join(f"{step * 1e3:g} mN" for step in STEPS) + " | length, of that over 30 mN |",
-        "| --- " + "| ---: " * (len(STEPS) + 1) + "|",
-    ]
+    columns = (*(f"{step * 1e3:g} mN" for step in STEPS), "length, of that over 30 mN")
+    rows = []
     lengths = (0.5,) if options.quick else (0.5, 1.0, 2.0)
     figure, axes = plt.subplots(1, len(lengths), figsize=(3.6 * len(lengths), 3.2), layout="constrained", squeeze=False)
     for length, axis in zip(lengths, axes[0], strict=True):
@@ -132,18 +132,18 @@ def main() -> None:
         same = [float(np.median(cosines(found.derivative, found.differences[step]))) for step in STEPS]
         smooth = np.linalg.norm(found.differences[30e-3], axis=1)
         ratio = np.median(np.linalg.norm(found.derivative, axis=1) / smooth)
-        lines.append(f"| {length:g} | " + " | ".join(f"{cosine:.2f}" for cosine in same) + f" | {ratio:.1f} |")
+        rows.append((Cell((length,), "g"), *(Cell((cosine,)) for cosine in same), Cell((float(ratio),), ".1f")))
         axis.plot(found.loss[:, 0] * 1e3, found.loss[:, 1], color="0.2")
         axis.axvline(lost * 1e3, color="0.6", linestyle=":", label="truth")
         axis.set_title(f"windows of {length:g} s")
         axis.set_xlabel("lift lost (mN)")
     axes[0, 0].set_ylabel("cost")
     axes[0, 0].legend(frameon=False)
-    text = "\n".join(lines)
     figure.savefig(options.output / "cost.png", dpi=150)
     plt.close(figure)
     print("How far errors change as their derivative says: median cosine over windows, by the size of the step\n")
-    _setup.write_table(text, options.output)
+    tables = {"slopes": Table(("window (s)", *columns), tuple(rows))}
+    _setup.write_tables(tables, options.output, options.results, {"robot": [dataset.ROBOT_SEED]})
     print(f"\nWritten to {options.output}.")
 
 

@@ -16,8 +16,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
-import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 sys.path.append("experiments")  # a notebook runs in the repository's root
@@ -34,6 +33,7 @@ from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.cli import train_aerodynamics
+from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.errors import Evaluation, base_name
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.csv_format import read_recording
@@ -44,6 +44,9 @@ from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.simulator import Simulator
+
+HORIZON = 5.0
+"""s."""
 
 # %% [markdown]
 # ## Recordings: the same commands, with all of the lift and with less
@@ -67,16 +70,24 @@ def lift(buoyancy: float) -> float:
 
 
 # %%
-def row(label: str, result: Evaluation) -> str:
-    """Errors at 5 s by group: position (m), yaw (deg)."""
-    cells = []
-    for group in result.groups:
-        position, yaw = (
-            np.mean([getattr(errors, quantity)[5.0][0] for errors in result.residual if errors.group == group])
-            for quantity in ("position", "orientation")
-        )
-        cells.append(f"{position:.3f} m, {yaw:.1f} deg")
-    return f"| {label} | " + " | ".join(cells) + " |"
+def errors_table(results: Mapping[str, Evaluation]) -> Table:
+    """Return errors over 5 s, by group; cells have one value a recording."""
+    groups = sorted(next(iter(results.values())).groups, reverse=True)  # near before far
+    forms = {"position": ".3f", "orientation": ".1f"}
+    columns = [f"{group}: {called}" for group in groups for called in ("position (m)", "yaw (deg)")]
+    rows = []
+    for label, result in results.items():
+        cells = [
+            Cell(
+                tuple(getattr(errors, quantity)[HORIZON][0] for errors in result.residual if errors.group == group),
+                form,
+                spread=False,
+            )
+            for group in groups
+            for quantity, form in forms.items()
+        ]
+        rows.append((label, *cells))
+    return Table((f"{HORIZON:g} s", *columns), tuple(rows))
 
 
 def main() -> None:
@@ -87,6 +98,7 @@ def main() -> None:
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the larger test set")
     parser.add_argument("--output", type=Path, default=Path("runs/deflation"), help="folder of the run and the table")
     parser.add_argument("--quick", action="store_true", help="one test gait; the numbers mean little")
+    parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     options = parser.parse_args()
 
     air = options.air
@@ -96,7 +108,7 @@ def main() -> None:
     known = TrainedResidual.load(air, load_robot())
     simulator = Simulator(load_robot(), known.actuators)
     model = simulator.mj_model
-    full = virtual_robot.draw_robot(0)
+    full = virtual_robot.draw_robot(dataset.ROBOT_SEED)
     deflated = dataclasses.replace(full, buoyancy=full.buoyancy * (1 - options.loss))
     bundled = dataset.jobs()
     tests = [*(job for job in bundled if job.split == "test"), *dataset.fresh_jobs(options.fresh)]
@@ -110,38 +122,28 @@ def main() -> None:
     before, after = motions(full, tests, 1000, "before"), motions(deflated, tests, 1000, "after")
     training = [job for job in bundled if job.split == "training"]
     every = motions(deflated, training if options.anew else training[:1], 2000, "after")
-    one = every[:1]
-    seconds = []
-    for _ in range(2):  # the first compiles
-        started = time.perf_counter()
-        fit = identify_air(simulator, one, AirConfig(), fixed_from=known.params, free=("lift",))
-        seconds.append(time.perf_counter() - started)
+    fit = identify_air(simulator, every[:1], AirConfig(), fixed_from=known.params, free=("lift",))
 
     sound = OpenLoopEvaluator(simulator, before, known.model, base_name(True))(known.params)
     evaluator = OpenLoopEvaluator(simulator, after, known.model, base_name(True))
-    rows = [
-        row("all of the lift", sound),
-        row(f"{options.loss:.0%} less, lift as it was", evaluator(known.params)),
-        row(f"{options.loss:.0%} less, lift from one recording", evaluator(fit.parameters)),
-    ]
+    less = f"{options.loss:.0%} less"
+    results = {
+        "all of the lift": sound,
+        f"{less}, lift as it was": evaluator(known.params),
+        f"{less}, lift from one recording": evaluator(fit.parameters),
+    }
     if options.anew:
         anew = identify_air(simulator, every, AirConfig(**train_aerodynamics.QUICK if options.quick else {}))
-        rows.append(
-            row(f"{options.loss:.0%} less, all of the air, {len(every)} recordings", evaluator(anew.parameters))
-        )
+        results[f"{less}, all of the air, {len(every)} recordings"] = evaluator(anew.parameters)
     lost, found = lift(options.loss * full.buoyancy), float(known.params.lift - fit.parameters.lift)
-    groups = " | ".join(f"{group}, 5 s" for group in sound.groups)
-    text = "\n".join(
-        [
-            f"| | {groups} |",
-            "| --- " * (1 + len(sound.groups)) + "|",
-            *rows,
-            "",
-            f"Lift lost: {lost * 1e3:.0f} mN; found: {found * 1e3:.0f} mN "
-            f"(standard error {float(fit.standard_errors.lift) * 1e3:.1f}), in {seconds[1]:.0f} s beside compiling.",
-        ]
-    )
-    _setup.write_table(text, options.output)
+    error = 1e3 * float(fit.standard_errors.lift)
+    lift_row = (Cell((1e3 * lost,), ".0f"), Cell((1e3 * found,), ".0f", standard_error=error))
+    tables = {
+        "errors": errors_table(results),
+        "lift": Table(("lift lost (mN)", "found (standard error)"), (lift_row,)),
+    }
+    seeds = {"robot": [dataset.ROBOT_SEED], "recordings": [options.fresh]}
+    _setup.write_tables(tables, options.output, options.results, seeds)
 
 
 if __name__ == "__main__":

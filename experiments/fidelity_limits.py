@@ -18,6 +18,7 @@ import dataclasses
 import multiprocessing
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 sys.path.append("experiments")  # a notebook runs in the repository's root
@@ -36,6 +37,7 @@ from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
+from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.open_loop import START_INTERVAL
 from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.reconstruct import reconstruct
@@ -144,25 +146,37 @@ def errors(virtual: VirtualRobot, job: dataset.Job) -> tuple[str, Float[np.ndarr
 
 
 # %%
+def table(found: Sequence[tuple[str, Float[np.ndarray, "variants 2"]]]) -> Table:
+    """Return errors by variant and group; cells have one value a recording. `found` is of each recording: see
+    `errors`."""
+    groups = sorted({group for group, _ in found}, reverse=True)  # near before far
+    columns = [f"{group}: {quantity}" for group in groups for quantity in ("position (mm)", "yaw (deg)")]
+    rows = []
+    for place, variant in enumerate(VARIANTS):
+        cells: list[Cell] = []
+        for group in groups:
+            away, turned = np.transpose([rows[place] for of, rows in found if of == group]).tolist()
+            cells += [Cell(tuple(1e3 * each for each in away), ".0f", spread=False)]
+            cells += [Cell(tuple(turned), ".1f", spread=False)]
+        rows.append((variant.label, *cells))
+    return Table((f"{HORIZON:g} s", *columns), tuple(rows))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="What no simulator could do better, and what each shortcut costs.")
     parser.add_argument("--robot", type=int, default=dataset.ROBOT_SEED, help="seed of the virtual robot")
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the test set, that of fidelity.py")
     parser.add_argument("--output", type=Path, default=Path("runs/fidelity-limits"), help="folder of the table")
     parser.add_argument("--quick", action="store_true", help="two recordings; the numbers mean little")
+    parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     options = parser.parse_args()
 
     virtual = virtual_robot.draw_robot(options.robot)
     jobs = dataset.fresh_jobs(options.fresh, 1 if options.quick else 6)
     with multiprocessing.get_context("spawn").Pool() as pool:
         found = pool.starmap(errors, [(virtual, job) for job in jobs], chunksize=1)
-    groups = sorted({group for group, _ in found}, reverse=True)  # near before far
-    means = {group: np.mean([rows for of, rows in found if of == group], axis=0) for group in groups}
-    lines = [f"| {HORIZON:g} s | " + " | ".join(groups) + " |", "| --- " + "| ---: " * len(groups) + "|"]
-    for place, variant in enumerate(VARIANTS):
-        cells = [f"{1e3 * means[group][place, 0]:.0f} mm, {means[group][place, 1]:.1f} deg" for group in groups]
-        lines.append(f"| {variant.label} | " + " | ".join(cells) + " |")
-    _setup.write_table("\n".join(lines), options.output)
+    seeds = {"robot": [options.robot], "recordings": [options.fresh]}
+    _setup.write_tables({"limits": table(found)}, options.output, options.results, seeds)
     print(f"\n{len(jobs)} recordings. Written to {options.output}.")
 
 

@@ -6,8 +6,8 @@
 # the validation recordings, with true states instead of motion capture's. The force that explains *these* is what the
 # network should have said.
 #
-# `python experiments/force_labels.py RUN [RUN ...]`, of `train supervised` on the bundled recordings,
-# takes two minutes. The table is in docs/fidelity.md, beside what the same networks do in open loop.
+# `python experiments/force_labels.py RUN [RUN ...]`, of `train supervised --force-scales 1` on the bundled recordings,
+# one run a seed, takes two minutes. The table is in docs/fidelity.md, beside what such networks do in open loop.
 
 # %%
 from __future__ import annotations
@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 sys.path.append("experiments")  # a notebook runs in the repository's root
@@ -23,6 +24,7 @@ import _setup
 
 _setup.prepare()
 
+import collect_runs
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
@@ -31,6 +33,7 @@ from jaxtyping import Float
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
@@ -82,21 +85,25 @@ def forces(simulator: Simulator, residual: TrainedResidual, motion: Motion) -> F
     return np.asarray(jax.jit(jax.vmap(at))(np.arange(HISTORY - 1, len(motion.command))))
 
 
+GROUPS = ("near", "far")
+
+
 def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def row(name: str, found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> str:
-    """Markdown: the error of `found`, over that of no force at all."""
-    cells = []
-    for group in ("near", "far"):
+def cells(found: Sequence[Mapping[str, np.ndarray]], true: Mapping[str, np.ndarray]) -> list[Cell]:
+    """By group, all axes and then each: the error of forces over that of no force; one value for each of `found`."""
+
+    def off(forces: Mapping[str, np.ndarray], group: str, axes: slice) -> float:
         ours, exact = (
-            np.concatenate([each for motion, each in forces.items() if motion.startswith(group)])
-            for forces in (found, true)
+            np.concatenate([force[:, axes] for motion, force in each.items() if motion.startswith(group)])
+            for each in (forces, true)
         )
-        cells.append(f"{rms(ours - exact) / rms(exact):.2f}")
-        cells.append(", ".join(f"{rms(ours[:, i] - exact[:, i]) / rms(exact[:, i]):.2f}" for i in range(3)))
-    return f"| {name} | " + " | ".join(cells) + " |"
+        return rms(ours - exact) / rms(exact)
+
+    parts = (slice(None), *(slice(i, i + 1) for i in range(3)))
+    return [Cell(tuple(off(forces, group, axes) for forces in found)) for group in GROUPS for axes in parts]
 
 
 def figure(shown: dict[str, np.ndarray], title: str, path: Path, seconds: float = 6.0) -> None:
@@ -120,11 +127,13 @@ def figure(shown: dict[str, np.ndarray], title: str, path: Path, seconds: float 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Are the forces that regression finds the right ones?")
-    parser.add_argument("runs", type=Path, nargs="+", help="of train supervised")
+    parser.add_argument("runs", type=Path, nargs="+", help="of train supervised, which differ in their seed")
     parser.add_argument("--output", type=Path, default=Path("runs/force_labels"), help="folder of table and figure")
+    parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()
-    networks = {folder.name: TrainedResidual.load(folder, load_robot()) for folder in arguments.runs}
-    first = next(iter(networks.values()))
+    networks = [TrainedResidual.load(folder, load_robot()) for folder in arguments.runs]
+    seeds = [collect_runs.seed_of(read_config(folder, "supervised")) for folder in arguments.runs]
+    first = networks[0]
     robot = load_robot()
     config = typed_config(SupervisedConfig, read_config(arguments.runs[0], "supervised"), "fit", arguments.runs[0])
     simulator = Simulator(robot, first.actuators)
@@ -141,16 +150,18 @@ def main() -> None:
             seen = read_recording(recordings[f"{job.name}.csv.gz"], load_robot())
             labels[job.name] = label(reconstruct(seen, load_robot(), simulator.mj_model))[HISTORY - 1 :]
             print(f"{job.name}: true forces {1e3 * rms(true[job.name]):.0f} mN (RMS along an axis)", flush=True)
-    lines = ["| error over that of no force | near | x, y, z | far | x, y, z |", "| --- " * 5 + "|"]
-    lines.append(row("labels from motion capture", labels, true))
-    for name, network in networks.items():
-        found = {each: forces(simulator, network, motion) for each, motion in twins.items()}
-        lines.append(row(name, found, true))
+    found = [{name: forces(simulator, network, motion) for name, motion in twins.items()} for network in networks]
+    columns = [f"{group}{axis}" for group in GROUPS for axis in ("", ": x", ": y", ": z")]
+    rows = (
+        ("labels from motion capture", *cells([labels], true)),
+        ("network from true states", *cells(found, true)),
+    )
+    table = Table(("error over that of no force", *columns), rows)
     arguments.output.mkdir(parents=True, exist_ok=True)
     shown = next(iter(true))
-    series = {"true": true[shown], "label": labels[shown], "network": forces(simulator, first, twins[shown])}
+    series = {"true": true[shown], "label": labels[shown], "network": found[0][shown]}
     figure(series, f"{shown}: the force that explains each control step", arguments.output / "force_labels.png")
-    _setup.write_table("\n".join(lines), arguments.output)
+    _setup.write_tables({"forces": table}, arguments.output, arguments.results, {"training": seeds})
     print(f"\nWritten to {arguments.output}.")
 
 

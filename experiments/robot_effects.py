@@ -7,6 +7,7 @@
 # one alone. What a setting gains where an effect is missing is what this effect costs it.
 #
 # `python experiments/robot_effects.py --output runs/all` takes a few minutes; stages that are missing are made first.
+# `--quick` shows that it works.
 
 # %%
 from __future__ import annotations
@@ -25,6 +26,7 @@ import _setup
 _setup.prepare()
 
 import numpy as np
+import transfer_tables
 
 from ballu_mjx.ballu.actuators import CABLE_SLACK, ActuatorParameters
 from ballu_mjx.ballu.model import load_model
@@ -32,6 +34,7 @@ from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.ballu.virtual.trials import run_trials
 from ballu_mjx.cli import pipeline
+from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.transfer import Transfer
 from ballu_mjx.policies import pipeline_layout
 from ballu_mjx.policies.policy import Policy
@@ -114,16 +117,21 @@ def measure(policy: Policy, robots: dict[str, VirtualRobot], count: int, folder:
     return results
 
 
-def table(results: dict[str, dict[str, list[Transfer]]], quantity: str, label: str) -> str:
-    """Markdown: means over trials, and the spread."""
-    lines = [f"| {label} | " + " | ".join(results) + " |", "| --- " + "| ---: " * len(results) + "|"]
+def table(results: dict[str, dict[str, list[Transfer]]], distance: str) -> Table:
+    """Return errors between robot and simulation and how far the robot came along `distance`, by setting; cells have
+    one value a trial."""
+    columns = [
+        f"{setting}: {called} (m)" for setting in results for called in ("mean CoM error", f"{distance}-distance")
+    ]
+    rows = []
     for name in next(iter(results.values())):
-        cells = []
-        for transfers in results.values():
-            values = [getattr(t, quantity) for t in transfers[name]]
-            cells.append(f"{np.mean(values):.2f} ± {np.std(values):.2f}")
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        cells = [
+            Cell(tuple(getattr(transfer, quantity) for transfer in transfers[name]))
+            for transfers in results.values()
+            for quantity in ("com_error", f"{distance}_distance")
+        ]
+        rows.append((name, *cells))
+    return Table(("robot", *columns), tuple(rows))
 
 
 # %% [markdown]
@@ -133,7 +141,11 @@ def table(results: dict[str, dict[str, list[Transfer]]], quantity: str, label: s
 # %%
 def main() -> None:
     parser = argparse.ArgumentParser(description="Which of the virtual robot's effects cost a policy its way.")
-    parser.add_argument("--output", type=Path, default=Path("runs/all"), help="folder of `train all`")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        help=f"folder of `train all` ({transfer_tables.OUTPUT}, or {transfer_tables.QUICK_OUTPUT} under --quick)",
+    )
     parser.add_argument("--robot-seed", type=int, default=0, help="the robot that `train all` ran on")
     parser.add_argument("--seed", type=int, default=0, help="whose policies")
     parser.add_argument("--task", default="walk", choices=("walk", "turn"))
@@ -141,20 +153,25 @@ def main() -> None:
         "--settings", nargs="+", default=list(pipeline_layout.SETTINGS), choices=pipeline_layout.SETTINGS
     )
     parser.add_argument("--trials", type=int, default=3, help="trials of each policy on each robot")
+    parser.add_argument("--quick", action="store_true", help="train for seconds, try once; the numbers mean nothing")
+    parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()
-    story = pipeline.Story(pipeline.Options(output=arguments.output, robot_seed=arguments.robot_seed), arguments.seed)
+    quick = arguments.quick
+    output = arguments.output or (transfer_tables.QUICK_OUTPUT if quick else transfer_tables.OUTPUT)
+    options = pipeline.Options(output=output, robot_seed=arguments.robot_seed, quick=quick)
+    story, trials = pipeline.Story(options, arguments.seed), 1 if quick else arguments.trials
     robots = variants(virtual_robot.draw_robot(arguments.robot_seed))
-    folder = arguments.output / f"effects-{arguments.task}-seed-{arguments.seed}"
+    folder = output / f"effects-{arguments.task}-seed-{arguments.seed}"
     results = {}
     for setting in arguments.settings:
         policy = Policy.load(story.policy(arguments.task, setting))
-        results[setting] = measure(policy, robots, arguments.trials, folder / setting)
-    distance, label = ("x_distance", "x-distance (m)") if arguments.task == "walk" else ("y_distance", "y-distance (m)")
-    text = table(results, distance, label) + "\n\n" + table(results, "com_error", "mean CoM error (m)")
+        results[setting] = measure(policy, robots, trials, folder / setting)
     plain = {s: {n: [t.to_json() for t in found] for n, found in by.items()} for s, by in results.items()}
     (folder / "effects.json").write_text(json.dumps(plain, indent=2) + "\n")
-    (folder / "effects.md").write_text(text + "\n")
-    print(f"\n{text}\n\nWritten to {folder}.")
+    seeds = {"training": [arguments.seed], "robot": [arguments.robot_seed]}
+    tables = {"effects": table(results, "x" if arguments.task == "walk" else "y")}
+    _setup.write_tables(tables, folder, arguments.results, seeds)
+    print(f"\nWritten to {folder}.")
 
 
 if __name__ == "__main__":

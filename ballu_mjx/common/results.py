@@ -37,6 +37,8 @@ class Cell:
     """Show the lowest and the highest beside the mean."""
     bounds: tuple[float, float] | None = None
     """Ends of a confidence interval, shown instead of the lowest and the highest; None: there is none."""
+    standard_error: float | None = None
+    """Of one estimated value, shown in parentheses in its format; None: there is none."""
 
     def to_text(self) -> str:
         """Return the mean, and the lowest and the highest in brackets; without them where there is one value."""
@@ -48,7 +50,8 @@ class Cell:
         ends = (min(self.values), max(self.values)) if self.bounds is None else self.bounds
         mean, low, high = (_format(value, self.form) for value in (statistics.fmean(self.values), *ends))
         unit = f" {self.unit}" if self.unit else ""
-        return f"{mean}{unit}" + (f" [{low}, {high}]" if self.spread and len(self.values) > 1 else "")
+        error = "" if self.standard_error is None else f" ({_format(self.standard_error, self.form)})"
+        return f"{mean}{error}{unit}" + (f" [{low}, {high}]" if self.spread and len(self.values) > 1 else "")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,6 +194,9 @@ def _table_from_json(content: Mapping[str, Any]) -> Table:
             raise ValueError("a cell holds what is no number")
         values = tuple(math.inf if x is None else float(x) for x in value["values"])
         bounds = None if value["bounds"] is None else (float(value["bounds"][0]), float(value["bounds"][1]))
-        return Cell(**value | {"values": values, "bounds": bounds})
+        error = value.get("standard_error")  # older files have none
+        return Cell(
+            **value | {"values": values, "bounds": bounds, "standard_error": None if error is None else float(error)}
+        )
 
     return Table(tuple(content["columns"]), tuple(tuple(cell(value) for value in row) for row in content["rows"]))

@@ -31,6 +31,7 @@ def test_cells_show_mean_and_range_and_what_diverged():
     assert Cell(()).to_text() == ""
     assert Cell((-0.4, -3.0, 2.0), ".0f").to_text() == "0 [-3, 2]"
     assert Cell((1.0, 3.0), ".1f", bounds=(0.5, 3.5)).to_text() == "2.0 [0.5, 3.5]"
+    assert Cell((-1.26,), ".1f", "mm", standard_error=0.34).to_text() == "-1.3 (0.3) mm"
     with pytest.raises(ValueError, match="2 cells"):
         Table(("a", "b"), (("one",),))
 
@@ -41,7 +42,7 @@ def test_results_are_read_as_written_and_say_where_they_come_from(folder: Path):
     assert found.machine["cores"] > 0 and found.versions["jax"]
     assert found.caption().startswith("Development data. `python ")
     assert found.caption().endswith("Training seeds: 3, 4.")
-    infinite = Table(("a",), ((Cell((1.0, math.inf)),),))
+    infinite = Table(("a",), ((Cell((1.0, math.inf), standard_error=0.5),),))
     write_results(folder / "infinite.json", {"a": infinite}, "Data")
     assert read_results(folder / "infinite.json").tables["a"] == infinite
     assert json.loads((folder / "infinite.json").read_text())["tables"]["a"]["rows"][0][0]["values"] == [1.0, None]
