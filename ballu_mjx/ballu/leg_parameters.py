@@ -46,6 +46,9 @@ class IdentificationConfig:
     knee_spring_reference: bool = False
     """Identify where the knees' springs would be at rest, and with it how far they are preloaded, too. Held by default:
     the design says where that is, and in a sweep it trades with the springs' stiffness."""
+    nominal_springs: bool = True
+    """With the richer model, hold the knees' springs at their nominal stiffness. A sweep shows the scale of forces by
+    gravity alone, and small errors of the model decide it then."""
     motion: bool = True
     """Learn from the whole motion, not from settled angles alone; delay, lag, backlash, dry friction and the knee's
     damping are then further unknowns."""
