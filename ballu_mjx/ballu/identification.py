@@ -231,6 +231,11 @@ dozens of iterations."""
 _INSIDE = 4.0
 """Largest coordinate that a search of the motion starts from: 2 % of the bounds' span inside them. A slack that settled
 angles put at its bound has next to no slope left, and would stay there."""
+_FORCES = (
+    "knee_spring_stiffness", "motor_gain", "torque_limit", "cable_stiffness", "motor_friction", "knee_friction",
+    "knee_damping",
+)  # fmt: skip
+"""Parameters that are forces: without gravity, a sweep would look the same with all of them twice as large."""
 _SHORT = 6
 """Iterations after which one of two searches goes on."""
 _LEAST_SPREAD = 1e-9
@@ -250,9 +255,11 @@ def identify_legs(
        Both are done twice, with the `FURTHER` parameters held at their nominal values and with all. The second search
        has the first's solution among its starts. The richer model is kept where it explains what the simpler one
        leaves (`Selection`).
-    3. With the richer model, or where the data leave directions open: with what is known of robots beforehand, so that
+    3. With the richer model the springs are held at their nominal stiffness, which sets the scale of all forces
+       (`nominal_springs`).
+    4. With the richer model, or where the data leave directions open: with what is known of robots beforehand, so that
        what a sweep hardly shows stays near the nominal values.
-    4. With `objective="hausdorff"`, the paper's distance between curves, from there.
+    5. With `objective="hausdorff"`, the paper's distance between curves, from there.
 
     **Raises** `InputError` from `IdentificationConfig`'s check.
     """
@@ -318,6 +325,9 @@ class Identifier:
                 selection = self._select(simpler, coordinates, int(further.sum()), spread, data)
             if selection.richer:
                 ends = richer_ends
+                if config.nominal_springs:
+                    kept = every & (np.arange(len(every)) != list(free).index("knee_spring_stiffness"))
+                    coordinates = self._with_nominal_springs(coordinates, data, kept, report)
             else:
                 kept, coordinates = ~further, simpler
         else:
@@ -330,7 +340,7 @@ class Identifier:
             coordinates, _ = self._squares(
                 lambda y: self._with_priors(y, data, kept, spread),
                 coordinates,
-                config.steps,
+                2 * config.steps,  # along the weakest directions, which the data alone left open
                 partial(report, "priors"),
                 _PATIENCE,
             )
@@ -421,6 +431,31 @@ class Identifier:
             both = [self._follow(y, data, kept, report, _SHORT) for y in (coordinates, by_settled)]
             coordinates = self._nearest(both, data, kept)
         return self._follow(coordinates, data, kept, report, config.steps), ends
+
+    def _with_nominal_springs(
+        self,
+        coordinates: Float[np.ndarray, "legs size"],
+        data: LegData,
+        kept: Bool[np.ndarray, " size"],
+        report: Report,
+    ) -> Float[np.ndarray, "legs size"]:
+        """Return where searches end that begin with nominal springs, and all that pulls or brakes scaled likewise; then
+        with the dynamics back where they begin, for stiction, lag and play can stand in for each other."""
+        size, space = self._size, self.space
+        spring = LEG_PARAMETERS.index("knee_spring_stiffness")
+        scaled = coordinates.copy()
+        for y in scaled:
+            vector = np.array(space.vector(jnp.asarray(y[:size])))
+            scale = space.nominal[spring] / vector[spring]
+            pulls = np.isin(LEG_PARAMETERS, _FORCES) & space.free
+            vector[pulls] *= scale
+            margin = 0.01 * (space.upper - space.lower)
+            vector[space.free] = np.clip(vector, space.lower + margin, space.upper - margin)[space.free]
+            y[:size] = space.coordinates(vector)
+            y[size:] += np.isin(LegDynamics._fields, _FORCES)[: len(y) - size] * np.log(scale)
+        anew = np.concatenate([scaled[:, :size], np.zeros_like(scaled[:, size:])], axis=1)
+        starts = [scaled] if not self.config.motion else [scaled, anew]
+        return self._nearest([self._follow(y, data, kept, report, self.config.steps) for y in starts], data, kept)
 
     def _follow(
         self,
