@@ -231,11 +231,6 @@ dozens of iterations."""
 _INSIDE = 4.0
 """Largest coordinate that a search of the motion starts from: 2 % of the bounds' span inside them. A slack that settled
 angles put at its bound has next to no slope left, and would stay there."""
-_FORCES = (
-    "knee_spring_stiffness", "motor_gain", "torque_limit", "cable_stiffness", "motor_friction", "knee_friction",
-    "knee_damping",
-)  # fmt: skip
-"""Parameters that are forces: without gravity, a sweep would look the same with all of them twice as large."""
 _SHORT = 6
 """Iterations after which one of two searches goes on."""
 _LEAST_SPREAD = 1e-9
@@ -311,23 +306,23 @@ class Identifier:
         free = np.array(LEG_PARAMETERS)[self.space.free]
         further = np.isin([*free, *(LegDynamics._fields if config.motion else ())], FURTHER)
         every = np.ones_like(further)
+        spring = list(free).index("knee_spring_stiffness")
         kept, selection = every, None
         if further.any():
             simpler, ends = self._search(data, ~further, report)
-            coordinates, richer_ends = self._search(data, every, report, simpler)
+            rich = every & ~(config.nominal_springs & np.isin(np.arange(len(every)), spring))
+            coordinates, richer_ends = self._search(data, rich, report, simpler)
             spread = self._spread(coordinates, data)
-            selection = self._select(simpler, coordinates, int(further.sum()), spread, data)
+            more = int(rich.sum()) - int((~further).sum())
+            selection = self._select(simpler, coordinates, more, spread, data)
             if selection.richer:
                 # The simpler search may have ended in a valley that the richer one left.
                 again = np.where(further, simpler, coordinates)
                 again = self._follow(again, data, ~further, report, config.steps)
                 simpler = self._nearest([simpler, again], data, ~further)
-                selection = self._select(simpler, coordinates, int(further.sum()), spread, data)
+                selection = self._select(simpler, coordinates, more, spread, data)
             if selection.richer:
-                ends = richer_ends
-                if config.nominal_springs:
-                    kept = every & (np.arange(len(every)) != list(free).index("knee_spring_stiffness"))
-                    coordinates = self._with_nominal_springs(coordinates, data, kept, report)
+                kept, ends = rich, richer_ends
             else:
                 kept, coordinates = ~further, simpler
         else:
@@ -408,6 +403,7 @@ class Identifier:
         report("draws", 1, 1, float(losses.min()))
         starts = draws[np.argsort(losses, axis=1)[:, : self._starts]]
         if simpler is not None:
+            simpler = np.where(kept, simpler, np.concatenate([draws[0], np.zeros(simpler.shape[1] - size)]))
             starts[:, -1] = simpler[:, :size]
         leg = np.repeat(legs, self._starts)
         ends, ended = self._least_squares(
@@ -430,32 +426,12 @@ class Identifier:
         if not np.array_equal(coordinates, by_settled):
             both = [self._follow(y, data, kept, report, _SHORT) for y in (coordinates, by_settled)]
             coordinates = self._nearest(both, data, kept)
-        return self._follow(coordinates, data, kept, report, config.steps), ends
-
-    def _with_nominal_springs(
-        self,
-        coordinates: Float[np.ndarray, "legs size"],
-        data: LegData,
-        kept: Bool[np.ndarray, " size"],
-        report: Report,
-    ) -> Float[np.ndarray, "legs size"]:
-        """Return where searches end that begin with nominal springs, and all that pulls or brakes scaled likewise; then
-        with the dynamics back where they begin, for stiction, lag and play can stand in for each other."""
-        size, space = self._size, self.space
-        spring = LEG_PARAMETERS.index("knee_spring_stiffness")
-        scaled = coordinates.copy()
-        for y in scaled:
-            vector = np.array(space.vector(jnp.asarray(y[:size])))
-            scale = space.nominal[spring] / vector[spring]
-            pulls = np.isin(LEG_PARAMETERS, _FORCES) & space.free
-            vector[pulls] *= scale
-            margin = 0.01 * (space.upper - space.lower)
-            vector[space.free] = np.clip(vector, space.lower + margin, space.upper - margin)[space.free]
-            y[:size] = space.coordinates(vector)
-            y[size:] += np.isin(LegDynamics._fields, _FORCES)[: len(y) - size] * np.log(scale)
-        anew = np.concatenate([scaled[:, :size], np.zeros_like(scaled[:, size:])], axis=1)
-        starts = [scaled] if not self.config.motion else [scaled, anew]
-        return self._nearest([self._follow(y, data, kept, report, self.config.steps) for y in starts], data, kept)
+        ended = self._follow(coordinates, data, kept, report, config.steps)
+        # Stiction, lag and play can stand in for each other, and a slack at its bound has no slope: once more, with the
+        # dynamics back where they began and what stands at a bound back at its nominal value.
+        inside = np.where(np.abs(ended[:, :size]) > _INSIDE, draws[0], ended[:, :size])
+        again = np.concatenate([inside, np.tile(first, (len(legs), 1))], axis=1)
+        return self._nearest([ended, self._follow(again, data, kept, report, config.steps)], data, kept), ends
 
     def _follow(
         self,
