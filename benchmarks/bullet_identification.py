@@ -230,13 +230,14 @@ def examine(seed: int, identify: Callable[[Sweep], Identification]) -> dict[str,
     return result
 
 
+def compared(row: Mapping[str, float], form: str) -> str:
+    """Return nominal and identified errors, with their ratio in brackets."""
+    nominal, identified = row["nominal"], row["identified"]
+    return f"{nominal:{form}} -> {identified:{form}} ({identified / nominal:.2f})"
+
+
 def table(results: Mapping[int, Mapping[str, Any]]) -> Table:
     """Return errors of nominal and identified actuators, with their ratio in brackets."""
-
-    def compared(row: Mapping[str, float], form: str) -> str:
-        nominal, identified = row["nominal"], row["identified"]
-        return f"{nominal:{form}} -> {identified:{form}} ({identified / nominal:.2f})"
-
     groups = list(next(iter(results.values()))["open_loop_m"])
     heads = ("robot", "settled angles (deg)", *(f"{group} (m)" for group in groups), "guard's ratio, and choice")
     return Table(
@@ -257,12 +258,8 @@ def true_legs_table(robots: Sequence[int]) -> Table:
     """Return walking errors (m) of nominal and of true legs, with their ratio in brackets."""
     errors = {seed: open_loop(record(seed, walking_commands(SECONDS)), true_actuators(draw(seed))) for seed in robots}
     groups = list(next(iter(errors.values())))
-    made = []
-    for seed, rows in errors.items():
-        cells = (f"{rows[g]['nominal']:.3f} -> {rows[g]['identified']:.3f}" for g in groups)
-        ratios = (f"{rows[g]['identified'] / rows[g]['nominal']:.2f}" for g in groups)
-        made.append((str(seed), *(f"{cell} ({ratio})" for cell, ratio in zip(cells, ratios, strict=True))))
-    return Table(("robot", *(f"{group} (m)" for group in groups)), tuple(made))
+    made = tuple((str(seed), *(compared(rows[group], ".3f") for group in groups)) for seed, rows in errors.items())
+    return Table(("robot", *(f"{group} (m)" for group in groups)), made)
 
 
 def read_earlier(path: Path, robots: Sequence[int], commit: str) -> dict[str, Any]:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import scipy.optimize
 from common import cores
-from jaxtyping import Bool, Float
 
 THREADS = len(cores())
 DIFFERENCE = 1e-6
@@ -66,30 +65,6 @@ def compare(one: Sequence[Search], other: Search) -> str:
 def lowest_so_far(trace: Trace) -> Trace:
     values = np.minimum.accumulate([value for _, value in trace])
     return [(seconds, float(value)) for (seconds, _), value in zip(trace, values, strict=True)]
-
-
-class Shares:
-    """Values as shares of the span between their bounds, of the logarithm where the search is over that: units that
-    differ by a factor of 30 would make a search worse."""
-
-    def __init__(
-        self,
-        lower: Float[np.ndarray, " size"],
-        upper: Float[np.ndarray, " size"],
-        logarithmic: Bool[np.ndarray, " size"],
-    ) -> None:
-        self._logarithmic = logarithmic
-        self._low, self._high = self._scaled(lower), self._scaled(upper)
-
-    def values(self, shares: Float[np.ndarray, "*batch size"]) -> Float[np.ndarray, "*batch size"]:
-        scaled = self._low + shares * (self._high - self._low)
-        return np.where(self._logarithmic, np.exp(np.where(self._logarithmic, scaled, 0.0)), scaled)
-
-    def of(self, values: Float[np.ndarray, "*batch size"]) -> Float[np.ndarray, "*batch size"]:
-        return (self._scaled(values) - self._low) / (self._high - self._low)
-
-    def _scaled(self, values: np.ndarray) -> np.ndarray:
-        return np.where(self._logarithmic, np.log(np.where(self._logarithmic, values, 1.0)), values)
 
 
 def lbfgsb(

@@ -46,7 +46,6 @@ from searches import (
     DIFFERENCE,
     THREADS,
     Search,
-    Shares,
     Trace,
     compare,
     lbfgsb,
@@ -63,6 +62,7 @@ from ballu_mjx.ballu.model import SIDES, load_suspended_leg, suspend
 from ballu_mjx.ballu.sweep import Sweep, read_sweep
 from ballu_mjx.ballu.sysid_report import mean_error
 from ballu_mjx.common.results import Cell, Table, write_results
+from ballu_mjx.identification.parameters import Shares
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.model import assets, set_fields

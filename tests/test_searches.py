@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import sysid_pendulum  # pyright: ignore[reportMissingImports]
-from searches import Search, Shares, compare, lbfgsb  # pyright: ignore[reportMissingImports]
+from searches import Search, compare, lbfgsb  # pyright: ignore[reportMissingImports]
 
 from ballu_mjx.identification.declarations import declared_parameters
+from ballu_mjx.identification.parameters import Shares
 from ballu_mjx.identification.residuals import MeasuredMotion, WindowSimulator, cut_windows
 
 SHARES = Shares(np.array([1e-3, -1.0]), np.array([1e1, 3.0]), np.array([True, False]))

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
 from ballu_mjx.identification.body_deformation import UNDEFORMED, deform_body
@@ -79,6 +79,36 @@ class Parameter:
             raise ValueError(f"{self.name}: bounds of a logarithmic parameter are above 0")
 
 
+class Shares:
+    """Values as shares of the way from lower to upper bounds, 0 to 1; of the logarithm where the search is over that.
+    Units that differ by a factor of 30 would make a search worse."""
+
+    def __init__(
+        self,
+        lower: Float[np.ndarray, " size"],
+        upper: Float[np.ndarray, " size"],
+        logarithmic: Bool[np.ndarray, " size"],
+    ) -> None:
+        self._logarithmic = logarithmic
+        self._low, self._high = self._scaled(lower), self._scaled(upper)
+
+    def of(self, values: Float[np.ndarray, "*batch size"]) -> Float[np.ndarray, "*batch size"]:
+        """Return where values lie between their bounds."""
+        return (self._scaled(values) - self._low) / (self._high - self._low)
+
+    def values(self, shares: Float[np.ndarray, "*batch size"]) -> Float[np.ndarray, "*batch size"]:
+        """Return the values there."""
+        scaled = self._low + shares * (self._high - self._low)
+        return np.where(self._logarithmic, np.exp(np.where(self._logarithmic, scaled, 0.0)), scaled)
+
+    def slopes(self, values: Float[np.ndarray, " size"]) -> Float[np.ndarray, " size"]:
+        """Return how values change by their shares."""
+        return (self._high - self._low) * np.where(self._logarithmic, values, 1.0)
+
+    def _scaled(self, values: np.ndarray) -> np.ndarray:
+        return np.where(self._logarithmic, np.log(np.where(self._logarithmic, values, 1.0)), values)
+
+
 class ParameterSet:
     """Parameters of a model, as a vector in their units or as shares of the way from the lower to the upper bound."""
 
@@ -90,24 +120,22 @@ class ParameterSet:
         self.nominal = np.array([p.nominal for p in self.parameters])
         self.lower, self.upper = np.array([p.bounds for p in self.parameters]).reshape(-1, 2).T
         self.prior = np.array([p.prior for p in self.parameters])
-        self._logarithmic = np.array([p.logarithmic for p in self.parameters], bool)
-        self._low, self._high = self._scaled(self.lower), self._scaled(self.upper)
+        self._span = Shares(self.lower, self.upper, np.array([p.logarithmic for p in self.parameters], bool))
 
     def __len__(self) -> int:
         return len(self.parameters)
 
     def shares(self, values: Float[np.ndarray, "*batch parameters"]) -> Float[np.ndarray, "*batch parameters"]:
         """Return where values lie between their bounds, 0 to 1; logarithms where the search runs over those."""
-        return (self._scaled(values) - self._low) / (self._high - self._low)
+        return self._span.of(values)
 
     def at_shares(self, shares: Float[np.ndarray, "*batch parameters"]) -> Float[np.ndarray, "*batch parameters"]:
         """Return the values there."""
-        scaled = self._low + shares * (self._high - self._low)
-        return np.where(self._logarithmic, np.exp(np.where(self._logarithmic, scaled, 0.0)), scaled)
+        return self._span.values(shares)
 
     def by_shares(self, values: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " parameters"]:
         """Return how values change by their shares."""
-        return (self._high - self._low) * np.where(self._logarithmic, values, 1.0)
+        return self._span.slopes(values)
 
     def draw(self, seed: int, count: int) -> Float[np.ndarray, "count parameters"]:
         """Return the nominal values, then draws from the priors within the bounds; what lies on or near a bound is
@@ -200,10 +228,6 @@ class ParameterSet:
     def _indices(self, field: str) -> np.ndarray:
         targets = [t for p in self.parameters for t in p.targets if isinstance(t, FieldTarget) and t.field == field]
         return np.array(sorted({target.index[0] for target in targets}), int)
-
-    def _scaled(self, values: np.ndarray) -> np.ndarray:
-        logarithms = np.log(np.where(self._logarithmic, values, 1.0))
-        return np.where(self._logarithmic, logarithms, values)
 
 
 LEAST_FRICTION = 1e-9
