@@ -250,9 +250,11 @@ def identify_legs(
        Both are done twice, with the `FURTHER` parameters held at their nominal values and with all. The second search
        has the first's solution among its starts. The richer model is kept where it explains what the simpler one
        leaves (`Selection`).
-    3. With the richer model, or where the data leave directions open: with what is known of robots beforehand, so that
+    3. With the richer model the springs are held at their nominal stiffness, which sets the scale of all forces
+       (`nominal_springs`).
+    4. With the richer model, or where the data leave directions open: with what is known of robots beforehand, so that
        what a sweep hardly shows stays near the nominal values.
-    4. With `objective="hausdorff"`, the paper's distance between curves, from there.
+    5. With `objective="hausdorff"`, the paper's distance between curves, from there.
 
     **Raises** `InputError` from `IdentificationConfig`'s check.
     """
@@ -304,20 +306,23 @@ class Identifier:
         free = np.array(LEG_PARAMETERS)[self.space.free]
         further = np.isin([*free, *(LegDynamics._fields if config.motion else ())], FURTHER)
         every = np.ones_like(further)
+        spring = list(free).index("knee_spring_stiffness")
         kept, selection = every, None
         if further.any():
             simpler, ends = self._search(data, ~further, report)
-            coordinates, richer_ends = self._search(data, every, report, simpler)
+            rich = every & ~(config.nominal_springs & np.isin(np.arange(len(every)), spring))
+            coordinates, richer_ends = self._search(data, rich, report, simpler)
             spread = self._spread(coordinates, data)
-            selection = self._select(simpler, coordinates, int(further.sum()), spread, data)
+            more = int(rich.sum()) - int((~further).sum())
+            selection = self._select(simpler, coordinates, more, spread, data)
             if selection.richer:
                 # The simpler search may have ended in a valley that the richer one left.
                 again = np.where(further, simpler, coordinates)
                 again = self._follow(again, data, ~further, report, config.steps)
                 simpler = self._nearest([simpler, again], data, ~further)
-                selection = self._select(simpler, coordinates, int(further.sum()), spread, data)
+                selection = self._select(simpler, coordinates, more, spread, data)
             if selection.richer:
-                ends = richer_ends
+                kept, ends = rich, richer_ends
             else:
                 kept, coordinates = ~further, simpler
         else:
@@ -330,7 +335,7 @@ class Identifier:
             coordinates, _ = self._squares(
                 lambda y: self._with_priors(y, data, kept, spread),
                 coordinates,
-                config.steps,
+                2 * config.steps,  # along the weakest directions, which the data alone left open
                 partial(report, "priors"),
                 _PATIENCE,
             )
@@ -398,6 +403,7 @@ class Identifier:
         report("draws", 1, 1, float(losses.min()))
         starts = draws[np.argsort(losses, axis=1)[:, : self._starts]]
         if simpler is not None:
+            simpler = np.where(kept, simpler, np.concatenate([draws[0], np.zeros(simpler.shape[1] - size)]))
             starts[:, -1] = simpler[:, :size]
         leg = np.repeat(legs, self._starts)
         ends, ended = self._least_squares(
@@ -420,7 +426,12 @@ class Identifier:
         if not np.array_equal(coordinates, by_settled):
             both = [self._follow(y, data, kept, report, _SHORT) for y in (coordinates, by_settled)]
             coordinates = self._nearest(both, data, kept)
-        return self._follow(coordinates, data, kept, report, config.steps), ends
+        ended = self._follow(coordinates, data, kept, report, config.steps)
+        # Stiction, lag and play can stand in for each other, and a slack at its bound has no slope: once more, with the
+        # dynamics back where they began and what stands at a bound back at its nominal value.
+        inside = np.where(np.abs(ended[:, :size]) > _INSIDE, draws[0], ended[:, :size])
+        again = np.concatenate([inside, np.tile(first, (len(legs), 1))], axis=1)
+        return self._nearest([ended, self._follow(again, data, kept, report, config.steps)], data, kept), ends
 
     def _follow(
         self,

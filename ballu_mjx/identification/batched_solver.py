@@ -98,5 +98,5 @@ class BatchedSolver:
         return np.asarray(y), np.asarray(loss)
 
 
-_WORTH = 1e-4
+_WORTH = 1e-5
 """Of the loss: what an iteration gains at least."""
