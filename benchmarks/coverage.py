@@ -1,8 +1,10 @@
 """Do standard errors cover the truth where the model lacks something?
 
 A servo arm (`tests/servo_arm.py`) whose true parameters are drawn from their priors is recorded with 0.5 deg of noise
-and 1 deg of dry friction, which no parameter can express. `fit_robot` identifies it. How often does the truth lie
-within two standard errors: of the sandwich, which count residuals that go together, and of white noise?
+and 1 deg of dry friction, which no declared parameter can express. `fit_robot` identifies it. How often does the truth
+lie within two standard errors: of the robust ones, which count residuals that go together, and of white noise?
+
+Then what `suggest_parameters` proposes is declared too, and the arm is identified once more.
 
     python benchmarks/coverage.py                    # 50 draws
     python benchmarks/coverage.py --draws 4
@@ -17,7 +19,7 @@ import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 from ballu_mjx.common import runtime
 
@@ -27,11 +29,12 @@ import numpy as np
 from common import described, machine, write
 
 from ballu_mjx.common.results import Table, write_results
-from ballu_mjx.identification.declarations import declared_parameters
+from ballu_mjx.identification.declarations import declared_parameters, parameters_of
 from ballu_mjx.identification.declared import measure_recording
-from ballu_mjx.identification.fit_robot import FitConfig, fit_robot
+from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, fit_robot
 from ballu_mjx.identification.parameters import ParameterSet
 from ballu_mjx.identification.residuals import SamplingConfig
+from ballu_mjx.identification.undeclared import suggest_parameters
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.description import RobotDescription
 
@@ -60,10 +63,18 @@ def draw_truth(parameters: ParameterSet, seed: int) -> dict[str, float]:
     return truth
 
 
-def examine(
-    robot: RobotDescription, parameters: ParameterSet, folder: Path, seed: int, friction: float
-) -> dict[str, Any]:
-    """Return a draw's truth, what was found, and both standard errors."""
+class Draw(NamedTuple):
+    """One arm: of each parameter its truth, what was found, and both standard errors."""
+
+    declared: dict[str, dict[str, float]]
+    suggested: tuple[str, ...]
+    """Parameters that were proposed."""
+    completed: dict[str, dict[str, float]]
+    """The same with these declared too."""
+
+
+def examine(robot: RobotDescription, parameters: ParameterSet, folder: Path, seed: int, friction: float) -> Draw:
+    """Draw an arm, record it, identify it, declare what is proposed, and identify it again."""
     truth, model = draw_truth(parameters, seed), robot.load_model()
     sampling = SamplingConfig(angle_noise=float(np.deg2rad(NOISE)))
     motions = []
@@ -71,11 +82,23 @@ def examine(
         options = {"truth": truth, "noise": NOISE, "friction": friction}
         path = record_arm(folder, robot, f"draw-{seed}-{number}", 100 * seed + number, "suspended", **options)
         motions.append(measure_recording(read_recording(path, robot), robot, model, sampling))
-    fit = fit_robot(parameters, motions[:-1], motions[-1:], FitConfig(starts=1))
-    found = zip(parameters.names, fit.values, fit.standard_errors, fit.white_noise_errors, strict=True)
+    config = FitConfig(starts=1)
+    first = again = fit_robot(parameters, motions[:-1], motions[-1:], config)
+    proposed = suggest_parameters(robot, first, motions[:-1], config)
+    if proposed:
+        more = parameters_of(robot, model, [each.entry for each in proposed])
+        complete = ParameterSet([*parameters.parameters, *more], parameters.commands)
+        again = fit_robot(complete, motions[:-1], motions[-1:], config)
+    return Draw(compared(first, truth), tuple(each.parameter.name for each in proposed), compared(again, truth))
+
+
+def compared(fit: RobotFit, truth: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    """Return what was found of the parameters whose truth is known."""
+    found = zip(fit.parameters.names, fit.values, fit.standard_errors, fit.white_noise_errors, strict=True)
     return {
         name: {"truth": truth[name], "found": float(v), "robust": float(r), "white": float(w)}
         for name, v, r, w in found
+        if name in truth
     }
 
 
@@ -101,7 +124,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path)
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()
-    draws = []
+    draws: list[Draw] = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         robot = write_arm(folder)
@@ -109,14 +132,20 @@ def main() -> None:
         for seed in range(arguments.draws):
             draws.append(examine(robot, parameters, folder, seed, arguments.friction))
             print(f"draw {seed + 1} of {arguments.draws}", flush=True)
-    found = coverage_table(draws)
+    names = sorted({name for draw in draws for name in draw.suggested})
+    rows = [(name, f"{np.mean([name in draw.suggested for draw in draws]):.0%}") for name in names]
+    tables = {
+        "coverage": coverage_table([draw.declared for draw in draws]),
+        "suggested": Table(("proposed", "in draws"), tuple(rows) or (("nothing", ""),)),
+        "completed": coverage_table([draw.completed for draw in draws]),
+    }
     print(f"{described(machine())}; {NOISE:g} deg of noise, {arguments.friction:g} deg of friction")
-    print(found.to_markdown())
+    print("\n\n".join(table.to_markdown() for table in tables.values()))
     if arguments.output:
-        write(arguments.output, "coverage", {"noise_deg": NOISE, "friction_deg": arguments.friction, "draws": draws})
+        made = [draw._asdict() for draw in draws]
+        write(arguments.output, "coverage", {"noise_deg": NOISE, "friction_deg": arguments.friction, "draws": made})
     if arguments.results:
-        data = f"Made data, {arguments.draws} draws from seed 0 on"
-        write_results(arguments.results, {"coverage": found}, data)
+        write_results(arguments.results, tables, f"Made data, {arguments.draws} draws from seed 0 on")
 
 
 if __name__ == "__main__":

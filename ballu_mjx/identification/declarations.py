@@ -25,7 +25,7 @@ nominal principal axes (a log-Cholesky factor relative to nominal; Rucker and We
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -53,9 +53,7 @@ def declared_parameters(robot: RobotDescription, model: mujoco.MjModel) -> Param
     """
     if not robot.identify:
         raise InputError(f'{robot.file}: "identify" is missing; list there which parameters to identify.')
-    found: list[Parameter] = []
-    for number, entry in enumerate(robot.identify, 1):
-        found += _Declaration(robot, model, number, entry).parameters()
+    found = parameters_of(robot, model, robot.identify)
     names = [parameter.name for parameter in found]
     for name in names:
         if names.count(name) > 1:
@@ -67,6 +65,20 @@ def declared_parameters(robot: RobotDescription, model: mujoco.MjModel) -> Param
                 problem = f'"identify" sets the same number by {name} and {other}'
                 raise InputError(f"{robot.file}: {problem}; leave one out.")
     return ParameterSet(found, len(robot.commands))
+
+
+def parameters_of(
+    robot: RobotDescription, model: mujoco.MjModel, entries: Sequence[Mapping[str, Any]]
+) -> list[Parameter]:
+    """Return the parameters of entries of the form that `identify` has.
+
+    **Raises** `InputError` naming the description, the entry and the fix.
+    """
+    return [
+        parameter
+        for number, entry in enumerate(entries, 1)
+        for parameter in _Declaration(robot, model, number, entry).parameters()
+    ]
 
 
 _ELEMENTS = ("joint", "actuator", "tendon", "geom", "body", "command")

@@ -1,8 +1,7 @@
 """Identification of declared parameters from recordings, for any robot.
 
-Levenberg-Marquardt over windows of recordings (`identification.residuals`), from several starts, with exact derivatives
-taken forwards through the simulation. Each window's starting state is an unknown of its own. It is eliminated window by
-window (variable projection), so that the search sees the parameters alone, however many windows there are.
+Levenberg-Marquardt over windows of recordings (`identification.window_objective`), from several starts, with exact
+derivatives taken forwards through the simulation.
 
 What comes out is always compared with the nominal parameters on held-out windows.
 """
@@ -22,21 +21,8 @@ from jaxtyping import Float, Int
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.bounded_solver import bounded_least_squares
 from ballu_mjx.identification.parameters import Direction, IdentifiedParameters, ParameterSet
-from ballu_mjx.identification.residuals import MeasuredMotion, Simulated, Windows, WindowSimulator, cut_windows
-
-
-@dataclasses.dataclass(frozen=True)
-class WindowConfig:
-    """What recordings are cut into, and how they count."""
-
-    window_seconds: float = 1.0
-    """Length of a window, s."""
-    interval_seconds: float | None = None
-    """Time between the starts of two windows, s. Without this option: a window's length."""
-    outlying: float = 3.0
-    """Differences beyond so many times their scatter count less (pseudo-Huber loss)."""
-    start_spread: float = 1.0
-    """How uncertain starting states are, in units of the measurements' noise; 0: they are as measured."""
+from ballu_mjx.identification.residuals import MeasuredMotion, Windows, WindowSimulator, cut_windows
+from ballu_mjx.identification.window_objective import WindowConfig, WindowObjective, WindowSearch
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +86,8 @@ class RobotFit:
     parameters: ParameterSet
     values: Float[np.ndarray, " parameters"]
     standard_errors: Float[np.ndarray, " parameters"]
-    """Sandwich: windows err independently, in whatever way (cluster-robust by window)."""
+    """Windows err independently, in whatever way: what leaving out one window at a time changes (cluster-robust, of the
+    kind CR3)."""
     white_noise_errors: Float[np.ndarray, " parameters"]
     """Standard errors if what is left were white noise."""
     correlations: Float[np.ndarray, "parameters parameters"]
@@ -176,7 +163,7 @@ def check_data(
     check_fit_config(config)
     with jax.enable_x64(True):
         windows = cut_windows(motions, config.window_seconds, config.interval_seconds)
-        return _visibility(_Objective(WindowSimulator(parameters, motions, windows), config), config)
+        return _visibility(WindowObjective(WindowSimulator(parameters, motions, windows), config), config)
 
 
 def fit_robot(
@@ -219,7 +206,7 @@ def fit_robot(
         else:
             held_out = cut_windows(validation, config.window_seconds, config.interval_seconds)
             simulator = WindowSimulator(parameters, validation, held_out)
-        objective = _Objective(WindowSimulator(parameters, training, windows), config)
+        objective = WindowObjective(WindowSimulator(parameters, training, windows), config)
         report("data check", 0, 1, float("nan"))
         visibility = _visibility(objective, config)
         report("data check", 1, 1, float("nan"))
@@ -233,7 +220,7 @@ def fit_robot(
             report(stage, before + iteration, whole, min(value, lowest))
 
         for number, begin in enumerate(parameters.draw(config.seed, config.starts)):
-            search, before = _Search(objective, objective.measured_start(), on_evaluation), number * config.steps
+            search, before = WindowSearch(objective, objective.measured_start(), on_evaluation), number * config.steps
             tell = partial(told, "search", before, config.starts * config.steps)
             found, loss = bounded_least_squares(search, parameters.shares(begin), config.steps, tell, _PATIENCE)
             lowest = min(lowest, loss)
@@ -242,7 +229,7 @@ def fit_robot(
         _, shares, best = searches[int(np.argmin(losses))]
         if config.reweigh:
             objective.rescale(best.residuals)
-            best, lowest = _Search(objective, best.start, on_evaluation), np.inf
+            best, lowest = WindowSearch(objective, best.start, on_evaluation), np.inf
             tell = partial(told, "refinement", 0, config.steps)
             shares, _ = bounded_least_squares(best, shares, config.steps, tell, _PATIENCE)
             objective.rescale(best.residuals)
@@ -258,7 +245,7 @@ def fit_robot(
         directions=analysis.directions,
         unseen=visibility.unseen,
         at_bounds=parameters.at_bounds(values),
-        scatter=_scatter(best.residuals),
+        scatter=objective.scale,
         losses=np.sort(losses),
         nominal=pair[0],
         identified=pair[1],
@@ -286,129 +273,6 @@ def replay(
         return tuple(_held_out(simulator, np.asarray(values, float)) for values in points)
 
 
-class _Reduced(NamedTuple):
-    """Residuals, and how they change by the parameters while starting states move along to their best."""
-
-    values: Float[np.ndarray, "windows rows"]
-    slopes: Float[np.ndarray, "windows rows parameters"]
-    """In the parameters' units; at right angles to all that starting states can change."""
-    start: Float[np.ndarray, "windows start"]
-    """The best starting states, to first order."""
-    start_slopes: Float[np.ndarray, "windows start parameters"]
-
-    @property
-    def loss(self) -> float:
-        return float(np.sum(self.values**2))
-
-
-class _Objective:
-    """Softened residuals of all windows."""
-
-    def __init__(self, simulator: WindowSimulator, config: FitConfig) -> None:
-        self.simulator, self.config = simulator, config
-        self.parameters = simulator.parameters
-        self.scale = np.ones(simulator.channels)
-        """Of each channel's scatter, in units of its noise."""
-
-    def rescale(self, differences: Float[np.ndarray, "windows samples channels"]) -> None:
-        """Weigh channels by their robust scatter, and none by less than its noise."""
-        self.scale = _scatter(differences)
-
-    def measured_start(self) -> Float[np.ndarray, "windows start"]:
-        """Return starting states that are not moved; without columns where they are known."""
-        return np.zeros((self.simulator.count, self.simulator.channels if self.config.start_spread else 0))
-
-    def __call__(
-        self, values: Float[np.ndarray, " parameters"], start: Float[np.ndarray, "windows start"]
-    ) -> tuple[_Reduced, Simulated]:
-        simulated = self.simulator.linearize(values, start)
-        soft, steepness = soften(simulated.values / self.scale, self.config.outlying)
-        weight = (steepness / self.scale)[..., None]
-        windows, moving = start.shape
-        flat = lambda x: x.reshape(windows, -1, *x.shape[3:])  # noqa: E731
-        slopes, residuals = flat(weight * simulated.by_parameters), flat(soft)
-        if not moving:
-            none = np.zeros((windows, 0, slopes.shape[-1]))
-            return _Reduced(values=residuals, slopes=slopes, start=start, start_slopes=none), simulated
-        own = np.tile(np.eye(moving) / self.config.start_spread, (windows, 1, 1))
-        by_start = np.concatenate([flat(weight * simulated.by_start), own], axis=1)
-        slopes = np.concatenate([slopes, np.zeros((windows, moving, slopes.shape[-1]))], axis=1)
-        residuals = np.concatenate([residuals, start / self.config.start_spread], axis=1)
-        q, r = np.linalg.qr(by_start)
-        turned = np.swapaxes(q, 1, 2)
-        along, along_slopes = turned @ residuals[..., None], turned @ slopes
-        reduced = _Reduced(
-            values=residuals,
-            slopes=slopes - q @ along_slopes,
-            start=start - np.linalg.solve(r, along)[..., 0],
-            start_slopes=-np.linalg.solve(r, along_slopes),
-        )
-        return reduced, simulated
-
-
-def _scatter(differences: Float[np.ndarray, "windows samples channels"]) -> Float[np.ndarray, " channels"]:
-    """Return each channel's robust standard deviation, in units of its noise; none is below it."""
-    return np.maximum(1.0, _NORMAL * np.median(np.abs(differences), axis=(0, 1)))
-
-
-_NORMAL = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
-
-
-def soften(values: Float[np.ndarray, "*shape"], outlying: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return what has the pseudo-Huber loss of `values` for its square, with their signs; and its slopes."""
-    root = np.sqrt(1 + (values / outlying) ** 2)
-    soft = values * np.sqrt(2 / (root + 1))
-    return soft, np.sqrt((root + 1) / 2) / root
-
-
-class _Search:
-    """What the solver evaluates: residuals and their Jacobian by the parameters' shares, compressed to as many rows as
-    there are parameters (and one), which keep all sums of squares. Starting states are remembered from the best point
-    so far, and moved along with the parameters."""
-
-    def __init__(
-        self,
-        objective: _Objective,
-        start: Float[np.ndarray, "windows start"],
-        on_evaluation: Callable[[Float[np.ndarray, " parameters"]], None] | None,
-    ) -> None:
-        self.objective, self.start, self.on_evaluation = objective, start, on_evaluation
-        self.residuals = np.zeros((0, 0, 0))
-        """Differences at the best point so far, in units of noise."""
-        self._best: tuple[float, np.ndarray, _Reduced] | None = None
-        self._refused = 0
-
-    def __call__(self, shares: Float[np.ndarray, " parameters"]) -> tuple[np.ndarray, np.ndarray]:
-        parameters = self.objective.parameters
-        values, start = parameters.at_shares(shares), self.start
-        if self._best is not None:
-            _, at, reduced = self._best
-            step = reduced.start + reduced.start_slopes @ (values - at) - start
-            start = start + np.clip(step / 2.0**self._refused, -_FAR, _FAR)
-        reduced, simulated = self.objective(values, start)
-        if self.on_evaluation is not None:
-            self.on_evaluation(values)
-        prior = (values - parameters.nominal) / parameters.prior
-        loss = reduced.loss + float(prior @ prior)
-        if self._best is None or loss < self._best[0]:
-            self._best, self._refused = (loss, values, reduced), 0
-            self.start, self.residuals = start, simulated.values
-        else:  # starting states may be what went too far
-            self._refused += 1
-        # Window by window first: one tall table is left to many threads of LAPACK, and takes a hundred times as long.
-        table = np.concatenate([reduced.slopes, reduced.values[..., None]], axis=2)
-        windows = np.asarray(np.linalg.qr(table, mode="r")).reshape(-1, len(values) + 1)
-        own = np.concatenate([np.diag(1 / parameters.prior), prior[:, None]], axis=1)
-        triangle = np.asarray(np.linalg.qr(np.concatenate([windows, own]), mode="r"))
-        triangle[:, :-1] *= parameters.by_shares(values)
-        return triangle[:, -1], triangle[:, :-1]
-
-
-_FAR = 3.0
-"""Longest step of a starting state, in units of its uncertainty: the linearization holds no farther."""
-
-
 class _Analysis(NamedTuple):
     white: np.ndarray
     robust: np.ndarray
@@ -416,7 +280,7 @@ class _Analysis(NamedTuple):
     directions: tuple[Direction, ...]
 
 
-def _analyse(objective: _Objective, values: Float[np.ndarray, " parameters"], start: np.ndarray) -> _Analysis:
+def _analyse(objective: WindowObjective, values: Float[np.ndarray, " parameters"], start: np.ndarray) -> _Analysis:
     """Standard errors in the parameters' units."""
     parameters = objective.parameters
     reduced, _ = objective(values, start)
@@ -428,10 +292,14 @@ def _analyse(objective: _Objective, values: Float[np.ndarray, " parameters"], st
     slopes = reduced.slopes * unit
     flat = slopes.reshape(-1, size)
     known = np.diag(np.where(np.isfinite(parameters.prior), 1.0, 0.0) + _SLIGHT)
-    bread = np.linalg.inv(flat.T @ flat / variance + known)
+    inverse = flat.T @ flat / variance + known
+    bread = np.linalg.inv(inverse)
+    # With few windows, products of scores come out too small: each window has pulled the fit towards itself. What
+    # leaving it out would change has not (jackknife; Bell & McCaffrey, Survey Methodology 28, 2002).
     scores = np.einsum("wr,wrp->wp", reduced.values, slopes) / variance
-    meat = scores.T @ scores * windows / max(windows - 1, 1)
-    sandwich = bread @ (meat + known) @ bread
+    own = np.einsum("wrp,wrq->wpq", slopes, slopes) / variance
+    changes = np.linalg.solve(inverse - own, scores[..., None])[..., 0]
+    sandwich = changes.T @ changes * (windows - 1) / windows + bread @ known @ bread
     deviations = [np.sqrt(np.diag(covariance)) for covariance in (bread, sandwich)]
     correlations = sandwich / np.outer(deviations[1], deviations[1])
     _, singular, right = np.linalg.svd(flat / np.sqrt(variance), full_matrices=False)
@@ -443,7 +311,7 @@ def _analyse(objective: _Objective, values: Float[np.ndarray, " parameters"], st
 _SLIGHT = 1e-9
 
 
-def _visibility(objective: _Objective, config: FitConfig) -> Visibility:
+def _visibility(objective: WindowObjective, config: FitConfig) -> Visibility:
     parameters = objective.parameters
     unit = np.where(np.isfinite(parameters.prior), parameters.prior, (parameters.upper - parameters.lower) / 2)
     start = objective.measured_start()

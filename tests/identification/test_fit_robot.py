@@ -14,7 +14,7 @@ from robot_files import write_robot
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_report import fit_table
-from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, check_data, fit_robot, replay, soften
+from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, check_data, fit_robot, replay
 from ballu_mjx.identification.parameters import ParameterSet
 from ballu_mjx.identification.residuals import (
     MeasuredMotion,
@@ -23,6 +23,7 @@ from ballu_mjx.identification.residuals import (
     cut_windows,
     measure,
 )
+from ballu_mjx.identification.window_objective import soften
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.description import RobotDescription
 

@@ -1,0 +1,172 @@
+"""What a fit leaves, and which parameter that is not declared would explain it.
+
+Standard errors cannot show what a model lacks: dry friction that no parameter has goes into damping, however many
+recordings there are. What is left shows it. Each candidate (friction, damping and armature of joints, gains of
+actuators, the drivetrain of commands) is tried as one step of Gauss-Newton beside the declared parameters: a score
+test, which takes a single linearization.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import mujoco
+import numpy as np
+from scipy.stats import t as student
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.identification.declarations import parameters_of
+from ballu_mjx.identification.fit_robot import RobotFit
+from ballu_mjx.identification.parameters import Parameter, ParameterSet
+from ballu_mjx.identification.residuals import MeasuredMotion, WindowSimulator, cut_windows
+from ballu_mjx.identification.window_objective import ReducedResiduals, WindowConfig, WindowObjective
+from ballu_mjx.robots.description import RobotDescription
+
+
+class Suggestion(NamedTuple):
+    """A parameter that is worth declaring."""
+
+    entry: Mapping[str, Any]
+    """For the key `identify` of the description; bounds and prior are rough."""
+    parameter: Parameter
+    value: float
+    """Where it would go, to first order, in its unit."""
+    explained: float
+    """Share of the squares that are left which it would take away, beside the suggestions before it."""
+
+    def words(self) -> str:
+        """Return it as a sentence."""
+        value = f"{self.value:.2g} {self.parameter.unit.removeprefix('1')}".strip()
+        return f"{self.parameter.name}, about {value}, would explain {self.explained:.0%} of what is left."
+
+
+SMALL_EFFECT = 0.02
+"""Cohen's f^2 of a small effect: what is explained over what is left then (Cohen, "Statistical power analysis for the
+behavioral sciences", 1988)."""
+_CHANCE = 0.003
+"""Of a candidate that explains nothing to pass for one that does."""
+
+
+def candidate_entries(robot: RobotDescription, model: mujoco.MjModel) -> list[dict[str, Any]]:
+    """Return declarations of what robots often have and models often lack."""
+    entries: list[dict[str, Any]] = []
+    for number in range(model.njnt):
+        joint = model.joint(number)
+        if joint.name and model.jnt_type[number] in _SCALAR_JOINTS:
+            entries += [{"joint": joint.name, "field": field} for field in ("frictionloss", "damping", "armature")]
+    for number in range(model.nu):
+        if name := model.actuator(number).name:
+            entries += [{"actuator": name, "field": field} for field in ("kp", "kd", "strength")]  # of what it has
+    for command in robot.commands:
+        entries += [{"command": command, "field": field} for field in ("delay", "backlash", "lag", "scale", "offset")]
+    return entries
+
+
+_SCALAR_JOINTS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+
+
+def suggest_parameters(
+    robot: RobotDescription,
+    fit: RobotFit,
+    motions: Sequence[MeasuredMotion],
+    config: WindowConfig | None = None,
+) -> tuple[Suggestion, ...]:
+    """Return undeclared parameters that would explain what `fit` leaves.
+
+    The candidate that explains most comes first. The next ones explain what is left beside it (forward selection). A
+    candidate counts where all windows together tell it from nominal, each erring independently (Student's t). It may go
+    there (friction is not negative), and has at least a small effect.
+
+    **Arguments**
+
+    - `motions`, `config`: those of the fit.
+    """
+    config, model = config or WindowConfig(), motions[0].model
+    taken = {target[:2] for parameter in fit.parameters.parameters for target in parameter.targets}
+    entries, candidates = [], []
+    for entry in candidate_entries(robot, model):
+        parameter = _candidate(robot, model, entry)
+        if parameter is not None and not taken & {target[:2] for target in parameter.targets}:
+            taken |= {target[:2] for target in parameter.targets}
+            entries.append(entry)
+            candidates.append(parameter)
+    if not candidates:
+        return ()
+    extended = ParameterSet([*fit.parameters.parameters, *candidates], fit.parameters.commands)
+    values = np.concatenate([fit.values, [candidate.nominal for candidate in candidates]])
+    with jax.enable_x64(True):
+        windows = cut_windows(motions, config.window_seconds, config.interval_seconds)
+        objective = WindowObjective(WindowSimulator(extended, motions, windows), config)
+        objective.scale = fit.scatter
+        start = objective.measured_start()
+        reduced, _ = objective(values, start)
+        for _ in range(_SETTLING):
+            reduced, _ = objective(values, reduced.start)
+    chosen = _select(reduced, fit.parameters, candidates)
+    return tuple(
+        Suggestion(_bounded(entries[c], candidates[c], value), candidates[c], value, explained)
+        for c, value, explained in chosen
+    )
+
+
+_SETTLING = 3
+"""Evaluations in which starting states move to their best."""
+
+
+def _candidate(robot: RobotDescription, model: mujoco.MjModel, entry: Mapping[str, Any]) -> Parameter | None:
+    """Return the parameter of an entry, with bounds around 0 where its nominal value suggests none; None: the element
+    has no such thing."""
+    for bounds in ({}, {"bounds": [0, 1]}):
+        try:
+            return parameters_of(robot, model, [{**entry, **bounds}])[0]
+        except InputError:
+            continue
+    return None
+
+
+def _bounded(entry: Mapping[str, Any], candidate: Parameter, value: float) -> dict[str, Any]:
+    """Return an entry that can be declared: with bounds, where its nominal value suggests none."""
+    if candidate.nominal or "command" in entry:
+        return dict(entry)
+    return {**entry, "bounds": [0, float(f"{_ROOM * value:.1g}")]}
+
+
+_ROOM = 4.0
+"""Times the first guess: an upper bound."""
+
+
+def _select(
+    reduced: ReducedResiduals, declared: ParameterSet, candidates: Sequence[Parameter]
+) -> list[tuple[int, float, float]]:
+    """Return numbers of candidates, where they would go, and the share of the squares that each takes away, one after
+    the other: what those before it can take up is theirs."""
+    size, windows = len(declared), len(reduced.values)
+    known, tried, left = reduced.slopes[..., :size], reduced.slopes[..., size:], reduced.values
+    prior = np.where(np.isfinite(declared.prior), declared.prior, np.inf) ** -2.0
+    critical = student.ppf(1 - _CHANCE / 2, max(windows - 1, 1))
+    chosen: list[tuple[int, float, float]] = []
+    while len(chosen) < len(candidates):
+        flat = known.reshape(-1, known.shape[-1])
+        taken = np.linalg.lstsq(flat.T @ flat + np.diag(prior), flat.T @ tried.reshape(flat.shape[0], -1), rcond=None)
+        own = tried - known @ taken[0]
+        pulls = -np.einsum("wr,wrc->wc", left, own)
+        curvature = np.sum(own**2, axis=(0, 1)) + np.finfo(float).tiny
+        steps = pulls.sum(axis=0) / curvature
+        gained = steps**2 * curvature
+        spread = np.sqrt(windows) * np.std(pulls, axis=0, ddof=min(windows - 1, 1)) + np.finfo(float).tiny
+        sure = np.abs(pulls.sum(axis=0)) > critical * spread
+        for number, candidate in enumerate(candidates):
+            blocked = steps[number] < 0 and candidate.nominal <= max(candidate.bounds[0], 0.0)
+            small = gained[number] < SMALL_EFFECT * (np.sum(left**2) - gained[number])
+            if blocked or small or not sure[number] or any(number == c for c, _, _ in chosen):
+                gained[number] = 0.0
+        best = int(np.argmax(gained))
+        if gained[best] == 0:
+            break
+        value = max(candidates[best].nominal + float(steps[best]), candidates[best].bounds[0])
+        chosen.append((best, value, float(gained[best]) / reduced.loss))
+        left = left + own[..., best] * steps[best]
+        known, prior = np.concatenate([known, tried[..., best, None]], axis=2), np.append(prior, 0.0)
+    return chosen
