@@ -50,6 +50,7 @@ from ballu_mjx.ballu.sweep import SAMPLE_TIMESTEP, Sweep
 from ballu_mjx.identification.batched_solver import BatchedSolver, Evaluate, along_directions
 from ballu_mjx.identification.effective_samples import integrated_autocorrelation_time
 from ballu_mjx.identification.parameters import Direction
+from ballu_mjx.identification.undeclared import SMALL_EFFECT
 
 
 class LegData(NamedTuple):
@@ -176,8 +177,12 @@ class Selection(NamedTuple):
 
     @property
     def richer(self) -> bool:
-        """Whether the richer model is kept: what it explains is neither chance nor negligible."""
-        return self.statistic > self.threshold and self.effect > _LEAST_EFFECT
+        """Whether the richer model is kept: what it explains is neither chance nor negligible.
+
+        With thousands of samples, an F-test sees errors of the simulator's time step: hundredths of a degree, which the
+        further parameters would take up at the price of wrong springs and gains.
+        """
+        return self.statistic > self.threshold and self.effect > SMALL_EFFECT
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -221,10 +226,6 @@ class Identification:
 _PATIENCE = 4
 _LEVEL = 0.05
 """Of the F-test."""
-_LEAST_EFFECT = 0.02
-"""Cohen's f^2 of a small effect (Cohen, "Statistical power analysis for the behavioral sciences", 1988). With
-thousands of samples, an F-test sees errors of the simulator's time step: hundredths of a degree, which the further
-parameters would take up at the price of wrong springs and gains."""
 _FIRST_DAMPING = 5 * DEGREE
 """Unit of angles in a search, which starts with Levenberg's damping at 1. In radians, weak directions are damped for
 dozens of iterations."""

@@ -68,7 +68,7 @@ class SysidData(loggers.LoggingOptions):
     """Folder of the run, new or empty. Without this option: one under runs/, named after the time."""
     quick: bool = False
     """Within two minutes, compiling included: of BALLU settled angles alone, from fewer starts; of declared parameters
-    one short search."""
+    one short search, and no search for parameters that are not declared."""
 
 
 def train(
@@ -172,6 +172,7 @@ def _train_declared(
             validation,
             progress=report,
             on_data_check=checked,
+            suggest=not data.quick,
         )
         stages.close()
         run.write("identification.txt", found.report + "\n")

@@ -23,6 +23,7 @@ from ballu_mjx.identification.residuals import (
     measure,
     measured_from_motion,
 )
+from ballu_mjx.identification.undeclared import Suggestion, suggest_parameters, suggestions_table
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
@@ -40,11 +41,13 @@ class IdentifiedByFit(IdentifiedActuators):
     - `held_out`: motions that the held-out windows are of.
     - `choice`: replay of the validation recordings with nominal and with identified values; None: there were none, or
       none as long as a second.
+    - `suggestions`: parameters that are not declared and would explain what is left.
     """
 
     fit: RobotFit
     held_out: tuple[MeasuredMotion, ...]
     choice: Choice | None
+    suggestions: tuple[Suggestion, ...]
 
 
 def check_recordings(robot: RobotDescription, recordings: Mapping[Path, Recording], window_seconds: float) -> str:
@@ -104,6 +107,7 @@ def identify_declared(
     validation: Mapping[Path, Recording] | None = None,
     progress: IdentificationProgress | None = None,
     on_data_check: Callable[[Visibility], None] | None = None,
+    suggest: bool = True,
 ) -> IdentifiedByFit:
     """Identify the parameters that `robot` declares.
 
@@ -113,6 +117,7 @@ def identify_declared(
       window is held out.
     - `sampling`: of recordings of a robot whose root is held.
     - `progress`: is told of every iteration, `on_data_check` before the search of which parameters the data show.
+    - `suggest`: look for parameters that are not declared and would explain what is left.
 
     **Raises** `InputError` for options out of range, recordings that cannot be used, and declarations that do not fit
     the model.
@@ -132,15 +137,25 @@ def identify_declared(
     motions = [recorded_motion(each, robot, model, sampling) for each in validation.values()]
     long_enough = [motion for motion in motions if motion.time[-1] >= min(HORIZONS)]
     choice = choose_actuators(robot, identified, long_enough) if long_enough else None
+    suggestions: tuple[Suggestion, ...] = ()
+    if suggest:
+        if progress is not None:
+            progress("what is left", 0, 1, float("nan"))
+        suggestions = suggest_parameters(robot, fit, training, config)
+        if progress is not None:
+            progress("what is left", 1, 1, float("nan"))
     report = fit_table(fit, model, config.window_seconds, "validation recordings" if held else "the same recordings")
+    if suggestions:
+        report += f"\n\n{suggestions_table(suggestions)}"
     if choice is not None:
         report += f"\n\nOpen-loop replay of the validation recordings:\n{choice.table()}"
     return IdentifiedByFit(
         robot=specimen,
         parameters=identified,
         report=report,
-        details=fit_details(fit, model),
+        details={**fit_details(fit, model), "undeclared": [each.details() for each in suggestions]},
         fit=fit,
         held_out=tuple(held or training),
         choice=choice,
+        suggestions=suggestions,
     )

@@ -22,7 +22,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.bounded_solver import bounded_least_squares
 from ballu_mjx.identification.parameters import Direction, IdentifiedParameters, ParameterSet
 from ballu_mjx.identification.residuals import MeasuredMotion, Windows, WindowSimulator, cut_windows
-from ballu_mjx.identification.window_objective import WindowConfig, WindowObjective, WindowSearch
+from ballu_mjx.identification.window_objective import ReducedResiduals, WindowConfig, WindowObjective, WindowSearch
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,8 +86,7 @@ class RobotFit:
     parameters: ParameterSet
     values: Float[np.ndarray, " parameters"]
     standard_errors: Float[np.ndarray, " parameters"]
-    """Windows err independently, in whatever way: what leaving out one window at a time changes (cluster-robust, of the
-    kind CR3)."""
+    """Windows err independently, in whatever way (`analyse`)."""
     white_noise_errors: Float[np.ndarray, " parameters"]
     """Standard errors if what is left were white noise."""
     correlations: Float[np.ndarray, "parameters parameters"]
@@ -234,7 +233,7 @@ def fit_robot(
             shares, _ = bounded_least_squares(best, shares, config.steps, tell, _PATIENCE)
             objective.rescale(best.residuals)
         values = parameters.at_shares(shares)
-        analysis = _analyse(objective, values, best.start)
+        analysis = analyse(objective(values, best.start)[0], parameters)
         pair = [_held_out(simulator, point) for point in (parameters.nominal, values)]
     return RobotFit(
         parameters=parameters,
@@ -273,18 +272,23 @@ def replay(
         return tuple(_held_out(simulator, np.asarray(values, float)) for values in points)
 
 
-class _Analysis(NamedTuple):
-    white: np.ndarray
-    robust: np.ndarray
-    correlations: np.ndarray
+class Analysis(NamedTuple):
+    """How well residuals determine parameters: standard errors in the parameters' units."""
+
+    white: Float[np.ndarray, " parameters"]
+    robust: Float[np.ndarray, " parameters"]
+    correlations: Float[np.ndarray, "parameters parameters"]
     directions: tuple[Direction, ...]
 
 
-def _analyse(objective: WindowObjective, values: Float[np.ndarray, " parameters"], start: np.ndarray) -> _Analysis:
-    """Standard errors in the parameters' units."""
-    parameters = objective.parameters
-    reduced, _ = objective(values, start)
-    size, windows = len(values), len(reduced.values)
+def analyse(reduced: ReducedResiduals, parameters: ParameterSet) -> Analysis:
+    """Return standard errors at a minimum, if what is left were white noise and if windows err independently.
+
+    The latter are what leaving out one window at a time changes (jackknife, CR3). Products of scores come out too small
+    with few windows, because each window has pulled the fit towards itself (Bell & McCaffrey, Survey Methodology 28,
+    2002).
+    """
+    size, windows = len(parameters), len(reduced.values)
     # As many rows say where starting states begin as there are starting states.
     variance = reduced.loss / max(reduced.values.size - reduced.start.size - size, 1)
     # In units of what bounds or priors leave open, so that all are of a size.
@@ -294,18 +298,16 @@ def _analyse(objective: WindowObjective, values: Float[np.ndarray, " parameters"
     known = np.diag(np.where(np.isfinite(parameters.prior), 1.0, 0.0) + _SLIGHT)
     inverse = flat.T @ flat / variance + known
     bread = np.linalg.inv(inverse)
-    # With few windows, products of scores come out too small: each window has pulled the fit towards itself. What
-    # leaving it out would change has not (jackknife; Bell & McCaffrey, Survey Methodology 28, 2002).
     scores = np.einsum("wr,wrp->wp", reduced.values, slopes) / variance
     own = np.einsum("wrp,wrq->wpq", slopes, slopes) / variance
     changes = np.linalg.solve(inverse - own, scores[..., None])[..., 0]
-    sandwich = changes.T @ changes * (windows - 1) / windows + bread @ known @ bread
-    deviations = [np.sqrt(np.diag(covariance)) for covariance in (bread, sandwich)]
-    correlations = sandwich / np.outer(deviations[1], deviations[1])
+    jackknife = changes.T @ changes * (windows - 1) / windows + bread @ known @ bread
+    deviations = [np.sqrt(np.diag(covariance)) for covariance in (bread, jackknife)]
+    correlations = jackknife / np.outer(deviations[1], deviations[1])
     _, singular, right = np.linalg.svd(flat / np.sqrt(variance), full_matrices=False)
     signed = [row * np.sign(row[np.argmax(np.abs(row))]) for row in right]
     directions = [Direction(row, float(1 / max(s, 1e-12))) for row, s in zip(signed, singular, strict=True)]
-    return _Analysis(deviations[0] * unit, deviations[1] * unit, correlations, tuple(directions))
+    return Analysis(deviations[0] * unit, deviations[1] * unit, correlations, tuple(directions))
 
 
 _SLIGHT = 1e-9

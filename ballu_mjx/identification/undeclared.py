@@ -8,6 +8,7 @@ test, which takes a single linearization.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -36,10 +37,21 @@ class Suggestion(NamedTuple):
     explained: float
     """Share of the squares that are left which it would take away, beside the suggestions before it."""
 
-    def words(self) -> str:
-        """Return it as a sentence."""
-        value = f"{self.value:.2g} {self.parameter.unit.removeprefix('1')}".strip()
-        return f"{self.parameter.name}, about {value}, would explain {self.explained:.0%} of what is left."
+    def details(self) -> dict[str, Any]:
+        """Return it as JSON's types."""
+        name, unit = self.parameter.name, self.parameter.unit
+        return {"name": name, "unit": unit, "value": self.value, "explained": self.explained, "entry": dict(self.entry)}
+
+
+def suggestions_table(suggestions: Sequence[Suggestion]) -> str:
+    """Return suggestions in words, with what to write in the description."""
+    lines = ["Not declared, and would explain what is left:"]
+    for each in suggestions:
+        value = f"{each.value:.2g} {each.parameter.unit.removeprefix('1')}".strip()
+        lines.append(f"  {each.parameter.name}, about {value}: {each.explained:.0%} of the squares.")
+        lines.append(f'    Add to "identify": {json.dumps(dict(each.entry))}')
+    lines.append("Declare these and identify again: until then other parameters stand in for them.")
+    return "\n".join(lines)
 
 
 SMALL_EFFECT = 0.02

@@ -14,8 +14,8 @@ from robot_files import write_robot
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_report import fit_table
-from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, check_data, fit_robot, replay
-from ballu_mjx.identification.parameters import ParameterSet
+from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, analyse, check_data, fit_robot, replay
+from ballu_mjx.identification.parameters import Parameter, ParameterSet
 from ballu_mjx.identification.residuals import (
     MeasuredMotion,
     SamplingConfig,
@@ -23,7 +23,7 @@ from ballu_mjx.identification.residuals import (
     cut_windows,
     measure,
 )
-from ballu_mjx.identification.window_objective import soften
+from ballu_mjx.identification.window_objective import ReducedResiduals, soften
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.description import RobotDescription
 
@@ -181,9 +181,9 @@ def test_with_states_as_measured_the_best_point_tried_is_found(motions: list[Mea
     fit = fit_robot(parameters, motions[:2], motions[2:], config, on_evaluation=tried.append)
     with jax.enable_x64(True):
         simulator = WindowSimulator(parameters, motions[:2], cut_windows(motions[:2], 1.0))
-        # Channels count by the measurements' noise alone, and starting states do not move.
+        # Positions count by the measurements' noise alone, and starting states do not move.
         losses = [
-            np.sum(soften(simulator.differences(values), config.outlying)[0] ** 2)
+            np.sum(soften(simulator.differences(values)[..., : simulator.nv], config.outlying)[0] ** 2)
             + np.sum(((values - parameters.nominal) / parameters.prior) ** 2)
             for values in (fit.values, *tried)
         ]
@@ -224,3 +224,25 @@ def test_what_cannot_be_fitted_is_refused(motions: list[MeasuredMotion], paramet
     path.write_text("\n".join(rows) + "\n")
     with pytest.raises(InputError, match="joint elbow was not recorded"):
         measure(read_recording(path, description), description, model)
+
+
+def test_standard_errors_are_what_leaving_out_windows_changes():
+    """Of a linear model without priors, whose windows each have an error of their own: refitted without each."""
+    rng = np.random.default_rng(0)
+    windows, rows = 7, 5
+    slopes = rng.normal(size=(windows, rows, 2))
+    measured = slopes @ [1.0, -2.0] + rng.normal(size=(windows, 1)) + 0.1 * rng.normal(size=(windows, rows))
+
+    def solved(kept: np.ndarray) -> np.ndarray:
+        return np.linalg.lstsq(slopes[kept].reshape(-1, 2), measured[kept].ravel(), rcond=None)[0]
+
+    every = np.ones(windows, bool)
+    best = solved(every)
+    changes = np.array([solved(every & (np.arange(windows) != left)) - best for left in range(windows)])
+    names, bounds = ("one", "other"), (-100.0, 100.0)
+    parameters = ParameterSet([Parameter(name, "1", 0.0, bounds, np.inf, False, ()) for name in names], 0)
+    none = np.zeros((windows, 0))
+    reduced = ReducedResiduals(slopes @ best - measured, slopes, none, np.zeros((windows, 0, 2)))
+    found = analyse(reduced, parameters)
+    expected = np.sqrt((windows - 1) / windows * np.sum(changes**2, axis=0))
+    np.testing.assert_allclose(found.robust, expected, rtol=1e-3)
