@@ -33,7 +33,7 @@ from ballu_mjx.ballu.recordings import make_recording
 from ballu_mjx.recordings.recording import Recording
 
 ROBOTS = range(5)
-CHOSEN_ON = (0, 1)
+CHOSEN_ON = (0, 1, 2)
 """Robots that choices may look at."""
 TIMESTEP = 1e-3
 CAPTURE_TIMESTEP = 0.01

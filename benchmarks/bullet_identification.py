@@ -8,7 +8,7 @@ actuators:
   (`identification.guard`), on gaits (near) and on what is none (far);
 - what `--actuators auto` takes, by the guard's replay of further recordings.
 
-Choices are made on robots 0 and 1. All five take about an hour on two cores.
+Choices are made on robots 0, 1 and 2. All five take about an hour on two cores.
 
 `--true-legs` identifies nothing, and replays walks with the robots' true legs and drivetrains, as far as the package's
 model has them. What is left then is air, contact and the form of the mechanism, which no sweep shows. It takes minutes.
@@ -312,7 +312,7 @@ def main() -> None:
     if arguments.results is not None:
         about = {key: value for key, value in stored["machine"].items() if key not in ("versions", "load")}
         measured = {"commit": stored["commit"], "machine": about, "versions": stored["machine"]["versions"]}
-        data = f"Development data: choices were made on robots {' and '.join(map(str, CHOSEN_ON))}"
+        data = f"Development data: choices were made on robots {', '.join(map(str, CHOSEN_ON))}"
         write_results(arguments.results, {"errors": found}, data, seeds={"robots": robots}, measured=measured)
 
 

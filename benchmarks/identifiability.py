@@ -23,7 +23,14 @@ import jax
 import numpy as np
 
 from ballu_mjx.ballu.identification import Fit, Identifier, leg_data
-from ballu_mjx.ballu.leg_parameters import LEG_PARAMETERS, IdentificationConfig, LegDynamics, dynamics_coordinates
+from ballu_mjx.ballu.leg_parameters import (
+    ALL_PARAMETERS,
+    LEG_PARAMETERS,
+    PAPER_PARAMETERS,
+    IdentificationConfig,
+    LegDynamics,
+    dynamics_coordinates,
+)
 from ballu_mjx.ballu.model import SIDES
 from ballu_mjx.ballu.sweep import Sweep, read_sweep
 from ballu_mjx.ballu.virtual import robot as virtual_robot
@@ -85,14 +92,14 @@ def with_noise(sweep: Sweep, seed: int) -> Sweep:
 
 def of_the_model_itself(seeds: int, draws: int) -> None:
     """Starts and noise."""
-    identifier = Identifier(IdentificationConfig(), blank(), silent)
+    identifier = Identifier(ALL_PARAMETERS, blank(), silent)
     space = identifier.space
     changes = np.array(CHANGES)
     vectors = np.where(space.relative, space.nominal * changes, space.nominal + changes)
     clean = simulate(identifier, vectors)
     worst = np.zeros(len(LEG_PARAMETERS))
     for seed in range(seeds):
-        identifier.config = IdentificationConfig(seed=seed)
+        identifier.config = dataclasses.replace(ALL_PARAMETERS, seed=seed)
         found = np.stack([fit.vector for fit in identifier.run(clean, silent).fits])
         worst = np.maximum(worst, np.abs(found - vectors).max(axis=0))
     print(f"Without noise, worst of {seeds} draws of starts:")
@@ -101,7 +108,7 @@ def of_the_model_itself(seeds: int, draws: int) -> None:
         print(f"  {name:24}{shown}")
     within = []
     for seed in range(draws):
-        identifier.config = IdentificationConfig(draws=32)
+        identifier.config = dataclasses.replace(ALL_PARAMETERS, draws=32)
         for fit, vector in zip(identifier.run(with_noise(clean, seed), silent).fits, vectors, strict=True):
             within += list(np.abs(fit.vector - vector) < 2 * fit.standard_errors)
     print(f"With 0.5 deg of noise, {draws} draws: within two standard errors {np.mean(within):.1%} of the parameters")
@@ -113,14 +120,7 @@ def of_virtual_robots(robots: int) -> None:
         "as it is": IdentificationConfig(),
         "settled angles alone": IdentificationConfig(motion=False),
         "and no slack": IdentificationConfig(motion=False, cable_slack=False),
-        "the paper's eight": IdentificationConfig(
-            motion=False,
-            cable_slack=False,
-            torque_limit=False,
-            motor_travel=False,
-            cable_stiffness=False,
-            knee_spring_reference=False,
-        ),
+        "the paper's eight": dataclasses.replace(PAPER_PARAMETERS, motion=False),
     }
     for way, config in ways.items():
         print(f"\nVirtual robots, {way}: identified over true, (left, right)")

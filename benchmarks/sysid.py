@@ -57,7 +57,13 @@ from searches import (
 from ballu_mjx.ballu.actuators import ActuatorParameters, actuator_fields
 from ballu_mjx.ballu.curves import curve_distances
 from ballu_mjx.ballu.identification import Identification, Identifier
-from ballu_mjx.ballu.leg_parameters import LEG_PARAMETERS, IdentificationConfig, ParameterTransform, nominal_leg
+from ballu_mjx.ballu.leg_parameters import (
+    LEG_PARAMETERS,
+    PAPER_PARAMETERS,
+    IdentificationConfig,
+    ParameterTransform,
+    nominal_leg,
+)
 from ballu_mjx.ballu.model import SIDES, load_suspended_leg, suspend
 from ballu_mjx.ballu.sweep import Sweep, read_sweep
 from ballu_mjx.ballu.sysid_report import mean_error
@@ -380,14 +386,7 @@ def measure(quick: bool) -> list[Row]:
     comparisons = []
     for beyond in (True,) if quick else (False, True):
         # As many starts as by default: the compiled program's size depends on them.
-        config = IdentificationConfig(
-            motion=False,
-            torque_limit=beyond,
-            cable_slack=beyond,
-            motor_travel=False,
-            cable_stiffness=False,
-            knee_spring_reference=False,
-        )
+        config = dataclasses.replace(PAPER_PARAMETERS, motion=False, torque_limit=beyond, cable_slack=beyond)
         if quick:
             config = dataclasses.replace(config, draws=15, steps=8)
         space = ParameterTransform(nominal_leg(), config)

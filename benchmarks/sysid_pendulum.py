@@ -2,7 +2,7 @@
 
 The recordings, the model and the parameters are those of `experiments/real/double_pendulum/`. All three ways have
 the same windows, starting states as measured, bounds and first point (nominal, and a little inside its bounds), no
-priors, and the same residuals: positions and velocities at every sample over `WEIGHTS`, softened (pseudo-Huber). The
+priors, and the same residuals: positions at every sample over `WEIGHT`, softened (pseudo-Huber). The
 objective is their root mean square.
 
 - ours: `fit_robot`, Levenberg-Marquardt with exact derivatives through MJX, one start.
@@ -69,8 +69,8 @@ EXPERIMENTS = Path(__file__).parents[1] / "experiments" / "real"
 sys.path[1:1] = [str(EXPERIMENTS / "double_pendulum"), str(EXPERIMENTS)]
 import double_pendulum  # pyright: ignore[reportMissingImports]
 
-WEIGHTS = np.deg2rad(2.0), np.deg2rad(20.0)
-"""Of positions (rad) and velocities (rad/s): about what the identified model leaves."""
+WEIGHT = np.deg2rad(2.0)
+"""Of positions (rad): about what the identified model leaves."""
 SECONDS = 1.0
 """Of a window; windows end to end."""
 OUTLYING = FitConfig().outlying
@@ -139,8 +139,9 @@ class WindowRollouts:
         return np.sqrt(np.mean(residuals(self.differences(vectors)) ** 2, axis=(1, 2, 3)))
 
 
-def residuals(differences: Float[np.ndarray, "*batch channels"]) -> Float[np.ndarray, "*batch channels"]:
-    return soften(differences / np.repeat(WEIGHTS, differences.shape[-1] // 2), OUTLYING)[0]
+def residuals(differences: Float[np.ndarray, "*batch channels"]) -> Float[np.ndarray, "*batch positions"]:
+    """Those of positions, the first half of the channels."""
+    return soften(differences[..., : differences.shape[-1] // 2] / WEIGHT, OUTLYING)[0]
 
 
 class CompileClock:
@@ -319,10 +320,7 @@ def main() -> None:
     parameters = without_priors(declared_parameters(robot, robot.load_model()))
     names = double_pendulum.TRAINING[:1] if arguments.quick else double_pendulum.TRAINING
     training, held_out = (
-        [
-            dataclasses.replace(m, position_noise=np.full(2, WEIGHTS[0]), velocity_noise=np.full(2, WEIGHTS[1]))
-            for m in double_pendulum.load(arguments.data, each)
-        ]
+        [dataclasses.replace(m, position_noise=np.full(2, WEIGHT)) for m in double_pendulum.load(arguments.data, each)]
         for each in (names, double_pendulum.VALIDATION)
     )
     clock, missing = CompileClock(), missing_for_toolbox()

@@ -68,6 +68,14 @@ class IdentificationConfig:
     """Seeds the draws."""
 
 
+PAPER_PARAMETERS = IdentificationConfig(
+    torque_limit=False, cable_slack=False, motor_travel=False, cable_stiffness=False
+)
+"""The paper's four of a leg: spring stiffness, motor gain, motor angle at command 0, the knee's stop."""
+ALL_PARAMETERS = IdentificationConfig(knee_spring_reference=True, nominal_springs=False)
+"""Every parameter free, with either model."""
+
+
 class ParameterRange(NamedTuple):
     """What is known of a parameter beforehand."""
 

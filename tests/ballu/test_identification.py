@@ -16,10 +16,11 @@ from ballu_mjx.ballu.actuators import ActuatorParameters, actuator_fields
 from ballu_mjx.ballu.curves import curve_distances, directed_hausdorff, polynomial_curve
 from ballu_mjx.ballu.identification import CompiledLeg, Identifier, leg_data
 from ballu_mjx.ballu.leg_parameters import (
+    ALL_PARAMETERS,
     FURTHER,
     LEG_PARAMETERS,
     NOMINAL_DYNAMICS,
-    IdentificationConfig,
+    PAPER_PARAMETERS,
     LegDynamics,
     ParameterTransform,
     dynamics_coordinates,
@@ -49,9 +50,7 @@ def double() -> Iterator[None]:
 
 BEYOND = ["torque_limit", "cable_slack", "motor_travel", "cable_stiffness", "knee_spring_reference"]
 """What is not among the paper's eight."""
-EVERY = IdentificationConfig(knee_spring_reference=True, nominal_springs=False)
-"""All parameters free, with either model."""
-SPACE = ParameterTransform(nominal_leg(), EVERY)
+SPACE = ParameterTransform(nominal_leg(), ALL_PARAMETERS)
 
 
 def vector(change: list[float]) -> np.ndarray:
@@ -78,7 +77,7 @@ DATA = leg_data(blank())
 
 @pytest.fixture(scope="module")
 def identifier() -> Identifier:
-    return Identifier(EVERY, blank(), lambda *_: None)
+    return Identifier(ALL_PARAMETERS, blank(), lambda *_: None)
 
 
 @pytest.fixture(scope="module")
@@ -238,10 +237,7 @@ def test_coordinates_map_onto_the_bounds_and_back() -> None:
         assert np.all((SPACE.lower < values) & (values < SPACE.upper))
         assert SPACE.coordinates(values) == pytest.approx(draw, abs=1e-9)
     assert np.asarray(SPACE.vector(jnp.asarray(SPACE.draw(0, 1)[0]))) == pytest.approx(SPACE.nominal)
-    options = IdentificationConfig(
-        torque_limit=False, cable_slack=False, motor_travel=False, cable_stiffness=False, knee_spring_reference=False
-    )
-    paper = ParameterTransform(nominal_leg(), options)
+    paper = ParameterTransform(nominal_leg(), PAPER_PARAMETERS)
     held = np.asarray(paper.vector(jnp.asarray(paper.draw(0, 1)[1]))) == paper.nominal
     assert [name for name, same in zip(LEG_PARAMETERS, held, strict=True) if same] == BEYOND
 
@@ -278,7 +274,7 @@ def test_known_parameters_are_recovered(noiseless: Sweep, identifier: Identifier
     """Some draws end in a long curved valley, where the motion is right to a tenth of a capture's noise."""
     every = []
     for seed in range(2):
-        identifier.config = dataclasses.replace(EVERY, seed=seed, draws=32)
+        identifier.config = dataclasses.replace(ALL_PARAMETERS, seed=seed, draws=32)
         every.append(identifier.run(noiseless, lambda *_: None).fits)
         assert all(fit.residual < np.deg2rad(0.05) for fit in every[-1])
     for leg, truth in enumerate(TRUTH):
@@ -296,7 +292,7 @@ def test_the_richer_model_is_taken_where_a_robot_asks_for_it(physics: CompiledLe
     """Springs then stay at their nominal stiffness, and all else is found about it."""
     spring, travel = (LEG_PARAMETERS.index(name) for name in ("knee_spring_stiffness", "motor_travel"))
     truths = [np.where(np.arange(len(truth)) == spring, SPACE.nominal, truth) for truth in TRUTH]
-    identifier.config = dataclasses.replace(EVERY, nominal_springs=True, draws=32, steps=15)
+    identifier.config = dataclasses.replace(ALL_PARAMETERS, nominal_springs=True, draws=32, steps=15)
     found = identifier.run(noisy(sweep_of(physics, *truths), 0), lambda *_: None)
     assert found.selection is not None and found.selection.richer
     for fit, truth in zip(found.fits, truths, strict=True):
@@ -314,7 +310,7 @@ def test_the_simpler_model_stays_where_a_robot_has_no_more(physics: CompiledLeg,
     motion = physics.motion(y, DATA.commanded)[0][:, DATA.counts]
     settled = rest(physics, *plain)[:, :, physics.leg.angles]
     sweep = dataclasses.replace(blank(), settled=np.moveaxis(settled, 0, -1), motion=np.moveaxis(motion, 0, -1))
-    identifier.config = dataclasses.replace(EVERY, draws=32, steps=15)
+    identifier.config = dataclasses.replace(ALL_PARAMETERS, draws=32, steps=15)
     found = identifier.run(noisy(sweep, 0), lambda *_: None)
     assert found.selection is not None and not found.selection.richer
     assert found.selection.statistic > 0 and found.selection.effect > 0, "it has the simpler solution among its starts"
@@ -335,7 +331,7 @@ def test_the_simpler_model_stays_where_a_robot_has_no_more(physics: CompiledLeg,
 @pytest.mark.slow
 def test_standard_errors_are_honest(noiseless: Sweep, identifier: Identifier) -> None:
     """With 0.5 deg of noise, nine in ten estimates within two standard errors."""
-    identifier.config = dataclasses.replace(EVERY, draws=32, steps=12)
+    identifier.config = dataclasses.replace(ALL_PARAMETERS, draws=32, steps=12)
     within = []
     for seed in range(2):
         result = identifier.run(noisy(noiseless, seed), lambda *_: None)
@@ -353,7 +349,7 @@ def test_friction_and_play_pass_for_actuators_only_where_settled_angles_are_all(
     sweep = noisy(dataclasses.replace(noiseless, settled=ends), 0)
     off = {}
     for motion in (True, False):
-        identifier.config = dataclasses.replace(EVERY, motion=motion, draws=32, steps=15)
+        identifier.config = dataclasses.replace(ALL_PARAMETERS, motion=motion, draws=32, steps=15)
         fits = identifier.run(sweep, lambda *_: None).fits
         zero = LEG_PARAMETERS.index("default_motor_angle")
         off[motion] = [abs(fit.vector[zero] - truth[zero]) for fit, truth in zip(fits, TRUTH, strict=True)]
@@ -366,7 +362,7 @@ def test_what_a_sweep_leaves_open_is_named_and_held_near_nominal(physics: Compil
     strong = [vector(HIGH), vector(HIGH)]
     settled = np.moveaxis(rest(physics, *strong)[:, :, physics.leg.angles], 0, -1)
     sweep = dataclasses.replace(blank(), settled=settled)
-    identifier.config = dataclasses.replace(EVERY, motion=False, draws=16, steps=12)
+    identifier.config = dataclasses.replace(ALL_PARAMETERS, motion=False, draws=16, steps=12)
     limit = LEG_PARAMETERS.index("torque_limit")
     for fit in identifier.run(noisy(sweep, 0, np.deg2rad(0.1)), lambda *_: None).fits:
         largest = [np.argmax(np.abs(direction.weights)) for direction in fit.open_directions]
@@ -387,7 +383,7 @@ def test_the_papers_objective_is_lower_where_it_is_what_is_minimized(noiseless: 
     )
     distances = {}
     for objective in ("pointwise", "hausdorff"):
-        identifier.config = dataclasses.replace(EVERY, objective=objective, motion=False, draws=16, steps=15)
+        identifier.config = dataclasses.replace(ALL_PARAMETERS, objective=objective, motion=False, draws=16, steps=15)
         result = identifier.run(sweep, lambda *_: None)
         assert result.config.objective == objective
         distances[objective] = sum(
