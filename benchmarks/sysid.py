@@ -56,7 +56,8 @@ from searches import (
 
 from ballu_mjx.ballu.actuators import ActuatorParameters, actuator_fields
 from ballu_mjx.ballu.curves import curve_distances
-from ballu_mjx.ballu.identification import Identification, Identifier
+from ballu_mjx.ballu.identification import Identifier
+from ballu_mjx.ballu.leg_fit import Identification
 from ballu_mjx.ballu.leg_parameters import (
     LEG_PARAMETERS,
     PAPER_PARAMETERS,

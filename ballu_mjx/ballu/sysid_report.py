@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.ballu.curves import curve_distances
-from ballu_mjx.ballu.identification import Identification
+from ballu_mjx.ballu.leg_fit import Identification
 from ballu_mjx.ballu.leg_parameters import (
     DEGREE,
     FURTHER,

@@ -14,7 +14,7 @@ from scipy.spatial.distance import directed_hausdorff as scipy_directed_hausdorf
 
 from ballu_mjx.ballu.actuators import ActuatorParameters, actuator_fields
 from ballu_mjx.ballu.curves import curve_distances, directed_hausdorff, polynomial_curve
-from ballu_mjx.ballu.identification import CompiledLeg, Identifier, leg_data
+from ballu_mjx.ballu.identification import Identifier
 from ballu_mjx.ballu.leg_parameters import (
     ALL_PARAMETERS,
     FURTHER,
@@ -26,6 +26,7 @@ from ballu_mjx.ballu.leg_parameters import (
     dynamics_coordinates,
     nominal_leg,
 )
+from ballu_mjx.ballu.leg_residuals import CompiledLeg, leg_data
 from ballu_mjx.ballu.model import SIDES, suspend
 from ballu_mjx.ballu.sweep import Sweep
 from ballu_mjx.robots.model import assets, set_fields
