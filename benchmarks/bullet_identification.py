@@ -59,9 +59,9 @@ from jaxtyping import Float
 from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.ballu.actuators_file import actuators_to_json
 from ballu_mjx.ballu.gaits import Gait
-from ballu_mjx.ballu.identification import Identifier
-from ballu_mjx.ballu.leg_fit import Identification
+from ballu_mjx.ballu.leg_fit import Identifier
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
+from ballu_mjx.ballu.leg_results import Identification
 from ballu_mjx.ballu.model import SIDES, suspend
 from ballu_mjx.ballu.sweep import Sweep, read_sweep
 from ballu_mjx.ballu.sysid_report import identification_details

@@ -32,8 +32,8 @@ from ballu_mjx.common.results import Table, write_results
 from ballu_mjx.identification.declarations import declared_parameters, parameters_of
 from ballu_mjx.identification.declared import measure_recording
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, fit_robot
+from ballu_mjx.identification.measured_motion import SamplingConfig
 from ballu_mjx.identification.parameters import ParameterSet
-from ballu_mjx.identification.residuals import SamplingConfig
 from ballu_mjx.identification.undeclared import suggest_parameters
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.description import RobotDescription

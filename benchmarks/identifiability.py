@@ -22,8 +22,7 @@ runtime.prepare()
 import jax
 import numpy as np
 
-from ballu_mjx.ballu.identification import Identifier
-from ballu_mjx.ballu.leg_fit import Fit
+from ballu_mjx.ballu.leg_fit import Identifier
 from ballu_mjx.ballu.leg_parameters import (
     ALL_PARAMETERS,
     LEG_PARAMETERS,
@@ -33,6 +32,7 @@ from ballu_mjx.ballu.leg_parameters import (
     dynamics_coordinates,
 )
 from ballu_mjx.ballu.leg_residuals import leg_data
+from ballu_mjx.ballu.leg_results import Fit
 from ballu_mjx.ballu.model import SIDES
 from ballu_mjx.ballu.sweep import Sweep, read_sweep
 from ballu_mjx.ballu.virtual import robot as virtual_robot

@@ -4,7 +4,7 @@ The objective is the sum over both legs of the directed Hausdorff distances from
 and knee, of settled angles. All three know the same bounds, for the paper's eight parameters and for twelve (with
 torque limits and slack):
 
-- ours: `ballu_mjx.ballu.identification` from settled angles alone, with either objective. The time is a second run's;
+- ours: `ballu_mjx.ballu.leg_fit` from settled angles alone, with either objective. The time is a second run's;
   compiling, once for each size of sweep, stands apart.
 - the paper's way: scipy's L-BFGS-B from the nominal values, finite differences through C MuJoCo. Two favours: the
   parameters of both legs are perturbed at once, as neither leg feels the other, and the joints are damped so that they
@@ -56,8 +56,7 @@ from searches import (
 
 from ballu_mjx.ballu.actuators import ActuatorParameters, actuator_fields
 from ballu_mjx.ballu.curves import curve_distances
-from ballu_mjx.ballu.identification import Identifier
-from ballu_mjx.ballu.leg_fit import Identification
+from ballu_mjx.ballu.leg_fit import Identifier
 from ballu_mjx.ballu.leg_parameters import (
     LEG_PARAMETERS,
     PAPER_PARAMETERS,
@@ -65,6 +64,7 @@ from ballu_mjx.ballu.leg_parameters import (
     ParameterTransform,
     nominal_leg,
 )
+from ballu_mjx.ballu.leg_results import Identification
 from ballu_mjx.ballu.model import SIDES, load_suspended_leg, suspend
 from ballu_mjx.ballu.sweep import Sweep, read_sweep
 from ballu_mjx.ballu.sysid_report import mean_error

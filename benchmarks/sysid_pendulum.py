@@ -58,9 +58,10 @@ from searches import (
 from ballu_mjx.common.results import Cell, Table, write_results
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_robot import FitConfig, fit_robot
+from ballu_mjx.identification.measured_motion import MeasuredMotion
 from ballu_mjx.identification.parameters import ParameterSet
-from ballu_mjx.identification.residuals import MeasuredMotion, Windows, cut_windows
 from ballu_mjx.identification.window_objective import soften
+from ballu_mjx.identification.window_simulator import Windows, cut_windows
 from ballu_mjx.robots.description import read_description
 from ballu_mjx.robots.model import set_fields
 from ballu_mjx.sim.drivetrain import filter_commands

@@ -11,8 +11,9 @@ import sysid_pendulum  # pyright: ignore[reportMissingImports]
 from searches import Search, compare, lbfgsb  # pyright: ignore[reportMissingImports]
 
 from ballu_mjx.identification.declarations import declared_parameters
+from ballu_mjx.identification.measured_motion import MeasuredMotion
 from ballu_mjx.identification.parameters import Shares
-from ballu_mjx.identification.residuals import MeasuredMotion, WindowSimulator, cut_windows
+from ballu_mjx.identification.window_simulator import WindowSimulator, cut_windows
 
 SHARES = Shares(np.array([1e-3, -1.0]), np.array([1e1, 3.0]), np.array([True, False]))
 

@@ -6,9 +6,9 @@ import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
-from ballu_mjx.ballu.identification import identify_legs
-from ballu_mjx.ballu.leg_fit import Identification
+from ballu_mjx.ballu.leg_fit import identify_legs
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
+from ballu_mjx.ballu.leg_results import Identification
 from ballu_mjx.ballu.sweep import LEVELS, Sweep, read_sweep
 from ballu_mjx.ballu.sysid_report import identification_details, identification_table
 from ballu_mjx.recordings.recording import Recording

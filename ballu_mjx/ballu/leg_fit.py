@@ -1,100 +1,295 @@
-"""What identification finds of BALLU's legs."""
+"""Identification of the actuators from a suspended sweep (paper, section "System Identification", Algorithm 1).
+
+The legs hang from a base held still, so that each is identified by itself, both at once. The search begins with settled
+angles. What decides is the whole motion, with what a command meets on its way: delay, backlash and dry friction
+(`LegDynamics`), under which no leg is ever quite at rest. Both are computed in `ballu.leg_residuals`.
+
+All functions compute in double precision and are to be called inside `jax.enable_x64(True)`, but for `identify_legs`,
+which sees to it itself. A leg's parameters are a vector in the order of `LEG_PARAMETERS`; a pair of angles is (motor,
+knee).
+"""
 
 from __future__ import annotations
 
-import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from functools import partial
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
 
-from ballu_mjx.ballu.actuators import ActuatorParameters
-from ballu_mjx.ballu.leg_parameters import FURTHER, LEG_PARAMETERS, IdentificationConfig, LegDynamics
-from ballu_mjx.identification.parameters import Direction
-from ballu_mjx.identification.undeclared import SMALL_EFFECT
+from ballu_mjx.ballu.curves import curve_distances
+from ballu_mjx.ballu.leg_model_selection import select_model
+from ballu_mjx.ballu.leg_parameters import (
+    DEGREE,
+    FURTHER,
+    LEG_PARAMETERS,
+    SIMPLE_DYNAMICS,
+    IdentificationConfig,
+    LegDynamics,
+    ParameterTransform,
+    check_identification_config,
+    dynamics_coordinates,
+    leg_dynamics,
+    nominal_leg,
+)
+from ballu_mjx.ballu.leg_residuals import CompiledLeg, LegResiduals, leg_data
+from ballu_mjx.ballu.leg_results import Fit, Identification
+from ballu_mjx.ballu.leg_uncertainty import analyse_legs
+from ballu_mjx.ballu.model import SIDES
+from ballu_mjx.ballu.sweep import Sweep
+from ballu_mjx.identification.batched_solver import BatchedSolver, Evaluate
 
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Fit:
-    """One leg, identified."""
-
-    vector: Float[np.ndarray, " parameters"]
-    standard_errors: Float[np.ndarray, " parameters"]
-    """In the parameters' units, with all free parameters unknown, whether or not the simpler model was kept; 0 for
-    those that the configuration holds. See `leg_uncertainty`."""
-    correlations: Float[np.ndarray, "free free"]
-    """Of the same errors."""
-    directions: tuple[Direction, ...]
-    """Of the parameters that were fitted, from the best to the least determined."""
-    dynamics: LegDynamics | None
-    """None: the motion had no part in the fit."""
-    dynamics_errors: LegDynamics | None
-    """Standard errors of `dynamics`."""
-    residual: float
-    """Root mean square (rad) of all residuals."""
-    losses: Float[np.ndarray, " starts"]
-    """Sums of squares (rad^2, settled angles) that the starts ended at, in ascending order."""
-
-    @property
-    def open_directions(self) -> tuple[Direction, ...]:
-        """Those that the data leave open: held near the nominal values."""
-        return tuple(d for d in self.directions if d.standard_error > 1.0)
-
-
-class Selection(NamedTuple):
-    """Whether the `FURTHER` parameters of both legs are worth having."""
-
-    statistic: float
-    """F, with as many samples as the residuals are worth."""
-    threshold: float
-    """F that chance exceeds in 5 of 100 sweeps."""
-    effect: float
-    """Cohen's f^2: what the further parameters explain of the squares, over what they leave."""
-
-    @property
-    def richer(self) -> bool:
-        """Whether the richer model is kept: what it explains is neither chance nor negligible.
-
-        With thousands of samples, an F-test sees errors of the simulator's time step: hundredths of a degree, which the
-        further parameters would take up at the price of wrong springs and gains.
-        """
-        return self.statistic > self.threshold and self.effect > SMALL_EFFECT
+_PATIENCE = 4
+_FIRST_DAMPING = 5 * DEGREE
+"""Unit of angles in a search, which starts with Levenberg's damping at 1. In radians, weak directions are damped for
+dozens of iterations."""
+_INSIDE = 4.0
+"""Largest coordinate that a search of the motion starts from: 2 % of the bounds' span inside them. A slack that settled
+angles put at its bound has next to no slope left, and would stay there."""
+_SHORT = 6
+"""Iterations after which one of two searches goes on."""
+Report = Callable[[str, int, int, float], None]
+"""(stage, iteration, most iterations, the lowest loss among the searches)."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Identification:
-    """Both legs (left, right)."""
+def identify_legs(
+    sweep: Sweep, config: IdentificationConfig | None = None, report: Report | None = None
+) -> Identification:
+    """Fit both legs' parameters to a sweep.
 
-    fits: tuple[Fit, Fit]
-    settled: Float[np.ndarray, "holds 2 2"]
-    """Angles (rad) at which the identified robot is in balance, without friction and play; (motor, knee), (left, right)
-    last, as in `Sweep`."""
-    simulated: Float[np.ndarray, "holds 2 2"] | None
-    """What its simulated motion comes to; None where that was not fitted."""
-    nominal_settled: Float[np.ndarray, "holds 2 2"]
-    """The same as `settled`, of the nominal robot."""
-    free: tuple[str, ...]
-    """Parameters that the configuration leaves free: those of `Fit.correlations`."""
-    fitted: tuple[str, ...]
-    """Those that were fitted: without `FURTHER`, where the simpler model was kept."""
-    selection: Selection | None
-    """None: no further parameter was free."""
-    config: IdentificationConfig
+    1. Settled angles alone, from several starts side by side, the best of many draws: searches that start with a servo
+       that never saturates, say, end in a valley of their own.
+    2. From the end whose motion is nearest, the whole motion.
+       Both are done twice, with the `FURTHER` parameters held at their nominal values and with all. The second search
+       has the first's solution among its starts. The richer model is kept where it explains what the simpler one
+       leaves (`Selection`).
+    3. With the richer model the springs are held at their nominal stiffness, which sets the scale of all forces
+       (`nominal_springs`).
+    4. With the richer model, or where the data leave directions open: with what is known of robots beforehand, so that
+       what a sweep hardly shows stays near the nominal values.
+    5. With `objective="hausdorff"`, the paper's distance between curves, from there.
 
-    @property
-    def keeps_simpler(self) -> bool:
-        """Whether the `FURTHER` parameters could be fitted, and were not worth it."""
-        return self.selection is not None and not self.selection.richer
+    **Raises** `InputError` from `IdentificationConfig`'s check.
+    """
+    config = config or IdentificationConfig()
+    check_identification_config(config)
+    report = report or (lambda stage, iteration, steps, value: None)
+    with jax.enable_x64(True):
+        return Identifier(config, sweep, report).run(sweep, report)
 
-    @property
-    def parameters(self) -> ActuatorParameters:
-        """What simulators take; without `FURTHER`, the nominal robot's, where the simpler model was kept."""
-        rows: dict[str, np.ndarray] = dict(
-            zip(LEG_PARAMETERS, np.stack([fit.vector for fit in self.fits], axis=1), strict=True)
+
+def _levenberg_marquardt() -> optx.LevenbergMarquardt:
+    """Return Levenberg-Marquardt that damps ten times less after a step which gained 90 % of what was foretold. By
+    default it is 3.5 times after 99 %, which steps along a curved valley hardly ever gain."""
+    solver = optx.LevenbergMarquardt(rtol=1e-5, atol=1e-5)
+    region = optx.ClassicalTrustRegion(high_cutoff=0.9, high_constant=10.0)
+    return eqx.tree_at(lambda solver: solver.search, solver, region)
+
+
+class Identifier:
+    """The stages of `identify_legs`, compiled once for sweeps of the same sizes."""
+
+    def __init__(self, config: IdentificationConfig, sweep: Sweep, report: Report) -> None:
+        self.config = config
+        data = leg_data(sweep)
+        starts = min(config.starts, config.draws + 1)
+        report("compiling", 0, 1, float("nan"))
+        self.space = ParameterTransform(nominal_leg(), config)
+        self.physics = CompiledLeg(self.space, starts * len(SIDES), data, motion=config.motion)
+        report("compiling", 1, 1, float("nan"))
+        self._starts, self._size = starts, int(self.space.free.sum())
+        self._squares = BatchedSolver(_levenberg_marquardt())
+        self._shape = BatchedSolver(optx.LBFGS(rtol=1e-5, atol=1e-5))
+
+        def objective(angles: Array, command: Array, measured: Array) -> Array:
+            return jnp.sum(curve_distances(command, angles, measured, config.degree)[0])
+
+        gradient = jax.value_and_grad(objective)
+        self._curve_gradients = jax.jit(jax.vmap(lambda command, angles, measured: gradient(angles, command, measured)))
+
+    def run(self, sweep: Sweep, report: Report) -> Identification:
+        """Return both legs' identification from a sweep of the sizes that were compiled for."""
+        config, size, data = self.config, self._size, leg_data(sweep)
+        residuals = LegResiduals(self.space, self.physics, data, self._curve_gradients, motion=config.motion)
+        legs = np.arange(len(SIDES))
+        free = np.array(LEG_PARAMETERS)[self.space.free]
+        further = np.isin([*free, *(LegDynamics._fields if config.motion else ())], FURTHER)
+        every = np.ones_like(further)
+        spring = list(free).index("knee_spring_stiffness")
+        kept, selection = every, None
+        if further.any():
+            simpler, ends = self._search(residuals, ~further, report)
+            rich = every & ~(config.nominal_springs & np.isin(np.arange(len(every)), spring))
+            coordinates, richer_ends = self._search(residuals, rich, report, simpler)
+            spread = residuals.spread(coordinates)
+            more = int(rich.sum()) - int((~further).sum())
+            selection = select_model(simpler, coordinates, more, spread, residuals)
+            if selection.richer:
+                # The simpler search may have ended in a valley that the richer one left.
+                again = np.where(further, simpler, coordinates)
+                again = self._follow(again, residuals, ~further, report, config.steps)
+                simpler = self._nearest([simpler, again], residuals, ~further)
+                selection = select_model(simpler, coordinates, more, spread, residuals)
+            if selection.richer:
+                kept, ends = rich, richer_ends
+            else:
+                kept, coordinates = ~further, simpler
+        else:
+            coordinates, ends = self._search(residuals, every, report)
+            spread = residuals.spread(coordinates)
+        leg = np.repeat(legs, self._starts)
+        ended = np.sum(residuals.settled(ends, leg, kept)[0] ** 2, axis=1).reshape(len(legs), -1)
+        analyses = analyse_legs(residuals, coordinates, kept, spread)
+        if kept[further].any() or any(d.standard_error > 1 for each in analyses for d in each.directions):
+            coordinates, _ = self._squares(
+                lambda y: residuals.with_priors(y, kept, spread),
+                coordinates,
+                2 * config.steps,  # along the weakest directions, which the data alone left open
+                partial(report, "priors"),
+                _PATIENCE,
+            )
+            analyses = analyse_legs(residuals, coordinates, kept, spread)
+        if config.objective == "hausdorff":
+            # From every search's end: a maximum over points and a sum over joints has more valleys still.
+            starts = np.concatenate([coordinates[:, None, :size], ends.reshape(len(legs), -1, size)[:, 1:]], axis=1)
+            shaped, distances = self._shape(
+                lambda y: residuals.curve_distances(y, leg, kept),
+                starts.reshape(-1, size),
+                config.steps,
+                partial(report, "curves"),
+            )
+            best = np.argmin(distances.reshape(len(legs), -1), axis=1)
+            shaped = shaped.reshape(len(legs), -1, size)[legs, best]
+            coordinates = np.concatenate([shaped, coordinates[:, size:]], axis=1)
+            analyses = analyse_legs(residuals, coordinates, kept, spread)
+
+        before = np.tile(self.space.coordinates(self.space.nominal), (len(legs), 1))
+        settled = [residuals.angles(y, data.command)[0] for y in (coordinates[:, :size], before)]
+        fits = [
+            Fit(
+                vector=np.asarray(self.space.vector(jnp.asarray(coordinates[leg, :size]))),
+                standard_errors=analysis.standard_errors,
+                correlations=analysis.correlations,
+                directions=analysis.directions,
+                dynamics=LegDynamics(*map(float, leg_dynamics(jnp.asarray(coordinates[leg, size:]))))
+                if config.motion
+                else None,
+                dynamics_errors=analysis.dynamics_errors,
+                residual=analysis.scatter,
+                losses=np.sort(ended[leg]),
+            )
+            for leg, analysis in enumerate(analyses)
+        ]
+        after, nominal = (np.moveaxis(angles, 0, -1) for angles in settled)
+        moving = None
+        if config.motion:
+            paths, _ = self.physics.motion(coordinates, data.commanded)
+            moving = sweep.means(np.moveaxis(paths[:, data.counts], 0, -1))
+        return Identification(
+            fits=(fits[0], fits[1]),
+            settled=after,
+            simulated=moving,
+            nominal_settled=nominal,
+            free=tuple(map(str, free)),
+            fitted=tuple(map(str, free[kept[:size]])),
+            selection=selection,
+            config=config,
         )
-        dynamics = [fit.dynamics for fit in self.fits if fit.dynamics is not None]
-        for name in LegDynamics._fields if dynamics else ():
-            rows[name] = np.maximum([getattr(each, name) for each in dynamics], 0.0)
-        kept = {name: row for name, row in rows.items() if not (self.keeps_simpler and name in FURTHER)}
-        return ActuatorParameters(**{name: jnp.asarray(row, jnp.float32) for name, row in kept.items()})
+
+    def _search(
+        self,
+        residuals: LegResiduals,
+        kept: Bool[np.ndarray, " size"],
+        report: Report,
+        simpler: np.ndarray | None = None,
+    ) -> tuple[Float[np.ndarray, "legs size"], Float[np.ndarray, "searches settled_size"]]:
+        """Return coordinates of both legs, and where the searches by settled angles ended, of the parameters that are
+        `kept`; never worse than `simpler`, a model's with fewer."""
+        config, size, legs = self.config, self._size, np.arange(len(SIDES))
+        draws = self.space.draw(config.seed, config.draws)
+        held = ~kept[:size]
+        draws[:, held] = draws[0, held]
+        coordinates, leg = np.tile(draws, (len(legs), 1)), np.repeat(legs, len(draws))
+        report("draws", 0, 1, float("nan"))
+        values, _ = residuals.settled(coordinates, leg, kept)
+        losses = np.sum(values**2, axis=1).reshape(len(legs), -1)
+        report("draws", 1, 1, float(losses.min()))
+        starts = draws[np.argsort(losses, axis=1)[:, : self._starts]]
+        if simpler is not None:
+            simpler = np.where(kept, simpler, np.concatenate([draws[0], np.zeros(simpler.shape[1] - size)]))
+            starts[:, -1] = simpler[:, :size]
+        leg = np.repeat(legs, self._starts)
+        ends, ended = self._least_squares(
+            lambda y: residuals.settled(y, leg, kept),
+            starts.reshape(-1, size),
+            config.steps,
+            partial(report, "settled angles"),
+        )
+        nearest = np.argmin(ended.reshape(len(legs), -1), axis=1)
+        by_leg = ends.reshape(len(legs), -1, size)
+        if not config.motion:
+            return by_leg[legs, nearest], ends
+        by_leg = np.clip(by_leg, -_INSIDE, _INSIDE)
+        # Settled angles leave much open, and a servo far from its limit has no gradient by it. The motion says from
+        # which end to go on: where it begins nearest, or soon gets nearest.
+        first = np.where(kept[size:], 0.0, dynamics_coordinates(SIMPLE_DYNAMICS))
+        candidates = [np.concatenate([y, np.tile(first, (len(legs), 1))], axis=1) for y in np.moveaxis(by_leg, 1, 0)]
+        candidates += [] if simpler is None else [simpler]
+        coordinates, by_settled = self._nearest(candidates, residuals, kept), np.stack(candidates)[nearest, legs]
+        if not np.array_equal(coordinates, by_settled):
+            both = [self._follow(y, residuals, kept, report, _SHORT) for y in (coordinates, by_settled)]
+            coordinates = self._nearest(both, residuals, kept)
+        ended = self._follow(coordinates, residuals, kept, report, config.steps)
+        # Stiction, lag and play can stand in for each other, and a slack at its bound has no slope: once more, with the
+        # dynamics back where they began and what stands at a bound back at its nominal value.
+        inside = np.where(np.abs(ended[:, :size]) > _INSIDE, draws[0], ended[:, :size])
+        again = np.concatenate([inside, np.tile(first, (len(legs), 1))], axis=1)
+        return self._nearest([ended, self._follow(again, residuals, kept, report, config.steps)], residuals, kept), ends
+
+    def _follow(
+        self,
+        start: Float[np.ndarray, "legs size"],
+        residuals: LegResiduals,
+        kept: Bool[np.ndarray, " size"],
+        report: Report,
+        steps: int,
+    ) -> Float[np.ndarray, "legs size"]:
+        """Return where a search by all residuals ends."""
+        stage = "motion" if self.config.motion else "settled angles"
+        return self._least_squares(lambda y: residuals(y, kept), start, steps, partial(report, stage))[0]
+
+    def _least_squares(
+        self,
+        evaluate: Evaluate,
+        start: Float[np.ndarray, "n size"],
+        steps: int,
+        report: Callable[[int, int, float], None],
+    ) -> tuple[Float[np.ndarray, "n size"], Float[np.ndarray, " n"]]:
+        """Return where searches end that minimize squares of angles, and their losses (rad^2)."""
+
+        def scaled(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            values, jacobians = evaluate(y)
+            return values / _FIRST_DAMPING, jacobians / _FIRST_DAMPING
+
+        ends, losses = self._squares(
+            scaled,
+            start,
+            steps,
+            lambda iteration, most, loss: report(iteration, most, loss * _FIRST_DAMPING**2),
+            _PATIENCE,
+        )
+        return ends, losses * _FIRST_DAMPING**2
+
+    def _nearest(
+        self,
+        candidates: Sequence[Float[np.ndarray, "legs size"]],
+        residuals: LegResiduals,
+        kept: Bool[np.ndarray, " size"],
+    ) -> Float[np.ndarray, "legs size"]:
+        """Return for each leg the candidate with the lowest sum of squares."""
+        losses = [np.sum(residuals(y, kept)[0] ** 2, axis=1) for y in candidates]
+        return np.stack(candidates)[np.argmin(losses, axis=0), np.arange(len(SIDES))]

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from ballu_mjx.ballu.gait import planted_feet
-from ballu_mjx.ballu.leg_fit import Identification
+from ballu_mjx.ballu.leg_results import Identification
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model
 from ballu_mjx.ballu.sweep import Sweep
 from ballu_mjx.viz.style import COMMAND_COLOURS, colour_of, label_of, save_figure

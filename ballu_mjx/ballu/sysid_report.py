@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.ballu.curves import curve_distances
-from ballu_mjx.ballu.leg_fit import Identification
 from ballu_mjx.ballu.leg_parameters import (
     DEGREE,
     FURTHER,
@@ -19,6 +18,7 @@ from ballu_mjx.ballu.leg_parameters import (
     LegDynamics,
     nominal_leg,
 )
+from ballu_mjx.ballu.leg_results import Identification
 from ballu_mjx.ballu.model import SIDES
 from ballu_mjx.ballu.sweep import Sweep
 from ballu_mjx.identification.parameters import Direction

@@ -13,7 +13,7 @@ from ballu_mjx.cli._command import load_chosen_robot, open_run, written_to
 from ballu_mjx.common import files
 from ballu_mjx.evaluation.open_loop import Evaluators
 from ballu_mjx.identification.guard import choose_actuators
-from ballu_mjx.identification.stability import check_stability
+from ballu_mjx.identification.stable_time_step import check_stability
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.dataset import USES, RecordingsData, ResidualDataset
 from ballu_mjx.residuals.envmimic import EnvMimicConfig

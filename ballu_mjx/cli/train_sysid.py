@@ -23,8 +23,8 @@ from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.declared import IdentifiedByFit, check_recordings, identify_declared
 from ballu_mjx.identification.fit_report import autocorrelation, channel_names, channel_scales
 from ballu_mjx.identification.fit_robot import FitConfig, Visibility, check_fit_config
+from ballu_mjx.identification.measured_motion import SamplingConfig, check_sampling_config
 from ballu_mjx.identification.parameters import IdentifiedParameters
-from ballu_mjx.identification.residuals import SamplingConfig, check_sampling_config
 from ballu_mjx.identification.window_objective import WindowConfig
 from ballu_mjx.identification.write_back import identified_to_json, identified_xml
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording

@@ -7,6 +7,9 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
+
+from ballu_mjx.common.rotations import quaternion_conjugate, quaternion_product
 
 HORIZONS = (1.0, 2.0, 5.0, 10.0, 20.0)
 """Seconds over which errors are taken, where neither robot nor recordings ask for others."""
@@ -264,3 +267,33 @@ def _mean_of_finite(values: Sequence[float]) -> float:
     """Return the mean over those that are finite; infinity where none is."""
     finite = [value for value in values if np.isfinite(value)]
     return float(np.mean(finite)) if finite else np.inf
+
+
+def orientation_errors(
+    simulated: Float[np.ndarray, "*states 3"], recorded: Float[np.ndarray, "*states 3"], upright: bool
+) -> Float[np.ndarray, "*states"]:
+    """Return errors of orientation (deg) of roll, pitch and yaw (rad; intrinsic z-y-x).
+
+    Of an upright robot simulated less recorded yaw, wrapped to 180 deg. Else the angle of the rotation between both.
+    """
+    if upright:
+        turn = simulated[..., 2] - recorded[..., 2]
+        return np.rad2deg(np.arctan2(np.sin(turn), np.cos(turn)))
+    turn = quaternion_product(quaternion_conjugate(_quaternion(simulated)), _quaternion(recorded))
+    scalar, vector = turn[..., 0], np.linalg.norm(turn[..., 1:], axis=-1)
+    return np.rad2deg(2 * np.arctan2(vector, np.abs(scalar)))
+
+
+def _quaternion(euler: Float[np.ndarray, "*states 3"]) -> Float[np.ndarray, "*states 4"]:
+    # SciPy's rotations raise where an angle is not finite; simulations that diverged have such states.
+    halves = np.moveaxis(np.asarray(euler, np.float64), -1, 0) / 2
+    (cr, cp, cy), (sr, sp, sy) = np.cos(halves), np.sin(halves)
+    return np.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ],
+        axis=-1,
+    )

@@ -18,7 +18,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
-from ballu_mjx.common.rotations import quaternion_conjugate, quaternion_product
 from ballu_mjx.evaluation.errors import (
     Errors,
     Evaluation,
@@ -26,6 +25,7 @@ from ballu_mjx.evaluation.errors import (
     choose_horizons,
     has_diverged,
     median_of_starts,
+    orientation_errors,
     summarize_starts,
 )
 from ballu_mjx.identification.parameters import LEAST_FRICTION
@@ -79,36 +79,6 @@ def measured_hinges(robot: RobotDescription, model: mujoco.MjModel, motion: Moti
     return {
         name: int(joint.qposadr[0]) for name, joint in found.items() if joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE
     }
-
-
-def orientation_errors(
-    simulated: Float[np.ndarray, "*states 3"], recorded: Float[np.ndarray, "*states 3"], upright: bool
-) -> Float[np.ndarray, "*states"]:
-    """Return errors of orientation (deg) of roll, pitch and yaw (rad; intrinsic z-y-x).
-
-    Of an upright robot simulated less recorded yaw, wrapped to 180 deg. Else the angle of the rotation between both.
-    """
-    if upright:
-        turn = simulated[..., 2] - recorded[..., 2]
-        return np.rad2deg(np.arctan2(np.sin(turn), np.cos(turn)))
-    turn = quaternion_product(quaternion_conjugate(_quaternion(simulated)), _quaternion(recorded))
-    scalar, vector = turn[..., 0], np.linalg.norm(turn[..., 1:], axis=-1)
-    return np.rad2deg(2 * np.arctan2(vector, np.abs(scalar)))
-
-
-def _quaternion(euler: Float[np.ndarray, "*states 3"]) -> Float[np.ndarray, "*states 4"]:
-    # SciPy's rotations raise where an angle is not finite; simulations that diverged have such states.
-    halves = np.moveaxis(np.asarray(euler, np.float64), -1, 0) / 2
-    (cr, cp, cy), (sr, sp, sy) = np.cos(halves), np.sin(halves)
-    return np.stack(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ],
-        axis=-1,
-    )
 
 
 def evaluate(simulator: AugmentedSimulator, motions: Sequence[Motion]) -> Evaluation:

@@ -14,8 +14,7 @@ from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_report import fit_details, fit_table
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, Visibility, check_fit_config, fit_robot
 from ballu_mjx.identification.guard import HORIZONS, Choice, choose_actuators
-from ballu_mjx.identification.parameters import IdentifiedParameters
-from ballu_mjx.identification.residuals import (
+from ballu_mjx.identification.measured_motion import (
     MeasuredMotion,
     SamplingConfig,
     check_sampling_config,
@@ -23,6 +22,7 @@ from ballu_mjx.identification.residuals import (
     measure,
     measured_from_motion,
 )
+from ballu_mjx.identification.parameters import IdentifiedParameters
 from ballu_mjx.identification.undeclared import Suggestion, suggest_parameters, suggestions_table
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct

@@ -20,9 +20,10 @@ from scipy.stats import t as student
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.declarations import parameters_of
 from ballu_mjx.identification.fit_robot import RobotFit
+from ballu_mjx.identification.measured_motion import MeasuredMotion
 from ballu_mjx.identification.parameters import Parameter, ParameterSet
-from ballu_mjx.identification.residuals import MeasuredMotion, WindowSimulator, cut_windows
 from ballu_mjx.identification.window_objective import ReducedResiduals, WindowConfig, WindowObjective
+from ballu_mjx.identification.window_simulator import WindowSimulator, cut_windows
 from ballu_mjx.robots.description import RobotDescription
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.identification.residuals import Simulated, WindowSimulator
+from ballu_mjx.identification.window_simulator import Simulated, WindowSimulator
 
 
 @dataclasses.dataclass(frozen=True)

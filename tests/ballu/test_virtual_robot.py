@@ -311,7 +311,7 @@ def test_no_number_of_the_virtual_robot_s_ranges_stands_where_it_is_identified()
 
 def test_identification_does_not_load_the_virtual_robot():
     """Not by way of others either."""
-    modules = "ballu_mjx.ballu.identification, ballu_mjx.residuals.aerodynamics_fit, ballu_mjx.residuals.envmimic"
+    modules = "ballu_mjx.ballu.leg_fit, ballu_mjx.residuals.aerodynamics_fit, ballu_mjx.residuals.envmimic"
     code = f"import sys, {modules}; print([name for name in sys.modules if 'ballu_mjx.ballu.virtual' in name])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"

@@ -19,11 +19,11 @@ from ballu_mjx.evaluation.errors import (
     Evaluation,
     choose_horizons,
     mean_by_group,
+    orientation_errors,
     quotient,
     summarize_starts,
 )
 from ballu_mjx.evaluation.errors_file import evaluation_from_json, evaluation_to_json, read_evaluation
-from ballu_mjx.evaluation.open_loop import orientation_errors
 from ballu_mjx.recordings.groups import group_of
 
 

@@ -15,15 +15,10 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_report import fit_table
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, analyse, check_data, fit_robot, replay
+from ballu_mjx.identification.measured_motion import MeasuredMotion, SamplingConfig, measure
 from ballu_mjx.identification.parameters import Parameter, ParameterSet
-from ballu_mjx.identification.residuals import (
-    MeasuredMotion,
-    SamplingConfig,
-    WindowSimulator,
-    cut_windows,
-    measure,
-)
 from ballu_mjx.identification.window_objective import ReducedResiduals, soften
+from ballu_mjx.identification.window_simulator import WindowSimulator, cut_windows
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.description import RobotDescription
 

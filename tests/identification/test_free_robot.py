@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from ballu_mjx.identification.measured_motion import measured_from_motion
 from ballu_mjx.identification.parameters import FieldTarget, Parameter, ParameterSet
-from ballu_mjx.identification.residuals import WindowSimulator, cut_windows, measured_from_motion
+from ballu_mjx.identification.window_simulator import WindowSimulator, cut_windows
 from ballu_mjx.recordings.motion import Motion
 
 MODEL = """

@@ -10,7 +10,7 @@ from servo_arm import TRUTH, record_arm, write_arm
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.declared import measure_recording
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, fit_robot
-from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig
+from ballu_mjx.identification.measured_motion import MeasuredMotion, SamplingConfig
 from ballu_mjx.identification.undeclared import candidate_entries, suggest_parameters, suggestions_table
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.description import RobotDescription

@@ -32,7 +32,8 @@ import numpy as np
 
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_robot import FitConfig, HeldOut, RobotFit, fit_robot, replay
-from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, cut_windows, measure
+from ballu_mjx.identification.measured_motion import MeasuredMotion, SamplingConfig, measure
+from ballu_mjx.identification.window_simulator import cut_windows
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.description import read_description
 

@@ -31,7 +31,7 @@ import numpy as np
 
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, fit_robot, replay
-from ballu_mjx.identification.residuals import MeasuredMotion, SamplingConfig, measure
+from ballu_mjx.identification.measured_motion import MeasuredMotion, SamplingConfig, measure
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.robots.description import read_description
 

@@ -10,7 +10,7 @@ import pytest
 from servo_arm import write_arm
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.identification.stability import check_stability
+from ballu_mjx.identification.stable_time_step import check_stability
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.robots.description import RobotDescription, read_description
 
