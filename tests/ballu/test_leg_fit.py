@@ -275,7 +275,7 @@ def test_known_parameters_are_recovered(noiseless: Sweep, identifier: Identifier
     """Some draws end in a long curved valley, where the motion is right to a tenth of a capture's noise."""
     every = []
     for seed in range(2):
-        identifier.config = dataclasses.replace(ALL_PARAMETERS, seed=seed, draws=32)
+        identifier.config = dataclasses.replace(ALL_PARAMETERS, seed=seed, draws=32, steps=20)
         every.append(identifier.run(noiseless, lambda *_: None).fits)
         assert all(fit.residual < np.deg2rad(0.05) for fit in every[-1])
     for leg, truth in enumerate(TRUTH):
