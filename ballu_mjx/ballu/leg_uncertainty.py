@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from ballu_mjx.ballu.leg_parameters import DYNAMICS_PRIOR, LEG_PARAMETERS, LegDynamics, leg_dynamics
 from ballu_mjx.ballu.leg_residuals import LegResiduals
-from ballu_mjx.identification.parameters import Direction
+from ballu_mjx.identification.parameters import Direction, principal_directions
 
 
 class LegAnalysis(NamedTuple):
@@ -55,16 +55,13 @@ def analyse_legs(
         known, unknown = shown[:, :size][:, kept[:size]], shown[:, size:][:, kept[size:]]
         unknown, singular, _ = np.linalg.svd(unknown, full_matrices=False)
         unknown = unknown[:, singular > 1e-9 * singular.max(initial=0.0)]
-        _, singular, right = np.linalg.svd(known - unknown @ (unknown.T @ known), full_matrices=False)
-        signed = [w * np.sign(w[np.argmax(np.abs(w))]) for w in right]
-        errors = 1 / np.maximum(singular, 1e-12)
         results.append(
             LegAnalysis(
                 scatter=scatter,
                 standard_errors=standard_errors,
                 dynamics_errors=_dynamics_errors(y[size:], deviation[size:]) if residuals.moves else None,
                 correlations=(covariance / np.outer(deviation, deviation))[:size, :size],
-                directions=tuple(Direction(w, float(e)) for w, e in zip(signed, errors, strict=True)),
+                directions=principal_directions(known - unknown @ (unknown.T @ known)),
             )
         )
     return results

@@ -231,9 +231,8 @@ def _draw(folder: Path, found: IdentifiedByFit) -> None:
     path = folder / "residual_autocorrelation.png"
     identification_plots.residual_autocorrelation(path, lag, correlations, channel_names(model))
     declared = fit.parameters
-    spread = np.where(np.isfinite(declared.prior), declared.prior, (declared.upper - declared.lower) / 2)
-    change = (fit.values - declared.nominal) / spread
-    errors = fit.standard_errors / spread, fit.white_noise_errors / spread
+    change = (fit.values - declared.nominal) / declared.unit
+    errors = fit.standard_errors / declared.unit, fit.white_noise_errors / declared.unit
     identification_plots.parameter_intervals(folder / "parameters.png", declared.names, change, *errors)
 
 

@@ -46,7 +46,9 @@ class BatchedSolver:
     stages.
     """
 
-    def __init__(self, solver: Any) -> None:
+    def __init__(self, solver: Any, worth: float = 1e-4) -> None:
+        """`worth`: share of the loss that an iteration gains at least, or it counts as idle."""
+        self._worth = worth
         least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
 
         @jax.custom_jvp
@@ -90,13 +92,9 @@ class BatchedSolver:
         for iteration in range(steps):
             y, state, loss, done = self._step(y, evaluated, state)
             report(iteration + 1, steps, float(jnp.min(loss)))
-            idle = idle + 1 if bool(np.all(loss >= (1 - _WORTH) * lowest)) else 0
+            idle = idle + 1 if bool(np.all(loss >= (1 - self._worth) * lowest)) else 0
             lowest = np.minimum(lowest, loss)
             if bool(jnp.all(done)) or idle == patience:
                 break
             evaluated = tuple(map(jnp.asarray, evaluate(np.asarray(state.y_eval))))
         return np.asarray(y), np.asarray(loss)
-
-
-_WORTH = 1e-5
-"""Of the loss: what an iteration gains at least."""

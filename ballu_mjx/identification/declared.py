@@ -139,11 +139,10 @@ def identify_declared(
     choice = choose_actuators(robot, identified, long_enough) if long_enough else None
     suggestions: tuple[Suggestion, ...] = ()
     if suggest:
-        if progress is not None:
-            progress("what is left", 0, 1, float("nan"))
+        tell = progress or (lambda stage, iteration, steps, value: None)
+        tell("what is left", 0, 1, float("nan"))
         suggestions = suggest_parameters(robot, fit, training, config)
-        if progress is not None:
-            progress("what is left", 1, 1, float("nan"))
+        tell("what is left", 1, 1, float("nan"))
     report = fit_table(fit, model, config.window_seconds, "validation recordings" if held else "the same recordings")
     if suggestions:
         report += f"\n\n{suggestions_table(suggestions)}"

@@ -97,8 +97,8 @@ class RobotFit:
     unseen: tuple[str, ...]
     """Parameters that the data check says these recordings cannot show."""
     at_bounds: tuple[str, ...]
-    scatter: Float[np.ndarray, " channels"]
-    """Robust standard deviation of what is left, in units of the measurements' noise; positions, then velocities."""
+    scatter: Float[np.ndarray, " positions"]
+    """Robust standard deviation of what is left, of positions, in units of the measurements' noise."""
     losses: Float[np.ndarray, " starts"]
     """Where the searches ended, in ascending order."""
     nominal: HeldOut
@@ -276,12 +276,11 @@ def replay(
 
 def _visibility(objective: WindowObjective, config: FitConfig) -> Visibility:
     parameters = objective.parameters
-    unit = np.where(np.isfinite(parameters.prior), parameters.prior, (parameters.upper - parameters.lower) / 2)
     start = objective.measured_start()
     signal = np.zeros(len(parameters))
     for values in parameters.draw(config.seed, _DRAWS):
         reduced, _ = objective(values, start)
-        signal = np.maximum(signal, np.sqrt(np.sum((reduced.slopes * unit) ** 2, axis=(0, 1))))
+        signal = np.maximum(signal, np.sqrt(np.sum((reduced.slopes * parameters.unit) ** 2, axis=(0, 1))))
     return Visibility(parameters.names, signal)
 
 

@@ -28,6 +28,17 @@ class Direction(NamedTuple):
     """Of the combination, by the data alone: above 1 they say less than is known without them."""
 
 
+def principal_directions(slopes: Float[np.ndarray, "rows parameters"]) -> tuple[Direction, ...]:
+    """Return the combinations that data determine independently, from the best to the least determined; the largest
+    weight of each is positive.
+
+    `slopes`: how residuals, in units of their scatter, change by parameters in units of their prior spread.
+    """
+    _, singular, right = np.linalg.svd(slopes, full_matrices=False)
+    signed = [row * np.sign(row[np.argmax(np.abs(row))]) for row in right]
+    return tuple(Direction(row, float(1 / max(s, 1e-12))) for row, s in zip(signed, singular, strict=True))
+
+
 class FieldTarget(NamedTuple):
     """An entry of a model field, set to the parameter's value times a factor."""
 
@@ -120,6 +131,8 @@ class ParameterSet:
         self.nominal = np.array([p.nominal for p in self.parameters])
         self.lower, self.upper = np.array([p.bounds for p in self.parameters]).reshape(-1, 2).T
         self.prior = np.array([p.prior for p in self.parameters])
+        self.unit = np.where(np.isfinite(self.prior), self.prior, (self.upper - self.lower) / 2)
+        """What priors leave open of each parameter, or else bounds do."""
         self._span = Shares(self.lower, self.upper, np.array([p.logarithmic for p in self.parameters], bool))
 
     def __len__(self) -> int:

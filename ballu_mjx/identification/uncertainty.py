@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.identification.parameters import Direction, ParameterSet
+from ballu_mjx.identification.parameters import Direction, ParameterSet, principal_directions
 from ballu_mjx.identification.window_objective import ReducedResiduals
 
 
@@ -31,8 +31,7 @@ def analyse(reduced: ReducedResiduals, parameters: ParameterSet) -> Analysis:
     # As many rows say where starting states begin as there are starting states.
     variance = reduced.loss / max(reduced.values.size - reduced.start.size - size, 1)
     # In units of what bounds or priors leave open, so that all are of a size.
-    unit = np.where(np.isfinite(parameters.prior), parameters.prior, (parameters.upper - parameters.lower) / 2)
-    slopes = reduced.slopes * unit
+    slopes = reduced.slopes * parameters.unit
     flat = slopes.reshape(-1, size)
     known = np.diag(np.where(np.isfinite(parameters.prior), 1.0, 0.0) + _SLIGHT)
     inverse = flat.T @ flat / variance + known
@@ -43,10 +42,8 @@ def analyse(reduced: ReducedResiduals, parameters: ParameterSet) -> Analysis:
     jackknife = changes.T @ changes * (windows - 1) / windows + bread @ known @ bread
     deviations = [np.sqrt(np.diag(covariance)) for covariance in (bread, jackknife)]
     correlations = jackknife / np.outer(deviations[1], deviations[1])
-    _, singular, right = np.linalg.svd(flat / np.sqrt(variance), full_matrices=False)
-    signed = [row * np.sign(row[np.argmax(np.abs(row))]) for row in right]
-    directions = [Direction(row, float(1 / max(s, 1e-12))) for row, s in zip(signed, singular, strict=True)]
-    return Analysis(deviations[0] * unit, deviations[1] * unit, correlations, tuple(directions))
+    white, robust = (deviation * parameters.unit for deviation in deviations)
+    return Analysis(white, robust, correlations, principal_directions(flat / np.sqrt(variance)))
 
 
 _SLIGHT = 1e-9

@@ -3,7 +3,7 @@
 Standard errors cannot show what a model lacks: dry friction that no parameter has goes into damping, however many
 recordings there are. What is left shows it. Each candidate (friction, damping and armature of joints, gains of
 actuators, the drivetrain of commands) is tried as one step of Gauss-Newton beside the declared parameters: a score
-test, which takes a single linearization.
+test, which takes no search.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ def suggestions_table(suggestions: Sequence[Suggestion]) -> str:
     """Return suggestions in words, with what to write in the description."""
     lines = ["Not declared, and would explain what is left:"]
     for each in suggestions:
-        value = f"{each.value:.2g} {each.parameter.unit.removeprefix('1')}".strip()
+        unit = "" if each.parameter.unit == "1" else each.parameter.unit
+        value = f"{each.value:.2g} {unit}".strip()
         lines.append(f"  {each.parameter.name}, about {value}: {each.explained:.0%} of the squares.")
         lines.append(f'    Add to "identify": {json.dumps(dict(each.entry))}')
     lines.append("Declare these and identify again: until then other parameters stand in for them.")
@@ -157,7 +158,7 @@ def _select(
     the other: what those before it can take up is theirs."""
     size, windows = len(declared), len(reduced.values)
     known, tried, left = reduced.slopes[..., :size], reduced.slopes[..., size:], reduced.values
-    prior = np.where(np.isfinite(declared.prior), declared.prior, np.inf) ** -2.0
+    prior = declared.prior**-2.0
     critical = student.ppf(1 - _CHANCE / 2, max(windows - 1, 1))
     chosen: list[tuple[int, float, float]] = []
     while len(chosen) < len(candidates):
