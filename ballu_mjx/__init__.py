@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ballu_mjx.policies.environments.brax_env import brax_env
     from ballu_mjx.policies.environments.gym_env import gym_env, gym_vector_env
     from ballu_mjx.policies.load_simulator import load_simulator
-    from ballu_mjx.policies.locomotion_env import LocomotionConfig
+    from ballu_mjx.policies.locomotion_config import LocomotionConfig
     from ballu_mjx.policies.policy import Policy
     from ballu_mjx.policies.training import locomotion_ppo, train_policy
     from ballu_mjx.recordings.load import load_recordings

@@ -83,7 +83,7 @@ class _ReachedError(Exception):
 def train_ours(launched: float, seed: int, steps: int, target: float, config: dict[str, Any]) -> Curve:
     """`python -m ballu_mjx.train walk` without its run folder; `config` is a `PPOConfig`."""
     runtime.prepare()
-    from ballu_mjx.policies.locomotion_env import LocomotionConfig
+    from ballu_mjx.policies.locomotion_config import LocomotionConfig
     from ballu_mjx.policies.policy import environment_of
     from ballu_mjx.policies.tasks import TASKS
     from ballu_mjx.rl import learner, ppo, training_state

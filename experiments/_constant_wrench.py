@@ -12,17 +12,17 @@ from jaxtyping import Array, Float
 from scipy import optimize
 
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.recordings.segment_errors import count_lost
-from ballu_mjx.recordings.segments import cut_segments, simulate_segment
-from ballu_mjx.sim.force_model import Action, BoundForces, Commands, ForceModel, History
+from ballu_mjx.recordings.motion_windows import cut_motion_windows, simulate_motion_window
+from ballu_mjx.recordings.window_errors import count_lost
 from ballu_mjx.sim.observation import ObservationLayout, world_rotation
+from ballu_mjx.sim.residual import Action, BoundResidual, Commands, History, Residual
 from ballu_mjx.sim.simulator import Simulator
 
 WINDOW = 2.0
 """Seconds that each simulation of the fit lasts."""
 
 
-class ConstantWrench(ForceModel):
+class ConstantWrench(Residual):
     """A force (N) and a torque (N m) on the tracked body: constant in the world's frame, or in the heading frame of a
     robot that may go anywhere. Its parameters are the six numbers."""
 
@@ -55,11 +55,11 @@ def fit_constant_wrench(
     **Raises** `InputError` where no motion is as long as a window.
     """
     model = ConstantWrench(anchored=simulator.robot.anchored)
-    windows = cut_segments(simulator, motions, WINDOW, WINDOW)
+    windows = cut_motion_windows(simulator, motions, WINDOW, WINDOW)
 
     def errors(params: Array) -> Array:
-        improved = simulator.with_residual(BoundForces(model, params))
-        return jax.vmap(lambda window: simulate_segment(improved, window).ravel())(windows)
+        improved = simulator.with_residual(BoundResidual(model, params))
+        return jax.vmap(lambda window: simulate_motion_window(improved, window).ravel())(windows)
 
     values, slopes = jax.jit(errors), jax.jit(jax.jacfwd(errors))
     found = optimize.least_squares(

@@ -38,7 +38,7 @@ from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
-from ballu_mjx.residuals.network import NetworkForces
+from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.presets import preset_values
 from ballu_mjx.rl import learner, ppo, training_state
 from ballu_mjx.rl.ppo import PPOConfig
@@ -102,7 +102,7 @@ def train(
     env_config = EnvMimicConfig(**row.env)
     ppo_config = PPOConfig(**{**sizes.ppo, "num_timesteps": sizes.steps, "seed": seed, **row.ppo})
     env = EnvMimicEnv(simulator, motions["training"], env_config)
-    forces = NetworkForces(
+    forces = NetworkResidual(
         env_config, simulator.robot, ppo.make_inference(env.observation_size, env.action_size, ppo_config)
     )
     evaluator = OpenLoopEvaluator(simulator, motions["validation"], forces)

@@ -33,9 +33,9 @@ from jaxtyping import Array, Float
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.common.results import Cell, Table
+from ballu_mjx.recordings.motion_windows import MotionWindows
 from ballu_mjx.recordings.reconstruct import reconstruct
-from ballu_mjx.recordings.segment_errors import pseudo_huber
-from ballu_mjx.recordings.segments import Segments
+from ballu_mjx.recordings.window_errors import pseudo_huber
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirWindows
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.robots.registry import load_robot
@@ -80,7 +80,7 @@ def slopes(simulated: AirWindows, known: Float[np.ndarray, " parameters"], lift:
         vector[lift] -= less
         return simulated.errors(vector)
 
-    def along(vector: Array, direction: Array, window: Segments) -> Array:
+    def along(vector: Array, direction: Array, window: MotionWindows) -> Array:
         return jax.jvp(lambda vector: simulated.simulate(vector, window), (vector,), (direction,))[1]
 
     direction = np.zeros_like(known, np.float32)

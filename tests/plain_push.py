@@ -7,10 +7,10 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ballu_mjx.sim.force_model import Action, ForceModel
+from ballu_mjx.sim.residual import Action, Residual
 
 
-class PlainPush(ForceModel):
+class PlainPush(Residual):
     """A force along x (N) on the tracked body, which is its parameter."""
 
     @property

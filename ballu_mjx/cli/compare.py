@@ -18,7 +18,7 @@ import tyro
 from ballu_mjx.cli._help import parse_options
 from ballu_mjx.common import runtime
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.evaluation.statistics import LEVEL, t_interval
+from ballu_mjx.evaluation.seed_intervals import LEVEL, t_interval
 
 _LAST = 0.1
 """Part of a training, at its end, over which its reward is averaged."""

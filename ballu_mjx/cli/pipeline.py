@@ -33,7 +33,7 @@ from ballu_mjx.evaluation import transfer
 from ballu_mjx.evaluation.transfer import Transfer
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.policies.deploy.export import weights
-from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_locomotion_config
+from ballu_mjx.policies.locomotion_config import LocomotionConfig, check_locomotion_config
 from ballu_mjx.policies.pipeline_layout import (
     NEAR,
     ROUNDS,

@@ -16,7 +16,8 @@ from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, open_run, st
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.actuators import AUTO, NOMINAL, read_actuators, validation_ratio
 from ballu_mjx.policies.closed_loop import Rollout
-from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_task, variant_of
+from ballu_mjx.policies.locomotion_config import LocomotionConfig, check_task
+from ballu_mjx.policies.locomotion_env import variant_of
 from ballu_mjx.policies.policy import check_belongs
 from ballu_mjx.policies.tasks import Task
 from ballu_mjx.policies.training import (

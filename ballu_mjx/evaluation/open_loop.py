@@ -34,8 +34,8 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, pad_to_bucket, stack_motions
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.drivetrain import DrivetrainParameters, identity_drivetrain
-from ballu_mjx.sim.force_model import BoundForces, ForceModel
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
+from ballu_mjx.sim.residual import BoundResidual, Residual
 from ballu_mjx.sim.sharding import compile_for_devices, device_shardings
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState
@@ -98,9 +98,9 @@ class Evaluators:
     def __init__(self, simulator: Simulator) -> None:
         """`simulator` is the one without residual."""
         self._simulator = simulator
-        self._made: list[tuple[ForceModel, Sequence[Motion], OpenLoopEvaluator]] = []
+        self._made: list[tuple[Residual, Sequence[Motion], OpenLoopEvaluator]] = []
 
-    def of(self, residual: ForceModel, motions: Sequence[Motion]) -> OpenLoopEvaluator:
+    def of(self, residual: Residual, motions: Sequence[Motion]) -> OpenLoopEvaluator:
         """Return the evaluator of `residual` on `motions`; the same one for the same arguments."""
         made = None
         for known, on, evaluator in self._made:
@@ -132,7 +132,7 @@ class OpenLoopEvaluator:
         self,
         simulator: Simulator,
         motions: Sequence[Motion],
-        residual: ForceModel,
+        residual: Residual,
         base: str = "vanilla",
     ) -> None:
         """Prepare to replay `motions` in `simulator` without and with `residual`; `base` is the name without it."""
@@ -285,7 +285,7 @@ class OpenLoopEvaluator:
         generalized positions after each."""
         recording, start = place
         own = self._simulator.with_model(model).with_drivetrain(drivetrain)
-        simulator = own.with_residual(BoundForces(self._residual, params), scale)
+        simulator = own.with_residual(BoundResidual(self._residual, params), scale)
 
         def step(rollout: RolloutState, time: Array) -> tuple[RolloutState, tuple]:
             after = simulator.step(rollout, reference.command[recording, time])

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.common.results import Cell, Table
-from ballu_mjx.evaluation.statistics import LEVEL, seed_means, t_interval
+from ballu_mjx.evaluation.seed_intervals import LEVEL, seed_means, t_interval
 
 STRIDE = 1.0
 """Seconds between the points that the length of a path is taken over."""
@@ -184,7 +184,7 @@ _TURNING = (
 def walking_table(results: Mapping[str, Sequence[Sequence[Transfer]]]) -> str:
     """Return Table I in Markdown, `results[setting][seed][trial]`: `mean [low, high]`, and the paper's number.
 
-    The interval is `statistics.t_interval` of the seeds' means; a mean over one seed has none. Rows are in the order
+    The interval of the seeds' means is `seed_intervals.t_interval`; a single seed has none. Rows are in the order
     given. A setting that the paper does not have shows `-` for its numbers. The last column, which the paper does not
     have, tells gaits from what is none: mean and range of `gait.count_steps` over all trials, on the robot and in the
     policies' own simulators. The caption says what the brackets are.

@@ -10,121 +10,25 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import math
 from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from brax.envs.base import Env, State
 from jaxtyping import Array, Float, Int
 
-from ballu_mjx.common.errors import InputError
+from ballu_mjx.policies.domain_randomization import Setting, colliding_geoms, draw_start, make_setting
+from ballu_mjx.policies.locomotion_config import LocomotionConfig, check_task
 from ballu_mjx.policies.tasks import Step, Task
 from ballu_mjx.policies.variants import SimulatorVariant
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.robots.model import ModelParameters, bare_parameters
-from ballu_mjx.sim.drivetrain import DrivetrainParameters, drivetrain_of
+from ballu_mjx.robots.model import ModelParameters
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout, heading_observation
 from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
-
-
-@dataclasses.dataclass(frozen=True)
-class LocomotionConfig:
-    """The simulator that a policy is trained in."""
-
-    domain_randomization: bool = False
-    """Draw friction and starting state anew for every episode, as the paper does (not masses, not buoyancy: gaits
-    depend on these too finely)."""
-    friction: tuple[float, float] = (0.5, 1.1)
-    """Range of the coefficient of sliding friction, one for all geoms that collide."""
-    start_yaw: float = 20.0
-    """Starting headings are drawn from plus or minus this, deg."""
-    start_tilt: float = 2.0
-    """Starting roll and pitch of the base are drawn from plus or minus this, deg."""
-    start_angle: float = 3.0
-    """Spread of the starting angles of hinges, deg, within their ranges; joints that the robot's description holds stay
-    where they are."""
-    start_offset: float = 0.005
-    """Spread of the starting positions of slides, m, likewise."""
-    start_velocity: float = 0.03
-    """Spread of the starting velocity, m/s; hinges and base turn at five times as much, rad/s."""
-    episode_seconds: float = 12.0
-    """Mean length of an episode, s; each lasts between half and one and a half times as long."""
-    sampled_residual: bool = False
-    """Draw the residual's forces from its policy's distribution, instead of taking the most likely ones."""
-    residual_decay: float = 0.0
-    """How fast the residual's force fades where its observation leaves the range seen in its training: it is
-    multiplied by exp(-decay x excess), the excess in widths of that range. 0: not at all."""
-    outside_cost: float = 0.0
-    """Reward (m/s) lost per width of that range by which the residual's observation leaves it: keeps the policy where
-    the residual knows what it does, which a policy paid for speed otherwise leaves. 0: nothing."""
-
-
-_STARTS = ("start_yaw", "start_tilt", "start_angle", "start_offset", "start_velocity")
-_NOT_NEGATIVE = (*_STARTS, "residual_decay", "outside_cost")
-
-
-def check_locomotion_config(config: LocomotionConfig, control_timestep: float) -> None:
-    """Check the options for a robot with so many seconds between two commands.
-
-    **Raises** `InputError` for options out of range, naming the option and the fix.
-    """
-    low, high = config.friction
-    if not 0 < low <= high < math.inf:
-        raise InputError(f"--friction is {low:g} {high:g}: give two numbers above 0, the smaller first.")
-    least = 2 * control_timestep
-    if not least <= config.episode_seconds < math.inf:
-        raise InputError(
-            f"--episode-seconds is {config.episode_seconds:g}: it must be {least:g} or more; {least:g} is the nearest."
-        )
-    for name in _NOT_NEGATIVE:
-        if not 0 <= getattr(config, name) < math.inf:
-            raise InputError(
-                f"--{name.replace('_', '-')} is {getattr(config, name):g}: it must be 0 or more; 0 is the nearest."
-            )
-
-
-def check_task(task: Task, robot: RobotDescription) -> None:
-    """Check that a robot can do a task.
-
-    **Raises** `InputError` where it cannot.
-    """
-    if robot.anchored:
-        raise InputError(
-            f"{task.name} needs a free-floating robot; {robot.name} is anchored ({robot.model.name} has no free joint)."
-        )
-
-
-class StartSpread(NamedTuple):
-    """How starting states vary."""
-
-    turn: Float[Array, " 3"]
-    """Largest roll, pitch and yaw (rad)."""
-    joint: Float[Array, " joints"]
-    """Standard deviation of each joint (rad, m)."""
-    velocity: Float[Array, " nv"]
-    """Standard deviation of each velocity (m/s, rad/s)."""
-
-
-class Setting(NamedTuple):
-    """What tells one simulator from another, as arrays; see `make_setting`."""
-
-    fields: dict[str, Array]
-    """Fields of the MJX model that identified actuators change."""
-    drivetrain: DrivetrainParameters | None
-    """What commands meet on their way to the actuators; None: nothing."""
-    initial: Float[Array, " nq"]
-    """Pose that episodes start from."""
-    joint_range: Float[Array, "joints 2"]
-    """Smallest and largest value of each joint (rad, m); infinite where it has no limit."""
-    friction: Float[Array, "colliding 2"]
-    """Range of the sliding friction of each geom that collides."""
-    spread: StartSpread
 
 
 class Contents(NamedTuple):
@@ -209,8 +113,6 @@ class LocomotionEnv(Env):
         self._colliding = colliding_geoms(model)
         self._friction = jnp.asarray(model.geom_friction)
         self._rest = jnp.asarray(robot.adapter.rest_command(robot, model), jnp.float32)
-        self._root = 0 if robot.anchored else 7
-        """Numbers of the root's pose in `qpos`."""
 
     @property
     def contents(self) -> Contents:
@@ -301,18 +203,8 @@ class LocomotionEnv(Env):
         return locomotion_observation(rollout.features, self.robot.anchored)
 
     def _start(self, setting: Setting, rng: Array) -> State:
-        key_friction, key_turn, key_joint, key_velocity, rng = jax.random.split(rng, 5)
-        low, high = setting.friction.T
-        friction = low + (high - low) * jax.random.uniform(key_friction)
-        initial, spread, root = setting.initial, setting.spread, self._root
-        joints = initial[root:] + spread.joint * jax.random.normal(key_joint, (len(initial) - root,))
-        joints = jnp.clip(joints, *setting.joint_range.T)
-        if root:
-            half = spread.turn * jax.random.uniform(key_turn, (3,), minval=-1.0) / 2
-            quaternion = _product(jnp.concatenate([jnp.ones(1), half]), initial[3:7])
-            joints = jnp.concatenate([initial[:3], quaternion / jnp.linalg.norm(quaternion), joints])
-        qvel = spread.velocity * jax.random.normal(key_velocity, spread.velocity.shape)
-        return self._begin(setting, joints, qvel, friction, rng)
+        qpos, qvel, friction, rng = draw_start(setting, self.robot, rng)
+        return self._begin(setting, qpos, qvel, friction, rng)
 
     def _begin(self, setting: Setting, qpos: Array, qvel: Array, friction: Array, rng: Array) -> State:
         key, key_length = jax.random.split(rng)
@@ -333,44 +225,6 @@ class LocomotionEnv(Env):
         return self.residual.out_of_range(rollout.history, rollout.with_command(command))
 
 
-def colliding_geoms(model: mujoco.MjModel) -> Int[np.ndarray, " colliding"]:
-    """Return the ids of the geoms that may touch others, the world's included."""
-    return np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0))
-
-
-def make_setting(
-    robot: RobotDescription, model: mujoco.MjModel, config: LocomotionConfig, actuators: ModelParameters | None
-) -> Setting:
-    """Return what tells a simulator from another; `model` is the nominal robot, `actuators` None: nominal ones."""
-    parameters = robot.adapter.nominal_actuators(model) if actuators is None else actuators
-    improved = robot.load_model(actuators)
-    on = 1.0 if config.domain_randomization else 0.0
-    degree = np.pi / 180
-    # One program: thirty small ones take half a second of every start.
-    fields = {} if parameters is None else jax.jit(lambda parameters: parameters.fields(model))(parameters)
-    first = 0 if robot.anchored else 1
-    hinges = model.jnt_type[first:] == int(mujoco.mjtJoint.mjJNT_HINGE)
-    joint = np.where(hinges, config.start_angle * degree, config.start_offset)
-    joint[[model.joint(name).id - first for name in robot.held]] = 0.0
-    limited = improved.jnt_limited[first:, None].astype(bool)
-    along = np.concatenate([[True] * 3 + [False] * 3] * first + [~hinges])
-    turn = np.array([config.start_tilt, config.start_tilt, config.start_yaw])
-    own = improved.geom_friction[colliding_geoms(model), 0]
-    drawn = np.tile(config.friction, (len(own), 1))
-    return Setting(
-        fields=jax.tree.map(jnp.float32, fields),
-        drivetrain=drivetrain_of(bare_parameters(actuators)),
-        initial=jnp.asarray(robot.adapter.initial_qpos(robot, improved), jnp.float32),
-        joint_range=jnp.asarray(np.where(limited, improved.jnt_range[first:], [-np.inf, np.inf]), jnp.float32),
-        friction=jnp.asarray(drawn if config.domain_randomization else np.stack([own, own], axis=1), jnp.float32),
-        spread=StartSpread(
-            turn=jnp.asarray(on * turn * degree, jnp.float32),
-            joint=jnp.asarray(on * joint, jnp.float32),
-            velocity=jnp.asarray(on * config.start_velocity * np.where(along, 1.0, 5.0), jnp.float32),
-        ),
-    )
-
-
 def variant_of(
     config: LocomotionConfig, actuators: ModelParameters | None, residual: TrainedResidual | None
 ) -> SimulatorVariant:
@@ -378,9 +232,3 @@ def variant_of(
     if residual is not None:
         return SimulatorVariant(residual.model.name)
     return SimulatorVariant(identified=actuators is not None, randomized=config.domain_randomization)
-
-
-def _product(one: Float[Array, " 4"], other: Float[Array, " 4"]) -> Float[Array, " 4"]:
-    """Return the product of two quaternions (w, x, y, z): `other` first, then `one`."""
-    scalar = one[0] * other[0] - one[1:] @ other[1:]
-    return jnp.concatenate([scalar[None], one[0] * other[1:] + other[0] * one[1:] + jnp.cross(one[1:], other[1:])])

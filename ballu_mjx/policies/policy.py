@@ -14,10 +14,9 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.closed_loop import ClosedLoop
+from ballu_mjx.policies.locomotion_config import LocomotionConfig, check_locomotion_config
 from ballu_mjx.policies.locomotion_env import (
-    LocomotionConfig,
     LocomotionEnv,
-    check_locomotion_config,
     command_of,
     locomotion_observation,
     num_observations,

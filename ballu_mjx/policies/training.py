@@ -10,7 +10,7 @@ import jax
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.closed_loop import ClosedLoop, Rollout
-from ballu_mjx.policies.locomotion_env import LocomotionConfig, check_locomotion_config
+from ballu_mjx.policies.locomotion_config import LocomotionConfig, check_locomotion_config
 from ballu_mjx.policies.policy import Policy, environment_of
 from ballu_mjx.policies.tasks import Task, find_task
 from ballu_mjx.residuals.trained import TrainedResidual

@@ -22,10 +22,11 @@ from jaxtyping import Array, Float
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.residuals.body_motion import body_motion, smooth_speed
-from ballu_mjx.residuals.network import ForceNetworkConfig, network_input
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
+from ballu_mjx.residuals.network_input import network_input
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.sim.force_model import Action, Commands, Fields, ForceModel, History
 from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.residual import Action, Commands, Fields, History, Residual
 from ballu_mjx.sim.step import count_substeps
 
 
@@ -77,8 +78,8 @@ def longest_delay(robot: RobotDescription) -> float:
     return (HISTORY - 1) * robot.control_timestep
 
 
-class Aerodynamics(ForceModel):
-    """The force model (see `force_model.ForceModel`) whose parameters are `AirParameters`."""
+class Aerodynamics(Residual):
+    """The force model (see `residual.Residual`) whose parameters are `AirParameters`."""
 
     def __init__(self, robot: RobotDescription, model: mujoco.MjModel) -> None:
         """Prepare for `robot`; `model` is its C model without the residual.

@@ -24,8 +24,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.recordings.segment_errors import OUTLYING, count_lost, pseudo_huber
-from ballu_mjx.recordings.segments import Segments, check_segments, cut_segments, simulate_segment
+from ballu_mjx.recordings.motion_windows import (
+    MotionWindows,
+    check_motion_windows,
+    cut_motion_windows,
+    simulate_motion_window,
+)
+from ballu_mjx.recordings.window_errors import OUTLYING, count_lost, pseudo_huber
 from ballu_mjx.residuals.aerodynamics import (
     AIR_PARAMETERS,
     SIGNED_AIR_PARAMETERS,
@@ -33,7 +38,7 @@ from ballu_mjx.residuals.aerodynamics import (
     AirParameters,
     longest_delay,
 )
-from ballu_mjx.sim.force_model import BoundForces
+from ballu_mjx.sim.residual import BoundResidual
 from ballu_mjx.sim.sharding import shard_over_devices
 from ballu_mjx.sim.simulator import Simulator
 
@@ -99,7 +104,7 @@ Report = Callable[[int, float], None]
 
 def check_air_config(config: AirConfig, control_timestep: float) -> None:
     """**Raises** `InputError` for options out of range, naming the option."""
-    check_segments(config.window_seconds, config.interval_seconds, control_timestep)
+    check_motion_windows(config.window_seconds, config.interval_seconds, control_timestep)
     if config.evaluations < 1:
         raise InputError(f"--evaluations is {config.evaluations}: it must be 1 or more; 1 is the nearest.")
 
@@ -226,7 +231,7 @@ def _soften(
 ) -> tuple[Float[np.ndarray, "windows entries"], Float[np.ndarray, "windows entries directions"]]:
     """Scale errors (and their derivatives), window by window.
 
-    The sum of squares becomes `segment_errors.pseudo_huber` of each window's whole error."""
+    The sum of squares becomes `window_errors.pseudo_huber` of each window's whole error."""
     squared = np.sum(errors**2, axis=1)[:, None] + 1e-12
     loss = pseudo_huber(squared)
     factor = np.sqrt(loss / squared)
@@ -250,7 +255,7 @@ class AirWindows:
         """s."""
         none, self._unravel = ravel_pytree(AirParameters.none())
         self._delay = int(self._unravel(jnp.arange(len(none), dtype=none.dtype)).delay)
-        self.windows = cut_segments(self._simulator, motions, config.window_seconds, config.interval_seconds)
+        self.windows = cut_motion_windows(self._simulator, motions, config.window_seconds, config.interval_seconds)
         self._run = shard_over_devices(self.simulate, shared=1)
         self.timestep = float(simulator.mj_model.opt.timestep)
         self.control_steps = 0
@@ -303,8 +308,8 @@ class AirWindows:
         self.control_steps += math.prod(np.shape(self.windows.features)[:2])
         return count_lost(np.array(self._run(np.float32(vector), self.windows), np.float64))
 
-    def simulate(self, vector: Float[Array, " parameters"], window: Segments) -> Float[Array, " entries"]:
+    def simulate(self, vector: Float[Array, " parameters"], window: MotionWindows) -> Float[Array, " entries"]:
         """`errors` of one window, at a whole delay; JAX's own transformations apply."""
         air = self._unravel(vector)
-        simulator = self._simulator.with_residual(BoundForces(self._air, air))
-        return simulate_segment(simulator, window).ravel()
+        simulator = self._simulator.with_residual(BoundResidual(self._air, air))
+        return simulate_motion_window(simulator, window).ravel()

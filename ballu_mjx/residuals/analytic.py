@@ -20,10 +20,11 @@ import optax
 from jaxtyping import Array, Float
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.recordings.segment_errors import pseudo_huber, segment_errors
-from ballu_mjx.recordings.segments import Segments, check_segments, start_segment
+from ballu_mjx.recordings.motion_windows import MotionWindows, check_motion_windows, start_motion_window
+from ballu_mjx.recordings.window_errors import pseudo_huber, window_errors
 from ballu_mjx.residuals.envmimic import start_spread
-from ballu_mjx.residuals.network import NetworkForces, square_newtons
+from ballu_mjx.residuals.network import NetworkResidual
+from ballu_mjx.residuals.network_loads import square_newtons
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.force_sets import FORCE_SETS
 from ballu_mjx.sim.linearize import ControlSteps, Linearized, Linearizer
@@ -67,7 +68,7 @@ class AnalyticConfig:
 
 def check_analytic_config(config: AnalyticConfig, control_timestep: float) -> None:
     """**Raises** `InputError` for options out of range, naming the option."""
-    check_segments(config.window_seconds, config.interval_seconds, control_timestep)
+    check_motion_windows(config.window_seconds, config.interval_seconds, control_timestep)
     positive = "relinearizations", "windows", "updates", "validate_every", "learning_rate", "max_grad_norm", "averaging"
     for name in positive:
         if not getattr(config, name) > 0:
@@ -75,15 +76,15 @@ def check_analytic_config(config: AnalyticConfig, control_timestep: float) -> No
 
 
 def compile_rollout(
-    simulator: AugmentedSimulator, forces: NetworkForces
-) -> Callable[[Any, Segments], tuple[ControlSteps, Float[np.ndarray, "windows windowsteps features"]]]:
+    simulator: AugmentedSimulator, forces: NetworkResidual
+) -> Callable[[Any, MotionWindows], tuple[ControlSteps, Float[np.ndarray, "windows windowsteps features"]]]:
     """Return a compiled simulation of windows under `forces`, in `simulator`.
 
     It takes the parameters of `forces` and windows, and returns all control steps, window after window, and the
     features after each.
     """
 
-    def run(params: Any, window: Segments) -> tuple[ControlSteps, Array]:
+    def run(params: Any, window: MotionWindows) -> tuple[ControlSteps, Array]:
         def step(state: RolloutState, command: Array) -> tuple[RolloutState, tuple[ControlSteps, Array]]:
             seen = forces.inputs(state.history, state.with_command(command))
             loads = forces.loads(params, seen, state.features[ObservationLayout.yaw])
@@ -91,11 +92,11 @@ def compile_rollout(
             after = simulator.step(state, command, does).state
             return after, (ControlSteps(state, command, loads), after.features)
 
-        return jax.lax.scan(step, *start_segment(window))[1]
+        return jax.lax.scan(step, *start_motion_window(window))[1]
 
     spread = shard_over_devices(run, shared=1)
 
-    def whole(params: Any, recorded: Segments) -> tuple[ControlSteps, np.ndarray]:
+    def whole(params: Any, recorded: MotionWindows) -> tuple[ControlSteps, np.ndarray]:
         steps, features = spread(params, recorded)
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps), features
 
@@ -107,10 +108,10 @@ Report = Callable[[int, Any, dict[str, float]], None]
 
 
 def train(
-    forces: NetworkForces,
+    forces: NetworkResidual,
     wrap: Callable[[Any], Any],
     start: Any,
-    recorded: Segments,
+    recorded: MotionWindows,
     spread: Float[np.ndarray, " inputs"],
     config: AnalyticConfig,
     report: Report,
@@ -154,8 +155,8 @@ def train(
 
 
 def _in_windows(
-    linearized: Linearized, loads: Float[Array | np.ndarray, "steps loads"], recorded: Segments
-) -> tuple[Linearized, Float[Array, "windows windowsteps loads"], Segments]:
+    linearized: Linearized, loads: Float[Array | np.ndarray, "steps loads"], recorded: MotionWindows
+) -> tuple[Linearized, Float[Array, "windows windowsteps loads"], MotionWindows]:
     shape, inputs = recorded.features.shape[:2], linearized.state.shape[1] + loads.shape[1]
     linearized = linearized._replace(state=linearized.state[..., :inputs], seen=linearized.seen[..., :inputs])
     parts = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32).reshape(*shape, *x.shape[1:]), (linearized, loads))
@@ -168,11 +169,11 @@ def _loss(
     robot: RobotDescription,
 ) -> Float[Array, ""]:
     """Of a whole window's error."""
-    return pseudo_huber(jnp.sum(segment_errors(features, recorded, robot) ** 2))
+    return pseudo_huber(jnp.sum(window_errors(features, recorded, robot) ** 2))
 
 
 def _updates(
-    forces: NetworkForces,
+    forces: NetworkResidual,
     wrap: Callable[[Any], Any],
     optimizer: optax.GradientTransformation,
     spread: Float[np.ndarray, " inputs"],
@@ -183,7 +184,7 @@ def _updates(
     """Gradient steps on linearized windows, compiled."""
 
     def window_loss(
-        params: Any, key: Array, linear: Linearized, about: Float[Array, "windowsteps loads"], window: Segments
+        params: Any, key: Array, linear: Linearized, about: Float[Array, "windowsteps loads"], window: MotionWindows
     ) -> tuple[Array, Array]:
         key_start, key_noise = jax.random.split(key)
         first = config.start_noise * start_spread * jax.random.normal(key_start, start_spread.shape)

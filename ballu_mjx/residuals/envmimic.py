@@ -24,15 +24,9 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.rotations import quaternion_integrate
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import pad_to_bucket, stack_motions
-from ballu_mjx.residuals.network import (
-    ForceNetworkConfig,
-    force_frame,
-    network_input,
-    num_loads,
-    recorded_inputs,
-    square_newtons,
-    world_loads,
-)
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
+from ballu_mjx.residuals.network_input import network_input, recorded_inputs
+from ballu_mjx.residuals.network_loads import force_frame, num_loads, square_newtons, world_loads
 from ballu_mjx.residuals.scales import settle_scales
 from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription

@@ -11,7 +11,8 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.open_loop import Evaluators
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, check_envmimic_config
-from ballu_mjx.residuals.network import NetworkForces, num_inputs
+from ballu_mjx.residuals.network import NetworkResidual
+from ballu_mjx.residuals.network_input import num_inputs
 from ballu_mjx.residuals.scales import settle_scales
 from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
 from ballu_mjx.rl import ppo
@@ -21,7 +22,7 @@ from ballu_mjx.rl.training_loop import TrainingLoop, Validation
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.progress import Progress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
-from ballu_mjx.sim.force_model import add_to_base
+from ballu_mjx.sim.residual import add_to_base
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 VALIDATE_EVERY = 400_000
@@ -69,7 +70,7 @@ def train_envmimic(
     env = EnvMimicEnv(augmented, motions, config)
     sizes = env.observation_size, env.action_size, ppo_config
     infer = ppo.make_inference(*sizes)
-    forces = NetworkForces(config, robot, infer, ppo.make_sampler(*sizes), network=ppo_config)
+    forces = NetworkResidual(config, robot, infer, ppo.make_sampler(*sizes), network=ppo_config)
     model, all_params = add_to_base(augmented.residual, forces)
     measure = (evaluators or Evaluators(plain)).of(model, motions if validation is None else validation)
     tells_best = Validation(lambda params: measure(all_params(params)).score)

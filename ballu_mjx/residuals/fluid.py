@@ -23,9 +23,10 @@ from jaxtyping import Array, Bool, Float
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.residuals.body_motion import body_motion, smooth_speed
-from ballu_mjx.residuals.network import ForceNetworkConfig, network_input
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
+from ballu_mjx.residuals.network_input import network_input
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.sim.force_model import Action, Commands, ForceModel, History
+from ballu_mjx.sim.residual import Action, Commands, History, Residual
 
 FLUID_FORMAT = "ballu-fluid/1"
 FLUID_FILE = "fluid.json"
@@ -87,8 +88,8 @@ def mirrored(terms: Sequence[Term]) -> Bool[np.ndarray, "terms 6"]:
     return np.array([term.odd for term in terms])[:, None] == _ODD_AXES
 
 
-class FluidForces(ForceModel):
-    """The force model (see `sim.force_model.ForceModel`) whose parameters are coefficients, (terms, 6), in SI units."""
+class FluidResidual(Residual):
+    """The force model (see `sim.residual.Residual`) whose parameters are coefficients, (terms, 6), in SI units."""
 
     def __init__(self, robot: RobotDescription, model: mujoco.MjModel, term_set: TermSet) -> None:
         """Prepare for `robot`, whose C model is `model`."""

@@ -22,17 +22,22 @@ from jaxtyping import Array, Float, Int
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.batched_solver import BatchedSolver
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.recordings.segment_errors import OUTLYING, count_lost, pseudo_huber
-from ballu_mjx.recordings.segments import Segments, check_segments, cut_segments, simulate_segment
-from ballu_mjx.residuals.fluid import TERM_SETS, FluidCoefficients, FluidForces, TermSet, terms_of
+from ballu_mjx.recordings.motion_windows import (
+    MotionWindows,
+    check_motion_windows,
+    cut_motion_windows,
+    simulate_motion_window,
+)
+from ballu_mjx.recordings.window_errors import OUTLYING, count_lost, pseudo_huber
+from ballu_mjx.residuals.fluid import TERM_SETS, FluidCoefficients, FluidResidual, TermSet, terms_of
 from ballu_mjx.residuals.fluid_parametrization import (
     PASSIVE_SETS,
     FreeCoefficients,
     Parametrization,
     PassiveCoefficients,
 )
-from ballu_mjx.sim.force_model import BoundForces
 from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.residual import BoundResidual
 from ballu_mjx.sim.sharding import chunks, shard_over_devices
 from ballu_mjx.sim.simulator import Simulator
 
@@ -68,7 +73,7 @@ def check_fluid_config(config: FluidConfig, control_timestep: float) -> None:
     if not config.window_seconds:
         raise InputError("--window-seconds names no length; give one or more, in seconds.")
     for seconds in config.window_seconds:
-        check_segments(seconds, seconds, control_timestep)
+        check_motion_windows(seconds, seconds, control_timestep)
     if config.passive and config.terms == TERM_SETS[-1]:
         raise InputError(
             f"--terms {config.terms}: passive forces have no such terms; give --no-passive, or {PASSIVE_SETS[-1]}."
@@ -139,7 +144,7 @@ def fit_fluid_forces(
     return FluidFit(best[1], scores, symmetric, windows.count, steps)
 
 
-def _thin(windows: Segments, most: int) -> Segments:
+def _thin(windows: MotionWindows, most: int) -> MotionWindows:
     """Return at most so many windows, evenly chosen."""
     count = len(windows.qpos)
     if count <= most:
@@ -153,21 +158,21 @@ class _Program:
 
     def __init__(self, simulator: Simulator) -> None:
         self._simulator = simulator
-        self.forces = FluidForces(simulator.robot, simulator.mj_model, TERM_SETS[-1])
+        self.forces = FluidResidual(simulator.robot, simulator.mj_model, TERM_SETS[-1])
         self.errors = shard_over_devices(self._errors, shared=1)
         self.slopes = shard_over_devices(self._along, shared=1)
         self.control_steps = 0
         """Simulated so far."""
 
     def _along(
-        self, params: Float[Array, "terms 6"], direction: Float[Array, "terms 6"], window: Segments
+        self, params: Float[Array, "terms 6"], direction: Float[Array, "terms 6"], window: MotionWindows
     ) -> Float[Array, " entries"]:
         return jax.jvp(lambda own: self._errors(own, window), (params,), (direction,))[1]
 
-    def _errors(self, params: Float[Array, "terms 6"], window: Segments) -> Float[Array, " entries"]:
+    def _errors(self, params: Float[Array, "terms 6"], window: MotionWindows) -> Float[Array, " entries"]:
         """One window's errors, in expected errors."""
-        simulator = self._simulator.with_residual(BoundForces(self.forces, params))
-        return simulate_segment(simulator, window).ravel()
+        simulator = self._simulator.with_residual(BoundResidual(self.forces, params))
+        return simulate_motion_window(simulator, window).ravel()
 
 
 class _Windows:
@@ -182,12 +187,12 @@ class _Windows:
     ) -> None:
         seconds = max(config.window_seconds)
         self.simulator = simulator
-        self.segments = _thin(cut_segments(simulator, motions, seconds, seconds), config.windows)
+        self.recorded = _thin(cut_motion_windows(simulator, motions, seconds, seconds), config.windows)
         self.program = _Program(simulator) if program is None else program
-        self.count, self.steps = np.shape(self.segments.features)[:2]
+        self.count, self.steps = np.shape(self.recorded.features)[:2]
 
     def errors(self, params: Float[np.ndarray, "terms 6"]) -> Float[np.ndarray, "windows entries"]:
-        """Return the errors of all windows, in expected errors (`segment_errors.count_lost`)."""
+        """Return the errors of all windows, in expected errors (`window_errors.count_lost`)."""
         self.program.control_steps += self.count * self.steps
         found = [self.program.errors(np.float32(params), self._chosen(rows)) for rows, _ in chunks(self.count, _BATCH)]
         return count_lost(np.concatenate(found).astype(np.float64)[: self.count])
@@ -210,9 +215,9 @@ class _Windows:
     def shortened(self, seconds: float) -> _Windows:
         """Return the same windows, cut off after so many seconds."""
         steps = round(seconds / self.simulator.control_timestep)
-        commands = self.segments.commands[:, : steps + HISTORY - 1]
+        commands = self.recorded.commands[:, : steps + HISTORY - 1]
         other = copy.copy(self)
-        other.segments = self.segments._replace(commands=commands, features=self.segments.features[:, :steps])
+        other.recorded = self.recorded._replace(commands=commands, features=self.recorded.features[:, :steps])
         other.steps = steps
         return other
 
@@ -220,8 +225,8 @@ class _Windows:
         """Return the root of the mean robust loss of windows, in expected errors."""
         return float(np.sqrt(np.mean(pseudo_huber(np.sum(self.errors(params) ** 2, axis=1))) / 6))
 
-    def _chosen(self, rows: Int[np.ndarray, " rows"]) -> Segments:
-        return jax.tree.map(lambda x: np.asarray(x)[rows], self.segments)
+    def _chosen(self, rows: Int[np.ndarray, " rows"]) -> MotionWindows:
+        return jax.tree.map(lambda x: np.asarray(x)[rows], self.recorded)
 
 
 class _Search:
@@ -278,7 +283,7 @@ class _Search:
 
 def _priors(windows: _Windows, spread: float) -> Float[np.ndarray, "terms 6"]:
     """Return the coefficients whose terms accelerate the robot by `spread`, at the terms' size in the recordings."""
-    history = jnp.asarray(windows.segments.history)
+    history = jnp.asarray(windows.recorded.history)
     _, terms = jax.jit(jax.vmap(windows.program.forces.values))(history)
     typical = np.sqrt(np.mean(np.asarray(terms, np.float64) ** 2, axis=0))
     mass, inertia = _whole_body(windows.simulator)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.residuals.fluid import FLUID_FILE, FluidForces
+from ballu_mjx.residuals.fluid import FLUID_FILE, FluidResidual
 from ballu_mjx.residuals.fluid_fit import FluidConfig, FluidFit, fit_fluid_forces
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.residuals.white_box_training import FitReport, fitted_residual
@@ -44,7 +44,7 @@ def fit_fluid(
     found = fit_fluid_forces(simulator, motions, validation, config, report)
     report.close(found.control_steps)
     record.write(FLUID_FILE, found.coefficients.to_json())
-    model = FluidForces(simulator.robot, simulator.mj_model, found.coefficients.term_set)
+    model = FluidResidual(simulator.robot, simulator.mj_model, found.coefficients.term_set)
     params = jnp.asarray(found.coefficients.values, jnp.float32)
     return fitted_residual(simulator, motions, model, params, record, fluid_table(found))
 

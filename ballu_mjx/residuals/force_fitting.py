@@ -14,12 +14,14 @@ from jaxtyping import Float
 
 from ballu_mjx.evaluation.open_loop import Evaluators
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.motion_windows import cut_motion_windows
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.recordings.segments import cut_segments
 from ballu_mjx.residuals import analytic, supervised
 from ballu_mjx.residuals.analytic import AnalyticConfig
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.residuals.network import NetworkForces, num_loads, recorded_inputs
+from ballu_mjx.residuals.network import NetworkResidual
+from ballu_mjx.residuals.network_input import recorded_inputs
+from ballu_mjx.residuals.network_loads import num_loads
 from ballu_mjx.residuals.scales import missing_loads, settle_scales
 from ballu_mjx.residuals.supervised import SupervisedConfig
 from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
@@ -28,9 +30,9 @@ from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
-from ballu_mjx.sim.force_model import add_to_base
 from ballu_mjx.sim.force_sets import FORCE_SETS, ForceSet
 from ballu_mjx.sim.linearize import Linearizer
+from ballu_mjx.sim.residual import add_to_base
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 
@@ -115,7 +117,7 @@ class _Setup:
 
     simulator: AugmentedSimulator
     motions: _Uses
-    forces: NetworkForces
+    forces: NetworkResidual
     start: Params
     inputs: Float[np.ndarray, "states inputs"]
 
@@ -218,7 +220,7 @@ class _Analytic(_Fit):
         """Gradients through the simulation; the validation is open loop."""
         setup, config = self.setup, self.config
         assert isinstance(config, AnalyticConfig)
-        cut = cut_segments(
+        cut = cut_motion_windows(
             setup.simulator.simulator, setup.motions.training, config.window_seconds, config.interval_seconds
         )
         total = config.relinearizations * config.updates
@@ -274,7 +276,7 @@ def _fit(
     reference, _ = stack_motions(plain, motions.training)
     inputs = np.asarray(recorded_inputs(reference, env, robot))
     sizes = {ppo.STATE: (inputs.shape[1],)}, num_loads(env, robot), network
-    network_forces = NetworkForces(env, robot, ppo.make_inference(*sizes), None, name, network)
+    network_forces = NetworkResidual(env, robot, ppo.make_inference(*sizes), None, name, network)
     start = ppo.initial_policy(inputs, sizes[1], network)
     model, all_params = add_to_base(augmented.residual, network_forces)
     measure = (evaluators or Evaluators(plain)).of(model, motions.validation)

@@ -1,6 +1,6 @@
 """The kinds of residual by name, each said once: what a run of it leaves, and how that is read.
 
-A new kind is a class with the interface `sim.force_model.ForceModel`, a function that loads it from a run's folder, and
+A new kind is a class with the interface `sim.residual.Residual`, a function that loads it from a run's folder, and
 an entry in `KINDS`.
 """
 
@@ -17,7 +17,7 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 
 if TYPE_CHECKING:
-    from ballu_mjx.sim.force_model import ForceModel
+    from ballu_mjx.sim.residual import Residual
 
 
 class StoredRun(NamedTuple):
@@ -36,7 +36,7 @@ class StoredRun(NamedTuple):
 class LoadedResidual(NamedTuple):
     """What a run has learned, without its base residual."""
 
-    model: ForceModel
+    model: Residual
     params: Any
     inputs: int
     """Size of the model's inputs."""
@@ -60,7 +60,9 @@ class ResidualKind:
 
 def _load_network(run: StoredRun) -> LoadedResidual:
     from ballu_mjx.residuals.envmimic import EnvMimicConfig, check_envmimic_config
-    from ballu_mjx.residuals.network import NetworkForces, load_scales, num_inputs, num_loads
+    from ballu_mjx.residuals.network import NetworkResidual
+    from ballu_mjx.residuals.network_input import num_inputs
+    from ballu_mjx.residuals.network_loads import load_scales, num_loads
     from ballu_mjx.rl import ppo
     from ballu_mjx.runs.checkpoints import restore_checkpoint
     from ballu_mjx.runs.folder import typed_config
@@ -83,12 +85,13 @@ def _load_network(run: StoredRun) -> LoadedResidual:
             f"{folder}: the stored parameters do not fit the networks in its config.json; restore one of them."
         )
     sample = ppo.make_sampler(*sizes) if task == "envmimic" else None
-    return LoadedResidual(NetworkForces(config, robot, infer, sample, task, network), params, inputs, step)
+    return LoadedResidual(NetworkResidual(config, robot, infer, sample, task, network), params, inputs, step)
 
 
 def _load_aerodynamics(run: StoredRun) -> LoadedResidual:
     from ballu_mjx.residuals.aerodynamics import AERODYNAMICS_FILE, Aerodynamics, read_air_parameters
-    from ballu_mjx.residuals.network import ForceNetworkConfig, num_inputs
+    from ballu_mjx.residuals.network_config import ForceNetworkConfig
+    from ballu_mjx.residuals.network_input import num_inputs
 
     model = Aerodynamics(run.robot, run.robot.load_model(run.actuators))
     params = read_air_parameters(run.folder / AERODYNAMICS_FILE, run.robot)
@@ -98,11 +101,12 @@ def _load_aerodynamics(run: StoredRun) -> LoadedResidual:
 def _load_fluid(run: StoredRun) -> LoadedResidual:
     import jax.numpy as jnp
 
-    from ballu_mjx.residuals.fluid import FLUID_FILE, FluidForces, read_fluid
-    from ballu_mjx.residuals.network import ForceNetworkConfig, num_inputs
+    from ballu_mjx.residuals.fluid import FLUID_FILE, FluidResidual, read_fluid
+    from ballu_mjx.residuals.network_config import ForceNetworkConfig
+    from ballu_mjx.residuals.network_input import num_inputs
 
     found = read_fluid(run.folder / FLUID_FILE)
-    model = FluidForces(run.robot, run.robot.load_model(run.actuators), found.term_set)
+    model = FluidResidual(run.robot, run.robot.load_model(run.actuators), found.term_set)
     params = jnp.asarray(found.values, jnp.float32)
     return LoadedResidual(model, params, num_inputs(ForceNetworkConfig(), run.robot), 0)
 

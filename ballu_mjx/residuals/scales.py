@@ -23,13 +23,14 @@ from jaxtyping import Array, Float, Int
 from ballu_mjx.identification.guard import physics_commands
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, stack_motions
-from ballu_mjx.residuals.network import ForceNetworkConfig, load_scales
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
+from ballu_mjx.residuals.network_loads import load_scales
 from ballu_mjx.robots.adapter import ResidualScales
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.c_model import improved_model
-from ballu_mjx.sim.force_model import BoundForces
 from ballu_mjx.sim.force_sets import FORCE_SETS, ForceSet, check_force_set, num_loads
 from ballu_mjx.sim.observation import HISTORY, commands_seen
+from ballu_mjx.sim.residual import BoundResidual
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 LIMIT_UNITS = 20.0
@@ -197,7 +198,7 @@ def _base_residual(
     applied, sent = np.zeros((len(motion.command), model.nv)), motion.command.copy()
     if simulator.residual is None:
         return applied, sent
-    bound: BoundForces = simulator.residual
+    bound: BoundResidual = simulator.residual
 
     def ask(time: Array) -> tuple[Array, Array, Array]:
         history = jax.lax.dynamic_slice_in_dim(reference.features[number], time - HISTORY + 1, HISTORY)

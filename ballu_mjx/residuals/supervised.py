@@ -24,7 +24,9 @@ from jaxtyping import Array, Float
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.residuals.network import ForceNetworkConfig, force_frame, load_scales, load_units, recorded_inputs
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
+from ballu_mjx.residuals.network_input import recorded_inputs
+from ballu_mjx.residuals.network_loads import force_frame, load_scales, load_units
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.coordinates import translations
 from ballu_mjx.sim.force_sets import FORCE_SETS
@@ -229,7 +231,7 @@ def examples(
 ) -> tuple[Float[np.ndarray, "examples inputs"], Float[np.ndarray, "examples loads"]]:
     """Return what the network sees of each recorded state that has a history, and the action that is its label.
 
-    Actions are those of `network.world_loads`.
+    Actions are those of `network_loads.world_loads`.
     """
     reference, _ = stack_motions(simulator, motions)
     first = HISTORY - 1

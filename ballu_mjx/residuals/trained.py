@@ -20,7 +20,7 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 from ballu_mjx.runs.folder import read_config
 from ballu_mjx.runs.record import TrainingRecord
-from ballu_mjx.sim.force_model import BoundForces, Commands, ForceModel, History, SumOfForces
+from ballu_mjx.sim.residual import BoundResidual, Commands, History, Residual, SumOfResiduals
 from ballu_mjx.sim.simulator import AugmentedSimulator
 
 MARGIN = 0.1
@@ -45,7 +45,7 @@ class TrainedResidual:
     - `report`: what the training says of it, for the user; empty where that is nothing.
     """
 
-    model: ForceModel
+    model: Residual
     params: Any
     observed: tuple[Float[np.ndarray, ...], Float[np.ndarray, ...]]
     step: int
@@ -94,14 +94,14 @@ class TrainedResidual:
             if where.resolve() in loading:
                 raise InputError(f"{folder}: is its own base residual; restore its config.json.")
             base = TrainedResidual.load(where, robot, other_model=other_model, loading=loading)
-            both = base.bound.plus(BoundForces(model, params))
+            both = base.bound.plus(BoundResidual(model, params))
             model, params = both.model, both.params
         return TrainedResidual(model, params, _read_observed(folder / _OBSERVED, inputs), step, identified)
 
     @property
-    def bound(self) -> BoundForces:
+    def bound(self) -> BoundResidual:
         """Return the model with its parameters."""
-        return BoundForces(self.model, self.params, self.observed)
+        return BoundResidual(self.model, self.params, self.observed)
 
     @property
     def latency(self) -> float:
@@ -119,8 +119,8 @@ class TrainedResidual:
         return jnp.maximum(jnp.max(beyond) - MARGIN, 0.0)
 
 
-def _latency(model: ForceModel, params: Any) -> float:
-    if isinstance(model, SumOfForces):
+def _latency(model: Residual, params: Any) -> float:
+    if isinstance(model, SumOfResiduals):
         return sum(_latency(part, own) for part, own in zip(model.parts, params, strict=True))
     return float(params.delay) if isinstance(params, AirParameters) else 0.0
 

@@ -10,11 +10,12 @@ import numpy as np
 
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.residuals.network import ForceNetworkConfig, recorded_inputs
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
+from ballu_mjx.residuals.network_input import recorded_inputs
 from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import TrainingRecord
-from ballu_mjx.sim.force_model import ForceModel
+from ballu_mjx.sim.residual import Residual
 from ballu_mjx.sim.simulator import Simulator
 
 
@@ -41,7 +42,7 @@ class FitReport:
 
 
 def fitted_residual(
-    simulator: Simulator, motions: Sequence[Motion], model: ForceModel, params: Any, record: TrainingRecord, text: str
+    simulator: Simulator, motions: Sequence[Motion], model: Residual, params: Any, record: TrainingRecord, text: str
 ) -> TrainedResidual:
     """Return the residual of a fit to `motions`, with its report in words; `record` takes the range of its inputs."""
     reference, _ = stack_motions(simulator, motions)

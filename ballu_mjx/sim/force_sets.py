@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.sim.force_model import Action
+from ballu_mjx.sim.residual import Action
 
 ForceSet = Literal["force", "wrench", "multi", "joints", "commands"]
 """What a network acts with: a force on the tracked body (the paper's), a force and a torque on it, forces on it and at

@@ -27,8 +27,8 @@ from ballu_mjx.sim.drivetrain import (
     init_drivetrain,
     scan_drivetrain,
 )
-from ballu_mjx.sim.force_model import Action, BoundForces, Commands, HasForces, History
 from ballu_mjx.sim.observation import observe_features
+from ballu_mjx.sim.residual import Action, BoundResidual, Commands, HasResidual, History
 from ballu_mjx.sim.sharding import chunks
 from ballu_mjx.sim.step import PhysicsState, control_step, count_substeps, load_state, make_data, put_model, state_at
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
@@ -185,7 +185,7 @@ class Simulator:
         return jnp.repeat(parts, self.substeps // len(parts), axis=0)
 
     def with_residual(
-        self, residual: HasForces | None, scale: Float[Array, ""] | float | None = None
+        self, residual: HasResidual | None, scale: Float[Array, ""] | float | None = None
     ) -> AugmentedSimulator:
         """Return the simulator that the residual improves, its model fields included.
 
@@ -266,7 +266,7 @@ class AugmentedSimulator:
     """
 
     simulator: Simulator
-    residual: BoundForces | None = None
+    residual: BoundResidual | None = None
     scale: Float[Array, ""] | float | None = None
 
     @property
@@ -288,8 +288,8 @@ class AugmentedSimulator:
         """Return the simulator that the residual improves."""
         return Simulator(self.robot, self.actuators, model=self.simulator.mj_model)
 
-    def with_residual(self, residual: HasForces | None) -> AugmentedSimulator:
-        """Return the simulator with a further residual, which acts together with its own (`SumOfForces`)."""
+    def with_residual(self, residual: HasResidual | None) -> AugmentedSimulator:
+        """Return the simulator with a further residual, which acts together with its own (`SumOfResiduals`)."""
         if residual is None:
             return self
         assert self.scale is None, "A scaled residual takes no further one."
@@ -334,7 +334,7 @@ class AugmentedSimulator:
         - `state`: where the simulation stands; the residual sees its history and commands.
         - `command`: of the coming control step, in the actuators' own units.
         - `further`: what acts beside the residual.
-        - `action_scale`: multiplies what the residual does (`ForceModel.act`), not its delays and model fields.
+        - `action_scale`: multiplies what the residual does (`Residual.act`), not its delays and model fields.
         - `key`: to draw what the residual does; None: the most likely.
         """
         commands = state.with_command(command)

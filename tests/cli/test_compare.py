@@ -10,7 +10,7 @@ from scipy import stats
 from ballu_mjx.cli import compare
 from ballu_mjx.evaluation.errors import HORIZONS, Errors, Evaluation, quotient
 from ballu_mjx.evaluation.errors_file import evaluation_to_json
-from ballu_mjx.evaluation.statistics import t_interval
+from ballu_mjx.evaluation.seed_intervals import t_interval
 from ballu_mjx.runs.folder import Run
 from ballu_mjx.runs.layout import RUN_FORMAT
 

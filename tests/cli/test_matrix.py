@@ -17,7 +17,8 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.errors import HORIZONS, Errors, Evaluation
 from ballu_mjx.evaluation.errors_file import evaluation_to_json
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
-from ballu_mjx.policies.locomotion_env import LocomotionConfig, num_observations
+from ballu_mjx.policies.locomotion_config import LocomotionConfig
+from ballu_mjx.policies.locomotion_env import num_observations
 from ballu_mjx.recordings.csv_format import list_bundled
 from ballu_mjx.residuals.aerodynamics import (
     AERODYNAMICS_FILE,
@@ -29,7 +30,8 @@ from ballu_mjx.residuals.aerodynamics_fit import AirConfig
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.fluid import FLUID_FILE, FluidCoefficients, terms_of
 from ballu_mjx.residuals.fluid_fit import FluidConfig
-from ballu_mjx.residuals.network import num_inputs, num_loads
+from ballu_mjx.residuals.network_input import num_inputs
+from ballu_mjx.residuals.network_loads import num_loads
 from ballu_mjx.residuals.registry import RESIDUAL_TASKS
 from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.residuals.trained import TrainedResidual, write_observed

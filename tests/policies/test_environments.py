@@ -17,11 +17,13 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.environments.batch import LocomotionBatch, make_environment
 from ballu_mjx.policies.environments.brax_env import brax_env
 from ballu_mjx.policies.load_simulator import load_simulator
-from ballu_mjx.policies.locomotion_env import LocomotionConfig, locomotion_state
+from ballu_mjx.policies.locomotion_config import LocomotionConfig
+from ballu_mjx.policies.locomotion_env import locomotion_state
 from ballu_mjx.policies.tasks import TASKS, Task
 from ballu_mjx.residuals.fluid import FLUID_FILE, FluidCoefficients, terms_of
 from ballu_mjx.residuals.fluid_fit import FluidConfig
-from ballu_mjx.residuals.network import ForceNetworkConfig, num_inputs
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
+from ballu_mjx.residuals.network_input import num_inputs
 from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.residuals.trained import write_observed
 from ballu_mjx.robots.description import RobotDescription

@@ -27,7 +27,8 @@ from ballu_mjx.policies.deploy import controller, estimator, export
 from ballu_mjx.policies.deploy.check import Agreement, PolicyCheck, Trial, check_policy
 from ballu_mjx.policies.deploy.controller import TIMEOUT, Controller, observation_names
 from ballu_mjx.policies.deploy.estimator import Capture
-from ballu_mjx.policies.locomotion_env import LocomotionConfig, locomotion_observation, num_observations
+from ballu_mjx.policies.locomotion_config import LocomotionConfig
+from ballu_mjx.policies.locomotion_env import locomotion_observation, num_observations
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.residuals.aerodynamics import (
     AERODYNAMICS_FILE,

@@ -12,16 +12,13 @@ from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.ballu.features import foot_positions
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, KNEES, MOTORS, standing_qpos
 from ballu_mjx.policies.closed_loop import ClosedLoop
-from ballu_mjx.policies.locomotion_env import (
-    LocomotionConfig,
-    LocomotionEnv,
-    LocomotionState,
-    locomotion_observation,
-    locomotion_state,
-    make_setting,
-)
+from ballu_mjx.policies.domain_randomization import make_setting
+from ballu_mjx.policies.locomotion_config import LocomotionConfig
+from ballu_mjx.policies.locomotion_env import LocomotionEnv, LocomotionState, locomotion_observation, locomotion_state
 from ballu_mjx.policies.tasks import TASKS, Step
-from ballu_mjx.residuals.network import ForceNetworkConfig, NetworkForces, load_units
+from ballu_mjx.residuals.network import NetworkResidual
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
+from ballu_mjx.residuals.network_loads import load_units
 from ballu_mjx.residuals.trained import MARGIN, TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.learner import Learner
@@ -41,7 +38,7 @@ INPUTS = 87
 def make_residual(action: np.ndarray, width: float = 1e6) -> TrainedResidual:
     """A residual whose policy always answers `action`, and that has seen inputs within plus and minus `width`."""
     bound = np.full(INPUTS, width, np.float32)
-    forces = NetworkForces(
+    forces = NetworkResidual(
         ForceNetworkConfig(),
         load_robot(),
         infer=lambda params, seen: jnp.asarray(action, jnp.float32),
@@ -209,7 +206,9 @@ def test_one_program_serves_all_residuals_of_a_kind():
         inputs = np.random.default_rng(seed).normal(size=(50, INPUTS)).astype(np.float32)
         params = ppo.initial_policy(inputs, action, dataclasses.replace(network, seed=seed))
         seen = inputs.min(axis=0), inputs.max(axis=0)
-        learned = TrainedResidual(NetworkForces(ForceNetworkConfig(), load_robot(), infer), params, seen, 0, actuators)
+        learned = TrainedResidual(
+            NetworkResidual(ForceNetworkConfig(), load_robot(), infer), params, seen, 0, actuators
+        )
         env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(), actuators=actuators, residual=learned)
         learner = Learner(env, sizes)
         state = jax.eval_shape(learner._first, jax.random.PRNGKey(0), learner._contents)

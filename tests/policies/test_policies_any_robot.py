@@ -12,7 +12,9 @@ import pytest
 from rover import write_rover
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.policies.locomotion_env import LocomotionConfig, LocomotionEnv, locomotion_state, make_setting
+from ballu_mjx.policies.domain_randomization import make_setting
+from ballu_mjx.policies.locomotion_config import LocomotionConfig
+from ballu_mjx.policies.locomotion_env import LocomotionEnv, locomotion_state
 from ballu_mjx.policies.tasks import TASKS
 from ballu_mjx.robots.description import RobotDescription, read_description
 

@@ -18,7 +18,10 @@ from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, reward_terms, tracking_state
-from ballu_mjx.residuals.network import ForceNetworkConfig, NetworkForces, load_units, network_input, world_loads
+from ballu_mjx.residuals.network import NetworkResidual
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
+from ballu_mjx.residuals.network_input import network_input
+from ballu_mjx.residuals.network_loads import load_units, world_loads
 from ballu_mjx.rl.learner import Learner
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.registry import load_robot
@@ -250,7 +253,7 @@ def evaluator() -> OpenLoopEvaluator:
     """Of a recording without and a shorter one with `FORCE`; the policy's parameters are the force it gives."""
     config = ForceNetworkConfig()
     motions = [make_motion(np.zeros(3), "near-own", 60), make_motion(FORCE, "far-pushed", 50)]
-    constant = NetworkForces(config, load_robot(), lambda params, _: params / load_units(config, load_robot()))
+    constant = NetworkResidual(config, load_robot(), lambda params, _: params / load_units(config, load_robot()))
     return OpenLoopEvaluator(Simulator(load_robot()), motions, constant)
 
 
@@ -328,7 +331,7 @@ def test_one_program_serves_all_recordings_and_actuators(still: Motion, pushed: 
         evaluator = OpenLoopEvaluator(
             Simulator(load_robot(), model=model),
             motions,
-            NetworkForces(ForceNetworkConfig(), load_robot(), lambda params, _: params),
+            NetworkResidual(ForceNetworkConfig(), load_robot(), lambda params, _: params),
         )
         places = np.tile(np.array([0, 2], np.int32), (evaluator._size, 1))
         carry = evaluator._begin(places)

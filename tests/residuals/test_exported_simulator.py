@@ -25,17 +25,11 @@ from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.aerodynamics import Aerodynamics, AirParameters
 from ballu_mjx.residuals.deploy.export import export_simulator, rollout_in_double
 from ballu_mjx.residuals.deploy.residual import PARAMETERS_FILE, SETTINGS_FILE, ImprovedSimulator
-from ballu_mjx.residuals.fluid import FluidForces
-from ballu_mjx.residuals.network import (
-    ForceNetworkConfig,
-    NetworkForces,
-    load_names,
-    load_units,
-    network_input,
-    network_input_names,
-    num_inputs,
-    num_loads,
-)
+from ballu_mjx.residuals.fluid import FluidResidual
+from ballu_mjx.residuals.network import NetworkResidual
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
+from ballu_mjx.residuals.network_input import network_input, network_input_names, num_inputs
+from ballu_mjx.residuals.network_loads import load_names, load_units, num_loads
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription, read_description
@@ -43,8 +37,8 @@ from ballu_mjx.robots.mjcf import write_mjcf
 from ballu_mjx.robots.model import assets
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.c_model import improved_model
-from ballu_mjx.sim.force_model import BoundForces
 from ballu_mjx.sim.force_sets import ForceSet
+from ballu_mjx.sim.residual import BoundResidual
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 BALLOON = Path(__file__).parents[2] / "experiments" / "tethered_balloon" / "balloon.robot.json"
@@ -71,7 +65,7 @@ SCALES: dict[ForceSet, tuple[float, ...]] = {"joints": (0.05, 0.02), "commands":
 
 def network(
     robot: RobotDescription, forces: ForceSet, seed: int = 0, activation: Any = "swish", **settings: bool
-) -> BoundForces:
+) -> BoundResidual:
     """A network drawn at random, that pushes with tenths of a newton."""
     config = ForceNetworkConfig(
         forces=forces, force_scale=0.1, torque_scale=0.01, force_limit=1.0, scales=SCALES.get(forces, ()), **settings
@@ -83,17 +77,17 @@ def network(
     tree: Any = jax.device_get(params.policy)
     tree["params"]["Dense_0"]["kernel"] = 100.0 * tree["params"]["Dense_0"]["kernel"]
     infer = ppo.make_inference({ppo.STATE: (inputs,)}, loads, options)
-    forces_by_it = NetworkForces(config, robot, infer, name="envmimic", network=options)
-    return BoundForces(forces_by_it, params._replace(policy=tree))
+    forces_by_it = NetworkResidual(config, robot, infer, name="envmimic", network=options)
+    return BoundResidual(forces_by_it, params._replace(policy=tree))
 
 
-def fluid(robot: RobotDescription) -> BoundForces:
-    model = FluidForces(robot, robot.load_model(), "cubic")
+def fluid(robot: RobotDescription) -> BoundResidual:
+    model = FluidResidual(robot, robot.load_model(), "cubic")
     rng = np.random.default_rng(1)
-    return BoundForces(model, jnp.asarray(0.02 * rng.normal(size=(len(model.terms), 6)), jnp.float32))
+    return BoundResidual(model, jnp.asarray(0.02 * rng.normal(size=(len(model.terms), 6)), jnp.float32))
 
 
-def air(robot: RobotDescription, delay: float) -> BoundForces:
+def air(robot: RobotDescription, delay: float) -> BoundResidual:
     params = dataclasses.replace(
         AirParameters.none(),
         added_mass=jnp.float32(0.05),
@@ -105,7 +99,7 @@ def air(robot: RobotDescription, delay: float) -> BoundForces:
         turning_drag=jnp.array([0.01, 0.02, 0.01]),
         delay=jnp.float32(delay),
     )
-    return BoundForces(Aerodynamics(robot, robot.load_model()), params)
+    return BoundResidual(Aerodynamics(robot, robot.load_model()), params)
 
 
 def rover(folder: Path) -> AugmentedSimulator:
@@ -298,7 +292,7 @@ def test_what_cannot_be_exported_is_said_in_a_sentence(tmp_path: Path):
     (full / "notes.txt").write_text("keep")
     for simulator, place, words in (
         (plain, full, "not empty"),
-        (plain.with_residual(BoundForces(PlainPush(), 1.0)), tmp_path / "a", "kind that cannot be exported"),
+        (plain.with_residual(BoundResidual(PlainPush(), 1.0)), tmp_path / "a", "kind that cannot be exported"),
         (plain.with_residual(network(robot, "force"), 0.5), tmp_path / "b", "scaled"),
     ):
         with pytest.raises(InputError, match=words):

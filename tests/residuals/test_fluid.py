@@ -20,7 +20,7 @@ from ballu_mjx.residuals.deploy.export import rollout_positions
 from ballu_mjx.residuals.fluid import (
     AXES,
     FluidCoefficients,
-    FluidForces,
+    FluidResidual,
     TermSet,
     mirrored,
     read_fluid,
@@ -29,8 +29,8 @@ from ballu_mjx.residuals.fluid import (
 from ballu_mjx.residuals.fluid_fit import FluidConfig, FluidFit, check_fluid_config, fit_fluid_forces
 from ballu_mjx.residuals.fluid_parametrization import PASSIVE_SETS, PassiveCoefficients
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.sim.force_model import BoundForces
 from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.residual import BoundResidual
 from ballu_mjx.sim.simulator import Simulator
 
 GLIDER = """
@@ -140,8 +140,8 @@ def test_any_wrench_that_is_linear_and_takes_energy_is_passive():
 def test_a_glider_that_the_recordings_never_showed_stays_bounded(glider: RobotDescription, fit: FluidFit):
     """Ten times as fast as any recorded flight, and tumbling."""
     simulator = Simulator(glider)
-    forces = FluidForces(glider, simulator.mj_model, fit.coefficients.term_set)
-    improved = simulator.with_residual(BoundForces(forces, jnp.asarray(fit.coefficients.values, jnp.float32)))
+    forces = FluidResidual(glider, simulator.mj_model, fit.coefficients.term_set)
+    improved = simulator.with_residual(BoundResidual(forces, jnp.asarray(fit.coefficients.values, jnp.float32)))
     qpos, qvel = jnp.asarray(simulator.mj_model.qpos0, jnp.float32), jnp.array([3.0, -2.0, 2.0, 3.0, -3.0, 3.0])
     path = np.asarray(jax.jit(partial(rollout_positions, improved))(qpos, qvel, jnp.zeros((100, 2))))
     speed = np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1) / glider.control_timestep
@@ -154,7 +154,7 @@ def test_held_out_flights_are_predicted(fit: FluidFit):
 
 
 def test_the_mirror_image_of_a_motion_gets_the_mirror_image_of_the_wrench(glider: RobotDescription):
-    forces = FluidForces(glider, glider.load_model(), "cubic")
+    forces = FluidResidual(glider, glider.load_model(), "cubic")
     rng = np.random.default_rng(2)
     params = jnp.asarray(rng.normal(size=(len(forces.terms), 6)) * mirrored(forces.terms), jnp.float32)
     history = np.cumsum(rng.normal(size=(HISTORY, glider.features)) * 0.05, axis=0)
@@ -166,7 +166,7 @@ def test_the_mirror_image_of_a_motion_gets_the_mirror_image_of_the_wrench(glider
 
 
 def test_the_wrench_turns_with_the_body_s_heading(glider: RobotDescription):
-    forces = FluidForces(glider, glider.load_model(), "cubic")
+    forces = FluidResidual(glider, glider.load_model(), "cubic")
     rng = np.random.default_rng(3)
     params = jnp.asarray(rng.normal(size=(len(forces.terms), 6)), jnp.float32)
     history = np.cumsum(rng.normal(size=(HISTORY, 9)) * 0.05, axis=0)

@@ -19,14 +19,16 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals import supervised
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, tracking_state
-from ballu_mjx.residuals.network import ForceNetworkConfig, NetworkForces, load_scales, num_loads
+from ballu_mjx.residuals.network import NetworkResidual
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
+from ballu_mjx.residuals.network_loads import load_scales, num_loads
 from ballu_mjx.residuals.scales import describe_scales, missing_loads, settle_scales
 from ballu_mjx.residuals.supervised import SupervisedConfig
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.sim.force_model import BoundForces
 from ballu_mjx.sim.force_sets import ForceSet
 from ballu_mjx.sim.linearize import Linearizer
+from ballu_mjx.sim.residual import BoundResidual
 from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import count_substeps, state_at
 
@@ -62,10 +64,10 @@ def move(robot: RobotDescription, torque: Any = 0.0, shift: Any = 0.0, friction:
     return Motion("near-arm", np.arange(STEPS + 1) * robot.control_timestep, told, qpos, qvel, {})
 
 
-def constant(robot: RobotDescription, forces: ForceSet, loads: np.ndarray) -> BoundForces:
+def constant(robot: RobotDescription, forces: ForceSet, loads: np.ndarray) -> BoundResidual:
     """A residual that always gives `loads`."""
     config = ForceNetworkConfig(forces=forces, force_scale=1.0, force_limit=20.0, scales=(1.0,) * len(loads))
-    return BoundForces(NetworkForces(config, robot, lambda params, _: params), jnp.asarray(loads, jnp.float32))
+    return BoundResidual(NetworkResidual(config, robot, lambda params, _: params), jnp.asarray(loads, jnp.float32))
 
 
 def begin(simulator: Simulator, motion: Motion) -> RolloutState:
@@ -95,7 +97,7 @@ def test_a_simulator_with_what_is_missing_stays_on_the_recording(
             state = step(share, state, jnp.asarray(motion.command[time], jnp.float32))
         far.append(np.abs(np.asarray(state.physics.qpos) - motion.qpos[42]).max())
     assert far[0] < 1e-4 and far[1] > 5e-3
-    one, other = constant(robot, forces, loads), BoundForces(PlainPush(), 1.0)
+    one, other = constant(robot, forces, loads), BoundResidual(PlainPush(), 1.0)
     seen = state.history, state.with_command(jnp.zeros(2))
     for base in (one.plus(one), one.plus(other).plus(one)):
         action = base.act(*seen)

@@ -11,9 +11,10 @@ from servo_arm import identified, write_arm
 
 from ballu_mjx.cli import evaluate
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.residuals.fluid import FLUID_FILE, FluidCoefficients, FluidForces, terms_of
+from ballu_mjx.residuals.fluid import FLUID_FILE, FluidCoefficients, FluidResidual, terms_of
 from ballu_mjx.residuals.fluid_fit import FluidConfig
-from ballu_mjx.residuals.network import ForceNetworkConfig, num_inputs
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
+from ballu_mjx.residuals.network_input import num_inputs
 from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.residuals.trained import TrainedResidual, write_observed
 from ballu_mjx.robots.description import RobotDescription, read_description
@@ -52,7 +53,7 @@ def test_another_load_takes_what_was_learned(robot: RobotDescription, run: Path,
     with pytest.raises(InputError, match="is of the robot arm, not of heavier arm"):
         TrainedResidual.load(run, heavier)
     found = TrainedResidual.load(run, heavier, other_model=True)
-    assert isinstance(found.model, FluidForces) and found.model.robot is heavier
+    assert isinstance(found.model, FluidResidual) and found.model.robot is heavier
     # What was identified holds for the new model too.
     assert heavier.load_model(found.actuators).dof_damping[1] == pytest.approx(0.3)
 

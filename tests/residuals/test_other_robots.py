@@ -15,14 +15,16 @@ import pytest
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.motion_windows import cut_motion_windows
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.recordings.segments import cut_segments
 from ballu_mjx.residuals import analytic, supervised
 from ballu_mjx.residuals.aerodynamics import Aerodynamics, AirParameters
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.residuals.analytic import AnalyticConfig
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.residuals.network import NetworkForces, load_units, num_inputs, num_loads, recorded_inputs
+from ballu_mjx.residuals.network import NetworkResidual
+from ballu_mjx.residuals.network_input import num_inputs, recorded_inputs
+from ballu_mjx.residuals.network_loads import load_units, num_loads
 from ballu_mjx.residuals.supervised import SupervisedConfig
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
@@ -87,13 +89,13 @@ def test_gradients_through_the_simulation_find_the_push(motions: list[Motion], l
     reference, _ = stack_motions(SIMULATOR, motions)
     inputs = np.asarray(recorded_inputs(reference, CONFIG, ROBOT))
     sizes = {ppo.STATE: (num_inputs(CONFIG, ROBOT),)}, num_loads(CONFIG, ROBOT), NETWORK
-    forces = NetworkForces(CONFIG, ROBOT, ppo.make_inference(*sizes), name="analytic")
+    forces = NetworkResidual(CONFIG, ROBOT, ppo.make_inference(*sizes), name="analytic")
     start = ppo.initial_policy(inputs, num_loads(CONFIG, ROBOT), NETWORK)
     settings = AnalyticConfig(
         window_seconds=0.5, interval_seconds=0.5, relinearizations=2, updates=150, validate_every=150,
         observation_noise=0.0, start_noise=0.0,
     )  # fmt: skip
-    windows = cut_segments(SIMULATOR, motions, settings.window_seconds, settings.interval_seconds)
+    windows = cut_motion_windows(SIMULATOR, motions, settings.window_seconds, settings.interval_seconds)
     found = []
     analytic.train(
         forces,
@@ -159,8 +161,8 @@ def test_commands_in_other_units_are_the_same_robot(tmp_path: Path):
             forces, start.policy, (inputs, actions), SupervisedConfig(updates=20, validate_every=20),
             lambda step, policy, error, policies=policies: policies.append(policy),
         )  # fmt: skip
-        windows = cut_segments(simulator, [motion], 1.0, 1.0)
-        network = NetworkForces(CONFIG, robot, infer)
+        windows = cut_motion_windows(simulator, [motion], 1.0, 1.0)
+        network = NetworkResidual(CONFIG, robot, infer)
         rollout = analytic.compile_rollout(simulator.with_residual(None), network)
         _, features = rollout(start._replace(policy=policies[-1]), windows)
         learned.append((motion.qpos, inputs, np.asarray(features)))

@@ -16,12 +16,14 @@ from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.motion_windows import MotionWindows, cut_motion_windows
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.recordings.segments import Segments, cut_segments
 from ballu_mjx.residuals import analytic, supervised
 from ballu_mjx.residuals.analytic import AnalyticConfig, check_analytic_config
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.residuals.network import NetworkForces, load_units, num_inputs, num_loads, recorded_inputs
+from ballu_mjx.residuals.network import NetworkResidual
+from ballu_mjx.residuals.network_input import num_inputs, recorded_inputs
+from ballu_mjx.residuals.network_loads import load_units, num_loads
 from ballu_mjx.residuals.supervised import SupervisedConfig, check_supervised_config
 from ballu_mjx.residuals.trained import TrainedResidual
 from ballu_mjx.rl import ppo
@@ -46,7 +48,7 @@ INPUTS = num_inputs(EnvMimicConfig(), load_robot())
 NETWORK = PPOConfig(policy_layers=(16,), value_layers=(4,))
 WRENCH = EnvMimicConfig(forces="wrench")
 ACTIONS = num_loads(WRENCH, BALLU)
-FORCES = NetworkForces(WRENCH, BALLU, ppo.make_inference({ppo.STATE: (INPUTS,)}, ACTIONS, NETWORK), name="analytic")
+FORCES = NetworkResidual(WRENCH, BALLU, ppo.make_inference({ppo.STATE: (INPUTS,)}, ACTIONS, NETWORK), name="analytic")
 
 
 def pushed(name: str, height: float, model: mujoco.MjModel = MODEL, twist: float = 0.0, steps: int = 60) -> Motion:
@@ -75,8 +77,8 @@ def motions() -> list[Motion]:
 
 
 @pytest.fixture(scope="module")
-def recorded(motions: list[Motion]) -> Segments:
-    return cut_segments(SIMULATOR, motions, SECONDS, SECONDS)
+def recorded(motions: list[Motion]) -> MotionWindows:
+    return cut_motion_windows(SIMULATOR, motions, SECONDS, SECONDS)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +87,7 @@ def linearize() -> Linearizer:
 
 
 @pytest.fixture(scope="module")
-def inputs(motions: list[Motion], recorded: Segments) -> np.ndarray:
+def inputs(motions: list[Motion], recorded: MotionWindows) -> np.ndarray:
     """What networks see of the states in the windows."""
     reference, _ = stack_motions(SIMULATOR, motions)
     seen = np.asarray(recorded_inputs(reference, EnvMimicConfig(), BALLU)).reshape(len(motions), -1, INPUTS)
@@ -99,7 +101,7 @@ def start(inputs: np.ndarray) -> ppo.Params:
 
 
 @pytest.fixture(scope="module")
-def unforced(recorded: Segments, start: ppo.Params) -> ControlSteps:
+def unforced(recorded: MotionWindows, start: ppo.Params) -> ControlSteps:
     still = start._replace(policy=jax.tree.map(np.zeros_like, jax.device_get(start.policy)))
     return analytic.compile_rollout(SIMULATOR.with_residual(None), FORCES)(still, recorded)[0]
 
@@ -188,7 +190,7 @@ def test_examples_are_in_the_balloon_s_heading(motions: list[Motion]):
     assert len(seen) == len(actions)
 
 
-def test_gradients_find_the_push(recorded: Segments, inputs: np.ndarray, start: ppo.Params, linearize: Linearizer):
+def test_gradients_find_the_push(recorded: MotionWindows, inputs: np.ndarray, start: ppo.Params, linearize: Linearizer):
     config = AnalyticConfig(
         window_seconds=SECONDS,
         relinearizations=4,

@@ -24,7 +24,7 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, tracking_state
-from ballu_mjx.residuals.network import load_units, world_loads
+from ballu_mjx.residuals.network_loads import load_units, world_loads
 from ballu_mjx.residuals.run_config import describe_recording, find_recordings, run_robot
 from ballu_mjx.robots.description import read_description
 from ballu_mjx.robots.model import assets

@@ -16,17 +16,18 @@ from servo_arm import TRUTH, identified, true_path, wandering, write_arm
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.parameters import IdentifiedParameters
-from ballu_mjx.policies.locomotion_env import LocomotionConfig, LocomotionEnv, locomotion_state
+from ballu_mjx.policies.locomotion_config import LocomotionConfig
+from ballu_mjx.policies.locomotion_env import LocomotionEnv, locomotion_state
 from ballu_mjx.policies.tasks import TASKS
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.motion_windows import cut_motion_windows, start_motion_window
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.recordings.segments import cut_segments, start_segment
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, tracking_state
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.sim.drivetrain import DrivetrainParameters
-from ballu_mjx.sim.force_model import BoundForces, ForceModel
 from ballu_mjx.sim.linearize import ControlSteps, Linearizer
 from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.residual import BoundResidual, Residual
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
@@ -105,7 +106,7 @@ def test_without_a_drivetrain_nothing_is_carried_or_changed(robot: RobotDescript
         Simulator(robot, identified(robot, **TRUTH)).with_residual(None).step(start, commands[0])
 
 
-class Scaled(ForceModel):
+class Scaled(Residual):
     """Commands times a parameter, and no forces."""
 
     @property
@@ -121,7 +122,7 @@ class Scaled(ForceModel):
 
 def test_a_residuals_command_comes_before_the_drivetrain(simulator: Simulator):
     commands, start = jnp.asarray(wandering(1, 6)), begin(simulator, jnp.zeros(2))
-    halving = BoundForces(Scaled(), jnp.float32(0.5))
+    halving = BoundResidual(Scaled(), jnp.float32(0.5))
     ours = run(simulator.with_residual(halving), start, commands)
     halved = run(simulator.with_residual(None), start, commands / 2)
     np.testing.assert_allclose(ours[0], halved[0], atol=1e-6)
@@ -147,9 +148,9 @@ def test_windows_and_episodes_begin_in_the_drivetrains_recorded_state(simulator:
     def after(state: RolloutState, commands: Array) -> np.ndarray:
         return np.asarray(run(simulator.with_residual(None), state, commands)[0])
 
-    windows = cut_segments(simulator, [motion], 0.5, 0.5)
+    windows = cut_motion_windows(simulator, [motion], 0.5, 0.5)
     for number in (0, 3):
-        state, commands = start_segment(jax.tree.map(lambda x, number=number: x[number], windows))
+        state, commands = start_motion_window(jax.tree.map(lambda x, number=number: x[number], windows))
         first = HISTORY - 1 + 10 * number
         np.testing.assert_allclose(after(state, commands), motion.qpos[first + 1 : first + 11], atol=1e-3)
 
@@ -163,7 +164,7 @@ def test_windows_and_episodes_begin_in_the_drivetrains_recorded_state(simulator:
 
 
 def test_control_steps_are_linearized_about_the_drivetrains_state(simulator: Simulator, motion: Motion):
-    states, commands = jax.vmap(start_segment)(cut_segments(simulator, [motion], 0.1, 0.5))
+    states, commands = jax.vmap(start_motion_window)(cut_motion_windows(simulator, [motion], 0.1, 0.5))
     linear = Linearizer(simulator)(ControlSteps(states, commands[:, 0], np.zeros((len(commands), 3))))
     first = HISTORY - 1 + 10 * np.arange(len(commands))
     np.testing.assert_allclose(linear.qpos, motion.qpos[first + 1], atol=1e-3)

@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 from plain_push import PlainPush
 
 from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.sim.force_model import Action, BoundForces, Fields, ForceModel
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
+from ballu_mjx.sim.residual import Action, BoundResidual, Fields, Residual
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState, state_at
 
@@ -24,7 +24,7 @@ LAYOUT = ObservationLayout.of(ROBOT)
 BODY = SIMULATOR.mj_model.body("balloon").id
 
 
-class Springs(ForceModel):
+class Springs(Residual):
     """A residual that changes everything a residual can: heavier, late by a step, pulled towards its last places."""
 
     @property
@@ -74,7 +74,7 @@ def by_hand(start: RolloutState, scale: Float[Array, ""]) -> tuple[PhysicsState,
 
 @jax.jit
 def stepped(start: RolloutState, scale: Float[Array, ""]) -> Any:
-    return SIMULATOR.with_residual(BoundForces(Springs(), PARAMS), scale).step(start, COMMAND)
+    return SIMULATOR.with_residual(BoundResidual(Springs(), PARAMS), scale).step(start, COMMAND)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.4, 0.0])
@@ -89,7 +89,7 @@ def test_a_step_is_ask_step_observe_and_shift(start: RolloutState, scale: float)
     np.testing.assert_allclose(after.action.wrench, wrench, atol=1e-6)
     np.testing.assert_array_equal(after.state.commands, jnp.stack([start.commands[1], COMMAND]))
     if scale == 1.0:
-        whole = jax.jit(lambda state: SIMULATOR.with_residual(BoundForces(Springs(), PARAMS)).step(state, COMMAND))
+        whole = jax.jit(lambda state: SIMULATOR.with_residual(BoundResidual(Springs(), PARAMS)).step(state, COMMAND))
         np.testing.assert_allclose(whole(start).state.physics.qvel, physics.qvel, atol=1e-4)  # another program
         plain = jax.jit(lambda state: SIMULATOR.with_residual(None).step(state, COMMAND))
         assert np.abs(plain(start).state.physics.qvel - physics.qvel).max() > 1e-3
@@ -99,7 +99,7 @@ def test_further_wrenches_and_residuals_add_up(start: RolloutState):
     """Two residuals in a row, a scaled wrench and another one on the base: their sum pushes."""
 
     def both(simulator: Simulator | AugmentedSimulator) -> AugmentedSimulator:
-        return simulator.with_residual(BoundForces(Springs(), PARAMS)).with_residual(BoundForces(PlainPush(), 0.02))
+        return simulator.with_residual(BoundResidual(Springs(), PARAMS)).with_residual(BoundResidual(PlainPush(), 0.02))
 
     more = jnp.zeros((2, 6)).at[1, 2].set(0.1)
     after = jax.jit(lambda state: both(SIMULATOR).step(state, COMMAND, Action(more), action_scale=0.5))(start)
@@ -112,7 +112,7 @@ def test_further_wrenches_and_residuals_add_up(start: RolloutState):
     )
     assert altered.residual is not None and altered.residual.model.name == "springs+push"
     with pytest.raises(ValueError, match="Both residuals change body_mass"):
-        altered.with_residual(BoundForces(Springs(), PARAMS))
+        altered.with_residual(BoundResidual(Springs(), PARAMS))
 
 
 def test_numbers_that_are_not_finite_keep_the_earlier_state(start: RolloutState):

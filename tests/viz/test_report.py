@@ -30,7 +30,7 @@ from ballu_mjx.evaluation.errors import HORIZONS, Errors, Evaluation
 from ballu_mjx.evaluation.errors_file import evaluation_to_json
 from ballu_mjx.evaluation.transfer import Transfer, walking_table
 from ballu_mjx.policies import pipeline_layout
-from ballu_mjx.policies.locomotion_env import LocomotionConfig
+from ballu_mjx.policies.locomotion_config import LocomotionConfig
 from ballu_mjx.policies.training import locomotion_ppo
 from ballu_mjx.recordings.csv_format import list_bundled
 from ballu_mjx.recordings.groups import group_of

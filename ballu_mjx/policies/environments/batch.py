@@ -11,7 +11,8 @@ from brax.envs.base import State
 from jaxtyping import Array, Bool, Float
 
 from ballu_mjx.policies.load_simulator import load_simulator
-from ballu_mjx.policies.locomotion_env import LocomotionConfig, LocomotionEnv, check_locomotion_config
+from ballu_mjx.policies.locomotion_config import LocomotionConfig, check_locomotion_config
+from ballu_mjx.policies.locomotion_env import LocomotionEnv
 from ballu_mjx.policies.policy import environment_of
 from ballu_mjx.policies.tasks import find_task
 from ballu_mjx.policies.tasks.base import Task

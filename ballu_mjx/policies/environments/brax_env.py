@@ -11,7 +11,8 @@ from brax.envs.base import Env, State
 from jaxtyping import Array
 
 from ballu_mjx.policies.environments.batch import make_environment
-from ballu_mjx.policies.locomotion_env import LocomotionConfig, LocomotionEnv, locomotion_state
+from ballu_mjx.policies.locomotion_config import LocomotionConfig
+from ballu_mjx.policies.locomotion_env import LocomotionEnv, locomotion_state
 from ballu_mjx.policies.tasks.base import Task
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 

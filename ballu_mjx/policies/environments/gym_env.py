@@ -17,7 +17,8 @@ from jaxtyping import Float
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.deploy.controller import observation_names
 from ballu_mjx.policies.environments.batch import LocomotionBatch, make_environment
-from ballu_mjx.policies.locomotion_env import LocomotionConfig, LocomotionEnv
+from ballu_mjx.policies.locomotion_config import LocomotionConfig
+from ballu_mjx.policies.locomotion_env import LocomotionEnv
 from ballu_mjx.policies.tasks.base import Task
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 

@@ -24,16 +24,18 @@ from ballu_mjx.common.standalone import standalone_source
 from ballu_mjx.residuals.aerodynamics import Aerodynamics, air_parameters_to_json
 from ballu_mjx.residuals.deploy import residual as standalone
 from ballu_mjx.residuals.deploy.folder_texts import example_program, folder_readme
-from ballu_mjx.residuals.fluid import FluidForces
-from ballu_mjx.residuals.network import NetworkForces, load_names, load_scales, network_input_names
+from ballu_mjx.residuals.fluid import FluidResidual
+from ballu_mjx.residuals.network import NetworkResidual
+from ballu_mjx.residuals.network_input import network_input_names
+from ballu_mjx.residuals.network_loads import load_names, load_scales
 from ballu_mjx.rl.network_export import NetworkPort, OutputScale, check_onnx, network_arrays, onnx_model
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.mjcf import write_mjcf
 from ballu_mjx.runs.folder import new_folder
 from ballu_mjx.sim.c_model import DERIVED_FIELDS, improved_model, site_poses
 from ballu_mjx.sim.drivetrain import QUANTITIES
-from ballu_mjx.sim.force_model import BoundForces, ForceModel, SumOfForces
 from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.residual import BoundResidual, Residual, SumOfResiduals
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
@@ -136,13 +138,13 @@ def _parts(simulator: AugmentedSimulator) -> list[ExportedPart]:
     return [] if bound is None else [_export_part(simulator, *part) for part in _flat(bound.model, bound.params)]
 
 
-def _flat(model: ForceModel, params: Any) -> list[tuple[ForceModel, Any]]:
-    if isinstance(model, SumOfForces):
+def _flat(model: Residual, params: Any) -> list[tuple[Residual, Any]]:
+    if isinstance(model, SumOfResiduals):
         return [each for part, own in zip(model.parts, params, strict=True) for each in _flat(part, own)]
     return [(model, params)]
 
 
-def _export_part(simulator: AugmentedSimulator, model: ForceModel, params: Any) -> ExportedPart:
+def _export_part(simulator: AugmentedSimulator, model: Residual, params: Any) -> ExportedPart:
     for kind, export in _KINDS.items():
         if isinstance(model, kind):
             return export(simulator, model, jax.device_get(params))
@@ -150,7 +152,7 @@ def _export_part(simulator: AugmentedSimulator, model: ForceModel, params: Any) 
     raise InputError(f"The residual {model.name} is of a kind that cannot be exported; there are {known}.")
 
 
-def _network_part(simulator: AugmentedSimulator, model: NetworkForces, params: Any) -> ExportedPart:
+def _network_part(simulator: AugmentedSimulator, model: NetworkResidual, params: Any) -> ExportedPart:
     if model.network is None:
         raise InputError(f"The options of the network of {model.name} are unknown; load the residual from its run.")
     config, robot = model.config, simulator.robot
@@ -180,7 +182,7 @@ def _aerodynamic_part(simulator: AugmentedSimulator, model: Aerodynamics, params
     return ExportedPart({**settings, "parameters": air_parameters_to_json(params)}, {})
 
 
-def _fluid_part(simulator: AugmentedSimulator, model: FluidForces, params: Any) -> ExportedPart:
+def _fluid_part(simulator: AugmentedSimulator, model: FluidResidual, params: Any) -> ExportedPart:
     gravity = np.asarray(simulator.simulator.mj_model.opt.gravity)
     size = float(np.linalg.norm(gravity))
     settings = {
@@ -196,9 +198,9 @@ def _fluid_part(simulator: AugmentedSimulator, model: FluidForces, params: Any) 
 
 
 _KINDS: Mapping[type, Callable[..., ExportedPart]] = {
-    NetworkForces: _network_part,
+    NetworkResidual: _network_part,
     Aerodynamics: _aerodynamic_part,
-    FluidForces: _fluid_part,
+    FluidResidual: _fluid_part,
 }
 
 
@@ -333,7 +335,7 @@ def in_double(simulator: AugmentedSimulator, model: mujoco.MjModel) -> Augmented
     plain = Simulator(simulator.robot, simulator.actuators, model=model)
     plain = plain.with_drivetrain(double(simulator.simulator.drivetrain))
     bound = simulator.residual
-    return AugmentedSimulator(plain, None if bound is None else BoundForces(bound.model, double(bound.params)))
+    return AugmentedSimulator(plain, None if bound is None else BoundResidual(bound.model, double(bound.params)))
 
 
 def _begin_rollout(

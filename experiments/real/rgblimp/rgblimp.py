@@ -64,7 +64,7 @@ from ballu_mjx.residuals.fluid_fit import FluidConfig
 from ballu_mjx.residuals.fluid_training import fit_fluid
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.runs.progress import PhaseProgress
-from ballu_mjx.sim.force_model import Action, Commands, ForceModel, History
+from ballu_mjx.sim.residual import Action, Commands, History, Residual
 from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.viz import plots
 
@@ -146,7 +146,7 @@ def load(data: Path, numbers: Sequence[int], robot: RobotDescription, made: Path
 
 
 # %%
-class PublishedAerodynamics(ForceModel):
+class PublishedAerodynamics(Residual):
     """The published model as a residual; it has no parameters."""
 
     pressure_area = 0.5 * 1.2187 * 0.25
@@ -298,7 +298,7 @@ def tables(rows: Mapping[str, Mapping[str, Found]]) -> dict[str, Table]:
 def draw(
     path: Path,
     simulator: Simulator,
-    residuals: Mapping[str, tuple[ForceModel, Any]],
+    residuals: Mapping[str, tuple[Residual, Any]],
     test: Mapping[str, Sequence[Motion]],
 ) -> None:
     """Draw the first flight of each group, and what simulators make of it from its first state on."""
@@ -340,7 +340,7 @@ def main() -> None:
     config = FluidConfig(window_seconds=(0.5, 2.0), windows=150)
     if options.quick:
         config = FluidConfig(terms="linear", window_seconds=(0.5,), windows=10, steps=2)
-    residuals: dict[str, tuple[ForceModel, Any]] = {
+    residuals: dict[str, tuple[Residual, Any]] = {
         "published model": (PublishedAerodynamics(robot.control_timestep), jnp.zeros(0))
     }
     for name, passive in (("fluid", True), ("fluid, `--no-passive`", False)):

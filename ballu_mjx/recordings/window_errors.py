@@ -23,7 +23,7 @@ OUTLYING = 3.0
 """Expected errors beyond which a window counts less: a contact point slipped there, for example."""
 
 
-def segment_errors(
+def window_errors(
     features: Float[Array | np.ndarray, "windowsteps features"],
     recorded: Float[Array | np.ndarray, "windowsteps features"],
     robot: RobotDescription,

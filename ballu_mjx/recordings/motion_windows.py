@@ -19,14 +19,14 @@ from jaxtyping import Array, Float
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.recordings.segment_errors import segment_errors
+from ballu_mjx.recordings.window_errors import window_errors
 from ballu_mjx.sim.drivetrain import DrivetrainState
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
 
-class Segments(NamedTuple):
+class MotionWindows(NamedTuple):
     """Windows of recorded motions; `windowsteps` control steps each."""
 
     qpos: Float[Array | np.ndarray, "windows nq"]
@@ -42,7 +42,7 @@ class Segments(NamedTuple):
     """In the first states; None where the simulator has no drivetrain."""
 
 
-def check_segments(window_seconds: float, interval_seconds: float, control_timestep: float) -> None:
+def check_motion_windows(window_seconds: float, interval_seconds: float, control_timestep: float) -> None:
     """Check the windows' length and distance, at least two control steps (s).
 
     **Raises** `InputError` for lengths out of range, naming the option."""
@@ -52,9 +52,9 @@ def check_segments(window_seconds: float, interval_seconds: float, control_times
             raise InputError(f"{name} is {value:g}: it must be {shortest:g} or more; {shortest:g} is the nearest.")
 
 
-def cut_segments(
+def cut_motion_windows(
     simulator: Simulator, motions: Sequence[Motion], window_seconds: float, interval_seconds: float
-) -> Segments:
+) -> MotionWindows:
     """Windows of the given length, one every `interval_seconds`.
 
     **Raises** `InputError` where no recording is as long as a window.
@@ -74,7 +74,7 @@ def cut_segments(
     def of(array: np.ndarray, first: int, count: int) -> np.ndarray:
         return np.stack([array[r, s + first : s + first + count] for r, s in places])
 
-    return Segments(
+    return MotionWindows(
         of(qpos, 0, 1)[:, 0],
         of(qvel, 0, 1)[:, 0],
         of(features, 1 - history, history),
@@ -84,7 +84,7 @@ def cut_segments(
     )
 
 
-def start_segment(window: Segments) -> tuple[RolloutState, Float[Array, "windowsteps commands"]]:
+def start_motion_window(window: MotionWindows) -> tuple[RolloutState, Float[Array, "windowsteps commands"]]:
     """Return where one window starts, and the commands of its control steps."""
     physics = state_at(jnp.asarray(window.qpos), jnp.asarray(window.qvel))
     past = HISTORY - 1
@@ -93,13 +93,13 @@ def start_segment(window: Segments) -> tuple[RolloutState, Float[Array, "windows
     return RolloutState(physics, history, commands[:past], drivetrain), commands[past:]
 
 
-def simulate_segment(simulator: AugmentedSimulator, window: Segments) -> Float[Array, "windowsteps errors"]:
-    """Return `segment_errors` of one window, simulated from its start; JAX's own transformations apply."""
-    state, commands = start_segment(window)
+def simulate_motion_window(simulator: AugmentedSimulator, window: MotionWindows) -> Float[Array, "windowsteps errors"]:
+    """Return `window_errors` of one window, simulated from its start; JAX's own transformations apply."""
+    state, commands = start_motion_window(window)
 
     def step(state: RolloutState, command: Array) -> tuple[RolloutState, Array]:
         after = simulator.step(state, command).state
         return after, after.features
 
     _, features = jax.lax.scan(step, state, commands)
-    return segment_errors(features, window.features, simulator.robot)
+    return window_errors(features, window.features, simulator.robot)

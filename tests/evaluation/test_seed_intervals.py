@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ballu_mjx.evaluation.statistics import paired_difference, seed_means, t_interval
+from ballu_mjx.evaluation.seed_intervals import paired_difference, seed_means, t_interval
 
 DATASETS = 4000
 

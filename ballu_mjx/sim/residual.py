@@ -53,7 +53,7 @@ class Action(NamedTuple):
 
 
 @runtime_checkable
-class ForceModel(Protocol):
+class Residual(Protocol):
     """A kind of residual. All methods are pure: they may be jitted, vmapped and differentiated.
 
     A kind inherits from this class, and writes `name`, `inputs`, and what else it changes.
@@ -88,56 +88,56 @@ class ForceModel(Protocol):
         return Action.none()
 
 
-class BoundForces(NamedTuple):
+class BoundResidual(NamedTuple):
     """A kind of residual with its parameters."""
 
-    model: ForceModel
+    model: Residual
     params: Any
     observed: Any = None
     """Smallest and largest of each of its inputs in what it was learned from; None: unknown."""
 
     @property
-    def bound(self) -> BoundForces:
-        """Itself: what has parameters bound may be given for it (`HasForces`)."""
+    def bound(self) -> BoundResidual:
+        """Itself: what has parameters bound may be given for it (`HasResidual`)."""
         return self
 
     @property
     def fields(self) -> Fields:
-        """Model fields to simulate with; see `ForceModel.fields`."""
+        """Model fields to simulate with; see `Residual.fields`."""
         return self.model.fields(self.params)
 
     def act(self, history: History, commands: Commands, key: Array | None = None) -> Action:
-        """Return what it does over the coming control step; see `ForceModel.act`."""
+        """Return what it does over the coming control step; see `Residual.act`."""
         return self.model.act(self.params, history, commands, key)
 
-    def plus(self, further: BoundForces) -> BoundForces:
+    def plus(self, further: BoundResidual) -> BoundResidual:
         """Return both residuals, acting together."""
-        both = SumOfForces(self.model, further.model)
-        return BoundForces(both, (self.params, further.params), further.observed)
+        both = SumOfResiduals(self.model, further.model)
+        return BoundResidual(both, (self.params, further.params), further.observed)
 
 
 @runtime_checkable
-class HasForces(Protocol):
+class HasResidual(Protocol):
     """A residual with its parameters, or what holds one, such as what a training returns."""
 
     @property
-    def bound(self) -> BoundForces: ...
+    def bound(self) -> BoundResidual: ...
 
 
-def add_to_base(base: BoundForces | None, further: ForceModel) -> tuple[ForceModel, Callable[[Any], Any]]:
+def add_to_base(base: BoundResidual | None, further: Residual) -> tuple[Residual, Callable[[Any], Any]]:
     """Return `further` on top of a base residual, and what turns parameters of `further` into those of the sum.
 
     Without base residual: `further` itself, and the identity.
     """
     if base is None:
         return further, lambda params: params
-    return SumOfForces(base.model, further), lambda params: (base.params, params)
+    return SumOfResiduals(base.model, further), lambda params: (base.params, params)
 
 
-class SumOfForces(ForceModel):
+class SumOfResiduals(Residual):
     """Two residuals, acting together: `params` of both, in order. It sees what the second sees."""
 
-    def __init__(self, first: ForceModel, second: ForceModel) -> None:
+    def __init__(self, first: Residual, second: Residual) -> None:
         self.parts = first, second
 
     @property

@@ -1,0 +1,110 @@
+"""Domain randomization: the distribution of friction and starting states, and draws from it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ballu_mjx.common.rotations import quaternion_product
+from ballu_mjx.policies.locomotion_config import LocomotionConfig
+from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.model import ModelParameters, bare_parameters
+from ballu_mjx.sim.drivetrain import DrivetrainParameters, drivetrain_of
+
+
+class StartSpread(NamedTuple):
+    """How starting states vary."""
+
+    turn: Float[Array, " 3"]
+    """Largest roll, pitch and yaw (rad)."""
+    joint: Float[Array, " joints"]
+    """Standard deviation of each joint (rad, m)."""
+    velocity: Float[Array, " nv"]
+    """Standard deviation of each velocity (m/s, rad/s)."""
+
+
+class Setting(NamedTuple):
+    """What tells one simulator from another, as arrays; see `make_setting`."""
+
+    fields: dict[str, Array]
+    """Fields of the MJX model that identified actuators change."""
+    drivetrain: DrivetrainParameters | None
+    """What commands meet on their way to the actuators; None: nothing."""
+    initial: Float[Array, " nq"]
+    """Pose that episodes start from."""
+    joint_range: Float[Array, "joints 2"]
+    """Smallest and largest value of each joint (rad, m); infinite where it has no limit."""
+    friction: Float[Array, "colliding 2"]
+    """Range of the sliding friction of each geom that collides."""
+    spread: StartSpread
+
+
+def colliding_geoms(model: mujoco.MjModel) -> Int[np.ndarray, " colliding"]:
+    """Return the ids of the geoms that may touch others, the world's included."""
+    return np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0))
+
+
+def make_setting(
+    robot: RobotDescription, model: mujoco.MjModel, config: LocomotionConfig, actuators: ModelParameters | None
+) -> Setting:
+    """Return what tells a simulator from another; `model` is the nominal robot, `actuators` None: nominal ones."""
+    parameters = robot.adapter.nominal_actuators(model) if actuators is None else actuators
+    improved = robot.load_model(actuators)
+    on = 1.0 if config.domain_randomization else 0.0
+    degree = np.pi / 180
+    # One program: thirty small ones take half a second of every start.
+    fields = {} if parameters is None else jax.jit(lambda parameters: parameters.fields(model))(parameters)
+    first = 0 if robot.anchored else 1
+    hinges = model.jnt_type[first:] == int(mujoco.mjtJoint.mjJNT_HINGE)
+    joint = np.where(hinges, config.start_angle * degree, config.start_offset)
+    joint[[model.joint(name).id - first for name in robot.held]] = 0.0
+    limited = improved.jnt_limited[first:, None].astype(bool)
+    along = np.concatenate([[True] * 3 + [False] * 3] * first + [~hinges])
+    turn = np.array([config.start_tilt, config.start_tilt, config.start_yaw])
+    own = improved.geom_friction[colliding_geoms(model), 0]
+    drawn = np.tile(config.friction, (len(own), 1))
+    return Setting(
+        fields=jax.tree.map(jnp.float32, fields),
+        drivetrain=drivetrain_of(bare_parameters(actuators)),
+        initial=jnp.asarray(robot.adapter.initial_qpos(robot, improved), jnp.float32),
+        joint_range=jnp.asarray(np.where(limited, improved.jnt_range[first:], [-np.inf, np.inf]), jnp.float32),
+        friction=jnp.asarray(drawn if config.domain_randomization else np.stack([own, own], axis=1), jnp.float32),
+        spread=StartSpread(
+            turn=jnp.asarray(on * turn * degree, jnp.float32),
+            joint=jnp.asarray(on * joint, jnp.float32),
+            velocity=jnp.asarray(on * config.start_velocity * np.where(along, 1.0, 5.0), jnp.float32),
+        ),
+    )
+
+
+class Start(NamedTuple):
+    """Where an episode starts, drawn from a setting."""
+
+    qpos: Float[Array, " nq"]
+    qvel: Float[Array, " nv"]
+    friction: Float[Array, " colliding"]
+    """Sliding friction of the geoms that collide."""
+    rng: Array
+    """Key for what is drawn next."""
+
+
+def draw_start(setting: Setting, robot: RobotDescription, rng: Array) -> Start:
+    """Draw friction and starting state; without domain randomization both are the setting's own."""
+    key_friction, key_turn, key_joint, key_velocity, rng = jax.random.split(rng, 5)
+    low, high = setting.friction.T
+    friction = low + (high - low) * jax.random.uniform(key_friction)
+    initial, spread = setting.initial, setting.spread
+    root = 0 if robot.anchored else 7  # numbers of the root's pose in `qpos`
+    joints = initial[root:] + spread.joint * jax.random.normal(key_joint, (len(initial) - root,))
+    joints = jnp.clip(joints, *setting.joint_range.T)
+    if root:
+        half = spread.turn * jax.random.uniform(key_turn, (3,), minval=-1.0) / 2
+        quaternion = quaternion_product(jnp.concatenate([jnp.ones(1), half]), initial[3:7])
+        joints = jnp.concatenate([initial[:3], quaternion / jnp.linalg.norm(quaternion), joints])
+    qvel = spread.velocity * jax.random.normal(key_velocity, spread.velocity.shape)
+    return Start(joints, qvel, friction, rng)
