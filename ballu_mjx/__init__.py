@@ -1,10 +1,10 @@
-"""Sim-to-real for BALLU, a 0.29 kg biped held up by helium balloons, and for robots like it, in MJX and Brax.
+"""Sim-to-real transfer in MJX and Brax for BALLU, a 0.29 kg biped under helium balloons, and for similar robots.
 
-The package follows the order of Sontakke et al., "Residual Physics Learning and System Identification for
-Sim-to-real Transfer of Policies on Buoyancy Assisted Legged Robots": recording, identification, residual,
-policy, evaluation. Imports run one way along it.
+The package has the stages of Sontakke et al., "Residual Physics Learning and System Identification for Sim-to-real
+Transfer of Policies on Buoyancy Assisted Legged Robots": recording, identification, residual, policy, evaluation.
+A stage imports from earlier stages only.
 
-The names below are imported when they are first used, for JAX's start-up options must be settled before it is imported
+The public names below are imported at their first use. JAX's start-up options must be set before JAX is imported
 (`common.runtime.prepare`).
 """
 
@@ -92,7 +92,7 @@ _MODULES = {
     "train_envmimic": "residuals.envmimic_training",
     "train_policy": "policies.training",
 }
-"""Where the names are defined."""
+"""Module in which each public name is defined, relative to this package."""
 
 __all__ = [
     "AirConfig",
@@ -138,7 +138,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import what the package's root exports, at its first use."""
+    """Import a public name of the package at its first use."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     runtime = importlib.import_module(f"{__name__}.common.runtime")

@@ -1,8 +1,8 @@
-"""Registers the tasks in improved simulators under their names with Gymnasium, where it is installed, and with Brax.
+"""Registration of the tasks with Brax, and with Gymnasium if it is installed.
 
-`import ballu_mjx.environments`, then `gymnasium.make("ballu_mjx/Walk-v0", run="runs/envmimic-...")`,
-`gymnasium.make_vec(..., num_envs=512)` or `brax.envs.get_environment("ballu_mjx/Walk-v0", run=...)`. Without `run` and
-`robot` it is the nominal simulator of BALLU.
+After `import ballu_mjx.environments`, make a task with `gymnasium.make("ballu_mjx/Walk-v0", run="runs/envmimic-...")`,
+`gymnasium.make_vec(..., num_envs=512)` or `brax.envs.get_environment("ballu_mjx/Walk-v0", run=...)`. `run` selects the
+simulator of a run. Without `run` and `robot`, the task uses BALLU's nominal simulator.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def environment_name(task: str) -> str:
 
 
 NAMES = {environment_name(task): task for task in TASKS}
-"""Tasks by the names that they are registered under."""
+"""Task by the name under which it is registered."""
 
 for _name, _task in NAMES.items():
     envs.register_environment(_name, functools.partial(BraxEnv, _task))  # pyright: ignore[reportArgumentType]

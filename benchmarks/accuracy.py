@@ -1,18 +1,19 @@
-"""How accurate and how fast the simulation is for each setting of solver, integrator, cone and time step.
+"""Measure accuracy and speed of the simulation for settings of solver, integrator, friction cone and time step.
 
     python benchmarks/accuracy.py            # the table behind the <option> line of assets/ballu.xml
-    python benchmarks/accuracy.py --quick    # the chosen setting alone, fewer sequences
+    python benchmarks/accuracy.py --quick    # only the chosen setting, fewer sequences
 
-The judge is C MuJoCo in double precision. Random bang-bang commands (each leg 0 or 1, for 0.15 to 0.8 s at a time)
-drive the robot from rest for 2 s; the figure is how far the balloon ends from where the judge has it, in millimetres,
-as median and 95th percentile over the sequences:
+The reference is C MuJoCo in double precision. Random bang-bang commands (each leg 0 or 1, for 0.15 to 0.8 s at a time)
+drive the robot from rest for 2 s. The error is the distance (mm) of the balloon from the reference at the end, as
+median and 95th percentile over the sequences:
 
-- `tight`: against the same model and time step with the solver run to convergence;
-- `quarter`: against that at a quarter of the time step.
+- `tight`: the reference has the same model and time step, with the solver run to convergence.
+- `quarter`: the reference has, in addition, a quarter of the time step.
 
-The columns `C` judge C MuJoCo with the setting, the columns `MJX` the float32 rollouts in MJX that training uses.
-Speed is in simulated seconds per second for MJX, the batch sharded over all devices: `wall` by the clock, `cpu` from
-the processor time used, which a busy machine disturbs less. Exit status 1 where the chosen setting misses a target.
+The columns `C` are for C MuJoCo with the setting. The columns `MJX` are for the float32 rollouts in MJX that training
+uses. Speed is in simulated seconds per second for MJX, with the batch sharded over all devices. `wall` is by wall time.
+`cpu` is by processor time, which depends less on other load. The exit status is 1 if the chosen setting misses a
+target.
 """
 
 from __future__ import annotations
@@ -44,14 +45,15 @@ SOLVERS = {"Newton": mujoco.mjtSolver.mjSOL_NEWTON, "CG": mujoco.mjtSolver.mjSOL
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 
 DURATION = 2.0
-"""Seconds of a sequence."""
+"""Length of a sequence (s)."""
 TARGETS_MM = (5.0, 20.0, 20.0)
+"""Upper limits (mm): median and 95th percentile of `tight`, median of `quarter`."""
 TARGET_TEXT = "tight below 5 / 20 mm, quarter below 20 mm in the median"
 
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """One line of the table; `timestep` in seconds."""
+    """Setting of the simulation, one line of the table. `timestep` is in s."""
 
     timestep: float
     integrator: str
@@ -66,7 +68,7 @@ class Setting:
 
     @staticmethod
     def of(model: mujoco.MjModel) -> Setting:
-        """The setting that stands in `model`."""
+        """Return the setting of `model`."""
         option = model.opt
 
         def name(names: dict, value: int) -> str:
@@ -82,7 +84,7 @@ class Setting:
         )
 
     def model(self) -> mujoco.MjModel:
-        """The robot with this setting."""
+        """Return the robot's model with this setting."""
         model = load_model()
         model.opt.timestep = self.timestep
         model.opt.integrator = INTEGRATORS[self.integrator]
@@ -93,7 +95,7 @@ class Setting:
         return model
 
     def tight(self, divide: int = 1) -> mujoco.MjModel:
-        """The robot with the solver run to convergence, at the time step over `divide`."""
+        """Return the robot's model with the solver run to convergence, and with the time step divided by `divide`."""
         model = dataclasses.replace(self, timestep=self.timestep / divide, solver="Newton").model()
         model.opt.iterations, model.opt.tolerance = 100, 1e-10
         model.opt.ls_iterations, model.opt.ls_tolerance = 50, 1e-3
@@ -101,7 +103,7 @@ class Setting:
 
 
 def table(chosen: Setting) -> list[Setting]:
-    """The settings compared: the chosen one, then one change at a time, then the fast ones that tempt."""
+    """Return the settings to compare: the chosen one, then single changes, then fast settings."""
 
     def vary(**changes) -> Setting:
         return dataclasses.replace(chosen, **changes)
@@ -122,7 +124,7 @@ def table(chosen: Setting) -> list[Setting]:
 
 
 def bang_bang(key: int, count: int, steps: int) -> Float[np.ndarray, "count steps 2"]:
-    """Commands that jump between 0 and 1, each leg by itself, after 3 to 16 control steps."""
+    """Return commands that switch between 0 and 1, independently for each leg, after 3 to 16 control steps."""
     rng = np.random.default_rng(key)
     level = rng.integers(0, 2, (count, 2)).astype(float)
     left = rng.integers(3, 17, (count, 2))
@@ -136,7 +138,7 @@ def bang_bang(key: int, count: int, steps: int) -> Float[np.ndarray, "count step
 
 
 def settled(setting: Setting) -> Float[np.ndarray, " nq"]:
-    """The robot standing still with both commands at 0: generalized position after 4 s of damped motion."""
+    """Return the generalized position of the robot at rest with zero commands, after 4 s of damped motion."""
     model = setting.tight(4)
     data = mujoco.MjData(model)
     data.qpos[:] = standing_qpos(model)
@@ -147,7 +149,7 @@ def settled(setting: Setting) -> Float[np.ndarray, " nq"]:
 
 
 def balloon_positions(model: mujoco.MjModel, qpos: Float[np.ndarray, "count nq"]) -> Float[np.ndarray, "count 3"]:
-    """World position (m) of the balloon's site for each generalized position."""
+    """Return the position (m, world frame) of the balloon's site for each generalized position."""
     data = mujoco.MjData(model)
     site = data.site("balloon")
     positions = []
@@ -164,7 +166,7 @@ def c_rollout(
     commands: Float[np.ndarray, "count steps 2"],
     threads: int,
 ) -> Float[np.ndarray, "count 3"]:
-    """Balloon positions (m) at the end, by C MuJoCo on `threads` threads."""
+    """Return the final balloon positions (m), simulated by C MuJoCo on `threads` threads."""
     control = commands.repeat(count_substeps(model, CONTROL_TIMESTEP), axis=1)
     data = [mujoco.MjData(model) for _ in range(threads)]
     data[0].qpos[:] = qpos
@@ -177,7 +179,7 @@ def c_rollout(
 
 @dataclasses.dataclass(frozen=True)
 class MjxResult:
-    """Balloon positions (m) at the end, simulated seconds per second by the clock and by the processor time."""
+    """Final balloon positions (m), and simulated seconds per second of wall time and of processor time."""
 
     positions: Float[np.ndarray, "count 3"]
     wall: float
@@ -187,7 +189,10 @@ class MjxResult:
 def mjx_program(
     model: mujoco.MjModel, qpos: Float[np.ndarray, " nq"], devices: int
 ) -> Callable[[Float[Array, "batch steps 2"]], Float[Array, "batch nq"]]:
-    """The same by MJX in float32: from commands to final generalized positions, the batch sharded over `devices`."""
+    """Return a compiled MJX rollout in float32, from commands to final generalized positions.
+
+    The batch is sharded over `devices`.
+    """
     step_count, balloon = count_substeps(model, CONTROL_TIMESTEP), model.body("balloon").id
     mjx_model, template = put_model(model), make_data(model)
     start = state_at(jnp.asarray(qpos, jnp.float32), jnp.zeros(model.nv))
@@ -203,14 +208,14 @@ def mjx_program(
     axis_types = (jax.sharding.AxisType.Auto,)
     mesh = jax.make_mesh((devices,), ("batch",), axis_types=axis_types, devices=jax.local_devices()[:devices])
     spec = PartitionSpec("batch")
-    # Sharded by hand: left to the compiler, the solver's loops would wait for all devices at every iteration.
+    # Sharded explicitly. Otherwise the solver's loops would wait for all devices at every iteration.
     return jax.jit(jax.shard_map(jax.vmap(one), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
 
 
 def mjx_rollout(
     model: mujoco.MjModel, qpos: Float[np.ndarray, " nq"], commands: Float[np.ndarray, "count steps 2"], batch: int
 ) -> MjxResult:
-    """Positions and speed of `mjx_program` on all devices, the sequences repeated to fill `batch`."""
+    """Return positions and speed of `mjx_program` on all devices. The sequences are repeated to fill `batch`."""
     devices = jax.device_count()
     batch = -(-batch // devices) * devices
     rollout = mjx_program(model, qpos, devices)
@@ -231,7 +236,7 @@ def mjx_rollout(
 
 
 def distances(a: Float[np.ndarray, "count 3"], b: Float[np.ndarray, "count 3"]) -> tuple[float, float]:
-    """Median and 95th percentile of the distance, in millimetres; a diverged end counts as infinitely far."""
+    """Return the median and the 95th percentile of the distance (mm). A diverged rollout has an infinite distance."""
     distance = np.linalg.norm(a - b, axis=1) * 1e3
     distance = np.where(np.isfinite(distance), distance, np.inf)
     return float(np.median(distance)), float(np.percentile(distance, 95, method="higher"))
@@ -244,18 +249,18 @@ def main(
     seed: int = 0,
     mjx_too: Annotated[bool, tyro.conf.arg(name="mjx")] = True,
 ) -> None:
-    """Table of accuracy against speed.
+    """Print a table of accuracy and speed.
 
     Args:
-        quick: only the chosen setting, 16 sequences and a small batch: its numbers mean little.
-        sequences: number of random command sequences.
-        batch: number of environments in MJX for the measurement of speed.
-        seed: of the commands.
-        mjx_too: judge and time MJX as well; without it only C MuJoCo is judged, in seconds.
+        quick: Use only the chosen setting, 16 sequences and a small batch. The result means little.
+        sequences: Number of random command sequences.
+        batch: Number of environments in MJX for the measurement of speed.
+        seed: Seed of the commands.
+        mjx_too: Measure MJX as well. Without it, only C MuJoCo is measured, within seconds.
     """
     if quick:
         sequences, batch = 16, 32
-    mujoco.set_mju_user_warning(lambda _: None)  # settings that diverge belong in the table
+    mujoco.set_mju_user_warning(lambda _: None)  # Diverging settings are part of the table.
     chosen = Setting.of(load_model())
     settings = [chosen] if quick else table(chosen)
     steps = round(DURATION / CONTROL_TIMESTEP)

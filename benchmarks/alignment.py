@@ -1,7 +1,8 @@
-"""How well is a log's offset found by how the legs move? Robots by which nothing in the estimate was chosen.
+"""Measure how accurately the offset of a command log is estimated from the motion of the legs.
 
-Walks of several virtual robots, with two seconds of rest at both ends, whose log is on the recording's own clock; then
-random jumps. Printed: the error of the offset, and how many the confidence lets through, by kind.
+Several virtual robots are recorded, on which no choice in the estimate was based. They walk, with two seconds of rest
+at both ends. Then their commands jump randomly. The clocks of log and recording are the same. The output is the error
+of the offset, and the number of trials with sufficient confidence, for each kind of commands.
 """
 
 from __future__ import annotations
@@ -21,12 +22,14 @@ from ballu_mjx.cli.record import LEAST_CONFIDENCE, Import
 from ballu_mjx.recordings.clock_alignment import align
 
 SECONDS = 14.0
+"""Length of the commands (s)."""
 REST = np.zeros((40, 2))
+"""Commands of 2 s of rest."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--robots", type=int, default=8, help="robots of the family, from seed 11 on")
+    parser.add_argument("--robots", type=int, default=8, help="number of virtual robots, from seed 11 on")
     robots = range(11, 11 + parser.parse_args().robots)
     rng = np.random.default_rng(0)
     for kind in ("walks", "random jumps"):

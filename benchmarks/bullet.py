@@ -1,15 +1,16 @@
-"""The robot in PyBullet, the paper's engine: a rival for the benchmarks, built from the MuJoCo model's own numbers.
+"""The robot in PyBullet, the paper's engine, built from the MuJoCo model for comparisons in benchmarks.
 
-The URDF has the model's bodies, joints, joint limits and foot spheres. What Bullet has no word for is done beside it,
-by the model's formulas:
+The URDF has the model's bodies, joints, joint limits and foot spheres. This module simulates the features that Bullet
+lacks, with the model's formulas:
 
 - Knee springs and cables are torques on the knees, set before every physics step.
 - Lift is a force at the balloon's centre of mass, set before every physics step.
-- Armature, which Bullet lacks: of neck and hips, it is given to the lighter of the two bodies, the base, as inertia
-  about the axis. Of a motor it is five orders of magnitude more than the arm's inertia: its motion (servo, back-EMF,
-  cable, armature) is integrated here, damping implicitly, and a velocity motor of Bullet's makes the joint follow.
+- The armature of neck and hips is added to the inertia about the axis of the lighter body, which is the base.
+- The armature of a motor is five orders of magnitude larger than the arm's inertia. So the motor's motion (servo,
+  back-EMF, cable, armature) is integrated here, with implicit damping. A velocity motor of Bullet makes the joint
+  follow.
 
-Limits and contacts are Bullet's: hard, where MuJoCo's give a little.
+Joint limits and contacts are those of Bullet. They are hard, while MuJoCo's are slightly soft.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES
 from ballu_mjx.policies.deploy.estimator import euler_angles
 
 TIMESTEPS = (1 / 240, 1e-3)
-"""Bullet's own default, and a finer one (s); both divide the control step."""
+"""Time steps (s): Bullet's default and a finer one. Both divide the control step."""
 _GRIP = 10.0
-"""Torque (N m) with which a motor joint may be made to follow: far more than it takes."""
+"""Largest torque (N m) of the velocity motor that moves a motor joint, far more than needed."""
 
 
 def urdf(model: mujoco.MjModel) -> str:
-    """The robot as a URDF: a link for every body but the world, named as in the model."""
+    """Return the robot as a URDF, with a link for every body except the world. Names are those of the model."""
     robot = ElementTree.Element("robot", name="ballu")
     inertia = inertias(model)
     for body in range(1, model.nbody):
@@ -57,7 +58,7 @@ def urdf(model: mujoco.MjModel) -> str:
 
 
 def inertias(model: mujoco.MjModel) -> Float[np.ndarray, "bodies 3"]:
-    """Principal moments of inertia (kg m^2), with the armature of all joints but the motors'."""
+    """Return principal moments of inertia (kg m^2), including the armature of all joints except the motors."""
     inertia = model.body_inertia.copy()
     for dof in range(model.nv):
         joint = model.dof_jntid[dof]
@@ -69,11 +70,17 @@ def inertias(model: mujoco.MjModel) -> Float[np.ndarray, "bodies 3"]:
 
 
 class Robot:
-    """One robot on a floor in a world of its own."""
+    """One robot on a floor, in a separate Bullet world."""
 
     def __init__(self, model: mujoco.MjModel, timestep: float, *, held: bool = False) -> None:
-        """`model` is the robot in MuJoCo, `timestep` (s) Bullet's, a whole part of the control step. `held`: the base
-        stays where `reset` puts it."""
+        """Create the world.
+
+        **Arguments**
+
+        - `model`: the robot in MuJoCo.
+        - `timestep`: Bullet's time step (s), which must divide the control step.
+        - `held`: whether the base is fixed in the pose of `reset`.
+        """
         self.model, self.timestep = model, timestep
         self.substeps = round(CONTROL_TIMESTEP / timestep)
         self._world, self._body = open_world(urdf(model), model.opt.gravity, timestep, held=held)
@@ -93,11 +100,11 @@ class Robot:
                 restitution=0.0,
                 maxJointVelocity=1e3,
             )
-            # Of the file Bullet takes no inertia that no rigid body has, such as one with armature; in a call with
-            # other values it is lost.
+            # Bullet rejects an inertia in the URDF that no rigid body can have, for example with armature. A call of
+            # changeDynamics with other values resets it, so it is set in a separate call.
             moments = inertia[model.body(name).id].tolist()
             self._world.changeDynamics(self._body, link, localInertiaDiagonal=moments)
-        for index in self._joint.values():  # Bullet brakes every joint unless told not to
+        for index in self._joint.values():  # Bullet brakes every joint by default.
             self._world.setJointMotorControl2(self._body, index, pybullet.VELOCITY_CONTROL, force=0.0)
         self._legs = [_Leg(model, side, timestep) for side in SIDES]
         self._driven = [self._joint[f"{kind}_{side}"] for kind in ("knee", "motor") for side in SIDES]
@@ -109,25 +116,25 @@ class Robot:
         self._masses = model.body_mass[1:] / model.body_mass[1:].sum()
 
     def close(self) -> None:
-        """Give the world back."""
+        """Close the Bullet world."""
         self._world.disconnect()
 
     def reset(self, qpos: Float[np.ndarray, " nq"]) -> None:
-        """At rest in a state of MuJoCo's."""
+        """Place the robot at MuJoCo's generalized position `qpos`, at rest."""
         turn = Rotation.from_quat(qpos[3:7], scalar_first=True)
-        centre = qpos[:3] + turn.apply(self.model.body_ipos[1])  # Bullet's base is the base's centre of mass
+        centre = qpos[:3] + turn.apply(self.model.body_ipos[1])  # Bullet places a base by its centre of mass.
         self._world.resetBasePositionAndOrientation(self._body, centre.tolist(), turn.as_quat().tolist())
         self._world.resetBaseVelocity(self._body, [0.0] * 3, [0.0] * 3)
         for name, angle in zip(self._names, qpos[7:], strict=True):
             self._world.resetJointState(self._body, self._joint[name], float(angle), 0.0)
 
     def step(self, command: Sequence[float]) -> None:
-        """One control step under the commands (left, right) in [0, 1]."""
+        """Advance one control step with the commands (left, right), in [0, 1]."""
         for _ in range(self.substeps):
             self.physics_step(command)
 
     def physics_step(self, command: Sequence[float]) -> None:
-        """One physics step."""
+        """Advance one physics step with the commands (left, right), in [0, 1]."""
         world, body = self._world, self._body
         states = world.getJointStates(body, self._driven)
         forces, targets = [], []
@@ -149,7 +156,7 @@ class Robot:
         world.stepSimulation()
 
     def qpos(self) -> Float[np.ndarray, " nq"]:
-        """The state's generalized position, MuJoCo's."""
+        """Return the generalized position, as in MuJoCo."""
         centre, quaternion = self._world.getBasePositionAndOrientation(self._body)
         turn = Rotation.from_quat(quaternion)
         states = self._world.getJointStates(self._body, [self._joint[name] for name in self._names])
@@ -157,28 +164,28 @@ class Robot:
         return np.concatenate([origin, turn.as_quat(scalar_first=True), [state[0] for state in states]])
 
     def joint_angle(self, name: str) -> float:
-        """rad"""
+        """Return a joint's angle (rad)."""
         return self._world.getJointState(self._body, self._joint[name])[0]
 
     def total_mass(self) -> float:
-        """kg, as Bullet has it."""
+        """Return the total mass (kg) in Bullet."""
         links = (-1, *self._link.values())
         return sum(self._world.getDynamicsInfo(self._body, link)[0] for link in links)
 
     def joint_limits(self, name: str) -> tuple[float, float]:
-        """rad, as Bullet has them; the lower above the upper where there are none."""
+        """Return a joint's limits (rad) in Bullet. Without limits, the lower one is above the upper one."""
         info = self._world.getJointInfo(self._body, self._joint[name])
         return info[8], info[9]
 
     def observe(self) -> tuple[Float[np.ndarray, " 27"], Float[np.ndarray, " 3"]]:
-        """The features of `observation.observe_features`, and the centre of mass (m, world)."""
+        """Return the features of `observation.observe_features`, and the centre of mass (m, world frame)."""
         centre, quaternion = self._world.getBasePositionAndOrientation(self._body)
         velocity, spin = self._world.getBaseVelocity(self._body)
         states = self._world.getLinkStates(self._body, self._com_links, computeLinkVelocity=1)
         com = self._masses @ np.array([centre, *(state[0] for state in states)])
 
         def point(body: int, offset: np.ndarray) -> np.ndarray:
-            """Position and velocity of a site, by its body and place in the frame at the body's centre of mass."""
+            """Return position and velocity of a site, given its body and its `offset` in the body's inertial frame."""
             place, orientation, linear, angular = centre, quaternion, velocity, spin
             if body > 1:
                 state = states[body - 2]
@@ -195,7 +202,7 @@ class Robot:
 
 
 class _Leg:
-    """What drives one leg: servo, cable and knee spring, in plain numbers, for it runs in every physics step."""
+    """Actuation of one leg: servo, cable and knee spring. It uses Python floats for speed."""
 
     def __init__(self, model: mujoco.MjModel, side: str, timestep: float) -> None:
         servo, cable = model.actuator(f"servo_{side}").id, model.tendon(f"cable_{side}").id
@@ -214,12 +221,12 @@ class _Leg:
         self._inertia = float(model.dof_armature[dof] + own)
         self._brake = 1.0 + timestep * model.dof_damping[dof] / self._inertia
         self._timestep = timestep
-        for name, value in vars(self).items():  # NumPy's scalars are slow
+        for name, value in vars(self).items():  # NumPy scalars are slow.
             setattr(self, name, value.tolist() if isinstance(value, np.generic | np.ndarray) else value)
 
     def drive(self, command: float, knee: float, motor: float, motor_velocity: float) -> tuple[float, float]:
-        """Torque on the knee (N m), and the motor's velocity (rad/s) at the end of the physics step."""
-        # The cable's upper end turns with the motor (about -y) and then with the knee (about y) around the knee's axis.
+        """Return the torque on the knee (N m), and the motor's velocity (rad/s) at the end of the physics step."""
+        # The cable's upper end rotates with the motor (about -y), and then with the knee (about y) around its axis.
         sin_m, cos_m, sin_k, cos_k = math.sin(motor), math.cos(motor), math.sin(knee), math.cos(knee)
         x, z = self._arm[0] - self._radius * sin_m, self._arm[1] + self._radius * cos_m
         dx = cos_k * x + sin_k * z - self._anchor[0]
@@ -237,7 +244,7 @@ class _Leg:
 
 
 def _at_centre_of_mass(model: mujoco.MjModel, name: str) -> tuple[int, Float[np.ndarray, " 3"]]:
-    """A site's body, and its place (m) in the frame of the body's centre of mass and principal axes."""
+    """Return a site's body, and its position (m) in the body's inertial frame (centre of mass, principal axes)."""
     site = model.site(name)
     body = int(model.site_bodyid[site.id])
     turn = Rotation.from_quat(model.body_iquat[body], scalar_first=True).inv()

@@ -1,17 +1,18 @@
-"""A second family of virtual BALLU robots, in PyBullet, to judge identification and residuals by.
+"""A second family of virtual BALLU robots, in PyBullet, for tests of identification and residuals.
 
-Masses, places and lengths are the real robot's, from its CAD export. The mechanism is another one than the package's:
+Masses, positions and lengths are those of the real robot, from its CAD export. The mechanism differs from the
+package's:
 
-- An arm is moved by a position loop: a time constant, a top speed, and a travel below 90 deg. Play lies between the
-  loop and the arm. The load bends the arm a little.
-- A cable is a one-sided spring and damper between its tie points. Its tension saturates.
-- Knees are viscous.
-- Air: quadratic drag and added mass, both by forces on the balloons, and a torque against turning.
-- Contacts and joint stops are Bullet's.
+- A position loop moves each arm, with a time constant, a top speed, and a travel below 90 deg. There is backlash
+  between the loop and the arm. The load bends the arm slightly.
+- A cable is a one-sided spring and damper between its attachment points. Its tension saturates.
+- Knees have viscous friction.
+- The air exerts quadratic drag and the force of the added mass on the balloons, and a torque against their rotation.
+- Contacts and joint stops are those of Bullet.
 
-`draw(seed)` draws a robot from the ranges that stand in it. Seeds 0 to 4 are the family. Choices are made on robots 0
-and 1; results are reported for all five. The package does not import this module, and no start, prior or bound of any
-fit is taken from it.
+`draw(seed)` draws a robot from the ranges in its code. Seeds 0 to 4 are the family. Choices in the package were based
+on robots 0, 1 and 2 (`CHOSEN_ON`). Results are reported for all five. The package does not import this module. No
+start, prior or bound of any fit is taken from it.
 """
 
 from __future__ import annotations
@@ -33,22 +34,27 @@ from ballu_mjx.ballu.recordings import make_recording
 from ballu_mjx.recordings.recording import Recording
 
 ROBOTS = range(5)
+"""Seeds of the family."""
 CHOSEN_ON = (0, 1, 2)
-"""Robots that choices may look at."""
+"""Robots on which choices in the package may be based."""
 TIMESTEP = 1e-3
+"""Physics step (s)."""
 CAPTURE_TIMESTEP = 0.01
+"""Sampling interval of recordings (s)."""
 POSITION_NOISE = 5e-4
+"""Standard deviation of recorded positions (m)."""
 ANGLE_NOISE = float(np.deg2rad(0.3))
+"""Standard deviation of recorded angles and orientations (rad)."""
 GRAVITY = 9.81
 _DEGREE = np.pi / 180
 
-# ---- the robot's numbers (SI units; x forward, y left, z up) ----
+# ---- constants of the robot (SI units; x forward, y left, z up) ----
 
 BASE_MASS, BASE_COM, BASE_INERTIA = 0.02127, (-0.00044, 0.00002, -0.0039), (2.3943e-5, 2.1653e-6, 2.3619e-5)
 FEMUR_MASS, FEMUR_COM, FEMUR_INERTIA = 0.00944, (-0.00005, 0.0, -0.17956), (1.7050e-4, 1.7049e-4, 1.0243e-7)
 TIBIA_MASS, TIBIA_COM, TIBIA_INERTIA = 0.04367, (0.0068, -0.00419, -0.22605), (1.5546e-4, 1.5892e-4, 5.6535e-6)
 ARM_MASS = 0.00016
-"""Of an arm; it is carried by the tibia."""
+"""Mass of an arm, which is part of the tibia's."""
 BALLOON_MASS, BALLOON_COM, BALLOON_INERTIA = 0.15898, (-0.00006, 0.0, 0.37953), (1.4214e-2, 1.4208e-2, 1.0256e-2)
 TOTAL_MASS = BASE_MASS + BALLOON_MASS + 2 * (FEMUR_MASS + TIBIA_MASS + ARM_MASS)
 NECK, HIP_Y, FEMUR_LENGTH = (0.00444, 0.0, 0.015), 0.058025, 0.36501
@@ -62,46 +68,47 @@ STANDING_HIP = -14 * _DEGREE
 
 @dataclasses.dataclass(frozen=True)
 class BulletRobot:
-    """One robot of the family. Pairs are (left, right); SI units, radians."""
+    """Parameters of one robot of the family, in SI units and radians. Pairs are (left, right)."""
 
     name: str
     arm_travel: tuple[float, float]
-    """Share of 90 deg that a command of 1 asks for."""
+    """Angle of the arm at command 1, as a share of 90 deg."""
     arm_zero: tuple[float, float]
-    """Angle at command 0."""
+    """Angle of the arm at command 0."""
     arm_lag: tuple[float, float]
     """Time constant of the position loop."""
     arm_speed: tuple[float, float]
-    """Top speed."""
+    """Top speed of the arm."""
     arm_yield: tuple[float, float]
-    """Bending under load, rad/(N m)."""
+    """Compliance of the arm, rad/(N m)."""
     play: tuple[float, float]
-    """Width of the play between position loop and arm."""
+    """Width of the backlash between position loop and arm."""
     delay: float
-    """From a command to the position loop."""
+    """Delay from the command to the position loop."""
     cable_stiffness: tuple[float, float]
     cable_damping: tuple[float, float]
     cable_limit: tuple[float, float]
-    """Tension (N) at which the cable gives way."""
+    """Tension (N) at which the cable saturates."""
     cable_slack: tuple[float, float]
-    """With the arm at 0 and the knee at its stop."""
+    """Slack with the arm at 0 and the knee at its stop."""
     spring_stiffness: tuple[float, float]
     knee_stop: tuple[float, float]
     knee_damping: tuple[float, float]
     foot_friction: tuple[float, float]
     buoyancy: float
-    """Lift over weight."""
+    """Ratio of lift to weight."""
     balloon_offset: tuple[float, float]
-    """Of the balloons' centre of mass and lift, in x and y."""
+    """Offset of the balloons' centre of mass and lift in x and y."""
     drag: float
-    """N/(m/s)^2."""
+    """Coefficient of the quadratic drag, N/(m/s)^2."""
     turning_drag: float
-    """N m/(rad/s)^2."""
+    """Coefficient of the torque against rotation, N m/(rad/s)^2."""
     added_mass: float
+    """Added mass of the balloons."""
 
 
 def draw(seed: int) -> BulletRobot:
-    """Draw a robot."""
+    """Draw the robot with this seed."""
     rng = np.random.default_rng([seed, 41])
 
     def one(low: float, high: float) -> float:
@@ -138,20 +145,24 @@ def draw(seed: int) -> BulletRobot:
 # ---- recordings ----
 
 SWEEP_HOLD = 2.0
+"""Duration of a hold in a sweep (s)."""
 
 
 def sweep_commands(count: int = 20) -> Float[np.ndarray, "holds 2"]:
-    """Return levels spread over [0, 1], both legs, in rising order."""
+    """Return evenly spaced levels in [0, 1] in rising order, the same for both legs."""
     return np.repeat(np.round(np.linspace(0.0, 1.0, count), 4)[:, None], 2, axis=1)
 
 
 def held_out_commands(seed: int, count: int = 16) -> Float[np.ndarray, "holds 2"]:
-    """Return random levels, each leg its own, in random order."""
+    """Return random levels in [0, 1], different for each leg."""
     return np.round(np.random.default_rng([seed, 42]).uniform(0.0, 1.0, (count, 2)), 4)
 
 
 def record_sweep(robot: BulletRobot, commands: Float[np.ndarray, "holds 2"], name: str, seed: int = 0) -> Recording:
-    """Hold the base and each pair of commands for `SWEEP_HOLD` seconds; the first has settled when recording begins."""
+    """Return a sweep with a fixed base and each pair of commands held for `SWEEP_HOLD` (s).
+
+    The legs have settled at the first commands before the recording begins.
+    """
     world = World(robot, held=True)
     rng = np.random.default_rng([seed, 43])
     world.run(commands[0], 2.0)
@@ -176,7 +187,7 @@ def record_sweep(robot: BulletRobot, commands: Float[np.ndarray, "holds 2"], nam
 
 
 def walking_commands(seconds: float) -> dict[str, Float[np.ndarray, "steps 2"]]:
-    """Return hand-designed commands by recording: `near-*` are walking gaits, `far-*` are not."""
+    """Return hand-designed commands by recording. `near-*` are walking gaits, `far-*` are other commands."""
     return {
         "near-1": Gait(1.2, 0.5, (0.4, 0.4), (0.9, 0.9)).commands(seconds),
         "near-2": Gait(1.4, 0.45, (0.45, 0.45), (0.8, 0.8)).commands(seconds),
@@ -186,7 +197,10 @@ def walking_commands(seconds: float) -> dict[str, Float[np.ndarray, "steps 2"]]:
 
 
 def record_walking(robot: BulletRobot, commands: Float[np.ndarray, "steps 2"], name: str, seed: int = 0) -> Recording:
-    """Play commands at 20 Hz, after standing still for two seconds; motion capture sees balloons, base and feet."""
+    """Return a recording of commands at 20 Hz, after two seconds of standing.
+
+    It has the poses of balloons and base, and the positions of the feet.
+    """
     world = World(robot)
     rng = np.random.default_rng([seed, 44])
     world.run(np.zeros(2), 2.0)
@@ -224,7 +238,7 @@ def record_walking(robot: BulletRobot, commands: Float[np.ndarray, "steps 2"], n
 
 
 class World:
-    """A robot in Bullet, on a floor; or held by its base."""
+    """A robot in Bullet, standing on a floor or with a fixed base (`held`)."""
 
     def __init__(self, robot: BulletRobot, *, held: bool = False) -> None:
         self.robot = robot
@@ -239,9 +253,9 @@ class World:
                 self._body, link, linearDamping=0.0, angularDamping=0.0, restitution=0.0,
                 lateralFriction=robot.foot_friction[side], maxJointVelocity=1e3,
             )  # fmt: skip
-            # No rigid body has the base's, with armature: a file may not ask for it, a call of its own may.
+            # No rigid body can have the base's inertia with armature. Bullet rejects it in a URDF, but not here.
             self._world.changeDynamics(self._body, link, localInertiaDiagonal=inertia[name])
-        for link in self._links.values():  # Bullet brakes every joint unless told not to
+        for link in self._links.values():  # Bullet brakes every joint by default.
             self._world.setJointMotorControl2(self._body, link, pybullet.VELOCITY_CONTROL, force=0.0)
         self._legs = [_Leg(robot, side) for side in range(2)]
         for side, knee in enumerate(self._knees):
@@ -251,32 +265,32 @@ class World:
         self._world.resetBasePositionAndOrientation(self._body, [0.0, 0.0, 1.5 if held else 0.72], [0, 0, 0, 1])
         self._queue: list[np.ndarray] = []
         self._air = np.zeros(3), np.zeros(3)
-        """The balloons' last velocity, and their acceleration as the added mass feels it."""
+        """Last velocity of the balloons, and their filtered acceleration for the force of the added mass."""
 
     def close(self) -> None:
-        """Give the world back."""
+        """Close the Bullet world."""
         self._world.disconnect()
 
     @property
     def arms(self) -> list[float]:
-        """Return the arms' angles (rad)."""
+        """Angles of the arms (rad)."""
         return [leg.arm for leg in self._legs]
 
     @property
     def knees(self) -> list[float]:
-        """Return the knees' angles (rad)."""
+        """Angles of the knees (rad)."""
         return [state[0] for state in self._world.getJointStates(self._body, self._knees)]
 
     def total_mass(self) -> float:
-        """Return the mass (kg) as Bullet has it."""
+        """Return the total mass (kg) in Bullet."""
         return sum(self._world.getDynamicsInfo(self._body, link)[0] for link in (-1, *self._links.values()))
 
     def floor_force(self) -> float:
-        """Return the upward force (N) of the floor."""
+        """Return the upward force (N) from the floor."""
         return sum(contact[9] for contact in self._world.getContactPoints(self._body))
 
     def run(self, command: Float[np.ndarray, " 2"], seconds: float) -> None:
-        """Advance under commands."""
+        """Advance by `seconds` with a command."""
         late = round(self.robot.delay / TIMESTEP)
         for _ in range(round(seconds / TIMESTEP)):
             self._queue.append(command)
@@ -312,7 +326,7 @@ class World:
         self._air = back.apply(self._air[0]), back.apply(self._air[1])
 
     def look(self) -> tuple[Float[np.ndarray, "4 3"], Rotation, Rotation]:
-        """Return places (m) of balloons, base, left and right foot; orientations of balloons and base."""
+        """Return positions (m) of balloons, base, left and right foot, and orientations of balloons and base."""
         centre, quaternion = self._world.getBasePositionAndOrientation(self._body)
         base = Rotation.from_quat(quaternion)
         names = ("balloon", *(f"tibia_{side}" for side in SIDES))
@@ -326,11 +340,11 @@ class World:
 
 
 _AIR_FILTER = 0.01
-"""s; without it the added mass would answer its own force within a step."""
+"""Time constant of the filtered acceleration (s). Without the filter, the added mass would react to its own force."""
 
 
 class _Leg:
-    """What drives one knee: command, position loop, play, arm, cable, spring."""
+    """Actuation of one knee: position loop, backlash, arm, cable and spring."""
 
     def __init__(self, robot: BulletRobot, side: int) -> None:
         self._travel, self._zero = robot.arm_travel[side] * ARM_RANGE, robot.arm_zero[side]
@@ -346,7 +360,7 @@ class _Leg:
         self._torque = 0.0
 
     def drive(self, command: float, knee: float, velocity: float) -> float:
-        """Return the torque on the knee (N m) in this time step."""
+        """Advance one physics step and return the torque on the knee (N m)."""
         target = self._zero + self._travel * command
         rate = min(max((target - self._loop) / self._lag, -self._speed), self._speed)
         self._loop += TIMESTEP * rate
@@ -359,12 +373,12 @@ class _Leg:
             rate = by_knee * velocity + by_arm * (self.arm - self._last) / TIMESTEP
             tension = min(max(self._stiffness * stretch + self._damping * rate, 0.0), self._most)
         self._last = self.arm
-        self._torque += 0.05 * (tension * by_arm - self._torque)  # bends over 20 time steps
+        self._torque += 0.05 * (tension * by_arm - self._torque)  # The arm bends over 20 physics steps.
         return -self._spring * (knee - self._springref) - self._friction * velocity - tension * by_knee
 
 
 def _cable(knee: float, arm: float) -> tuple[float, float, float]:
-    """Return the distance (m) between the tie points, and its derivatives by knee and arm."""
+    """Return the distance (m) of the attachment points, and its derivatives with respect to knee and arm."""
     sin_k, cos_k = math.sin(knee), math.cos(knee)
     x, z = ARM_X - ARM_LENGTH * math.sin(arm), ARM_Z + ARM_LENGTH * math.cos(arm)
     along, up = cos_k * x + sin_k * z, -sin_k * x + cos_k * z
@@ -375,11 +389,11 @@ def _cable(knee: float, arm: float) -> tuple[float, float, float]:
     return length, (dx * up - dz * along) / length, by_arm / length
 
 
-# ---- the file ----
+# ---- URDF ----
 
 
 def _inertias() -> dict[str, list[float]]:
-    """Moments of inertia (kg m^2); the base's with the armature of neck and hips about y."""
+    """Return moments of inertia (kg m^2). The base's include the armature of neck and hips about y."""
     base = np.array(BASE_INERTIA) + [0.0, 3 * PASSIVE_ARMATURE, 0.0]
     own = {"base": base, "balloon": BALLOON_INERTIA}
     for side in SIDES:
@@ -388,7 +402,7 @@ def _inertias() -> dict[str, list[float]]:
 
 
 def urdf(robot: BulletRobot) -> str:
-    """Return the robot as a URDF; knees are at 0 where the leg is straight."""
+    """Return the robot as a URDF. The angle of a knee is 0 if the leg is straight."""
     root = ElementTree.Element("robot", name="ballu")
     offset = np.array([*robot.balloon_offset, 0.0])
     _link(root, "base", BASE_MASS, BASE_COM, BASE_INERTIA)
@@ -426,7 +440,7 @@ def _joint(
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=child)
     ElementTree.SubElement(joint, "axis", xyz="0 1 0")
-    damping = 0.0 if limits else PASSIVE_DAMPING  # the knees' is a torque, with the cable's
+    damping = 0.0 if limits else PASSIVE_DAMPING  # The damping of the knees is part of their torque.
     ElementTree.SubElement(joint, "dynamics", damping=repr(damping), friction="0")
     if limits:
         low, high = (repr(float(value)) for value in limits)

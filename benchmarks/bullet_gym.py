@@ -1,4 +1,4 @@
-"""A locomotion task on the robot in PyBullet, as a Gymnasium environment: for Stable-Baselines3, the paper's stack."""
+"""Gymnasium environment of a locomotion task in PyBullet, for Stable-Baselines3. Both are the paper's software."""
 
 from __future__ import annotations
 
@@ -14,16 +14,18 @@ from ballu_mjx.policies.deploy.controller import observation
 from ballu_mjx.policies.tasks import TASKS, Step
 
 OBSERVATIONS = 28
-"""As `locomotion_env.num_observations`, which would bring MJX and Brax into every process."""
+"""Result of `locomotion_env.num_observations`, which would import MJX and Brax in every process."""
 
 
 class LocomotionEnv(gymnasium.Env):
-    """`locomotion_env.LocomotionEnv` in the nominal simulator, with PyBullet under it: the same observations, actions,
-    rewards, starting state and random lengths of episodes. `info["reward"]` is the reward as it was, whatever wrappers
-    make of it."""
+    """Equivalent of `locomotion_env.LocomotionEnv` in the nominal simulator, but simulated in PyBullet.
+
+    Observations, actions, rewards, starting state and random episode lengths are the same. `info["reward"]` is the
+    original reward, without changes by wrappers.
+    """
 
     def __init__(self, task: str, timestep: float, episode_seconds: float) -> None:
-        """`timestep` (s) is Bullet's, `episode_seconds` the mean length of an episode."""
+        """Create the environment of `task`, with Bullet's `timestep` (s) and the mean length of an episode (s)."""
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBSERVATIONS,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
         model = load_model()
@@ -35,7 +37,7 @@ class LocomotionEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Float[np.ndarray, " 28"], dict[str, Any]]:
-        """Standing, at the origin, facing x."""
+        """Return the observation of a new episode. The robot stands at the origin and faces x."""
         super().reset(seed=seed)
         self.robot.reset(self._start)
         features, self._com = self.robot.observe()
@@ -45,7 +47,7 @@ class LocomotionEnv(gymnasium.Env):
     def step(
         self, action: Float[np.ndarray, " 2"]
     ) -> tuple[Float[np.ndarray, " 28"], float, bool, bool, dict[str, Any]]:
-        """Advance one control step under the policy's commands."""
+        """Advance one control step with the policy's commands."""
         command = np.clip((np.asarray(action, float) + 1) / 2, 0.0, 1.0)
         self.robot.step(command.tolist())
         features, com = self.robot.observe()
@@ -58,5 +60,5 @@ class LocomotionEnv(gymnasium.Env):
         return seen.astype(np.float32), reward, not finite, self._remaining <= 0, {"reward": reward}
 
     def close(self) -> None:
-        """Give the world back."""
+        """Close the Bullet world."""
         self.robot.close()

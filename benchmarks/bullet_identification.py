@@ -1,23 +1,24 @@
-"""Does identification help on robots that the package's model class does not contain?
+"""Measure if identification improves the simulation of robots outside of the package's model class.
 
-For each robot of `bullet_family` a sweep is recorded and identified as `train sysid` does. Compared with nominal
-actuators:
+For each robot of `bullet_family`, a sweep is recorded and identified as in `train sysid`. The identified actuators are
+compared with the nominal ones:
 
-- settled angles: mean absolute error (deg) of motors and knees on commands that no fit saw, by the simulator itself;
-- free walking: position RMSE (m) of open-loop replays from recorded states over 1 s and 5 s, drivetrain included
-  (`identification.guard`), on gaits (near) and on what is none (far);
-- what `--actuators auto` takes, by the guard's replay of further recordings.
+- settled angles: mean absolute error (deg) of simulated motors and knees, on commands that the fit did not use.
+- free walking: position RMSE (m) of open-loop replays from recorded states over 1 s and 5 s, with the drivetrain
+  (`identification.guard`). Near recordings are of gaits, far ones of other commands.
+- the choice of `--actuators auto`, from the guard's replay of other recordings.
 
-Choices are made on robots 0, 1 and 2. All five take about an hour on two cores.
+Choices in the package were based on robots 0, 1 and 2. All five take about an hour on two cores.
 
-`--true-legs` identifies nothing, and replays walks with the robots' true legs and drivetrains, as far as the package's
-model has them. What is left then is air, contact and the form of the mechanism, which no sweep shows. It takes minutes.
+`--true-legs` identifies nothing. It replays walks with the robots' true legs and drivetrains, as far as the package's
+model can represent them. The remaining error is due to air, contact and the form of the mechanism, which no sweep
+shows. It takes minutes.
 
     python benchmarks/bullet_identification.py
     python benchmarks/bullet_identification.py --robots 0 1
     python benchmarks/bullet_identification.py --true-legs
-    python benchmarks/bullet_identification.py --quick             # one robot, settled angles alone
-    python benchmarks/bullet_identification.py --output FOLDER     # robots that stand there already are not repeated
+    python benchmarks/bullet_identification.py --quick             # one robot, fitted to settled angles only
+    python benchmarks/bullet_identification.py --output FOLDER     # skip robots whose results are there already
 """
 
 from __future__ import annotations
@@ -77,14 +78,14 @@ from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.drivetrain import count_slots, drivetrain_of, filter_commands
 
 SECONDS = 20.0
-"""Of each walking recording."""
+"""Length of each walking recording (s)."""
 ANGLES = [f"{kind}_{side}" for kind in ("motor", "knee") for side in SIDES]
 SETTLED = 50
-"""Samples at the end of a hold whose mean is its settled angle."""
+"""Number of samples at the end of a hold whose mean is its settled angle."""
 
 
 def suspended_model() -> mujoco.MjModel:
-    """Return the nominal robot with its base held."""
+    """Return the model of the nominal robot with a fixed base."""
     spec = mujoco.MjSpec.from_file(str(assets() / "ballu.xml"))
     suspend(spec)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
@@ -94,8 +95,10 @@ def suspended_model() -> mujoco.MjModel:
 def settled(
     recording: Recording, actuators: ModelParameters | None, model: mujoco.MjModel
 ) -> Float[np.ndarray, "holds 2 2"]:
-    """Return settled angles (rad; motor and knee, left and right) of C MuJoCo under a recording's commands, with the
-    drivetrain where the parameters have one."""
+    """Return settled angles (rad; motor and knee, left and right) of C MuJoCo with a recording's commands.
+
+    The drivetrain is simulated if the parameters include one.
+    """
     if actuators is not None:
         full = load_robot().load_model(actuators)
         model = suspended_model()
@@ -122,13 +125,13 @@ def settled(
 
 
 def hold_means(angles: Float[np.ndarray, "samples 4"]) -> Float[np.ndarray, "holds 2 2"]:
-    """Return the means of `ANGLES` at the end of each hold; some joints still creep there."""
+    """Return the means of `ANGLES` at the end of each hold. Some joints still creep at that time."""
     holds = angles.reshape(-1, round(SWEEP_HOLD / CAPTURE_TIMESTEP), 2, 2)
     return holds[:, -SETTLED:].mean(axis=1)
 
 
 def copy_numbers(full: mujoco.MjModel, held: mujoco.MjModel) -> None:
-    """Give the held robot the numbers of joints, servos and cables of the free one, by name."""
+    """Copy the parameters of joints, servos and cables from the free robot's model to the fixed one's."""
     for number in range(held.njnt):
         name = held.joint(number).name
         one, other = held.joint(number), full.joint(name)
@@ -143,7 +146,7 @@ def copy_numbers(full: mujoco.MjModel, held: mujoco.MjModel) -> None:
 
 
 def validation_commands() -> dict[str, Float[np.ndarray, "steps 2"]]:
-    """Return commands by recording, for the guard."""
+    """Return the commands of the guard's recordings, by name."""
     steps = round(SECONDS / load_robot().control_timestep)
     rng = np.random.default_rng(46)
     held = np.repeat(np.round(rng.uniform(size=(steps // 12 + 1, 2)), 4), 12, axis=0)[:steps]
@@ -151,14 +154,17 @@ def validation_commands() -> dict[str, Float[np.ndarray, "steps 2"]]:
 
 
 def walking(recordings: Mapping[str, Recording], actuators: ModelParameters | None) -> list[Motion]:
-    """Return recorded states, with the motors where these actuators take them, drivetrain included."""
+    """Return recorded states. Their motor angles follow from these actuators, including the drivetrain."""
     robot = load_robot()
     model, drivetrain = robot.load_model(actuators), drivetrain_of(actuators)
     return [reconstruct(recording, robot, model, drivetrain=drivetrain) for recording in recordings.values()]
 
 
 def open_loop(recordings: Mapping[str, Recording], actuators: ModelParameters) -> dict[str, dict[str, float]]:
-    """Return nominal and identified position RMSE (m) by group and horizon, each from its own reconstruction."""
+    """Return nominal and identified position RMSE (m), by group and horizon.
+
+    Each starts from states that were reconstructed with its own actuators.
+    """
     robot = load_robot()
     own = choose_actuators(robot, actuators, walking(recordings, actuators), HORIZONS).rows
     plain = choose_actuators(robot, actuators, walking(recordings, None), HORIZONS).rows
@@ -169,10 +175,10 @@ def open_loop(recordings: Mapping[str, Recording], actuators: ModelParameters) -
 
 
 def true_actuators(robot: BulletRobot) -> ActuatorParameters:
-    """Return the robot's own numbers in the package's form.
+    """Return the robot's true parameters in the package's model.
 
-    An arm's yielding is one over the servo's gain. A cable's limit has no counterpart: nearest is the servo torque that
-    pulls as hard at the arm's full length.
+    The compliance of an arm is the inverse of the servo's gain. The limit of a cable's tension has no counterpart. The
+    closest parameter is the servo torque that causes this tension at the arm's full length.
     """
     values = {
         "knee_spring_stiffness": robot.spring_stiffness,
@@ -195,12 +201,12 @@ def true_actuators(robot: BulletRobot) -> ActuatorParameters:
 
 
 def record(seed: int, commands: Mapping[str, Float[np.ndarray, "steps 2"]]) -> dict[str, Recording]:
-    """Return free recordings by name."""
+    """Return free recordings of a robot, by name."""
     return {name: record_walking(draw(seed), own, name, seed) for name, own in commands.items()}
 
 
 def examine(seed: int, identify: Callable[[Sweep], Identification]) -> dict[str, Any]:
-    """Return all numbers of one robot."""
+    """Return all results of one robot."""
     bullet, model = draw(seed), suspended_model()
     sweep = read_sweep({Path("sweep.csv"): record_sweep(bullet, sweep_commands(), "sweep", seed)})
     held_out = record_sweep(bullet, held_out_commands(seed), "held-out", seed + 100)
@@ -232,13 +238,13 @@ def examine(seed: int, identify: Callable[[Sweep], Identification]) -> dict[str,
 
 
 def compared(row: Mapping[str, float], form: str) -> str:
-    """Return nominal and identified errors, with their ratio in brackets."""
+    """Return a text of nominal and identified errors, with their ratio in brackets."""
     nominal, identified = row["nominal"], row["identified"]
     return f"{nominal:{form}} -> {identified:{form}} ({identified / nominal:.2f})"
 
 
 def table(results: Mapping[int, Mapping[str, Any]]) -> Table:
-    """Return errors of nominal and identified actuators, with their ratio in brackets."""
+    """Return a table of errors of nominal and identified actuators, with their ratio in brackets."""
     groups = list(next(iter(results.values()))["open_loop_m"])
     heads = ("robot", "settled angles (deg)", *(f"{group} (m)" for group in groups), "guard's ratio, and choice")
     return Table(
@@ -256,7 +262,7 @@ def table(results: Mapping[int, Mapping[str, Any]]) -> Table:
 
 
 def true_legs_table(robots: Sequence[int]) -> Table:
-    """Return walking errors (m) of nominal and of true legs, with their ratio in brackets."""
+    """Return a table of walking errors (m) of nominal and true legs, with their ratio in brackets."""
     errors = {seed: open_loop(record(seed, walking_commands(SECONDS)), true_actuators(draw(seed))) for seed in robots}
     groups = list(next(iter(errors.values())))
     made = tuple((str(seed), *(compared(rows[group], ".3f") for group in groups)) for seed, rows in errors.items())
@@ -264,25 +270,27 @@ def true_legs_table(robots: Sequence[int]) -> Table:
 
 
 def read_earlier(path: Path, robots: Sequence[int], commit: str) -> dict[str, Any]:
-    """Return what an interrupted run left, to go on from.
+    """Return the results of an interrupted run, to continue it. They are empty if there is none.
 
-    **Raises** `InputError` where robots are missing and the code has changed since.
+    **Raises** `InputError` if robots are missing and the code has changed since.
     """
     if not path.exists():
         return {"commit": commit, "robots": {}}
     earlier = json.loads(path.read_text(encoding="utf-8"))
     earlier["robots"] = {int(seed): result for seed, result in earlier["robots"].items()}
     if earlier["commit"] != commit and not set(robots) <= set(earlier["robots"]):
-        raise InputError(f"{path} is of commit {earlier['commit']}, and this is {commit}; give an empty folder.")
+        raise InputError(f"{path} is of commit {earlier['commit']}, but this is {commit}; give an empty folder.")
     return earlier
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--robots", type=int, nargs="+", default=None, choices=list(ROBOTS))
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--true-legs", action="store_true")
-    parser.add_argument("--output", type=Path, default=Path("runs/bench-bullet_identification"))
+    parser.add_argument("--robots", type=int, nargs="+", default=None, choices=list(ROBOTS), help="seeds (all)")
+    parser.add_argument("--quick", action="store_true", help="one robot, fitted to settled angles only")
+    parser.add_argument("--true-legs", action="store_true", help="use the true legs instead of identifying them")
+    parser.add_argument(
+        "--output", type=Path, default=Path("runs/bench-bullet_identification"), help="folder for the results"
+    )
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()
     robots = arguments.robots or (CHOSEN_ON[:1] if arguments.quick else list(ROBOTS))
@@ -297,7 +305,7 @@ def main() -> None:
 
     def identify(sweep: Sweep) -> Identification:
         with jax.enable_x64(True):
-            if not compiled:  # one program serves all sweeps of a size
+            if not compiled:  # One program serves all sweeps of a size.
                 compiled.append(Identifier(config, sweep, silent))
             return compiled[0].run(sweep, silent)
 
@@ -318,7 +326,7 @@ def main() -> None:
 
 
 def silent(stage: str, iteration: int, steps: int, value: float) -> None:
-    """No report."""
+    """Ignore progress."""
 
 
 if __name__ == "__main__":

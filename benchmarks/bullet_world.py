@@ -1,4 +1,4 @@
-"""A world in PyBullet with a floor and one robot; what both `bullet` and `bullet_family` simulate in."""
+"""A PyBullet world with a floor and one robot, for `bullet` and `bullet_family`."""
 
 from __future__ import annotations
 
@@ -12,10 +12,16 @@ from pybullet_utils.bullet_client import BulletClient  # pyright: ignore[reportM
 
 
 def open_world(urdf: str, gravity: Sequence[float], timestep: float, *, held: bool) -> tuple[Any, int]:
-    """Return a world, and the number of the robot that a URDF describes in it.
+    """Return a world with a floor and a robot, and the robot's body number.
 
-    `gravity` is in m/s^2, `timestep` in s. `held`: the base stays where it is put. Bullet multiplies the coefficients
-    of friction of two surfaces; the floor's is 1, so the robot's alone decides.
+    Bullet multiplies the friction coefficients of two surfaces. The floor's is 1, so the robot's coefficient applies.
+
+    **Arguments**
+
+    - `urdf`: the robot as a URDF.
+    - `gravity`: gravity (m/s^2).
+    - `timestep`: time step (s).
+    - `held`: whether the base is fixed.
     """
     world: Any = BulletClient(pybullet.DIRECT)
     world.setGravity(*gravity)

@@ -1,6 +1,6 @@
-"""Is each public C3D file read exactly as an independent reader does, or refused with a true sentence?
+"""Check that public C3D files are read as independent readers do, or refused with a correct message.
 
-The files are the sample collections of these projects, in all versions that their repositories' histories hold:
+The files are the sample collections of these projects, in all versions of their repositories' histories:
 
     git clone https://github.com/Biomechanical-ToolKit/BTKData
     git clone https://github.com/pyomeca/ezc3d
@@ -11,11 +11,11 @@ The files are the sample collections of these projects, in all versions that the
     pip install ezc3d c3d
     python benchmarks/c3d_collections.py --data FOLDER-WITH-THE-CLONES
 
-Clones may be bare. What a clone lacks (a partial one, or a file behind Git LFS) is listed as not to be had.
+Clones may be bare. Files that a clone lacks (in a partial clone, or behind Git LFS) are listed as "not to be had".
 
-The independent readers are ezc3d (https://github.com/pyomeca/ezc3d) and py-c3d (`c3d` on PyPI). Places are compared of
-all points in all frames; a point with a negative residual, or at exactly 0, counts as not seen in all readers. Files of
-the same content are compared once, and counted in the first collection by name.
+The independent readers are ezc3d (https://github.com/pyomeca/ezc3d) and py-c3d (`c3d` on PyPI). The positions of all
+points in all frames are compared. In all readers, a point with a negative residual, or at exactly 0, counts as not
+seen. Files of the same content are compared once, and counted in the first collection by name.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from ballu_mjx.common.results import Cell, Table, write_results
 from ballu_mjx.recordings.importers.c3d_file import C3DError, read_c3d_points
 
 ROUNDING = 2e-7
-"""Of the largest coordinate: single precision."""
+"""Tolerance of single precision, as a share of the largest coordinate."""
 _LFS = b"version https://git-lfs"
-"""Begins what stands in for a file behind Git LFS."""
+"""Start of the placeholder of a file behind Git LFS."""
 LONGEST = 120.0
-"""s, for another reader."""
+"""Timeout of another reader (s)."""
 _BEGIN = """
 import io, os, sys, warnings
 import numpy as np
@@ -72,33 +72,34 @@ with open(path, "rb") as stream:
 place, residual = every[:3], every[3]
 """,
 }
-"""Scripts of processes of their own: some files take a reader's process down."""
+"""Scripts of the other readers. They run in separate processes, because some files crash them."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Compared:
-    """One file."""
+    """Comparison of one file."""
 
     name: str
     ours: str
-    """"equal", "DIFFERENT", "read alone", or "refused: " and the sentence."""
+    """"equal", "DIFFERENT", "read alone" (by no other reader), or "refused: " and the message."""
     others: dict[str, str]
+    """Verdict on each other reader."""
 
 
 def collect(clone: Path) -> tuple[dict[str, bytes], list[str]]:
-    """Return the C3D files in all versions of a clone, by path and version, and the paths of those that it lacks."""
+    """Return all versions of the C3D files in a clone, by path and version, and the paths of files that it lacks."""
     git = ["git", f"--git-dir={clone / '.git' if (clone / '.git').exists() else clone}"]
-    # Names and versions alone: rename detection would read the files, which a partial clone lacks.
+    # List names and versions only, because rename detection would read files that a partial clone lacks.
     line = [*git, "log", "--all", "-m", "--root", "--raw", "--no-renames", "--no-abbrev", "--format=", "-z"]
     listed = subprocess.run([*line, "--", ":(icase)*.c3d"], capture_output=True, check=True).stdout
     fields = listed.decode(errors="replace").split("\0")
     changes = [*zip(fields[::2], fields[1::2], strict=False)]
-    versions = {change.split()[3]: path for change, path in reversed(changes)}  # by its newest path
+    versions = {change.split()[3]: path for change, path in reversed(changes)}  # Under the newest path.
     found: dict[str, bytes] = {}
     lacking: list[str] = []
     for version, path in versions.items():
         if not version.strip("0"):
-            continue  # deleted there
+            continue  # The file was deleted.
         read = subprocess.run([*git, "cat-file", "blob", version], capture_output=True, check=False)
         if read.returncode or read.stdout.startswith(_LFS):
             lacking.append(path)
@@ -108,7 +109,7 @@ def collect(clone: Path) -> tuple[dict[str, bytes], list[str]]:
 
 
 def compare(name: str, content: bytes) -> Compared:
-    """Return what the readers make of a file."""
+    """Return the comparison of all readers on a file with this content."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "file.c3d"
         path.write_bytes(content)
@@ -129,6 +130,7 @@ def _compare(name: str, path: Path) -> Compared:
 
 
 def _read(script: str, path: Path) -> np.ndarray | str:
+    """Return the positions (3, points, frames) that another reader's script finds, or its error message."""
     line = [sys.executable, "-c", _BEGIN + script + _END, str(path)]
     try:
         done = subprocess.run(line, capture_output=True, timeout=LONGEST, check=False)
@@ -177,7 +179,7 @@ def main() -> int:
 
 
 def count_table(results: list[Compared], collections_of: list[str]) -> Table:
-    """Return how many files of each collection were read, and how."""
+    """Return a table of the numbers of files in each collection, by verdict."""
     head = ("collection", "files", "equal", "refused", "read alone", "different", "ezc3d differs or fails", "py-c3d")
     rows = []
     for name in [*dict.fromkeys(collections_of), "all"]:

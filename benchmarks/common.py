@@ -1,4 +1,4 @@
-"""What the benchmarks share: the machine's description, measurements in child processes, and where results go."""
+"""Shared parts of the benchmarks: description of the machine, measurements in child processes, and output."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from ballu_mjx.common import provenance, runtime
 from ballu_mjx.common.provenance import usable_cores as cores
 
 CHILD = "--child"
-"""First argument of a script that is to measure one thing; the second is JSON."""
+"""First argument of a script that runs as a child process for one measurement. The second is the request in JSON."""
 _PACKAGES = (*provenance.PACKAGES, "pybullet", "torch", "stable-baselines3", "playground")
 
 
 def core_counts() -> list[int]:
-    """One, its doublings, and all."""
+    """Return the numbers of cores to measure: the powers of two below the number of usable cores, and that number."""
     count, counts = 1, []
     while count < len(cores()):
         counts.append(count)
@@ -33,23 +33,30 @@ def core_counts() -> list[int]:
 
 
 def machine() -> dict[str, Any]:
-    """What a figure's reader must know of the machine. The load tells whether others were at work at the same time."""
+    """Return a description of the machine, with package versions and load. The load shows if other work was running."""
     versions = {name: version for name, version in provenance.package_versions(_PACKAGES).items() if version}
     load = os.getloadavg() if hasattr(os, "getloadavg") else None
     return {**provenance.describe_machine(), "versions": versions, "load": load}
 
 
 def described(machine: Mapping[str, Any]) -> str:
-    """`machine()` in a line."""
+    """Return the result of `machine` as one line."""
     return f"{machine['cores']} cores of {machine['cpu']}"
 
 
 def child(
     script: str, request: Mapping[str, Any], *, cores: Sequence[int] | None = None, env: Mapping[str, str] | None = None
 ) -> Any:
-    """What `script` answers to `request` in a process of its own, kept to `cores` (None: all) from its start on.
+    """Run `script` in a separate process and return its answer to `request`.
 
-    **Raises** `SystemExit` where it fails, its own words shown.
+    **Arguments**
+
+    - `script`: path of a script that calls `answer`.
+    - `request`: keyword arguments of its measurement.
+    - `cores`: cores to which the process is restricted from its start. None for all.
+    - `env`: additional environment variables.
+
+    **Raises** `SystemExit` if the process fails. Its error output is shown.
     """
 
     def keep() -> None:
@@ -65,7 +72,10 @@ def child(
 
 
 def unprepared() -> dict[str, str]:
-    """This process's environment without what `runtime.prepare` set in it: a child has its own cores and cache."""
+    """Return this process's environment without the changes of `runtime.prepare`.
+
+    A child process has its own cores and cache.
+    """
     environment = dict(os.environ)
     flag = f"--xla_force_host_platform_device_count={len(cores())}"
     environment["XLA_FLAGS"] = environment.get("XLA_FLAGS", "").replace(flag, "").strip()
@@ -75,7 +85,7 @@ def unprepared() -> dict[str, str]:
 
 
 def answer(measure: Callable[..., Any]) -> bool:
-    """Where this process is a child: answer its request, the keyword arguments of `measure`; returns whether it is."""
+    """Call `measure` with the request and print its result, if this process is a child. Return whether it is one."""
     if sys.argv[1:2] != [CHILD]:
         return False
     print("\n" + json.dumps(measure(**json.loads(sys.argv[2]))), flush=True)
@@ -83,7 +93,7 @@ def answer(measure: Callable[..., Any]) -> bool:
 
 
 def write(folder: Path, name: str, result: Mapping[str, Any]) -> None:
-    """Write a benchmark's result into `folder` as NAME.json, with machine, command and time."""
+    """Write a benchmark's result to `name`.json in `folder`, with machine, command and time."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{name}.json"
     when = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
@@ -93,13 +103,13 @@ def write(folder: Path, name: str, result: Mapping[str, Any]) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG."""
+    """Write a figure to `path` as PNG."""
     path.parent.mkdir(parents=True, exist_ok=True)
     FigureCanvasAgg(figure).print_figure(path, dpi=120)
     print(f"Written to {path}.")
 
 
 def spread(values: Sequence[float], digits: int = 0) -> str:
-    """Median (least to most)."""
+    """Return the text "median (minimum to maximum)" of values."""
     middle = float(np.median(values))
     return f"{middle:,.{digits}f} ({min(values):,.{digits}f} to {max(values):,.{digits}f})"

@@ -1,15 +1,16 @@
-"""Do standard errors cover the truth where the model lacks something?
+"""Measure how often standard errors cover the truth if the model lacks an effect.
 
-A servo arm (`tests/servo_arm.py`) whose true parameters are drawn from their priors is recorded with 0.5 deg of noise
-and 1 deg of dry friction, which no declared parameter can express. `fit_robot` identifies it. How often does the truth
-lie within two standard errors: of the robust ones, which count residuals that go together, and of white noise?
+A servo arm (`tests/servo_arm.py`) has true parameters that are drawn from their priors. It is recorded with 0.5 deg of
+noise and 1 deg of dry friction, which no declared parameter can express. `fit_robot` identifies it. The result is the
+share of draws in which the truth lies within two standard errors. Robust standard errors account for correlated
+residuals. Those of white noise do not.
 
-Then what `suggest_parameters` proposes is declared too, and the arm is identified once more.
+Then the parameters that `suggest_parameters` proposes are declared too, and the arm is identified again.
 
     python benchmarks/coverage.py                    # 50 draws
     python benchmarks/coverage.py --draws 4
-    python benchmarks/coverage.py --friction 0       # nothing is left out
-    python benchmarks/coverage.py --output FOLDER    # FOLDER/coverage.json too
+    python benchmarks/coverage.py --friction 0       # the model lacks nothing
+    python benchmarks/coverage.py --output FOLDER    # also write FOLDER/coverage.json
 """
 
 from __future__ import annotations
@@ -42,16 +43,16 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from servo_arm import record_arm, write_arm  # pyright: ignore[reportMissingImports]
 
 DRAWS, NOISE, FRICTION = 50, 0.5, 1.0
-"""Draws; deg."""
+"""Default number of draws, noise of angles (deg), and dry friction (deg)."""
 KINDS = ("robust", "white")
 RECORDINGS = 3
-"""For the fit, of 6 s each; one more is held out."""
+"""Number of recordings of 6 s for the fit. One more is held out."""
 ZERO_SPREADS = {"shoulder_delay": 0.02, "shoulder_backlash": 0.05}
-"""True values of what is 0 in the nominal arm are half-normal."""
+"""Scales of the half-normal distributions of true values that are 0 in the nominal arm."""
 
 
 def draw_truth(parameters: ParameterSet, seed: int) -> dict[str, float]:
-    """Return true values, drawn from the priors within the bounds."""
+    """Return true values, drawn from the priors and kept within the bounds."""
     rng = np.random.default_rng([seed, 45])
     truth = {}
     for parameter in parameters.parameters:
@@ -64,17 +65,18 @@ def draw_truth(parameters: ParameterSet, seed: int) -> dict[str, float]:
 
 
 class Draw(NamedTuple):
-    """One arm: of each parameter its truth, what was found, and both standard errors."""
+    """Result of one arm."""
 
     declared: dict[str, dict[str, float]]
+    """True value, identified value and both standard errors of each declared parameter."""
     suggested: tuple[str, ...]
-    """Parameters that were proposed."""
+    """Names of the proposed parameters."""
     completed: dict[str, dict[str, float]]
-    """The same with these declared too."""
+    """As `declared`, with the proposed parameters declared too."""
 
 
 def examine(robot: RobotDescription, parameters: ParameterSet, folder: Path, seed: int, friction: float) -> Draw:
-    """Draw an arm, record it, identify it, declare what is proposed, and identify it again."""
+    """Draw an arm, record it, identify it, declare the proposed parameters, and identify it again."""
     truth, model = draw_truth(parameters, seed), robot.load_model()
     sampling = SamplingConfig(angle_noise=float(np.deg2rad(NOISE)))
     motions = []
@@ -93,7 +95,7 @@ def examine(robot: RobotDescription, parameters: ParameterSet, folder: Path, see
 
 
 def compared(fit: RobotFit, truth: Mapping[str, float]) -> dict[str, dict[str, float]]:
-    """Return what was found of the parameters whose truth is known."""
+    """Return the results of a fit for the parameters with known true values."""
     found = zip(fit.parameters.names, fit.values, fit.standard_errors, fit.white_noise_errors, strict=True)
     return {
         name: {"truth": truth[name], "found": float(v), "robust": float(r), "white": float(w)}
@@ -103,7 +105,7 @@ def compared(fit: RobotFit, truth: Mapping[str, float]) -> dict[str, dict[str, f
 
 
 def coverage_table(draws: Sequence[Mapping[str, Mapping[str, float]]]) -> Table:
-    """Return shares of draws within two standard errors, beside the mean error and both standard errors."""
+    """Return a table of the shares of draws within two standard errors, mean errors and median standard errors."""
     made, shares = [], []
     for name in draws[0]:
         rows = [draw[name] for draw in draws]
@@ -119,9 +121,9 @@ def coverage_table(draws: Sequence[Mapping[str, Mapping[str, float]]]) -> Table:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=DRAWS)
-    parser.add_argument("--friction", type=float, default=FRICTION, help="dry friction that no parameter has (deg)")
-    parser.add_argument("--output", type=Path)
+    parser.add_argument("--draws", type=int, default=DRAWS, help="number of arms")
+    parser.add_argument("--friction", type=float, default=FRICTION, help="dry friction that the model lacks (deg)")
+    parser.add_argument("--output", type=Path, help="folder for coverage.json")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()
     draws: list[Draw] = []

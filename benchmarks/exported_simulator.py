@@ -1,10 +1,10 @@
-"""How far an exported simulator in C MuJoCo is from ours.
+"""Measure the difference between an exported simulator in C MuJoCo and ours.
 
 `python benchmarks/exported_simulator.py --case RUN FOLDER --case RUN FOLDER`
 
-From the first state of each recording, under its commands, three simulators run side by side: ours in single precision,
-ours in double precision, and the exported one. The differences tell a fault of the export from the rounding of single
-precision. Positions are of the tracked site, angles of its body.
+Three simulators start from the first state of each recording and replay its commands: ours in single precision, ours in
+double precision, and the exported one. Their differences separate errors of the export from rounding in single
+precision. Positions are those of the tracked site, angles those of its body.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from ballu_mjx.sim.simulator import AugmentedSimulator
 from ballu_mjx.viz.style import label_of
 
 PAIRS = (("exported", "double"), ("exported", "single"), ("single", "double"))
-"""Simulators that are compared."""
+"""Pairs of simulators to compare."""
 Poses = tuple[Float[np.ndarray, "runs steps 3"], Float[np.ndarray, "runs steps 4"]]
-"""Of the tracked site: places (m) and quaternions."""
+"""Positions (m) and quaternions of the tracked site."""
 
 
 def rollouts(
@@ -48,14 +48,14 @@ def rollouts(
     qvel: Float[np.ndarray, "runs nv"],
     commands: Float[np.ndarray, "runs steps commands"],
 ) -> Float[np.ndarray, "runs steps nq"]:
-    """Return generalized positions after each control step, in the precision that JAX is set to."""
+    """Return generalized positions after each control step, in JAX's current precision."""
 
     run = jax.jit(jax.vmap(functools.partial(rollout_positions, simulator)))
     return np.asarray(run(qpos, qvel, commands))
 
 
 def in_c(folder: Path, qpos: np.ndarray, qvel: np.ndarray, commands: np.ndarray) -> Float[np.ndarray, "runs steps nq"]:
-    """Return the same of the exported simulator."""
+    """Return generalized positions after each control step of the exported simulator."""
     simulator, runs = ImprovedSimulator(folder), []
     for start, speed, sent in zip(qpos, qvel, commands, strict=True):
         simulator.reset(start, speed, sent[0])
@@ -64,22 +64,22 @@ def in_c(folder: Path, qpos: np.ndarray, qvel: np.ndarray, commands: np.ndarray)
 
 
 def apart(one: Poses, other: Poses) -> tuple[Float[np.ndarray, "runs steps"], Float[np.ndarray, "runs steps"]]:
-    """Return distances (mm) and angles (deg) between two simulators' poses."""
+    """Return distances (mm) and angles (deg) between the poses of two simulators."""
     distance = 1000 * np.linalg.norm(one[0] - other[0], axis=-1)
-    # By the sine of half the angle: the cosine has no digits left for small ones.
+    # Use the sine of half the angle, because the cosine loses all digits for small angles.
     w, v = one[1][..., :1], one[1][..., 1:]
     turned = w * other[1][..., 1:] - other[1][..., :1] * v - np.cross(v, other[1][..., 1:])
     return distance, 2 * np.rad2deg(np.arcsin(np.minimum(np.linalg.norm(turned, axis=-1), 1.0)))
 
 
 class Case(NamedTuple):
-    """A run's simulators beside each other, at the end of each rollout.
+    """Differences between the simulators of a run, at the end of each rollout.
 
     **Fields**
 
     - `label`: robot and residual.
-    - `recordings`: their names.
-    - `apart`: distances (mm) and angles (deg) by pair of simulators.
+    - `recordings`: names of the recordings.
+    - `apart`: distances (mm) and angles (deg), by pair of simulators.
     """
 
     label: str
@@ -88,9 +88,9 @@ class Case(NamedTuple):
 
 
 def measure(run: Path, recordings: Sequence[Path], count: int, seconds: float) -> Case:
-    """Return how far a run's simulators are apart after `seconds`, from the starts of `count` recordings.
+    """Return the differences between a run's simulators after `seconds`, from the starts of `count` recordings.
 
-    **Raises** `InputError` where no recording is long enough.
+    **Raises** `InputError` if no recording is long enough.
     """
     simulator = load_simulator(run)
     robot = simulator.robot
@@ -120,7 +120,7 @@ def measure(run: Path, recordings: Sequence[Path], count: int, seconds: float) -
 
 
 def cases_table(cases: Sequence[Case]) -> Table:
-    """Return median and worst differences of the exported simulator over the recordings, one row a run."""
+    """Return the median and largest differences of the exported simulator over the recordings, one row per run."""
     columns = ["robot, residual", "recordings"]
     pairs = [pair for pair in PAIRS if "exported" in pair]
     for _, other in pairs:
@@ -136,7 +136,7 @@ def cases_table(cases: Sequence[Case]) -> Table:
 
 
 def recordings_table(cases: Sequence[Case]) -> Table:
-    """Return the differences of every recording."""
+    """Return the differences for every recording."""
     columns = ["robot, residual", "recording"]
     for one, other in PAIRS:
         columns += [f"{one} - {other} (mm)", "(deg)"]
@@ -157,14 +157,14 @@ def main() -> None:
         action="append",
         required=True,
         metavar="PATH",
-        help="a run of a residual, of identified actuators or of a policy, then recordings or folders of them",
+        help="a run of a residual, of identified actuators or of a policy, then recordings or folders of recordings",
     )
-    parser.add_argument("--count", type=int, default=10, help="recordings to use (10)")
-    parser.add_argument("--seconds", type=float, default=5.0, help="length of a rollout (5)")
-    parser.add_argument("--results", type=Path, help="JSON file to write; without it the tables are only printed")
+    parser.add_argument("--count", type=int, default=10, help="number of recordings to use (10)")
+    parser.add_argument("--seconds", type=float, default=5.0, help="length of a rollout (s, default 5)")
+    parser.add_argument("--results", type=Path, help="JSON file for the tables; by default they are only printed")
     options = parser.parse_args()
     if any(len(case) < 2 for case in options.case):
-        raise InputError("--case takes a run and its recordings; give both.")
+        raise InputError("--case needs a run and its recordings; give both.")
     cases = [measure(run, recordings, options.count, options.seconds) for run, *recordings in options.case]
     tables = {"cases": cases_table(cases), "recordings": recordings_table(cases)}
     for table in tables.values():

@@ -1,12 +1,12 @@
-"""What a sweep can tell: `python benchmarks/identifiability.py`.
+"""Measure how well a sweep determines the parameters: `python benchmarks/identifiability.py`.
 
-1. On sweeps simulated with known parameters: are they found from different draws of starts, without noise; and with
-   0.5 deg of noise, how often does the truth lie within two standard errors?
-2. On sweeps of virtual robots, of which identification knows nothing: how far from the truth is what it finds; and how
-   far without what it has beyond settled angles and torque limits: first without the motion, and so without delay, play
-   and friction, then without the cables' slack too.
+1. Sweeps are simulated with known parameters. Without noise, the largest error over different draws of starts is
+   printed. With 0.5 deg of noise, the share of parameters whose truth lies within two standard errors is printed.
+2. Sweeps are recorded of virtual robots, of which identification knows nothing. The identified parameters are compared
+   with the truth. This is repeated with parts of the method removed: first the motion between commands (and so delay,
+   backlash and friction), then also the cables' slack, and then all but the paper's eight parameters.
 
-Takes about a quarter of an hour; `--quick` a third of it.
+It takes about a quarter of an hour, and with `--quick` a third of that.
 """
 
 from __future__ import annotations
@@ -38,23 +38,24 @@ from ballu_mjx.ballu.sweep import Sweep, read_sweep
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 
 NOISE = float(np.deg2rad(0.5))
+"""Noise of a sample (rad)."""
 SAMPLES, TIMES, LEVELS = 30, 60, 20
-"""Of a hold: samples of its mean, and of its motion; and holds."""
+"""Samples in the mean of a hold, samples of its motion, and number of holds."""
 DYNAMICS = LegDynamics(
     delay=0.043, motor_friction=3e-3, knee_friction=8e-4, backlash=float(np.deg2rad(2.0)), lag=0.02, knee_damping=4e-3
 )
 CHANGES = ([1.3, 0.7, 0.05, 0.06, 0.75, 1.2e-3, -0.15, 0.8, 0.03], [0.8, 1.2, -0.08, -0.03, 0.6, 2e-4, 0.0, 1.3, 0.0])
-"""Left and right: times the nominal parameters; angles (rad), slack (m) and travel added."""
+"""True parameters, left and right: factors on the nominal ones, but added to angles (rad), slack (m) and travel."""
 WIDTHS = (14, 14, 15, 20, 16)
 RATIOS = ("knee_spring_stiffness", "motor_gain", "torque_limit")
 
 
 def silent(stage: str, iteration: int, steps: int, value: float) -> None:
-    """No report."""
+    """Ignore progress."""
 
 
 def simulate(identifier: Identifier, vectors: np.ndarray) -> Sweep:
-    """A sweep of the model itself, without noise."""
+    """Return a sweep of the model itself with these parameters, without noise."""
     physics, data = identifier.physics, leg_data(blank())
     y = np.stack([identifier.space.coordinates(vector) for vector in vectors])
     qpos, _ = physics.settled(y, data.command)
@@ -68,7 +69,7 @@ def simulate(identifier: Identifier, vectors: np.ndarray) -> Sweep:
 
 
 def blank() -> Sweep:
-    """Of the right sizes."""
+    """Return a sweep of the right sizes without measurements."""
     times = LEVELS * TIMES
     return Sweep(
         robot="model",
@@ -83,7 +84,7 @@ def blank() -> Sweep:
 
 
 def with_noise(sweep: Sweep, seed: int) -> Sweep:
-    """White noise on every sample."""
+    """Return a sweep with white noise on every sample."""
     rng = np.random.default_rng(seed)
     return dataclasses.replace(
         sweep,
@@ -93,7 +94,7 @@ def with_noise(sweep: Sweep, seed: int) -> Sweep:
 
 
 def of_the_model_itself(seeds: int, draws: int) -> None:
-    """Starts and noise."""
+    """Print errors over draws of starts, and coverage over draws of noise, for sweeps of the model itself."""
     identifier = Identifier(ALL_PARAMETERS, blank(), silent)
     space = identifier.space
     changes = np.array(CHANGES)
@@ -117,7 +118,7 @@ def of_the_model_itself(seeds: int, draws: int) -> None:
 
 
 def of_virtual_robots(robots: int) -> None:
-    """Against their truth."""
+    """Print identified parameters of virtual robots, relative to their true ones."""
     ways = {
         "as it is": IdentificationConfig(),
         "settled angles alone": IdentificationConfig(motion=False),
@@ -138,7 +139,7 @@ def of_virtual_robots(robots: int) -> None:
 
 
 def row(virtual: virtual_robot.VirtualRobot, fits: tuple[Fit, Fit]) -> str:
-    """One robot's line."""
+    """Return the line of one robot."""
     found = {name: [fit.vector[index] for fit in fits] for index, name in enumerate(LEG_PARAMETERS)}
     ratios = [np.array(found[name]) / np.array(getattr(virtual, name)) for name in RATIOS]
     slack = 1e3 * (np.array(found["cable_slack"]) - np.array(virtual.cable_slack))
@@ -149,7 +150,7 @@ def row(virtual: virtual_robot.VirtualRobot, fits: tuple[Fit, Fit]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a few draws, two robots")
+    parser.add_argument("--quick", action="store_true", help="fewer draws, two robots")
     seeds, draws, robots = (1, 2, 2) if parser.parse_args().quick else (2, 8, 3)
     with jax.enable_x64(True):
         of_the_model_itself(seeds, draws)

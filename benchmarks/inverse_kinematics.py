@@ -1,18 +1,21 @@
-"""How well states are reconstructed from recordings.
+"""Measure the accuracy of states that are reconstructed from recordings.
 
     python benchmarks/inverse_kinematics.py            # three gaits of 20 s
     python benchmarks/inverse_kinematics.py --quick
 
-The nominal robot walks in C MuJoCo under bang-bang commands and is seen as motion capture would see it, at 100 Hz with
-noise. Errors are printed as median / 95th percentile over all control steps, of velocities as root mean square:
+The nominal robot walks in C MuJoCo under bang-bang commands. Its motion is recorded at 100 Hz with the noise of motion
+capture. Errors of positions are printed as median / 95th percentile over all control steps, errors of velocities as
+root mean square:
 
-- `recorded base` has the base's orientation in the recording, `no base` has not, `exact` is `no base` without noise;
-- `stand-in` is the virtual robot of the family that the bundled recordings come from, seen without its base's
-  orientation, its states judged against its own; its motors, unlike the model's, show how far its servos differ.
+- `recorded base`: the recording has the base's orientation.
+- `no base`: the recording lacks the base's orientation.
+- `exact`: as `no base`, but without noise.
+- `stand-in`: a virtual robot of the family of the bundled recordings, without the base's orientation. Its states are
+  compared with its own true states. The errors of its motors show how much its servos differ from the model's.
 
-Divergence is what the states are for: C MuJoCo, started from them ten times a second, against the recorded walk, by how
-far the balloon's place and heading have gone astray after 0.25, 1 and 2 s. `crude` are the same positions
-with velocities from differences of neighbouring samples.
+Divergence measures the use of the states as starting states. C MuJoCo starts from them ten times a second and replays
+the walk. The errors are those of the balloon's position and heading after 0.25, 1 and 2 s. `crude` has the same
+positions, with velocities from differences of neighbouring samples.
 """
 
 from __future__ import annotations
@@ -43,21 +46,24 @@ from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.registry import load_robot
 
 CAPTURE_STEP = 0.01
+"""Sampling interval of motion capture (s)."""
 HORIZONS = (0.25, 1.0, 2.0)
-"""s"""
+"""Times (s) after which divergence is measured."""
 GAITS = ((1.2, 0.4, 0.5), (1.6, 0.5, 0.4), (0.8, 0.45, 0.5))
-"""Period (s), duty, phase of the right leg."""
+"""Period (s), duty cycle and phase of the right leg."""
 SITES = ("balloon", "base", "foot_left", "foot_right")
 HIPS, KNEES, MOTORS = [8, 11], [9, 12], [10, 13]
-"""Places in qpos."""
+"""Indices in qpos."""
 
 TARGETS = {"knees deg": 1.0, "femurs deg": 1.0, "tibias deg": 1.0, "base mm": 2.0}
-"""Largest median errors on noisy recordings of the nominal robot; with the base's orientation also of `hips deg`."""
+"""Limits of median errors on noisy recordings of the nominal robot.
+
+With the base's orientation, `hips deg` has a limit of 1 too."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Walk:
-    """True states at 100 Hz, and the commands held from each to the next."""
+    """True states at 100 Hz, with the command that is held until the next."""
 
     command: Float[np.ndarray, "T 2"]
     qpos: Float[np.ndarray, "T nq"]
@@ -65,7 +71,7 @@ class Walk:
 
 
 def walk(model: mujoco.MjModel, gait: tuple[float, float, float], duration: float) -> Walk:
-    """The nominal robot from standing."""
+    """Return a walk of the nominal robot in a gait, from standing, for `duration` (s)."""
     period, duty, phase = gait
     moment = np.arange(round(duration / CAPTURE_STEP) + 1) * CAPTURE_STEP
     turns = moment[:, None] / period + np.array([0.0, phase]) + 1e-9
@@ -84,7 +90,10 @@ def walk(model: mujoco.MjModel, gait: tuple[float, float, float], duration: floa
 def capture(
     model: mujoco.MjModel, walked: Walk, noise: ReconstructionParameters | None, base: bool, seed: int
 ) -> Recording:
-    """What motion capture sees, with the noise that the reconstruction assumes, or without any."""
+    """Return a recording of a walk, with the noise that the reconstruction assumes, or without noise (None).
+
+    `base` is whether the recording has the base's orientation.
+    """
     rng = np.random.default_rng(seed)
     data = mujoco.MjData(model)
     places, balloon = [], []
@@ -117,7 +126,7 @@ def capture(
 
 
 def errors(walked: Walk, motion: Motion) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Absolute errors of the positions, and errors of the velocities, by name."""
+    """Return the absolute errors of positions, and the errors of velocities, by name."""
     every = round(CONTROL_TIMESTEP / CAPTURE_STEP)
     qpos, qvel = walked.qpos[::every][: len(motion.qpos)], walked.qvel[::every][: len(motion.qpos)]
     turn = Rotation.from_quat(qpos[:, 3:7], scalar_first=True).inv() * Rotation.from_quat(
@@ -125,7 +134,7 @@ def errors(walked: Walk, motion: Motion) -> tuple[dict[str, np.ndarray], dict[st
     )
     x, pitch, z = turn.as_rotvec(degrees=True).T
     degrees = np.rad2deg(motion.qpos - qpos)
-    # About the common axis of hips and knees; what is left of a direction's error is the base's roll and yaw.
+    # Angles about the common axis of hips and knees. The rest of a direction's error is the base's roll and yaw.
     femur = degrees[:, HIPS] + pitch[:, None]
     tibia = femur + degrees[:, KNEES]
     rate = motion.qvel - qvel
@@ -154,7 +163,7 @@ def errors(walked: Walk, motion: Motion) -> tuple[dict[str, np.ndarray], dict[st
 def replay(
     model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, commands: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Balloon's place and heading at each horizon, the commands held over their control steps."""
+    """Return the balloon's position (m) and heading (rad) at each horizon. A command is held for its control step."""
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = qpos, qvel
     substeps = round(CONTROL_TIMESTEP / model.opt.timestep)
@@ -172,7 +181,10 @@ def replay(
 
 
 def divergence(model: mujoco.MjModel, walked: Walk, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (mm) and heading (deg) between starts from `motion` and from the truth, [starts, horizons]."""
+    """Return errors of distance (mm) and heading (deg) of replays from `motion`, each [starts, horizons].
+
+    They are relative to replays from the true states.
+    """
     every = round(CONTROL_TIMESTEP / CAPTURE_STEP)
     distance, turn = [], []
     for k in range(0, len(motion.command) - round(HORIZONS[-1] / CONTROL_TIMESTEP), 2):
@@ -185,18 +197,18 @@ def divergence(model: mujoco.MjModel, walked: Walk, motion: Motion) -> tuple[np.
 
 
 def crude(model: mujoco.MjModel, motion: Motion, recording: Recording) -> Motion:
-    """`motion` with velocities from neighbouring samples, at the recording's rate, of unfiltered positions."""
+    """Return `motion` with velocities from differences of neighbouring unfiltered samples, at the recording's rate."""
     unfiltered = ReconstructionParameters(position_window=0.05, rate_window=0.05, rotation_window=0.05)
     return dataclasses.replace(motion, qvel=reconstruct(recording, load_robot(), model, unfiltered).qvel)
 
 
 def spread(values: np.ndarray, digits: int = 2) -> str:
-    """Median / 95 %."""
+    """Return the text "median / 95th percentile" of values."""
     return f"{np.median(values):.{digits}f} / {np.percentile(values, 95):.{digits}f}"
 
 
 def table(columns: dict[str, dict[str, str]]) -> None:
-    """Rows by name, a column a case."""
+    """Print a table with one row per quantity and one column per case."""
     rows = list(dict.fromkeys(name for column in columns.values() for name in column))
     width = max(16, *(len(cell) + 2 for column in columns.values() for cell in column.values()))
     print(f"{'':24}" + "".join(f"{case:>{width}}" for case in columns))
@@ -205,16 +217,17 @@ def table(columns: dict[str, dict[str, str]]) -> None:
 
 
 def gather(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Return the arrays of all parts, concatenated by name."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def main(quick: bool = False, duration: float = 20.0, seed: int = 0) -> None:
-    """Table of errors of the reconstructed states.
+    """Print tables of the errors of reconstructed states.
 
     Args:
-        quick: one gait of 6 s: its numbers mean little.
-        duration: seconds a gait.
-        seed: of the noise.
+        quick: Use one gait of 6 s. The result means little.
+        duration: Length of each gait (s).
+        seed: Seed of the noise.
     """
     gaits = GAITS[:1] if quick else GAITS
     duration = 6.0 if quick else duration
@@ -291,7 +304,7 @@ def main(quick: bool = False, duration: float = 20.0, seed: int = 0) -> None:
 
 
 def fill(recording: Recording) -> Recording:
-    """Hidden markers interpolated, by way of a file, as users' recordings come."""
+    """Return a recording after writing and reading it as a file, which interpolates gaps as in users' recordings."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording.csv"
         write_recording(recording, path, load_robot())

@@ -1,10 +1,10 @@
-"""Is there a gap to close? What the virtual robot does that the vanilla simulator does not.
+"""Measure the difference between the virtual robot and the vanilla simulator.
 
-1. Yaw after 20 s, averaged over a gait and its left-right mirrored twin: a simulator without a side turns by nothing
-   on average, the robot turns.
-2. Vanilla started from recorded states: RMSE over a horizon of 10 s, recording by recording; and the same with the
-   robot's true actuator parameters, which the best identification could find, to see what is left to the air, the
-   balloon's offset, friction, backlash and latency.
+1. Yaw after 20 s, averaged over a gait and its left-right mirrored copy. In a symmetric simulator the average is 0. The
+   robot turns.
+2. RMSE of vanilla over a horizon of 10 s, started from recorded states, for each recording. It is repeated with the
+   robot's true actuator parameters, the result of a perfect identification. The remaining error is due to air, balloon
+   offset, friction, backlash and latency.
 
 `python benchmarks/phenomenon.py`
 """
@@ -33,26 +33,28 @@ from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.step import count_substeps
 
 SECONDS = 20.0
+"""Length of a gait's recording (s)."""
 GAITS = ((0.7, 0.40, 1.0), (0.9, 0.35, 0.9), (1.1, 0.45, 0.8), (1.3, 0.40, 1.0), (1.6, 0.30, 0.8), (1.9, 0.40, 0.7))
-"""Period (s), duty and height of bang-bang gaits, legs half a period apart."""
+"""Period (s), duty cycle and amplitude of bang-bang gaits, with the legs half a period apart."""
 HORIZON = 10.0
+"""Length of a replay (s)."""
 
 
 def gait_commands(gait: tuple[float, float, float]) -> Float[np.ndarray, "steps 2"]:
-    """Commands at the control rate."""
+    """Return the commands of a gait at the control rate."""
     period, duty, high = gait
     phase = np.arange(round(SECONDS / CONTROL_TIMESTEP))[:, None] * CONTROL_TIMESTEP / period
     return np.where((phase + np.array([0.0, 0.5])) % 1.0 < duty - 1e-9, high, 0.0)
 
 
 def yaw(qpos: Float[np.ndarray, "states nq"]) -> Float[np.ndarray, " states"]:
-    """Unwrapped yaw of the base, deg."""
+    """Return the unwrapped yaw of the base (deg)."""
     rotation = Rotation.from_quat(qpos[:, 3:7], scalar_first=True)
     return np.rad2deg(np.unwrap(rotation.as_euler("ZYX")[:, 0]))
 
 
 def robot_yaw(seed: int, trial: int, commands: Float[np.ndarray, "steps 2"]) -> float:
-    """Yaw (deg) that the virtual robot gains over the commands."""
+    """Return the change of the virtual robot's yaw (deg) over the commands."""
     virtual, circumstances = virtual_robot.draw_robot(seed), virtual_robot.draw_trial(trial)
     qpos, _ = virtual_robot.record_truth(virtual, circumstances, virtual_robot.open_loop(commands), SECONDS)
     turned = yaw(qpos)
@@ -62,7 +64,7 @@ def robot_yaw(seed: int, trial: int, commands: Float[np.ndarray, "steps 2"]) -> 
 def replay(
     model: mujoco.MjModel, starts: list[tuple[np.ndarray, np.ndarray]], commands: Float[np.ndarray, "runs steps 2"]
 ) -> Float[np.ndarray, "runs steps nq"]:
-    """Generalized positions at the end of every control step, in C MuJoCo."""
+    """Return the generalized positions at the end of every control step, simulated in C MuJoCo."""
     spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
     data = mujoco.MjData(model)
     states = np.zeros((len(starts), mujoco.mj_stateSize(model, spec)))
@@ -76,7 +78,7 @@ def replay(
 
 
 def standing(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """The state after two seconds of standing still."""
+    """Return the state after two seconds of standing with zero commands."""
     data = mujoco.MjData(model)
     data.qpos[:] = standing_qpos(model)
     mujoco.mj_step(model, data, round(2.0 / model.opt.timestep))
@@ -84,7 +86,7 @@ def standing(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
 
 
 def horizon_errors(model: mujoco.MjModel, motion: Motion) -> tuple[float, float]:
-    """Mean over starts a second apart of the base's position RMSE (m) and yaw RMSE (deg) over the horizon."""
+    """Return position RMSE (m) and yaw RMSE (deg) of the base over the horizon, averaged over starts 1 s apart."""
     steps, interval = round(HORIZON / CONTROL_TIMESTEP), round(1.0 / CONTROL_TIMESTEP)
     firsts = range(2, len(motion.command) - steps + 1, interval)
     commands = np.stack([motion.command[first : first + steps] for first in firsts])
@@ -100,8 +102,8 @@ def horizon_errors(model: mujoco.MjModel, motion: Motion) -> tuple[float, float]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--robot", type=int, default=0, help="seed of the virtual robot (the bundled one: 0)")
-    parser.add_argument("--quick", action="store_true", help="two gaits and two recordings")
+    parser.add_argument("--robot", type=int, default=0, help="seed of the virtual robot; 0 is the bundled one")
+    parser.add_argument("--quick", action="store_true", help="two gaits, and one recording of each split")
     arguments = parser.parse_args()
     gaits = GAITS[:2] if arguments.quick else GAITS
 
@@ -115,7 +117,7 @@ def main() -> None:
     both = np.stack([job[2] for job in jobs])
     simulated = replay(vanilla, [standing(vanilla)] * len(both), both)
     vanilla_turned = np.reshape([yaw(run)[-1] for run in simulated], (-1, 2)).mean(axis=1)
-    print(f"Yaw after {SECONDS:g} s, mean of a gait and its mirrored twin (deg)")
+    print(f"Yaw after {SECONDS:g} s, mean of a gait and its mirrored copy (deg)")
     print(f"{'period (s)':>12}{'duty':>8}{'height':>8}{'robot':>10}{'vanilla':>10}")
     for gait, ours, theirs in zip(gaits, turned, vanilla_turned, strict=True):
         print(f"{gait[0]:>12g}{gait[1]:>8g}{gait[2]:>8g}{ours:>10.1f}{theirs:>10.1f}")

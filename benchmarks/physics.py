@@ -1,17 +1,17 @@
-"""How fast is the physics, and how right? The robot in MJX, beside C MuJoCo and PyBullet.
+"""Compare speed and accuracy of the robot's physics in MJX, C MuJoCo and PyBullet.
 
-Random bang-bang commands drive the robot from rest, each engine on one core and on all, in processes of its own:
+Random bang-bang commands drive the robot from rest. Each engine runs on one core and on all, in separate processes:
 
-- MJX in single precision, for batches from 1 to 8,192, sharded over a host device per core;
-- C MuJoCo's `rollout` of the same model in double precision, a thread per core, for the same batches;
-- PyBullet (bullet.py), a process per core, springs, cables and lift set from Python in every physics step, at Bullet's
-  default step and at a finer one.
+- MJX in single precision, for batches from 1 to 8,192, sharded over one host device per core.
+- C MuJoCo's `rollout` of the same model in double precision, with one thread per core, for the same batches.
+- PyBullet (bullet.py), with one process per core, at Bullet's default time step and at a finer one. Springs, cables and
+  lift are set from Python in every physics step.
 
-Beside every speed stands the error: how far (mm) the balloon is after 2 s from where C MuJoCo has it at a quarter of
-the model's time step with the solver run to convergence, median and 95th percentile over the sequences (see
-accuracy.py). Speeds are medians of five, compiling left out.
+The error of each engine is the distance (mm) of the balloon after 2 s from a reference, as median and 95th percentile
+over the sequences. The reference is C MuJoCo at a quarter of the model's time step, with the solver run to convergence
+(see accuracy.py). Speeds are medians of five measurements, without compiling.
 
-`python benchmarks/physics.py`; `--quick` shows within minutes that it works, and its numbers mean little.
+`python benchmarks/physics.py`. With `--quick` it runs within minutes as a check, and its results mean little.
 """
 
 from __future__ import annotations
@@ -43,38 +43,38 @@ MJX, MUJOCO, PYBULLET = "MJX", "C MuJoCo", "PyBullet"
 COLOURS = {MJX: "#0072b2", MUJOCO: "#d55e00", PYBULLET: "#009e73"}
 BATCHES = (1, 4, 16, 64, 256, 1024, 4096, 8192)
 MEASURED_STEPS = 40_000
-"""Control steps, all robots together, in one measurement, as far as 4 to 40 a robot allow."""
+"""Control steps in one measurement, summed over all robots. A robot takes at least 4 and at most 40."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Speed and accuracy of MJX, C MuJoCo and PyBullet."""
+    """Options of the comparison of engines."""
 
     batches: tuple[int, ...] = BATCHES
-    """Robots side by side."""
+    """Numbers of robots that are simulated in parallel."""
     repeats: int = 5
-    """Measurements of each speed."""
+    """Number of measurements of each speed."""
     sequences: int = 64
-    """Command sequences that accuracy is judged by."""
+    """Number of command sequences for the measurement of accuracy."""
     output: Path = Path("runs/bench-physics")
     """Folder for physics.json and physics.png."""
     quick: bool = False
-    """Two batches, three measurements, eight sequences."""
+    """Use two batches, three measurements and eight sequences."""
 
 
 def commands_for(batch: int) -> np.ndarray:
-    """Commands (batch, steps, 2) of a measurement."""
+    """Return the commands (batch, steps, 2) of a measurement."""
     steps = int(np.clip(MEASURED_STEPS // batch, 4, 40))
     return accuracy.bang_bang(0, batch, steps)
 
 
 def measure(engine: str, **request: Any) -> Any:
-    """What a child process answers."""
+    """Return the measurement of a child process."""
     return {MJX: mjx_rates, MUJOCO: mujoco_rates, PYBULLET: pybullet_rates, "errors": errors}[engine](**request)
 
 
 def mjx_rates(batches: Sequence[int], repeats: int) -> list[list[float]]:
-    """Control steps per second on all devices, by batch."""
+    """Return control steps per second of MJX on all devices, by batch."""
     setting = accuracy.Setting.of(load_model())
     model, qpos = setting.model(), accuracy.settled(setting)
     found = []
@@ -92,13 +92,13 @@ def mjx_rates(batches: Sequence[int], repeats: int) -> list[list[float]]:
 
 
 def mujoco_rates(batches: Sequence[int], repeats: int) -> list[list[float]]:
-    """Control steps per second with a thread per core, by batch."""
+    """Return control steps per second of C MuJoCo with one thread per core, by batch."""
     model, threads = load_model(), len(common.cores())
     return [throughput.rollout_rates(model, threads, repeats, commands_for(batch)) for batch in batches]
 
 
 def pybullet_rates(timestep: float, repeats: int, steps: int) -> list[float]:
-    """Control steps per second with a process per core, `steps` control steps in each measurement."""
+    """Return control steps per second of PyBullet with one process per core, from measurements of `steps` steps."""
     context = multiprocessing.get_context("spawn")
     count = len(common.cores())
     barrier = context.Barrier(count)
@@ -111,13 +111,13 @@ _barrier: Any = None
 
 
 def _share(barrier: Any) -> None:
-    """A barrier can be given to a worker only when it starts."""
+    """Store the barrier in a worker process, which can receive it only at its start."""
     global _barrier
     _barrier = barrier
 
 
 def _pybullet_seconds(request: tuple[float, int, int]) -> list[float]:
-    """Seconds that one process took for each measurement, all processes starting together."""
+    """Return the seconds of each measurement in one process. All processes start a measurement together."""
     import bullet
 
     timestep, repeats, steps = request
@@ -138,7 +138,7 @@ def _pybullet_seconds(request: tuple[float, int, int]) -> list[float]:
 
 
 def errors(sequences: int) -> dict[str, tuple[float, float]]:
-    """Median and 95th percentile (mm) of each engine's error."""
+    """Return the median and the 95th percentile of each engine's error (mm)."""
     import bullet
 
     setting = accuracy.Setting.of(load_model())
@@ -168,7 +168,7 @@ def _bullet_name(timestep: float) -> str:
 
 
 def plot(path: Path, rows: list[dict[str, Any]], errors: dict[str, tuple[float, float]], machine: str) -> None:
-    """Simulated seconds per second over the batch; engines whose speed knows no batch are level lines."""
+    """Plot simulated seconds per second over batch size. Engines without batches are horizontal lines."""
     figure = Figure(figsize=(8.0, 5.0), layout="constrained")
     axes = figure.subplots()
     counts = sorted({row["cores"] for row in rows})

@@ -1,11 +1,12 @@
-"""One training in several processes: does it learn the same, and as fast?
+"""Compare a training in several processes with the same training in one process.
 
-`python -m ballu_mjx.train envmimic` runs twice for every seed: in one process that has all cores, and in a process a
-core (two at least), each kept to its own, which find each other over the loopback interface (`--coordinator`). Shown
-are both learning curves, mean and range over seeds. Where several processes learn what one does, the means differ by
-about a standard error, which the seeds' spread tells: the difference is told in these, beside the rates.
+`python -m ballu_mjx.train envmimic` runs twice for every seed. The first run is one process with all cores. The second
+is one process per core (at least two), each restricted to its core. They connect over the loopback interface
+(`--coordinator`). The plot shows both learning curves, as mean and range over seeds. If several processes learn the
+same as one, their means differ by about one standard error, which follows from the spread over seeds. The difference is
+printed in standard errors, along with the speeds.
 
-`python benchmarks/processes.py`; `--quick` shows within minutes that it works, and its numbers mean little.
+`python benchmarks/processes.py`. With `--quick` it runs within minutes as a check, and its results mean little.
 """
 
 from __future__ import annotations
@@ -36,21 +37,21 @@ CURVES = {"reward": "reward per control step", "validation_error": "validation e
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """The main job, in one process and in several."""
+    """Options of the comparison between one process and several."""
 
     seeds: tuple[int, ...] = (0, 1, 2)
-    """A training of each kind for every seed."""
+    """Seeds. Each kind of training runs once for every seed."""
     steps: int = 1_000_000
-    """Control steps of each."""
+    """Control steps of each training."""
     output: Path = Path("runs/bench-processes")
-    """Folder for processes.json, processes.png and the runs. Runs that are there already are made again."""
+    """Folder for processes.json, processes.png and the runs. Earlier runs in it are replaced."""
     quick: bool = False
-    """One seed, `train envmimic --quick`."""
+    """Use one seed and `train envmimic --quick`."""
 
 
 @contextlib.contextmanager
 def started(command: list[str], log: Path, cores: list[int]) -> Iterator[subprocess.Popen[bytes]]:
-    """A process kept to `cores`, and ended with whoever started it."""
+    """Run a process that is restricted to `cores`. It is ended when the context ends."""
 
     def keep() -> None:
         if hasattr(os, "sched_setaffinity"):
@@ -68,9 +69,9 @@ def started(command: list[str], log: Path, cores: list[int]) -> Iterator[subproc
 
 
 def train(kind: str, seed: int, options: Options) -> list[dict[str, Any]]:
-    """Rows of the run's `metrics.jsonl`.
+    """Train in one process or in several, and return the rows of the run's `metrics.jsonl`.
 
-    **Raises** `SystemExit` naming the log of a process that failed.
+    **Raises** `SystemExit` naming the log if a process fails.
     """
     from ballu_mjx.runs.metrics import read_metrics
 
@@ -101,22 +102,24 @@ def train(kind: str, seed: int, options: Options) -> list[dict[str, Any]]:
 
 
 def curve(rows: list[dict[str, Any]], name: str) -> tuple[Float[np.ndarray, " steps"], Float[np.ndarray, " steps"]]:
-    """Control steps, and what was measured there."""
+    """Return the control steps and values of the metric `name`."""
     found = [(row["step"], row[name]) for row in rows if name in row]
     steps, values = np.array(found, float).T
     return steps, values
 
 
 def apart(one: Float[np.ndarray, "seeds steps"], several: Float[np.ndarray, "seeds steps"]) -> float:
-    """Difference of the means over seeds in its standard errors, both as root mean squares over steps: about 1 where
-    both are draws of the same."""
+    """Return the difference of the means over seeds in standard errors, both as root mean squares over steps.
+
+    It is about 1 if both are samples of the same distribution.
+    """
     variance = sum(values.var(axis=0, ddof=1) / len(values) for values in (one, several))
     difference = one.mean(axis=0) - several.mean(axis=0)
     return float(np.sqrt(np.mean(difference**2) / np.mean(variance)))
 
 
 def plot(path: Path, found: dict[str, list[list[dict[str, Any]]]], machine: str) -> None:
-    """A panel a curve: mean and range over seeds."""
+    """Plot mean and range over seeds, with one panel per metric."""
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     for axes, (name, label) in zip(figure.subplots(1, len(CURVES)), CURVES.items(), strict=True):
         for kind, runs_of_kind in found.items():

@@ -1,17 +1,18 @@
-"""How does training scale? Steps per second of the main job over cores, devices, environments, episodes and recordings.
+"""Measure how the speed of training depends on cores, devices, environments, episode length and recordings.
 
-Every measurement is a process of its own that runs PPO on EnvMimic with the command's sizes but for what is varied, and
-tells control steps per second, learning included (medians of five training steps, the first, which compiles, left out),
-the seconds that the first one took, and the most memory it ever held (resident):
+Every measurement is a separate process that runs PPO on EnvMimic with the default sizes, except for the varied one. It
+reports control steps per second, including learning (medians of five training steps). The first training step compiles.
+Its duration is reported separately, as is the peak resident memory. The varied quantities are:
 
-- cores: kept to one, two, ... cores, with a host device for each;
-- devices: all cores, split into one, two, ... host devices; these two several times in turn, for what is compared must
-  meet the machine in the same mood;
-- environments: from 64 to 8,192, a training step with as many pieces of experience;
-- episode length: from 1 to 10 s;
-- recordings: from one to sixteen, the bundled ones again and again.
+- cores: the process is restricted to one, two, ... cores, with a host device for each.
+- devices: all cores are divided into one, two, ... host devices.
+- environments: from 64 to 8,192, with as many trajectory segments in a training step.
+- episode length: from 1 to 10 s.
+- recordings: from one to sixteen, with the bundled ones repeated.
 
-`python benchmarks/scaling.py`; `--quick` shows within minutes that it works, and its numbers mean little.
+Cores and devices are measured several times in turn, so that changes of other load affect all values alike.
+
+`python benchmarks/scaling.py`. With `--quick` it runs within minutes as a check, and its results mean little.
 """
 
 from __future__ import annotations
@@ -41,35 +42,35 @@ AXES = {
     "episode_seconds": "mean length of an episode (s)",
     "recordings": "recordings",
 }
-"""What is varied, and how its axis is called."""
+"""Varied quantities, with the labels of their axes."""
 IN_TURN = ("cores", "devices")
-"""Whose values are measured one after the other, and all again."""
+"""Quantities whose values are measured several times in turn."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Speed and memory of training, over what it depends on."""
+    """Options of the measurement of speed and memory."""
 
     environments: tuple[int, ...] = (64, 256, 1024, 4096, 8192)
-    """Numbers of environments."""
+    """Numbers of environments to measure."""
     episode_seconds: tuple[float, ...] = (1.0, 3.0, 10.0)
-    """Mean lengths of an episode, s."""
+    """Mean episode lengths to measure (s)."""
     recordings: tuple[int, ...] = (1, 4, 16)
-    """Numbers of recordings."""
+    """Numbers of recordings to measure."""
     repeats: int = 5
-    """Training steps that are timed."""
+    """Number of timed training steps."""
     turns: int = 3
-    """How often cores and devices are measured in turn."""
+    """Number of times that cores and devices are measured in turn."""
     only: tuple[str, ...] = ()
-    """Vary these alone, of cores, devices, environments, episode_seconds and recordings. Without this option: all."""
+    """Quantities to vary: cores, devices, environments, episode_seconds, recordings. Default: all."""
     output: Path = Path("runs/bench-scaling")
     """Folder for scaling.json, scaling.png and memory.png."""
     quick: bool = False
-    """Cores alone, with few and short steps of 64 environments."""
+    """Vary only the number of cores, with few and short steps of 64 environments."""
 
 
 def measure(environments: int, episode_seconds: float | None, recordings: int | None, repeats: int) -> dict[str, Any]:
-    """What a child process answers: steps per second, seconds of the first step, and bytes held at most."""
+    """Return steps per second, duration of the first step (s) and peak memory (bytes). A child process calls this."""
     runtime.prepare()
     import jax
 
@@ -109,7 +110,7 @@ def measure(environments: int, episode_seconds: float | None, recordings: int | 
 
 
 def merged(answers: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Of all turns; compiled was in the first."""
+    """Return the result of all turns. The duration of the first step is that of the first turn, which compiles."""
     return {
         "steps_per_second": [rate for answer in answers for rate in answer["steps_per_second"]],
         "first_seconds": answers[0]["first_seconds"],
@@ -119,7 +120,7 @@ def merged(answers: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def speedups(fewest: Sequence[Mapping[str, Any]], most: Sequence[Mapping[str, Any]]) -> list[float]:
-    """Of each turn."""
+    """Return the ratio of speeds for each turn."""
 
     def speed(answer: Mapping[str, Any]) -> float:
         return float(np.median(answer["steps_per_second"]))
@@ -128,7 +129,7 @@ def speedups(fewest: Sequence[Mapping[str, Any]], most: Sequence[Mapping[str, An
 
 
 def plot_speed(path: Path, rows: list[dict[str, Any]], machine: str) -> None:
-    """A panel for each thing varied."""
+    """Plot the speed, with one panel per varied quantity."""
     shown = [axis for axis in AXES if any(row["axis"] == axis for row in rows)]
     figure = Figure(figsize=(4.0 * len(shown), 3.6), layout="constrained")
     for axes, axis in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
@@ -147,7 +148,7 @@ def plot_speed(path: Path, rows: list[dict[str, Any]], machine: str) -> None:
 
 
 def plot_memory(path: Path, rows: list[dict[str, Any]], machine: str) -> None:
-    """Peak memory over the number of environments."""
+    """Plot peak memory over the number of environments."""
     figure = Figure(figsize=(6.0, 4.0), layout="constrained")
     axes = figure.subplots()
     held = [row["peak_bytes"] / 1e9 for row in rows]

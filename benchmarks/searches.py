@@ -1,4 +1,4 @@
-"""What the benchmarks of identification share: other ways to search, timed, and how two ways compare."""
+"""Shared parts of the identification benchmarks: timed alternative optimizers, and comparison of two methods."""
 
 from __future__ import annotations
 
@@ -17,37 +17,42 @@ from common import cores
 
 THREADS = len(cores())
 DIFFERENCE = 1e-6
-"""Finite difference, as a share of the span between the bounds."""
+"""Step of finite differences, as a share of the span between the bounds."""
 
 Trace = list[tuple[float, float]]
-"""Seconds since the start, and the lowest objective so far."""
+"""Pairs of seconds since the start and lowest objective so far."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """One way with one set of parameters, judged."""
+    """Judged result of one method with one set of parameters."""
 
     way: str
+    """Name of the method."""
     parameters: int
+    """Number of parameters."""
     seconds: float
+    """Duration of the search (s), without compiling."""
     compile_seconds: float | None
+    """Duration of compiling (s). None if nothing is compiled."""
     objective: float
+    """Final objective, by the common judge."""
     trace: Trace
-    """Empty where the objective is known at the end only."""
+    """Course of the objective. Empty if only the final objective is known."""
 
     def reached(self, objective: float) -> float:
-        """Return the seconds until the objective was no larger; inf where it never was."""
+        """Return the seconds until the objective was at most `objective`, or infinity if it never was."""
         if self.trace:
             return next((seconds for seconds, value in self.trace if value <= objective), np.inf)
         return self.seconds if self.objective <= objective else np.inf
 
 
 CLOSE = 1e-3
-"""Of an objective: the judge is more exact than the searches are."""
+"""Relative tolerance of an objective, because the judge is more accurate than the searches."""
 
 
 def compare(one: Sequence[Search], other: Search) -> str:
-    """Say how much sooner the first way, of which there are variants, or the other gets to the same objective."""
+    """Return a text that compares the times to the same objective of the best variant in `one` and of `other`."""
     best = min(one, key=lambda row: row.objective)
     target = max(best.objective, other.objective) * (1 + CLOSE)
     ours_at, row = min(((r.reached(target), r) for r in one), key=lambda pair: pair[0])
@@ -63,6 +68,7 @@ def compare(one: Sequence[Search], other: Search) -> str:
 
 
 def lowest_so_far(trace: Trace) -> Trace:
+    """Return a trace with the running minimum of its objectives."""
     values = np.minimum.accumulate([value for _, value in trace])
     return [(seconds, float(value)) for (seconds, _), value in zip(trace, values, strict=True)]
 
@@ -70,7 +76,10 @@ def lowest_so_far(trace: Trace) -> Trace:
 def lbfgsb(
     function: Callable[[np.ndarray], tuple[float, np.ndarray]], start: np.ndarray, iterations: int
 ) -> tuple[np.ndarray, float, Trace]:
-    """scipy's L-BFGS-B within 0 and 1, of a function that returns value and gradient: place, seconds, trace."""
+    """Minimize a function of value and gradient within [0, 1] by SciPy's L-BFGS-B.
+
+    **Returns** the minimum, the seconds and the trace.
+    """
     trace: Trace = []
 
     def noting(shares: np.ndarray) -> tuple[float, np.ndarray]:
@@ -78,7 +87,7 @@ def lbfgsb(
         trace.append((time.perf_counter() - began, value))
         return value, gradient
 
-    function(start)  # compiles
+    function(start)  # Compiles.
     began = time.perf_counter()
     bounds, options = [(0.0, 1.0)] * len(start), {"maxiter": iterations}
     found = scipy.optimize.minimize(noting, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
@@ -86,7 +95,7 @@ def lbfgsb(
 
 
 def missing_for_toolbox() -> list[str]:
-    """Distributions that `mujoco.sysid` needs and that are not installed, if it cannot be used for want of them."""
+    """Return the missing packages that `mujoco.sysid` needs. Empty if it can be used."""
     from mujoco import sysid
 
     if hasattr(sysid, "optimize"):
@@ -105,7 +114,10 @@ def missing_for_toolbox() -> list[str]:
 def optimize_by_toolbox(
     parameters: Any, residual: Callable[..., Any], iterations: int
 ) -> tuple[np.ndarray, float, list[tuple[float, np.ndarray]]]:
-    """`mujoco.sysid.optimize`, its own optimizer: place, seconds, and the places that it visited, with their time."""
+    """Minimize a residual by the optimizer of `mujoco.sysid`.
+
+    **Returns** the minimum, the seconds, and the visited points with their times (s).
+    """
     from mujoco import sysid
 
     visited: list[tuple[float, np.ndarray]] = []
@@ -116,9 +128,9 @@ def optimize_by_toolbox(
             visited.append((time.perf_counter() - began, x.ravel().copy()))
         return result
 
-    residual(parameters.as_vector(), parameters.copy())  # compiles
+    residual(parameters.as_vector(), parameters.copy())  # Compiles.
     began = time.perf_counter()
-    # Parameters in their own units: the toolbox's advice for those is to scale by the Jacobian.
+    # The parameters have different units, for which the toolbox recommends to scale by the Jacobian.
     with contextlib.redirect_stdout(io.StringIO()):
         found, _ = sysid.optimize(
             initial_params=parameters, residual_fn=noting, verbose=False, max_iters=iterations, x_scale="jac"

@@ -1,11 +1,11 @@
-"""Whether the simulation stays sane under abuse: random commands and random forces on the balloon.
+"""Check that the simulation stays stable under random commands and random forces on the balloon.
 
     python benchmarks/stability.py           # 2,000 environments for 20 s
     python benchmarks/stability.py --quick
 
-Every environment gets new commands, uniform in [0, 1], and a new force on the balloon, uniform within 1 N on each
-axis, at every control step. Exit status 1 where a state is not finite or a joint is faster than 100 rad/s, looked at
-after every physics step.
+At every control step, every environment gets new commands, uniform in [0, 1], and a new force on the balloon, uniform
+within 1 N on each axis. States are checked after every physics step. The exit status is 1 if a state is not finite or a
+joint is faster than 100 rad/s.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from ballu_mjx.ballu.model import CONTROL_TIMESTEP, JOINTS, load_model, standing
 from ballu_mjx.sim.step import PhysicsState, control_step, count_substeps, make_data, put_model, state_at
 
 MAX_JOINT_SPEED = 100.0
-"""rad/s"""
+"""Largest allowed joint speed (rad/s)."""
 
 
 def main(
     quick: bool = False, environments: int = 2000, duration: float = 20.0, force: float = 1.0, seed: int = 0
 ) -> None:
-    """Random commands and forces on many environments.
+    """Simulate many environments under random commands and forces.
 
     Args:
-        quick: 100 environments for 5 s: its numbers mean little.
-        environments: simulated side by side.
-        duration: simulated time, s.
-        force: largest force on each axis, N.
-        seed: of the commands and forces.
+        quick: Simulate 100 environments for 5 s. The result means little.
+        environments: Number of environments, simulated in parallel.
+        duration: Simulated time (s).
+        force: Largest force on each axis (N).
+        seed: Seed of the commands and forces.
     """
     if quick:
         environments, duration = 100, 5.0
@@ -54,7 +54,7 @@ def main(
     start = state_at(jnp.asarray(standing_qpos(model), jnp.float32), jnp.zeros(model.nv))
 
     def worst(key: Array) -> tuple[Array, Array]:
-        """Number of physics steps with a state that is not finite; each hinge's greatest speed (rad/s) before that."""
+        """Return the number of physics steps with a non-finite state, and each hinge's largest finite speed (rad/s)."""
 
         def control(state: PhysicsState, key: Array) -> tuple[PhysicsState, tuple[Array, Array]]:
             command_key, force_key = jax.random.split(key)

@@ -1,11 +1,11 @@
-"""Where does a physics step's time go? On one core, the batch first (`jax.vmap`) and last (`batch_last`).
+"""Profile a physics step on one core, with the batch as the first axis (`jax.vmap`) and as the last (`vmap_last`).
 
-Parts are compiled alone and in growing chains, so that XLA can leave nothing out that a part needs; they do not add up
-exactly to the whole, in which XLA fuses across them. Beside the times stand XLA's own count of the whole step's
-arithmetic, which says what the floor would be, and C MuJoCo's step on one thread. For what each kernel takes,
-`--kernels` lists the longest by JAX's profiler.
+The parts of a step are compiled separately, in growing chains, so that XLA cannot omit what a part needs. Their times
+do not add up exactly to that of the whole step, in which XLA fuses operations of different parts. The output also shows
+XLA's count of arithmetic operations, which gives a lower bound, and the time of C MuJoCo's step on one thread.
+`--kernels` lists the slowest kernels, from JAX's profiler.
 
-`python benchmarks/step_profile.py`: ten minutes, most of it compiling; `--quick` times the whole step alone.
+`python benchmarks/step_profile.py` takes ten minutes, mostly for compiling. `--quick` times only the whole step.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ FIRST, LAST, C = "batch first", "batch last", "C MuJoCo"
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Time of the parts of a physics step."""
+    """Options of the profile of a physics step."""
 
     batches: tuple[int, ...] = (64, 256, 512, 1024, 4096)
-    """Robots side by side, of the whole step; its parts are timed with 512."""
+    """Numbers of robots for the time of the whole step. Its parts are timed with 512 robots."""
     kernels: int = 0
-    """So many of the kernels that take longest, of the whole step."""
+    """Number of the slowest kernels of the whole step to list."""
     output: Path = Path("runs/bench-step-profile")
     """Folder for step_profile.json."""
     quick: bool = False
-    """The whole step of 512 robots alone."""
+    """Time only the whole step, with 512 robots."""
 
 
 def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any]:
-    """What a child process answers: microseconds per robot and physics step, by part."""
+    """Return microseconds per robot and physics step, by part. A child process calls this function."""
     runtime.prepare()
     import jax
     import jax.numpy as jnp
@@ -88,7 +88,7 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
         return physics_step(mjx_model, template.replace(ctrl=command), state)  # pyright: ignore
 
     whole = batched(step)
-    for _ in range(50):  # walking about, feet on the floor
+    for _ in range(50):  # Until the robots walk, with feet on the floor.
         state = whole(state, commands)
     found: dict[str, Any] = {"whole": 1e6 * seconds(whole, state) / batch}
     cost: Any = whole.lower(state, commands).compile().cost_analysis()
@@ -118,7 +118,7 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
 
 
 def _kernels(run: Callable[[], Any], count: int, batch: int) -> list[tuple[str, int, float]]:
-    """Name, executions and microseconds a robot of the longest."""
+    """Return name, number of executions and microseconds per robot of the slowest kernels."""
     import jax
 
     with tempfile.TemporaryDirectory() as folder:
@@ -137,7 +137,7 @@ def _kernels(run: Callable[[], Any], count: int, batch: int) -> list[tuple[str, 
 
 
 def main(options: Options) -> None:
-    """Measure, print, write."""
+    """Measure, print and write the profile."""
     core = common.cores()[:1]
     batches = (512,) if options.quick else options.batches
     result: dict[str, Any] = {

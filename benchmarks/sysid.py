@@ -1,24 +1,25 @@
-"""How good and how fast is identification? Three ways, on the bundled sweep, by the paper's objective, in one run.
+"""Compare accuracy and speed of three identification methods on the bundled sweep, by the paper's objective.
 
-The objective is the sum over both legs of the directed Hausdorff distances from simulated to measured curves, for motor
-and knee, of settled angles. All three know the same bounds, for the paper's eight parameters and for twelve (with
-torque limits and slack):
+The objective is the directed Hausdorff distance from simulated to measured curves of settled angles, summed over motor
+and knee of both legs. All methods have the same bounds, for the paper's eight parameters and for twelve (with torque
+limits and slack):
 
-- ours: `ballu_mjx.ballu.leg_fit` from settled angles alone, with either objective. The time is a second run's;
-  compiling, once for each size of sweep, stands apart.
-- the paper's way: scipy's L-BFGS-B from the nominal values, finite differences through C MuJoCo. Two favours: the
-  parameters of both legs are perturbed at once, as neither leg feels the other, and the joints are damped so that they
-  settle soon.
-- MuJoCo's toolbox `mujoco.sysid` (`pip install "mujoco[sysid]"`), which fits time series: the whole recording is played
-  to it, and judged at the end of each hold. Its own optimizer and residual, from the nominal values.
+- ours: `ballu_mjx.ballu.leg_fit` from settled angles only, with either objective. The time is that of a second run.
+  Compiling, once for each size of sweep, is reported separately.
+- the paper's way: SciPy's L-BFGS-B from the nominal values, with finite differences through C MuJoCo. Two measures
+  speed it up. The parameters of both legs are perturbed at once, because neither leg affects the other. The joints are
+  damped so that they settle early.
+- MuJoCo's toolbox `mujoco.sysid` (`pip install "mujoco[sysid]"`), which fits time series. It simulates the whole
+  recording and compares the angles at the end of each hold, with its own optimizer and residual, from the nominal
+  values.
 
-One judge for all: C MuJoCo, simulated until nothing moves. Mean angle errors are over all holds after a fit to all, and
-over every fourth hold after a fit to the others.
+All results are judged by C MuJoCo, simulated until nothing moves. Mean angle errors are over all holds after a fit to
+all of them, and over every fourth hold after a fit to the others.
 
     python benchmarks/sysid.py
-    python benchmarks/sysid.py --quick           # twelve parameters, fewer draws and iterations, nothing left out
-    python benchmarks/sysid.py --output FOLDER   # numbers and traces as FOLDER/sysid.json too
-    python benchmarks/sysid.py --results FILE    # the table, as `docs/render.py` takes it
+    python benchmarks/sysid.py --quick           # only twelve parameters, fewer draws and iterations, no hold left out
+    python benchmarks/sysid.py --output FOLDER   # also write numbers and traces to FOLDER/sysid.json
+    python benchmarks/sysid.py --results FILE    # also write the table for `docs/render.py`
 """
 
 from __future__ import annotations
@@ -80,10 +81,11 @@ DEGREE = IdentificationConfig().degree
 OBJECTIVES = ("pointwise", "hausdorff")
 
 DAMPING = {"hip": 0.12, "knee": 0.01, "motor": 0.0114}
-"""N m s/rad: the hip close to critical; more at knee or motor would be slower."""
+"""Damping (N m s/rad). The hip is nearly critically damped. With more, knee and motor would settle later."""
 SEARCH_STEPS, JUDGE_STEPS = 500, 3000
-"""Steps of the robot's own time step until settled, to 1e-3 rad at worst, and to rounding. A longer time step would
-soften the knee's stop and so move the angles."""
+"""Physics steps until the legs are settled: to within 1e-3 rad for searches, and to rounding for the judge.
+
+A longer time step would soften the knee's stop and so change the angles."""
 
 Vectors = Float[np.ndarray, "2 parameters"]
 """Parameters of both legs, in the order of `NAMES`."""
@@ -91,18 +93,20 @@ Vectors = Float[np.ndarray, "2 parameters"]
 
 @dataclasses.dataclass(frozen=True)
 class Row(Search):
-    """One way with one set of parameters, judged; its trace is as the method itself settles the legs."""
+    """Judged result of one method with one set of parameters. Its trace has the method's own settled angles."""
 
     backward: float
-    """The same from measured to simulated."""
+    """Objective in the other direction, from measured to simulated curves."""
     error: float
+    """Mean angle error over all holds (deg)."""
     error_left_out: float | None
-    """deg."""
+    """Mean angle error over holds that the fit did not use (deg). None if there are none."""
     vectors: list[list[float]]
+    """Identified parameters of both legs."""
 
 
 class Legs:
-    """Settled angles by C MuJoCo, of many sets of parameters side by side."""
+    """Simulator of settled angles in C MuJoCo, for many sets of parameters in parallel."""
 
     def __init__(self, steps: int, *, exact: bool = False) -> None:
         self.steps = steps
@@ -122,6 +126,7 @@ class Legs:
     def settled(
         self, vectors: Float[np.ndarray, "n 2 parameters"], command: Float[np.ndarray, "holds 2"]
     ) -> Float[np.ndarray, "n holds 2 2"]:
+        """Return the settled angles (rad; motor and knee, left and right) for each set of parameters and each hold."""
         holds, kind = len(command), mujoco.mjtState.mjSTATE_FULLPHYSICS
         models, states, controls = [], [], []
         for pair in vectors:
@@ -145,13 +150,13 @@ class Legs:
 
 
 def _fields_of(model: mujoco.MjModel) -> Callable[[np.ndarray], dict[str, np.ndarray]]:
-    """`model.actuator_fields` from rows of parameters, compiled: else the finite differences would wait for it."""
+    """Return `actuator_fields` of a model, compiled, because finite differences call it often."""
     compiled = jax.jit(lambda rows: actuator_fields(model, ActuatorParameters(*rows)))
     return lambda rows: {name: np.asarray(value) for name, value in compiled(rows).items()}
 
 
 def distances(data: Sweep) -> Callable[[Float[np.ndarray, "n holds 2 2"]], Float[np.ndarray, "n 2"]]:
-    """The paper's objective and its reverse, of settled angles."""
+    """Return a function from settled angles to the paper's objective and to that in the other direction."""
 
     def both(angles: jax.Array) -> jax.Array:
         return sum(
@@ -172,7 +177,7 @@ def distances(data: Sweep) -> Callable[[Float[np.ndarray, "n holds 2 2"]], Float
 def ours(
     data: Sweep, config: IdentificationConfig, repeats: int
 ) -> tuple[float, dict[str, tuple[Vectors, float, Identification]]]:
-    """Seconds of compiling; for each objective vectors, seconds of the last run, and the result."""
+    """Return the seconds of compiling and, by objective, parameters, seconds of the last run, and result."""
     marks: list[float] = []
 
     def report(stage: str, iteration: int, steps: int, value: float) -> None:
@@ -182,7 +187,7 @@ def ours(
     results = {}
     identifier = Identifier(config, data, report)
     for objective in OBJECTIVES:
-        # Both share the programs that take long to compile.
+        # Both objectives share the programs that take long to compile.
         identifier.config = dataclasses.replace(config, objective=objective)
         for _ in range(repeats):
             began = time.perf_counter()
@@ -196,7 +201,7 @@ def ours(
 
 
 def papers_way(data: Sweep, space: ParameterTransform, iterations: int) -> tuple[Vectors, float, Trace]:
-    """L-BFGS-B over C MuJoCo: vectors, seconds, trace.
+    """Return parameters, seconds and trace of L-BFGS-B with C MuJoCo.
 
     Coordinates are shares of the span between the bounds.
     """
@@ -210,7 +215,7 @@ def papers_way(data: Sweep, space: ParameterTransform, iterations: int) -> tuple
 
     def parts(shares: np.ndarray) -> Float[np.ndarray, "n 2"]:
         angles = legs.settled(np.stack([vectors(x) for x in shares]), data.command)
-        # By leg: the other's angles as measured add nothing.
+        # Evaluate each leg with the measured angles of the other, which contribute 0.
         alone = np.repeat(angles[:, None], len(SIDES), axis=1)
         for leg in range(len(SIDES)):
             alone[:, leg, :, :, 1 - leg] = data.settled[:, :, 1 - leg]
@@ -233,7 +238,7 @@ def papers_way(data: Sweep, space: ParameterTransform, iterations: int) -> tuple
 
 
 def _toolbox_spec() -> mujoco.MjSpec:
-    """Both legs, hanging, with the sensors that the recording has; hips damped as for the others."""
+    """Return the specification of both suspended legs, with a sensor for each recorded angle."""
     spec = mujoco.MjSpec.from_file(str(assets() / "ballu.xml"))
     suspend(spec)
     spec.delete(spec.body("balloon"))
@@ -250,7 +255,7 @@ def _toolbox_spec() -> mujoco.MjSpec:
 def toolbox(
     data: Sweep, kept: np.ndarray, source: Recording, space: ParameterTransform, iterations: int
 ) -> tuple[Vectors, float, Trace]:
-    """`mujoco.sysid.optimize`: vectors, seconds, trace. `data` is the whole sweep, of which `kept` is fitted."""
+    """Return parameters, seconds and trace of `mujoco.sysid.optimize` on the holds `kept` of the sweep `data`."""
     from mujoco import sysid
 
     spec, free = _toolbox_spec(), np.flatnonzero(space.free)
@@ -301,7 +306,7 @@ def toolbox(
 
 
 def table(rows: list[Row]) -> Table:
-    """Return the rows as `docs/render.py` takes them."""
+    """Return the results as a table for `docs/render.py`."""
     heads = (
         "way",
         "parameters",
@@ -330,7 +335,7 @@ def table(rows: list[Row]) -> Table:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="twelve parameters only, fewer draws and iterations")
+    parser.add_argument("--quick", action="store_true", help="only twelve parameters, fewer draws and iterations")
     parser.add_argument("--output", type=Path, help="folder for sysid.json")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()
@@ -345,6 +350,7 @@ def main() -> None:
 
 
 def measure(quick: bool) -> list[Row]:
+    """Run all methods, print their results, and return them."""
     (path,) = list_bundled("suspended")
     source = read_recording(path, load_robot())
     whole = read_sweep({path: source})
@@ -386,7 +392,7 @@ def measure(quick: bool) -> list[Row]:
     add("nominal", 0, nominal, 0.0, None, nominal, [])
     comparisons = []
     for beyond in (True,) if quick else (False, True):
-        # As many starts as by default: the compiled program's size depends on them.
+        # Use the default number of starts, because the compiled program's size depends on it.
         config = dataclasses.replace(PAPER_PARAMETERS, motion=False, torque_limit=beyond, cable_slack=beyond)
         if quick:
             config = dataclasses.replace(config, draws=15, steps=8)
@@ -414,7 +420,7 @@ def measure(quick: bool) -> list[Row]:
     print()
     print("\n".join(comparisons))
     if missing:
-        print(f'mujoco.sysid was left out: {", ".join(missing)} not installed (pip install "mujoco[sysid]").')
+        print(f'mujoco.sysid was left out. Not installed: {", ".join(missing)} (pip install "mujoco[sysid]").')
     return rows
 
 

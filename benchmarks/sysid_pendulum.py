@@ -1,19 +1,19 @@
-"""How good and how fast is identification on a real robot? Three ways on recordings of a double pendulum, in one run.
+"""Compare accuracy and speed of three identification methods on recordings of a real double pendulum.
 
-The recordings, the model and the parameters are those of `experiments/real/double_pendulum/`. All three ways have
-the same windows, starting states as measured, bounds and first point (nominal, and a little inside its bounds), no
-priors, and the same residuals: positions at every sample over `WEIGHT`, softened (pseudo-Huber). The
-objective is their root mean square.
+The recordings, the model and the parameters are those of `experiments/real/double_pendulum/`. All methods have the same
+windows, measured starting states, bounds, first point (nominal, slightly inside of the bounds) and residuals, and no
+priors. The residuals are the errors of positions at every sample over `WEIGHT`, with a pseudo-Huber loss. The objective
+is their root mean square.
 
 - ours: `fit_robot`, Levenberg-Marquardt with exact derivatives through MJX, one start.
-- `mujoco.sysid` (`pip install "mujoco[sysid]"`): its own optimizer and finite differences. Windows and columns go
-  through one `rollout`.
-- scipy's L-BFGS-B, finite differences by C MuJoCo's `rollout`, all columns at once, on all cores.
+- `mujoco.sysid` (`pip install "mujoco[sysid]"`): its own optimizer and finite differences. All windows and perturbed
+  parameters go through one `rollout`.
+- SciPy's L-BFGS-B: finite differences by C MuJoCo's `rollout`, for all parameters at once, on all cores.
 
-One judge for all: C MuJoCo, the solver run to its end. It is taken of every point that a search visited, after the
-search. The time is that of the search. Compiling stands apart: it is what JAX says that it traced, lowered and
-compiled. `fit_robot` also checks the data before the search and finds standard errors after it; its whole call stands
-beside.
+All methods are judged by C MuJoCo with the solver run to convergence. After a search, its visited points are judged.
+The reported time is that of the search. The time in which JAX traces, lowers and compiles is reported separately.
+`fit_robot` also checks the data before the search and computes standard errors after it. The time of its whole call is
+reported too.
 
     python benchmarks/sysid_pendulum.py --data FOLDER
     python benchmarks/sysid_pendulum.py --data FOLDER --quick     # one recording, few iterations
@@ -71,14 +71,15 @@ sys.path[1:1] = [str(EXPERIMENTS / "double_pendulum"), str(EXPERIMENTS)]
 import double_pendulum  # pyright: ignore[reportMissingImports]
 
 WEIGHT = np.deg2rad(2.0)
-"""Of positions (rad): about what the identified model leaves."""
+"""Unit of position residuals (rad), about the error of the identified model."""
 SECONDS = 1.0
-"""Of a window; windows end to end."""
+"""Length of a window (s). Windows are contiguous."""
 OUTLYING = FitConfig().outlying
+"""Threshold of the pseudo-Huber loss."""
 
 
 class WindowRollouts:
-    """Windows of motions by C MuJoCo, with many sets of parameters side by side."""
+    """Simulator of windows in C MuJoCo, for many sets of parameters in parallel."""
 
     def __init__(
         self, parameters: ParameterSet, motions: Sequence[MeasuredMotion], windows: Windows, *, exact: bool = False
@@ -111,6 +112,7 @@ class WindowRollouts:
         self._scratch = mujoco.MjData(self.model)
 
     def model_of(self, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:
+        """Return the model with these parameters."""
         model = copy.copy(self.model)
         set_fields(model, {name: np.asarray(value) for name, value in self._fields(values).items()})
         mujoco.mj_setConst(model, self._scratch)
@@ -119,11 +121,11 @@ class WindowRollouts:
     def states(
         self, models: Sequence[mujoco.MjModel], vectors: Float[np.ndarray, "n parameters"]
     ) -> Float[np.ndarray, "n windows samples states"]:
-        """Return time, positions and velocities at the samples."""
+        """Return time (s), positions and velocities at the samples of each window."""
         count, controls = len(self.start), {}
         for vector in vectors:
             key = vector[self._drivetrain].tobytes()
-            if key not in controls:  # most differ in the model alone
+            if key not in controls:  # Most sets differ only in the model.
                 controls[key] = np.asarray(self._filtered(vector))[self.windows.motion[:, None], self._steps]
         control = np.concatenate([controls[vector[self._drivetrain].tobytes()] for vector in vectors])
         start = np.tile(self.start, (len(vectors), 1))
@@ -134,19 +136,21 @@ class WindowRollouts:
     def differences(
         self, vectors: Float[np.ndarray, "n parameters"]
     ) -> Float[np.ndarray, "n windows samples channels"]:
+        """Return simulated minus measured positions and velocities."""
         return self.states([self.model_of(vector) for vector in vectors], vectors)[..., 1:] - self.measured
 
     def objectives(self, vectors: Float[np.ndarray, "n parameters"]) -> Float[np.ndarray, " n"]:
+        """Return the objective for each set of parameters."""
         return np.sqrt(np.mean(residuals(self.differences(vectors)) ** 2, axis=(1, 2, 3)))
 
 
 def residuals(differences: Float[np.ndarray, "*batch channels"]) -> Float[np.ndarray, "*batch positions"]:
-    """Those of positions, the first half of the channels."""
+    """Return the residuals of positions, which are the first half of the channels."""
     return soften(differences[..., : differences.shape[-1] // 2] / WEIGHT, OUTLYING)[0]
 
 
 class CompileClock:
-    """Seconds in which JAX traced, lowered or compiled, by its own account; what it does inside another counts once."""
+    """Recorder of the time in which JAX traces, lowers or compiles. Nested events count once."""
 
     def __init__(self) -> None:
         self._spans: list[tuple[float, float]] = []
@@ -158,6 +162,7 @@ class CompileClock:
             self._spans.append((now - duration_secs, now))
 
     def between(self, begin: float, end: float) -> float:
+        """Return the seconds of compiling between two times of `time.perf_counter`."""
         total = 0.0
         for first, last in sorted(self._spans):
             first, last = max(first, begin), min(last, end)
@@ -168,16 +173,18 @@ class CompileClock:
 
 @dataclasses.dataclass(frozen=True)
 class Found(Search):
-    """A search on the pendulum."""
+    """Result of a search on the pendulum."""
 
     values: np.ndarray
+    """Identified parameters."""
     whole_call: float | None = None
-    """Seconds of all of `fit_robot`, compiling left out."""
+    """Seconds of the whole call of `fit_robot`, without compiling."""
 
 
 def ours(
     parameters: ParameterSet, training: Sequence[MeasuredMotion], judge: WindowRollouts, clock: CompileClock, steps: int
 ) -> Found:
+    """Identify by `fit_robot`."""
     tried: list[tuple[float, np.ndarray]] = []
     begins: list[float] = []
     config = FitConfig(
@@ -201,6 +208,7 @@ def ours(
 
 
 def judged(judge: WindowRollouts, visited: Sequence[tuple[float, np.ndarray]]) -> Trace:
+    """Return the trace of visited points, with the judge's objective."""
     values = [float(judge.objectives(vector[None])[0]) for _, vector in visited]
     return lowest_so_far([(seconds, value) for (seconds, _), value in zip(visited, values, strict=True)])
 
@@ -208,6 +216,7 @@ def judged(judge: WindowRollouts, visited: Sequence[tuple[float, np.ndarray]]) -
 def finite_differences(
     parameters: ParameterSet, simulator: WindowRollouts, judge: WindowRollouts, start: np.ndarray, iterations: int
 ) -> Found:
+    """Identify by L-BFGS-B with finite differences."""
     size = len(parameters)
 
     def function(place: np.ndarray) -> tuple[float, np.ndarray]:
@@ -224,6 +233,7 @@ def finite_differences(
 def toolbox(
     parameters: ParameterSet, simulator: WindowRollouts, judge: WindowRollouts, start: np.ndarray, iterations: int
 ) -> Found:
+    """Identify by `mujoco.sysid`."""
     from mujoco import sysid
 
     def vector(declared: Any) -> np.ndarray:
@@ -241,10 +251,10 @@ def toolbox(
     def difference(declared: Any, predicted: Any, measured: Any, *_: Any, state: np.ndarray, **__: Any) -> tuple:
         return residuals(state[:, 1:] - measured.data), measured, measured
 
-    # The toolbox sees all windows, end to end, as one sequence: one by one takes it many times as long.
+    # The toolbox gets all windows as one sequence, because separate sequences take it many times as long.
     times = np.arange(simulator.measured[..., 0].size) * simulator.motions[0].sample_timestep
     measured = sysid.TimeSeries(times, simulator.measured.reshape(len(times), -1))
-    ctrl = sysid.TimeSeries(times, np.zeros((len(times), simulator.model.nu)))  # `simulate` has the delayed commands
+    ctrl = sysid.TimeSeries(times, np.zeros((len(times), simulator.model.nu)))  # `simulate` uses the delayed commands.
     spec = mujoco.MjSpec.from_file(str(read_pendulum().model))
     sequences = sysid.ModelSequences(
         "pendulum", spec, "windows", simulator.start[0], ctrl, measured, allow_missing_sensors=True
@@ -266,15 +276,20 @@ def toolbox(
 
 
 def read_pendulum() -> Any:
+    """Return the description of the double pendulum."""
     return read_description(double_pendulum.FOLDER / "double_pendulum.robot.json")
 
 
 def without_priors(parameters: ParameterSet) -> ParameterSet:
+    """Return the parameters with infinitely wide priors."""
     return ParameterSet([dataclasses.replace(p, prior=np.inf) for p in parameters.parameters], parameters.commands)
 
 
 def table(rounds: Sequence[Sequence[Found]], validation: WindowRollouts) -> Table:
-    """Return a row a way; times of all repetitions, errors of the first: searches draw no random numbers."""
+    """Return a table with one row per method, with times of all rounds and errors of the first.
+
+    Errors do not differ between rounds, because the searches use no random numbers.
+    """
     best = min(row.objective for row in rounds[0])
     shared = max(min(r.objective for r in rounds[0] if r.way == way) for way in {r.way for r in rounds[0]})
     heads = (
@@ -314,7 +329,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
     parser.add_argument("--quick", action="store_true", help="one recording, few iterations")
-    parser.add_argument("--repeat", type=int, default=3, help="rounds, in turn; times are of all")
+    parser.add_argument("--repeat", type=int, default=3, help="number of rounds for the times")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()
     robot = read_pendulum()
@@ -349,7 +364,7 @@ def main() -> None:
         found = table(rounds, validation)
     print(found.to_markdown())
     if missing:
-        print(f'mujoco.sysid was left out: {", ".join(missing)} not installed (pip install "mujoco[sysid]").')
+        print(f'mujoco.sysid was left out. Not installed: {", ".join(missing)} (pip install "mujoco[sysid]").')
     if arguments.results is not None:
         data = "Development data: six recordings; two others are the validation"
         write_results(arguments.results, {"ways": found}, data)

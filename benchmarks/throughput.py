@@ -1,9 +1,12 @@
-"""How fast is training? Control steps per second of PPO on EnvMimic, learning included, beside bare physics.
+"""Measure the speed of training: control steps per second of PPO on EnvMimic, compared with simulation only.
 
-In one run, on the same machine: PPO on the bundled recordings with the command's own sizes; the same environments
-stepped without learning; and C MuJoCo's `rollout` of the same model at the same time step, with as many threads as
-there are devices. Speeds are given in control steps and in simulated seconds per second; the first, compiling call of
-everything is left out.
+Three speeds are measured in one run on the same machine:
+
+- PPO on the bundled recordings, with the default sizes, including learning.
+- The same environments, stepped without learning.
+- C MuJoCo's `rollout` of the same model at the same time step, with one thread per device.
+
+Speeds are in control steps and in simulated seconds per second. The first call of each, which compiles, is left out.
 
 `python benchmarks/throughput.py`
 """
@@ -35,7 +38,7 @@ from ballu_mjx.sim.step import count_substeps
 
 
 def training_rates(env: EnvMimicEnv, config: ppo.PPOConfig) -> list[float]:
-    """Control steps per second of each training step but the first, which compiles."""
+    """Return control steps per second of each training step except the first, which compiles."""
     rates: list[float] = []
 
     def note(step: int, state: training_state.TrainingState, metrics: dict[str, float]) -> None:
@@ -47,7 +50,7 @@ def training_rates(env: EnvMimicEnv, config: ppo.PPOConfig) -> list[float]:
 
 
 def stepping_rates(env: EnvMimicEnv, num_envs: int, repeats: int, length: int = 20) -> list[float]:
-    """Control steps per second of the environments alone, sharded over all devices."""
+    """Return control steps per second of the environments without learning, sharded over all devices."""
     wrapped = training_env.wrap_for_training(env)
     devices = jax.local_device_count()
     keys = jax.random.split(jax.random.key(0), num_envs).reshape(devices, -1)
@@ -66,7 +69,7 @@ def stepping_rates(env: EnvMimicEnv, num_envs: int, repeats: int, length: int = 
 def rollout_rates(
     model: mujoco.MjModel, threads: int, repeats: int, commands: Float[np.ndarray, "runs steps 2"]
 ) -> list[float]:
-    """Control steps per second of C MuJoCo."""
+    """Return control steps per second of C MuJoCo, for each repeat."""
     count, (runs, steps, _) = count_substeps(model, CONTROL_TIMESTEP), commands.shape
     data = mujoco.MjData(model)
     data.qpos[:] = standing_qpos(model)
@@ -86,7 +89,7 @@ def rollout_rates(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="fewer repeats")
-    parser.add_argument("--num-envs", type=int, default=ppo.PPOConfig().num_envs, help="environments side by side")
+    parser.add_argument("--num-envs", type=int, default=ppo.PPOConfig().num_envs, help="environments in parallel")
     arguments = parser.parse_args()
     repeats = 3 if arguments.quick else 10
 

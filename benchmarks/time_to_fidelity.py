@@ -1,19 +1,18 @@
-"""How long from the command to a simulator worth having? `python -m ballu_mjx.train envmimic`, cold and warm.
+"""Measure the wall time of `python -m ballu_mjx.train envmimic` until the validation error is half of vanilla's.
 
-The command runs as a user runs it, first with an empty cache of compiled programs, then with the one this left. What is
-measured is the wall time until a validation finds half of vanilla's error, vanilla being the nominal robot without
-residual forces, and where that time goes:
+The command runs as a user runs it: first with an empty cache of compiled programs (cold), then with the cache of the
+first run (warm). Vanilla is the nominal robot without residual forces. The time is divided into stages:
 
-- import: Python and packages, measured by a process that imports them and does nothing else;
-- prepare: reading recordings, reconstructing their states;
-- compile: what the first training step and the first validation take beyond the others, and what comes before them;
-- train, evaluate: training steps and validations once compiled;
+- import: Python and packages, measured by a process that only imports them.
+- prepare: reading of recordings and reconstruction of their states.
+- compile: additional time of the first training step and the first validation, and the time before them.
+- train, evaluate: training steps and validations, once compiled.
 - rest: checkpoints and logs.
 
-A run's validation error is a ratio to its own base, which has identified actuators; the base's own ratio to vanilla is
-measured once, at the run's best checkpoint, and multiplies all of the run's.
+A run's validation error is a ratio to its base, which has identified actuators. The base's ratio to vanilla is measured
+once, at the run's best checkpoint, and all errors of the run are multiplied by it.
 
-`python benchmarks/time_to_fidelity.py`; `--quick` shows within minutes that it works, and its numbers mean little.
+`python benchmarks/time_to_fidelity.py`. With `--quick` it runs within minutes as a check, and its results mean little.
 """
 
 from __future__ import annotations
@@ -40,22 +39,22 @@ IMPORTS = "from ballu_mjx.common import runtime; runtime.prepare(); import ballu
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Wall time of EnvMimic to half of vanilla's validation error."""
+    """Options of the measurement."""
 
     target: float = 0.5
-    """Share of vanilla's validation error to be reached."""
+    """Target of the validation error, as a share of vanilla's."""
     validate_every: int = 200_000
     """Control steps between two validations."""
     arguments: tuple[str, ...] = ()
-    """Further options of `train envmimic`, after a --: --arguments -- --num-timesteps 1000000, say."""
+    """Further options of `train envmimic`, after --, for example --arguments -- --num-timesteps 1000000."""
     output: Path = Path("runs/bench-time-to-fidelity")
     """Folder for time_to_fidelity.json and .png, and for the runs."""
     quick: bool = False
-    """Trainings of seconds, that reach nothing."""
+    """Use trainings of seconds, which do not reach the target."""
 
 
 def run(folder: Path, arguments: tuple[str, ...], cache: str) -> dict[str, float]:
-    """Train into `folder`; returns when (s after the start) lines that begin with certain words were printed."""
+    """Train in `folder`. Return the times (s after the start) of the first lines of some stages, and of the end."""
     command = [sys.executable, "-u", "-m", "ballu_mjx.train", "envmimic", "--output", str(folder), *arguments]
     marks: dict[str, float] = {}
     environment = common.unprepared() | {"JAX_COMPILATION_CACHE_DIR": cache}
@@ -73,15 +72,14 @@ def run(folder: Path, arguments: tuple[str, ...], cache: str) -> dict[str, float
 
 
 def import_seconds() -> float:
-    """Wall time of a process that imports what the command needs."""
+    """Return the wall time (s) of a process that only imports the packages of the command."""
     began = time.perf_counter()
     subprocess.run([sys.executable, "-c", IMPORTS], check=True, env=common.unprepared())
     return time.perf_counter() - began
 
 
 def timeline(rows: list[dict[str, Any]], marks: dict[str, float], imported: float) -> list[dict[str, Any]]:
-    """For every validation of a run's metrics: its step, its error, when it was done (s after the start), and what of
-    that each stage took (s)."""
+    """Return step, error, time (s after the start) and durations of all stages (s) until each validation of a run."""
     trained = [row for row in rows if "steps_per_second" in row]
     validated = [row for row in rows if "validation_error" in row]
     steps = np.diff([0, *(row["step"] for row in trained)])
@@ -94,10 +92,10 @@ def timeline(rows: list[dict[str, Any]], marks: dict[str, float], imported: floa
     for count, row in enumerate(validated, start=1):
         before = [other for other in trained if other["step"] <= row["step"]]
         if not before:
-            continue  # before any training
+            continue  # It was done before any training.
         when = marks["Compiling"] + before[-1]["seconds"] + row["validation_seconds"]
         training, evaluating = took[: len(before)].sum(), validating[:count].sum()
-        beforehand = trained[0]["seconds"] - took[0] - validating[0]  # the first state's program, mostly
+        beforehand = trained[0]["seconds"] - took[0] - validating[0]  # Mostly compiling of the initial state.
         compiling = beforehand + took[0] - usual + validating[0] - usual_validation
         stages = {
             "import": imported,
@@ -113,7 +111,7 @@ def timeline(rows: list[dict[str, Any]], marks: dict[str, float], imported: floa
 
 
 def vanilla_ratio(folder: str) -> float:
-    """A run's best validation error as a share of vanilla's, over its error as a share of its base's."""
+    """Return a run's base relative to vanilla: its best error relative to vanilla over that relative to its base."""
     runtime.prepare()
     from ballu_mjx.evaluation.errors import Evaluation
     from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
@@ -141,7 +139,7 @@ def vanilla_ratio(folder: str) -> float:
 
 
 def plot(path: Path, entries: list[dict[str, Any]], target: float, machine: str) -> None:
-    """Above, validation error over wall time; below, where the time goes."""
+    """Plot the validation error over wall time (above), and the durations of the stages (below)."""
     figure = Figure(figsize=(8.0, 7.0), layout="constrained")
     above, below = figure.subplots(2, 1, height_ratios=(2, 1))
     for entry, style in zip(entries, ("--", "-"), strict=True):
@@ -179,7 +177,7 @@ def main(options: Options) -> None:
             marks = run(folder, arguments, cache)
             line = timeline(read_metrics(folder), marks, imported)
             entries.append({"cache": state, "whole_command_seconds": marks["end"], "timeline": line})
-    # The two differ in nothing but their cache.
+    # The two runs differ only in their cache, so one ratio applies to both.
     factor = common.child(__file__, {"folder": str(options.output / f"{stamp}-warm")})
     for entry in entries:
         for point in entry["timeline"]:

@@ -1,21 +1,20 @@
-"""How long until it walks? PPO on the robot in MJX, beside the paper's stack: Stable-Baselines3 and PyBullet.
+"""Compare the wall time to learn to walk: our PPO in MJX, and the paper's software (Stable-Baselines3 and PyBullet).
 
-The task is forward walking: the reward is the velocity of the centre of mass along x (m/s). Both learn from the same
-observations, actions, random lengths of episodes and starting states, with the same networks. Of Stable-Baselines3's
-PPO there are two: one with the batch, epochs, discount and so on of ours (same), one with its own (defaults, rewards
-and observations normalized as its authors advise). It has as many processes as serve it best of one, two and four a
-core.
+The task is forward walking, and the reward is the velocity of the centre of mass along x (m/s). Both use the same
+observations, actions, random episode lengths, starting states and networks. Stable-Baselines3's PPO runs with two sets
+of options. `same` has our batch size, epochs, discount and so on. `defaults` has its own, with rewards and observations
+normalized as its authors recommend. It runs with one, two or four processes per core, whichever is fastest.
 
-What is measured, from the start of the process on (imports and compiling included): wall time until the mean reward of
-the last 100,000 control steps, exploration included, reaches the target; and control steps per second, learning
-included, the median over batches. Ours is timed with an empty cache of compiled programs (cold) and with a full one
-(warm). Who is slow waits long for those 100,000 steps; so the times until a single batch reaches the target are
-compared as well.
+Times are measured from the start of the process, including imports and compiling. The first result is the wall time
+until the mean reward of the last 100,000 control steps, with exploration, reaches the target. The second is the number
+of control steps per second, including learning, as the median over batches. Ours is measured with an empty cache of
+compiled programs (cold) and with a full one (warm). A slow method needs a long time for those 100,000 steps. So the
+times until a single batch reaches the target are compared too.
 
-Where MuJoCo Playground is installed (`pip install playground`), its training on its nearest task that needs no download
-stands beside it for the rate alone: the planar walker of DeepMind's Control Suite, brax's PPO, batches of our size.
+If MuJoCo Playground is installed (`pip install playground`), its speed is measured on its most similar task without
+downloads. This is the planar walker of DeepMind's Control Suite, with Brax's PPO and batches of our size.
 
-`python benchmarks/training.py`; `--quick` shows within minutes that it works, and its numbers mean little.
+`python benchmarks/training.py`. With `--quick` it runs within minutes as a check, and its results mean little.
 """
 
 from __future__ import annotations
@@ -40,48 +39,55 @@ TASK = "walk"
 OURS, SAME, DEFAULTS, PLAYGROUND = "ours", "SB3 + PyBullet (same)", "SB3 + PyBullet (defaults)", "Playground"
 COLOURS = {OURS: "#0072b2", SAME: "#d55e00", DEFAULTS: "#009e73"}
 PLAYGROUND_TASK = "WalkerWalk"
+"""Task of MuJoCo Playground."""
 EPISODE_SECONDS = 12.0
-"""Mean length of an episode (s), for both."""
+"""Mean length of an episode (s), for both simulators."""
 BULLET_TIMESTEP = 1 / 240
-"""s; Bullet's default, and its fastest here that stays stable."""
+"""Bullet's time step (s): its default, and the largest one that is stable here."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Wall time to walking, and steps per second."""
+    """Options of the comparison of trainings."""
 
     target: float = 0.2
-    """Mean reward (m/s) to be reached."""
+    """Target of the mean reward (m/s)."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
-    """A training of each kind for every seed; the ratio is of medians."""
+    """Seeds. Each method trains once for every seed, and ratios are of medians over seeds."""
     steps: int = 3_000_000
-    """Control steps after which a training ends that has not reached the target."""
+    """Control steps after which a training ends if it has not reached the target."""
     output: Path = Path("runs/bench-training")
     """Folder for training.json and training.png."""
     quick: bool = False
-    """One seed, some batches; nobody will walk."""
+    """Use one seed and a few batches, too few to learn to walk."""
 
 
 Curve = list[tuple[float, int, float]]
-"""Seconds since the process was started, control steps done, mean reward of the last batch (m/s)."""
+"""Seconds since the start of the process, control steps done, and mean reward of the last batch (m/s)."""
 
 
 WINDOW = 100_000
-"""Control steps over which the reward is averaged: of episodes that began together, one batch shows one phase."""
+"""Control steps over which the reward is averaged.
+
+One batch is not enough, because it shows only one phase of episodes that began together.
+"""
 
 
 def measure(kind: str, **request: Any) -> Any:
-    """What a child process answers."""
+    """Return the measurement of a child process."""
     functions = {OURS: train_ours, SAME: train_same, DEFAULTS: train_defaults, PLAYGROUND: playground_rate}
     return {"processes": stepping_rate, **functions}[kind](**request)
 
 
 class _ReachedError(Exception):
-    """The target is reached."""
+    """Exception that ends a training when the target is reached."""
 
 
 def train_ours(launched: float, seed: int, steps: int, target: float, config: dict[str, Any]) -> Curve:
-    """`python -m ballu_mjx.train walk` without its run folder; `config` is a `PPOConfig`."""
+    """Train as `python -m ballu_mjx.train walk`, without run folder, and return the curve.
+
+    `launched` is the start of the process (s, `time.time`), and `config` has the fields of a `PPOConfig`.
+    """
     runtime.prepare()
     from ballu_mjx.policies.locomotion_config import LocomotionConfig
     from ballu_mjx.policies.policy import environment_of
@@ -106,10 +112,10 @@ def train_ours(launched: float, seed: int, steps: int, target: float, config: di
 
 
 def _environments(processes: int, scale: float) -> Any:
-    """Environments, each in a process of its own, their rewards multiplied by `scale`.
+    """Return environments in separate processes, with rewards multiplied by `scale`.
 
-    Forked where the system can, which no JAX that has started stands against here: processes that import everything
-    anew would cost Stable-Baselines3 seconds for what is not its own.
+    Processes are forked if the system allows it. This is safe here, because JAX has not started. Otherwise they would
+    spend seconds on imports, which is not due to Stable-Baselines3.
     """
     from stable_baselines3.common.vec_env import SubprocVecEnv  # pyright: ignore[reportMissingImports]
 
@@ -125,7 +131,7 @@ def _environments(processes: int, scale: float) -> Any:
 
 
 def stepping_rate(processes: int, steps: int) -> float:
-    """Control steps per second of the environments alone."""
+    """Return the control steps per second of the environments without learning."""
     environments = _environments(processes, 1.0)
     environments.reset()
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, processes, 2)).astype(np.float32)
@@ -139,7 +145,7 @@ def stepping_rate(processes: int, steps: int) -> float:
 
 
 def train_same(launched: float, seed: int, steps: int, target: float, config: dict[str, Any], processes: int) -> Curve:
-    """Stable-Baselines3 with our hyperparameters; it has no adaptive learning rate and no averaged policy."""
+    """Train by Stable-Baselines3 with our options. It has no adaptive learning rate and no averaged policy."""
     from torch import nn  # pyright: ignore[reportMissingImports]
 
     batch = config["batch_size"] * config["unroll_length"]
@@ -152,7 +158,7 @@ def train_same(launched: float, seed: int, steps: int, target: float, config: di
         "gae_lambda": config["gae_lambda"],
         "clip_range": config["clipping_epsilon"],
         "ent_coef": config["entropy_cost"],
-        "vf_coef": 0.25,  # brax's
+        "vf_coef": 0.25,  # Brax's value.
         "max_grad_norm": config["max_grad_norm"],
         "policy_kwargs": {
             "net_arch": {"pi": list(config["policy_layers"]), "vf": list(config["value_layers"])},
@@ -167,7 +173,7 @@ def train_same(launched: float, seed: int, steps: int, target: float, config: di
 def train_defaults(
     launched: float, seed: int, steps: int, target: float, config: dict[str, Any], processes: int
 ) -> Curve:
-    """Stable-Baselines3 with all of its own; its networks are as large as ours."""
+    """Train by Stable-Baselines3 with its default options. Its default networks have the size of ours."""
     return _train_sb3(launched, seed, steps, target, processes, 1.0, {}, {})
 
 
@@ -186,12 +192,12 @@ def _train_sb3(
     from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
     from stable_baselines3.common.vec_env import VecNormalize  # pyright: ignore[reportMissingImports]
 
-    # Networks this small learn no faster on more, and the environments want the cores.
+    # Such small networks do not learn faster with more threads, and the environments need the cores.
     torch.set_num_threads(1)
     curve: Curve = []
 
     class Note(BaseCallback):
-        """Keeps the mean of the rewards as they were, and ends training at the target."""
+        """Callback that records the mean of unscaled rewards, and ends training at the target."""
 
         rewards: list[float] = []
         reached = False
@@ -216,7 +222,7 @@ def _train_sb3(
 
 
 def playground_rate(steps: int, config: dict[str, Any]) -> dict[str, float]:
-    """Control steps and simulated seconds per second of brax's PPO on Playground's task: its networks, our batch."""
+    """Return the speed of Brax's PPO on Playground's task, with its networks and our batch size."""
     runtime.prepare()
     import functools
 
@@ -251,7 +257,10 @@ def playground_rate(steps: int, config: dict[str, Any]) -> dict[str, float]:
 
 
 def seconds_to(curve: Curve, target: float, window: int = WINDOW) -> float | None:
-    """When the mean over the last `window` control steps, or the last batch, reached the target; None: never."""
+    """Return the seconds until the mean reward over the last `window` control steps reached the target. None if never.
+
+    The mean is over the last batch if that is longer.
+    """
     for last, (seconds, steps, _) in enumerate(curve):
         recent = [reward for _, done, reward in curve[: last + 1] if done > steps - window]
         if steps >= window and np.mean(recent) >= target:
@@ -260,13 +269,13 @@ def seconds_to(curve: Curve, target: float, window: int = WINDOW) -> float | Non
 
 
 def rate(curve: Curve) -> float | None:
-    """Control steps per second, the median over batches without the first, which compiles; None of one batch alone."""
+    """Return the median control steps per second over batches without the first, which compiles. None for one batch."""
     times, steps, _ = zip(*curve, strict=True)
     return float(np.median(np.diff(steps) / np.diff(times))) if len(curve) > 1 else None
 
 
 def plot(path: Path, rows: list[dict[str, Any]], target: float, machine: str) -> None:
-    """Mean reward over wall time."""
+    """Plot mean rewards over wall time."""
     figure = Figure(figsize=(8.0, 5.0), layout="constrained")
     axes = figure.subplots()
     seen = set()
@@ -333,7 +342,7 @@ def main(options: Options) -> None:
 
 
 def compare(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """How many times faster and sooner ours is than the better of Stable-Baselines3's two, medians over seeds."""
+    """Return ratios of speed and time between ours and the better variant of Stable-Baselines3 (medians over seeds)."""
 
     def median(kind: str, cache: str, name: str) -> float:
         values = [row[name] for row in rows if (row["kind"], row["cache"]) == (kind, cache)]

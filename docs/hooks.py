@@ -1,4 +1,4 @@
-"""What MkDocs leaves to do: the pages that stand outside of docs/, and formulas that need no script and no network."""
+"""MkDocs hooks that add the pages outside of docs/, and render formulas without script and network."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _OUTSIDE = {
     "benchmarks/README.md": "benchmarks.md",
 }
 _LINKED = ("CITATION.cff", "LICENSE")
-"""No pages, but linked to from the README."""
+"""Files that are not pages, but to which the README links."""
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 _SHORT_CODE = re.compile(r"<code>([^<]{1,24})</code>")
-"""Code in which a browser would break lines behind the hyphens of an option."""
+"""Short code. A browser would break its lines after the hyphens of an option."""
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that stand outside of docs/, and what the README links to."""
+    """Add the pages outside of docs/, and the files to which the README links."""
     root = Path(config.config_file_path).parent
     for source, page in _OUTSIDE.items():
         files.append(File.generated(config, page, content=(root / source).read_text(encoding="utf-8")))
@@ -34,7 +34,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
-    """Turn links that are written for GitHub into links as seen from docs/."""
+    """Convert links for GitHub to links that are relative to docs/."""
     markdown = re.sub(r"\]\((?:\.\./)?docs/", "](", markdown)
     for source, page in _OUTSIDE.items():
         markdown = re.sub(rf"\]\((?:\.\./)?{re.escape(source)}(#[^)]*)?\)", rf"]({page}\1)", markdown)
@@ -42,7 +42,7 @@ def on_page_markdown(markdown: str, **_: object) -> str:
 
 
 def on_page_content(html: str, **_: object) -> str:
-    """LaTeX to MathML. Wide formulas scroll by themselves, and short code is kept in one piece."""
+    """Convert LaTeX to MathML, make wide formulas scroll separately, and keep short code in one line."""
 
     def formula(found: re.Match[str]) -> str:
         if found[1] == "div":

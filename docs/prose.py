@@ -1,6 +1,6 @@
-"""Measure the prose of README and docs: sentences a page, words a sentence, and sentences that are too long.
+"""Measure the prose of README and docs: sentences per page, words per sentence, and sentences that are too long.
 
-python docs/prose.py           # a table of the pages, and every sentence over the limit
+python docs/prose.py           # print a table of the pages, and every sentence above the limit
 """
 
 from __future__ import annotations
@@ -13,8 +13,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 MOST_WORDS_ON_AVERAGE = 18.0
+"""Largest mean number of words in a sentence, over all pages."""
 MOST_WORDS = 35
+"""Largest number of words in a sentence."""
 README_LINES = 150
+"""Largest number of lines of the README."""
 
 _FENCE = re.compile(r"^[ \t]*(```|~~~).*?^[ \t]*\1[ \t]*$", re.MULTILINE | re.DOTALL)
 _SHOWN_FORMULA = re.compile(r"\$\$.*?\$\$", re.DOTALL)
@@ -30,20 +33,20 @@ _WORD = re.compile(r"[^\W_]")
 
 
 def pages() -> list[Path]:
-    """Return the pages that people read in order: README, docs without the reference, and what stands beside them."""
+    """Return the pages of prose: README, docs without the API reference, and some pages outside of docs/."""
     beside = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "benchmarks/README.md")
     return [ROOT / name for name in beside] + sorted((ROOT / "docs").glob("*.md"))
 
 
 def sentences(text: str) -> Iterator[str]:
-    """Yield the sentences of a page's paragraphs and list items: no headings, tables, code blocks or shown formulas."""
+    """Yield the sentences in paragraphs and list items, not in headings, tables, code blocks or displayed formulas."""
     for block, is_table in _blocks(text):
         if not is_table:
             yield from _split(block)
 
 
 def cell_sentences(text: str) -> Iterator[str]:
-    """Yield the sentences in a page's table cells."""
+    """Yield the sentences in the table cells of a page."""
     for row, is_table in _blocks(text):
         if is_table and not _RULE.match(row.strip()):
             for cell in row.strip().strip("|").split("|"):
@@ -51,12 +54,12 @@ def cell_sentences(text: str) -> Iterator[str]:
 
 
 def count_words(sentence: str) -> int:
-    """Return the number of words; code, a formula and a number with its unit's sign are one each."""
+    """Return the number of words. Code, a formula, and a number with the sign of its unit count as one word each."""
     return sum(bool(_WORD.search(word)) for word in sentence.split())
 
 
 def long_sentences(text: str) -> list[str]:
-    """Return all sentences of over `MOST_WORDS` words, those in table cells too."""
+    """Return all sentences of more than `MOST_WORDS` words, also those in table cells."""
     return [s for s in (*sentences(text), *cell_sentences(text)) if count_words(s) > MOST_WORDS]
 
 
@@ -66,7 +69,7 @@ def mean_words() -> float:
 
 
 def _blocks(text: str) -> Iterator[tuple[str, bool]]:
-    """Yield paragraphs, list items and table rows, and whether each is a row."""
+    """Yield paragraphs, list items and table rows. The second value is whether it is a table row."""
     for pattern, instead in ((_COMMENT, ""), (_FENCE, "\n\n"), (_SHOWN_FORMULA, " F "), (_IMAGE, "")):
         text = pattern.sub(instead, text)
     paragraph: list[str] = []
@@ -82,13 +85,14 @@ def _blocks(text: str) -> Iterator[tuple[str, bool]]:
 
 
 def _split(block: str) -> Iterator[str]:
+    """Yield the sentences of a block, with placeholders for formulas and code."""
     for pattern, instead in ((_FORMULA, "F"), (_LINK, r"\1"), (_CODE, "C")):
         block = pattern.sub(instead, block)
     yield from (s for s in _END.split(block) if s.strip() and _WORD.search(s))
 
 
 def main() -> int:
-    """Print the table and the long sentences; returns 1 where a limit is exceeded."""
+    """Print the table and the long sentences. Return 1 if a limit is exceeded."""
     faults = 0
     for page in pages():
         text = page.read_text(encoding="utf-8")

@@ -1,9 +1,9 @@
-"""Render tables of `results/*.json` into README and docs, where their marks stand.
+"""Render tables of `results/*.json` into the marked places of README and docs.
 
 python docs/render.py           # rewrite the pages
-python docs/render.py --check   # name the pages that differ, and fail where there are any
+python docs/render.py --check   # name the pages that differ, and fail if there are any
 
-A mark names the file and its tables; `caption` says where the numbers come from:
+A mark names the file and its tables. `caption` stands for a paragraph about the origin of the numbers:
 
     <!-- results: main_job short caption -->
     <!-- /results -->
@@ -29,12 +29,12 @@ _OPENED = re.compile(r"<!-- results:")
 
 
 def render_page(text: str, results: Path = RESULTS) -> str:
-    """Return a page with its tables as the files in `results` have them.
+    """Return a page with the current tables of the files in `results`.
 
-    **Raises** `InputError` for a file or table that is not there, and for a mark without end.
+    **Raises** `InputError` if a file or table is missing, or if a mark has no end.
     """
     if len(_OPENED.findall(text)) != len(_MARK.findall(text)):
-        raise InputError("A mark has no end, or is none: <!-- results: FILE TABLE -->, then <!-- /results -->.")
+        raise InputError("A mark is invalid or has no end; write <!-- results: FILE TABLE -->, then <!-- /results -->.")
 
     def rendered(found: re.Match[str]) -> str:
         path = results / f"{found['file']}.json"
@@ -54,12 +54,12 @@ def render_page(text: str, results: Path = RESULTS) -> str:
 
 
 def rendered_names(text: str) -> set[str]:
-    """Return the files whose tables a page shows."""
+    """Return the names of the result files whose tables a page shows."""
     return {found["file"] for found in _MARK.finditer(text)}
 
 
 def main(arguments: list[str]) -> int:
-    """Rewrite the pages, or with --check name those that differ; returns 1 where there are any."""
+    """Rewrite the pages, or with --check name those that differ and return 1 if there are any."""
     differing = []
     for page in prose.pages():
         text = page.read_text(encoding="utf-8")

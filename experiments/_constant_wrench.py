@@ -1,4 +1,4 @@
-"""A rival for residuals: the one force and torque that explain recordings best."""
+"""Baseline for residuals: the constant force and torque that explain recordings best."""
 
 from __future__ import annotations
 
@@ -19,28 +19,30 @@ from ballu_mjx.sim.residual import Action, BoundResidual, Commands, History, Res
 from ballu_mjx.sim.simulator import Simulator
 
 WINDOW = 2.0
-"""Seconds that each simulation of the fit lasts."""
+"""Length of the windows of the fit (s)."""
 
 
 class ConstantWrench(Residual):
-    """A force (N) and a torque (N m) on the tracked body: constant in the world's frame, or in the heading frame of a
-    robot that may go anywhere. Its parameters are the six numbers."""
+    """Residual with a constant force (N) and torque (N m) on the tracked body. Its parameters are these six numbers.
+
+    They are constant in the world frame for an anchored robot, and in the heading frame for other robots.
+    """
 
     def __init__(self, *, anchored: bool) -> None:
         self._anchored = anchored
 
     @property
     def name(self) -> str:
-        """Return what a simulator improved by it is called."""
+        """Return the name of a simulator with this residual."""
         return "constant wrench"
 
     def inputs(self, history: History, commands: Commands) -> Float[Array, " inputs"]:
-        """Return what it depends on: nothing, so that something must stand here."""
+        """Return the latest features. The wrench does not depend on them, but the interface needs an input."""
         del commands
         return history[-1]
 
     def act(self, params: Any, history: History, commands: Commands, key: Array | None = None) -> Action:
-        """Return the wrench."""
+        """Return the wrench in the world frame."""
         del commands, key
         turn = world_rotation(history[-1, ObservationLayout.yaw], self._anchored)
         return Action((params.reshape(2, 3) @ turn.T).reshape(1, 6))
@@ -49,10 +51,11 @@ class ConstantWrench(Residual):
 def fit_constant_wrench(
     simulator: Simulator, motions: Sequence[Motion]
 ) -> tuple[ConstantWrench, Float[np.ndarray, " 6"]]:
-    """Return the constant wrench with which windows of the motions end nearest to what was recorded, by least squares
-    through the simulation.
+    """Fit the constant wrench by least squares through the simulation of windows of the motions.
 
-    **Raises** `InputError` where no motion is as long as a window.
+    Return the residual and its parameters.
+
+    **Raises** `InputError` if no motion is as long as a window.
     """
     model = ConstantWrench(anchored=simulator.robot.anchored)
     windows = cut_motion_windows(simulator, motions, WINDOW, WINDOW)
@@ -61,11 +64,11 @@ def fit_constant_wrench(
         improved = simulator.with_residual(BoundResidual(model, params))
         return jax.vmap(lambda window: simulate_motion_window(improved, window).ravel())(windows)
 
-    values, slopes = jax.jit(errors), jax.jit(jax.jacfwd(errors))
+    values, jacobian = jax.jit(errors), jax.jit(jax.jacfwd(errors))
     found = optimize.least_squares(
         lambda x: count_lost(np.asarray(values(jnp.asarray(x, jnp.float32)), np.float64)).ravel(),
         np.zeros(6),
-        lambda x: np.nan_to_num(np.asarray(slopes(jnp.asarray(x, jnp.float32)), np.float64)).reshape(-1, 6),  # pyright: ignore[reportArgumentType]
+        lambda x: np.nan_to_num(np.asarray(jacobian(jnp.asarray(x, jnp.float32)), np.float64)).reshape(-1, 6),  # pyright: ignore[reportArgumentType]
         loss="soft_l1",
         x_scale="jac",
     )

@@ -1,4 +1,4 @@
-"""What experiments share, as scripts or as notebooks: call `prepare` before imports that bring in JAX."""
+"""Shared code of the experiments, as scripts or as notebooks. Call `prepare` before imports that need JAX."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
 
 def prepare() -> None:
-    """Install the package in Colab, drop a notebook's own arguments, and set JAX's start-up options.
+    """Install the package in Colab, remove a notebook's own arguments, and set JAX's start-up options.
 
     In a notebook, write the options of the experiment into `sys.argv[1:]` after this call.
     """
     if "google.colab" in sys.modules:
         if not Path("constraints.txt").exists():
-            raise SystemExit("Clone the repository first, and make it the current folder: %cd ballu-mjx.")
+            raise SystemExit("Clone the repository first, and change to its folder: %cd ballu-mjx.")
         subprocess.run([sys.executable, "-m", "pip", "install", "-q", "-c", "constraints.txt", "-e", "."], check=True)
     if "ipykernel" in sys.modules:
         sys.argv[1:] = []
@@ -30,7 +30,7 @@ def prepare() -> None:
 
 
 def write_table(text: str, folder: Path) -> None:
-    """Print Markdown, and write it to `table.md` in a folder."""
+    """Print Markdown `text`, and write it to `table.md` in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "table.md").write_text(text + "\n", encoding="utf-8")
     print(text)
@@ -39,7 +39,10 @@ def write_table(text: str, folder: Path) -> None:
 def write_tables(
     tables: Mapping[str, Table], folder: Path, results: Path | None, seeds: Mapping[str, Sequence[int]]
 ) -> None:
-    """Print tables, write them to `table.md` in a folder, and as data to `results` (None: not)."""
+    """Print tables, and write them to `table.md` in a folder.
+
+    If `results` is not None, also write their data and the `seeds` by use to this JSON file.
+    """
     from ballu_mjx.common.results import write_results
 
     write_table("\n\n".join(f"### {name}\n\n{table.to_markdown()}" for name, table in tables.items()), folder)
@@ -49,7 +52,7 @@ def write_tables(
 
 
 def run(main: Callable[[], None]) -> None:
-    """Call `main`; end after bad input with one sentence, and after an interrupt without a traceback."""
+    """Call `main`. Exit with a one-sentence message after invalid input, and without traceback after an interrupt."""
     from ballu_mjx.common.errors import InputError
 
     try:

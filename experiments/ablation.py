@@ -1,12 +1,12 @@
 # %% [markdown]
-# # What EnvMimic's options are worth
+# # Ablation of EnvMimic's options
 #
-# Each row of the ablation table in docs/envmimic.md is the default configuration with one thing changed, trained over
-# seeds and measured on twelve recordings of their own, six near and six far, drawn at random (neither those that the
-# main job validates on, which are too few, nor any test recording). Actuators are the identified ones.
+# Each row of the ablation table in docs/envmimic.md is the default configuration with one change. It is trained with
+# several seeds, and measured on twelve random recordings made for this purpose, six near and six far. These are neither
+# the main job's validation recordings, which are too few, nor test recordings. The actuators are the identified ones.
 #
-# `python experiments/ablation.py` takes about an hour on two cores; what is there already is not trained again.
-# `--quick` shows that it works.
+# `python experiments/ablation.py` takes about an hour on two cores. Finished trainings are not repeated. `--quick` is a
+# short trial run.
 
 # %%
 from __future__ import annotations
@@ -47,13 +47,13 @@ from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.simulator import Simulator
 
 # %% [markdown]
-# ## The rows
+# ## Rows of the table
 
 
 # %%
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """Changes to the defaults."""
+    """Changes to the default options of a training."""
 
     env: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     ppo: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -87,18 +87,24 @@ ROWS: Mapping[str, Row] = {
 # %%
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """How long to train, and how often to look."""
+    """Length of training, and interval between validations."""
 
     steps: int
+    """Control steps of a training."""
     validate_every: int
+    """Control steps between two validations."""
     ppo: Mapping[str, Any]
+    """Options of `PPOConfig` that set sizes."""
 
 
 def train(
     row: Row, seed: int, sizes: Sizes, simulator: Simulator, motions: Mapping[str, Sequence[Motion]]
 ) -> list[dict[str, Any]]:
-    """Validations of one training: step, score, and the ratios to the simulator without forces by group, quantity and
-    horizon."""
+    """Train once, and return its validations.
+
+    Each has the control step, the score, the reward, and ratios to the errors of the simulator without residual, by
+    group, quantity and horizon (s).
+    """
     env_config = EnvMimicConfig(**row.env)
     ppo_config = PPOConfig(**{**sizes.ppo, "num_timesteps": sizes.steps, "seed": seed, **row.ppo})
     env = EnvMimicEnv(simulator, motions["training"], env_config)
@@ -129,12 +135,15 @@ def train(
 
 
 # %% [markdown]
-# ## Table: one value a seed
+# ## Table, with one value for each seed
 
 
 # %%
 def table(results: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> Table:
-    """At the best validation, as the main job chooses it, and the score at the end of training."""
+    """Return the best score, the last score, and the ratios at the best score, by row.
+
+    The best validation is chosen as in the main job.
+    """
     names = list(next(iter(results.values()))[0][0]["ratios"])
     rows = []
     for label, histories in results.items():
@@ -147,16 +156,18 @@ def table(results: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]]) -> Table
 
 
 # %% [markdown]
-# ## All of it
+# ## Run
 
 
 # %%
 def main() -> None:
-    parser = argparse.ArgumentParser(description="EnvMimic's options, one changed at a time, over seeds.")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="trainings of each row")
-    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS), help="which rows", metavar="ROW")
+    parser = argparse.ArgumentParser(description="Ablation of EnvMimic's options, over seeds.")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds of each row (0 1 2)")
+    parser.add_argument(
+        "--rows", nargs="+", choices=list(ROWS), default=list(ROWS), help="rows to train (all)", metavar="ROW"
+    )
     parser.add_argument("--steps", type=int, default=1_200_000, help="control steps of each training")
-    parser.add_argument("--fresh", type=int, default=7, help="seed of the recordings to measure on")
+    parser.add_argument("--fresh", type=int, default=7, help="seed of the recordings for measurement")
     parser.add_argument("--output", type=Path, default=Path("runs/ablation"), help="folder of the results")
     parser.add_argument("--quick", action="store_true", help="two rows, trained for seconds; the numbers mean nothing")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
@@ -184,7 +195,7 @@ def main() -> None:
                 started = time.perf_counter()
                 history = train(ROWS[label], seed, sizes, simulator, motions)
                 path.write_text(json.dumps({"row": label, "seed": seed, "validations": history}, indent=1) + "\n")
-                jax.clear_caches()  # a dozen trainings' programs are more than a process may map
+                jax.clear_caches()  # the programs of a dozen trainings exceed the process's limit of memory maps
                 seconds = time.perf_counter() - started
                 print(f"{label}, seed {seed}: {history[-1]['score']:.2f} ({seconds:.0f} s)", flush=True)
             results.setdefault(label, []).append(json.loads(path.read_text())["validations"])

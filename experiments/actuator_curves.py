@@ -1,18 +1,18 @@
 # %% [markdown]
-# # Actuators: identified, non-linear, another one on each side
+# # Identification of BALLU's actuators: non-linear, and different on each side
 #
-# Section "Actuator System Identification" of the paper. Commands reach BALLU's knees through a servo, a cable and a
-# spring; friction, saturation and slack make of this a curve that the ideal simulator does not have. The paper holds 20
-# commands spread over [0, 1], measures the angles of both motors and both knees, and moves eight parameters of the
-# simulator until its four curves lie on the measured ones: directed Hausdorff distance between fitted polynomials,
-# L-BFGS-B. Its figure shows the four curves against the command.
+# This experiment belongs to the paper's section "Actuator System Identification". Commands reach BALLU's knees through
+# a servo, a cable and a spring. Friction, saturation and slack make the curve of angle over command non-linear, unlike
+# in the ideal simulator. The paper holds 20 commands spread over [0, 1], and measures the angles of both motors and
+# both knees. It fits eight parameters of the simulator to the four measured curves, by the directed Hausdorff distance
+# between fitted polynomials and L-BFGS-B. Its figure shows the four curves over the command.
 #
-# Here on the bundled sweep of the virtual robot, hung up by its base, with twelve parameters (torque limits and
-# the cables' slack are added), delay, friction and backlash beside them, and least squares over the whole motion;
-# docs/actuators.md tells why, and what the paper's objective gives instead.
+# Here, the recording is the bundled sweep of the virtual robot, which is suspended by its base. The fit has twelve
+# parameters (torque limits and the cables' slack are added), and delay, friction and backlash. It is least squares over
+# the whole motion. docs/actuators.md gives the reasons, and the results of the paper's objective.
 #
-# `python experiments/actuator_curves.py` takes about five minutes, half of it compiling; `--quick` fits settled angles
-# alone, from fewer starts.
+# `python experiments/actuator_curves.py` takes about five minutes, half of it compilation. `--quick` fits only settled
+# angles, from fewer starts.
 
 # %%
 from __future__ import annotations
@@ -39,16 +39,16 @@ FIGURE = "actuator_curves.png"
 """The last file that an identification writes."""
 
 # %% [markdown]
-# ## Identify
+# ## Identification
 #
-# The work is the package's: `python -m ballu_mjx.train sysid` does the same, with every option at hand.
+# The package does the identification. `python -m ballu_mjx.train sysid` does the same and has all options.
 
 
 # %%
 def identify(folder: Path, config: IdentificationConfig) -> None:
-    """Identify from the bundled sweep and print the table; where `folder` has the result already, print that one.
+    """Identify the actuators from the bundled sweep, and print the table. If `folder` has the result, only print it.
 
-    **Raises** `InputError` where `folder` holds something else.
+    **Raises** `InputError` if `folder` has a result of other options, or is unfinished.
     """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         train_sysid.train(train_sysid.SysidData(output=folder), config)
@@ -56,27 +56,27 @@ def identify(folder: Path, config: IdentificationConfig) -> None:
     found = read_config(folder, "sysid")["fit"]
     mend = "delete it, or give --output another folder"
     if found != json.loads(json.dumps(dataclasses.asdict(config))):
-        raise InputError(f"{folder}: was made with other options (--quick, or not); {mend}.")
+        raise InputError(f"{folder}: was made with other options (with or without --quick); {mend}.")
     if not (folder / FIGURE).exists():
         raise InputError(f"{folder}: its identification was interrupted; {mend}.")
     print((folder / "identification.txt").read_text())
 
 
 # %% [markdown]
-# ## All of it: table and figure
+# ## Table and figure
 #
-# Dots are measured, lines are the nominal and the identified simulator, dotted is the identified one with the robot's
-# friction and backlash. A command lifts the motor's arm and bends the knee; where the servo is at its limit, curves
-# flatten.
+# Dots are measured angles. Lines are angles in the nominal and in the identified simulator. Dotted lines are the
+# identified simulator with the robot's friction and backlash. A command lifts the motor's arm and bends the knee. The
+# curves flatten where the servo is at its torque limit.
 
 
 # %%
 def main() -> None:
-    parser = argparse.ArgumentParser(description="The paper's figure of the actuators, from the bundled sweep.")
+    parser = argparse.ArgumentParser(description="Make the paper's figure of the actuators from the bundled sweep.")
     parser.add_argument(
         "--output", type=Path, help=f"folder of the identification ({OUTPUT}, or {QUICK_OUTPUT} under --quick)"
     )
-    parser.add_argument("--quick", action="store_true", help="settled angles alone, from fewer starts")
+    parser.add_argument("--quick", action="store_true", help="fit only settled angles, from fewer starts")
     options = parser.parse_args()
     folder = options.output or (QUICK_OUTPUT if options.quick else OUTPUT)
     identify(folder, IdentificationConfig(**train_sysid.QUICK if options.quick else {}))

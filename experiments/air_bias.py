@@ -1,12 +1,12 @@
 # %% [markdown]
-# # What the legs lack passes for air
+# # Bias of the identified air due to missing leg effects
 #
-# The air is identified beside legs that have neither dry friction nor backlash and slack; the robot's have both. Here
-# the bundled robot's training gaits are recorded anew on robots without one or both of these, and the air identified
-# from each: what it finds beside the truth that no robot's legs change. Of the robot with all of its legs, a second
-# table has all sixteen numbers.
+# The air is identified with a model whose legs have neither dry friction nor backlash and slack. The robot's legs have
+# both. Here, the training gaits of the bundled robot are recorded again on robots without one or both of these effects.
+# The air is identified from each set of recordings, and compared with the true values, which are the same for all
+# robots. For the robot with all effects, a second table has all sixteen parameters.
 #
-# `python experiments/air_bias.py` takes about ten minutes on one core; `--quick` takes three gaits of two robots.
+# `python experiments/air_bias.py` takes about ten minutes on one core. `--quick` uses three gaits of two robots.
 
 # %%
 from __future__ import annotations
@@ -49,19 +49,20 @@ ROBOTS = {
     "no backlash or slack": PLAY,
     "neither": FRICTION | PLAY,
 }
-"""What is another, of the virtual robot."""
+"""Changes to the fields of the virtual robot, by the label of the changed robot."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Quantity:
-    """How a parameter of the air is shown."""
+    """Display of a parameter of the air."""
 
     label: str
     form: str
+    """Format of its numbers."""
     scale: float = 1.0
-    """From SI units to those of the label."""
+    """Factor from SI units to those of the label."""
     axes: str = ""
-    """Of a vector."""
+    """Names of the components of a vector. Empty for a scalar."""
 
 
 QUANTITIES = {
@@ -75,7 +76,7 @@ QUANTITIES = {
     "turning_drag": Quantity("drag on turning (N m s)", ".4f", axes="xyz"),
 }
 BIASED = ("lift", "added_mass", "added_inertia", "delay")
-"""What the legs might pass for."""
+"""Parameters that the legs' missing effects might bias."""
 
 
 # %% [markdown]
@@ -84,7 +85,7 @@ BIASED = ("lift", "added_mass", "added_inertia", "delay")
 
 # %%
 def truth(robot: VirtualRobot, model_buoyancy: float) -> dict[str, tuple[float, ...]]:
-    """Parameters of the robot's air that it has itself; its drag has another form."""
+    """Return the true parameters of the robot's air, in SI units. Drag is missing, because it has another form."""
     return {
         "added_mass": (robot.added_mass,),
         "added_inertia": (robot.added_inertia,),
@@ -95,7 +96,7 @@ def truth(robot: VirtualRobot, model_buoyancy: float) -> dict[str, tuple[float, 
 
 
 def identified_table(fit: AirFit, true: dict[str, tuple[float, ...]]) -> Table:
-    """Return all parameters with their standard errors, beside the true ones."""
+    """Return the table of all parameters with their standard errors, and of the true values."""
     rows = []
     for name, quantity in QUANTITIES.items():
         found, errors = (np.ravel(getattr(of, name)) * quantity.scale for of in (fit.parameters, fit.standard_errors))
@@ -107,7 +108,7 @@ def identified_table(fit: AirFit, true: dict[str, tuple[float, ...]]) -> Table:
 
 
 def legs_table(fits: dict[str, AirFit], true: dict[str, tuple[float, ...]]) -> Table:
-    """Return what was found on each robot."""
+    """Return the table of possibly biased parameters and of the cost, by robot."""
     shown = [(name, QUANTITIES[name]) for name in BIASED]
     own = [Cell((quantity.scale * true[name][0],), quantity.form) for name, quantity in shown]
     rows: list[tuple[Cell | str, ...]] = [("truth", *own, "")]
@@ -121,14 +122,14 @@ def legs_table(fits: dict[str, AirFit], true: dict[str, tuple[float, ...]]) -> T
 
 
 # %% [markdown]
-# ## All of it
+# ## Run
 
 
 # %%
 def main() -> None:
-    parser = argparse.ArgumentParser(description="What the legs lack, found as air.")
-    parser.add_argument("--output", type=Path, default=Path("runs/air-bias"), help="folder of recordings and table")
-    parser.add_argument("--quick", action="store_true", help="three gaits of two robots; the numbers mean little")
+    parser = argparse.ArgumentParser(description="Measure the bias of the identified air due to missing leg effects.")
+    parser.add_argument("--output", type=Path, default=Path("runs/air-bias"), help="folder of recordings and tables")
+    parser.add_argument("--quick", action="store_true", help="use three gaits of two robots; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     options = parser.parse_args()
 
@@ -147,7 +148,7 @@ def main() -> None:
     true = truth(full, buoyancy_ratio(model))
     tables = {"identified": identified_table(fits[WHOLE], true), "legs": legs_table(fits, true)}
     _setup.write_tables(tables, options.output, options.results, {"robot": [dataset.ROBOT_SEED]})
-    print(f"\nIn parentheses standard errors. Written to {options.output}.")
+    print(f"\nStandard errors are in parentheses. Written to {options.output}.")
 
 
 if __name__ == "__main__":

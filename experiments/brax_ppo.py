@@ -1,8 +1,9 @@
 # %% [markdown]
 # # Brax's own PPO in an improved simulator
 #
-# `python experiments/brax_ppo.py --run runs/envmimic-...` trains a walk in the simulator of a run: of a residual, of
-# identified actuators, or of a policy. Without `--run` it is the nominal simulator. `brax.training` is used unchanged.
+# `python experiments/brax_ppo.py --run runs/envmimic-...` trains a walking policy in the simulator of a run. The run
+# may be of a residual, of identified actuators, or of a policy. Without `--run`, the nominal simulator is used.
+# `brax.training` is used unchanged.
 
 # %%
 from __future__ import annotations
@@ -17,16 +18,16 @@ from pathlib import Path
 from brax import envs
 from brax.training.agents.ppo import train as ppo
 
-import ballu_mjx.environments  # noqa: F401  # registers the names
+import ballu_mjx.environments  # noqa: F401  # registers the tasks
 
 
 # %%
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Brax's own PPO in an improved simulator.")
-    parser.add_argument("--run", type=Path, help="run whose simulator it is")
+    parser = argparse.ArgumentParser(description="Train a policy with Brax's own PPO in an improved simulator.")
+    parser.add_argument("--run", type=Path, help="run folder that defines the simulator (nominal simulator without it)")
     parser.add_argument("--task", default="Walk", choices=["Walk", "Turn", "TurnRight", "WalkBackward"])
-    parser.add_argument("--steps", type=int, default=1_000_000, help="control steps")
-    parser.add_argument("--num-envs", type=int, default=512)
+    parser.add_argument("--steps", type=int, default=1_000_000, help="control steps of the training")
+    parser.add_argument("--num-envs", type=int, default=512, help="environments in parallel")
     options = parser.parse_args()
     env = envs.get_environment(f"ballu_mjx/{options.task}-v0", run=options.run)
     ppo.train(

@@ -1,6 +1,6 @@
-"""Record the bundled data set on the virtual robot, bit for bit: `python experiments/bundled_recordings.py`.
+"""Record the bundled data set on the virtual robot again, bit for bit: `python experiments/bundled_recordings.py`.
 
-What is recorded stands in `ballu_mjx.ballu.virtual.dataset`.
+`ballu_mjx.ballu.virtual.dataset` defines the recordings.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from ballu_mjx.robots.model import assets
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=assets() / "recordings", help="folder to write to")
-    parser.add_argument("--robot", type=int, default=ROBOT_SEED, help="seed of the virtual robot (bundled: 0)")
+    parser.add_argument("--robot", type=int, default=ROBOT_SEED, help="seed of the virtual robot (0, the bundled one)")
     arguments = parser.parse_args()
     for path in record_dataset(arguments.robot, arguments.output):
         print(path)

@@ -1,9 +1,9 @@
 # %% [markdown]
-# # A table of runs that differ in their seed
+# # Tables of runs that differ only in their seed
 #
 # `python experiments/collect_runs.py runs/seed-0 runs/seed-1 runs/seed-2 --results results/main_job.json` reads the
 # evaluations of residual runs, and writes tables of errors by group and horizon. `python docs/render.py` then renders
-# them into README and docs. The runs are made before, each with another seed:
+# them into README and docs. Make the runs first, each with another seed:
 #
 # `python -m ballu_mjx.train envmimic --seed 1 --output runs/seed-1`
 
@@ -40,40 +40,46 @@ _FORMS = {"position": (".3f", "m"), "orientation": (".1f", "deg")}
 
 # %%
 def seed_of(config: dict[str, Any]) -> int:
-    """Return the seed that a run learned with."""
+    """Return the training seed of a run, given its configuration."""
     return int(next(config[name]["seed"] for name in ("ppo", "fit") if "seed" in config.get(name, {})))
 
 
 def read_runs(folders: Sequence[Path]) -> tuple[list[Evaluation], list[dict[str, Any]]]:
-    """Return evaluations and configurations.
+    """Return the evaluations and configurations of runs.
 
-    **Raises** `InputError` where runs differ in more than the seed, two have one seed, or one was made by --quick.
+    **Raises** `InputError` if the runs differ in more than the seed, if two have the same seed, or if one was made with
+    --quick.
     """
     if len(rows_of_runs(folders)) != 1:
-        raise InputError("The runs differ in more than their seed; `ballu_mjx compare` says in what.")
+        raise InputError("The runs differ in more than their seed; `ballu_mjx compare` shows the differences.")
     configs = [read_config(folder, *RESIDUAL_TASKS) for folder in folders]
     if len({seed_of(config) for config in configs}) < len(configs):
         raise InputError("Two of the runs have the same seed; give each seed once.")
     if any(config["data"]["quick"] for config in configs):
-        raise InputError("A run was made with --quick, and its numbers mean little; make it without.")
+        raise InputError("A run was made with --quick, and its numbers mean little; repeat it without this option.")
     return [read_evaluation(folder / "evaluation.json") for folder in folders], configs
 
 
 def provenance_of(config: dict[str, Any], commit: str | None) -> dict[str, Any]:
-    """Return commit, machine and versions of a run; runs from before these were recorded are taken for this machine's.
+    """Return commit, machine and package versions of a run.
 
-    **Raises** `InputError` where the run does not say its commit, and none is given.
+    Old runs do not record all of these. For them, `commit` and this machine are used.
+
+    **Raises** `InputError` if the run does not record its commit, and `commit` is None.
     """
     start = config["starts"][0]
     commit = start.get("commit") or commit
     if commit is None:
-        raise InputError("The runs do not say which commit they were made with; give it by --commit.")
+        raise InputError("The runs do not record their commit; give it by --commit.")
     machine = start.get("machine") or provenance.describe_machine()
     return {"commit": commit, "machine": machine, "versions": start["versions"]}
 
 
 def errors_table(runs: Sequence[Evaluation], horizons: Sequence[float] | None = None) -> Table:
-    """Return errors without and with the residual, and their ratio, by group and horizon (s; None: all)."""
+    """Return the table of errors without and with the residual, and of their ratio, by group and horizon (s).
+
+    `horizons` selects horizons; None selects all.
+    """
     first = runs[0]
     name = label_of(first.name)
     columns = ["group", "horizon (s)"]
@@ -106,9 +112,10 @@ def remaining_errors(
     columns: Sequence[tuple[str, str]],
     horizon: float,
 ) -> dict[str, list[Cell]]:
-    """Return vanilla's errors over a horizon (s), and what each simulator leaves of them, a value a seed.
+    """Return vanilla's errors over a horizon (s), and the ratio of each simulator's errors to these.
 
-    `columns` are groups and quantities; `simulators` holds all seeds' errors by label.
+    `columns` are pairs of group and quantity. `simulators` holds the errors of all seeds, by label. Cells have one
+    value for each seed.
     """
     whole = {column: group_mean(vanilla, *column, horizon) for column in columns}
     rows = {"vanilla": [Cell((whole[column],), *_FORMS[column[1]]) for column in columns]}
@@ -121,7 +128,7 @@ def remaining_errors(
 
 
 def recordings_table(runs: Sequence[Evaluation]) -> Table:
-    """Return errors over whole recordings."""
+    """Return the table of errors over whole recordings, without and with the residual."""
     first, name = runs[0], label_of(runs[0].name)
     heads = (f"CoM error, {first.base} (m)", f"final {first.angle} error, {first.base} (deg)")
     columns = ("recording", heads[0], f"{name} (m)", heads[1], f"{name} (deg)")
@@ -142,11 +149,11 @@ def recordings_table(runs: Sequence[Evaluation]) -> Table:
 
 # %%
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Tables of residual runs that differ in their seed alone.")
-    parser.add_argument("runs", type=Path, nargs="+", help="folders of the runs")
-    parser.add_argument("--results", type=Path, help="JSON file to write; without it the tables are only printed")
-    parser.add_argument("--commit", help="of the code that the runs were made with, where they do not say")
-    parser.add_argument("--data", default="Development data", help="what the recordings are, for the caption")
+    parser = argparse.ArgumentParser(description="Make tables of residual runs that differ only in their seed.")
+    parser.add_argument("runs", type=Path, nargs="+", help="run folders")
+    parser.add_argument("--results", type=Path, help="JSON file to write; without it, the tables are only printed")
+    parser.add_argument("--commit", help="commit of the code that made the runs, if they do not record it")
+    parser.add_argument("--data", default="Development data", help="name of the data, for the caption")
     options = parser.parse_args()
     runs, configs = read_runs(options.runs)
     tables = {

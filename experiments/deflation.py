@@ -1,14 +1,14 @@
 # %% [markdown]
 # # Deflation: balloons lose lift over weeks
 #
-# The paper names it as future work. The identified air holds the lift as one of its parameters: when the robot has lost
-# some, that one is estimated again from a single recording of 20 s, and all others stay as they were. The table gives
-# the error on sixteen recordings (the commands of the bundled test and of the larger test set), made with all of the
-# lift and, in the same draughts, with 5 % less: with the lift as it was, and with the new one. `--anew` adds the air
-# identified from nothing, from all training gaits of the robot that has lost lift.
+# The paper names deflation as future work. The lift is one of the identified parameters of the air. After a loss, it is
+# identified again from one recording of 20 s, and all other parameters are kept. The errors are measured on sixteen
+# recordings, with the commands of the bundled test recordings and of the larger test set. They are recorded with the
+# full lift and, in the same draughts, with 5 % less. The table compares the old lift with the new one. `--anew` adds an
+# identification of all parameters from all training gaits of the deflated robot.
 #
-# `python experiments/deflation.py` takes about five minutes on two cores beside the identification of the air, which is
-# done first where `--air` names no run of it; `--quick` shows that it works.
+# `python experiments/deflation.py` takes about five minutes on two cores. Without `--air`, it first identifies the air,
+# which takes longer. `--quick` is a short trial run.
 
 # %%
 from __future__ import annotations
@@ -46,21 +46,24 @@ from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.simulator import Simulator
 
 HORIZON = 5.0
-"""s."""
+"""Horizon of the errors (s)."""
 
 # %% [markdown]
-# ## Recordings: the same commands, with all of the lift and with less
+# ## Recordings of the same commands with full and with less lift
 
 
 # %%
 def recorded(job: dataset.Job, virtual: VirtualRobot, trial: int, folder: Path) -> Recording:
-    """Some commands on a robot, in a draught of their own; recorded into `folder`."""
+    """Record the commands of a job on a virtual robot into `folder`, and return the recording.
+
+    `trial` is the seed of the trial conditions, such as the draught.
+    """
     path = dataset.record_job(dataclasses.replace(job, trial=trial), virtual, folder)
-    return read_recording(path, load_robot())  # which fills the gaps of hidden markers
+    return read_recording(path, load_robot())  # reading fills the gaps of hidden markers
 
 
 def lift(buoyancy: float) -> float:
-    """Force (N) of balloons that carry this share of BALLU's weight."""
+    """Return the lift (N) of balloons that carry a fraction `buoyancy` of BALLU's weight."""
     model = load_model()
     return buoyancy * float(model.body_mass.sum() * np.linalg.norm(model.opt.gravity))
 
@@ -71,7 +74,7 @@ def lift(buoyancy: float) -> float:
 
 # %%
 def errors_table(results: Mapping[str, Evaluation]) -> Table:
-    """Return errors over 5 s, by group; cells have one value a recording."""
+    """Return the table of errors over 5 s, by group. Cells have one value for each recording."""
     groups = sorted(next(iter(results.values())).groups, reverse=True)  # near before far
     forms = {"position": ".3f", "orientation": ".1f"}
     columns = [f"{group}: {called}" for group in groups for called in ("position (m)", "yaw (deg)")]
@@ -91,13 +94,15 @@ def errors_table(results: Mapping[str, Evaluation]) -> Table:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Lost lift, found again from one recording.")
-    parser.add_argument("--air", type=Path, help="run of `train aerodynamic`; without it, one is made")
-    parser.add_argument("--loss", type=float, default=0.05, help="share of the lift that is lost")
-    parser.add_argument("--anew", action="store_true", help="also identify all of the air anew: ten minutes more")
+    parser = argparse.ArgumentParser(description="Identify a loss of lift from one recording.")
+    parser.add_argument("--air", type=Path, help="folder of a `train aerodynamic` run; without it, one is made")
+    parser.add_argument("--loss", type=float, default=0.05, help="fraction of the lift that is lost (0.05)")
+    parser.add_argument(
+        "--anew", action="store_true", help="also identify all parameters of the air again; ten more minutes"
+    )
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the larger test set")
     parser.add_argument("--output", type=Path, default=Path("runs/deflation"), help="folder of the run and the table")
-    parser.add_argument("--quick", action="store_true", help="one test gait; the numbers mean little")
+    parser.add_argument("--quick", action="store_true", help="use one test gait; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     options = parser.parse_args()
 

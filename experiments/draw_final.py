@@ -1,7 +1,7 @@
 """Draw the seeds of the final tier: `python experiments/draw_final.py --tag TAG`.
 
-The seeds follow from the hash of the tagged commit. Whoever writes that commit cannot choose them, and whoever checks
-the table can draw them again. See experiments/protocol.md.
+The seeds follow from the hash of the tagged commit. The author of the commit therefore cannot choose them, and anybody
+can draw them again to check the table. See experiments/protocol.md.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from ballu_mjx.common.errors import InputError
 
 FORMAT = "ballu-final/1"
 COUNTS: Mapping[str, int] = {"robots": 3, "robots_outside": 2, "recordings": 1, "trials": 1, "trainings": 5}
-"""How many seeds are drawn for what: robots of the virtual robot's family, robots outside of the white box's class,
-sets of recordings, sets of trials, trainings of each method."""
+"""Number of seeds by use: robots of the virtual robot's family, robots outside the class of the aerodynamic residual
+(white box), sets of recordings, sets of trials, and trainings of each method."""
 FIRST_SEED, SEEDS = 10_000, 2**31
-"""Drawn seeds are from the first to below the second: development used small ones and a year's number."""
+"""Range of the drawn seeds, without its end. It excludes the seeds of development, which are small or a year."""
 _ROOT = Path(__file__).parents[1]
 
 
 def draw_seeds(commit: str) -> dict[str, list[int]]:
-    """Return the seeds, by use, that follow from the full hash of a commit."""
+    """Return the seeds that follow from the full hash of a commit, by use."""
     return {use: [_seed(f"{commit} {use} {number}") for number in range(count)] for use, count in COUNTS.items()}
 
 
@@ -39,9 +39,9 @@ def _seed(text: str) -> int:
 
 
 def draw_final(tag: str, output: Path, repository: Path) -> dict[str, Any]:
-    """Draw the seeds for a tag of `repository`, write them to `output`, and return what was written.
+    """Draw the seeds for a tag of `repository`, write them to `output`, and return the content of the file.
 
-    **Raises** `InputError` where `output` is there, the tag is missing or is not checked out, or the working tree has
+    **Raises** `InputError` if `output` exists, if the tag is missing or is not checked out, or if the working tree has
     changes.
     """
     if output.exists():
@@ -69,7 +69,7 @@ def draw_final(tag: str, output: Path, repository: Path) -> dict[str, Any]:
 
 
 def _git(repository: Path, *arguments: str) -> str:
-    """Return what git says; nothing where it fails."""
+    """Return the output of a git command, or an empty string if it fails."""
     done = subprocess.run(["git", "-C", str(repository), *arguments], capture_output=True, text=True)
     return done.stdout.strip() if done.returncode == 0 else ""
 

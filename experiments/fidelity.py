@@ -1,18 +1,24 @@
 # %% [markdown]
-# # Fidelity: the README's tables and figure
+# # Fidelity of simulators: tables and tracking figure
 #
-# Section "Improved Simulation Fidelity" of the paper, open loop: recorded commands are replayed from recorded states in
-# several simulators, on recordings that training never saw: vanilla, vanilla with identified actuators (vanilla+sysid),
-# either with EnvMimic's forces, and the second with what else pushes (a force alone on the balloon; forces at balloon,
-# base and feet) and with what the other methods learn: regression on the forces that explain recordings (supervised;
-# with all of its forces, as in the paper, and with the share of them that helps), gradients through the simulator
-# (analytic), the air's parameters (aerodynamic; all, or all but the lift), and networks for what the air leaves
-# (aerodynamic+analytic, aerodynamic+EnvMimic). Rows that isolate have the command delay without air, and the air
-# without delay and centre. One training a method and seed; runs that are there already are not repeated. Beside gaits
-# and commands unlike any, the actions of a walking policy that was trained in vanilla are replayed, as in the paper.
+# This experiment belongs to the paper's section "Improved Simulation Fidelity". Recorded commands are replayed open
+# loop from recorded states, on recordings that training does not use. The simulators are:
 #
-# `python experiments/fidelity.py` takes hours on two cores, `--methods` names some of it; `--robot N` does the same on
-# another virtual robot, recorded and its actuators identified first; `--quick` shows that it works.
+# - vanilla, and vanilla with identified actuators (vanilla+sysid);
+# - both with EnvMimic's forces; the second also with other loads: a force alone on the balloon, or forces at balloon,
+#   base and feet;
+# - regression on the forces that explain the recordings (supervised): with full forces, as in the paper, and with the
+#   scale of the forces that helps most;
+# - forces by gradients through the simulation (analytic);
+# - the air's parameters (aerodynamic): all of them, or all but the lift;
+# - networks in addition to the air (aerodynamic+analytic, aerodynamic+EnvMimic);
+# - for comparison, the command delay without air, and the air without delay and centre.
+#
+# Each method is trained once for each seed. Finished runs are not repeated. Test recordings have gaits, other commands,
+# and, as in the paper, the actions of a walking policy that was trained in vanilla.
+#
+# `python experiments/fidelity.py` takes hours on two cores. `--methods` selects a part. `--robot N` uses another
+# virtual robot; it is recorded, and its actuators are identified, first. `--quick` is a short trial run.
 
 # %%
 from __future__ import annotations
@@ -55,29 +61,30 @@ from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.viz import plots
 
 # %% [markdown]
-# ## Train
+# ## Training
 
 
 # %%
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """One way to a simulator that is better than vanilla."""
+    """Method to improve a simulator."""
 
     label: str
     arguments: tuple[str, ...]
-    """Of `python -m ballu_mjx.train`."""
+    """Arguments of `python -m ballu_mjx.train`."""
     seeded: bool = True
+    """Whether the result depends on a seed."""
     nominal: bool = False
-    """On nominal actuators instead of identified ones."""
+    """Whether to use nominal actuators instead of identified ones."""
     beside: str | None = None
-    """Learns what another method leaves; None: what identified actuators leave."""
+    """Method whose residual acts beside the one to be learned. None if there is no other residual."""
 
 
 AIR = "aerodynamic"
 
 
 def _air_without(*names: str) -> tuple[str, ...]:
-    """Arguments of a training that identifies the air but for some of its parameters."""
+    """Return the arguments of a training that identifies all parameters of the air but the named ones."""
     return AIR, "--free", *(name for name in AIR_PARAMETERS if name not in names)
 
 
@@ -99,13 +106,17 @@ METHODS = {
     "delay-envmimic": Method("vanilla+sysid+delay+EnvMimic", ("envmimic",), beside="delay"),
     "air-alone": Method("aerodynamic, no delay or centre", _air_without("delay", "centre"), seeded=False),
 }
-"""The last three isolate the command delay and the balloons' centre, which the white box alone has: the delay,
-identified from the same recordings, for simulators without air, and the air without both."""
+"""Methods by key. The last three isolate the command delay and the balloons' centre, which only the aerodynamic
+residual has. The delay is identified from the same recordings, for simulators without air. `air-alone` is the air
+without both."""
 
 
 def train(folder: Path, *arguments: str, result: str = "evaluation.json") -> None:
-    """Run `python -m ballu_mjx.train` into `folder`, unless its result is there. Of what was interrupted, reinforcement
-    learning goes on from its last checkpoint; all else, which takes minutes, begins anew."""
+    """Run `python -m ballu_mjx.train` into `folder`, unless its result is already there.
+
+    An interrupted EnvMimic training is resumed from its last checkpoint. Other interrupted runs, which take minutes,
+    start again.
+    """
     if (folder / result).exists():
         return
     options = [*arguments, "--output", str(folder)]
@@ -117,20 +128,22 @@ def train(folder: Path, *arguments: str, result: str = "evaluation.json") -> Non
 
 
 def load(folder: Path) -> Evaluation:
-    """The evaluation of one run."""
+    """Return the evaluation of one run."""
     return read_evaluation(folder / "evaluation.json")
 
 
 def simulated(folder: Path) -> float:
-    """Control steps that a run simulated to learn, validations left out; a derivative along one direction counts as one
-    more."""
+    """Return the number of control steps that a run simulated for learning, without validations.
+
+    A derivative along one direction counts as one more step.
+    """
     counted = read_column(folder, "control_steps")[1]
     return float(counted[-1] if len(counted) else read_column(folder, "reward")[0][-1])
 
 
 @dataclasses.dataclass(frozen=True)
 class Recorded:
-    """A virtual robot's recordings, and its identified actuators."""
+    """Recordings of a virtual robot by use, and the file of its identified actuators."""
 
     training: list[Path]
     validation: list[Path]
@@ -139,7 +152,10 @@ class Recorded:
 
 
 def record(robot_seed: int, folder: Path) -> Recorded:
-    """The bundled recordings for robot 0; for another one they are made, and its actuators identified, in `folder`."""
+    """Return recordings and identified actuators of a virtual robot.
+
+    For robot 0, they are the bundled ones. For another robot, make them in `folder` unless they are already there.
+    """
     place = assets() / "recordings"
     if robot_seed != dataset.ROBOT_SEED:
         place = folder / "recordings"
@@ -153,7 +169,10 @@ def record(robot_seed: int, folder: Path) -> Recorded:
 
 
 def replayed_policy(options: Options) -> Path:
-    """The robot under the actions of a walking policy that was trained in vanilla, replayed open loop (paper)."""
+    """Return the recording of the robot under the actions of a walking policy that was trained in vanilla.
+
+    The actions are replayed open loop, as in the paper. Policy and recording are made unless they are already there.
+    """
     source, seconds = options.output / "walk-vanilla", dataset.SECONDS["test"]
     train(source, "walk", *(["--quick"] if options.quick else []), result="replay.npz")
     path = options.output / "policy" / "policy.csv.gz"
@@ -169,14 +188,14 @@ def replayed_policy(options: Options) -> Path:
 
 
 def simulator(kind: TrainedResidual, paths: list[Path], *, nominal: bool = False) -> OpenLoopEvaluator:
-    """Recordings, for the residuals of a kind on its own actuators, or on nominal ones."""
+    """Return an evaluator on recordings for a kind of residual, with its own actuators or with `nominal` ones."""
     plain = Simulator(load_robot(), None if nominal else kind.actuators)
     motions = [reconstruct(read_recording(path, load_robot()), load_robot(), plain.mj_model) for path in paths]
     return OpenLoopEvaluator(plain, motions, kind.model)
 
 
 def evaluate(folders: list[Path], paths: list[Path]) -> list[Evaluation]:
-    """Runs of the same configuration and actuators, on other recordings than their own."""
+    """Evaluate runs on other recordings than their own. The runs must have the same configuration and actuators."""
     robot = load_robot()
     policies = [TrainedResidual.load(folder, robot) for folder in folders]
     evaluator = simulator(policies[0], paths)
@@ -184,7 +203,7 @@ def evaluate(folders: list[Path], paths: list[Path]) -> list[Evaluation]:
 
 
 def vanilla_errors(folder: Path, paths: list[Path]) -> tuple[Errors, ...]:
-    """Of the nominal robot without residual. `folder` is any residual's run: none of it acts."""
+    """Return the errors of the nominal robot without residual. `folder` is the run of any residual, which is off."""
     kind = TrainedResidual.load(folder, load_robot())
     evaluator = simulator(kind, paths, nominal=True)
     return evaluator.errors(evaluator.replay(kind.params, scale=0.0))
@@ -196,23 +215,25 @@ def vanilla_errors(folder: Path, paths: list[Path]) -> tuple[Errors, ...]:
 
 # %%
 Rows = Mapping[str, list[tuple[Errors, ...]]]
-"""Of each simulator, by its label, what it is off by on a set of recordings, those of all seeds; vanilla first."""
+"""Errors on a set of recordings, by the label of a simulator and by seed. Vanilla comes first."""
 
 
 def rows_of(vanilla: tuple[Errors, ...], results: Mapping[str, list[Evaluation]]) -> Rows:
-    """`results`: of each method of `METHODS`, those of all seeds."""
+    """Return the rows of the tables, given vanilla's errors and the evaluations of all seeds by key in `METHODS`."""
     rows = {"vanilla": [vanilla], "vanilla+sysid": [results["identified"][0].vanilla]}
     return rows | {METHODS[name].label: [run.residual for run in found] for name, found in results.items()}
 
 
 def groups_of(rows: Rows) -> list[str]:
-    """Near before far."""
+    """Return the groups of the recordings in reverse alphabetical order, so that near comes before far."""
     return sorted({errors.group for errors in rows["vanilla"][0]}, reverse=True)
 
 
 def comparison(rows: Rows, effort: Mapping[str, Cell], horizon: float) -> Table:
-    """Return what simulators leave of vanilla's RMSE over `horizon` s, and `effort`, what learning took. In vanilla's
-    row stand its errors themselves."""
+    """Return the table of ratios of the simulators' RMSE to vanilla's over `horizon` (s).
+
+    The row of vanilla has its errors themselves. The last column is `effort`, the simulated control steps in thousands.
+    """
     columns = [(group, quantity) for group in groups_of(rows) for quantity in ("position", "orientation")]
     called = {"position": "position", "orientation": "yaw"}
     head = [called[q] if group == OTHER else f"{group}: {called[q]}" for group, q in columns]
@@ -223,7 +244,7 @@ def comparison(rows: Rows, effort: Mapping[str, Cell], horizon: float) -> Table:
 
 
 def final_yaw(rows: Rows) -> Table:
-    """Return the final yaw error (deg, absolute) after whole recordings: means over a group's."""
+    """Return the table of absolute final yaw errors (deg) after whole recordings, averaged over each group."""
     groups = groups_of(rows)
     made = []
     for row, found in rows.items():
@@ -236,16 +257,16 @@ def final_yaw(rows: Rows) -> Table:
 
 
 # %% [markdown]
-# ## Figure: whole recordings, mean and range over seeds
+# ## Figure of whole recordings, with mean and range over seeds
 
 
 # %%
 DRAWN = ("regression", "identified", "analytic", AIR)
-"""Methods that the figure shows, where they were run, beside vanilla with and without identified actuators."""
+"""Methods in the figure if they were run, in addition to vanilla with and without identified actuators."""
 
 
 def figure(folders: Mapping[str, list[Path]], paths: list[Path], path: Path) -> None:
-    """Replay recordings in every simulator, with every seed's forces."""
+    """Replay recordings in every simulator, with the residuals of all seeds, and draw the tracking."""
     robot = load_robot()
     found = {
         name: [TrainedResidual.load(folder, robot) for folder in folders[name]] for name in DRAWN if name in folders
@@ -278,13 +299,13 @@ def figure(folders: Mapping[str, list[Path]], paths: list[Path], path: Path) -> 
 
 
 # %% [markdown]
-# ## All of it
+# ## Run
 
 
 # %%
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What the command line says."""
+    """Options of the command line."""
 
     methods: list[str]
     seeds: list[int]
@@ -296,16 +317,16 @@ class Options:
 
 
 def parse() -> Options:
-    parser = argparse.ArgumentParser(description="Fidelity of simulators: the README's tables and figure.")
-    always = ("identified", AIR)  # the long tables are of these
+    parser = argparse.ArgumentParser(description="Measure the fidelity of simulators, with tables and a figure.")
+    always = ("identified", AIR)  # the long tables need these
     parser.add_argument(
         "--methods",
         nargs="*",
         choices=[name for name in METHODS if name not in always],
         default=[name for name in METHODS if name not in always],
-        help=f"beside {', '.join(always)}",
+        help=f"methods in addition to {', '.join(always)} (all)",
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="one training a seed")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds (0 1 2)")
     parser.add_argument("--robot", type=int, default=dataset.ROBOT_SEED, help="seed of the virtual robot")
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the larger test set")
     parser.add_argument("--output", type=Path, default=Path("runs/fidelity"), help="folder of the runs")
@@ -319,7 +340,7 @@ def parse() -> Options:
 
 
 def arguments_of(method: Method, recorded: Recorded, training: list[Path], quick: bool) -> list[str]:
-    """Of `python -m ballu_mjx.train`, to learn by a method from some of the recordings."""
+    """Return the arguments of `python -m ballu_mjx.train` for a method and training recordings."""
     arguments = [*method.arguments, *(["--quick"] if quick else [])]
     for use, paths in (("recordings", training), ("validation", recorded.validation), ("test", recorded.test)):
         arguments += [f"--{use}", *map(str, paths)]
@@ -327,11 +348,14 @@ def arguments_of(method: Method, recorded: Recorded, training: list[Path], quick
 
 
 def learn(options: Options, recorded: Recorded) -> dict[str, list[Path]]:
-    """All runs of all methods; first those beside which others learn."""
+    """Run all methods with all seeds, and return the run folders by method.
+
+    Methods whose residuals others need run first.
+    """
     folders = {}
     for name in sorted(options.methods, key=lambda name: METHODS[name].beside is not None):
         method = METHODS[name]
-        # A quick training would test on what it validates on: the tables need the test recordings.
+        # By default, a quick run tests on its validation recordings, but the tables need the test recordings.
         training = recorded.training[:2] if options.quick else recorded.training
         arguments = arguments_of(method, recorded, training, options.quick)
         arguments += [] if method.beside is None else ["--residual", str(options.output / method.beside)]

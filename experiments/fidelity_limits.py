@@ -1,14 +1,14 @@
 # %% [markdown]
-# # What no simulator could do better, and what each shortcut costs
+# # Lower limit of simulation errors, and cost of each simplification
 #
-# Every error of a simulator includes that of the state it starts from: motion capture shows that to half a millimetre,
-# reconstruction to a millimetre and a degree or so. Here the virtual robot itself is started from reconstructed states,
-# a second apart, under the commands and in the draught of the recording. What it is off by after 5 s no simulator can
-# do without. Then one thing at a time is as training simulators have it: the air stands still, physics steps are long,
-# joints have no friction. What the error rises by is what that is worth.
+# Every error of a simulator includes the error of its starting state. Motion capture measures positions to about half a
+# millimetre, and reconstruction gives states to about a millimetre and a degree. Here, the virtual robot itself starts
+# from reconstructed states, one second apart, with the commands and the draught of the recording. Its error over 5 s is
+# a lower limit for all simulators. Then one property at a time is changed to that of the training simulators: still
+# air, long physics steps, or no joint friction. The increase of the error is the cost of this simplification.
 #
-# `python experiments/fidelity_limits.py` takes six minutes on two cores, for the twelve recordings of the larger test
-# set of `fidelity.py`; `--quick` takes two.
+# `python experiments/fidelity_limits.py` takes six minutes on two cores for the twelve recordings of the larger test
+# set of `fidelity.py`. `--quick` uses two recordings.
 
 # %%
 from __future__ import annotations
@@ -44,29 +44,31 @@ from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.robots.registry import load_robot
 
 HORIZON = 5.0
-"""Seconds from each start."""
+"""Horizon of the errors (s), from each start."""
 
 
 # %% [markdown]
-# ## What is another in each row
+# ## Variants: one in each row
 
 
 # %%
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """The robot, or a simulator that differs from it by as much."""
+    """Simulator that differs from the virtual robot in some properties."""
 
     label: str
     robot: tuple[str, ...] = ()
-    """Fields of `VirtualRobot` that are 0, for both legs."""
+    """Fields of `VirtualRobot` that are set to 0, for both legs."""
     still: bool = False
-    """No draught."""
+    """Whether there is no draught."""
     timestep: float = 0.0
-    """s, with the integrator and solver of the training simulator; 0: the robot's own of both."""
+    """Physics time step (s), with the integrator and solver of the training simulator. 0 for the robot's own time step,
+    integrator and solver."""
     iterations: int = 0
-    """Of the solver and of its line search; 0: those of the training simulator."""
+    """Maximum number of iterations of the solver and of its line search, if `timestep` is set. 0 for those of the
+    training simulator."""
     fluid: bool = True
-    """Drag and lift of the balloons; their added mass stays."""
+    """Whether drag and lift act on the balloons. Their added mass always does."""
 
 
 FRICTION, PLAY = ("knee_friction", "motor_friction"), ("backlash",)
@@ -87,7 +89,7 @@ VARIANTS = (
 
 
 def simulator(virtual: VirtualRobot, variant: Variant) -> mujoco.MjModel:
-    """The model of a variant."""
+    """Return the MuJoCo model of a variant."""
     model = virtual_robot.build(virtual)
     if variant.timestep:
         training = load_model().opt
@@ -100,12 +102,12 @@ def simulator(virtual: VirtualRobot, variant: Variant) -> mujoco.MjModel:
 
 
 # %% [markdown]
-# ## Errors from every second of a recording on
+# ## Errors from starts in every second of a recording
 
 
 # %%
 def seen(model: mujoco.MjModel, qpos: Float[np.ndarray, "states nq"]) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (m) of the balloon and its yaw (rad)."""
+    """Return positions (m) and yaw angles (rad) of the balloon for generalized positions."""
     data, places, turns = mujoco.MjData(model), [], []
     for each in qpos:
         data.qpos[:] = each
@@ -116,7 +118,10 @@ def seen(model: mujoco.MjModel, qpos: Float[np.ndarray, "states nq"]) -> tuple[n
 
 
 def errors(virtual: VirtualRobot, job: dataset.Job) -> tuple[str, Float[np.ndarray, "variants 2"]]:
-    """Group of a recording; RMSE of position (m) and yaw (deg) over the horizon, mean over starts, by variant."""
+    """Record a job, and return the group of the recording and the errors of all variants on it.
+
+    Errors are the RMSE of position (m) and yaw (deg) over the horizon, averaged over starts.
+    """
     trial = virtual_robot.draw_trial(job.trial)
     with tempfile.TemporaryDirectory() as folder:
         recorded = deflation.recorded(job, virtual, job.trial, Path(folder))
@@ -147,8 +152,10 @@ def errors(virtual: VirtualRobot, job: dataset.Job) -> tuple[str, Float[np.ndarr
 
 # %%
 def table(found: Sequence[tuple[str, Float[np.ndarray, "variants 2"]]]) -> Table:
-    """Return errors by variant and group; cells have one value a recording. `found` is of each recording: see
-    `errors`."""
+    """Return the table of errors by variant and group, with one value for each recording.
+
+    `found` holds the results of `errors` for all recordings.
+    """
     groups = sorted({group for group, _ in found}, reverse=True)  # near before far
     columns = [f"{group}: {quantity}" for group in groups for quantity in ("position (mm)", "yaw (deg)")]
     rows = []
@@ -163,11 +170,13 @@ def table(found: Sequence[tuple[str, Float[np.ndarray, "variants 2"]]]) -> Table
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="What no simulator could do better, and what each shortcut costs.")
+    parser = argparse.ArgumentParser(
+        description="Measure the lower limit of simulation errors, and the cost of each simplification."
+    )
     parser.add_argument("--robot", type=int, default=dataset.ROBOT_SEED, help="seed of the virtual robot")
-    parser.add_argument("--fresh", type=int, default=2026, help="seed of the test set, that of fidelity.py")
+    parser.add_argument("--fresh", type=int, default=2026, help="seed of the test set, as in fidelity.py (2026)")
     parser.add_argument("--output", type=Path, default=Path("runs/fidelity-limits"), help="folder of the table")
-    parser.add_argument("--quick", action="store_true", help="two recordings; the numbers mean little")
+    parser.add_argument("--quick", action="store_true", help="use two recordings; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     options = parser.parse_args()
 

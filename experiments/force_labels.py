@@ -1,13 +1,14 @@
 # %% [markdown]
-# # Regression: are the forces right, and does it help?
+# # Accuracy of force labels and of the networks that learn them
 #
-# The paper's supervised baseline fits a network to the force that explains each recorded control step. Whether that
-# regression is a good one can be asked here, for the virtual robot can be recorded without noise: the same trials as
-# the validation recordings, with true states instead of motion capture's. The force that explains *these* is what the
-# network should have said.
+# The paper's supervised baseline fits a network to the force that explains each recorded control step. The virtual
+# robot shows how accurate these forces are, because its true states are known. The trials of the validation recordings
+# are repeated with true states instead of motion capture. The forces that explain the *true* states are the reference
+# for labels and networks.
 #
-# `python experiments/force_labels.py RUN [RUN ...]`, of `train supervised --force-scales 1` on the bundled recordings,
-# one run a seed, takes two minutes. The table is in docs/fidelity.md, beside what such networks do in open loop.
+# `python experiments/force_labels.py RUN [RUN ...]` takes two minutes. The runs are of
+# `train supervised --force-scales 1` on the bundled recordings, one for each seed. The table is in docs/fidelity.md,
+# beside the open-loop errors with these networks.
 
 # %%
 from __future__ import annotations
@@ -48,15 +49,15 @@ from ballu_mjx.sim.observation import HISTORY, commands_seen
 from ballu_mjx.sim.simulator import Simulator
 
 # %% [markdown]
-# ## The same trials, with true states
+# ## The same trials with true states
 
 # %%
 SEEN_WELL = {"position_noise": 2e-5, "angle_noise": 0.01, "held_angle_noise": 0.01}
-"""Of `SupervisedConfig`: there is no motion capture between the robot and its twin."""
+"""Options of `SupervisedConfig` for true states, which have no motion-capture noise."""
 
 
 def twin(job: dataset.Job) -> Motion:
-    """What the virtual robot really did, at the control rate."""
+    """Return the true motion of the virtual robot in the trial of a job, at the control rate."""
     steps = len(job.commands)
     qpos, qvel = virtual_robot.record_truth(
         virtual_robot.draw_robot(dataset.ROBOT_SEED),
@@ -70,12 +71,12 @@ def twin(job: dataset.Job) -> Motion:
 
 
 # %% [markdown]
-# ## Labels and networks against it
+# ## Errors of labels and networks
 
 
 # %%
 def forces(simulator: Simulator, residual: TrainedResidual, motion: Motion) -> Float[np.ndarray, "steps 3"]:
-    """What a network pushes with (N, world) along a motion, from the first state with a history on."""
+    """Return the forces (N, world frame) of a residual along a motion, from the first state with a full history on."""
     reference, _ = stack_motions(simulator, [motion])
 
     def at(time: jax.Array) -> jax.Array:
@@ -89,11 +90,15 @@ GROUPS = ("near", "far")
 
 
 def rms(values: np.ndarray) -> float:
+    """Return the root mean square of all values."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
 def cells(found: Sequence[Mapping[str, np.ndarray]], true: Mapping[str, np.ndarray]) -> list[Cell]:
-    """By group, all axes and then each: the error of forces over that of no force; one value for each of `found`."""
+    """Return the RMS errors of forces relative to the RMS of the true ones, by group: all axes together, then each.
+
+    Cells have one value for each element of `found`, which holds forces by motion.
+    """
 
     def off(forces: Mapping[str, np.ndarray], group: str, axes: slice) -> float:
         ours, exact = (
@@ -107,7 +112,7 @@ def cells(found: Sequence[Mapping[str, np.ndarray]], true: Mapping[str, np.ndarr
 
 
 def figure(shown: dict[str, np.ndarray], title: str, path: Path, seconds: float = 6.0) -> None:
-    """Forces along the three axes over time."""
+    """Draw forces along the three axes over time."""
     styles = {"true": ("black", 1.6), "label": ("#e69f00", 1.0), "network": ("#56b4e9", 1.6)}
     whole, axes = plt.subplots(3, 1, figsize=(8, 6.4), sharex=True, layout="constrained")
     count = round(seconds / CONTROL_TIMESTEP)
@@ -126,8 +131,8 @@ def figure(shown: dict[str, np.ndarray], title: str, path: Path, seconds: float 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Are the forces that regression finds the right ones?")
-    parser.add_argument("runs", type=Path, nargs="+", help="of train supervised, which differ in their seed")
+    parser = argparse.ArgumentParser(description="Measure the accuracy of force labels and of supervised networks.")
+    parser.add_argument("runs", type=Path, nargs="+", help="folders of `train supervised` runs with different seeds")
     parser.add_argument("--output", type=Path, default=Path("runs/force_labels"), help="folder of table and figure")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()

@@ -1,13 +1,13 @@
 # %% [markdown]
 # # How many recordings does a residual need?
 #
-# The paper's case for reinforcement learning is data: a few recordings are enough, where regression wants many. Here
-# each way to a residual learns from one, two, four and six of the bundled training recordings, of as many gaits, and
-# from all of them, on identified actuators, and predicts the bundled test recordings: of gaits between those (near) and
-# of commands unlike any gait (far).
+# The paper's argument for reinforcement learning is that it needs few recordings, whereas regression needs many. Here,
+# each method learns a residual from 1, 2, 4 and 6 bundled training recordings of as many gaits, and from all 14.
+# Actuators are identified. The errors are measured on the bundled test recordings: gaits with parameters between those
+# of training (near), and commands unlike any gait (far).
 #
-# `python experiments/recording_counts.py` takes hours on two cores; `--methods` and `--counts` name some of it. Runs
-# that are there already are not repeated. `--quick` shows that it works.
+# `python experiments/recording_counts.py` takes hours on two cores. `--methods` and `--counts` select a part. Finished
+# runs are not repeated. `--quick` is a short trial run.
 
 # %%
 from __future__ import annotations
@@ -32,21 +32,21 @@ from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.viz.style import colour_of, label_of
 
 METHODS = {"identified": "envmimic", "regression": "supervised", "analytic": "analytic", "aerodynamic": "aerodynamic"}
-"""Of `fidelity.METHODS`, and what they are called in figures."""
+"""Key in `fidelity.METHODS` to name of the simulator in figures."""
 GROUPS = ("near", "far")
 HORIZON = 5.0
-"""s."""
+"""Horizon of the errors (s)."""
 QUANTITIES = {"position": "balloon position", "orientation": "yaw"}
 
 # %% [markdown]
-# ## Learn
+# ## Training
 
 
 # %%
 def learn(arguments: argparse.Namespace) -> dict[str, dict[int, list[Path]]]:
-    """Run folders by method and number of recordings, one a seed."""
+    """Train all residuals, and return their run folders by method and number of recordings, one for each seed."""
     recorded = fidelity.record(dataset.ROBOT_SEED, arguments.output)
-    # Every gait once before any a second time.
+    # The first takes of all gaits come before any second take.
     ordered = sorted(recorded.training, key=lambda path: path.name.partition("take-")[2])
     folders: dict[str, dict[int, list[Path]]] = {}
     for name in arguments.methods:
@@ -61,17 +61,17 @@ def learn(arguments: argparse.Namespace) -> dict[str, dict[int, list[Path]]]:
 
 
 # %% [markdown]
-# ## What is left of the error of vanilla+sysid
+# ## Errors relative to vanilla+sysid
 
 
 # %%
 def left(folders: list[Path], group: str, quantity: str) -> Float[np.ndarray, " seeds"]:
-    """Ratios to the simulator without the residual."""
+    """Return the ratio of the error with the residual to the error without it, by seed."""
     return np.array([fidelity.load(folder).ratio(group, quantity, HORIZON) for folder in folders])
 
 
 def table(found: dict[str, dict[int, list[Path]]]) -> Table:
-    """Return mean and range over seeds."""
+    """Return the table of ratios by method and number of recordings, with one value for each seed."""
     columns = [(group, quantity) for group in GROUPS for quantity in QUANTITIES]
     rows = []
     for name, counts in found.items():
@@ -82,7 +82,7 @@ def table(found: dict[str, dict[int, list[Path]]]) -> Table:
 
 
 def figure(found: dict[str, dict[int, list[Path]]], path: Path) -> None:
-    """What is left against the number of recordings; lines are means over seeds, bands the range."""
+    """Draw the ratios over the number of recordings. Lines are means over seeds, and bands are ranges."""
     whole, axes = plt.subplots(len(QUANTITIES), len(GROUPS), figsize=(8, 6.4), sharex=True, layout="constrained")
     for row, (quantity, title) in zip(axes, QUANTITIES.items(), strict=True):
         for ax, group in zip(row, GROUPS, strict=True):
@@ -111,15 +111,17 @@ def figure(found: dict[str, dict[int, list[Path]]], path: Path) -> None:
 
 
 # %% [markdown]
-# ## All of it
+# ## Run
 
 
 # %%
 def main() -> None:
-    parser = argparse.ArgumentParser(description="What is left of the error, by the number of recordings learned from.")
-    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS), help="which (all)")
-    parser.add_argument("--counts", type=int, nargs="+", default=[1, 2, 4, 6, 14], help="recordings (1 2 4 6 14)")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="one training a seed (0 1 2)")
+    parser = argparse.ArgumentParser(description="Errors of residuals by their number of training recordings.")
+    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS), help="methods (all)")
+    parser.add_argument(
+        "--counts", type=int, nargs="+", default=[1, 2, 4, 6, 14], help="numbers of recordings (1 2 4 6 14)"
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds (0 1 2)")
     parser.add_argument("--output", type=Path, default=Path("runs/recording_counts"), help="folder of the runs")
     parser.add_argument("--quick", action="store_true", help="learn for seconds; the numbers mean nothing")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")

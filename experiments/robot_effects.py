@@ -1,13 +1,13 @@
 # %% [markdown]
-# # Which of the robot's effects cost a policy its way?
+# # Effect of each of the virtual robot's properties on a policy
 #
-# The virtual robot differs from the training simulators in several ways at once: air (drag, lift, added mass), a
-# balloon cluster off centre, actuators that differ left to right, latency, draughts. Here policies of a finished
-# `python -m ballu_mjx.train all` walk on robots that lack one of these effects at a time, and on robots that have that
-# one alone. What a setting gains where an effect is missing is what this effect costs it.
+# The virtual robot differs from the training simulators in several effects at once: air (drag, lift, added mass), a
+# balloon cluster off centre, actuators that differ between left and right, latency, and draughts. Here, policies of a
+# finished `python -m ballu_mjx.train all` walk on robots without one of these effects, and on robots with only one of
+# them. The gain without an effect measures the cost of this effect. All trials are in still air.
 #
-# `python experiments/robot_effects.py --output runs/all` takes a few minutes; stages that are missing are made first.
-# `--quick` shows that it works.
+# `python experiments/robot_effects.py --output runs/all` takes a few minutes. Missing stages are made first. `--quick`
+# is a short trial run.
 
 # %%
 from __future__ import annotations
@@ -40,20 +40,20 @@ from ballu_mjx.policies import pipeline_layout
 from ballu_mjx.policies.policy import Policy
 
 # %% [markdown]
-# ## The effects, each as what takes it away
+# ## Effects, as functions that remove them
 
 # %%
 NOMINAL = ActuatorParameters.nominal(load_model())
 
 
 def pair(values: object) -> tuple[float, float]:
-    """Left and right."""
+    """Return the left and the right value as floats."""
     left, right = np.asarray(values, float)
     return float(left), float(right)
 
 
 def without_actuators(full: VirtualRobot) -> VirtualRobot:
-    """Nominal springs, stops and servos, without friction, backlash or slack."""
+    """Return the robot with nominal springs, stops, servos and cable slack, and without friction and backlash."""
     return dataclasses.replace(
         full,
         knee_spring_stiffness=pair(NOMINAL.knee_spring_stiffness),
@@ -69,7 +69,7 @@ def without_actuators(full: VirtualRobot) -> VirtualRobot:
 
 
 def without_drag(full: VirtualRobot) -> VirtualRobot:
-    """No fluid forces but added mass: the ellipsoid that the air sees shrinks to nothing."""
+    """Return the robot without drag and lift. The ellipsoid for fluid forces shrinks to 1 mm; added mass stays."""
     return dataclasses.replace(full, balloon_semi_axes=(1e-3, 1e-3, 1e-3))
 
 
@@ -81,12 +81,12 @@ EFFECTS: dict[str, Callable[[VirtualRobot], VirtualRobot]] = {
     "latency": lambda full: dataclasses.replace(full, latency=0.0),
     "floor": lambda full: dataclasses.replace(full, foot_friction=(0.9, 0.9), buoyancy=0.84),
 }
-"""By what they are called: a robot, to the same robot without the effect. The floor's friction and the exact lift,
-which differ little, go together."""
+"""Functions by the name of an effect. Each takes a robot and returns it without this effect. The floor's friction and
+the exact lift are one effect, because both differ little from their nominal values."""
 
 
 def variants(full: VirtualRobot) -> dict[str, VirtualRobot]:
-    """The whole robot, each effect taken away, each effect alone, and none."""
+    """Return robots by name: with all effects, without each one, with each one alone, and without any."""
     none = full
     for remove in EFFECTS.values():
         none = remove(none)
@@ -106,7 +106,10 @@ def variants(full: VirtualRobot) -> dict[str, VirtualRobot]:
 
 # %%
 def measure(policy: Policy, robots: dict[str, VirtualRobot], count: int, folder: Path) -> dict[str, list[Transfer]]:
-    """Trials of a policy on every variant."""
+    """Run `count` trials of a policy on each of the `robots`, and return them by robot.
+
+    Recordings go to `folder`.
+    """
     loop = policy.closed_loop()
     draws = [virtual_robot.still(virtual_robot.draw_trial(5_000_000 + number)) for number in range(count)]
     results = {}
@@ -118,8 +121,10 @@ def measure(policy: Policy, robots: dict[str, VirtualRobot], count: int, folder:
 
 
 def table(results: dict[str, dict[str, list[Transfer]]], distance: str) -> Table:
-    """Return errors between robot and simulation and how far the robot came along `distance`, by setting; cells have
-    one value a trial."""
+    """Return the table of CoM errors between robot and simulation, and of the robot's distance, by robot and setting.
+
+    `distance` is its axis, x or y. Cells have one value for each trial.
+    """
     columns = [
         f"{setting}: {called} (m)" for setting in results for called in ("mean CoM error", f"{distance}-distance")
     ]
@@ -135,25 +140,27 @@ def table(results: dict[str, dict[str, list[Transfer]]], distance: str) -> Table
 
 
 # %% [markdown]
-# ## All of it
+# ## Run
 
 
 # %%
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Which of the virtual robot's effects cost a policy its way.")
+    parser = argparse.ArgumentParser(
+        description="Measure policies on virtual robots without each of their effects, and with each of them alone."
+    )
     parser.add_argument(
         "--output",
         type=Path,
         help=f"folder of `train all` ({transfer_tables.OUTPUT}, or {transfer_tables.QUICK_OUTPUT} under --quick)",
     )
-    parser.add_argument("--robot-seed", type=int, default=0, help="the robot that `train all` ran on")
-    parser.add_argument("--seed", type=int, default=0, help="whose policies")
+    parser.add_argument("--robot-seed", type=int, default=0, help="seed of the virtual robot in `train all` (0)")
+    parser.add_argument("--seed", type=int, default=0, help="training seed of the policies (0)")
     parser.add_argument("--task", default="walk", choices=("walk", "turn"))
     parser.add_argument(
         "--settings", nargs="+", default=list(pipeline_layout.SETTINGS), choices=pipeline_layout.SETTINGS
     )
-    parser.add_argument("--trials", type=int, default=3, help="trials of each policy on each robot")
-    parser.add_argument("--quick", action="store_true", help="train for seconds, try once; the numbers mean nothing")
+    parser.add_argument("--trials", type=int, default=3, help="trials of each policy on each robot (3)")
+    parser.add_argument("--quick", action="store_true", help="train for seconds, one trial; the numbers mean nothing")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()
     quick = arguments.quick

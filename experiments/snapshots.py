@@ -1,16 +1,17 @@
 # %% [markdown]
-# # Snapshots of the robot: without and with residual physics
+# # Snapshots of the robot under policies without and with residual physics
 #
-# Section "Improved Sim-to-real Transfer" of the paper, its last two figures: photographs of one trial of a policy on
-# the robot, walking forward (at 0, 5, 11, 16 and 24 s) and turning left (at 0, 4, 10, 18 and 22 s). The policy in the
-# top row was trained with identified actuators and domain randomization, that in the bottom row with EnvMimic's forces
-# besides. In the paper the first turns away and the second walks twice as far.
+# This experiment repeats the last two figures of the paper's section "Improved Sim-to-real Transfer". They are
+# photographs of one trial of a policy on the robot, walking forward (at 0, 5, 11, 16 and 24 s) and turning left (at 0,
+# 4, 10, 18 and 22 s). The policy in the top row was trained with identified actuators and domain randomization. The
+# policy in the bottom row was also trained with EnvMimic's forces. In the paper, the first policy turns away, and the
+# second walks twice as far.
 #
-# Here the virtual robot's recordings take the camera's place: each is reconstructed into states of the model, and the
-# model is drawn from one fixed place, so that all pictures of a task have the same scale.
+# Here, recordings of the virtual robot replace the photographs. Each recording is reconstructed into states of the
+# model, and the model is drawn from a fixed viewpoint, so that all pictures of a task have the same scale.
 #
 # `python experiments/snapshots.py` needs the trials of `python -m ballu_mjx.train all` (or of
-# `experiments/transfer_tables.py`, which runs it); drawing takes a minute.
+# `experiments/transfer_tables.py`, which runs it). Drawing takes a minute.
 
 # %%
 from __future__ import annotations
@@ -45,58 +46,61 @@ from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.viz.style import colour_of, label_of
 
 TIMES = {"walk": (0.0, 5.0, 11.0, 16.0, 24.0), "turn": (0.0, 4.0, 10.0, 18.0, 22.0)}
-"""When the paper's pictures were taken (s)."""
+"""Times of the paper's pictures (s), by task."""
 SETTINGS = ("vanilla+sysid+dr", "envmimic")
 """Rows, from top to bottom."""
 COLOURS = {"left": "#1f77b4", "right": "#d64d1f", "frame": "#26262b", "balloon": "#b9bdc6"}
-"""Legs as in the model."""
+"""Colours by part. The legs have the colours of the model."""
 VIEW = {"walk": (14.0, -72.0), "turn": (14.0, -38.0)}
-"""Where the camera stands: elevation and azimuth (deg). Walking goes to the right, turning to the back."""
+"""Elevation and azimuth of the camera (deg), by task. Walking goes to the right, turning to the back."""
 
 WIDTH, HEIGHT = 4.0, 3.6
 """Largest size of a picture (inches)."""
 TOP = 1.5
-"""Height (m) that the balloons do not reach."""
+"""Height (m) that the balloons do not exceed."""
 
 # %% [markdown]
-# ## One trial, as states
+# ## States of one trial
 #
-# Inverse kinematics on the recorded markers gives the model's pose at every control step. The path is the centre of
-# mass's; the yaw is the balloons', without jumps.
+# Inverse kinematics on the recorded markers gives the model's pose at every control step. The path is that of the
+# centre of mass. The yaw is that of the balloons, unwrapped.
 
 
 # %%
 @dataclasses.dataclass(frozen=True)
 class Shown:
-    """A trial on the robot."""
+    """Trial on the robot, reconstructed."""
 
     setting: str
     qpos: Float[np.ndarray, "states nq"]
     com: Float[np.ndarray, "states 3"]
-    """m, world."""
+    """Position of the centre of mass (m, world frame)."""
     yaw: Float[np.ndarray, " states"]
-    """rad, world."""
+    """Yaw of the balloons (rad, world frame), unwrapped."""
 
     def state(self, time: float) -> int:
-        """The state nearest to `time` (s), which may be after the last by the samples that a recording's end loses."""
+        """Return the index of the state nearest to `time` (s).
+
+        `time` may be a little later than the last state, because a recording loses its last samples.
+        """
         return min(round(time / CONTROL_TIMESTEP), len(self.qpos) - 1)
 
 
 def read_trial(run: Path, task: str, setting: str, seed: int, trial: int, until: float) -> Shown:
-    """A trial in the folder `run` of `train all`.
+    """Read and reconstruct a trial in the folder `run` of `train all`.
 
-    **Raises** `InputError` where it is not there, or ends before `until` (s).
+    **Raises** `InputError` if it does not exist, or ends before `until` (s).
     """
     path = run / f"seed-{seed}" / f"trials-{task}-{setting}" / f"trial-{trial}.csv.gz"
     if not path.exists():
         raise InputError(
             f"{path}: there is no such trial; make it with `python -m ballu_mjx.train all --output {run} --tasks "
-            f"{task} --seeds {seed}`, or name one that is there by --run, --tasks, --settings, --seed and --trial."
+            f"{task} --seeds {seed}`, or select another trial by --run, --tasks, --settings, --seed and --trial."
         )
     model = load_model()
     motion = reconstruct(read_recording(path, load_robot()), load_robot(), model)
     if motion.time[-1] < until - 0.5:
-        raise InputError(f"{path}: ends at {motion.time[-1]:.1f} s, before {until:g} s; name earlier --times.")
+        raise InputError(f"{path}: ends at {motion.time[-1]:.1f} s, before {until:g} s; give earlier --times.")
     data = mujoco.MjData(model)
     com, yaw = [], []
     for state in motion.qpos:
@@ -107,19 +111,19 @@ def read_trial(run: Path, task: str, setting: str, seed: int, trial: int, until:
 
 
 def place(model: mujoco.MjModel, data: mujoco.MjData, qpos: Float[np.ndarray, " nq"]) -> None:
-    """Bring `data` to `qpos`, as far as drawing needs it."""
+    """Set `data` to the generalized positions `qpos`, and compute what drawing needs."""
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
 
 
 # %% [markdown]
-# ## The drawing: sticks for legs, the model's own ellipsoids for balloons
+# ## Drawing, with sticks for the legs and the model's ellipsoids for the balloons
 
 
 # %%
 def draw_robot(axis: Axes3D, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """The robot in `data`; a shadow of the balloons on the floor tells where it stands."""
+    """Draw the robot in the state of `data`, and a shadow of the balloons on the floor, which shows its position."""
     for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_ELLIPSOID):
         surface = ellipsoid(data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom])
         axis.plot_surface(
@@ -140,23 +144,24 @@ def draw_robot(axis: Axes3D, model: mujoco.MjModel, data: mujoco.MjData) -> None
 
 
 def stick(axis: Axes3D, points: Sequence[Float[np.ndarray, " 3"]], colour: str, width: float) -> None:
-    """A line through `points`, with round joints."""
+    """Draw a line through `points`, with round ends."""
     axis.plot(*np.array(points).T, color=colour, linewidth=width, solid_capstyle="round", zorder=5)
 
 
 def ellipsoid(
     centre: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"], radii: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, "3 n m"]:
-    """Points of its surface on a grid of longitude and latitude."""
+    """Return points (m) on the surface of an ellipsoid, on a grid of longitude and latitude."""
     longitude, latitude = np.meshgrid(np.linspace(0, 2 * np.pi, 23), np.linspace(0, np.pi, 15))
     sphere = [np.cos(longitude) * np.sin(latitude), np.sin(longitude) * np.sin(latitude), np.cos(latitude)]
     return centre[:, None, None] + np.einsum("ij,jnm->inm", rotation * radii, np.array(sphere))
 
 
 def draw(trials: Sequence[Shown], times: Sequence[float], view: tuple[float, float], path: Path) -> None:
-    """A row a trial, a column a time; the way so far in the setting's colour, the whole of it in grey.
+    """Draw a figure with a row for each trial and a column for each time.
 
-    Titles: x, y and yaw since the start, as in the paper's tables.
+    The path up to this time has the setting's colour, and the whole path is grey. Titles give x, y and yaw relative to
+    the start, as in the paper's tables.
     """
     model = load_model()
     data = mujoco.MjData(model)
@@ -202,7 +207,10 @@ def extent(
     view: tuple[float, float],
     points: Float[np.ndarray, "n 3"],
 ) -> tuple[float, float, float, float]:
-    """Left, right, bottom and top of `points` on the stage from `low` to `high`, in sides of the (square) axes."""
+    """Return left, right, bottom and top of `points` in the picture of the stage from `low` to `high`.
+
+    The unit is the side of the square axes.
+    """
     figure = Figure(figsize=(1.0, 1.0))
     axis = figure.add_axes((0.0, 0.0, 1.0, 1.0), projection="3d")
     assert isinstance(axis, Axes3D)
@@ -214,7 +222,7 @@ def extent(
 
 
 def limits(trials: Sequence[Shown], times: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a box on the floor that holds every way and all of the robot beside it (m)."""
+    """Return two corners (m) of a box on the floor that contains all paths, with a margin for the robot."""
     ways = np.concatenate([trial.com[: trial.state(max(times)) + 1, :2] for trial in trials])
     margin = 0.35  # half a robot's width
     low, high = np.floor(10 * (ways.min(axis=0) - margin)) / 10, np.ceil(10 * (ways.max(axis=0) + margin)) / 10
@@ -222,14 +230,14 @@ def limits(trials: Sequence[Shown], times: Sequence[float]) -> tuple[np.ndarray,
 
 
 def stage(axis: Axes3D, low: Float[np.ndarray, " 3"], high: Float[np.ndarray, " 3"], view: tuple[float, float]) -> None:
-    """The floor with a grid of half a metre, seen from `view`; one scale along all axes."""
+    """Draw the floor with a grid of 0.5 m, seen from `view` (deg), with the same scale along all axes."""
     axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    # Small enough that nothing is cut off at the axes' edges. (Pyright takes zoom for the int that its default is.)
+    # The zoom is so small that nothing is cut off at the edges. (Pyright infers int for zoom from its default.)
     axis.set_box_aspect(tuple(high - low), zoom=0.85)  # pyright: ignore[reportArgumentType]
     axis.view_init(*view)
     axis.set_proj_type("persp", focal_length=1.0)
     axis.set_axis_off()
-    axis.patch.set_visible(False)  # it would hide the neighbour
+    axis.patch.set_visible(False)  # it would hide neighbouring pictures
     axis.computed_zorder = False
     corners = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]], [low[0], low[1]]])
     axis.plot(*corners.T, 0.0, color="grey", linewidth=0.8, zorder=0)
@@ -243,32 +251,34 @@ def stage(axis: Axes3D, low: Float[np.ndarray, " 3"], high: Float[np.ndarray, " 
 
 
 # %% [markdown]
-# ## All of it
+# ## Run
 
 
 # %%
 def parse() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description="The paper's snapshots, from a finished folder of `train all`.")
+    parser = argparse.ArgumentParser(description="Draw the paper's snapshots, from a finished folder of `train all`.")
     parser.add_argument("--run", type=Path, default=Path("runs/all"), help="folder of `train all` (runs/all)")
-    parser.add_argument("--tasks", nargs="+", choices=list(TIMES), default=list(TIMES), help="a figure each (both)")
+    parser.add_argument(
+        "--tasks", nargs="+", choices=list(TIMES), default=list(TIMES), help="tasks, with a figure for each (both)"
+    )
     parser.add_argument(
         "--settings",
         nargs="+",
         choices=pipeline_layout.SETTINGS,
         default=list(SETTINGS),
-        help="a row each (the paper's two)",
+        help="training simulators, with a row for each (the paper's two)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="which training (0)")
-    parser.add_argument("--trial", type=int, default=1, help="which trial of it (1, the first)")
-    parser.add_argument("--times", type=float, nargs="+", help="s, a column each (the paper's)")
-    parser.add_argument("--output", type=Path, help="folder for snapshots_TASK.png (that of --run)")
+    parser.add_argument("--seed", type=int, default=0, help="training seed (0)")
+    parser.add_argument("--trial", type=int, default=1, help="number of the trial, from 1 (1)")
+    parser.add_argument("--times", type=float, nargs="+", help="times (s), with a column for each (the paper's)")
+    parser.add_argument("--output", type=Path, help="folder for snapshots_TASK.png (the folder of --run)")
     return parser.parse_args()
 
 
 def main() -> None:
     options = parse()
     if options.times and min(options.times) < 0:
-        raise InputError(f"--times has {min(options.times):g}: give seconds from the start, 0 or more.")
+        raise InputError(f"--times contains {min(options.times):g}; give seconds from the start, 0 or more.")
     folder = options.output or options.run
     for task in options.tasks:
         times = options.times or TIMES[task]

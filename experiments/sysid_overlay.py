@@ -1,12 +1,12 @@
 # %% [markdown]
-# # What identified actuators change
+# # Effect of identified actuators on the simulation
 #
-# Section "Actuator System Identification" of the paper, its check: the same periodic bang-bang commands with and
-# without identification. The paper found the final centres of mass 0.23 m apart, and joint angles 10.15 deg apart on
-# average. Here for the bundled robot's `actuators.json`, over several gaits; and both robots at the end of one, side by
-# side.
+# This experiment repeats a check in the paper's section "Actuator System Identification". The same periodic bang-bang
+# commands are simulated with nominal and with identified actuators. In the paper, the final centres of mass are 0.23 m
+# apart, and joint angles differ by 10.15 deg on average. Here, the identified actuators are the bundled
+# `actuators.json`, and several gaits are simulated. A figure shows both robots at the end of one gait.
 #
-# `python experiments/sysid_overlay.py` takes seconds: C MuJoCo suffices.
+# `python experiments/sysid_overlay.py` takes seconds, because it needs only C MuJoCo.
 
 # %%
 from __future__ import annotations
@@ -34,18 +34,22 @@ from ballu_mjx.robots.model import assets
 from ballu_mjx.viz.style import colour_of, label_of
 
 PERIODS = (0.8, 1.0, 1.2, 1.4, 1.6)
-"""Seconds; the legs half a period apart, each at full command for 0.4 of it."""
+"""Periods of the commands (s). The legs are half a period apart, each at full command for 0.4 of the period."""
 SECONDS = 10.0
+"""Length of a simulation (s)."""
 
 # %% [markdown]
-# ## The same commands in both simulators
+# ## Simulation of the same commands in both simulators
 
 
 # %%
 def simulate(
     model: mujoco.MjModel, period: float
 ) -> tuple[Float[np.ndarray, "steps 3"], Float[np.ndarray, "steps nq"]]:
-    """Centre of mass (m, world) and generalized positions every physics step, after two seconds of standing."""
+    """Simulate 2 s of standing, then the commands; return centre of mass (m, world frame) and generalized positions.
+
+    They are given at every physics step after the standing.
+    """
     data = mujoco.MjData(model)
     data.qpos[:] = standing_qpos(model)
     mujoco.mj_step(model, data, round(2.0 / model.opt.timestep))
@@ -60,7 +64,7 @@ def simulate(
 
 
 def compare(models: dict[str, mujoco.MjModel]) -> str:
-    """Differences between the two simulators, by period and on average."""
+    """Return lines with the differences between the two simulators, by period and on average."""
     lines = ["period (s)  final CoM (m)  knees and motors (deg)"]
     rows = []
     for period in PERIODS:
@@ -77,12 +81,14 @@ def compare(models: dict[str, mujoco.MjModel]) -> str:
 
 
 # %% [markdown]
-# ## Both robots in one picture, from the side: a stick drawing needs no renderer
+# ## Figure of both robots from the side
+#
+# A stick drawing needs no renderer.
 
 
 # %%
 def draw(models: dict[str, mujoco.MjModel], period: float, path: Path) -> None:
-    """The paths of the centres of mass seen from above, and both robots at the end, seen from the side."""
+    """Draw both robots at the end, seen from the side, and the paths of the centres of mass, seen from above."""
     figure = Figure(figsize=(10.0, 5.0), layout="constrained")
     side, above = figure.subplots(1, 2, width_ratios=[1, 2])
     for name, model in models.items():
@@ -110,15 +116,17 @@ def draw(models: dict[str, mujoco.MjModel], period: float, path: Path) -> None:
 
 
 # %% [markdown]
-# ## All of it
+# ## Run
 
 
 # %%
 def main() -> None:
-    parser = argparse.ArgumentParser(description="The same commands with nominal and with identified actuators.")
+    parser = argparse.ArgumentParser(description="Simulate the same commands with nominal and identified actuators.")
     bundled = assets() / "recordings" / ACTUATORS_FILE
-    parser.add_argument("--actuators", type=Path, default=bundled, help="identified actuators (the bundled robot's)")
-    parser.add_argument("--output", type=Path, default=Path("sysid_overlay.png"), help="picture to write")
+    parser.add_argument(
+        "--actuators", type=Path, default=bundled, help="file of identified actuators (the bundled one)"
+    )
+    parser.add_argument("--output", type=Path, default=Path("sysid_overlay.png"), help="figure to write")
     options = parser.parse_args()
     _, identified = read_actuators(options.actuators)
     models = {"vanilla": load_model(), "vanilla+sysid": load_model(identified)}

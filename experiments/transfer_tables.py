@@ -1,27 +1,27 @@
 # %% [markdown]
-# # Tables I and II: from simulation to the robot
+# # Tables I and II: transfer of policies from simulation to the robot
 #
-# Section "Improved Sim-to-real Transfer" of the paper. A policy is trained in four simulators: with identified
-# actuators (vanilla+sysid), with domain randomization (vanilla+DR), with both (vanilla+sysid+DR), and with EnvMimic's
-# forces besides both; and, beyond the paper, in a fifth with the identified air besides both (aerodynamic). Each then
-# runs on the robot.
+# This experiment belongs to the paper's section "Improved Sim-to-real Transfer". Policies are trained in four
+# simulators: with identified actuators (vanilla+sysid), with domain randomization (vanilla+DR), with both
+# (vanilla+sysid+DR), and with both and EnvMimic's forces (envmimic). Beyond the paper, a fifth simulator has both and
+# the identified air (aerodynamic). Each policy then runs on the robot.
 #
-# `--task walk` is Table I. The reward is the velocity along x, a trial takes 24 s. The table gives the mean distance
-# between the centres of mass of simulation and robot, and how far the robot came, along x and in all.
+# `--task walk` makes Table I. The reward is the velocity along x, and a trial takes 24 s. The table has the mean
+# distance between the centres of mass in simulation and on the robot, and the robot's distance along x and in total.
 #
-# `--task turn` is Table II. The reward is the velocity along y, to the left of the robot, which starts looking along x:
-# it must turn and walk. A trial takes 22 s. The table gives the difference in final yaw between simulation and robot,
-# and how far the robot came along y and how far it turned.
+# `--task turn` makes Table II. The reward is the velocity along y, to the left of the robot, which starts with its
+# heading along x. It must therefore turn and walk. A trial takes 22 s. The table has the difference in final yaw
+# between simulation and robot, and the robot's distance along y and change of yaw.
 #
-# The paper's robot is real, its numbers are one policy's each, and its yaw errors are signed. Here a virtual robot
-# stands in for it, every policy is trained with several seeds and tried five times, each time in another draught;
-# numbers are means (of the yaw error: of its absolute value, for errors to either side cancel) with the 95 % confidence
-# interval over seeds (Student's t), beside the paper's.
+# In the paper, the robot is real, each number is from one policy, and yaw errors are signed. Here, the robot is
+# virtual. Every policy is trained with several seeds and has five trials, each in another draught. Numbers are means
+# with 95 % confidence intervals over seeds (Student's t), beside the paper's numbers. Yaw errors are means of absolute
+# values, because signed errors cancel.
 #
-# `python experiments/transfer_tables.py --task walk` makes the stages of `python -m ballu_mjx.train all` that it needs;
-# those that are there are found again. This takes hours on two cores. Stages made with other options than the defaults
-# of `train all` are set aside and made again: for such a folder, `--figure-only` draws the figure and runs nothing.
-# `--quick` shows that it works.
+# `python experiments/transfer_tables.py --task walk` makes the stages of `python -m ballu_mjx.train all` that it needs,
+# unless they exist already. This takes hours on two cores. Stages that were made with other options than the defaults
+# of `train all` are renamed and made again. For a folder with other options, use `--figure-only`, which draws the
+# figure and runs nothing. `--quick` is a short trial run.
 
 # %%
 from __future__ import annotations
@@ -54,28 +54,30 @@ from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.viz.style import colour_of, label_of
 
 OUTPUT, QUICK_OUTPUT = Path("runs/all"), Path("runs/all-quick")
-"""Folders of the stages. Two, so that trying `--quick` sets no training of hours aside."""
+"""Folders of the stages. `--quick` has its own folder, so that it does not replace trainings of hours."""
 _SEED_STYLES = ("-", "--", ":", "-.")
 _SMALLEST_EXTENT = 0.4
-"""Least width and height (m) of a panel."""
+"""Smallest width and height (m) of a panel."""
 
 FIGURES = {"walk": "table_walking.png", "turn": "table_turning.png"}
-"""File of the figure, by the task."""
+"""File of the figure, by task."""
 
 Way = Float[np.ndarray, "samples 2"]
+"""Horizontal path of the base (m), from its start."""
 
 # %% [markdown]
-# ## The figure: all ways from above
-# What the table's means are taken over. A perfect policy that walks goes straight to the right, one that turns ends as
-# far up as it can. The lines are the recorded base's; the table is about the centre of mass, up in the balloons, some
-# centimetres off.
+# ## Figure: paths of all trials, seen from above
+#
+# The figure shows the trials of which the table has the means. A perfect walking policy goes straight to the right. A
+# perfect turning policy ends as far up as possible. The lines are paths of the recorded base. The table is about the
+# centre of mass, which is up in the balloons, some centimetres away.
 
 
 # %%
 def finished_trials(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[Path]]:
-    """Return the folders of trials, `[setting][seed]`, of settings that all seeds have.
+    """Return the folders of finished trials, `[setting][seed]`, for settings that all seeds have.
 
-    **Raises** `InputError` where `folder` holds no such trials.
+    **Raises** `InputError` if there is no such setting in `folder`.
     """
     found = {}
     for setting in (*pipeline_layout.SETTINGS, *pipeline_layout.settings_beyond(folder / f"seed-{seeds[0]}", task)):
@@ -85,14 +87,14 @@ def finished_trials(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, 
     if not found:
         numbers = " ".join(map(str, seeds))
         raise InputError(
-            f"{folder}: no setting has finished trials of {task!r} for all of the seeds {numbers}; make them with "
+            f"{folder}: no setting has finished trials of {task!r} for all seeds {numbers}; make them with "
             f"`python -m ballu_mjx.train all --output {folder} --tasks {task} --seeds {numbers}`."
         )
     return found
 
 
 def read_ways(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[list[Way]]]:
-    """Read the base's way from above (m), `[setting][seed][trial]`, from its start."""
+    """Read the horizontal paths of the base (m), `[setting][seed][trial]`, from their starts."""
     return {
         setting: [[_way(path) for path in sorted(trial.glob("trial-*.csv.gz"))] for trial in trials]
         for setting, trials in finished_trials(folder, task, seeds).items()
@@ -100,7 +102,7 @@ def read_ways(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[l
 
 
 def read_trials(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list[list[Transfer]]]:
-    """Read what the trials came to, `[setting][seed][trial]`."""
+    """Read the figures of the trials, `[setting][seed][trial]`."""
     return {
         setting: [read_transfer(trial / "transfer.json") for trial in trials]
         for setting, trials in finished_trials(folder, task, seeds).items()
@@ -108,7 +110,7 @@ def read_trials(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, list
 
 
 def _finished(trials: Path) -> bool:
-    """Whether `trials` is a stage that came to its end."""
+    """Return whether `trials` is the folder of a finished stage."""
     mark = trials.with_name(trials.name + ".stage.json")
     return mark.is_file() and bool(json.loads(mark.read_text())["done"])
 
@@ -116,12 +118,15 @@ def _finished(trials: Path) -> bool:
 def _way(path: Path) -> Way:
     base = base_position(read_recording(path, load_robot()))
     if base is None:  # only in suspended recordings
-        raise InputError(f"{path}: has no base position; it is no recording of a trial, take it out of the folder.")
+        raise InputError(f"{path}: has no base position, so that it is no recording of a trial; remove it.")
     return base[:, :2] - base[0, :2]
 
 
 def draw(ways: dict[str, list[list[Way]]], seeds: Sequence[int], path: Path) -> None:
-    """Draw one panel a setting, all to one scale: a line a trial, a dash pattern a seed, a dot where the robot ends."""
+    """Draw one panel for each setting, all to one scale.
+
+    Each trial is a line with a dot at its end. Seeds have different dash patterns.
+    """
     low, high = _limits(np.concatenate([way for runs in ways.values() for trials in runs for way in trials]))
     width, height = high - low
     columns = len(ways)
@@ -146,7 +151,7 @@ def draw(ways: dict[str, list[list[Way]]], seeds: Sequence[int], path: Path) -> 
         axis.set(title=label_of(setting), xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axis.set_aspect("equal")
         axis.grid(alpha=0.3)
-    for axis in axes.flat[len(ways) - columns : len(ways)]:  # the lowest of each column
+    for axis in axes.flat[len(ways) - columns : len(ways)]:  # the lowest panel of each column
         axis.set_xlabel("x (m)")
         axis.tick_params(labelbottom=True)
     for axis in axes[:, 0]:
@@ -160,7 +165,10 @@ def draw(ways: dict[str, list[list[Way]]], seeds: Sequence[int], path: Path) -> 
 
 
 def _limits(points: Way) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
-    """Corners of what is shown: all points and a margin, no narrower or flatter than is good to look at."""
+    """Return two corners (m) of the shown area: all points with a margin.
+
+    Its sides are `_SMALLEST_EXTENT` or more, and the shorter one is at least 0.4 of the longer one.
+    """
     low, high = points.min(axis=0), points.max(axis=0)
     size = np.maximum(1.1 * (high - low), _SMALLEST_EXTENT)
     size = np.maximum(size, 0.4 * size.max())
@@ -169,23 +177,24 @@ def _limits(points: Way) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2
 
 
 # %% [markdown]
-# ## Table and figure
-# Training, trials and table are the package's: `ballu_mjx.cli.pipeline` holds the stages,
-# `ballu_mjx.evaluation.transfer` the figures of a trial.
+# ## Run
+#
+# The package does the training, the trials and the table: `ballu_mjx.cli.pipeline` has the stages, and
+# `ballu_mjx.evaluation.transfer` computes the figures of a trial.
 
 
 # %%
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description="Tables I and II of the paper: tasks on the robot, by the simulator that the policy was trained in."
+        description="Make Tables I and II of the paper: transfer of policies to the robot, by training simulator."
     )
     parser.add_argument("--task", choices=list(FIGURES), required=True, help="walk: Table I; turn (left): Table II")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="trainings of every policy (0 1 2)")
-    parser.add_argument("--robot-seed", type=int, default=0, help="which virtual robot stands in for the hardware (0)")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds (0 1 2)")
+    parser.add_argument("--robot-seed", type=int, default=0, help="seed of the virtual robot (0)")
     parser.add_argument(
         "--output", type=Path, help=f"folder of `train all`'s stages ({OUTPUT}, or {QUICK_OUTPUT} under --quick)"
     )
-    parser.add_argument("--rounds", type=int, default=1, help="how often EnvMimic learns; see `train all --help` (1)")
+    parser.add_argument("--rounds", type=int, default=1, help="rounds of EnvMimic; see `train all --help` (1)")
     parser.add_argument(
         "--also",
         nargs="+",
@@ -194,7 +203,7 @@ def main() -> None:
         help="further simulators; see `train all --help` (none)",
     )
     parser.add_argument("--quick", action="store_true", help="train for seconds; the numbers mean nothing")
-    parser.add_argument("--figure-only", action="store_true", help="draw from the trials that are there; run nothing")
+    parser.add_argument("--figure-only", action="store_true", help="draw finished trials; run nothing")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     given = parser.parse_args()
     output = given.output or (QUICK_OUTPUT if given.quick else OUTPUT)

@@ -1,1 +1,1 @@
-"""BALLU: what only this robot has."""
+"""Code for BALLU alone: its model, legs, actuators, gaits, recordings and the virtual robot."""

@@ -1,6 +1,6 @@
-"""BALLU's actuators: servo, cable and knee, as numbers that identification changes and as fields of the model.
+"""BALLU's actuators: parameters of servo, cable and knee, and the model fields that they set.
 
-SI units and radians; arrays with a pair of entries are ordered (left, right).
+Units are SI units and radians. Arrays with a pair of entries are ordered (left, right).
 """
 
 from __future__ import annotations
@@ -17,37 +17,39 @@ from ballu_mjx.ballu.model import knee_ids, leg_sides
 from ballu_mjx.sim.drivetrain import DrivetrainParameters, identity_drivetrain
 
 CABLE_SLACK = 1e-4
-"""The nominal robot's slack of the cable (m) with the motor at 0 and the knee at its stop."""
+"""Slack (m) of the nominal robot's cables with the motor at 0 and the knee at its stop."""
 SERVO_RANGE = np.pi / 2
-"""Motor angle (rad) that a command of 1 asks for."""
+"""Motor angle (rad) that a command of 1 requests from a nominal servo."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ActuatorParameters:
-    """What differs from one servo, cable and knee to the next, each as (left, right), or for one leg alone: the first
-    four are the paper's eight free parameters (section "System Identification").
+    """Parameters of servos, cables and knees that differ between robots, as (left, right) or for one leg alone.
 
-    What each moves in the model:
+    The first four are the paper's eight free parameters of two legs (section "System Identification"). The paper does
+    not fit the next two. Each parameter sets fields of the model:
 
-    - `knee_spring_stiffness` (N m/rad): `jnt_stiffness` of the knees; the spring's zero, -45 deg, stays.
-    - `motor_gain` (N m/rad): the servo's position gain, in `actuator_gainprm` and `actuator_biasprm`.
-    - `default_motor_angle` (rad): the motor angle that command 0 asks for, `actuator_biasprm[:, 0]`.
-    - `default_knee_angle` (rad): the knee's stop, `jnt_range[:, 0]`; the cable's rest length follows it.
-    - `torque_limit` (N m): where the servo saturates, `actuator_forcerange`. Not among the paper's eight, by which a
-      servo weaker than nominal can be told only by a spring stiffer than the robot's.
-    - `cable_slack` (m): what is left of the cable's rest length, `tendon_lengthspring[:, 1]`, with the motor at 0 and
-      the knee at its stop. Not among the paper's eight either: without it, a cable that bends the knee late passes for
-      one that stretches, under torques up to three times the robot's.
+    - `knee_spring_stiffness` (N m/rad): stiffness of the knee springs. Field: `jnt_stiffness`.
+    - `motor_gain` (N m/rad): position gain of the servos. Fields: `actuator_gainprm`, `actuator_biasprm`.
+    - `default_motor_angle` (rad): motor angle requested by command 0. Field: `actuator_biasprm[:, 0]`.
+    - `default_knee_angle` (rad): angle of the knees' stops. Field: `jnt_range[:, 0]`. The cables' rest length depends
+      on it.
+    - `torque_limit` (N m): torque at which the servos saturate. Field: `actuator_forcerange`. If it is not
+      fitted, only a spring that is too stiff can explain a servo that is weaker than nominal.
+    - `cable_slack` (m): rest length of the cables, less the distance between their ends with the motor at 0 and the
+      knee at its stop. Field: `tendon_lengthspring[:, 1]`. If it is not fitted, a cable that bends the knee late is
+      identified as one that stretches, with torques of up to three times the robot's.
 
-    Beyond these, None leaves what the model has:
+    The following may be None. The nominal robot's value is then used:
 
-    - `motor_travel` (1): share of 90 deg that a command of 1 asks for, in `actuator_gainprm`.
-    - `cable_stiffness` (N/m): `tendon_stiffness`.
-    - `knee_spring_reference` (rad): the knee's angle at which its spring would be at rest, `qpos_spring`.
-    - `knee_damping` (N m s/rad): `dof_damping`; `knee_friction`, `motor_friction` (N m): `dof_frictionloss`.
-    - `delay` (s), `lag` (s) and `backlash` (rad, of the motor's target) are the commands' drivetrain, which no model
-      has and simulators add: `drivetrain()`.
+    - `motor_travel` (1): fraction of 90 deg that a command of 1 requests. Field: `actuator_gainprm`.
+    - `cable_stiffness` (N/m): stiffness of the cables. Field: `tendon_stiffness`.
+    - `knee_spring_reference` (rad): knee angle at which the spring is at rest; nominally -45 deg. Field: `qpos_spring`.
+    - `knee_damping` (N m s/rad): viscous damping of the knees. Field: `dof_damping`.
+    - `knee_friction`, `motor_friction` (N m): dry friction of the joints. Field: `dof_frictionloss`.
+    - `delay` (s), `lag` (s) and `backlash` (rad of motor angle): drivetrain between commands and servos. The model has
+      no drivetrain, so simulators take it from `drivetrain()`.
     """
 
     knee_spring_stiffness: Float[Array, " sides"]
@@ -67,11 +69,11 @@ class ActuatorParameters:
     backlash: Float[Array, " sides"] | None = None
 
     def fields(self, model: mujoco.MjModel) -> dict[str, Array]:
-        """Return `actuator_fields` of `model` for these parameters."""
+        """Return the fields of `model` that carry these parameters; see `actuator_fields`."""
         return actuator_fields(model, self)
 
     def drivetrain(self) -> DrivetrainParameters:
-        """Return the drivetrain of all commands; the identity's where nothing else is known."""
+        """Return the drivetrain of all commands. Parameters that are None have the values of `identity_drivetrain`."""
         found = identity_drivetrain(len(self.motor_gain))
         known = {name: getattr(self, name) for name in ("delay", "lag") if getattr(self, name) is not None}
         if self.backlash is not None:
@@ -80,7 +82,7 @@ class ActuatorParameters:
 
     @staticmethod
     def nominal(model: mujoco.MjModel) -> ActuatorParameters:
-        """The values that stand in `model`."""
+        """Return the parameters of `model`."""
         knees, servos = knee_ids(model), _servo_ids(model)
         gain = -model.actuator_biasprm[servos, 1]
         taut = cable_length(model, model.jnt_range[knees, 0], np.zeros(len(knees)))
@@ -101,10 +103,10 @@ class ActuatorParameters:
 def cable_length(
     model: mujoco.MjModel, knee: Float[Array | np.ndarray, " sides"], motor: Float[Array | np.ndarray, " sides"]
 ) -> Float[Array, " sides"]:
-    """Distance (m) between the cable's ends at the given knee and motor angles (rad).
+    """Return the distance (m) between the cable's ends at the given knee and motor angles (rad).
 
-    The same planar geometry as the model's spatial tendon, written out because the rest length must be known, and
-    differentiable, before any state is.
+    The geometry is that of the model's spatial tendon. It is written out here because the rest length must be known,
+    and be differentiable, before any state is computed.
     """
     knee, motor = jnp.asarray(knee), jnp.asarray(motor)
     lengths = []
@@ -121,7 +123,7 @@ def cable_length(
 
 
 def actuator_fields(model: mujoco.MjModel, parameters: ActuatorParameters) -> dict[str, Array]:
-    """Model fields that carry `parameters`, by name; for `mjx.Model.replace` or, as NumPy, for an `MjModel`."""
+    """Return model fields that carry `parameters`, by name, for `mjx.Model.replace` or `robots.model.set_fields`."""
     knees, servos = knee_ids(model), _servo_ids(model)
     gain = parameters.motor_gain
     reach = gain * SERVO_RANGE * _travel(parameters)
@@ -157,6 +159,7 @@ def actuator_fields(model: mujoco.MjModel, parameters: ActuatorParameters) -> di
 
 
 def _travel(parameters: ActuatorParameters) -> Float[Array, " sides"]:
+    """Return `motor_travel`, or the nominal 1 if it is None."""
     gain = parameters.motor_gain
     return jnp.ones_like(gain) if parameters.motor_travel is None else parameters.motor_travel
 

@@ -1,9 +1,16 @@
-"""Files of identified actuators, format `ballu-actuators/2`: what `train sysid` writes and `--actuators` reads.
+"""Files of identified actuators in the format `ballu-actuators/2`, which `train sysid` writes and `--actuators` reads.
 
-JSON with the keys `format`; `robot`, the name that its recordings carry; `parameters`, fields of
-`actuators.ActuatorParameters` as [left, right] in SI units and radians; and optionally `standard_errors` alike,
-`source` (the recordings) and whatever else the user wants to keep there. `cable_slack` and the fields that may be None
-may be missing: the nominal robot's. Files of `ballu-actuators/1` have no more than the first six fields.
+A file is a JSON object with these keys:
+
+- `format`: the name of the format.
+- `robot`: the name of the robot in its recordings.
+- `parameters`: fields of `actuators.ActuatorParameters` as [left, right], in SI units and radians. `cable_slack` and
+  the fields that may be None may be missing. The nominal robot's values are then used.
+- `standard_errors` (optional): standard errors in the same form.
+- `source` (optional): the recordings.
+- Further keys are ignored, so users may add their own.
+
+Files of `ballu-actuators/1` have at most the first six fields.
 """
 
 from __future__ import annotations
@@ -31,25 +38,25 @@ _POSITIVE = ("knee_spring_stiffness", "motor_gain", "torque_limit", "motor_trave
 _NOT_NEGATIVE = ("knee_damping", "knee_friction", "motor_friction", "delay", "lag", "backlash")
 _LARGEST_ANGLE = math.pi
 _LARGEST_SLACK = 0.05
-"""m: more than a motor arm of 16 mm can take up."""
+"""Largest cable slack (m), more than a motor arm of 16 mm can take up."""
 _SMALLEST, _LARGEST = 1e-9, 1e3
-"""Springs, gains and torques beyond this are no robot's of 0.3 kg."""
+"""Bounds (SI units) of springs, gains and torques. No robot of 0.3 kg has values outside them."""
 _LARGEST_STIFFNESS = 1e6
-"""N/m, of a cable."""
+"""Largest cable stiffness (N/m)."""
 _LONGEST_DELAY = 1.0
-"""s"""
+"""Longest delay or lag (s)."""
 
 
 def write_actuators(path: Path, robot: str, parameters: ActuatorParameters, more: Mapping[str, Any]) -> None:
-    """Write `parameters` of the robot named `robot`, with `more` keys beside them."""
+    """Write a file with the `parameters` of the robot named `robot`, and with the further keys of `more`."""
     content = {"format": ACTUATORS_FORMAT, "robot": robot, "parameters": actuators_to_json(parameters), **more}
     files.write(path, json.dumps(content, indent=2) + "\n")
 
 
 def read_actuators(path: Path) -> tuple[str, ActuatorParameters]:
-    """The robot's name and its parameters.
+    """Return the robot's name and its parameters from a file.
 
-    **Raises** `InputError` naming file, key and mend.
+    **Raises** `InputError` that names the file, the key and the fix.
     """
     if not path.exists():
         raise InputError(f"{path}: there is no such file; `python -m ballu_mjx.train sysid` writes one.")
@@ -57,22 +64,22 @@ def read_actuators(path: Path) -> tuple[str, ActuatorParameters]:
     if content.get("format") not in _READ:
         raise InputError(f'{path}: "format" is not "{ACTUATORS_FORMAT}"; give a file that `train sysid` wrote.')
     if not isinstance(content.get("robot"), str) or not content["robot"].strip():
-        raise InputError(f'{path}: "robot" must be the name that the robot\'s recordings carry.')
+        raise InputError(f'{path}: "robot" must be the name of the robot in its recordings.')
     if not isinstance(content.get("parameters"), dict):
         raise InputError(f'{path}: "parameters" is missing; give a file that `train sysid` wrote.')
     return content["robot"], actuators_from_json(content["parameters"], path)
 
 
 def actuators_to_json(parameters: ActuatorParameters) -> dict[str, list[float]]:
-    """Pairs [left, right] by name."""
+    """Return pairs [left, right] by name, without the parameters that are None."""
     known = {name: getattr(parameters, name) for name in _FIELDS}
     return {name: [float(f"{x:.6g}") for x in np.asarray(v)] for name, v in known.items() if v is not None}
 
 
 def actuators_from_json(values: Mapping[str, Any], path: Path) -> ActuatorParameters:
-    """The inverse of `as_json`.
+    """Return the inverse of `actuators_to_json`.
 
-    **Raises** `InputError` naming `path`, the parameter and the mend.
+    **Raises** `InputError` that names `path`, the parameter and the fix.
     """
     pairs = {}
     for name in _FIELDS:
@@ -96,5 +103,5 @@ def actuators_from_json(values: Mapping[str, Any], path: Path) -> ActuatorParame
     unknown = set(values) - set(_FIELDS)
     if unknown:
         name = reprlib.repr(sorted(unknown)[0])
-        raise InputError(f"{path}: there is no parameter {name}; there are {', '.join(_FIELDS)}.")
+        raise InputError(f"{path}: there is no parameter {name}; the parameters are {', '.join(_FIELDS)}.")
     return ActuatorParameters(**pairs)

@@ -1,4 +1,4 @@
-"""BALLU as a plug-in: what its description's `adapter` names."""
+"""BALLU's adapter, which the key `adapter` of its description names."""
 
 from __future__ import annotations
 
@@ -35,10 +35,16 @@ _ANGLES = ("motor_left", "motor_right", "knee_left", "knee_right")
 
 
 class Ballu(RobotAdapter, RecordingHooks):
-    """A robot with BALLU's legs: hips, knees with springs, and servos on the feet that bend the knees by cables."""
+    """Adapter of robots with BALLU's legs.
+
+    Each leg has a hip, a knee with a spring, and a servo near the foot that bends the knee by a cable.
+    """
 
     def check(self, robot: RobotDescription, model: mujoco.MjModel) -> str | None:
-        """Return which name of BALLU's the model or the description lacks, or that a slack cable transmits forces."""
+        """Return what is wrong with the model or the description, or None if nothing is.
+
+        Names must be BALLU's, and cables must have no damping, because it would act while they are slack.
+        """
         kinds = mujoco.mjtObj
         needed = [(kinds.mjOBJ_BODY, name) for name in ("base", "balloon")]
         needed += [(kinds.mjOBJ_BODY, f"{part}_{side}") for part in ("femur", "tibia", "arm") for side in SIDES]
@@ -56,13 +62,16 @@ class Ballu(RobotAdapter, RecordingHooks):
         return None
 
     def initial_qpos(self, robot: RobotDescription, model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:
-        """Return the standing pose: knees at their stops, feet on the floor."""
+        """Return the standing pose, with the knees at their stops and the feet on the floor."""
         del robot
         return standing_qpos(model)
 
     def residual_scales(self) -> ResidualScales:
-        """Return the sizes that the ablation chose (docs/envmimic.md). The forces that close the gap are hundredths of
-        a newton: with 1 N a unit, PPO's first steps throw the robot over. Limit: the paper's."""
+        """Return the scales that the ablation chose (docs/envmimic.md). The force limit is the paper's.
+
+        The forces that correct the simulator are hundredths of a newton. With a unit of 1 N, the robot falls over in
+        PPO's first steps.
+        """
         return ResidualScales(
             force_scale=0.05,
             torque_scale=0.005,
@@ -74,46 +83,47 @@ class Ballu(RobotAdapter, RecordingHooks):
         )
 
     def full_travel(self, robot: RobotDescription) -> float:
-        """Return 0.2 s: the servo takes 0.14 s for 60 deg without load, 0.21 s for 90."""
+        """Return 0.2 s, because the servo takes 0.14 s for 60 deg and 0.21 s for 90 deg without load."""
         del robot
         return 0.2
 
     def deployment_notes(self, robot: RobotDescription) -> DeploymentNotes:
-        """Return what markers and commands are on BALLU, and what to measure."""
+        """Return the places of the markers, the meaning of the commands, and what to measure before the first run."""
         del robot
         return DeploymentNotes(
             markers={
-                "balloon": "the balloon cluster's centre of mass, 0.38 m above the neck's hinge, on the robot's middle",
+                "balloon": "the balloon cluster's centre of mass, 0.38 m above the neck's hinge, in the robot's middle",
                 "base": "the middle of the hip axis",
                 "foot_left": "the centre of the left foot's sphere",
                 "foot_right": "the centre of the right foot's sphere",
             },
             commands=(
-                "0 is the servo relaxed (knee at its stop, cable just taut), 1 is 90 deg. The servo's own no-load "
-                "speed is 60 deg in 0.14 s (90 deg in 0.21 s), so a faster command would ask for what it cannot do."
+                "0 relaxes the servo (knee at its stop, cable just taut), 1 turns it by 90 deg. Without load, the "
+                "servo turns by 60 deg in 0.14 s (90 deg in 0.21 s), so it cannot follow a faster command."
             ),
             measure=(
-                "Pulse widths at command 0 (cable just taut, knee at its stop) and at 90 deg, of each servo; whether "
-                "one runs the other way round. Give them by --pulse-low and --pulse-high, or in send for each servo.",
-                "z of the feet standing (the foot sphere's radius, not 0), which foot is left, heights of base and "
-                "balloon.",
+                "The pulse widths of each servo at command 0 (cable just taut, knee at its stop) and at 90 deg, and "
+                "whether a servo turns in the opposite direction. Give the pulse widths by --pulse-low and "
+                "--pulse-high, or for each servo in send.",
+                "z of the feet while standing (the radius of the foot's sphere, not 0), which foot is left, and the "
+                "heights of base and balloon.",
             ),
         )
 
     def rollout_counts(self, features: Float[np.ndarray, "runs states features"]) -> Mapping[str, list[int]]:
-        """Return the steps of each run."""
+        """Return the number of steps in each run."""
         return {"steps": [int(count_steps(feet)[-1]) for feet in foot_positions(features)]}
 
     def draw_rollout(
         self, folder: Path, qpos: Float[np.ndarray, "states nq"], command: Float[np.ndarray, "steps commands"]
     ) -> None:
-        """Draw the gait into `gait.png`."""
-        from ballu_mjx.ballu import plots  # brings Matplotlib and the identification
+        """Draw the gait in a file `gait.png` in `folder`."""
+        from ballu_mjx.ballu import plots  # imports Matplotlib and the identification
 
         plots.gait(folder / "gait.png", qpos, command)
 
     def nominal_actuators(self, model: mujoco.MjModel) -> ActuatorParameters:
-        """Return the parameters that stand in `model`."""
+        """Return the actuator parameters of `model`."""
         return ActuatorParameters.nominal(model)
 
     def identify_actuators(
@@ -124,36 +134,39 @@ class Ballu(RobotAdapter, RecordingHooks):
         levels: int | None = None,
         progress: IdentificationProgress | None = None,
     ) -> IdentifiedActuators:
-        """Return what `identified_legs.identify_from_sweep` returns."""
+        """Return both legs' actuators, identified from a sweep; see `identified_legs.identify_from_sweep`."""
         del robot
         from ballu_mjx.ballu.identified_legs import identify_from_sweep  # Optimistix: slow to import
 
         return identify_from_sweep(recordings, config, levels, progress)
 
     def check_sweep(self, robot: RobotDescription, recordings: Mapping[Path, Any], levels: int | None = None) -> None:
-        """Check that the recordings are a sweep of both legs; see `sweep.read_sweep`."""
+        """Check that the recordings are a sweep of both legs; see `sweep.read_sweep`.
+
+        **Raises** `InputError` if they are not.
+        """
         del robot
         read_sweep(recordings, levels=LEVELS if levels is None else levels)
 
     def read_actuators(self, robot: RobotDescription, path: Path) -> tuple[str, ModelParameters]:
-        """Return what `actuators_file.read_actuators` returns."""
+        """Return the robot's name and its parameters from a file; see `actuators_file.read_actuators`."""
         del robot
         return actuators_file.read_actuators(path)
 
     def write_actuators(self, path: Path, found: IdentifiedActuators, more: Mapping[str, Any]) -> None:
-        """Write what `actuators_file.write_actuators` writes."""
+        """Write a file with the parameters, their details and the keys of `more`; see `actuators_file`."""
         assert isinstance(found.parameters, ActuatorParameters)
         actuators_file.write_actuators(path, found.robot, found.parameters, {**found.details, **more})
 
     def actuators_to_json(self, parameters: ModelParameters) -> dict[str, Any]:
-        """Return pairs [left, right] by name."""
+        """Return the parameters by name, as pairs [left, right]."""
         assert isinstance(parameters, ActuatorParameters)
         return actuators_file.actuators_to_json(parameters)
 
     def actuators_from_json(self, robot: RobotDescription, values: Mapping[str, Any], path: Path) -> ModelParameters:
         """Return the inverse of `actuators_to_json`.
 
-        **Raises** `InputError` naming file, parameter and fix.
+        **Raises** `InputError` that names the file, the parameter and the fix.
         """
         del robot
         return actuators_file.actuators_from_json(values, path)
@@ -161,19 +174,19 @@ class Ballu(RobotAdapter, RecordingHooks):
     # ---- recordings ----
 
     def check_recording(self, path: Path, recording: Recording) -> None:
-        """Check what `recordings.check_recording` does.
+        """Check BALLU's requirements on a recording; see `recordings.check_recording`.
 
-        **Raises** `InputError` naming file, column, row and fix.
+        **Raises** `InputError` that names the file, the column, the row and the fix.
         """
         recordings.check_recording(path, recording)
 
     @property
     def completed_joints(self) -> tuple[str, ...]:
-        """Return the motors, whose servos follow from the commands."""
+        """Return the motor joints, whose angles are simulated from the commands."""
         return tuple(f"motor_{side}" for side in SIDES)
 
     def complete_positions(self, fit: KinematicFit) -> KinematicFit:
-        """Return what `reconstruct.complete_positions` returns."""
+        """Return the fit with the base's pitch completed; see `reconstruct.complete_positions`."""
         return reconstruct.complete_positions(fit)
 
     def complete_joints(
@@ -183,21 +196,24 @@ class Ballu(RobotAdapter, RecordingHooks):
         qpos: Float[np.ndarray, "T nq"],
         qvel: Float[np.ndarray, "T nv"],
     ) -> tuple[Float[np.ndarray, "T nq"], Float[np.ndarray, "T nv"]]:
-        """Return what `reconstruct.complete_joints` returns."""
+        """Return the states with knees and motors completed; see `reconstruct.complete_joints`."""
         return reconstruct.complete_joints(model, grid, qpos, qvel)
 
     @property
     def origin(self) -> str:
-        """Return the base, which imported recordings start above the origin with."""
+        """Return the site that is above the origin at the start of an imported recording: the base."""
         return "base"
 
     @property
     def floors(self) -> Mapping[str, Mapping[str, float]]:
-        """Return the feet's radius (m): the floor is where the lowest foot stands."""
+        """Return the heights (m) of the feet's centres above the floor when they touch it.
+
+        The lowest foot then defines the floor.
+        """
         return {"feet": {f"foot_{side}": recordings.FOOT_RADIUS for side in SIDES}}
 
     def response(
         self, recording: Recording, time: Float[np.ndarray, " N"], command: Float[np.ndarray, "N 2"]
     ) -> tuple[Float[np.ndarray, "T 2"], Float[np.ndarray, " n"], Float[np.ndarray, "n 2"]] | None:
-        """Return how far each leg is bent, and would be by `leg_alignment.nominal_response`."""
+        """Return how far each leg is bent, as measured and for the nominal robot; see `leg_alignment.response`."""
         return leg_alignment.response(recording, time, command)

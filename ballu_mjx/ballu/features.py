@@ -1,4 +1,4 @@
-"""Parts of BALLU's observation by name."""
+"""Access to parts of BALLU's observation features."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from jaxtyping import Float
 
 
 def foot_positions(features: Float[np.ndarray, "*states 27"]) -> Float[np.ndarray, "*states 2 3"]:
-    """Positions (m, world) of BALLU's left and right foot in `features`."""
+    """Return the positions (m, world frame) of the left and the right foot from observation features."""
     return np.stack([features[..., 15:18], features[..., 21:24]], axis=-2)

@@ -1,4 +1,4 @@
-"""Hand-designed command sequences: gaits, and what is none."""
+"""Hand-designed command sequences: gaits, and sequences that are unlike any gait."""
 
 from __future__ import annotations
 
@@ -13,19 +13,25 @@ from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 
 @dataclasses.dataclass(frozen=True)
 class Gait:
-    """Bang-bang commands: each leg is at `high` for a fraction `duty` of every period, else at 0."""
+    """Bang-bang commands of a gait: `high` for a fraction `duty` of every period, and 0 otherwise."""
 
     period: float
-    """s."""
+    """Period (s)."""
     phase: float
-    """Right leg behind the left, in periods."""
+    """Phase by which the right leg is ahead of the left, as a fraction of the period."""
     duty: tuple[float, float]
+    """Fraction of the period with a high command (left, right)."""
     high: tuple[float, float]
+    """High command (left, right)."""
 
     def commands(self, seconds: float) -> Float[np.ndarray, "steps 2"]:
+        """Return commands (left, right) of `seconds` (s), with one row for each control step."""
         time = np.arange(round(seconds / CONTROL_TIMESTEP)) * CONTROL_TIMESTEP
         phases = time[:, None] / self.period + np.array([0.0, self.phase])
         return np.where(phases % 1.0 < np.array(self.duty) - 1e-9, np.array(self.high), 0.0)
+
+
+# The notes of the bundled recordings quote the docstrings of the four functions below.
 
 
 def hopping(seconds: float) -> Float[np.ndarray, "steps 2"]:
@@ -68,4 +74,4 @@ GAITS: Mapping[str, Callable[[float], Float[np.ndarray, "steps 2"]]] = {
     "telegraph": telegraph,
     "waves": waves,
 }
-"""Command sequences of a given length (s) by name, one row a control step."""
+"""Functions by name from a length (s) to a command sequence with one row for each control step."""

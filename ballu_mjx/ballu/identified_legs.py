@@ -1,4 +1,4 @@
-"""Identification of BALLU's legs, from recordings to a report."""
+"""Identification of BALLU's legs, from recordings to report."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ballu_mjx.robots.adapter import IdentificationProgress, IdentifiedActuators
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class IdentifiedLegs(IdentifiedActuators):
-    """Both legs' actuators, with the sweep that they were identified from, and the whole fit."""
+    """Identified actuators of both legs, with the sweep and the full result of the fit."""
 
     sweep: Sweep
     identification: Identification
@@ -29,9 +29,12 @@ def identify_from_sweep(
     levels: int | None = None,
     progress: IdentificationProgress | None = None,
 ) -> IdentifiedLegs:
-    """Identify both legs from suspended recordings, by file; see `identification.identify_legs`.
+    """Identify both legs from suspended recordings; see `leg_fit.identify_legs`.
 
-    `levels`: fewest command levels of each leg; None: the paper's 20.
+    **Arguments**
+
+    - `recordings`: the recordings, by file.
+    - `levels`: smallest number of command levels of each leg. None for the paper's 20.
 
     **Raises** `InputError` from `sweep.read_sweep`, and for options out of range.
     """

@@ -1,5 +1,7 @@
-"""What the legs do on commands, measured and as the nominal robot would: `recordings.clock_alignment` finds the offset
-of the clocks at which the two agree."""
+"""Responses of the legs to commands, as measured and for the nominal robot.
+
+`recordings.clock_alignment` finds the offset between two clocks at which both responses agree.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +15,15 @@ from ballu_mjx.recordings.recording import Kind, Recording
 from ballu_mjx.robots.model import assets
 
 _SETTLING = 2.0
-"""s of rest before the first command."""
+"""Time (s) of rest before the first command."""
 _VARIANTS = ((0.65, 0.9), (0.75, 0.8), (0.85, 0.9), (1.0, 0.8))
-"""Torque limits over the nominal one, and coefficients of friction."""
+"""Torque limits as a fraction of the nominal one, and coefficients of friction of the feet."""
 
 
 def measured_response(recording: Recording) -> Float[np.ndarray, "T 2"] | None:
-    """How far each leg is bent: knee angles (rad), or else how near each foot is to the base (m, negative distance).
+    """Return how far each leg is bent: the knee angle (rad), or else the negative distance (m) from base to foot.
 
-    None where the recording holds neither.
+    None if the recording has neither.
     """
     if (knees := knee(recording)) is not None:
         return knees
@@ -32,8 +34,12 @@ def measured_response(recording: Recording) -> Float[np.ndarray, "T 2"] | None:
 def response(
     recording: Recording, time: Float[np.ndarray, " N"], command: Float[np.ndarray, "N 2"]
 ) -> tuple[Float[np.ndarray, "T 2"], Float[np.ndarray, " n"], Float[np.ndarray, "n 2"]] | None:
-    """Return `measured_response` of a recording and, with its times (s), `nominal_response` to `command` sent at `time`
-    (s); None where the recording shows no leg."""
+    """Return the measured response of a recording, and the nominal response to `command` sent at `time` (s).
+
+    None if the recording does not show the legs.
+
+    **Returns** `measured_response`, then the times (s) and the values of `nominal_response`.
+    """
     measured = measured_response(recording)
     if measured is None:
         return None
@@ -43,17 +49,17 @@ def response(
 def nominal_response(
     time: Float[np.ndarray, " N"], command: Float[np.ndarray, "N 2"], kind: Kind, *, knees: bool
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
-    """The same of the nominal robot in C MuJoCo, on `command` sent at `time` (s) from rest.
+    """Return how far the nominal robot's legs bend in C MuJoCo, for `command` sent at `time` (s) from rest.
 
-    Servos, springs and the load on the legs take a good quarter of a second in all; a correlation with the command
-    itself would take that for an offset of the clock. The mean over servos of differing strength on floors of differing
-    friction, for a single walk's chance is no prediction.
+    Servos, springs and the load on the legs take slightly more than a quarter of a second to respond. A correlation
+    with the command itself would mistake this for an offset between the clocks. The response is a mean over servos of
+    different strength and floors of different friction, because a single walk depends too much on chance.
 
     **Arguments**
 
-    - `knees`: knee angles, or else negative distances.
+    - `knees`: whether to return knee angles (rad), as opposed to negative distances (m) from base to foot.
 
-    **Returns** Times (s), and one column a leg.
+    **Returns** Times (s), and responses with one column for each leg.
     """
     model = _suspended() if kind == "suspended" else load_model()
     strongest = model.actuator_forcerange.copy()
@@ -71,7 +77,7 @@ def nominal_response(
 def _simulate(
     model: mujoco.MjModel, command: Float[np.ndarray, "n 2"], kind: Kind, *, knees: bool
 ) -> Float[np.ndarray, "n 2"]:
-    """One column a leg, on one row of `command` a time step."""
+    """Return responses with one column for each leg, for one row of `command` at each time step."""
     data = mujoco.MjData(model)
     if kind == "free":
         data.qpos[:] = standing_qpos(model)
@@ -90,6 +96,7 @@ def _simulate(
 
 
 def _suspended() -> mujoco.MjModel:
+    """Return the model of the nominal robot, suspended."""
     spec = mujoco.MjSpec.from_file(str(assets() / "ballu.xml"))
     suspend(spec)
     return spec.compile()

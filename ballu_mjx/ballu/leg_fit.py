@@ -1,12 +1,12 @@
 """Identification of the actuators from a suspended sweep (paper, section "System Identification", Algorithm 1).
 
-The legs hang from a base held still, so that each is identified by itself, both at once. The search begins with settled
-angles. What decides is the whole motion, with what a command meets on its way: delay, backlash and dry friction
-(`LegDynamics`), under which no leg is ever quite at rest. Both are computed in `ballu.leg_residuals`.
+The legs are suspended from a fixed base. Each leg is therefore identified independently of the other, and both are
+fitted at once. The search begins with settled angles. The whole motion then decides. Its simulation includes delay,
+backlash and dry friction (`LegDynamics`), under which a leg is never quite at rest. Both kinds of residuals are
+computed in `ballu.leg_residuals`.
 
-All functions compute in double precision and are to be called inside `jax.enable_x64(True)`, but for `identify_legs`,
-which sees to it itself. A leg's parameters are a vector in the order of `LEG_PARAMETERS`; a pair of angles is (motor,
-knee).
+All functions compute in double precision and must be called inside `jax.enable_x64(True)`. Only `identify_legs` does
+this itself. A leg's parameters are a vector in the order of `LEG_PARAMETERS`. A pair of angles is (motor, knee).
 """
 
 from __future__ import annotations
@@ -44,18 +44,19 @@ from ballu_mjx.ballu.sweep import Sweep
 from ballu_mjx.identification.batched_solver import BatchedSolver, Evaluate
 
 _PATIENCE = 4
+"""Number of successive iterations without enough gain after which a search ends."""
 _WORTH = 1e-5
-"""Of the loss: what an iteration gains at least. With thousands of samples, 1e-4 is 0.4 in chi-squared."""
+"""Smallest gain of an iteration, as a fraction of the loss. With thousands of samples, 1e-4 is 0.4 in chi-squared."""
 _FIRST_DAMPING = 5 * DEGREE
-"""Unit of angles in a search, which starts with Levenberg's damping at 1. In radians, weak directions are damped for
-dozens of iterations."""
+"""Unit of angles (rad) in a search, whose first Levenberg damping is 1 in this unit. In radians, weak directions would
+stay damped for dozens of iterations."""
 _INSIDE = 4.0
-"""Largest coordinate that a search of the motion starts from: 2 % of the bounds' span inside them. A slack that settled
-angles put at its bound has next to no slope left, and would stay there."""
+"""Largest magnitude of a coordinate at the start of a search by the motion. The parameter is then 2 % of the interval
+away from a bound. If settled angles put the slack at its bound, the derivative is almost 0, and it would stay there."""
 _SHORT = 6
-"""Iterations after which one of two searches goes on."""
+"""Number of iterations of two short searches, of which the better one is continued."""
 Report = Callable[[str, int, int, float], None]
-"""(stage, iteration, most iterations, the lowest loss among the searches)."""
+"""Progress function, called with (stage, iteration, largest number of iterations, lowest loss of all searches)."""
 
 
 def identify_legs(
@@ -63,19 +64,19 @@ def identify_legs(
 ) -> Identification:
     """Fit both legs' parameters to a sweep.
 
-    1. Settled angles alone, from several starts side by side, the best of many draws: searches that start with a servo
-       that never saturates, say, end in a valley of their own.
-    2. From the end whose motion is nearest, the whole motion.
-       Both are done twice, with the `FURTHER` parameters held at their nominal values and with all. The second search
-       has the first's solution among its starts. The richer model is kept where it explains what the simpler one
-       leaves (`Selection`).
-    3. With the richer model the springs are held at their nominal stiffness, which sets the scale of all forces
+    1. Settled angles alone are fitted from several starts in parallel, the best of many draws. From a single start, the
+       search may end in a local minimum, for example with a servo that never saturates.
+    2. The whole motion is fitted, starting from the solution whose motion is nearest to the measured one.
+       Steps 1 and 2 are done twice: with the `FURTHER` parameters held at their nominal values, and with all
+       parameters. The second search has the first one's solution among its starts. The richer model is kept if it
+       explains enough of what the simpler one leaves (`Selection`).
+    3. In the richer model, the springs are held at their nominal stiffness, which sets the scale of all forces
        (`nominal_springs`).
-    4. With the richer model, or where the data leave directions open: with what is known of robots beforehand, so that
-       what a sweep hardly shows stays near the nominal values.
-    5. With `objective="hausdorff"`, the paper's distance between curves, from there.
+    4. With the richer model, or if the data leave directions open, the fit continues with the priors. Parameters that a
+       sweep hardly shows then stay near their nominal values.
+    5. With `objective="hausdorff"`, the paper's distance between curves is minimized from there.
 
-    **Raises** `InputError` from `IdentificationConfig`'s check.
+    **Raises** `InputError` from `check_identification_config`.
     """
     config = config or IdentificationConfig()
     check_identification_config(config)
@@ -85,8 +86,10 @@ def identify_legs(
 
 
 def _levenberg_marquardt() -> optx.LevenbergMarquardt:
-    """Return Levenberg-Marquardt that damps ten times less after a step which gained 90 % of what was foretold. By
-    default it is 3.5 times after 99 %, which steps along a curved valley hardly ever gain."""
+    """Return a Levenberg-Marquardt solver that divides its damping by 10 after a step with 90 % of the predicted gain.
+
+    The default is a division by 3.5 after 99 %, which steps along a curved valley hardly ever reach.
+    """
     solver = optx.LevenbergMarquardt(rtol=1e-5, atol=1e-5)
     region = optx.ClassicalTrustRegion(high_cutoff=0.9, high_constant=10.0)
     return eqx.tree_at(lambda solver: solver.search, solver, region)
@@ -114,7 +117,7 @@ class Identifier:
         self._curve_gradients = jax.jit(jax.vmap(lambda command, angles, measured: gradient(angles, command, measured)))
 
     def run(self, sweep: Sweep, report: Report) -> Identification:
-        """Return both legs' identification from a sweep of the sizes that were compiled for."""
+        """Return the identification of both legs from a sweep of the compiled sizes."""
         config, size, data = self.config, self._size, leg_data(sweep)
         residuals = LegResiduals(self.space, self.physics, data, self._curve_gradients, motion=config.motion)
         legs = np.arange(len(SIDES))
@@ -131,7 +134,7 @@ class Identifier:
             more = int(rich.sum()) - int((~further).sum())
             selection = select_model(simpler, coordinates, more, spread, residuals)
             if selection.richer:
-                # The simpler search may have ended in a valley that the richer one left.
+                # The simpler search may have ended in a local minimum that the richer one left.
                 again = np.where(further, simpler, coordinates)
                 again = self._follow(again, residuals, ~further, report, config.steps)
                 simpler = self._nearest([simpler, again], residuals, ~further)
@@ -150,13 +153,13 @@ class Identifier:
             coordinates, _ = self._squares(
                 lambda y: residuals.with_priors(y, kept, spread),
                 coordinates,
-                2 * config.steps,  # along the weakest directions, which the data alone left open
+                2 * config.steps,  # more, for the weakest directions, which the data alone left open
                 partial(report, "priors"),
                 _PATIENCE,
             )
             analyses = analyse_legs(residuals, coordinates, kept, spread)
         if config.objective == "hausdorff":
-            # From every search's end: a maximum over points and a sum over joints has more valleys still.
+            # Start from the end of every search: a maximum over points, summed over joints, has even more local minima.
             starts = np.concatenate([coordinates[:, None, :size], ends.reshape(len(legs), -1, size)[:, 1:]], axis=1)
             shaped, distances = self._shape(
                 lambda y: residuals.curve_distances(y, leg, kept),
@@ -209,8 +212,11 @@ class Identifier:
         report: Report,
         simpler: np.ndarray | None = None,
     ) -> tuple[Float[np.ndarray, "legs size"], Float[np.ndarray, "searches settled_size"]]:
-        """Return coordinates of both legs, and where the searches by settled angles ended, of the parameters that are
-        `kept`; never worse than `simpler`, a model's with fewer."""
+        """Return the coordinates of both legs, and the ends of the searches by settled angles.
+
+        Only the parameters in `kept` are fitted. The result is never worse than `simpler`, the solution of a model with
+        fewer parameters.
+        """
         config, size, legs = self.config, self._size, np.arange(len(SIDES))
         draws = self.space.draw(config.seed, config.draws)
         held = ~kept[:size]
@@ -236,8 +242,8 @@ class Identifier:
         if not config.motion:
             return by_leg[legs, nearest], ends
         by_leg = np.clip(by_leg, -_INSIDE, _INSIDE)
-        # Settled angles leave much open, and a servo far from its limit has no gradient by it. The motion says from
-        # which end to go on: where it begins nearest, or soon gets nearest.
+        # Settled angles leave much open, and a servo far from its torque limit has no gradient with respect to it. The
+        # motion therefore decides where to continue: at the end with the lowest loss now, or after a short search.
         first = np.where(kept[size:], 0.0, dynamics_coordinates(SIMPLE_DYNAMICS))
         candidates = [np.concatenate([y, np.tile(first, (len(legs), 1))], axis=1) for y in np.moveaxis(by_leg, 1, 0)]
         candidates += [] if simpler is None else [simpler]
@@ -246,8 +252,8 @@ class Identifier:
             both = [self._follow(y, residuals, kept, report, _SHORT) for y in (coordinates, by_settled)]
             coordinates = self._nearest(both, residuals, kept)
         ended = self._follow(coordinates, residuals, kept, report, config.steps)
-        # Stiction, lag and play can stand in for each other, and a slack at its bound has no slope: once more, with the
-        # dynamics back where they began and what stands at a bound back at its nominal value.
+        # Dry friction, lag and backlash can imitate one another, and a slack at its bound has no gradient. The search
+        # is therefore repeated, with the dynamics back at their start and parameters at a bound back at nominal.
         inside = np.where(np.abs(ended[:, :size]) > _INSIDE, draws[0], ended[:, :size])
         again = np.concatenate([inside, np.tile(first, (len(legs), 1))], axis=1)
         return self._nearest([ended, self._follow(again, residuals, kept, report, config.steps)], residuals, kept), ends
@@ -260,7 +266,7 @@ class Identifier:
         report: Report,
         steps: int,
     ) -> Float[np.ndarray, "legs size"]:
-        """Return where a search by all residuals ends."""
+        """Return the end of a search by all residuals that begins at `start`."""
         stage = "motion" if self.config.motion else "settled angles"
         return self._least_squares(lambda y: residuals(y, kept), start, steps, partial(report, stage))[0]
 
@@ -271,7 +277,7 @@ class Identifier:
         steps: int,
         report: Callable[[int, int, float], None],
     ) -> tuple[Float[np.ndarray, "n size"], Float[np.ndarray, " n"]]:
-        """Return where searches end that minimize squares of angles, and their losses (rad^2)."""
+        """Return the ends of searches that minimize sums of squared angles, and their losses (rad^2)."""
 
         def scaled(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             values, jacobians = evaluate(y)

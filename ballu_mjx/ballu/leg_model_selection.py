@@ -1,4 +1,4 @@
-"""Are BALLU's further leg parameters worth having? An F-test and an effect size."""
+"""Choice between the simpler and the richer model of BALLU's legs, by an F-test and an effect size."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from ballu_mjx.identification.undeclared import SMALL_EFFECT
 
 
 class Selection(NamedTuple):
-    """Whether the `FURTHER` parameters of both legs are worth having."""
+    """Result of the comparison of models without and with the `FURTHER` parameters, for both legs together."""
 
     statistic: float
-    """F, with as many samples as the residuals are worth."""
+    """F statistic, with the effective number of independent samples."""
     threshold: float
-    """F that chance exceeds in 5 of 100 sweeps."""
+    """Value of F that chance exceeds in 5 of 100 sweeps."""
     effect: float
-    """Cohen's f^2: what the further parameters explain of the squares, over what they leave."""
+    """Cohen's f^2: the squares that the further parameters explain, divided by the squares that they leave."""
 
     @property
     def richer(self) -> bool:
-        """Whether the richer model is kept: what it explains is neither chance nor negligible.
+        """Return whether the richer model is kept: its improvement is neither chance nor negligible.
 
-        With thousands of samples, an F-test sees errors of the simulator's time step: hundredths of a degree, which the
-        further parameters would take up at the price of wrong springs and gains.
+        With thousands of samples, an F-test detects errors of hundredths of a degree from the simulator's time step.
+        The further parameters would explain these errors, but springs and gains would then be wrong.
         """
         return self.statistic > self.threshold and self.effect > SMALL_EFFECT
 
@@ -40,15 +40,15 @@ def select_model(
     spread: Float[np.ndarray, "legs residuals"],
     residuals: LegResiduals,
 ) -> Selection:
-    """Compare two models that differ by `more` parameters a leg."""
+    """Compare the solutions of two models that differ by `more` parameters for each leg."""
     every = np.ones(richer.shape[1], bool)
-    lost, left = (residuals(y, every)[0] for y in (simpler, richer))
-    worth = float(np.sum(left**2 / spread**2))
-    between, within = more * len(SIDES), max(worth - richer.size, 1.0)
-    statistic = float(np.sum((lost**2 - left**2) / spread**2)) / between
-    effect = float(np.sum(lost**2 - left**2) / max(np.sum(left**2), np.finfo(float).tiny))
+    before, after = (residuals(y, every)[0] for y in (simpler, richer))
+    chi_squared = float(np.sum(after**2 / spread**2))
+    between, within = more * len(SIDES), max(chi_squared - richer.size, 1.0)
+    statistic = float(np.sum((before**2 - after**2) / spread**2)) / between
+    effect = float(np.sum(before**2 - after**2) / max(np.sum(after**2), np.finfo(float).tiny))
     return Selection(statistic, float(f_distribution.ppf(1 - _LEVEL, between, within)), effect)
 
 
 _LEVEL = 0.05
-"""Of the F-test."""
+"""Significance level of the F-test."""

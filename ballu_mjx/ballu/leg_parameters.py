@@ -1,4 +1,4 @@
-"""The parameters of a leg and its drivetrain: units, ranges, and the unbounded coordinates that are searched."""
+"""The parameters of a leg and its drivetrain: units, ranges, priors, and the unbounded coordinates of the search."""
 
 from __future__ import annotations
 
@@ -25,69 +25,71 @@ LEG_PARAMETERS = (
     "cable_stiffness",
     "knee_spring_reference",
 )
-"""A leg's parameters that settled angles depend on, in the order of a vector."""
+"""A leg's parameters that settled angles depend on, in the order of a parameter vector."""
 DEGREE = float(np.pi / 180)
+"""One degree (rad)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class IdentificationConfig:
-    """How actuators are identified. The defaults were chosen by measurement (docs/actuators.md)."""
+    """Options of the identification of actuators. The defaults were chosen by measurement (docs/actuators.md)."""
 
     torque_limit: bool = True
-    """Identify the servos' torque limits too. The paper's eight parameters alone can tell a weak servo only by a spring
-    stiffer than the robot's."""
+    """Identify the torque limits of the servos. Without them, only a knee spring that is too stiff can explain a weak
+    servo."""
     cable_slack: bool = True
-    """Identify the cables' slack too. Without it, springs and servos come out up to three times too strong."""
+    """Identify the slack of the cables. Without it, springs and servos come out up to three times too strong."""
     motor_travel: bool = True
-    """Identify what share of 90 deg a command of 1 asks for. Without it, a short travel passes for stiff springs, play
-    and friction."""
+    """Identify the travel of the servos, as a fraction of 90 deg. Without it, a short travel is mistaken for stiff
+    springs, backlash and friction."""
     cable_stiffness: bool = True
-    """Identify the cables' stiffness too."""
+    """Identify the stiffness of the cables."""
     knee_spring_reference: bool = False
-    """Identify where the knees' springs would be at rest, and with it how far they are preloaded, too. Held by default:
-    the design says where that is, and in a sweep it trades with the springs' stiffness."""
+    """Identify the rest angle of the knee springs, and thus their preload. It is held at nominal by default: the design
+    specifies it, and a sweep hardly separates it from the springs' stiffness."""
     nominal_springs: bool = True
-    """With the richer model, hold the knees' springs at their nominal stiffness. A sweep shows the scale of forces by
-    gravity alone, and small errors of the model decide it then."""
+    """Hold the knee springs at their nominal stiffness if the sweep requires the richer model (with travel, cable
+    stiffness, lag and knee damping). In a sweep, only gravity shows the scale of the forces. Small errors of the model
+    would therefore decide the stiffness."""
     motion: bool = True
-    """Learn from the whole motion, not from settled angles alone; delay, lag, backlash, dry friction and the knee's
-    damping are then further unknowns."""
+    """Fit the whole motion instead of the settled angles alone. Delay, lag, backlash, dry friction and knee damping are
+    then identified too."""
     objective: Literal["pointwise", "hausdorff"] = "pointwise"
-    """`pointwise`: least squares over all angles (Levenberg-Marquardt). `hausdorff`: the paper's distance between
-    curves (L-BFGS), started from the pointwise solution; motion has no part in it."""
+    """Objective of the fit. `pointwise`: the squares of all angle errors (Levenberg-Marquardt). `hausdorff`: the
+    paper's distance between curves (L-BFGS), starting from the pointwise solution and without the motion."""
     degree: int = 7
-    """Degree of the polynomials fitted to the curves of angle over command."""
+    """Degree of the polynomials that are fitted to the curves of angle over command, 1 or more."""
     draws: int = 128
-    """Parameters drawn at random for each leg, beside the nominal ones, to find good starts."""
+    """Number of random parameter vectors for each leg, besides the nominal one, to find good starts; 1 or more."""
     starts: int = 8
-    """Searches for each leg, from the best draws. Of declared parameters: from the nominal values, then from draws from
-    the priors."""
+    """Number of searches, 1 or more. For BALLU: for each leg, from the best draws. For declared parameters: from the
+    nominal values, then from draws from the priors."""
     steps: int = 40
-    """Most iterations of a search."""
+    """Largest number of iterations of a search, 1 or more."""
     seed: int = 0
-    """Seeds the draws."""
+    """Seed of the draws, 0 or more."""
 
 
 PAPER_PARAMETERS = IdentificationConfig(
     torque_limit=False, cable_slack=False, motor_travel=False, cable_stiffness=False
 )
-"""The paper's four of a leg: spring stiffness, motor gain, motor angle at command 0, the knee's stop."""
+"""Options for the paper's four parameters of a leg: spring stiffness, motor gain, motor angle at 0, knee stop."""
 ALL_PARAMETERS = IdentificationConfig(knee_spring_reference=True, nominal_springs=False)
-"""Every parameter free, with either model."""
+"""Options that free every parameter, in the simpler and in the richer model."""
 
 
 class ParameterRange(NamedTuple):
-    """What is known of a parameter beforehand."""
+    """Bounds and prior of a parameter."""
 
     factor: float | None
-    """Bounds are the nominal value divided and multiplied by this; or else:"""
+    """Factor by which the nominal value is divided and multiplied for the bounds. None if `reach` gives the bounds."""
     reach: tuple[float, float]
-    """Bounds are the nominal value less and plus these."""
+    """Distances of the lower and the upper bound from the nominal value. 0 if there is a factor."""
     prior: float
-    """How much robots differ (standard deviation): of the logarithm where there is a factor, else of the value."""
+    """Standard deviation among robots: of the logarithm if there is a factor, otherwise of the value."""
 
 
-# Makers of springs quote 10 % on the rate (Lee Spring, "Engineering Notes and Tolerances").
+# Makers of springs quote a tolerance of 10 % on the rate (Lee Spring, "Engineering Notes and Tolerances").
 RANGES: dict[str, ParameterRange] = {
     "knee_spring_stiffness": ParameterRange(4.0, (0.0, 0.0), 0.1),
     "motor_gain": ParameterRange(16.0, (0.0, 0.0), 0.7),
@@ -102,44 +104,44 @@ RANGES: dict[str, ParameterRange] = {
 
 
 class LegDynamics(NamedTuple):
-    """What only the motion shows of a leg: what a command meets on its way to the joints, and what brakes these."""
+    """Parameters of a leg that only its motion shows: of the drivetrain, and friction and damping of the joints."""
 
     delay: Any
-    """Seconds from a command to the servo's target."""
+    """Time (s) from a command to the servo's target."""
     motor_friction: Any
-    """Dry friction (N m)."""
+    """Dry friction of the motor (N m)."""
     knee_friction: Any
-    """Dry friction (N m)."""
+    """Dry friction of the knee (N m)."""
     backlash: Any
-    """Width (rad) of the play between the motor's target and its arm."""
+    """Width (rad of motor angle) of the backlash in the motor's target."""
     lag: Any
     """Time constant (s) with which the motor's target follows the command."""
     knee_damping: Any
-    """Viscous friction (N m s/rad)."""
+    """Viscous damping of the knee (N m s/rad)."""
 
 
 FIRST_DYNAMICS = LegDynamics(0.03, 2e-3, 5e-4, 1 * DEGREE, 0.01, 2e-3)
-"""Where the search begins."""
+"""Values at which the search begins."""
 
 
 DYNAMICS_PRIOR = np.array([3.0, 1.0, 1.0, 1.0, 2.0, 2.0])
-"""How much robots differ (standard deviation) in the coordinates of the dynamics, about where the search begins."""
+"""Standard deviations among robots, in the coordinates of the dynamics. The mean is the start of the search."""
 NOMINAL_DYNAMICS = {"knee_damping": 1e-3}
-"""The nominal robot's; the others are 0."""
+"""Dynamics of the nominal robot. Those that are not listed are 0."""
 SIMPLE_DYNAMICS = FIRST_DYNAMICS._replace(lag=1e-4, **NOMINAL_DYNAMICS)
-"""The same of the simpler model: no lag to speak of, and the nominal damping."""
+"""Start of the search with the simpler model: negligible lag, and the nominal damping."""
 FURTHER = ("motor_travel", "cable_stiffness", "knee_spring_reference", "lag", "knee_damping")
-"""Parameters that are fitted only where a sweep asks for them: each trades against others within a weak direction."""
+"""Parameters that only the richer model fits. Each trades against others within a weak direction of the data."""
 
 
 def dynamics_coordinates(values: LegDynamics) -> Float[np.ndarray, " 6"]:
-    """Unbounded coordinates: of the delay linear, of the others logarithms; 0 where the search begins."""
+    """Return unbounded coordinates: linear in the delay, logarithmic in the others, and 0 at `FIRST_DYNAMICS`."""
     others = np.log(np.array(values[1:]) / np.array(FIRST_DYNAMICS[1:]))
     return np.array([(values.delay - FIRST_DYNAMICS.delay) / DELAY_UNIT, *others])
 
 
 def leg_dynamics(coordinates: Float[Array, " 6"]) -> LegDynamics:
-    """The inverse of `dynamics_coordinates`."""
+    """Return the inverse of `dynamics_coordinates`."""
     delay, *others = coordinates
     return LegDynamics(
         FIRST_DYNAMICS.delay + DELAY_UNIT * delay,
@@ -148,15 +150,15 @@ def leg_dynamics(coordinates: Float[Array, " 6"]) -> LegDynamics:
 
 
 DELAY_UNIT = 0.01
-"""Seconds of delay that a coordinate of 1 stands for."""
+"""Change of the delay (s) for a change of its coordinate by 1."""
 
 
 class ParameterTransform:
-    """Between a leg's parameters in their units and the unbounded coordinates that are searched.
+    """Transform between a leg's parameters in their units and the unbounded coordinates of the search.
 
-    A coordinate runs through a logistic function from the lower to the upper bound: of the logarithm for stiffness,
-    gain and torque limit, of the value itself for angles and slack. Parameters that are not free keep their nominal
-    value.
+    A logistic function maps a coordinate to the interval between the bounds. The interval is that of the logarithm for
+    stiffness, gain and torque limit, and that of the value for angles, slack and travel. Parameters that are not free
+    keep their nominal value.
     """
 
     def __init__(self, nominal: Float[np.ndarray, " parameters"], config: IdentificationConfig) -> None:
@@ -167,11 +169,11 @@ class ParameterTransform:
         self.relative = np.array([r.factor is not None for r in ranges])
         self.lower, self.upper = nominal / factors - below, nominal * factors + above
         self.prior = np.array([r.prior for r in ranges])
-        """Standard deviation of each parameter among robots: of its logarithm where it is relative."""
+        """Standard deviation of each parameter among robots: of its logarithm if it is `relative`."""
         self.free = np.isin(LEG_PARAMETERS, free_parameters(config))
 
     def vector(self, coordinates: Float[Array, " free"]) -> Float[Array, " parameters"]:
-        """A leg's parameters, in their units."""
+        """Return a leg's parameters in their units."""
         free, relative = self.free, self.relative[self.free]
         lower, upper = self.lower[free], self.upper[free]
         ratio = np.where(relative, upper / np.where(relative, lower, 1.0), 1.0)
@@ -180,7 +182,7 @@ class ParameterTransform:
         return jnp.asarray(self.nominal).at[np.flatnonzero(free)].set(values)
 
     def coordinates(self, vector: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " free"]:
-        """The inverse of `vector`, for values within the bounds."""
+        """Return the inverse of `vector`, for values within the bounds."""
         share = (vector - self.lower) / (self.upper - self.lower)
         logs = [np.log(np.where(self.relative, x, 1.0)) for x in (vector, self.lower, self.upper)]
         span = np.where(self.relative, logs[2] - logs[1], 1.0)
@@ -188,7 +190,7 @@ class ParameterTransform:
         return np.log(share / (1 - share))
 
     def deviations(self, vector: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " parameters"]:
-        """Return how far parameters are from nominal, in standard deviations among robots."""
+        """Return the distances of parameters from nominal, in standard deviations among robots."""
         logarithms = np.log(np.where(self.relative, vector / np.where(self.relative, self.nominal, 1.0), 1.0))
         return np.where(self.relative, logarithms, vector - self.nominal) / self.prior
 
@@ -197,21 +199,21 @@ class ParameterTransform:
         return self.prior * np.where(self.relative, vector, 1.0)
 
     def draw(self, seed: int, count: int) -> Float[np.ndarray, "draws free"]:
-        """Coordinates: of the nominal values, then of uniform draws from the middle half of the bounds' span."""
+        """Return coordinates of the nominal values, then of uniform draws from the middle half between the bounds."""
         shares = np.random.default_rng(seed).uniform(0.25, 0.75, (count, int(self.free.sum())))
         return np.concatenate([self.coordinates(self.nominal)[None], np.log(shares / (1 - shares))])
 
 
 def nominal_leg() -> Float[np.ndarray, " parameters"]:
-    """A leg's nominal parameters."""
+    """Return a leg's nominal parameters."""
     nominal = ActuatorParameters.nominal(load_suspended_leg(SIDES[0]))
     return np.concatenate([np.asarray(getattr(nominal, name), float) for name in LEG_PARAMETERS])
 
 
 def check_identification_config(config: IdentificationConfig) -> None:
-    """Refuse sizes that make no sense.
+    """Check the ranges of the options that are numbers.
 
-    **Raises** `InputError` naming the option.
+    **Raises** `InputError` that names the option.
     """
     for name in ("draws", "starts", "steps", "degree"):
         if getattr(config, name) < 1:
@@ -221,5 +223,5 @@ def check_identification_config(config: IdentificationConfig) -> None:
 
 
 def free_parameters(config: IdentificationConfig) -> tuple[str, ...]:
-    """All but those that have an option of their name which is off."""
+    """Return the parameters of a leg without those whose option of the same name is off."""
     return tuple(name for name in LEG_PARAMETERS if getattr(config, name, True))

@@ -1,9 +1,11 @@
-"""Residuals of BALLU's suspended legs against a sweep, with their Jacobians: settled angles, the whole motion, and the
-distances from nominal parameters.
+"""Residuals of BALLU's suspended legs on a sweep, with their Jacobians.
 
-Settled angles under a command are the root of MJX's inverse dynamics at rest, differentiated as an implicit function.
-The motion is simulated from the first command to the last and differentiated forwards. All functions compute in double
-precision and are to be called inside `jax.enable_x64(True)`.
+A residual is here the difference between a simulated and a measured angle, or between a parameter and its prior. It is
+not a residual force.
+
+The settled angles under a command are the root of MJX's inverse dynamics at rest. They are differentiated as an
+implicit function. The motion is simulated from the first command to the last, and differentiated in forward mode. All
+functions compute in double precision and must be called inside `jax.enable_x64(True)`.
 """
 
 from __future__ import annotations
@@ -31,21 +33,29 @@ from ballu_mjx.identification.effective_samples import integrated_autocorrelatio
 
 
 class LegData(NamedTuple):
-    """A `Sweep` with the legs (left, right) first and (motor, knee) last; rad. In its motion each recording is preceded
-    by a stretch under its first command, in which the leg comes to rest."""
+    """A `Sweep` with the axis (left, right) first and the axis (motor, knee) last. Angles are in rad.
+
+    In its motion, each recording is preceded by 2 s under its first command, in which the leg comes to rest.
+    """
 
     command: Float[np.ndarray, "legs holds"]
+    """Command of each hold."""
     settled: Float[np.ndarray, "legs holds 2"]
+    """Settled angles (rad)."""
     weights: Float[np.ndarray, "legs holds 2"]
-    """Root of the samples in each mean: a mean of n samples counts as n of them, if the joint was at rest."""
+    """Square roots of the number of samples in each mean, reduced for joints that still creep."""
     commanded: Float[np.ndarray, "legs times"]
+    """Command at each time of the motion."""
     motion: Float[np.ndarray, "legs times 2"]
+    """Measured angles (rad) at each time."""
     counts: Bool[np.ndarray, " times"]
+    """Whether a time enters the residuals. The added 2 s do not."""
     begins: Bool[np.ndarray, " times"]
+    """Whether the leg is set to rest at a time: at the beginning of the added 2 s."""
 
 
 def leg_data(sweep: Sweep) -> LegData:
-    """As the fit takes it."""
+    """Return a sweep in the form that the fit uses."""
     firsts = np.flatnonzero(sweep.begins)
     rows = np.insert(np.arange(len(sweep.hold)), np.repeat(firsts, _AT_REST), np.repeat(firsts, _AT_REST))
     before = np.insert(np.zeros(len(sweep.hold), bool), np.repeat(firsts, _AT_REST), True)
@@ -62,13 +72,17 @@ def leg_data(sweep: Sweep) -> LegData:
 
 
 _AT_REST = round(2.0 / SAMPLE_TIMESTEP)
+"""Number of samples before each recording in which the leg comes to rest."""
 _DRIFT = 0.05 * DEGREE
-"""A joint that creeps on by more has not arrived, and its angle counts for less."""
+"""Drift (rad) above which a joint has not reached its settled angle, so that the angle has a lower weight."""
 
 
 class CompiledLeg:
-    """The two MJX programs, compiled side by side: values and Jacobians in a `ParameterTransform`'s coordinates, for
-    batches of fixed sizes. The second, of the motion, only where it is wanted."""
+    """Two compiled MJX programs, for settled angles and for the motion.
+
+    They return values and Jacobians in the coordinates of a `ParameterTransform`, for batches of fixed sizes. They are
+    compiled in parallel, the second only if `motion` is True.
+    """
 
     def __init__(self, space: ParameterTransform, batch: int, data: LegData, *, motion: bool) -> None:
         self.leg, self.batch = SuspendedLeg(), batch
@@ -77,9 +91,9 @@ class CompiledLeg:
 
         def settled(coordinates: Array, command: Array) -> tuple[Array, Array]:
             vectors, by_coordinates = jax.vmap(lambda y: (space.vector(y), jax.jacfwd(space.vector)(y)))(coordinates)
-            qpos, slopes = self.leg.settled(jnp.repeat(vectors, holds, axis=0), command.ravel())
-            slopes = slopes.reshape(batch, holds, *slopes.shape[1:])
-            return qpos.reshape(batch, holds, -1), slopes @ by_coordinates[:, None]
+            qpos, jacobians = self.leg.settled(jnp.repeat(vectors, holds, axis=0), command.ravel())
+            jacobians = jacobians.reshape(batch, holds, *jacobians.shape[1:])
+            return qpos.reshape(batch, holds, -1), jacobians @ by_coordinates[:, None]
 
         def moving(coordinates: Array, command: Array) -> tuple[Array, Array]:
             def path(y: Array, command: Array) -> Array:
@@ -97,31 +111,35 @@ class CompiledLeg:
     def settled(
         self, coordinates: Float[np.ndarray, "n size"], command: Float[np.ndarray, "n holds"]
     ) -> tuple[Float[np.ndarray, "n holds nq"], Float[np.ndarray, "n holds nq size"]]:
-        """Positions at rest and their derivatives, for any number of coordinates."""
-        values, slopes = [], []
+        """Return generalized positions at rest and their derivatives, for any number of coordinate vectors."""
+        values, jacobians = [], []
         for first in range(0, len(coordinates), self.batch):
             count = min(self.batch, len(coordinates) - first)
             rows = np.minimum(first + np.arange(self.batch), first + count - 1)
-            value, slope = self._compiled[0](jnp.asarray(coordinates[rows]), jnp.asarray(command[rows]))
+            value, jacobian = self._compiled[0](jnp.asarray(coordinates[rows]), jnp.asarray(command[rows]))
             values.append(np.asarray(value)[:count])
-            slopes.append(np.asarray(slope)[:count])
-        return np.concatenate(values), np.concatenate(slopes)
+            jacobians.append(np.asarray(jacobian)[:count])
+        return np.concatenate(values), np.concatenate(jacobians)
 
     def motion(
         self, coordinates: Float[np.ndarray, "legs _"], commanded: Float[np.ndarray, "legs times"]
     ) -> tuple[Float[np.ndarray, "legs times 2"], Float[np.ndarray, "legs times 2 _"]]:
-        """Both legs' motion and its derivatives; coordinates end with those of `leg_dynamics`."""
+        """Return both legs' motion and its derivatives. The coordinates end with those of `leg_dynamics`."""
         value, jacobian = self._compiled[1](jnp.asarray(coordinates), jnp.asarray(commanded))
         return np.asarray(value), np.asarray(jacobian)
 
 
 CurveGradients = Callable[..., tuple[Array, Array]]
-"""(command, angles, measured), each of n legs, to the paper's distances and their gradients by the angles."""
+"""Function of (command, angles, measured) of n legs. It returns the paper's distances and their gradients with respect
+to the angles."""
 
 
 class LegResiduals:
-    """Residuals of both legs against one sweep, in a `ParameterTransform`'s coordinates, and then those of
-    `dynamics_coordinates`. `kept` says which parameters are free; the others' derivatives are 0."""
+    """Residuals of both legs on one sweep, as functions of coordinates.
+
+    The coordinates are those of a `ParameterTransform`, followed by those of `dynamics_coordinates`. `kept` marks the
+    parameters that are fitted. Derivatives with respect to the others are set to 0.
+    """
 
     def __init__(
         self,
@@ -134,15 +152,15 @@ class LegResiduals:
     ) -> None:
         self.space, self.physics, self.data, self.moves = space, physics, data, motion
         self.size = int(space.free.sum())
-        """Free parameters that settled angles depend on."""
+        """Number of free parameters that settled angles depend on."""
         self._curve_gradients = curve_gradients
 
     def angles(
         self, coordinates: Float[np.ndarray, "n size"], command: Float[np.ndarray, "n holds"]
     ) -> tuple[Float[np.ndarray, "n holds 2"], Float[np.ndarray, "n holds 2 size"]]:
-        """Simulated settled angles (rad) and their derivatives."""
-        qpos, slope = self.physics.settled(coordinates, command)
-        return qpos[:, :, self.physics.leg.angles], slope[:, :, self.physics.leg.angles]
+        """Return simulated settled angles (rad) and their derivatives."""
+        qpos, jacobian = self.physics.settled(coordinates, command)
+        return qpos[:, :, self.physics.leg.angles], jacobian[:, :, self.physics.leg.angles]
 
     def settled(
         self,
@@ -150,25 +168,25 @@ class LegResiduals:
         leg: Int[np.ndarray, " n"],
         kept: Bool[np.ndarray, " _"],
     ) -> tuple[Float[np.ndarray, "n residuals"], Float[np.ndarray, "n residuals size"]]:
-        """Simulated less measured settled angles, weighted, and their Jacobians by the parameters that are `kept`."""
-        angles, slope = self.angles(coordinates, self.data.command[leg])
+        """Return the simulated minus the measured settled angles, weighted, and their Jacobians."""
+        angles, jacobian = self.angles(coordinates, self.data.command[leg])
         weights = self.data.weights[leg]
         count = len(coordinates)
         return (
             (weights * (angles - self.data.settled[leg])).reshape(count, -1),
-            (weights[..., None] * slope).reshape(count, -1, self.size) * kept[: self.size],
+            (weights[..., None] * jacobian).reshape(count, -1, self.size) * kept[: self.size],
         )
 
     def __call__(
         self, coordinates: Float[np.ndarray, "legs size"], kept: Bool[np.ndarray, " size"]
     ) -> tuple[Float[np.ndarray, "legs residuals"], Float[np.ndarray, "legs residuals size"]]:
-        """The same for both legs, or the whole motion's."""
+        """Return the residuals of both legs and their Jacobians: of the whole motion, or else of settled angles."""
         legs = len(coordinates)
         if not self.moves:
             return self.settled(coordinates, np.arange(legs), kept)
-        paths, slopes = self.physics.motion(coordinates, self.data.commanded)
+        paths, jacobians = self.physics.motion(coordinates, self.data.commanded)
         values = (paths - self.data.motion)[:, self.data.counts]
-        return values.reshape(legs, -1), slopes[:, self.data.counts].reshape(legs, -1, slopes.shape[-1]) * kept
+        return values.reshape(legs, -1), jacobians[:, self.data.counts].reshape(legs, -1, jacobians.shape[-1]) * kept
 
     def with_priors(
         self,
@@ -176,21 +194,23 @@ class LegResiduals:
         kept: Bool[np.ndarray, " size"],
         spread: Float[np.ndarray, "legs residuals"],
     ) -> tuple[Float[np.ndarray, "legs rows"], Float[np.ndarray, "legs rows size"]]:
-        """All residuals for what they are worth; then how far parameters are from nominal, in units of what robots
-        differ by."""
+        """Return residuals divided by `spread`, followed by those of the priors, and their Jacobians.
+
+        The residuals of the priors are the distances of parameters from nominal, in standard deviations among robots.
+        """
         values, jacobians = self(coordinates, kept)
         space, size = self.space, self.size
-        rows, row_slopes = [], []
+        rows, row_jacobians = [], []
         for y in coordinates:
-            vector, slope = self.parameters(y[:size])
+            vector, jacobian = self.parameters(y[:size])
             own = y[size:] / DYNAMICS_PRIOR[: len(y) - size]
             rows.append(np.concatenate([space.deviations(vector)[space.free], own]))
-            slope = np.concatenate([slope / space.units(vector)[space.free, None], np.zeros((len(own), size))])
+            jacobian = np.concatenate([jacobian / space.units(vector)[space.free, None], np.zeros((len(own), size))])
             beside = np.concatenate([np.zeros((size, len(own))), np.diag(1 / DYNAMICS_PRIOR[: len(own)])])
-            row_slopes.append(np.concatenate([slope, beside], axis=1) * kept)
+            row_jacobians.append(np.concatenate([jacobian, beside], axis=1) * kept)
         return (
             np.concatenate([values / spread, np.array(rows)], axis=1),
-            np.concatenate([jacobians / spread[..., None], np.array(row_slopes)], axis=1),
+            np.concatenate([jacobians / spread[..., None], np.array(row_jacobians)], axis=1),
         )
 
     def curve_distances(
@@ -199,20 +219,24 @@ class LegResiduals:
         leg: Int[np.ndarray, " n"],
         kept: Bool[np.ndarray, " _"],
     ) -> tuple[Float[np.ndarray, "n 1"], Float[np.ndarray, "n 1 size"]]:
-        """The legs' parts of the paper's objective."""
-        angles, slope = self.angles(coordinates, self.data.command[leg])
+        """Return the legs' parts of the paper's objective, and their gradients."""
+        angles, jacobian = self.angles(coordinates, self.data.command[leg])
         values, gradients = self._curve_gradients(self.data.command[leg], angles, self.data.settled[leg])
-        changes = np.einsum("nha,nhas->ns", gradients, slope)[:, None]
+        changes = np.einsum("nha,nhas->ns", gradients, jacobian)[:, None]
         return np.asarray(values)[:, None], changes * kept[: self.size]
 
     def parameters(self, coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A leg's parameters, and the free ones' derivatives in the coordinates."""
+        """Return a leg's parameters, and the derivatives of the free ones with respect to the coordinates."""
         vector = self.space.vector(jnp.asarray(coordinates))
         return np.asarray(vector), np.asarray(jax.jacfwd(self.space.vector)(jnp.asarray(coordinates)))[self.space.free]
 
     def spread(self, coordinates: Float[np.ndarray, "legs size"]) -> Float[np.ndarray, "legs residuals"]:
-        """Return what each residual is divided by to count for what it is worth: scatter, times the root of the
-        integrated autocorrelation time. Never 0: a model's own recording leaves nothing but rounding."""
+        """Return the divisors that give each residual the weight of its information.
+
+        They are the scatter of settled angles. For the motion, the scatter is multiplied by the square root of the
+        integrated autocorrelation time. Divisors are never 0, because a fit to a recording of the model itself leaves
+        only rounding errors.
+        """
         values, _ = self(coordinates, np.ones(coordinates.shape[1], bool))
         if not self.moves:
             count = max(values.shape[1] - coordinates.shape[1], 1)
@@ -227,4 +251,4 @@ class LegResiduals:
 
 
 _LEAST_SPREAD = 1e-9
-"""rad"""
+"""Smallest divisor (rad)."""

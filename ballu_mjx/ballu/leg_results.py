@@ -1,4 +1,4 @@
-"""What identification finds of BALLU's legs."""
+"""Results of the identification of BALLU's legs."""
 
 from __future__ import annotations
 
@@ -16,59 +16,65 @@ from ballu_mjx.identification.parameters import Direction
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
-    """One leg, identified."""
+    """Identified parameters of one leg."""
 
     vector: Float[np.ndarray, " parameters"]
+    """Parameters in their units, in the order of `LEG_PARAMETERS`."""
     standard_errors: Float[np.ndarray, " parameters"]
-    """In the parameters' units, with all free parameters unknown, whether or not the simpler model was kept; 0 for
-    those that the configuration holds. See `leg_uncertainty`."""
+    """Standard errors in the parameters' units. All free parameters are taken as unknown, even if the simpler model was
+    kept. 0 for parameters that the configuration holds. See `leg_uncertainty`."""
     correlations: Float[np.ndarray, "free free"]
-    """Of the same errors."""
+    """Correlations of these errors, for the parameters in `Identification.free`."""
     directions: tuple[Direction, ...]
-    """Of the parameters that were fitted, from the best to the least determined."""
+    """Directions of the fitted parameters, from the best to the least determined."""
     dynamics: LegDynamics | None
-    """None: the motion had no part in the fit."""
+    """Identified dynamics. None if the motion was not fitted."""
     dynamics_errors: LegDynamics | None
-    """Standard errors of `dynamics`."""
+    """Standard errors of `dynamics`. None if the motion was not fitted."""
     residual: float
-    """Root mean square (rad) of all residuals."""
+    """Root mean square (rad) of all residuals. Residuals of settled angles are weighted; see `LegData.weights`."""
     losses: Float[np.ndarray, " starts"]
-    """Sums of squares (rad^2, settled angles) that the starts ended at, in ascending order."""
+    """Sums of squares (rad^2) of weighted settled-angle residuals at the ends of the searches, in ascending order."""
 
     @property
     def open_directions(self) -> tuple[Direction, ...]:
-        """Those that the data leave open: held near the nominal values."""
+        """Return the directions that the data leave open. Priors hold them near the nominal values."""
         return tuple(d for d in self.directions if d.standard_error > 1.0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Identification:
-    """Both legs (left, right)."""
+    """Result of the identification of both legs (left, right)."""
 
     fits: tuple[Fit, Fit]
+    """Fits of the left and the right leg."""
     settled: Float[np.ndarray, "holds 2 2"]
-    """Angles (rad) at which the identified robot is in balance, without friction and play; (motor, knee), (left, right)
-    last, as in `Sweep`."""
+    """Settled angles (rad) of the identified robot, in equilibrium without friction and backlash. The last two axes are
+    (motor, knee) and (left, right), as in `Sweep`."""
     simulated: Float[np.ndarray, "holds 2 2"] | None
-    """What its simulated motion comes to; None where that was not fitted."""
+    """Mean angles (rad) of its simulated motion at the end of each hold. None if the motion was not fitted."""
     nominal_settled: Float[np.ndarray, "holds 2 2"]
-    """The same as `settled`, of the nominal robot."""
+    """Settled angles (rad) of the nominal robot, in the form of `settled`."""
     free: tuple[str, ...]
-    """Parameters that the configuration leaves free: those of `Fit.correlations`."""
+    """Names of the parameters that the configuration leaves free, in the order of `Fit.correlations`."""
     fitted: tuple[str, ...]
-    """Those that were fitted: without `FURTHER`, where the simpler model was kept."""
+    """Names of the fitted parameters. `FURTHER` parameters are not among them if the simpler model was kept."""
     selection: Selection | None
-    """None: no further parameter was free."""
+    """Comparison of the simpler and the richer model. None if no `FURTHER` parameter was free."""
     config: IdentificationConfig
+    """Options of the identification."""
 
     @property
     def keeps_simpler(self) -> bool:
-        """Whether the `FURTHER` parameters could be fitted, and were not worth it."""
+        """Return whether the `FURTHER` parameters were free, but the simpler model was kept."""
         return self.selection is not None and not self.selection.richer
 
     @property
     def parameters(self) -> ActuatorParameters:
-        """What simulators take; without `FURTHER`, the nominal robot's, where the simpler model was kept."""
+        """Return the parameters for simulators.
+
+        If the simpler model was kept, the `FURTHER` parameters have their nominal values.
+        """
         rows: dict[str, np.ndarray] = dict(
             zip(LEG_PARAMETERS, np.stack([fit.vector for fit in self.fits], axis=1), strict=True)
         )

@@ -1,8 +1,8 @@
-"""How well a sweep determines the parameters of BALLU's legs.
+"""Uncertainty of the parameters of BALLU's legs, identified from a sweep.
 
-Residuals are divided by their scatter and by the root of their integrated autocorrelation time, both of the richer
-model's residuals, by leg and channel: where a model lacks something, its errors go together in time, and many samples
-are worth few.
+Residuals are divided by their scatter and by the square root of their integrated autocorrelation time. Both are
+computed for each leg and channel, from the residuals of the richer model. The errors of an incomplete model are
+correlated in time, so that many samples have the information of few.
 """
 
 from __future__ import annotations
@@ -20,13 +20,18 @@ from ballu_mjx.identification.parameters import Direction, principal_directions
 
 
 class LegAnalysis(NamedTuple):
-    """Of one leg: what residuals scatter by, and how well they determine its parameters."""
+    """Uncertainty of one leg's parameters; see `leg_results.Fit`."""
 
     scatter: float
+    """Root mean square of the residuals (rad)."""
     standard_errors: Float[np.ndarray, " parameters"]
+    """Standard errors in the parameters' units."""
     dynamics_errors: LegDynamics | None
+    """Standard errors of the dynamics. None if the motion was not fitted."""
     correlations: Float[np.ndarray, "free free"]
+    """Correlations of the standard errors of the free parameters."""
     directions: tuple[Direction, ...]
+    """Directions of the fitted parameters, from the best to the least determined."""
 
 
 def analyse_legs(
@@ -35,24 +40,27 @@ def analyse_legs(
     kept: Bool[np.ndarray, " size"],
     spread: Float[np.ndarray, "legs residuals"],
 ) -> list[LegAnalysis]:
-    """Directions of the parameters that are kept; standard errors with all unknown, beside what is known of robots
-    beforehand."""
+    """Return the uncertainty of each leg's parameters.
+
+    The directions are those of the parameters in `kept`, determined by the data alone. The standard errors take all
+    parameters as unknown, and include the priors.
+    """
     space, size = residuals.space, residuals.size
     results = []
     rows = zip(coordinates, *residuals(coordinates, np.ones_like(kept)), spread, strict=True)
-    for y, value, jacobian, worth in rows:
+    for y, value, jacobian, divisor in rows:
         scatter = float(np.sqrt(np.sum(value**2) / max(np.count_nonzero(value) - np.count_nonzero(kept), 1)))
-        vector, slope = residuals.parameters(y[:size])
+        vector, derivatives = residuals.parameters(y[:size])
         units = space.units(vector)[space.free]
-        priors = np.concatenate([units / np.diag(slope), DYNAMICS_PRIOR[: len(y) - size]])
-        # In units of the prior, whatever the coordinates.
-        shown = jacobian * priors / worth[:, None]
-        covariance = np.linalg.inv(shown.T @ shown + np.eye(len(y)))
+        priors = np.concatenate([units / np.diag(derivatives), DYNAMICS_PRIOR[: len(y) - size]])
+        # The Jacobian with respect to parameters in units of their priors.
+        scaled = jacobian * priors / divisor[:, None]
+        covariance = np.linalg.inv(scaled.T @ scaled + np.eye(len(y)))
         deviation = np.sqrt(np.diag(covariance))
         standard_errors = np.zeros(len(LEG_PARAMETERS))
         standard_errors[space.free] = deviation[:size] * units
-        # Of each direction, what the dynamics cannot take up.
-        known, unknown = shown[:, :size][:, kept[:size]], shown[:, size:][:, kept[size:]]
+        # Remove from each direction the part that the dynamics can explain.
+        known, unknown = scaled[:, :size][:, kept[:size]], scaled[:, size:][:, kept[size:]]
         unknown, singular, _ = np.linalg.svd(unknown, full_matrices=False)
         unknown = unknown[:, singular > 1e-9 * singular.max(initial=0.0)]
         results.append(
@@ -68,6 +76,6 @@ def analyse_legs(
 
 
 def _dynamics_errors(coordinates: Float[np.ndarray, " 6"], deviation: Float[np.ndarray, " 6"]) -> LegDynamics:
-    """Return standard errors in the dynamics' units from those in units of their priors."""
-    slope = np.diag(np.asarray(jax.jacfwd(lambda y: jnp.stack(leg_dynamics(y)))(jnp.asarray(coordinates))))
-    return LegDynamics(*map(float, slope * DYNAMICS_PRIOR * deviation))
+    """Return standard errors in the units of the dynamics, given those in units of the priors."""
+    derivatives = np.diag(np.asarray(jax.jacfwd(lambda y: jnp.stack(leg_dynamics(y)))(jnp.asarray(coordinates))))
+    return LegDynamics(*map(float, derivatives * DYNAMICS_PRIOR * deviation))

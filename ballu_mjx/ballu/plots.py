@@ -1,4 +1,4 @@
-"""Figures of BALLU: gaits, actuator curves, ways from above."""
+"""Figures of BALLU: gaits, actuator curves, and trajectories from above."""
 
 from __future__ import annotations
 
@@ -17,17 +17,20 @@ from ballu_mjx.ballu.sweep import Sweep
 from ballu_mjx.viz.style import COMMAND_COLOURS, colour_of, label_of, save_figure
 
 SIDE_COLOURS = COMMAND_COLOURS[:2]
-"""Left and right, as in the model."""
+"""Colours of the left and the right leg, as in the model."""
 
 
 def gait(
     path: Path, qpos: Float[np.ndarray, "states nq"], command: Float[np.ndarray, "steps 2"], *, start: float = 6.0
 ) -> None:
-    """What a gait looks like: a strip of stick figures from the side, one every quarter of a second; the feet's heights
-    and the commands over time, stance marked (a foot near the floor and at rest; a swinging foot may graze the floor);
-    the way from above.
+    """Draw a gait in four panels.
 
-    Strip and time plots show eight seconds from `start` (s) on; all are at the control rate.
+    - Stick figures from the side, one every quarter of a second.
+    - The heights of the feet over time, with marks where a foot is planted (`gait.planted_feet`).
+    - The commands over time.
+    - The trajectory of the centre of mass from above, with the places of the planted feet.
+
+    The first three panels show eight seconds from `start` (s) on. `qpos` and `command` are at the control rate.
     """
     period = CONTROL_TIMESTEP
     sticks, feet, com = _sticks(qpos)
@@ -74,7 +77,7 @@ def draw_trajectories(
     simulated: Sequence[Float[np.ndarray, "states 3"]],
     simulator: str,
 ) -> None:
-    """The centre of mass from above in each trial (m): on the robot, and in the policy's own simulator."""
+    """Draw the centre of mass (m) from above in each trial, on the robot and in the policy's own simulator."""
     figure = Figure(figsize=(7.0, 6.0), layout="constrained")
     axis = figure.subplots()
     for name, runs in ((simulator, simulated), ("recording", hardware)):
@@ -91,7 +94,7 @@ def draw_trajectories(
 
 
 def _sticks(qpos: Float[np.ndarray, "states nq"]) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
-    """Polylines (m, world) of body and legs, positions of the feet, and the centre of mass, for each state."""
+    """Return polylines of body and legs, positions of the feet, and centres of mass in each state (m, world frame)."""
     model = load_model()
     data = mujoco.MjData(model)
     lines: dict[str, list[np.ndarray]] = {"body": [], **{side: [] for side in SIDES}}
@@ -110,8 +113,11 @@ def _sticks(qpos: Float[np.ndarray, "states nq"]) -> tuple[dict[str, np.ndarray]
 
 
 def actuator_curves(path: Path, sweep: Sweep, result: Identification) -> None:
-    """Settled angles over commands, a panel for each joint: measured, nominal and identified (the paper's figure of the
-    actuators); dotted, identified with the drivetrain that belongs to it."""
+    """Draw settled angles over commands: measured, nominal and identified, with one panel for each joint.
+
+    This is the paper's figure of the actuators. Dotted lines are the angles at the end of each hold in the simulated
+    motion, with the identified friction and drivetrain.
+    """
     figure = Figure(figsize=(9.0, 6.5), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True, sharey="row")
     simulations = {"vanilla": result.nominal_settled, "vanilla+sysid": result.settled}

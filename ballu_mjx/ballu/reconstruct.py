@@ -1,9 +1,10 @@
-"""What BALLU adds to the reconstruction of its recordings.
+"""BALLU's additions to the reconstruction of its recordings.
 
-- The base's pitch: with the neck's lever of 15 mm, markers show it to some 7 deg a sample. Unless the base's
-  orientation is recorded, it is fitted over the whole recording at once to markers and the base's torque balance.
-- Motor angles: the model's own servo, driven by the recorded commands and held back by the cable at the knee angles
-  found, so that motor, cable and knee agree. A recording's motor columns, where there are any, are taken instead.
+- Base pitch: the neck's lever is only 15 mm long, so markers determine the pitch of a sample to about 7 deg. If the
+  base's orientation is not recorded, the pitch is fitted over the whole recording at once, to the markers and to the
+  base's torque balance.
+- Motor angles: they are simulated by the model's servo, driven by the recorded commands and loaded by the cable at the
+  knee angles found. Motor, cable and knee then agree. If motor angles are recorded, these are used instead.
 """
 
 from __future__ import annotations
@@ -27,32 +28,32 @@ from ballu_mjx.recordings.inverse_kinematics import KinematicFit
 from ballu_mjx.recordings.motion import MeasurementGrid
 
 BASE_PITCH = "base_pitch"
-"""Key of `Motion.uncertainty`: the standard deviation (rad) of the base's pitch. Neck and hips share this error with
-the opposite sign; balloon, legs and feet in the world do not."""
+"""Key of `Motion.uncertainty` for the standard deviation (rad) of the base's pitch. Neck and hip angles have the same
+error with the opposite sign. The world poses of balloon, legs and feet do not have it."""
 
 _CHUNK = 512
-"""Samples in a compiled call: recordings of any length share one program."""
+"""Number of samples in a compiled call, so that recordings of any length share one program."""
 _TORQUE_NOISE = 1e-3
-"""Standard deviation (N m) of the base's torque balance, a sample at 100 Hz; 1 deg of pitch is 2e-4 N m."""
+"""Standard deviation (N m) of the base's torque balance in a sample at 100 Hz. 1 deg of pitch is 2e-4 N m."""
 _FORCE_WINDOW = 0.15
 """Width (s) of the Savitzky-Golay filter for the accelerations in the base's torque balance."""
 _PITCH_HELD = 1e4
-"""Weight (1/rad) by which the second fit holds the base's pitch where the torque balance has found it."""
+"""Weight (1/rad) with which the second fit holds the base's pitch at the value from the torque balance."""
 _STOP_GIVE = float(np.deg2rad(0.5))
-"""How far (rad) below its stop a knee may be: the stop is soft, and the spring holds the knee 0.35 deg inside."""
+"""Largest angle (rad) of a knee below its stop. The stop is soft, and the spring holds the knee 0.35 deg inside it."""
 _SERVO_SUBSTEP = 1e-3
-"""Longest step (s) of the servo's simulation, whose fastest time constant is about 9 ms."""
+"""Longest time step (s) of the servo's simulation, whose fastest time constant is about 9 ms."""
 _SETTLING = 0.5
-"""Seconds for which the first command is held before the recording starts, for the servo to arrive."""
+"""Time (s) for which the first command is held before the recording starts, so that the servo reaches its target."""
 
 
 # ---- the base's pitch ----
 
 
 def complete_positions(fit: KinematicFit) -> KinematicFit:
-    """Return the fit with the base's pitch by its torque balance, unless the base's orientation is recorded.
+    """Return the fit with the base's pitch from its torque balance, unless the base's orientation is recorded.
 
-    `fit.uncertainty` has the pitch's standard deviation as `BASE_PITCH`.
+    In either case, `uncertainty` of the result has the standard deviation (rad) of the pitch as `BASE_PITCH`.
     """
     grid, parameters = fit.problem.grid, fit.problem.parameters
     if "base" in grid.orientations:
@@ -65,20 +66,21 @@ def complete_positions(fit: KinematicFit) -> KinematicFit:
 
 
 _PITCH_DOF = 4
-"""Place in qvel of the base's rotation about its y axis."""
+"""Index in qvel of the base's rotation about its y axis."""
 
 
 def _base_pitch(fit: KinematicFit) -> tuple[Float[np.ndarray, "T 4"], float]:
-    """Base quaternions with a pitch that agrees with markers and torques, and the pitch's standard deviation (rad).
+    """Return base quaternions with a pitch that fits markers and torques, and the pitch's standard deviation (rad).
 
-    The hips' axes run through the base's frame, so legs and balloon in the world are known without its pitch theta.
-    About that axis, with psi the world pitches of balloon and femurs, a and d the armature and damping of neck and
-    hips, F the balloon's pull at the neck r and G the base's weight and inertia force at its centre of mass c:
+    The hips' axes pass through the base's origin. The world poses of legs and balloon are therefore known without the
+    base's pitch theta. Let psi be the world pitches of balloon and femurs, and a and d the armature and damping of neck
+    and hips. Let F be the balloon's pull at the neck r, and G the base's weight and inertia force at its centre of mass
+    c. The torque balance about the hips' axis is:
 
         (I + sum a) theta'' + (sum d) theta' = sum (a psi'' + d psi') + r(theta) x F + c(theta) x G
 
-    Its least-squares fit over all samples, together with the inverse kinematics' pitches, is a banded problem, solved
-    by Gauss-Newton.
+    Its least-squares fit over all samples, together with the pitches of the inverse kinematics, is a banded problem.
+    Gauss-Newton solves it.
     """
     model, grid, parameters = fit.problem.model, fit.problem.grid, fit.problem.parameters
     qpos, step, count = fit.qpos, grid.step, len(fit.qpos)
@@ -110,7 +112,7 @@ def _base_pitch(fit: KinematicFit) -> tuple[Float[np.ndarray, "T 4"], float]:
     before, now, after = (scipy.sparse.eye_array(*shape, k=k) for k in range(3))
     first, second = (after - before) / (2 * step), (after - 2 * now + before) / step**2
 
-    # It varies little; the median does not believe samples whose pitch has wandered to where it would be well seen.
+    # The information varies little. The median ignores samples whose wrong pitch makes it seem well determined.
     information = np.median(1.0 / np.linalg.inv(fit.information)[:, _PITCH_DOF, _PITCH_DOF])
     torque_noise = _TORQUE_NOISE * np.sqrt(0.01 / step)
     pitch = np.full(count, np.mean(measured))
@@ -143,7 +145,10 @@ def _base_pitch(fit: KinematicFit) -> tuple[Float[np.ndarray, "T 4"], float]:
 def _pitch(
     quaternion: Float[np.ndarray, "T 4"],
 ) -> tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T 3"], Float[np.ndarray, "T 3"]]:
-    """Pitch (rad) about the body's own y axis, from the horizontal axis `forward`; `up` completes the frame."""
+    """Return the pitch (rad) about the body's y axis, and the axes of the frame in which it is measured.
+
+    These are the horizontal axis `forward`, from which the pitch is measured, and `up`, which completes the frame.
+    """
     matrix = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     x, y = matrix[:, :, 0], matrix[:, :, 1]
     forward = np.cross(y, np.array([0.0, 0.0, 1.0]))
@@ -161,8 +166,7 @@ def complete_joints(
     qpos: Float[np.ndarray, "T nq"],
     qvel: Float[np.ndarray, "T nv"],
 ) -> tuple[Float[np.ndarray, "T nq"], Float[np.ndarray, "T nv"]]:
-    """Return states with the knees at their stops or above, and the motors where their servos take them, unless they
-    are recorded."""
+    """Return states with the knees at or above their stops, and with simulated motors if these are not recorded."""
     qpos, qvel = qpos.copy(), qvel.copy()
     stops = np.array([model.joint(f"knee_{side}").range for side in SIDES])
     knees = qpos[:, 7:][:, KNEES]
@@ -175,7 +179,7 @@ def complete_joints(
 def _servos(
     model: mujoco.MjModel, grid: MeasurementGrid, knee: Float[np.ndarray, "T 2"]
 ) -> tuple[Float[np.ndarray, "T 2"], Float[np.ndarray, "T 2"]]:
-    """Motor angles (rad) and rates that the model's servos take under the commands, with the knees going as they do."""
+    """Return motor angles (rad) and rates (rad/s) of the model's servos under the commands, for given knee angles."""
     servos = [model.actuator(f"servo_{side}").id for side in SIDES]
     cables = [model.tendon(f"cable_{side}").id for side in SIDES]
     dofs = [model.joint(f"motor_{side}").dofadr[0] for side in SIDES]
@@ -194,7 +198,7 @@ def _servos(
         "damping": model.dof_damping[dofs],
         "armature": model.dof_armature[dofs],
     }
-    # The femur's tie point in the tibia's frame, from the servo's axis.
+    # The cable's end at the femur in the tibia's frame, relative to the servo's axis.
     tie = np.stack(
         [
             np.cos(knee) * ties[:, 0] - np.sin(knee) * ties[:, 2] - arms[:, 0],
@@ -235,9 +239,11 @@ def _servo_chunk(
     dt: Float[Array, ""],
     substeps: int,
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Servo arms (left, right) on their armature, implicit in the rate: state after, and at each sample.
+    """Simulate the servo arms (left, right) and return the final state, and the angles and rates at each sample.
 
-    armature m'' = clip(servo) - damping m' - (dl/dm) tension, where l is the cable's length.
+    The equation, with the motor angle m and the cable's length l, is integrated implicitly in the damping's rate m':
+
+        armature m'' = clip(servo) - damping m' - (dl/dm) tension
     """
     c = constants
 

@@ -1,4 +1,4 @@
-"""One leg of the nominal robot in MJX, hanging from a base held still."""
+"""Simulation in MJX of one leg that is suspended from a fixed base."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 
 
 def leg_actuators(vector: Float[Array, " parameters"]) -> ActuatorParameters:
-    """Of a model with one leg."""
+    """Return the actuator parameters of a model with one leg, from a vector in the order of `LEG_PARAMETERS`."""
     return ActuatorParameters(**dict(zip(LEG_PARAMETERS, vector[:, None], strict=True)))
 
 
 class SuspendedLeg:
-    """The nominal robot's leg in MJX, hanging from a base held still, for any actuator parameters.
+    """One leg in MJX, suspended from a fixed base, with any actuator parameters.
 
-    The left leg, which serves for both: the right one is its mirror image, and moves alike. Legs come in one batch:
-    one for each command, parameters and direction of a derivative.
+    The left leg represents both, because the right one is its mirror image and moves in the same way. Several legs are
+    one batch, with an entry for each command, parameter vector and direction of a derivative.
     """
 
     def __init__(self) -> None:
@@ -42,13 +42,13 @@ class SuspendedLeg:
         self._dofs = np.array([joint.dofadr[0] for joint in joints])
         self._mjx = put_model(self.model)
         self._data = make_data(self.model)
-        rubbing = copy.copy(self.model)
-        rubbing.dof_frictionloss[self._dofs] = (
+        with_friction = copy.copy(self.model)
+        with_friction.dof_frictionloss[self._dofs] = (
             FIRST_DYNAMICS.motor_friction,
             FIRST_DYNAMICS.knee_friction,
-        )  # MJX leaves out those of 0
-        self._rubbing = put_model(rubbing)
-        self._rubbing_data = make_data(rubbing)
+        )  # not 0, because MJX leaves out joints without dry friction
+        self._friction_model = put_model(with_friction)
+        self._friction_data = make_data(with_friction)
         self._relaxation_damping = np.zeros(self.model.nv)
         for kind, damping in _RELAXATION_DAMPING.items():
             self._relaxation_damping[self.model.joint(f"{kind}_{SIDES[0]}").dofadr[0]] = damping
@@ -57,8 +57,11 @@ class SuspendedLeg:
     def settled(
         self, vectors: Float[Array, "legs parameters"], commands: Float[Array, " legs"]
     ) -> tuple[Float[Array, "legs nq"], Float[Array, "legs nq parameters"]]:
-        """Generalized positions at rest under each leg's command; `[:, self.angles]` are motor and knee (rad). And
-        their derivatives, those of an implicit function."""
+        """Return generalized positions at rest under each leg's command, and derivatives with respect to parameters.
+
+        The entries `[:, self.angles]` are the angles (rad) of motor and knee. The derivatives are those of an implicit
+        function.
+        """
         close = jax.vmap(vmap_with_trailing_batch(self._relaxed_qpos))(vectors, commands)
         qpos, jacobians = self._rest(close, vectors, commands)
         nq = self.model.nq
@@ -71,14 +74,15 @@ class SuspendedLeg:
         command: Float[Array, " times"],
         begins: Bool[np.ndarray, " times"],
     ) -> Float[Array, "times 2"]:
-        """One leg's motor and knee angle (rad) every `SAMPLE_TIMESTEP`, each as it was the delay before.
+        """Return one leg's motor and knee angles (rad) every `SAMPLE_TIMESTEP`.
+
+        The leg is simulated without delay. The angles are then shifted in time by the delay. The result can be
+        differentiated in forward mode.
 
         **Arguments**
 
-        - `command`: held from each time to the next.
-        - `begins`: where the leg is set to rest at the default angles, and the play to its middle.
-
-        Differentiable forwards.
+        - `command`: command at each time, held until the next.
+        - `begins`: times at which the leg is set to rest at the default angles, and the backlash to its middle.
         """
         timestep = float(self.model.opt.timestep)
         inner = round(SAMPLE_TIMESTEP / timestep)
@@ -86,7 +90,7 @@ class SuspendedLeg:
         def path(vector: Array, dynamics: LegDynamics, command: Array) -> Array:
             own = {name: getattr(dynamics, name)[None] for name in ("knee_friction", "motor_friction", "knee_damping")}
             parameters = dataclasses.replace(leg_actuators(vector), **own, backlash=dynamics.backlash[None])
-            model = with_fields(self._rubbing, actuator_fields(self.model, parameters))
+            model = with_fields(self._friction_model, actuator_fields(self.model, parameters))
             start = state_at(self._default_qpos(vector), jnp.zeros(self.model.nv))
             drivetrain = parameters.drivetrain()._replace(lag=dynamics.lag[None])
 
@@ -98,7 +102,7 @@ class SuspendedLeg:
                 state, driven = jax.tree.map(partial(jnp.where, begins), (start, at_rest), (state, driven))
                 for _ in range(inner):
                     driven, ctrl = step_drivetrain(drivetrain, driven, command[None], timestep)
-                    state = physics_step(model, self._rubbing_data.replace(ctrl=ctrl), state)  # pyright: ignore
+                    state = physics_step(model, self._friction_data.replace(ctrl=ctrl), state)  # pyright: ignore
                 return (state, driven), state.qpos[self.angles]
 
             first = init_drivetrain(drivetrain, command[:1], 2)
@@ -112,7 +116,7 @@ class SuspendedLeg:
     def _residual_torque(
         self, qpos: Float[Array, " nq"], vector: Float[Array, " parameters"], command: Float[Array, ""]
     ) -> Float[Array, " nv"]:
-        """Generalized force (N m) that nothing balances, at rest in `qpos`: zero where the leg hangs still."""
+        """Return the unbalanced generalized forces (N m) at rest in `qpos`. They are 0 if the leg is in equilibrium."""
         model = self._with(vector)
         rest = jnp.zeros(self.model.nv)
         data = self._data.replace(qpos=qpos, qvel=rest, qacc=rest, ctrl=command[None])  # pyright: ignore
@@ -120,17 +124,22 @@ class SuspendedLeg:
         return data.qfrc_actuator - data.qfrc_inverse
 
     def _with(self, vector: Float[Array, " parameters"]) -> mjx.Model:
+        """Return the MJX model with the parameters of `vector`."""
         return with_fields(self._mjx, actuator_fields(self.model, leg_actuators(vector)))
 
     def _default_qpos(self, vector: Float[Array, " parameters"]) -> Float[Array, " nq"]:
+        """Return the position with motor and knee at their default angles."""
         rest = [vector[LEG_PARAMETERS.index(name)] for name in ("default_motor_angle", "default_knee_angle")]
         return jnp.zeros(self.model.nq).at[self.angles].set(jnp.stack(rest))
 
     def _relaxed_qpos(self, vector: Float[Array, " parameters"], command: Float[Array, ""]) -> Float[Array, " nq"]:
-        """Close to rest, by simulating the way there from command 0, heavily damped and in long steps: whether the
-        cable is taut, the stop holds and the servo saturates is then settled."""
+        """Return a position close to rest, from a simulation with strong damping and long steps.
+
+        The simulation starts at the default angles. It determines whether the cable is taut, the knee is at its stop
+        and the servo saturates.
+        """
         model = self._with(vector)
-        # One iteration will do here: what is not exact is Newton's to mend.
+        # One solver iteration suffices, because Newton's method in `_rest` corrects the result.
         option = model.opt.replace(timestep=jnp.asarray(_RELAXATION_TIMESTEP), iterations=1, ls_iterations=4)
         model = model.replace(dof_damping=jnp.asarray(self._relaxation_damping), opt=option)  # pyright: ignore
         start = state_at(self._default_qpos(vector), jnp.zeros(self.model.nv))
@@ -144,10 +153,12 @@ class SuspendedLeg:
         vectors: Float[Array, "legs parameters"],
         commands: Float[Array, " legs"],
     ) -> tuple[Float[Array, "legs nq"], Float[Array, "legs nv nq+parameters"]]:
-        """Where nothing is left unbalanced, and the derivatives there of what is, by positions and parameters.
+        """Return positions in equilibrium, and there the Jacobian of the unbalanced forces.
 
-        By Newton's method with Levenberg's damping, from close by. Optimistix has such solvers; each holds MJX's
-        program several times over, this one once.
+        The Jacobian is with respect to positions, then parameters.
+
+        The solver is Newton's method with Levenberg's damping, starting from `close`. Optimistix has equivalent
+        solvers, but each of them contains MJX's program several times. This one contains it once.
         """
         nq = self.model.nq
         every = jnp.eye(nq + vectors.shape[1])
@@ -163,10 +174,10 @@ class SuspendedLeg:
             x, value = (jnp.where(better[:, None], *pair) for pair in ((trial, x), (new_value, value)))
             jacobian = jnp.where(better[:, None, None], new_jacobian, jacobian)
             damping = jnp.where(better, damping / 100, damping * 10)
-            slope = jacobian[..., :nq]
-            normal = jnp.swapaxes(slope, 1, 2) @ slope
+            by_position = jacobian[..., :nq]
+            normal = jnp.swapaxes(by_position, 1, 2) @ by_position
             damped = normal * (1 + damping[:, None, None] * jnp.eye(nq))
-            step = jnp.linalg.solve(damped, jnp.swapaxes(slope, 1, 2) @ value[..., None])[..., 0]
+            step = jnp.linalg.solve(damped, jnp.swapaxes(by_position, 1, 2) @ value[..., None])[..., 0]
             return x, value, jacobian, damping, x - step, count + 1
 
         def unfinished(state: tuple[Array, ...]) -> Array:
@@ -180,11 +191,14 @@ class SuspendedLeg:
 
 
 _RELAXATION_TIMESTEP = 0.05
+"""Time step (s) of the damped simulation."""
 _RELAXATION_STEPS = 150
+"""Number of its time steps."""
 _RELAXATION_DAMPING = {"hip": 0.1, "knee": 0.12, "motor": 0.2}
-"""N m s/rad: more than half the time step times the stiffness of each joint, which keeps such long steps stable."""
+"""Joint damping (N m s/rad): more than half the time step times each joint's stiffness, which keeps it stable."""
 
 
 _ROOT_STEPS = 40
+"""Largest number of Newton steps."""
 _ROOT_TOLERANCE = 1e-9
-"""rad: the next step would be lost in rounding."""
+"""Step size (rad) at which the solver ends, because the next step would be below the rounding error."""

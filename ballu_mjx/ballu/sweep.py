@@ -1,7 +1,7 @@
-"""Actuator sweeps: what a suspended recording says about the way from commands to joint angles.
+"""Actuator sweeps: the relation between commands and joint angles in suspended recordings.
 
-A sweep holds one pair of commands after the other, each until the joints have settled. Identification reads from it
-the settled angles (the paper's data, section "System Identification") and the whole motion.
+A sweep holds one pair of commands after another, each until the joints have settled. Identification uses its settled
+angles (the paper's data, section "System Identification") and its whole motion.
 """
 
 from __future__ import annotations
@@ -19,49 +19,55 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.recording import Recording
 
 LEVELS = 20
-"""Command levels of a sweep (paper)."""
+"""Smallest number of command levels of a sweep (paper)."""
 SAMPLE_TIMESTEP = 0.01
-"""Seconds between two samples of the motion."""
+"""Time (s) between two samples of the motion."""
 SHORTEST_HOLD = 0.6
-"""Seconds for which each command must be held at least."""
+"""Shortest time (s) for which each command must be held."""
 _SETTLED_SECONDS = 0.5
+"""Longest window (s) at the end of a hold over which settled angles are averaged."""
 _SETTLED_WITHIN = float(np.deg2rad(0.5))
-"""Drift (rad) within the settled window above which a joint creeps."""
+"""Drift (rad) within this window above which a joint creeps."""
 _MOVING = float(np.deg2rad(2.0))
-"""Drift (rad) above which it moves, and the hold says nothing of where it would settle."""
+"""Drift (rad) above which a joint still moves, so that the hold does not show its settled angle."""
 _SAME_LEVEL = 0.005
+"""Largest difference of neighbouring commands that count as the same level."""
 _REACHES = (0.1, 0.9)
+"""Upper bound of the lowest command of a sweep, and lower bound of the highest."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sweep:
-    """Angles (rad) of one or more suspended recordings of a robot, by hold; the last two axes are (motor, knee) and
-    (left, right)."""
+    """Joint angles (rad) of one or more suspended recordings of a robot, by hold.
+
+    The last two axes of angles are (motor, knee) and (left, right).
+    """
 
     robot: str
+    """Name of the robot in its recordings."""
     command: Float[np.ndarray, "holds 2"]
-    """Commands held (left, right)."""
+    """Commands (left, right) of each hold."""
     settled: Float[np.ndarray, "holds 2 2"]
-    """Means over the last stretch of each hold."""
+    """Settled angles (rad): means over a window at the end of each hold."""
     drift: Float[np.ndarray, "holds 2 2"]
-    """How far the second half of that stretch lies from its first."""
+    """Mean angle (rad) over the second half of this window, minus the mean over its first half."""
     samples: Int[np.ndarray, " holds"]
-    """Samples in each of those means."""
+    """Number of samples in this window."""
     motion: Float[np.ndarray, "times 2 2"]
-    """All angles, every `SAMPLE_TIMESTEP`, one recording after the other."""
+    """All angles (rad), every `SAMPLE_TIMESTEP`, one recording after the other."""
     hold: Int[np.ndarray, " times"]
-    """The hold at each of these times."""
+    """Index of the hold at each of these times."""
     begins: Bool[np.ndarray, " times"]
-    """Where a recording begins: what was before has no part in what follows."""
+    """Whether a recording begins at a time. Earlier times then have no influence on later ones."""
 
     def means(self, motion: Float[np.ndarray, "times 2 2"]) -> Float[np.ndarray, "holds 2 2"]:
-        """Of a motion like this one: what it comes to at the end of each hold."""
+        """Return the mean angles (rad) at the end of each hold, of a motion at the same times as this one."""
         count = min(round(_SETTLED_SECONDS / SAMPLE_TIMESTEP), int(np.bincount(self.hold).min()) // 3)
         return np.array([motion[self.hold == hold][-count:].mean(axis=0) for hold in range(len(self.command))])
 
     @property
     def creep(self) -> str | None:
-        """Return which holds end with a joint that still creeps, in words; None: none does."""
+        """Return a sentence about the holds that end with a joint that still creeps, or None if no hold does."""
         drift = np.abs(self.drift)
         creeping = int(np.sum(drift.max(axis=(1, 2)) > _SETTLED_WITHIN))
         if not creeping:
@@ -70,12 +76,12 @@ class Sweep:
         name = f"{('motor', 'knee')[joint]}_{SIDES[side]}"
         return (
             f"{creeping} of {len(drift)} holds end with a joint that still creeps, by up to "
-            f"{np.rad2deg(drift.max()):.1f} deg ({name}). Their settled angles count for less; the motion "
-            "counts in full."
+            f"{np.rad2deg(drift.max()):.1f} deg ({name}). Their settled angles have a lower weight; the motion "
+            "has its full weight."
         )
 
     def settled_without(self, left_out: Sequence[int]) -> Sweep:
-        """The settled angles of all other holds, and no motion."""
+        """Return a sweep with the settled angles of all holds except those in `left_out`, and without motion."""
         kept = np.setdiff1d(np.arange(len(self.command)), left_out)
         settled = {name: getattr(self, name)[kept] for name in ("command", "settled", "drift", "samples")}
         motion = {name: getattr(self, name)[:0] for name in ("motion", "hold", "begins")}
@@ -83,18 +89,21 @@ class Sweep:
 
 
 def read_sweep(recordings: Mapping[Path, Recording], *, levels: int = LEVELS) -> Sweep:
-    """The sweep in one or more suspended recordings of one robot.
+    """Return the sweep in one or more suspended recordings of one robot.
 
-    Legs may have been swept together or one after the other.
+    The legs may be swept together or one after the other.
 
     **Arguments**
 
-    - `recordings`: by the file that messages name.
-    - `levels`: fewest command levels a leg.
+    - `recordings`: the recordings, by the file that error messages name.
+    - `levels`: smallest number of command levels of each leg.
 
-    **Raises** `InputError` for recordings that are sound but no such sweep: of another kind or of several robots, with
-    a leg whose command never moves, with too few levels or levels that do not span [0, 1], with holds too short or
-    joints still moving by more than 2 deg at their end. Slower creep is accepted: see `Sweep.creep`.
+    **Raises** `InputError` for recordings that are valid but are not a usable sweep:
+
+    - They are of another kind, or of several robots.
+    - The command of a leg never changes, has too few levels, or its levels do not span [0, 1].
+    - A hold is too short, or a joint still moves by more than 2 deg at its end. Slower creep is accepted; see
+      `Sweep.creep`.
     """
     names = ", ".join(str(path) for path in recordings)
     robots = sorted({recording.robot for recording in recordings.values()})
@@ -104,8 +113,8 @@ def read_sweep(recordings: Mapping[Path, Recording], *, levels: int = LEVELS) ->
     for path, recording in recordings.items():
         if recording.kind != "suspended":
             raise InputError(
-                f"{path}: is a {recording.kind} recording; actuators are identified from suspended ones (feet off the "
-                'ground, "kind": "suspended").'
+                f"{path}: this is a {recording.kind} recording; actuators are identified from suspended ones (feet off "
+                'the ground, "kind": "suspended").'
             )
         parts.append(_holds(path, recording))
     firsts = np.cumsum([0] + [len(part[0]) for part in parts])
@@ -118,17 +127,18 @@ def read_sweep(recordings: Mapping[Path, Recording], *, levels: int = LEVELS) ->
 
 
 def _check_levels(names: str, side: str, command: Float[np.ndarray, " holds"], levels: int) -> None:
+    """Refuse commands of a leg with too few levels, or with levels that do not span [0, 1]."""
     ordered = np.sort(command)
     count = 1 + int(np.sum(np.diff(ordered) > _SAME_LEVEL))
     if count == 1:
         raise InputError(
             f"{names}: command_{side} stays at {ordered[0]:g}: the {side} leg was not swept; add a recording in which "
-            "it was."
+            "this leg is swept."
         )
     if count < levels:
         raise InputError(
-            f"{names}: holds {count} levels of command_{side}; {levels} spread over [0, 1] are needed (--levels "
-            f"{count} accepts these, at the price of larger standard errors)."
+            f"{names}: there are {count} levels of command_{side}; {levels} spread over [0, 1] are needed (--levels "
+            f"{count} accepts these, with larger standard errors)."
         )
     if ordered[0] > _REACHES[0] or ordered[-1] < _REACHES[1]:
         raise InputError(
@@ -137,8 +147,10 @@ def _check_levels(names: str, side: str, command: Float[np.ndarray, " holds"], l
 
 
 def _holds(path: Path, recording: Recording) -> tuple[np.ndarray, ...]:
-    """Command, settled angles, drift and samples of each hold of one recording; its motion, and the hold at each
-    time."""
+    """Return the command, settled angles, drift and number of samples of each hold, the motion, and its hold indices.
+
+    All are those of one recording, in the order of the fields of `Sweep`.
+    """
     motors, knees = motor(recording), knee(recording)
     assert motors is not None and knees is not None  # mandatory in suspended recordings
     time, angles = recording.time, np.stack([motors, knees], axis=1)
@@ -149,7 +161,7 @@ def _holds(path: Path, recording: Recording) -> tuple[np.ndarray, ...]:
         place = int(np.argmin(durations))
         raise InputError(
             f"{path}: the command at {time[starts[place]]:.2f} s is held for {durations[place]:.2f} s only; hold each "
-            f"until the joints settle, {SHORTEST_HOLD:g} s or more (2 s is good)."
+            f"command until the joints settle, for {SHORTEST_HOLD:g} s or more (2 s is good)."
         )
     settled_seconds = min(_SETTLED_SECONDS, durations.min() / 3)
     settled, drifts, samples = [], [], []

@@ -1,4 +1,4 @@
-"""An identification in words: a table, and details beneath it."""
+"""Report of an identification as text: a table with details below it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ballu_mjx.ballu.sweep import Sweep
 from ballu_mjx.identification.parameters import Direction
 
 _STRONG = 0.9
-"""Correlations beyond this are named."""
+"""Magnitude of a correlation above which the report names it."""
 
 
 _UNITS = {
@@ -49,13 +49,16 @@ _DYNAMICS_UNITS = {
 
 
 def mean_error(simulated: Float[np.ndarray, "holds 2 2"], sweep: Sweep) -> float:
-    """Mean absolute error (deg) of the settled angles."""
+    """Return the mean absolute error (deg) of the settled angles."""
     return float(np.mean(np.abs(simulated - sweep.settled)) / DEGREE)
 
 
 def identification_table(sweep: Sweep, result: Identification) -> str:
-    """For the terminal: nominal and identified values with standard errors, errors before and after, and what the data
-    leave open."""
+    """Return the report for the terminal.
+
+    It has the nominal and identified values with standard errors, the errors before and after, and the directions that
+    the data leave open.
+    """
     nominal = nominal_leg()
     lines = [f"{'':33}{'nominal':>10}{'identified':>12}{'standard error':>16}"]
     for index, name in enumerate(LEG_PARAMETERS):
@@ -86,8 +89,8 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
             f"{np.rad2deg(fit.residual):.2f} deg ({side})" for side, fit in zip(SIDES, result.fits, strict=True)
         )
         lines.append(
-            f"Of the whole motion is left, root mean square: {scatter}; if that is more than your capture's noise, "
-            "this model lacks something."
+            f"Root mean square error of the whole motion: {scatter}. If it exceeds the noise of your motion capture, "
+            "the model lacks an effect."
         )
     with jax.enable_x64(True):
         for label, angles in (("before", result.nominal_settled), ("after", result.settled)):
@@ -96,28 +99,28 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
                 pair = angles[:, :, side], sweep.settled[:, :, side]
                 distances += np.asarray(curve_distances(sweep.command[:, side], *pair, result.config.degree))
             there, back = distances.sum(axis=1)
-            lines.append(f"Curves {label}: Hausdorff distance {there:.4f} simulated to measured, {back:.4f} back.")
+            lines.append(f"Curves {label}: Hausdorff distance {there:.4f} simulated to measured, {back:.4f} reverse.")
     if (selection := result.selection) is not None:
-        reason = "so they are identified" if selection.richer else "so they stay nominal"
+        reason = "They are therefore identified" if selection.richer else "They therefore stay nominal"
         lines.append(
-            "Travel, cable stiffness, spring reference, lag and knee damping explain "
-            f"{selection.effect:.1%} of what they leave (2 % wanted), F = {selection.statistic:.1f} (5 % level: "
-            f"{selection.threshold:.1f}), {reason}."
+            "Travel, cable stiffness, spring reference, lag and knee damping reduce the sum of squares by "
+            f"{selection.effect:.1%} of what is left (2 % are required), with F = {selection.statistic:.1f} "
+            f"(5 % level: {selection.threshold:.1f}). {reason}."
         )
     lines.append(
-        "Standard errors take all parameters as unknown, these too, and hold what is known of robots beforehand."
+        "Standard errors take all free parameters as unknown, also those that stay nominal, and include the priors."
     )
     for side, fit in zip(SIDES, result.fits, strict=True):
         singular = ", ".join(f"{1 / d.standard_error:.3g}" for d in fit.directions)
-        lines.append(f"Singular values, {side} (Jacobian over noise, in units of what robots differ by): {singular}")
+        lines.append(f"Singular values, {side} (Jacobian over noise, in units of the priors): {singular}")
         lines += [
             f"Left open, {side}, and held near nominal: {_in_words(d, result.fitted)}" for d in fit.open_directions
         ]
         weakest = fit.directions[-1]
         if not fit.open_directions:
             lines.append(
-                f"Least determined, {side}: {_in_words(weakest, result.fitted)}, to {weakest.standard_error:.0%} of "
-                "what robots differ by."
+                f"Least determined, {side}: {_in_words(weakest, result.fitted)}, with a standard error of "
+                f"{weakest.standard_error:.0%} of its prior."
             )
         names = result.free
         pairs = [(fit.correlations[i, j], i, j) for i in range(len(names)) for j in range(i)]
@@ -130,7 +133,7 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
 
 
 def identification_details(result: Identification) -> dict[str, Any]:
-    """What stands beside the parameters in `actuators.json`."""
+    """Return the keys beside the parameters in `actuators.json`: standard errors and correlations."""
     errors = {name: [fit.standard_errors[i] for fit in result.fits] for i, name in enumerate(LEG_PARAMETERS)}
     dynamics = [fit.dynamics_errors for fit in result.fits if fit.dynamics_errors is not None]
     for name in LegDynamics._fields if dynamics else ():
@@ -146,7 +149,7 @@ def identification_details(result: Identification) -> dict[str, Any]:
 
 
 def _in_words(direction: Direction, names: Sequence[str]) -> str:
-    """The parameters that make up most of a direction, with their signs."""
+    """Return the parameters with the largest weights in a direction, with these weights."""
     parts = [(w, n) for w, n in zip(direction.weights, names, strict=True) if abs(w) > 0.3]
     ordered = sorted(parts, key=lambda part: -abs(part[0]))
     return " ".join(f"{w:+.2f} {name.replace('_', ' ')}" for w, name in ordered)

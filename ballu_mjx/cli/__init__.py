@@ -1,1 +1,1 @@
-"""Commands: they parse, print and return exit statuses."""
+"""Commands: option parsing, printing and exit statuses."""

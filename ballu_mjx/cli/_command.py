@@ -1,4 +1,4 @@
-"""What the training commands share: their table, the options that --quick and --resume imply, and what they say."""
+"""Shared code of the training commands: their definition, options that --quick and --resume imply, and messages."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
 
 PROGRAM = "python -m ballu_mjx.train"
 _KEPT = ("validate_every", "keep_every", "wandb")
-"""Options of a command's data that a run keeps."""
+"""Options in a command's data section that --resume takes from the run."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainCommand:
-    """A subcommand of `train`.
+    """Subcommand of `train`.
 
     **Fields**
 
-    - `summary`: what its help says.
-    - `sections`: its options, as instances of dataclasses that hold the defaults, by the section's name.
-    - `run`: takes the sections by name, and returns the exit status.
-    - `quick`: other defaults under --quick, by section and option.
-    - `defaults`: takes the data section, and returns other defaults that follow from it, by section and option; None:
-      those under --quick.
+    - `summary`: its help text.
+    - `sections`: its options by section name, as dataclass instances that hold the defaults.
+    - `run`: function that takes the sections by name and returns the exit status.
+    - `quick`: defaults under --quick, by section and option.
+    - `defaults`: function that takes the data section and returns the defaults that it implies, by section and option.
+      None if only --quick changes defaults.
     """
 
     summary: str
@@ -51,14 +51,14 @@ class TrainCommand:
 
     @property
     def help(self) -> str:
-        """The summary, and what --quick makes of the options."""
+        """Summary, with the defaults under --quick."""
         changed = [_flag(name, value) for values in self.quick.values() for name, value in values.items()]
         return self.summary + (f" Defaults under --quick: {' '.join(changed)}." if changed else "")
 
     def implied(self, name: str, data: Any) -> Mapping[str, Any] | None:
-        """Return the sections with the defaults that the options in `data` imply; None: those that they have anyway.
+        """Return the sections with the defaults that the options in `data` imply. None if these change no default.
 
-        **Raises** `InputError` where the run of --resume is none of the command called `name`.
+        **Raises** `InputError` if the run of --resume is not from the command `name`.
         """
         folder: Path | None = getattr(data, "resume", None)
         if folder is not None:
@@ -83,7 +83,7 @@ class TrainCommand:
 
 
 def _flag(name: str, value: Any) -> str:
-    """Return an option as one would type it."""
+    """Return an option as it is typed on the command line."""
     flag = name.replace("_", "-")
     if isinstance(value, bool):
         return f"--{'' if value else 'no-'}{flag}"
@@ -91,7 +91,10 @@ def _flag(name: str, value: Any) -> str:
 
 
 def parsers(commands: Mapping[str, TrainCommand], sections: Mapping[str, Mapping[str, Any]] | None = None) -> dict:
-    """Return what tyro makes the parsers of `commands` from, by name; `sections` holds other defaults than theirs."""
+    """Return a dataclass for each of the `commands`, from which tyro makes the parser.
+
+    `sections` holds sections by command name. They replace the command's own sections, with other defaults.
+    """
     return {name: _parser(name, each, (sections or {}).get(name)) for name, each in commands.items()}
 
 
@@ -104,9 +107,9 @@ def _parser(name: str, command: TrainCommand, sections: Mapping[str, Any] | None
 
 
 def run_command(commands: Mapping[str, TrainCommand], arguments: Sequence[str] | None, description: str) -> int:
-    """Parse the arguments (None: the process's own), and run the command that they name; returns its exit status.
+    """Parse the arguments (None: those of the process), run the command that they name, and return its exit status.
 
-    Defaults that depend on other options, --resume and --quick, are settled by a second parse.
+    --resume, --quick and other options change defaults. A second parse uses these defaults.
 
     **Raises** `InputError` for options that cannot be used.
     """
@@ -137,15 +140,16 @@ def run_command(commands: Mapping[str, TrainCommand], arguments: Sequence[str] |
 def load_chosen_robot(
     robot: str | None, resume: Path | None = None, task: str | None = None, residual: Path | None = None
 ) -> RobotDescription:
-    """Return the robot of the option --robot, or that of the run of a `task` that goes on.
+    """Return the robot to train for.
 
-    Without both it is the robot of the run of a `residual`, if there is one, and else the default one.
+    With `resume` and `task`, it is the robot of the resumed run. Otherwise it is `robot`, the value of --robot. Without
+    --robot, it is the robot of the run `residual`. Without all of these, it is the default robot.
 
-    **Raises** `InputError` where there is no such robot, or both --robot and --resume are given.
+    **Raises** `InputError` if the robot does not exist, or if both --robot and --resume are given.
     """
     if resume is not None and task is not None:
         if robot is not None:
-            raise InputError("--robot does not go with --resume, which keeps the robot; leave one out.")
+            raise InputError("--robot does not go with --resume, which keeps the run's robot; leave one out.")
         return run_robot(read_config(resume, task), resume)
     if robot is None and residual is not None:
         return run_robot(read_config(residual, *RESIDUAL_TASKS), residual)
@@ -155,7 +159,7 @@ def load_chosen_robot(
 
 
 def start_from(task: str, data: Any, ppo: PPOConfig) -> ResumePoint:
-    """Return where training starts by a command's data section, and tell the user what is worth knowing of it.
+    """Return the point at which training starts, given a command's data section; print a notice about it, if any.
 
     **Raises** `InputError` from `find_resume_point`.
     """
@@ -167,16 +171,16 @@ def start_from(task: str, data: Any, ppo: PPOConfig) -> ResumePoint:
 
 @dataclasses.dataclass
 class Written:
-    """Where a command writes to."""
+    """Folder to which a command writes."""
 
     folder: Path | None = None
 
 
 @contextlib.contextmanager
 def written_to(*, first: bool = True) -> Iterator[Written]:
-    """Say at the end where everything lies, and how long it took; `first` is whether this process writes.
+    """Print the output folder and the elapsed time at the end.
 
-    The command sets `folder` of what it gets.
+    The command sets `folder` of the yielded object. `first` is whether this process writes and prints.
     """
     started, written = time.perf_counter(), Written()
     yield written
@@ -188,9 +192,9 @@ def written_to(*, first: bool = True) -> Iterator[Written]:
 def open_run(
     folder: Path, content: Mapping[str, Any], resumed_at: int | None, wandb: str | None, *, first: bool = True
 ) -> Iterator[TrainingRecord]:
-    """Open the run's folder for a training: in memory alone where another process writes; see `Run`.
+    """Open a run's folder for training (see `Run`), or a record in memory if another process writes (`first` False).
 
-    A training that is interrupted is told how to go on.
+    If training is interrupted, print the command that resumes it.
     """
     if not first:
         yield MemoryRecord(content)
@@ -201,5 +205,5 @@ def open_run(
             yield run
         except TrainingInterrupted as stopped:
             print(f"Interrupted; saved at step {stopped.step:,}.", file=sys.stderr)
-            print(f"To go on: {PROGRAM} {content['task']} --resume {folder}", file=sys.stderr)
+            print(f"To resume: {PROGRAM} {content['task']} --resume {folder}", file=sys.stderr)
             raise

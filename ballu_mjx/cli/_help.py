@@ -1,7 +1,7 @@
-"""The order of options in --help: data, length of training and what to learn first; processes and debugging last.
+"""Order of the options in --help: data, length of training and what to learn first; processes and debugging last.
 
-tyro shows options by the dataclass that holds them, those of base classes first. Help alone is therefore made from
-other dataclasses, which hold the same options by what they are for.
+tyro groups options by the dataclass that holds them, with those of base classes first. For --help alone, the options
+are therefore copied into other dataclasses, one for each purpose.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class _Group(NamedTuple):
     title: str
     description: str
     names: tuple[str, ...]
-    """Options in the order that help shows them in."""
+    """Names of the options, in the order in which --help shows them."""
 
 
 _FIRST = (
@@ -38,20 +38,20 @@ _FIRST = (
     ),
     _Group(
         "length of training",
-        "How long and how often to learn, and from where to go on.",
+        "Number of steps, seeds and checkpoints, and the run to resume.",
         ("quick", "num_timesteps", "policy_steps", "residual_steps", "updates", "relinearizations", "evaluations")
         + ("starts", "steps", "rounds", "seed", "seeds", "trials", "takes", "validate_every", "keep_every", "resume"),
     ),
     _Group(
         "what to learn",
-        "Choices that decide what comes out.",
+        "Choices of the method and of the quantities to learn.",
         ("preset", "forces", "terms", "free", "force_scales", "motion", "objective", "also", "domain_randomization"),
     ),
 )
 _LAST = (
     _Group(
         "several processes",
-        "One training by several processes, on one machine or many (docs/distributed.md).",
+        "One training in several processes, on one or several machines (docs/distributed.md).",
         ("coordinator", "num_processes", "process_id"),
     ),
     _Group("logging and debugging", "", ("wandb", "debug")),
@@ -65,28 +65,31 @@ _DETAILS = {
     "sampling": "details of sampling",
     "story": "more",
 }
-"""Titles of what is left of a section."""
+"""Title of the group with a section's remaining options."""
 
 
 def asks_for_help(arguments: Sequence[str] | None) -> bool:
-    """Return whether the arguments (None: the process's own) ask for --help."""
+    """Return whether the arguments (None: those of the process) ask for --help."""
     return any(each in _ASKS_FOR_HELP for each in (sys.argv[1:] if arguments is None else arguments))
 
 
 def parse_options(options: type[_Options], arguments: Sequence[str] | None, prog: str) -> _Options:
-    """Return a command's options from its arguments (None: the process's own); --help shows them in order."""
+    """Return a command's options, parsed from its arguments (None: those of the process).
+
+    --help shows the options in the order of this module.
+    """
     if asks_for_help(arguments):
         tyro.cli(arranged(options), args=arguments, prog=prog, config=(tyro.conf.OmitArgPrefixes,))
     return tyro.cli(options, args=arguments, prog=prog)
 
 
 def arranged(options: type, sections: Mapping[str, Any] | None = None) -> type:
-    """Return a dataclass for --help alone, which holds the options of another one in groups.
+    """Return a dataclass for --help alone, which holds the same options as another dataclass, in groups.
 
     **Arguments**
 
-    - `options`: the command's options; where it has `sections`, a dataclass of these.
-    - `sections`: the defaults of each section, by name; None: `options` has none.
+    - `options`: dataclass of the command's options, or of its sections.
+    - `sections`: defaults of each section, by name. None if `options` has no sections.
     """
     held = {"": options} if sections is None else sections
     found = {name: _described_fields(section) for name, section in held.items()}
@@ -111,7 +114,7 @@ def arranged(options: type, sections: Mapping[str, Any] | None = None) -> type:
             made += fields
             continue
         group = dataclasses.make_dataclass(f"Group{number}", fields, frozen=True, kw_only=True)
-        group.__doc__ = description or " "  # without text, dataclasses write their signature there
+        group.__doc__ = description or " "  # without a docstring, dataclasses write their signature there
         made.append((f"group{number}", Annotated[group, tyro.conf.arg(name=title)]))
     result = dataclasses.make_dataclass(options.__name__, made, frozen=True, kw_only=True)
     result.__doc__ = options.__doc__
@@ -119,8 +122,10 @@ def arranged(options: type, sections: Mapping[str, Any] | None = None) -> type:
 
 
 def _described_fields(section: Any) -> dict[str, tuple[str, Any, Any]]:
-    """Return the fields of a dataclass, or of an instance with other defaults, as `dataclasses.make_dataclass` takes
-    them, by name, with their help."""
+    """Return the fields of a dataclass by name, with their help, in the form that `dataclasses.make_dataclass` takes.
+
+    `section` is the dataclass, or an instance whose values are the defaults.
+    """
     options = section if isinstance(section, type) else type(section)
     hints, said, found = typing.get_type_hints(options, include_extras=True), _field_docstrings(options), {}
     for field in dataclasses.fields(options):
@@ -133,7 +138,7 @@ def _described_fields(section: Any) -> dict[str, tuple[str, Any, Any]]:
 
 
 def _field_docstrings(options: type) -> dict[str, str]:
-    """Return the text under each field, of the class and of those that it is made from."""
+    """Return the docstring of each field by name, those of base classes included."""
     found: dict[str, str] = {}
     for cls in reversed(options.__mro__):
         if not dataclasses.is_dataclass(cls):

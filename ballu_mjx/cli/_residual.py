@@ -1,4 +1,4 @@
-"""What the commands that learn a residual share: reading and checking, the run, and the evaluation at the end."""
+"""Shared code of the commands that learn a residual: reading and checking data, the run, and the final evaluation."""
 
 from __future__ import annotations
 
@@ -30,14 +30,15 @@ from ballu_mjx.viz import artifacts
 
 @dataclasses.dataclass(frozen=True)
 class Prepared:
-    """Recordings and simulator, ready to learn from.
+    """Recordings and simulator, ready to learn a residual from.
 
     **Fields**
 
-    - `motions`: by use.
-    - `base`: residual that the simulator has already, and `where` its run; None: none.
-    - `simulator`: without it.
-    - `evaluators`: of `simulator`.
+    - `motions`: reconstructed recordings by use (training, validation, test).
+    - `simulator`: simulator without any residual.
+    - `base`: residual that acts beside the one to be learned. None if there is none.
+    - `where`: run folder of `base`. None if there is none.
+    - `evaluators`: open-loop evaluators of `simulator`.
     """
 
     task: str
@@ -51,18 +52,18 @@ class Prepared:
 
     @property
     def improved(self) -> AugmentedSimulator:
-        """The simulator with its base residual."""
+        """Simulator with the base residual, if there is one."""
         return self.simulator.with_residual(None if self.base is None else self.base.bound)
 
     def describe(self, sections: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what `config.json` holds."""
+        """Return the content of `config.json`."""
         devices = [str(device) for device in jax.devices()]
         identified, robot = self.dataset.identified, self.dataset.robot
         content = describe_run(self.task, sections, self.dataset.files, devices, identified, robot)
         return content | {"residual": None if self.where is None else str(self.where.resolve())}
 
     def show_evaluation(self, residual: TrainedResidual, *, quick: bool) -> None:
-        """Write and print how the simulator with the residual replays the test recordings."""
+        """Evaluate the simulator with the residual on the test recordings; write and print the errors."""
         print(f"{self.dataset.replayed}:\n")
         test = self.evaluators.of(residual.model, self.motions["test"])
         print(artifacts.write_evaluation(test, residual.params, self.folder).table())
@@ -81,15 +82,15 @@ def train_residual(
     start: ResumePoint | None = None,
     first: bool = True,
 ) -> int:
-    """Read and check everything, learn in a run's folder, show what came out; returns the exit status.
+    """Read and check all inputs, learn a residual in a run's folder, show the result, and return the exit status.
 
     **Arguments**
 
-    - `sections`: returns the command's options as `config.json` holds them, what the recordings tell filled in.
-    - `learn`: what the command is for.
-    - `show`: takes the run's folder and the residual, before its evaluation is printed.
+    - `sections`: function that returns the options for `config.json`, with values that depend on the recordings set.
+    - `learn`: function that learns the residual.
+    - `show`: function that takes the run's folder and the residual. It is called before the evaluation is printed.
     - `base`, `first`: see `prepare`.
-    - `start`: where training goes on; None: from the beginning.
+    - `start`: point from which training resumes. None to start a new training.
     """
     start = start or ResumePoint()
     loggers.check(data.wandb)
@@ -106,7 +107,7 @@ def train_residual(
 
 
 def settle(env: EnvMimicConfig, prepared: Prepared, *, first: bool = True) -> EnvMimicConfig:
-    """Return the network's options with scales, limit and cost as numbers, and tell the user.
+    """Return the network's options with numbers for scales, limit and cost, and print these.
 
     **Raises** `InputError` from `scales.settle_scales`.
     """
@@ -117,7 +118,7 @@ def settle(env: EnvMimicConfig, prepared: Prepared, *, first: bool = True) -> En
 
 
 def show_report(folder: Path, residual: TrainedResidual) -> None:
-    """Write what was identified to the run's folder, and print it."""
+    """Write the report of the identification to the run's folder, and print it."""
     files.write(folder / "identification.txt", residual.report + "\n")
     print(f"\n{residual.report}\n")
 
@@ -125,12 +126,15 @@ def show_report(folder: Path, residual: TrainedResidual) -> None:
 def prepare(
     task: str, data: RecordingsData, base: Path | None = None, resume: Path | None = None, *, first: bool = True
 ) -> Prepared:
-    """Read and check everything that a residual is learned from, and tell the user what is used for what.
+    """Read and check all inputs of residual learning, and print the use of each.
 
-    `base` is the run of the residual that the simulator has already, `resume` the run that goes on, `first` whether
-    this process writes.
+    **Arguments**
 
-    **Raises** `InputError` for recordings, actuators or a base residual that cannot be used, naming them.
+    - `base`: run folder of a residual that acts beside the one to be learned. None if there is none.
+    - `resume`: run folder to resume. None for a new run.
+    - `first`: whether this process writes and prints.
+
+    **Raises** `InputError` for recordings, actuators or a base residual that cannot be used. The message names them.
     """
     robot = load_chosen_robot(data.robot, resume, task, base)
     residual = None if base is None else TrainedResidual.load(base, robot)
@@ -152,7 +156,7 @@ def prepare(
             print(f"Open-loop replay of the validation recordings by actuators:\n\n{choice.table()}\n", flush=True)
         if dataset.undecided and not choice.improves:
             if first:
-                print("Nominal actuators are taken; --actuators FILE takes the identified ones.", flush=True)
+                print("Nominal actuators are taken; --actuators FILE selects the identified ones.", flush=True)
             dataset, simulator = dataset.with_actuators(None, "nominal"), Simulator(robot)
             motions = dataset.reconstruct(simulator)
     return Prepared(task, folder, dataset, motions, simulator, residual, base, Evaluators(simulator))

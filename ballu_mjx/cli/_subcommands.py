@@ -1,4 +1,4 @@
-"""Commands with subcommands that are not `train`'s."""
+"""Commands with subcommands, other than `train`."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ def run_subcommand(
     run: Callable[[Any], int],
     arguments: Sequence[str] | None,
 ) -> int:
-    """Parse the arguments (None: the process's own) of the command called `name`, and run the chosen subcommand's
-    options; returns the exit status (`runtime.exit_status`)."""
+    """Parse the arguments (None: those of the process) of the command `name`, and run the chosen subcommand.
+
+    Return the exit status (`runtime.exit_status`).
+    """
     arguments = sys.argv[1:] if arguments is None else arguments
 
     def parse_and_run() -> int:

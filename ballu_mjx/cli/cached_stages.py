@@ -1,4 +1,4 @@
-"""Stages of a pipeline that are kept while what they were made from stays the same."""
+"""Cached stages of a pipeline: a stage is made again only if its options or its inputs have changed."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ _KEY = re.compile("[0-9a-f]{16}")
 def cached_stage(
     folder: Path, options: Any, needs: Sequence[Path], make: Callable[[Path], None], *, goes_on: bool = True
 ) -> Path:
-    """`folder` as `make` leaves it, made unless it is there with the key of `options` and `needs`.
+    """Return the `folder` of a stage. Call `make` to fill it unless it is already there with the same key.
 
-    A folder with another key is set aside. One with the same key that was not finished is handed to `make` as it is, if
-    that `goes_on` from checkpoints and there are any.
+    The key is a hash of `options` and of the keys of the stages `needs`. A folder with another key is renamed and kept.
+    If a folder with the same key is unfinished, `make` continues in it if `goes_on` is true and it has checkpoints.
+    Otherwise the folder is emptied first.
     """
     content = {
         "options": options if isinstance(options, dict) else plain(options),
@@ -43,44 +44,46 @@ def cached_stage(
         shutil.rmtree(aside, ignore_errors=True)
         if folder.exists():
             folder.rename(aside)
-        print(f"{folder}: made with other options; set aside as {aside.name}.")
+        print(f"{folder}: made with other options or inputs; renamed to {aside.name}.")
         found = None
-    print(f"\n== {folder.name}" + (" (goes on)" if goes_on and found is not None else ""), flush=True)
+    print(f"\n== {folder.name}" + (" (resumed)" if goes_on and found is not None else ""), flush=True)
     if folder.exists() and not (goes_on and found is not None and list_checkpoints(folder)):
-        shutil.rmtree(folder)  # a beginning of nothing
+        shutil.rmtree(folder)  # unfinished, and `make` cannot continue in it
     folder.mkdir(parents=True, exist_ok=True)
     write_mark(mark, key, content, done=False)
     make(folder)
     write_mark(mark, key, content, done=True)
-    # Programs of a stage stay mapped otherwise, until the process has no map left.
+    # Otherwise the compiled programs of all stages stay mapped, until the process reaches its limit of memory maps.
     jax.clear_caches()
     gc.collect()
     return folder
 
 
 def stage_mark(folder: Path) -> Path:
-    """Where a stage's key stands: beside its folder, which is its maker's."""
+    """Return the path of the file with a stage's key. It is beside the folder, which only `make` fills."""
     return folder.with_name(folder.name + ".stage.json")
 
 
 def write_mark(path: Path, key: str, content: dict[str, Any], *, done: bool) -> None:
+    """Write a stage's key, whether the stage is `done`, and the `content` from which the key was made."""
     files.write(path, json.dumps({"key": key, "done": done, **content}, indent=2, default=str) + "\n")
 
 
 def read_mark(path: Path) -> dict[str, Any]:
-    """The content of a stage's file.
+    """Return the content of a stage's file.
 
-    **Raises** `InputError` where it is damaged.
+    **Raises** `InputError` if the file is damaged.
     """
-    mend = "delete it, and its stage will be made anew"
+    mend = "delete it, and its stage will be made again"
     content = files.read_json(path, mend)
     key = content.get("key")
     if not (isinstance(key, str) and _KEY.fullmatch(key) and isinstance(content.get("done"), bool)):
-        raise InputError(f'{path}: "key" and "done" are not as this program writes them; {mend}.')
+        raise InputError(f'{path}: the values of "key" and "done" are not valid; {mend}.')
     return content
 
 
 def plain(options: Any) -> Any:
+    """Return options as JSON-compatible values: a dataclass as a dict with its class name under "kind"."""
     if isinstance(options, tuple):
         return [plain(option) for option in options]
     return dataclasses.asdict(options) | {"kind": type(options).__name__}

@@ -1,6 +1,6 @@
-"""Runs side by side: `python -m ballu_mjx compare RUN RUN...`.
+"""Comparison of runs: `python -m ballu_mjx compare RUN RUN...`.
 
-Runs that differ in nothing but their seed are one row: mean, with the 95 % confidence interval (Student's t).
+Runs that differ only in their seed share a row: mean and 95 % confidence interval (Student's t).
 """
 
 from __future__ import annotations
@@ -21,42 +21,45 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.seed_intervals import LEVEL, t_interval
 
 _LAST = 0.1
-"""Part of a training, at its end, over which its reward is averaged."""
+"""Final fraction of a training over which the reward is averaged."""
 _POINTS = 200
-"""Of a drawn learning curve."""
+"""Number of points of a drawn learning curve."""
 _UNTOLD = ("seed", "num_timesteps")
-"""Options in which the runs of a row may differ: of the second, only the part that a run has done counts."""
+"""Options in which the runs of a row may differ. A run counts with the steps that it has done, not with the number of
+steps that it was given."""
 
 
 _MEAN_RATIO = "mean ratio"
-"""The score that checkpoints are chosen by, of the test recordings."""
+"""Score on the test recordings. The same score on the validation recordings chooses the checkpoint."""
 _NOT_SHARED = """\
-Figures of all rows: {shared}. "-" is not measured: the method has no reward, or the recordings are of other groups or
-lengths. A ratio compares a run with its own simulator without residual. It does not say which row's errors are smaller.
-`python -m ballu_mjx evaluate RUN --recordings ... --output RUN` measures runs of one robot on the same recordings."""
+Figures of all rows: {shared}. "-" is not measured: the method has no reward, or the recordings differ in group or
+length. A ratio compares a run with its own simulator without residual. It does not say which row's errors are
+smaller. `python -m ballu_mjx evaluate RUN --recordings ... --output RUN` measures runs of one robot on the same
+recordings."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Options(runtime.CommandOptions):
-    """Compare runs of one task: a table and a plot, mean with 95 % interval over runs that differ in the seed alone."""
+    """Compare runs of one task in a table and a plot. Runs that differ only in their seed share a row, with their mean
+    and 95 % confidence interval."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of runs."""
+    """Run folders."""
     output: Path | None = None
-    """Folder for compare.md and compare.png. Without this option: the table is only printed."""
+    """Folder for compare.md and compare.png. Without this option, the table is only printed."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """Runs that differ in their seed alone."""
+    """Runs that differ only in their seed."""
 
     label: str
-    """The options in which they differ from other rows."""
+    """Options and values in which the runs differ from other rows."""
     folders: tuple[Path, ...]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status (`runtime.exit_status`)."""
+    """Run the command; return the exit status (`runtime.exit_status`)."""
 
     def run() -> None:
         runtime.prepare()
@@ -66,9 +69,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def rows(folders: Sequence[Path]) -> list[Row]:
-    """Runs by what they have in common.
+    """Return the runs grouped into rows, one for each set of options.
 
-    **Raises** `InputError` where one is no run, or the tasks differ.
+    **Raises** `InputError` if a folder is no run, is given twice, or has another task.
     """
     from ballu_mjx.policies.tasks import TASKS
     from ballu_mjx.residuals.registry import RESIDUAL_TASKS
@@ -94,10 +97,11 @@ def rows(folders: Sequence[Path]) -> list[Row]:
 
 
 def figures(folder: Path) -> dict[str, float]:
-    """What a run came to, by name: reward at the end, and ratios to the simulator without forces where it has an
-    evaluation.
+    """Return a run's figures by name: its final reward, and the error ratios of its evaluation if it has one.
 
-    **Raises** `InputError` where the run has not trained yet, or its evaluation is damaged.
+    A ratio divides the error with the residual by the error without it.
+
+    **Raises** `InputError` if the run has not trained yet, or if its evaluation is missing or damaged.
     """
     from ballu_mjx.evaluation.errors_file import read_evaluation
     from ballu_mjx.policies.tasks import TASKS
@@ -116,7 +120,7 @@ def figures(folder: Path) -> dict[str, float]:
         )
     found = {}
     if len(steps):
-        at_end = (steps > (1 - _LAST) * steps[-1]) | (steps == steps[-1])  # the second where that is step 0
+        at_end = (steps > (1 - _LAST) * steps[-1]) | (steps == steps[-1])  # the latter is for a last step of 0
         found["reward at the end"] = float(reward[at_end].mean())
     if path.exists():
         evaluation = read_evaluation(path)
@@ -132,7 +136,10 @@ def figures(folder: Path) -> dict[str, float]:
 
 
 def table(found: Mapping[str, Sequence[Mapping[str, float]]]) -> str:
-    """Markdown: rows by label, a column for each figure, those that all runs have first."""
+    """Return a Markdown table of the figures of each row's runs, `found[label][run][figure]`.
+
+    It has a row for each label and a column for each figure. Figures that all runs have come first.
+    """
     everything = [figures for members in found.values() for figures in members]
     names = list(dict.fromkeys(name for figures in everything for name in figures))
     shared = [name for name in names if all(name in figures for figures in everything)]
@@ -160,8 +167,11 @@ def table(found: Mapping[str, Sequence[Mapping[str, float]]]) -> str:
 
 
 def curve(folders: Sequence[Path], name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Control steps, mean and half-width of the interval of what was measured under `name`, as far as all of the runs
-    got; None where one of them has not measured it twice."""
+    """Return a learning curve of the metric `name`: control steps, mean over runs, and half-width of the interval.
+
+    It covers the steps that all runs have reached. None if a run has fewer than two values, or if the runs have no
+    steps in common. The half-width is NaN for a single run.
+    """
     from ballu_mjx.runs.metrics import read_column
 
     columns = [read_column(folder, name) for folder in folders]
@@ -181,7 +191,7 @@ def _compare(options: Options) -> None:
     from ballu_mjx.viz import plots
 
     if not options.runs:
-        raise InputError("No run is given; name the folders of one or more.")
+        raise InputError("No run is given; name one or more run folders.")
     found = rows(options.runs)
     text = table({row.label: [figures(folder) for folder in row.folders] for row in found})
     print(text)
@@ -203,7 +213,7 @@ def _compare(options: Options) -> None:
 
 
 def _options(config: Mapping[str, Any]) -> dict[str, str]:
-    """What tells a run from others: options of environment and learning, actuators, residual and recordings."""
+    """Return the properties that distinguish runs: task, options, robot, actuators, recordings and residual."""
     found = {"task": config["task"]} | {
         name: json.dumps(value)
         for section in ("env", "ppo", "fit")
@@ -222,7 +232,7 @@ def _options(config: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _kind(config: Mapping[str, Any]) -> str:
-    """What runs may be compared: residuals of whatever kind, and policies of one task."""
+    """Return a run's kind. Only runs of one kind can be compared: all residuals, or all policies of one task."""
     from ballu_mjx.residuals.registry import RESIDUAL_TASKS
 
     return "residual" if config["task"] in RESIDUAL_TASKS else config["task"]

@@ -1,6 +1,6 @@
-"""Completion of the script `ballu_mjx` by the shell: `ballu_mjx completion bash`.
+"""Shell completion of the script `ballu_mjx`: `ballu_mjx completion bash`.
 
-Made by tyro from the options of all commands. JAX, and all that needs it, is imported inside functions:
+tyro makes it from the options of all commands. JAX and modules that need it are imported inside functions:
 `runtime.prepare` has to come first.
 """
 
@@ -21,9 +21,10 @@ SHELLS = ("bash", "zsh")
 
 
 def completion_script(shell: str, commands: Sequence[str]) -> str:
-    """What the shell, one of `SHELLS`, reads to complete subcommands, options, their choices, and in bash paths.
+    """Return the completion script for a shell, one of `SHELLS`.
 
-    `commands`: the modules of this package that are commands.
+    It completes subcommands, options and their choices; in bash also paths. `commands` are the names of the modules in
+    this package that are commands.
     """
     runtime.prepare()
     text = io.StringIO()
@@ -34,13 +35,13 @@ def completion_script(shell: str, commands: Sequence[str]) -> str:
             args=["--tyro-print-completion", shell],
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
         )
-    if shell == "bash":  # tyro completes the paths of options alone
+    if shell == "bash":  # tyro completes paths of options, but not of positional arguments
         text.write(f"complete -o default -F _tyro_{PROGRAM} {PROGRAM}\n")
     return text.getvalue()
 
 
 def _parser(command: str) -> Any:
-    """What tyro makes a command's parser from."""
+    """Return the type from which tyro makes a command's parser."""
     module = importlib.import_module(f"{__package__}.{command}")
     return _either(module.subcommands()) if hasattr(module, "subcommands") else module.Options
 

@@ -1,6 +1,6 @@
 """Evaluation from the command line: `python -m ballu_mjx evaluate RUN`.
 
-JAX, and all that needs it, is imported inside functions: `runtime.prepare` has to come first.
+JAX and modules that need it are imported inside functions: `runtime.prepare` has to come first.
 """
 
 from __future__ import annotations
@@ -23,27 +23,28 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Options(runtime.CommandOptions):
-    """Replay recordings open loop, without and with a run's residual forces, and print the errors of both."""
+    """Replay recordings open loop, without and with a run's residual, and print the errors of both."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
     recordings: tuple[Path, ...] = ()
-    """Recordings to replay, files or folders. Without this option: the run's own for the test."""
+    """Recordings to replay, files or folders. Without this option: the run's test recordings."""
     robot: str | None = None
-    """Replay in this robot's model instead of the run's: the name of a robot that comes with the package, or the file
-    of a description. Both may differ in masses, lengths and the like, as with another load; goes with --recordings."""
+    """Robot to simulate instead of the run's: the name of a robot that comes with the package, or a description file.
+    It may differ from the run's robot in masses, lengths and the like, for example by another payload. Requires
+    --recordings."""
     last: bool = False
-    """Take the last checkpoint instead of the best by validation error."""
+    """Evaluate the last checkpoint instead of the one with the smallest validation error."""
     noise_floor: bool = False
-    """Also tell which errors the noise of motion capture (0.5 mm, 0.3 deg) makes by the starting states alone: no
-    simulator can be expected to do much better."""
+    """Also print the errors that motion-capture noise (0.5 mm, 0.3 deg) in the starting states causes. No simulator can
+    be expected to have much smaller errors."""
     output: Path | None = None
-    """Folder for evaluation.txt, evaluation.json, tracking.png and replay.npz, the run's own, say. Without this option:
-    the table is only printed."""
+    """Folder for evaluation.txt, evaluation.json, tracking.png and replay.npz, for example the run's folder. Without
+    this option: the table is only printed."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status (`runtime.exit_status`)."""
+    """Run the command; return the exit status (`runtime.exit_status`)."""
 
     def run() -> None:
         runtime.prepare()
@@ -72,7 +73,7 @@ def _evaluate(options: Options) -> None:
     which = "last" if options.last else "best"
     own = run_robot(config, options.run)
     if options.robot is not None and not options.recordings:
-        raise InputError("--robot goes with --recordings, of that robot; give some.")
+        raise InputError("--robot goes with --recordings; give recordings of that robot.")
     robot = own if options.robot is None else load_robot(options.robot)
     check_simulates(robot)
     loaded = TrainedResidual.load(options.run, robot, which, other_model=robot is not own)
@@ -104,11 +105,11 @@ def _evaluate(options: Options) -> None:
 
 
 def noise_floor(floor: Sequence[Errors], errors: Sequence[Errors]) -> str:
-    """For the terminal: by group and horizon, what noise alone makes of a simulator's errors, and what these are."""
+    """Return lines for the terminal: errors due to noise alone and errors of the simulator, by group and horizon."""
     from ballu_mjx.evaluation.errors import mean_by_group
 
     lines = [
-        "Of these errors, those that the noise of motion capture (0.5 mm, 0.3 deg) in the starting states makes:",
+        "Part of these errors that motion-capture noise (0.5 mm, 0.3 deg) in the starting states causes:",
     ]
     for noise, ours in zip(mean_by_group(floor), mean_by_group(errors), strict=True):
         for horizon, (position, _) in noise.position.items():

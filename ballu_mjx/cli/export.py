@@ -1,6 +1,6 @@
-"""`python -m ballu_mjx export policy`, `... simulator`, `... check`: into the user's own tools.
+"""Export to other tools: `python -m ballu_mjx export policy`, `... simulator`, `... check`.
 
-JAX, and all that needs it, is imported inside functions: `runtime.prepare` has to come first.
+JAX and modules that need it are imported inside functions: `runtime.prepare` has to come first.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ballu_mjx.policies.deploy.export import ExportOptions, export_policy
 
 @dataclasses.dataclass(frozen=True)
 class PolicyOptions(runtime.CommandOptions, ExportOptions):
-    """Write a locomotion policy as a controller for the robot that needs Python and NumPy only."""
+    """Write a locomotion policy as a controller for the robot. The controller needs only Python and NumPy."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run."""
@@ -27,45 +27,47 @@ class PolicyOptions(runtime.CommandOptions, ExportOptions):
 
 @dataclasses.dataclass(frozen=True)
 class SimulatorOptions(runtime.CommandOptions):
-    """Write a run's simulator for C MuJoCo: the model with identified values, and what applies drivetrain and residual.
+    """Write a run's simulator for C MuJoCo: the model with identified values, and code for drivetrain and residual.
 
-    It needs Python, NumPy and MuJoCo only."""
+    It needs only Python, NumPy and MuJoCo."""
 
     run: tyro.conf.Positional[Path]
-    """Folder of a run of a residual, of identified actuators, or of a policy (the simulator that it was trained in)."""
+    """Folder of a run of a residual, of identified actuators, or of a policy. For a policy, the simulator in which it
+    was trained is exported."""
     output: Path | None = None
     """Folder to write into, new or empty. Without this option: simulator/ in the run's folder."""
     onnx: bool = False
-    """Write each network of the residual too, as NAME.onnx. Its properties name inputs and outputs, with units. Needs
-    the extra onnx."""
+    """Also write each network of the residual, as NAME.onnx. The file's metadata name inputs and outputs with units.
+    Needs the extra onnx."""
     check_seconds: float = 5.0
-    """Length of a rollout in double precision that goes with the folder for its self-test, s; 0: none."""
+    """Length (s, 0 to 60) of a reference rollout in double precision, with which the exported simulator tests itself. 0
+    for no rollout."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CheckOptions(runtime.CommandOptions):
-    """Run an exported policy in C MuJoCo, beside the simulator that it was trained in.
+    """Run an exported policy in C MuJoCo, and compare it with the same policy in its training simulator.
 
-    The exit status is 1 where they differ."""
+    The exit status is 1 if they differ."""
 
     folder: tyro.conf.Positional[Path]
-    """What `export policy` wrote."""
+    """Folder that `export policy` wrote."""
     simulator: Path | None = None
-    """An exported simulator to run in. Without this option: the policy's own one."""
+    """Exported simulator in which to run the policy. Without this option: the simulator in which it was trained."""
     run: Path | None = None
-    """Folder of the policy's run. Without this option: where it was."""
+    """Folder of the policy's run. Without this option: the folder from which the policy was exported."""
     seconds: float | None = None
-    """Length of the trial, s. Without this option: the task's."""
+    """Length of the trial (s). Without this option: the task's trial length."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status (`runtime.exit_status`)."""
-    description = "Take results into other tools. Each subcommand explains its options with --help."
+    """Run the command; return the exit status (`runtime.exit_status`)."""
+    description = "Export results to other tools. Each subcommand explains its options with --help."
     return run_subcommand("export", description, subcommands(), _run, arguments)
 
 
 def subcommands() -> dict[str, type]:
-    """Options of the subcommands by name."""
+    """Return the options of the subcommands by name."""
     return {"policy": PolicyOptions, "simulator": SimulatorOptions, "check": CheckOptions}
 
 
@@ -87,11 +89,11 @@ def _simulator(options: SimulatorOptions) -> int:
     output = options.output or options.run / "simulator"
     found = export_simulator(simulator, output, onnx=options.onnx, check_seconds=options.check_seconds)
     if found.left_out:
-        print(f"MJCF cannot hold {', '.join(found.left_out)}; parameters.npz does.")
+        print(f"MJCF cannot represent {', '.join(found.left_out)}; parameters.npz contains these values.")
     if found.deviation is not None:
         distance, angle = found.deviation
         print(
-            f"C MuJoCo differs from the simulator by {1000 * distance:.2g} mm and {angle:.2g} deg at most over "
+            f"C MuJoCo differs from the simulator by at most {1000 * distance:.2g} mm and {angle:.2g} deg over "
             f"{options.check_seconds:g} s, in double precision."
         )
     print(f"Written to {found.folder}: {', '.join(sorted(path.name for path in found.folder.iterdir()))}.")

@@ -1,11 +1,18 @@
-"""The whole story in one command, on a virtual robot: `python -m ballu_mjx.train all`.
+"""All experiments of the paper in one command, on a virtual robot: `python -m ballu_mjx.train all`.
 
-Stages, in the paper's order: an actuator sweep and its identification; vanilla policies; their actions replayed on the
-robot, several times each; one EnvMimic a task, and beyond the paper the air identified from the same recordings;
-policies in all simulators; trials on the robot; tables. With `--rounds`, EnvMimic learns again from the robot under its
-own policies, and they in the simulator that this makes; `--also` adds simulators. Every stage is a folder, and beside
-it stands the key of what it was made from (options, and the keys of the stages it needs): an interrupted run goes on
-where it was, and a changed option redoes what depends on it and nothing else.
+The stages are, in the paper's order:
+
+1. Record an actuator sweep, and identify the actuators.
+2. Train vanilla policies.
+3. Replay their actions on the robot, several times each.
+4. Learn one EnvMimic for each task. Beyond the paper, identify the air from the same recordings.
+5. Train policies in all simulators.
+6. Run the policies on the robot, and write tables.
+
+With `--rounds`, EnvMimic learns again from the robot's motion under its own policies, and policies are trained again in
+the resulting simulator. `--also` adds simulators. Every stage has a folder, and beside it a file with the stage's key:
+a hash of its options and of the keys of the stages that it needs. An interrupted run therefore resumes at the
+unfinished stage, and a changed option repeats only the stages that depend on it.
 """
 
 from __future__ import annotations
@@ -65,40 +72,41 @@ _DECIMALS = 4
 
 @dataclasses.dataclass(frozen=True)
 class Options(loggers.LoggingOptions):
-    """What to run, and how long to train."""
+    """Experiments to run, and lengths of training."""
 
     output: Path = Path("runs/all")
-    """Folder of all stages. What is there already and was made with the same options is kept."""
+    """Folder of all stages. A stage that is already there and was made with the same options is kept."""
     robot_seed: int = 0
-    """Which virtual robot of the family stands in for the hardware."""
+    """Seed of the virtual robot that replaces the hardware."""
     seeds: tuple[int, ...] = (0,)
-    """Seeds of the trainings: each trains every policy and residual anew."""
+    """Training seeds. Every policy and residual is trained once for each."""
     tasks: tuple[Literal["walk", "turn"], ...] = ("walk", "turn")
-    """The paper's two tasks."""
+    """Tasks of the paper to run."""
     trials: int = 5
-    """Trials on the robot for each policy, each in a draught of its own."""
+    """Number of trials of each policy on the robot. The draught differs between trials."""
     takes: int = 2
-    """Recordings of each sequence of actions, each in a draught of its own."""
+    """Number of recordings of each action sequence. The draught differs between recordings."""
     policy_steps: int = 3_000_000
-    """Control steps to train each policy for."""
+    """Number of control steps for which each policy is trained."""
     residual_steps: int = 3_000_000
-    """Control steps to train each EnvMimic for."""
+    """Number of control steps for which each EnvMimic is trained."""
     rounds: int = 1
-    """How often EnvMimic learns. From the second time on, its recordings are joined by the robot's motion under the
-    policies trained the time before, in closed loop; then policies are trained anew: `envmimic-2`, and so on."""
+    """Number of times that EnvMimic is learned. From the second round on, it also learns from the robot's closed-loop
+    motion under the policies of the previous round. Policies are then trained again; their simulators are called
+    `envmimic-2` and so on."""
     also: tuple[Literal["envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised", "analytic"], ...] = ()
-    """Further simulators to train policies in: with EnvMimic's forces, and policies that pay for leaving what these
-    were learned from; with one EnvMimic that learns from the recordings of both tasks, instead of one a task; with one
-    that pushes with a torque too; with the forces that regression (all of them, the paper's baseline), and that
-    gradients through the simulation, learn from the task's."""
+    """Further simulators in which to train policies. envmimic-near: EnvMimic's forces, with a cost (--outside-cost) for
+    leaving their training range. envmimic-shared: one EnvMimic learned from the recordings of both tasks.
+    envmimic-wrench: an EnvMimic with a force and a torque. supervised: forces by regression, at full scale (the paper's
+    baseline). analytic: forces by gradients through the simulation."""
     outside_cost: float = 0.5
-    """What they pay in `envmimic-near`; see `train walk --help`."""
+    """Cost of leaving the residual's training range in `envmimic-near`. See `train walk --help`."""
     quick: bool = False
-    """Every stage within five minutes in all, for one task and two simulators; the tables mean nothing."""
+    """Run every stage, in five minutes altogether, for one task and two simulators. The tables then mean nothing."""
 
 
 def run(options: Options) -> int:
-    """Run what is missing, print the tables; returns the exit status."""
+    """Run the missing stages, print the tables, and return the exit status."""
     _check(options)
     settings = settings_of(options)
     if options.quick:
@@ -123,28 +131,28 @@ def run(options: Options) -> int:
 
 
 def settings_of(options: Options) -> tuple[str, ...]:
-    """The simulators that policies are trained in, in the tables' order."""
+    """Return the names of the simulators in which policies are trained, in the order of the tables."""
     first = ("vanilla+dr", ROUNDS) if options.quick else SETTINGS
     return (*first, *(_again(number) for number in range(2, options.rounds + 1)), *options.also)
 
 
 def _again(number: int) -> str:
-    """Return what EnvMimic's setting is called in a round."""
+    """Return the name of the simulator with EnvMimic of a round."""
     return SimulatorVariant(ROUNDS, round=number).name
 
 
 class _Job(NamedTuple):
-    """A recording to be made on the robot."""
+    """Recording to be made on the robot."""
 
     use: str
-    """Its folder: training or validation."""
+    """Name of its folder: training or validation."""
     name: str
     controller: CaptureController
     seconds: float
 
 
 class Story:
-    """The stages of one seed. Each method makes its stage, and the ones before, unless they are there."""
+    """Stages of one seed. Each method makes its stage, and the stages that it needs, unless they exist already."""
 
     def __init__(self, options: Options, seed: int) -> None:
         self.options, self.seed = options, seed
@@ -152,7 +160,7 @@ class Story:
         self._shared, self._own = options.output, options.output / f"seed-{seed}"
 
     def sweep(self) -> Path:
-        """An actuator sweep of the robot."""
+        """Return the folder of an actuator sweep of the robot."""
 
         def make(folder: Path) -> None:
             sweep = virtual_robot.record_sweep(self._robot, seed=self.options.robot_seed, name="sweep")
@@ -161,7 +169,7 @@ class Story:
         return cached_stage(self._shared / "sweep", {"robot": self.options.robot_seed}, [], make)
 
     def identified(self) -> Path:
-        """The run of the identification."""
+        """Return the run folder of the identification."""
         sweep = self.sweep()
         config = IdentificationConfig(**train_sysid.QUICK if self.options.quick else {})
 
@@ -173,7 +181,7 @@ class Story:
         return cached_stage(self._shared / "sysid", config, [sweep], make)
 
     def policy(self, task: str, setting: str) -> Path:
-        """The run of a policy's training."""
+        """Return the run folder of a policy that is trained for `task` in the simulator `setting`."""
         variant = SimulatorVariant.parse(setting)
         learned = variant.residual is not None
         config = LocomotionConfig(
@@ -183,7 +191,8 @@ class Story:
         quick = train_policy.QUICK if self.options.quick else {"num_timesteps": self.options.policy_steps}
         ppo = locomotion_ppo(seed=self.seed, **quick)
         needs = []
-        # Six checkpoints in all, or one a training step: the last three are what is replayed on the robot.
+        # At most six checkpoints, one for each training step if there are fewer. The last three are replayed on the
+        # robot.
         data = train_policy.Data(keep_every=max(ppo.num_timesteps // 6, 1), wandb=self.options.wandb)
         if learned:
             needs = [self.residual(task, setting)]
@@ -201,15 +210,18 @@ class Story:
         return cached_stage(self._own / f"{task}-{setting}", (config, ppo), needs, make)
 
     def recordings(self, task: str) -> Path:
-        """The robot's motion under the actions of vanilla policies, replayed open loop (paper: several of them, several
-        times each): those of the last checkpoints of two trainings, without and with domain randomization."""
+        """Return the folder of recordings of the robot under the actions of vanilla policies, replayed open loop.
+
+        The policies are the last checkpoints of two trainings, without and with domain randomization. As in the paper,
+        each action sequence is replayed several times.
+        """
         settings = ("vanilla+dr",) if self.options.quick else ("vanilla", "vanilla+dr")
         sources = [self.policy(task, setting) for setting in settings]
 
         def jobs(seconds: float) -> Iterator[_Job]:
             sequences = [commands for source in sources for commands in self._actions(source, seconds + 5.0)]
             for index, commands in enumerate(sequences):
-                # The last of the randomized training's sequences validates, a little longer than the others.
+                # The last sequence of the randomized training is for validation; it is a little longer than the others.
                 use = "validation" if index == len(sequences) - 1 else "training"
                 played = commands if use == "validation" else commands[: round(seconds / CONTROL_TIMESTEP)]
                 for take in range(self.options.takes):
@@ -220,8 +232,11 @@ class Story:
         return self._recorded(f"recordings-{task}", sources, task, "recordings", jobs, notes)
 
     def trained_last(self, task: str, number: int) -> Path:
-        """The robot's motion under the policies of the round before, in closed loop: those of the last checkpoints,
-        each several times; and the last one's once more, a little longer, which validates."""
+        """Return the folder of closed-loop recordings of the robot under the policies of the round before `number`.
+
+        The policies are the last checkpoints, each recorded several times for training. The very last one is recorded
+        once more for validation, a little longer.
+        """
         source = self.policy(task, _again(number - 1))
 
         def jobs(seconds: float) -> Iterator[_Job]:
@@ -244,8 +259,10 @@ class Story:
         jobs: Callable[[float], Iterable[_Job]],
         notes: str,
     ) -> Path:
-        """Record what `jobs` gives for a length (s) of training recordings; `draws` tells its circumstances from those
-        of other stages."""
+        """Make the recordings that `jobs` returns for a length of training recordings (s), and return their folder.
+
+        `draws` enters the seed of the trial conditions, so that these differ between stages.
+        """
         seconds = 6.0 if self.options.quick else 20.0
 
         def make(folder: Path) -> None:
@@ -262,8 +279,11 @@ class Story:
         return cached_stage(self._own / stage, made, sources, make)
 
     def residual(self, task: str, setting: str) -> Path:
-        """The run of a setting's residual, learned from the recordings of the task, those of all rounds up to its
-        own."""
+        """Return the run folder of the residual of a simulator.
+
+        It is learned from the recordings of the task in all rounds up to its own. `envmimic-shared` is learned from the
+        recordings of both tasks.
+        """
         variant = SimulatorVariant.parse(setting)
         method, number = variant.residual, variant.round
         if method == SHARED:
@@ -272,7 +292,7 @@ class Story:
             recordings = [self.recordings(task), *(self.trained_last(task, n) for n in range(2, number + 1))]
         identified = self.identified()
         fits = {"aerodynamic": self._air, "supervised": self._supervised, "analytic": self._analytic}
-        # The paper's force: policies exploited a wrench (docs/transfer.md).
+        # A force alone, as in the paper: policies exploited a wrench (docs/transfer.md).
         envmimic = functools.partial(self._envmimic, "wrench" if method == WRENCH else "force")
         options = fits.get(method or "", envmimic)()
 
@@ -300,7 +320,7 @@ class Story:
         return cached_stage(residual_folder(self._own, task, setting), options, needs, make, goes_on=method not in fits)
 
     def _supervised(self) -> SupervisedConfig:
-        # All of its forces: the paper's baseline, not what is left of it where they do not help.
+        # Full forces, as in the paper's baseline. Other scales would reduce them where they do not help.
         return SupervisedConfig(
             force_scales=(1.0,), seed=self.seed, **train_forces.QUICK["supervised"] if self.options.quick else {}
         )
@@ -316,7 +336,7 @@ class Story:
         return EnvMimicConfig(forces=forces), PPOConfig(seed=self.seed, **quick)
 
     def transfers(self, task: str, setting: str) -> list[Transfer]:
-        """How the policy's trials on the robot compare with its own simulator."""
+        """Return the trials of a policy on the robot, each compared with the same policy in its own simulator."""
         source = self.policy(task, setting)
         count = self.options.trials
 
@@ -331,7 +351,10 @@ class Story:
         return transfer.read_transfer(folder / "transfer.json")
 
     def _actions(self, run: Path, seconds: float) -> list[np.ndarray]:
-        """Commands of each of a policy's kept checkpoints over `seconds`, in its own simulator from standing."""
+        """Return the commands of each kept checkpoint of a policy, over `seconds` in its own simulator, from standing.
+
+        Commands are rounded to 3 decimals.
+        """
         policies = [Policy.load(run, step) for step in _last_steps(run)]
         loop = policies[0].closed_loop()
         start, count = loop.standing(), round(seconds / CONTROL_TIMESTEP)
@@ -339,12 +362,12 @@ class Story:
 
 
 def _last_steps(run: Path) -> list[int]:
-    """Of a run's last checkpoints; the best may be an earlier one, and the first is of no training at all."""
+    """Return the steps of a run's last checkpoints, without the untrained one at step 0."""
     return [step for step in list_checkpoints(run)[-KEPT:] if step > 0]
 
 
 def _draw(seed: int, task: str, use: str, number: int) -> int:
-    """The seed of a trial's circumstances. The same for all settings, which so meet the same draughts."""
+    """Return the seed of a trial's conditions. It is the same for all simulators, so that their draughts are equal."""
     digest = hashlib.sha256(f"{seed} {task} {use} {number}".encode()).digest()
     return int.from_bytes(digest[:4], "big")
 
@@ -364,7 +387,8 @@ def _check(options: Options) -> None:
 
 
 COMMAND = TrainCommand(
-    "The whole story on a virtual robot: data, actuators, residuals, policies in five simulators, trials.",
+    "Run all experiments of the paper on a virtual robot: recordings, actuators, residuals, policies in five "
+    "simulators, and trials.",
     {"story": Options()},
     lambda story: run(story),
 )

@@ -1,6 +1,6 @@
 """Recordings from the command line: `python -m ballu_mjx record import`, `... check`, `... simulate`.
 
-JAX, and all that needs it, is imported inside functions: `runtime.prepare` has to come first.
+JAX and modules that need it are imported inside functions: `runtime.prepare` has to come first.
 """
 
 from __future__ import annotations
@@ -30,82 +30,83 @@ Format = Literal[
     "auto", "lerobot", "bag", "npz", "c3d", "motive", "qualisys", "euroc", "tum", "vicon", "table"
 ]  # fmt: skip
 LEAST_CONFIDENCE = 0.4
-"""Of an `Alignment`: below it, another offset may as well be meant."""
+"""Smallest accepted confidence of an `Alignment`. Below it, another offset fits about as well."""
 LEAST_CORRELATION = 0.35
-"""Below it, the log does not belong to the motion."""
+"""Smallest accepted correlation. Below it, the command log does not belong to the captured motion."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Import(runtime.CommandOptions):
-    """Turn a motion-capture file into a recording, with the commands of a log beside it."""
+    """Make a recording from a motion-capture file and a command log."""
 
     file: tyro.conf.Positional[Path]
-    """What was captured: an export of OptiTrack, Qualisys or Vicon, C3D, a TUM or EuRoC trajectory, a ROS bag or MCAP,
-    a LeRobot dataset's folder, an .npz archive, or a table (a CSV with names in its first row)."""
+    """Motion-capture file: an export of OptiTrack, Qualisys or Vicon, C3D, a TUM or EuRoC trajectory, a ROS bag or
+    MCAP, a LeRobot dataset's folder, an .npz archive, or a table (a CSV with names in its first row)."""
     mapping: Path
-    """What in it is which part of the robot: a TOML or JSON file, see `example-mapping`."""
+    """TOML or JSON file that maps names in the capture to parts of the robot. `record example-mapping` prints one."""
     output: Path
-    """The recording to write, NAME.csv or NAME.csv.gz; NAME.json comes beside it."""
+    """Recording to write, NAME.csv or NAME.csv.gz. NAME.json is written beside it."""
     commands: Path | None = None
-    """Log of the commands: a CSV, an .npz archive or a bag. Without this option they must be in the file itself."""
+    """Command log: a CSV, an .npz archive or a bag. Without this option: the motion-capture file holds the commands."""
     offset: float | None = None
-    """Seconds to add to the log's times for those of the capture (whose first sample is at 0, or at its own time in a
-    table); 0 for one clock. Without this option the offset is looked for in how the robot moves, where its adapter
-    predicts that."""
+    """Time (s) to add to the log's times to get the capture's times. The capture begins at 0, or at its first time in a
+    table. 0 if both have one clock. Without this option: the offset is estimated from the robot's motion, if the
+    robot's adapter can predict this motion."""
     offset_range: tuple[float, float] | None = None
-    """Look for the offset between these two only: what tells the periods of a gait apart."""
+    """Smallest and largest offset (s) to search. A range is needed if the commands are periodic and several offsets
+    fit."""
     delay: float = 0.05
-    """Seconds from a command as logged to the servo's start, beyond what the nominal robot takes: what an offset that
-    was looked for does not count as the clock's."""
+    """Assumed delay (s) from a logged command to the start of the servo, beyond the nominal robot's. It is subtracted
+    from an estimated offset, because it does not belong to the clocks."""
     format: Format = "auto"
-    """Of the file. auto: by its ending and first lines."""
+    """Format of the file. auto: chosen by its extension and its first lines."""
     robot: str = "ballu"
-    """The robot: a name, or a description file."""
+    """Name of a robot, or its description file."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Map(runtime.CommandOptions):
-    """List what a file holds, and write a first mapping for it."""
+    """List the content of a motion-capture file, and write a draft of its mapping."""
 
     file: tyro.conf.Positional[Path]
-    """As of `import`."""
+    """Motion-capture file; see `record import --help`."""
     output: Path | None = None
-    """The mapping to write, a .toml. Without this option it is printed."""
+    """Mapping to write, NAME.toml. Without this option: the mapping is printed."""
     format: Format = "auto"
-    """Of the file. auto: by its ending and first lines."""
+    """Format of the file. auto: chosen by its extension and its first lines."""
     robot: str = "ballu"
-    """The robot: a name, or a description file."""
+    """Name of a robot, or its description file."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Check(runtime.CommandOptions):
-    """Tell what recordings hold: rate, gaps, ranges and commands. Broken ones are refused, with the place and fix."""
+    """Summarize recordings: rate, gaps, ranges and commands. For an invalid recording, print the place and the fix."""
 
     recordings: tyro.conf.Positional[tuple[Path, ...]]
     """Recordings, or folders of them."""
     output: Path | None = None
-    """Folder for a figure of each, NAME.png. Without this option there are none."""
+    """Folder for a figure of each recording, NAME.png. Without this option: no figures."""
     robot: str = "ballu"
-    """The robot: a name, or a description file."""
+    """Name of a robot, or its description file."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status (`runtime.exit_status`)."""
+    """Run the command; return the exit status (`runtime.exit_status`)."""
     description = "Make and check recordings of the robot. Each subcommand explains its options with --help."
     return run_subcommand("record", description, subcommands(), _run, arguments)
 
 
 def subcommands() -> dict[str, type]:
-    """Options of the subcommands by name."""
+    """Return the options of the subcommands by name."""
     return {"import": Import, "map": Map, "check": Check, "simulate": Simulate, "example-mapping": _Example}
 
 
 @dataclasses.dataclass(frozen=True)
 class _Example(runtime.CommandOptions):
-    """Print a mapping file with every key and its default: to be saved, and cut down to what your room needs."""
+    """Print a mapping file with every key and its default. Save it, and delete the keys that you do not need."""
 
     robot: str = "ballu"
-    """The robot: a name, or a description file."""
+    """Name of a robot, or its description file."""
 
 
 def _run(options: Import | Map | Check | Simulate | _Example) -> int:
@@ -139,9 +140,9 @@ def _import(options: Import) -> None:
 
     check_new(options.output)
     if options.offset is not None and options.offset_range is not None:
-        raise InputError("--offset and --offset-range: the one gives what the other looks for; give one of them.")
+        raise InputError("--offset and --offset-range exclude each other; give one of them.")
     if options.commands is None and (options.offset is not None or options.offset_range is not None):
-        raise InputError("--offset: it is a command log's, and there is none; add --commands.")
+        raise InputError("--offset and --offset-range need a command log; add --commands.")
     robot = load_robot(options.robot)
     mapping = read_mapping(options.mapping, robot)
     trajectories = read_capture(options.file, mapping, None if options.format == "auto" else options.format)
@@ -165,7 +166,7 @@ def _import(options: Import) -> None:
         time = time + found
     recording, cut = with_commands(options.commands or options.file, recording, time, command)
     if max(cut) > 0:
-        print(f"cut off, for there are no commands: {cut[0]:.2f} s at the start, {cut[1]:.2f} s at the end")
+        print(f"cut off, without commands: {cut[0]:.2f} s at the start, {cut[1]:.2f} s at the end")
     if options.commands is not None and (changes := _changes(command)) > 0 and _changes(recording.command) == 0:
         print(
             f"{options.commands}: the commands change {changes} times, and never within the capture; check time_unit "
@@ -185,7 +186,10 @@ def _offset(
     time: Float[np.ndarray, " N"],
     command: Float[np.ndarray, "N commands"],
 ) -> float:
-    """The log's offset by how the robot moves; prints it, and raises `InputError` where it is not clear."""
+    """Return the offset (s) of the command log, estimated from the robot's motion, and print it.
+
+    **Raises** `InputError` if the offset is not clear.
+    """
     from ballu_mjx.recordings.clock_alignment import align
     from ballu_mjx.recordings.hooks import hooks_of
 
@@ -193,12 +197,14 @@ def _offset(
     for path, clock in ((log, time), (options.file, recording.time)):
         if not 1.0 <= clock[-1] - clock[0] <= _LONGEST_SEARCH:
             raise InputError(
-                f"{path}: lasts {clock[-1] - clock[0]:.4g} s; offsets are found for 1 to {_LONGEST_SEARCH:g} s, cut it "
-                f"or {by_hand}."
+                f"{path}: lasts {clock[-1] - clock[0]:.4g} s; offsets are estimated for 1 to {_LONGEST_SEARCH:g} s, "
+                f"cut it or {by_hand}."
             )
     response = hooks_of(robot).response(recording, time, command)
     if response is None:
-        raise InputError(f"{log}: nothing that {robot.name} is known to do on commands was captured; {by_hand}.")
+        raise InputError(
+            f"{log}: the capture holds no motion that the adapter of {robot.name} predicts from commands; {by_hand}."
+        )
     motion, grid, predicted = response
     within = options.offset_range
     if within is not None:
@@ -206,27 +212,27 @@ def _offset(
     found = align(recording.time, motion, grid, predicted, within=within)
     if found is None:
         raise InputError(
-            f"{log}: nothing moves in it or in the capture, or too little of the two overlaps; {by_hand}, or fix "
+            f"{log}: the commands or the robot never move, or log and capture hardly overlap; {by_hand}, or correct "
             "--offset-range."
         )
     best, offset = found.best, found.best.offset - options.delay
     told = f"offset {offset:+.3f} s: correlation {best.correlation:.2f} over {found.overlap:.1f} s"
     if abs(best.correlation) < LEAST_CORRELATION:
         raise InputError(
-            f"{log}: fits the motion nowhere, best at {told}; give this trial's log, correct [commands] in "
-            f"{options.mapping}, or {by_hand}."
+            f"{log}: the commands do not fit the motion at any offset; best is {told}. Give this trial's log, correct "
+            f"[commands] in {options.mapping}, or {by_hand}."
         )
     if best.correlation < 0:
         raise InputError(
-            f"{log}: the robot moves against the commands, at {told}; turn the ranges of [commands] round in "
+            f"{log}: the robot moves against the commands, at {told}; reverse the ranges of [commands] in "
             f"{options.mapping}, or {by_hand}."
         )
     other = found.second
     if other is not None and found.confidence < LEAST_CONFIDENCE:
         raise InputError(
-            f"{log}: the commands repeat themselves, and do not tell {told} from {other.offset - options.delay:+.3f} s "
-            f"({other.correlation:.2f}), a confidence of {found.confidence:.2f}; give the right one by --offset, or "
-            "where to look by --offset-range."
+            f"{log}: the commands repeat themselves, so that two offsets fit: {told}, and "
+            f"{other.offset - options.delay:+.3f} s ({other.correlation:.2f}), a confidence of {found.confidence:.2f}; "
+            "give the right one by --offset, or a range by --offset-range."
         )
     print(f"{log}: {told}; good to about {_ALIGNMENT_ERROR:g} s")
     if other is not None:
@@ -236,13 +242,14 @@ def _offset(
 
 
 _LONGEST_SEARCH = 7200.0
-"""s."""
+"""Longest capture or log (s) for which an offset is estimated."""
 _ALIGNMENT_ERROR = 0.05
-"""s; nine of ten trials of virtual robots (benchmarks/alignment.py)."""
+"""Error (s) that an estimated offset does not exceed in nine of ten trials of virtual robots
+(benchmarks/alignment.py)."""
 
 
 def _write(options: Import, robot: RobotDescription, recording: Recording) -> None:
-    """Write, and read back what was written: the format's own reader judges it."""
+    """Write the recording, and read it back to check it. A recording that cannot be read is deleted."""
     from ballu_mjx.recordings.csv_format import read_recording, sidecar_path, write_recording
     from ballu_mjx.recordings.summary import held_sites
 
@@ -254,7 +261,7 @@ def _write(options: Import, robot: RobotDescription, recording: Recording) -> No
         for path in (options.output, sidecar_path(options.output)):
             path.unlink()
         raise InputError(
-            f"{options.file}: gives no recording by {options.mapping}, nothing written: {error}"
+            f"{options.file}: gives no valid recording with {options.mapping}, nothing written: {error}"
         ) from error
     duration = read.time[-1] - read.time[0]
     filled = sum(read.interpolated.values())
@@ -275,7 +282,7 @@ def _map(options: Map) -> None:
         if options.output.suffix != ".toml":
             raise InputError(f"--output {options.output}: a mapping is TOML; give a name that ends in .toml.")
         if options.output.exists():
-            raise InputError(f"{options.output}: stands there already; delete it, or give another --output.")
+            raise InputError(f"{options.output}: exists already; delete it, or give another --output.")
         files.check_folder(options.output.parent)
     robot = load_robot(options.robot)
     contents = find_reader(options.file, None if options.format == "auto" else options.format).list(options.file)
@@ -302,7 +309,7 @@ def _check(options: Check) -> int:
     robot = load_robot(options.robot)
     paths = list_recordings(options.recordings)
     if not paths:
-        raise InputError("There is nothing to check; name a recording, or a folder of them.")
+        raise InputError("There is no recording to check; name a recording, or a folder of recordings.")
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
     broken = 0

@@ -1,6 +1,6 @@
 """Recordings of the virtual BALLU: `python -m ballu_mjx record simulate`.
 
-The stand-in for the hardware is imported here alone, inside a function, and what it records leaves as a file.
+Of the recording commands, only this one imports the virtual robot, inside a function. Its result is a recording file.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Simulate(runtime.CommandOptions):
-    """Record on the virtual BALLU: try out a method, or what to send, before the hardware does."""
+    """Record on the virtual BALLU, to try a method or commands before using the hardware."""
 
     output: Path
-    """The recording to write, NAME.csv or NAME.csv.gz; NAME.json comes beside it."""
+    """Recording to write, NAME.csv or NAME.csv.gz. NAME.json is written beside it."""
     commands: Path | None = None
     """CSV with the columns time (s), command_left and command_right in [0, 1], played at the control rate."""
     gait: Literal["walking", "turning", "hopping", "one-legged", "telegraph", "waves"] | None = None
-    """A command sequence by name, in place of --commands."""
+    """Named command sequence, instead of --commands."""
     seconds: float = 20.0
-    """Length of the gait."""
+    """Length of the gait (s)."""
     robot_seed: int = 0
-    """Which robot of the family; 0 is the one of the bundled recordings."""
+    """Seed of the virtual robot's physical parameters. 0 is the robot of the bundled recordings."""
     trial_seed: int = 0
-    """Which day: draught, start, noise and drop-outs of motion capture."""
+    """Seed of the trial's conditions: draught, starting state, noise and drop-outs of motion capture."""
     suspended: bool = False
-    """An actuator sweep with the feet off the ground, in place of a gait."""
+    """Record an actuator sweep with the feet off the ground instead of a gait."""
     levels: int = 20
-    """Commands of the sweep, spread over [0, 1]."""
+    """Number of command levels of the sweep, spread over [0, 1]."""
     hold: float = 2.0
-    """Seconds for which the sweep holds each."""
+    """Time for which the sweep holds each level (s)."""
 
 
 def simulate(options: Simulate) -> None:
-    """Record, write the recording, and print what `record check` tells of it."""
+    """Simulate, write the recording, and print the summary of `record check`."""
     from ballu_mjx.ballu.virtual import robot as virtual_robot
     from ballu_mjx.recordings.csv_format import check_new, read_recording, recording_name, write_recording
     from ballu_mjx.recordings.summary import find_gaps, summarize_recording
@@ -60,7 +60,7 @@ def simulate(options: Simulate) -> None:
     virtual = virtual_robot.draw_robot(options.robot_seed)
     if options.suspended:
         if options.commands is not None or options.gait is not None:
-            raise InputError("--suspended: a sweep has its own commands; leave --commands and --gait out.")
+            raise InputError("--suspended: a sweep has its own commands; leave out --commands and --gait.")
         if not (2 <= options.levels <= 1000 and 0.1 <= options.hold <= 60.0):
             raise InputError("--levels, --hold: give 2 levels or more, and 0.1 to 60 s.")
         result = virtual_robot.record_sweep(
@@ -83,7 +83,7 @@ def simulate(options: Simulate) -> None:
 
 
 def _commands(options: Simulate, robot: RobotDescription) -> tuple[Float[np.ndarray, "steps 2"], str]:
-    """Commands at the control rate, and what to say of them."""
+    """Return the commands at the control rate, and a note that describes them."""
     from ballu_mjx.ballu.gaits import GAITS
     from ballu_mjx.recordings.importers.capture import read_commands
     from ballu_mjx.recordings.importers.mapping import Commands

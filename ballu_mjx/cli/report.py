@@ -1,4 +1,4 @@
-"""`python -m ballu_mjx report RUN`: a run as one page for the browser."""
+"""Report of a run as one page for the browser: `python -m ballu_mjx report RUN`."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from ballu_mjx.viz.report_content import collect
 
 @dataclasses.dataclass(frozen=True)
 class Options(runtime.CommandOptions):
-    """Write a run, or a folder of `train all`, as one page for the browser, which needs no network."""
+    """Write a report of a run, or of a folder of `train all`, as one page for the browser. It needs no network."""
 
     run: tyro.conf.Positional[Path]
     """Folder of the run, or of `train all`."""
     output: Path | None = None
     """File to write. Without this option: report.html in the run's folder."""
     open: bool = False
-    """Show it in the browser."""
+    """Open the page in the browser."""
     video: bool = False
-    """Write the replay as MP4 too, beside the page."""
+    """Also write the replay as MP4, beside the page."""
     show: str | None = None
-    """Recording (or task) that the video shows. Without this option: the first."""
+    """Recording (or task) for the video. Without this option: the first."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status (`runtime.exit_status`)."""
+    """Run the command; return the exit status (`runtime.exit_status`)."""
 
     def run() -> None:
         options = parse_options(Options, arguments, "python -m ballu_mjx report")
@@ -53,14 +53,14 @@ def _report(options: Options) -> None:
         raise InputError(f"--output {path}: is a folder; give a file.")
     content = collect(options.run)
     if options.show is not None and options.show not in (names := [take.name for take in content.takes]):
-        raise InputError(f"--show {options.show}: there is no such replay; one of {', '.join(names) or 'none'}.")
+        raise InputError(f"--show {options.show}: there is no such replay; give one of {', '.join(names) or 'none'}.")
     path.parent.mkdir(parents=True, exist_ok=True)
     files.write(path, render(content))
     print(f"Written to {path}, {path.stat().st_size / 1e6:.1f} MB.")
     if not content.takes:
         print(
-            "It has no replay in 3D: identifications have none; that of a residual is written by "
-            "`python -m ballu_mjx evaluate RUN --output RUN`."
+            "The report has no replay in 3D. An identification has none. For a residual, "
+            "`python -m ballu_mjx evaluate RUN --output RUN` writes it."
         )
     elif options.video:
         shown = next(take for take in content.takes if options.show in (None, take.name))

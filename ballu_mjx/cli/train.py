@@ -1,6 +1,6 @@
 """Training from the command line: `python -m ballu_mjx.train sysid`, `... envmimic`, `... walk` and so on.
 
-JAX, and all that needs it, is imported inside functions: `runtime.prepare` has to come first.
+JAX and modules that need it are imported inside functions: `runtime.prepare` has to come first.
 """
 
 from __future__ import annotations
@@ -15,17 +15,19 @@ if TYPE_CHECKING:
     from ballu_mjx.cli._command import TrainCommand
 
 _SIGNALS = 128
-"""Statuses from here on are of processes that were interrupted, all of them together."""
+"""Exit statuses from this number on mean that all processes of a training were interrupted together."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status (`runtime.exit_status`)."""
+    """Run the command; return the exit status (`runtime.exit_status`)."""
 
     def run() -> int:
         runtime.prepare()
         from ballu_mjx.cli._command import run_command
 
-        description = "Learn from recordings of the robot. Each subcommand explains its options with --help."
+        description = (
+            "Identify actuators, learn residuals and train policies. Each subcommand explains its options with --help."
+        )
         return run_command(_commands(), arguments, description)
 
     status = runtime.exit_status(run, arguments)
@@ -37,14 +39,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def subcommands() -> Mapping[str, Any]:
-    """Return what tyro makes the subcommands' parsers from, by name."""
+    """Return the types from which tyro makes the subcommands' parsers, by name."""
     from ballu_mjx.cli._command import parsers
 
     return parsers(_commands())
 
 
 def _commands() -> Mapping[str, TrainCommand]:
-    """Return the subcommands by name, in the order of the work."""
+    """Return the subcommands by name, in the order of use."""
     from ballu_mjx.cli import (
         pipeline,
         train_aerodynamics,

@@ -1,4 +1,4 @@
-"""Identifying the air: `python -m ballu_mjx.train aerodynamic`."""
+"""Identification of the air around the robot: `python -m ballu_mjx.train aerodynamic`."""
 
 from __future__ import annotations
 
@@ -28,18 +28,19 @@ class AirData(RecordingsData):
     """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
     fixed_from: Path | None = None
-    """Folder of an earlier run whose parameters are kept but for those of --free: balloons lose lift over weeks, and
-    `--fixed-from RUN --free lift` finds how much from one recording. Without this option none are kept."""
+    """Folder of an earlier run. Parameters that are not in --free keep their values of that run. For example, balloons
+    lose lift over weeks, and `--fixed-from RUN --free lift` identifies the present lift from one recording. Without
+    this option: they are 0."""
     free: tuple[Literal[AIR_PARAMETERS], ...] = AIR_PARAMETERS  # pyright: ignore[reportInvalidTypeForm]
-    """Parameters to identify; the others are as in --fixed-from, or 0. Leave the lift out where the model's was
-    weighed: what the legs' model lacks can pass for it."""
+    """Parameters to identify. The others keep their values of --fixed-from, or are 0. Leave out the lift if the model
+    has a weighed value: the fit can attribute errors of the legs' model to the lift."""
 
 
 def train(data: AirData, fit: AirConfig) -> int:
-    """Read and check everything, identify, evaluate; returns the exit status."""
+    """Read and check all inputs, identify the air, evaluate the result, and return the exit status."""
     check_air_config(fit, load_robot(data.robot or DEFAULT_ROBOT).control_timestep)
     if not data.free:
-        raise InputError(f"--free names no parameter; there are {', '.join(AIR_PARAMETERS)}.")
+        raise InputError(f"--free names no parameter; choose from {', '.join(AIR_PARAMETERS)}.")
     earlier = _earlier(data)
 
     def learn(prepared: Prepared, run: TrainingRecord) -> TrainedResidual:
@@ -57,18 +58,18 @@ def train(data: AirData, fit: AirConfig) -> int:
 
 
 def _earlier(data: AirData) -> TrainedResidual | None:
-    """Return the earlier result."""
+    """Return the residual of --fixed-from. None without this option."""
     if data.fixed_from is None:
         return None
     found = TrainedResidual.load(data.fixed_from, load_chosen_robot(data.robot))
     if not isinstance(found.model, Aerodynamics):
-        raise InputError(f"{data.fixed_from}: is no run of `train aerodynamic`; give one.")
+        raise InputError(f"{data.fixed_from}: is no run of `train aerodynamic`; give --fixed-from one of its runs.")
     return found
 
 
 COMMAND = TrainCommand(
-    "Identify the air around the robot (added mass, drag, lift, its centre) by least squares through the simulation: "
-    "no forces are learned. Measure it on recordings that the fit never saw.",
+    "Identify parameters of the air around the robot (added mass, drag, lift and its centre) by least squares through "
+    "the simulation. Evaluate them on test recordings. No network is trained.",
     {"data": AirData(), "fit": AirConfig()},
     train,
     {"fit": QUICK},

@@ -1,4 +1,4 @@
-"""Training residual forces: `python -m ballu_mjx.train envmimic`."""
+"""Training of residual forces by reinforcement learning: `python -m ballu_mjx.train envmimic`."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ class Data(RecordingsData, distributed.DistributedOptions):
     """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
     residual: Path | None = None
-    """Folder of another residual's run, which acts beside the forces: these learn what it leaves. It must have
-    been learned beside the same actuators. Without this option: none."""
+    """Run folder of another residual, which acts in addition to the forces to be learned. Both must have the same
+    actuators. Without this option: none."""
     resume: Path | None = None
-    """Go on with the run in this folder, from its last checkpoint, with its recordings and configuration; options
-    given beside it change these. --num-timesteps counts from the run's start."""
+    """Resume the run in this folder from its last checkpoint, with its recordings and configuration. Options on the
+    command line override its configuration. --num-timesteps counts from the start of the run."""
     preset: PresetName | None = None
-    """Other defaults of the options, which may still be given beside it. paper: state, action, reward, network and
-    optimizer of the paper, and Stable-Baselines3's defaults (docs/envmimic.md). Without this option: none."""
+    """Named set of defaults. Options on the command line override them. paper: state, action, reward, network and
+    optimizer of the paper, and the defaults of Stable-Baselines3 (docs/envmimic.md). Without this option: none."""
     validate_every: int = VALIDATE_EVERY
-    """Control steps between two validations, each of which leaves a checkpoint."""
+    """Number of control steps between two validations. Each validation writes a checkpoint."""
 
 
 def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
-    """Read and check everything, train, evaluate; returns the exit status."""
+    """Read and check all inputs, train, evaluate the result, and return the exit status."""
     distributed.join(data)
     if data.preset is not None and data.resume is not None:
-        raise InputError("--preset does not go with --resume, which keeps the run's options; leave one out.")
+        raise InputError("--preset does not go with --resume, which keeps the run's options; leave out one of them.")
     robot = load_chosen_robot(data.robot, data.resume, "envmimic", data.residual)
     check_envmimic_options(env, ppo, data.validate_every, robot.control_timestep)
     check_force_set(env.forces, robot)
@@ -88,17 +88,19 @@ def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
 
 
 def _base_residual(data: Data) -> Path | None:
-    """Return the run of the residual that acts beside the forces to be learned."""
+    """Return the run folder of the residual that acts beside the forces to be learned. None if there is none."""
     if data.resume is None:
         return data.residual
     if data.residual is not None:
-        raise InputError("--residual does not go with --resume, which keeps the simulator; leave one out.")
+        raise InputError("--residual does not go with --resume, which keeps the simulator; leave out one of them.")
     return run_residual(read_config(data.resume, "envmimic"), data.resume)
 
 
 def _defaults(data: Data) -> Mapping[str, Mapping[str, Any]]:
-    """Return the defaults that --preset and --quick imply. A preset keeps its own sizes under --quick: they fit each
-    other."""
+    """Return the defaults that --preset and --quick imply.
+
+    Sizes of a preset override those of --quick, because the preset's sizes match each other.
+    """
     quick = QUICK if data.quick else {}
     if data.preset is None:
         return {"ppo": quick} if quick else {}
@@ -107,8 +109,7 @@ def _defaults(data: Data) -> Mapping[str, Mapping[str, Any]]:
 
 
 COMMAND = TrainCommand(
-    "Learn residual forces from recordings by reinforcement learning, and measure them on recordings that training "
-    "never saw.",
+    "Learn residual forces from recordings by reinforcement learning. Evaluate them on test recordings.",
     {"data": Data(), "env": EnvMimicConfig(), "ppo": PPOConfig()},
     train,
     {"ppo": QUICK},

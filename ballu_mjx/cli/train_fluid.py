@@ -1,4 +1,4 @@
-"""Fitting fluid forces: `python -m ballu_mjx.train fluid`."""
+"""Fit of fluid forces: `python -m ballu_mjx.train fluid`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ QUICK: Mapping[str, Any] = {"terms": "linear", "window_seconds": (0.5,), "window
 
 
 def train(data: RecordingsData, fit: FluidConfig) -> int:
-    """Read and check everything, fit, evaluate; returns the exit status."""
+    """Read and check all inputs, fit, evaluate the result, and return the exit status."""
     check_fluid_config(fit, load_chosen_robot(data.robot).control_timestep)
 
     def learn(prepared: Prepared, run: TrainingRecord) -> TrainedResidual:
@@ -32,8 +32,8 @@ def train(data: RecordingsData, fit: FluidConfig) -> int:
 
 
 COMMAND = TrainCommand(
-    "Fit force and torque on the tracked body as polynomials of its velocity: lift, drag, side force, moments and "
-    "rotary damping, for any body in air or water.",
+    "Fit the force and torque on the tracked body as polynomials of its velocity: lift, drag, side force, moments and "
+    "rotary damping. For any body in air or water.",
     {"data": RecordingsData(), "fit": FluidConfig()},
     train,
     {"fit": QUICK},

@@ -30,7 +30,7 @@ _CURVES = {
     "supervised": ("force_error", "error of validation forces (ratio)"),
     "analytic": ("validation_error", "validation error (ratio)"),
 }
-"""The metric that tells the best, and what the figure calls it."""
+"""Metric that chooses the checkpoint, and its label in the figure."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,22 +38,22 @@ class ForcesData(RecordingsData):
     """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
     forces: ForceSet = "force"
-    """What the network acts with: a force on the tracked body (the paper's), a force and a torque there (wrench),
-    forces there and at every measured point (multi), forces and torques along joints (joints), or changes of the
-    commands (commands)."""
+    """Output of the network. force: a force on the tracked body (as in the paper). wrench: a force and a torque on it.
+    multi: forces on it and at every measured point. joints: forces and torques along joints. commands: changes of the
+    commands."""
     residual: Path | None = None
-    """Folder of another residual's run, which acts beside the forces: these learn what it leaves. It must have been
-    learned beside the same actuators. Without this option: none."""
+    """Run folder of another residual, which acts in addition to the forces to be learned. Both must have the same
+    actuators. Without this option: none."""
 
 
 def train_supervised(data: ForcesData, fit: SupervisedConfig) -> int:
-    """Read and check everything, label, regress, evaluate; returns the exit status."""
+    """Read and check all inputs, label forces, fit the network to them, evaluate it, and return the exit status."""
     check_supervised_config(fit)
     return _train("supervised", data, fit, fit_supervised, _robot(data))
 
 
 def train_analytic(data: ForcesData, fit: AnalyticConfig) -> int:
-    """Read and check everything, learn, evaluate; returns the exit status."""
+    """Read and check all inputs, learn, evaluate the result, and return the exit status."""
     robot = _robot(data)
     check_analytic_config(fit, robot.control_timestep)
     return _train("analytic", data, fit, fit_analytic, robot)
@@ -104,15 +104,15 @@ def _train(
 
 
 SUPERVISED = TrainCommand(
-    "Learn residual forces by regression on the forces that explain the recordings (the paper's baseline), and measure "
-    "them on recordings that training never saw.",
+    "Learn residual forces by regression on the forces that explain the recordings (the paper's baseline). Evaluate "
+    "them on test recordings.",
     {"data": ForcesData(), "fit": SupervisedConfig()},
     train_supervised,
     {"fit": QUICK["supervised"]},
 )
 ANALYTIC = TrainCommand(
-    "Learn residual forces by gradients of the tracking error through the simulation, and measure them on recordings "
-    "that training never saw.",
+    "Learn residual forces by gradients of the tracking error through the simulation. Evaluate them on test "
+    "recordings.",
     {"data": ForcesData(), "fit": AnalyticConfig()},
     train_analytic,
     {"fit": QUICK["analytic"]},

@@ -1,4 +1,4 @@
-"""Training a locomotion policy: `python -m ballu_mjx.train walk` and the other tasks."""
+"""Training of a locomotion policy: `python -m ballu_mjx.train walk` and the other tasks."""
 
 from __future__ import annotations
 
@@ -48,31 +48,31 @@ QUICK: Mapping[str, Any] = {"num_timesteps": 60_000, "num_envs": 256, "batch_siz
 
 @dataclasses.dataclass(frozen=True)
 class Data(loggers.LoggingOptions, distributed.DistributedOptions):
-    """The simulator's parts, and folders."""
+    """Robot, actuators and residual of the simulator, and folders."""
 
     robot: str | None = None
-    """Whose policy this is: the name of a robot that comes with the package, or the file of a description
+    """Robot for which the policy is trained: the name of a robot that comes with the package, or a description file
     (docs/own_robot.md). Without this option: the robot of --resume or --residual, or else ballu."""
     actuators: Path = AUTO
-    """File of identified actuators (`train sysid` writes it), or the word nominal, or auto: the residual's if there is
-    one, else nominal."""
+    """File of identified actuators (`train sysid` writes it), or one of two words. nominal: nominal actuators. auto:
+    the actuators of --residual, or nominal ones without it."""
     residual: Path | None = None
-    """Folder of a run of `train envmimic`, supervised, analytic or aerodynamic, whose residual acts in every control
-    step. Without this option: none."""
+    """Run folder of a residual (`train envmimic`, supervised, analytic, aerodynamic or fluid), which acts in every
+    control step. Without this option: none."""
     output: Path | None = None
     """Folder of the run, new or empty. Without this option: one under runs/, named after task and time."""
     resume: Path | None = None
-    """Go on with the run in this folder, from its last checkpoint, in its simulator; options of env and ppo given
-    beside it change these. --num-timesteps counts from the run's start."""
+    """Resume the run in this folder from its last checkpoint, in its simulator. Options of task and reinforcement
+    learning on the command line override the run's. --num-timesteps counts from the start of the run."""
     quick: bool = False
-    """See everything work within two minutes; the policy will not walk."""
+    """Try the command within two minutes. The policy will not walk."""
     keep_every: int = KEEP_EVERY
-    """Control steps between two checkpoints; the last three are kept, and the best, whose policy earns most in whole
-    trials without exploration."""
+    """Number of control steps between two checkpoints. The last three are kept, and the best one, which has the highest
+    reward in whole trials without exploration."""
 
 
 def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
-    """Check everything, train, show the gait; returns the exit status."""
+    """Check all inputs, train a policy, write and print its rollouts, and return the exit status."""
     distributed.join(data)
     loggers.check(data.wandb)
     start = start_from(task.name, data, ppo)
@@ -123,7 +123,7 @@ def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
 
 
 def _verdict(path: Path) -> str:
-    """Return what the file says of identified beside nominal actuators, in words."""
+    """Return how identified actuators compare with nominal ones according to their file, as text in parentheses."""
     ratio = validation_ratio(path)
     if ratio is None:
         return ""
@@ -132,7 +132,7 @@ def _verdict(path: Path) -> str:
 
 
 def summary(task: Task, rollout: Rollout, robot: RobotDescription, with_residual: bool) -> str:
-    """Return what some runs did, in words: means and ranges."""
+    """Return a sentence with mean and range of distance (m), change of yaw (deg) and counts over some rollouts."""
     way = rollout.com[:, -1] - rollout.com[:, 0]
     yaw = np.rad2deg(np.unwrap(rollout.yaw, axis=1))
     counts = robot.adapter.rollout_counts(rollout.features)
@@ -156,12 +156,14 @@ def summary(task: Task, rollout: Rollout, robot: RobotDescription, with_residual
 
 
 def _parts(task: Task, data: Data, robot: RobotDescription) -> tuple[ModelParameters | None, Path | None]:
-    """Return actuators (None: nominal), and the run of the residual (None: none)."""
+    """Return the actuators (None if nominal) and the run folder of the residual (None if there is none)."""
     if data.resume is not None:
         chosen = None if data.actuators == AUTO else data.actuators
         for option, given in (("--actuators", chosen), ("--residual", data.residual)):
             if given is not None:
-                raise InputError(f"{option} does not go with --resume, which keeps the simulator; leave one out.")
+                raise InputError(
+                    f"{option} does not go with --resume, which keeps the simulator; leave out one of them."
+                )
         stored = read_config(data.resume, task.name)
         return run_actuators(stored, data.resume, robot), run_residual(stored, data.resume)
     if data.actuators == NOMINAL:
@@ -172,7 +174,7 @@ def _parts(task: Task, data: Data, robot: RobotDescription) -> tuple[ModelParame
 
 
 def command_for(task: Task) -> TrainCommand:
-    """Return the command of a task."""
+    """Return the command that trains a policy for a task."""
     return TrainCommand(
         f"{task.summary} In the nominal simulator, or one improved by --actuators and --residual.",
         {"data": Data(), "env": LocomotionConfig(), "ppo": locomotion_ppo()},

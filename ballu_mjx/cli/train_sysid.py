@@ -1,4 +1,4 @@
-"""Identifying actuators: `python -m ballu_mjx.train sysid`."""
+"""Identification of actuators: `python -m ballu_mjx.train sysid`."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ from ballu_mjx.viz.report_content import IDENTIFICATION_FILE, collect
 QUICK: Mapping[str, Any] = {"motion": False, "starts": 4}
 """Defaults of `IdentificationConfig` under `--quick`, for BALLU's legs."""
 QUICK_DECLARED: Mapping[str, Any] = {"starts": 1, "steps": 5}
-"""Those for declared parameters."""
+"""Defaults of `FitConfig` under `--quick`, for declared parameters."""
 IDENTIFIED_MODEL = "identified.xml"
 _SHARED = ("starts", "steps", "seed")
-"""Options of `IdentificationConfig` that declared parameters have too."""
+"""Options of `IdentificationConfig` that also apply to declared parameters."""
 _WINDOWS_DRAWN = 4
 
 
@@ -53,22 +53,23 @@ class SysidData(loggers.LoggingOptions):
     """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
     recordings: tuple[Path, ...] = ()
-    """Recordings of one robot: of BALLU suspended ones, its legs swept together or one after the other; of a robot that
-    declares parameters any in which its commands vary. Without this option: the bundled sweep."""
+    """Recordings of one robot. BALLU needs suspended recordings, with its legs swept together or one after the other. A
+    robot with declared parameters needs any recordings in which its commands vary. Without this option: the bundled
+    sweep of BALLU."""
     validation: tuple[Path, ...] = ()
-    """Recordings that the fit of declared parameters does not see, and that say whether it helps. Without this option:
+    """Recordings on which the fit of declared parameters is judged; the fit does not use them. Without this option:
     every fourth window of --recordings."""
     robot: str | None = None
-    """Whose recordings these are: the name of a robot that comes with the package, or the file of a description
-    (docs/own_robot.md), whose key "identify" declares what to identify (docs/identify.md). Without this option:
-    ballu, whose legs have a method of their own."""
+    """Robot of the recordings: the name of a robot that comes with the package, or a description file
+    (docs/own_robot.md). The file's key "identify" declares the parameters to identify (docs/identify.md). Without this
+    option: ballu, whose legs have their own method."""
     levels: int = 20
-    """Fewest command levels for each of BALLU's legs (paper: 20)."""
+    """Smallest accepted number of command levels for each of BALLU's legs (paper: 20)."""
     output: Path | None = None
     """Folder of the run, new or empty. Without this option: one under runs/, named after the time."""
     quick: bool = False
-    """Within two minutes, compiling included: of BALLU settled angles alone, from fewer starts; of declared parameters
-    one short search, and no search for parameters that are not declared."""
+    """Run within two minutes, compilation included. For BALLU, fit only settled angles, from fewer starts. For declared
+    parameters, run one short search, and do not search for parameters that are missing in the declaration."""
 
 
 def train(
@@ -77,7 +78,7 @@ def train(
     windows: WindowConfig | None = None,
     sampling: SamplingConfig | None = None,
 ) -> int:
-    """Read and check the recordings, identify, write; returns the exit status."""
+    """Read and check the recordings, identify the actuators, write the results, and return the exit status."""
     windows, sampling = windows or WindowConfig(), sampling or SamplingConfig()
     loggers.check(data.wandb)
     robot = load_chosen_robot(data.robot)
@@ -85,7 +86,7 @@ def train(
         return _train_declared(data, fit, windows, sampling, robot)
     for changed in (*_changed(windows), *_changed(sampling), *(["validation"] if data.validation else [])):
         option = changed.replace("_", "-")
-        raise InputError(f"--{option} is for declared parameters; {robot.name} has a method of its own, leave it out.")
+        raise InputError(f"--{option} is for declared parameters, but {robot.name} has its own method; leave it out.")
     return _train_by_adapter(data, fit, robot)
 
 
@@ -131,7 +132,7 @@ def _train_declared(
 ) -> int:
     for changed in (*_changed(fit, _SHARED), *(["levels"] if data.levels != SysidData.levels else [])):
         option = changed.replace("_", "-")
-        raise InputError(f"--{option} is for BALLU's legs; {robot.name} declares what to identify, leave it out.")
+        raise InputError(f"--{option} is for BALLU's legs, but {robot.name} declares its parameters; leave it out.")
     config = FitConfig(**dataclasses.asdict(windows), **{name: getattr(fit, name) for name in _SHARED})
     check_fit_config(config)
     check_sampling_config(sampling)
@@ -141,7 +142,7 @@ def _train_declared(
     paths, held = list_recordings(data.recordings), list_recordings(data.validation)
     both = {path.resolve() for path in paths} & {path.resolve() for path in held}
     if both:
-        raise InputError(f"{min(both)}: is among --recordings and --validation; take it out of one of them.")
+        raise InputError(f"{min(both)}: is among --recordings and --validation; remove it from one of them.")
     recordings, validation = ({path: read_recording(path, robot) for path in each} for each in (paths, held))
     specimen = check_recordings(robot, {**recordings, **validation}, config.window_seconds)
     folder = new_folder(data.output, "sysid")
@@ -186,12 +187,12 @@ def _train_declared(
 
 
 def data_check(seen: Visibility) -> str:
-    """Return which parameters recordings can show, in words."""
+    """Return a text that says which declared parameters the recordings can identify."""
     if not seen.unseen:
         return f"Data check: these recordings show all {len(seen.names)} parameters."
     return (
         f"Data check: these recordings cannot show {', '.join(seen.unseen)}. A change as large as the spread among "
-        "robots hides in the noise; what is identified of these is the nominal value."
+        "robots is hidden by the noise; the identified values of these stay nominal."
     )
 
 
@@ -205,7 +206,7 @@ def _actuators_json(robot: RobotDescription, found: IdentifiedByFit, paths: Sequ
 
 
 def _draw(folder: Path, found: IdentifiedByFit) -> None:
-    """Draw held-out windows, what is left on them, and the parameters' intervals."""
+    """Draw held-out windows, the autocorrelation of their residuals, and the parameters' intervals."""
     fit, model = found.fit, found.held_out[0].model
     scales, units = channel_scales(model)
     nv, timestep = model.nv, found.held_out[0].sample_timestep
@@ -237,7 +238,7 @@ def _draw(folder: Path, found: IdentifiedByFit) -> None:
 
 
 def _write_model(folder: Path, robot: RobotDescription, found: IdentifiedByFit) -> None:
-    """Write the MJCF with the identified values, and say where it can be loaded."""
+    """Write the MJCF with the identified values, and print its path and how to load it."""
     assert isinstance(found.parameters, IdentifiedParameters)
     path = folder / IDENTIFIED_MODEL
     try:
@@ -248,7 +249,7 @@ def _write_model(folder: Path, robot: RobotDescription, found: IdentifiedByFit) 
     try:
         mujoco.MjModel.from_xml_path(str(path))
         print(f"{path}: the model with the identified values, for plain MuJoCo.")
-    except ValueError:  # a mesh or texture that is not there
+    except ValueError:  # a mesh or texture is missing beside the file
         print(f"{path}: the model with the identified values. Copy it beside {robot.model}, whose files it names.")
 
 
@@ -260,7 +261,7 @@ def _write_page(folder: Path) -> None:
 
 
 def _defaults(data: SysidData) -> Mapping[str, Mapping[str, Any]]:
-    """Return what the robot and --quick make of other options' defaults, by section."""
+    """Return the defaults that the robot and --quick imply, by section."""
     if not declares_parameters(load_chosen_robot(data.robot)):
         return {"fit": QUICK} if data.quick else {}
     usual = {name: getattr(FitConfig(), name) for name in _SHARED}
@@ -270,9 +271,10 @@ def _defaults(data: SysidData) -> Mapping[str, Mapping[str, Any]]:
 _DECLARED = ", ".join(f"--{name} {getattr(FitConfig, name)}" for name in _SHARED[:2])
 
 COMMAND = TrainCommand(
-    "Identify a robot's actuators from recordings: what `--actuators` of the other commands takes. Of BALLU from a "
-    'suspended sweep. Of a robot whose description declares parameters under "identify" from any recordings; it also '
-    f"writes identified.xml, the model with the identified values. Defaults there: {_DECLARED}.",
+    "Identify a robot's actuators from recordings, and write the file that `--actuators` of other commands takes. "
+    'BALLU needs a suspended sweep. A robot whose description declares parameters under "identify" may use any '
+    "recordings; for it, the command also writes identified.xml, the model with the identified values, and the "
+    f"defaults are {_DECLARED}.",
     {"data": SysidData(), "fit": IdentificationConfig(), "windows": WindowConfig(), "sampling": SamplingConfig()},
     train,
     {"fit": QUICK},

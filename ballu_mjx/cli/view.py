@@ -1,6 +1,6 @@
-"""A run or a recording, live in 3D: `python -m ballu_mjx view RUN`.
+"""Live 3D view of a run or a recording: `python -m ballu_mjx view RUN`.
 
-JAX, MuJoCo, and all that needs them, are imported inside functions: `runtime.prepare` has to come first.
+JAX, MuJoCo and modules that need them are imported inside functions: `runtime.prepare` has to come first.
 """
 
 from __future__ import annotations
@@ -28,31 +28,32 @@ if TYPE_CHECKING:
 
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 _FRAME = 1.0 / 40.0
-"""Seconds between two looks at the clock."""
+"""Time between two updates of the view (s)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Options(runtime.CommandOptions):
-    """Show the replay of a run, or a recording as it is reconstructed, in 3D: in the browser, on this machine alone."""
+    """Show the replay of a run, or a reconstructed recording, in 3D in the browser. The server accepts only connections
+    from this machine."""
 
     source: tyro.conf.Positional[Path]
     """Folder of a run or of `train all`, or a recording (.csv or .csv.gz)."""
     port: int = 8080
-    """Port to serve at on 127.0.0.1; where it is taken, the next that is free."""
+    """Port of the server on 127.0.0.1. If it is taken, the next free port is used."""
     open: bool = False
-    """Show it in the browser at once."""
+    """Open the view in the browser at once."""
     mujoco: bool = False
-    """Open MuJoCo's own viewer instead, which needs a screen."""
+    """Open MuJoCo's own viewer instead. It needs a screen."""
     rerun: Path | None = None
-    """Write a file for Rerun's viewer instead, NAME.rrd: the recording (or task) of --show. Needs the extra rerun."""
+    """Write the recording (or task) of --show to a file for Rerun's viewer instead, NAME.rrd. Needs the extra rerun."""
     robot: str = "ballu"
-    """Robot of a recording: its name, or the file of its description. A run knows its own."""
+    """Robot of a recording: its name, or its description file. For a run, the run's own robot is used."""
     show: str | None = None
-    """Recording (or task) to begin with. Without this option: the first."""
+    """Recording (or task) to show first. Without this option: the first one."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command until it is interrupted; returns the exit status (`runtime.exit_status`)."""
+    """Run the command until it is interrupted; return the exit status (`runtime.exit_status`)."""
 
     def run() -> None:
         try:
@@ -75,16 +76,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 _mujoco(takes[first])
             else:
                 _serve(takes, first, options)
-        except KeyboardInterrupt:  # the way to close it
+        except KeyboardInterrupt:  # the normal way to close the view
             print("Closed.", file=sys.stderr)
 
     return runtime.exit_status(run, arguments)
 
 
 def load(source: Path, robot: str = "ballu") -> list[StoredRollout]:
-    """Return what there is to show of a run's folder, or of a recording of a robot.
+    """Return the replays of a run's folder, or a reconstructed recording of a robot as one replay.
 
-    **Raises** `InputError` where it is neither, or holds no replay.
+    **Raises** `InputError` if `source` is neither a run's folder nor a free recording, or if the run has no replay.
     """
     if source.is_dir():
         from ballu_mjx.viz.report_content import collect
@@ -98,7 +99,7 @@ def load(source: Path, robot: str = "ballu") -> list[StoredRollout]:
     description = load_robot(robot)
     recording = read_recording(list_recordings([source])[0], description)
     if recording.kind != "free":
-        raise InputError(f"{source}: is a {recording.kind} recording; only free ones have a way to show.")
+        raise InputError(f"{source}: is a {recording.kind} recording; only free recordings can be shown.")
     print("Reconstructing the recorded states ...", flush=True)
     motion = reconstruct(recording, description)
     return [
@@ -114,9 +115,9 @@ def load(source: Path, robot: str = "ballu") -> list[StoredRollout]:
 
 
 def choose(takes: Sequence[StoredRollout], name: str | None) -> int:
-    """Place of the take of that name; the first for None.
+    """Return the index of the replay called `name`, or 0 if `name` is None.
 
-    **Raises** `InputError` where there is none.
+    **Raises** `InputError` if there is no such replay.
     """
     names = [take.name for take in takes]
     if name is None:
@@ -127,7 +128,10 @@ def choose(takes: Sequence[StoredRollout], name: str | None) -> int:
 
 
 def check_screen() -> None:
-    """**Raises** `InputError` where there is no screen for MuJoCo's viewer."""
+    """Check that there is a screen for MuJoCo's viewer.
+
+    **Raises** `InputError` if there is none.
+    """
     import glfw
 
     with warnings.catch_warnings():
@@ -138,7 +142,7 @@ def check_screen() -> None:
 
 
 class Player:
-    """Takes on a server, with controls; `advance` lets time pass."""
+    """Player of replays on a server, with controls. `advance` moves its clock."""
 
     def __init__(self, server: LocalServer, takes: Sequence[StoredRollout], first: int = 0) -> None:
         self._server, self._takes = server, takes
@@ -163,7 +167,10 @@ class Player:
             self._scrubbed = self._scrubbed or event.client is not None
 
     def advance(self, seconds: float) -> None:
-        """Let time pass while it plays, from the start again after the end, and show what is the case then."""
+        """Advance the clock by `seconds` times the chosen speed, if it plays, and show the state at that time.
+
+        After the end, the replay begins again.
+        """
         if self._shown is None or self._shown[0] != self.take.value:
             self._load()
         take, end = self._stage.take, self.clock.max
@@ -172,7 +179,7 @@ class Player:
             now = now + seconds * float(self.speed.value) if now < end else 0.0
             self.clock.value = min(now, end)
         self._scrubbed = False
-        # The states are evenly spaced but for the last digits.
+        # Times of the states may differ from multiples of the time step in the last digits.
         state = int(np.argmin(np.abs(take.time - take.time[0] - now)))
         for name, box in zip(self._stage.robots, self._boxes, strict=True):
             self._stage.robots[name].visible = box.value
@@ -183,7 +190,7 @@ class Player:
 
     @property
     def state(self) -> int:
-        """The state that is shown."""
+        """Index of the state that is shown."""
         return 0 if self._shown is None else self._shown[1]
 
     def _load(self) -> None:
@@ -208,7 +215,7 @@ class Player:
         self._show(0)
 
     def _close(self) -> tuple[np.ndarray, np.ndarray]:
-        """A camera beside robots that are followed."""
+        """Return position and target (m) of a camera beside the robots, which it follows."""
         shapes = self._stage.shapes
         target = np.array([0.0, 0.0, self._stage.centre(0)[2]])
         return target + shapes.extent * np.array([-0.6, -1.8, 0.35]), target
@@ -248,7 +255,7 @@ def _serve(takes: Sequence[StoredRollout], first: int, options: Options) -> None
 
 
 def _mujoco(take: StoredRollout) -> None:
-    """Show a take in MuJoCo's viewer, over and over, until its window is closed; the space bar pauses."""
+    """Show a replay in MuJoCo's viewer in a loop, until its window is closed. The space bar pauses."""
     import mujoco
     import mujoco.viewer
 
@@ -286,5 +293,5 @@ def _mujoco(take: StoredRollout) -> None:
 
 
 def _distinct(names: Sequence[str]) -> list[str]:
-    """Names that no two have, for a list to choose from."""
+    """Return names made unique by a number, for a list to choose from."""
     return [name if names.count(name) == 1 else f"{name} ({index + 1})" for index, name in enumerate(names)]

@@ -1,1 +1,1 @@
-"""The ground under everything: errors, files, start-up. Knows no robot."""
+"""Foundations of the package, independent of any robot: errors, files, rotations, results and start-up."""

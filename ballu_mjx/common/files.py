@@ -1,4 +1,4 @@
-"""Files: text and JSON read with one sentence for what is wrong with them, and written to the end or not at all."""
+"""Reading of text and JSON files, with an error of one sentence, and writing of files, completely or not at all."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from typing import Any, NoReturn
 from ballu_mjx.common.errors import InputError
 
 LARGEST = 128 * 2**20
-"""Bytes of text that are read; close to two hours of recording at 100 Hz."""
+"""Largest size of a text file (bytes, decompressed): close to two hours of recording at 100 Hz."""
 _PROBE = 2**20
-"""Bytes that a folder must take before it is worked for."""
+"""Number of bytes that are written to test a folder before a computation."""
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def read_text(path: Path) -> str:
-    """The text of a file, unpacked where its name ends in .gz.
+    """Return the text of a file. A file whose name ends in .gz is decompressed.
 
-    **Raises** `InputError` where there is no such file, or none of at most `LARGEST` bytes of UTF-8 text.
+    **Raises** `InputError` if the file does not exist, cannot be read, has more than `LARGEST` bytes or is not UTF-8.
     """
     if not path.is_file():
         _refuse(path, "there is no such file", "put it there or check the path")
@@ -32,11 +32,11 @@ def read_text(path: Path) -> str:
         with gzip.open(path, "rb") if path.name.endswith(".gz") else path.open("rb") as stream:
             content = stream.read(LARGEST + 1)
     except (gzip.BadGzipFile, EOFError, zlib.error):
-        _refuse(path, "not a whole gzip file", "compress or copy it again, or give the plain .csv")
+        _refuse(path, "not a whole gzip file", "compress or copy it again, or give the uncompressed .csv")
     except OSError as error:
         _refuse(path, f"cannot be read ({error.strerror})", "check the file and its permissions")
     if len(content) > LARGEST:
-        _refuse(path, f"holds more than {LARGEST >> 20} MiB of text", "cut it into shorter ones")
+        _refuse(path, f"has more than {LARGEST >> 20} MiB of text", "split it into shorter files")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -45,17 +45,17 @@ def read_text(path: Path) -> str:
 
 
 def read_json(path: Path, mend: str) -> dict[str, Any]:
-    """The JSON object in a file; `mend` ends the sentence where there is none.
+    """Return the JSON object in a file. Messages about its content end with `mend`, which says how to fix it.
 
-    **Raises** `InputError` as `read_text`, and for text that is no JSON object or holds what is no text.
+    **Raises** `InputError` in the cases of `read_text` and `parse_object`.
     """
     return parse_object(read_text(path), str(path), mend)
 
 
 def parse_object(text: str, where: str, mend: str) -> dict[str, Any]:
-    """The JSON object in a text, that of the file and place `where`.
+    """Return the JSON object in a text. The arguments are those of `parse_json`.
 
-    **Raises** `InputError` as `parse_json`, and for what is no object.
+    **Raises** `InputError` in the cases of `parse_json`, and if the value is not an object.
     """
     content = parse_json(text, where, mend)
     if not isinstance(content, dict):
@@ -64,24 +64,25 @@ def parse_object(text: str, where: str, mend: str) -> dict[str, Any]:
 
 
 def parse_json(text: str, where: str, mend: str) -> Any:
-    """What a text, that of the file and place `where`, says in JSON.
+    """Return the JSON value in a text. Messages begin with `where` (file and place) and end with `mend` (the fix).
 
-    **Raises** `InputError` for what is no JSON, and for text in it that could not be written again.
+    **Raises** `InputError` if the text is not JSON, or has a string that UTF-8 cannot encode.
     """
     try:
         content = json.loads(text)
-        json.dumps(content, ensure_ascii=False).encode()  # half a surrogate pair could be neither printed nor written
+        json.dumps(content, ensure_ascii=False).encode()  # half a surrogate pair cannot be printed or written
     except (ValueError, RecursionError) as error:
         if isinstance(error, json.JSONDecodeError):
             raise InputError(f"{where}: not JSON (line {error.lineno}: {error.msg}); {mend}.") from error
-        raise InputError(f"{where}: not JSON that can be read ({type(error).__name__}); {mend}.") from error
+        raise InputError(f"{where}: not JSON that this program can read ({type(error).__name__}); {mend}.") from error
     return content
 
 
 def write(path: Path, content: str | bytes) -> None:
-    """Write all of a file or nothing, to the disk: what is there when this returns outlives a power failure.
+    """Write a file completely or not at all, and flush it to the disk.
 
-    The temporary file beside it is this process's own: two processes that write one file end with one of both.
+    Once this function has returned, the content survives a power failure. Each process uses its own temporary file
+    beside the target. If two processes write the same file, it ends with the content of one of them.
     """
     draft = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
@@ -98,7 +99,7 @@ def write(path: Path, content: str | bytes) -> None:
 
 
 def sync(path: Path) -> None:
-    """Have a file, or a folder's list of names, on the disk, where its file system can tell."""
+    """Flush a file, or a folder's list of names, to the disk, if the file system supports this."""
     if os.name == "nt" and path.is_dir():  # Windows cannot open folders
         return
     handle = os.open(path, os.O_RDONLY)
@@ -112,15 +113,15 @@ def sync(path: Path) -> None:
 
 
 def sync_all(folder: Path) -> None:
-    """Have everything in a folder on the disk."""
+    """Flush a folder, everything in it, and its entry in the parent folder to the disk."""
     for path in [*folder.rglob("*"), folder, folder.parent]:
         sync(path)
 
 
 def check_folder(folder: Path) -> None:
-    """Find out before the work whether results can be written to `folder`, which need not be there yet.
+    """Check before a computation that results can be written to `folder`, which need not exist yet.
 
-    **Raises** `InputError` where it, or what it would be made in, is no folder, is read-only or is full.
+    **Raises** `InputError` if `folder`, or the nearest parent that exists, is not a folder, is read-only or is full.
     """
     place = folder.absolute()
     try:
@@ -131,14 +132,14 @@ def check_folder(folder: Path) -> None:
         if is_full(error):
             raise InputError(f"{folder}: its disk is full; make room there, or give another folder.") from error
         raise InputError(
-            f"{folder}: cannot be written to ({error.strerror}); mend its permissions, or give another folder."
+            f"{folder}: cannot be written to ({error.strerror}); fix its permissions, or give another folder."
         ) from error
 
 
 def reserve(folder: Path, size: int) -> None:
-    """Write so many bytes into a folder, and take them away again.
+    """Write `size` bytes into a temporary file in a folder, and delete it. Quotas can only be detected in this way.
 
-    **Raises** `OSError` where it does not take them: quotas are not seen in any other way.
+    **Raises** `OSError` if the folder cannot hold them.
     """
     with tempfile.TemporaryFile(dir=folder) as file:
         file.write(bytes(size))
@@ -147,11 +148,12 @@ def reserve(folder: Path, size: int) -> None:
 
 
 def is_full(error: BaseException) -> bool:
-    """Whether an exception comes of a full disk; libraries in other languages tell of it in words alone."""
+    """Return whether a full disk caused an exception. Libraries in other languages say so only in its message."""
     if isinstance(error, OSError) and error.errno is not None:
         return error.errno in _FULL
     return any(os.strerror(number) in str(error) for number in _FULL)
 
 
 def _refuse(path: Path, problem: str, mend: str) -> NoReturn:
+    """Raise `InputError` with a file, its problem and the fix."""
     raise InputError(f"{path}: {problem}; {mend}.")

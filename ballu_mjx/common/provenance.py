@@ -1,4 +1,4 @@
-"""Where a number comes from: commit, versions and machine."""
+"""Provenance of measured numbers: commit, package versions and machine."""
 
 from __future__ import annotations
 
@@ -15,14 +15,17 @@ from typing import Any
 PACKAGES = (
     "ballu-mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "optimistix", "numpy", "scipy"
 )  # fmt: skip
-"""Those whose versions may change a number."""
+"""Packages whose versions may change a result."""
 CHANGED = "+changes"
-"""End of a commit's name where the working tree had changes."""
+"""Suffix of the commit if the working tree had changes."""
 _ROOT = Path(__file__).parents[2]
 
 
 def source_commit() -> str | None:
-    """Return the commit of the checkout that runs, ending in `CHANGED` where tracked files differ; None for a wheel."""
+    """Return the commit of this package's checkout, with the suffix `CHANGED` if tracked files differ from it.
+
+    None if the package was installed without a checkout.
+    """
     commit = _git("rev-parse", "HEAD") if (_ROOT / ".git").exists() else ""
     if not commit:
         return None
@@ -30,7 +33,7 @@ def source_commit() -> str | None:
 
 
 def package_versions(packages: Sequence[str] = PACKAGES) -> dict[str, str | None]:
-    """Return the installed version of each package; None where it is missing."""
+    """Return the installed version of each package, or None if it is not installed."""
     found: dict[str, str | None] = dict.fromkeys(packages)
     for package in packages:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -46,7 +49,7 @@ def usable_cores() -> list[int]:
 
 
 def describe_machine() -> dict[str, Any]:
-    """Return what a number's reader must know of the machine: processor, cores, memory, system and Python."""
+    """Return the machine's processor, number of usable cores, memory, operating system and Python version."""
     facts: dict[str, str] = {}
     for path, name in (("/proc/cpuinfo", "model name"), ("/proc/meminfo", "MemTotal")):
         with contextlib.suppress(OSError):
@@ -63,7 +66,7 @@ def describe_machine() -> dict[str, Any]:
 
 
 def _git(*arguments: str) -> str:
-    """Return what git says of the checkout; nothing where it fails or is missing."""
+    """Return the output of a git command in the checkout. Empty if the command fails or git is not installed."""
     try:
         done = subprocess.run(["git", "-C", str(_ROOT), *arguments], capture_output=True, text=True, check=False)
     except OSError:

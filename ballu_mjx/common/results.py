@@ -1,7 +1,7 @@
-"""Tables as data: `results/NAME.json`, written by the command that measured, and rendered as Markdown.
+"""Tables of results: files `results/NAME.json`, written by the command that measured, and rendered as Markdown.
 
-A table has rows of cells. A cell is text, or numbers: one a seed or repetition. Rendering shows their mean, with the
-lowest and the highest, or an interval, where there are several.
+A table has rows of cells. A cell is text, or numbers with one for each seed or repetition. Rendering shows the mean of
+several numbers, with the lowest and the highest, or with an interval.
 """
 
 from __future__ import annotations
@@ -21,27 +21,28 @@ from ballu_mjx.common.errors import InputError, is_number
 
 RESULTS_FORMAT = "ballu-results/1"
 _ROOT = Path(__file__).parents[2]
-_FIX = "write it anew by the command that it names"
+_FIX = "write it again with the command that it names"
 
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """Numbers of one cell: one a seed or repetition."""
+    """Numbers of one cell, one for each seed or repetition."""
 
     values: tuple[float, ...]
-    """Infinite ones stand for simulations that diverged."""
+    """The numbers. An infinite one marks a simulation that diverged."""
     form: str = ".2f"
     """Python's format of a number."""
     unit: str = ""
+    """Unit shown behind the mean."""
     spread: bool = True
-    """Show the lowest and the highest beside the mean."""
+    """Whether to show the lowest and the highest number beside the mean."""
     bounds: tuple[float, float] | None = None
-    """Ends of a confidence interval, shown instead of the lowest and the highest; None: there is none."""
+    """Ends of a confidence interval, shown instead of the lowest and the highest. None if there is no interval."""
     standard_error: float | None = None
-    """Of one estimated value, shown in parentheses in its format; None: there is none."""
+    """Standard error of one estimated value, shown in parentheses in the same format. None if there is none."""
 
     def to_text(self) -> str:
-        """Return the mean, and the lowest and the highest in brackets; without them where there is one value."""
+        """Return the mean, with the lowest and the highest (or `bounds`) in brackets if there are several values."""
         if not self.values:
             return ""
         if not all(map(math.isfinite, self.values)):
@@ -56,17 +57,17 @@ class Cell:
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """Rows of cells under the columns' names."""
+    """Rows of cells, and the names of the columns."""
 
     columns: tuple[str, ...]
     rows: tuple[tuple[Cell | str, ...], ...]
 
     def __post_init__(self) -> None:
         if any(len(row) != len(self.columns) for row in self.rows):
-            raise ValueError(f"a row has not the {len(self.columns)} cells of the columns")
+            raise ValueError(f"every row must have {len(self.columns)} cells, one for each column")
 
     def to_markdown(self) -> str:
-        """Return the table as Markdown; columns with numbers are aligned to the right."""
+        """Return the table as Markdown. Columns with numbers are aligned to the right."""
         numbers = [any(isinstance(row[i], Cell) for row in self.rows) for i in range(len(self.columns))]
         lines = [self.columns, tuple("---:" if right else "---" for right in numbers)]
         lines += [tuple(cell.to_text() if isinstance(cell, Cell) else cell for cell in row) for row in self.rows]
@@ -75,15 +76,16 @@ class Table:
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """Tables of one command, and where their numbers come from.
+    """Tables of one command, with the provenance of their numbers.
 
     **Fields**
 
-    - `command`: what measured, as typed in the repository's root.
-    - `commit`: of the code that measured; None: not a checkout.
+    - `command`: the command that measured, as typed in the repository's root.
+    - `commit`: the commit of the code that measured. None if it did not run from a checkout.
+    - `time`: the time of the measurement, in ISO 8601 format.
     - `machine`, `versions`: see `common.provenance`.
-    - `seeds`: by use.
-    - `data`: what the numbers are of, for the caption, such as "Development data".
+    - `seeds`: the seeds, by their use, such as "training".
+    - `data`: the kind of data for the caption, such as "Development data".
     """
 
     tables: Mapping[str, Table]
@@ -96,7 +98,7 @@ class Results:
     data: str
 
     def caption(self) -> str:
-        """Return sentences that say what the numbers are of, and where they come from."""
+        """Return a caption with the data, command, commit, machine and seeds of the numbers."""
         commit = ""
         if self.commit is not None:
             commit = f" at commit {self.commit[:7]}" + (" with changes" if provenance.CHANGED in self.commit else "")
@@ -106,13 +108,16 @@ class Results:
 
 
 def _format(value: float, form: str) -> str:
-    """Return a number in a format; what rounds to zero has no sign."""
+    """Return a number in a format, without a minus sign if it rounds to zero."""
     text = format(value, form)
     return text.removeprefix("-") if not text.strip("-0.") else text
 
 
 def command_line(arguments: Sequence[str] | None = None) -> str:
-    """Return what was typed (None: this process), as from the repository's root; other folders are left out."""
+    """Return a command line as typed in the repository's root. Absolute paths outside it are cut to the file name.
+
+    `arguments`: the script and its arguments. None for those of this process.
+    """
     script, *rest = sys.argv if arguments is None else arguments
     parts = []
     for part in (script, *rest):
@@ -133,13 +138,14 @@ def write_results(
     measured: Mapping[str, Any] | None = None,
     packages: Sequence[str] = provenance.PACKAGES,
 ) -> None:
-    """Write tables with the command, commit, machine, versions and seeds that they come from.
+    """Write tables with the command, commit, machine, versions and seeds of the measurement.
 
     **Arguments**
 
-    - `data`: what the numbers are of, for the caption.
-    - `measured`: `commit`, `machine` and `versions` of what measured, where that was another process; None: this one.
-    - `packages`: whose versions are written.
+    - `data`: the kind of data for the caption.
+    - `seeds`: the seeds, by their use.
+    - `measured`: `commit`, `machine` and `versions` of the process that measured. None if this process measured.
+    - `packages`: the packages whose versions are written.
     """
     here: Mapping[str, Any] = measured or {
         "commit": provenance.source_commit(),
@@ -162,18 +168,18 @@ def write_results(
 
 
 def read_results(path: Path) -> Results:
-    """Return what `write_results` wrote.
+    """Return the content of a file that `write_results` wrote.
 
-    **Raises** `InputError` where the file is none of the format.
+    **Raises** `InputError` if the file does not have this format.
     """
     content = files.read_json(path, _FIX)
     if content.get("format") != RESULTS_FORMAT:
-        raise InputError(f"{path}: is not of the format {RESULTS_FORMAT}; {_FIX}.")
+        raise InputError(f'{path}: is not of the format "{RESULTS_FORMAT}"; {_FIX}.')
     try:
         tables = {name: _table_from_json(table) for name, table in content["tables"].items()}
         return Results(tables, **{f.name: content[f.name] for f in dataclasses.fields(Results) if f.name != "tables"})
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path}: lacks a part, or holds a wrong one ({error}); {_FIX}.") from None
+        raise InputError(f"{path}: lacks a part or has an invalid one ({error}); {_FIX}.") from None
 
 
 def _table_to_json(table: Table) -> dict[str, Any]:
@@ -191,10 +197,10 @@ def _table_from_json(content: Mapping[str, Any]) -> Table:
         if isinstance(value, str):
             return value
         if not all(x is None or is_number(x) for x in value["values"]):
-            raise ValueError("a cell holds what is no number")
+            raise ValueError("a cell has a value that is not a number")
         values = tuple(math.inf if x is None else float(x) for x in value["values"])
         bounds = None if value["bounds"] is None else (float(value["bounds"][0]), float(value["bounds"][1]))
-        error = value.get("standard_error")  # older files have none
+        error = value.get("standard_error")  # older files lack it
         return Cell(
             **value | {"values": values, "bounds": bounds, "standard_error": None if error is None else float(error)}
         )

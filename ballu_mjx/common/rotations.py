@@ -1,7 +1,7 @@
-"""Quaternions (w, x, y, z), rotation matrices and rotation vectors, of NumPy's and of JAX's arrays alike.
+"""Quaternions (w, x, y, z), rotation matrices and rotation vectors, as NumPy or JAX arrays.
 
-What one line of `scipy.spatial.transform.Rotation` says is said by that. Here is what JAX needs too, or what inverse
-kinematics needs by the hundred thousand.
+The package calls `scipy.spatial.transform.Rotation` where one line of it suffices. This module has the operations that
+JAX needs too, and those that inverse kinematics applies to hundreds of thousands of rotations.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _TINY = 1e-30
 
 
 def quaternion_product(a: Float[Any, "*n 4"], b: Float[Any, "*n 4"]) -> Float[Any, "*n 4"]:
-    """Return the product of quaternions: the rotation `b` about the axes that `a` has turned."""
+    """Return the quaternion products a b: the rotation `b` about axes that the rotation `a` has turned."""
     w, x, y, z = _components(a)
     p, q, r, s = _components(b)
     return _namespace(a).stack(
@@ -30,14 +30,14 @@ def quaternion_product(a: Float[Any, "*n 4"], b: Float[Any, "*n 4"]) -> Float[An
 
 
 def quaternion_conjugate(quaternion: Float[Any, "*n 4"]) -> Float[Any, "*n 4"]:
-    """Return the inverse of unit quaternions."""
+    """Return the conjugates of quaternions, which are the inverses of unit quaternions."""
     return quaternion * np.array([1.0, -1.0, -1.0, -1.0], np.float32)
 
 
 def quaternion_integrate(quaternion: Float[Any, "*n 4"], vector: Float[Any, "*n 3"]) -> Float[Any, "*n 4"]:
-    """Return unit quaternions turned by rotation vectors (rad) about their own axes, as `mju_quatIntegrate` does.
+    """Return unit quaternions turned by rotation vectors (rad, body frame), as `mju_quatIntegrate` does.
 
-    It has a derivative at the zero vector.
+    The result is differentiable at the zero vector.
     """
     xp = _namespace(quaternion)
     angle = xp.sqrt(xp.maximum(xp.sum(vector**2, axis=-1, keepdims=True), _TINY))
@@ -48,7 +48,7 @@ def quaternion_integrate(quaternion: Float[Any, "*n 4"], vector: Float[Any, "*n 
 
 
 def quaternion_to_matrix(quaternion: Float[Any, "*n 4"]) -> Float[Any, "*n 3 3"]:
-    """Return rotation matrices of unit quaternions."""
+    """Return the rotation matrices of unit quaternions."""
     xp = _namespace(quaternion)
     w, x, y, z = _components(quaternion)
     rows = [
@@ -60,11 +60,14 @@ def quaternion_to_matrix(quaternion: Float[Any, "*n 4"]) -> Float[Any, "*n 3 3"]
 
 
 def matrix_to_quaternion(rotation: Float[Any, "3 3"]) -> Float[Any, " 4"]:
-    """Return the unit quaternion of one rotation, by whichever of its four components is largest; differentiable."""
+    """Return the unit quaternion of one rotation matrix, differentiably.
+
+    For accuracy it is computed from its component of largest magnitude.
+    """
     xp, r = _namespace(rotation), rotation
     x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
     xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
-    # Each row is the quaternion, times four times one of its components.
+    # Row i is the quaternion times four times its component i.
     rows = xp.asarray(
         [
             [1 + r[0, 0] + r[1, 1] + r[2, 2], x, y, z],
@@ -77,7 +80,7 @@ def matrix_to_quaternion(rotation: Float[Any, "3 3"]) -> Float[Any, " 4"]:
 
 
 def rotation_about(axis: Float[Any, " 3"], angle: Float[Any, "*n"]) -> Float[Any, "*n 3 3"]:
-    """Return rotations by angles (rad) about one unit axis, by Rodrigues' formula."""
+    """Return the rotation matrices of angles (rad) about one unit axis, by Rodrigues' formula."""
     xp = _namespace(angle)
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -86,7 +89,7 @@ def rotation_about(axis: Float[Any, " 3"], angle: Float[Any, "*n"]) -> Float[Any
 
 
 def matrix_to_rotation_vector(matrices: Float[np.ndarray, "N 3 3"]) -> Float[np.ndarray, "N 3"]:
-    """Return rotation vectors (rad) of rotations."""
+    """Return the rotation vectors (rad) of rotation matrices."""
     from scipy.spatial.transform import Rotation
 
     sine = np.stack(
@@ -101,14 +104,14 @@ def matrix_to_rotation_vector(matrices: Float[np.ndarray, "N 3 3"]) -> Float[np.
     cosine = np.trace(matrices, axis1=1, axis2=2) - 1
     vectors = sine * (np.arctan2(length, cosine) / np.maximum(length, 1e-300))[:, None]
     vectors[length < 1e-12] = 0.0
-    far = cosine < -1.9  # near a half turn the axis is lost in the sine
+    far = cosine < -1.9  # near a half turn the sine is too small to give the axis
     if far.any():
         vectors[far] = Rotation.from_matrix(matrices[far]).as_rotvec()
     return vectors
 
 
 def _namespace(array: Any) -> Any:
-    """Return `numpy` or `jax.numpy`."""
+    """Return the module of an array: `numpy` or `jax.numpy`."""
     return array.__array_namespace__()
 
 

@@ -1,6 +1,6 @@
-"""Start-up of the commands: what must be settled before JAX is imported.
+"""Start-up of the commands: settings that must be made before JAX is imported.
 
-This module imports neither JAX nor anything that does, so that a command's `main` can call `prepare` first.
+This module imports neither JAX nor a module that does, so that a command's `main` can call `prepare` first.
 """
 
 from __future__ import annotations
@@ -28,33 +28,35 @@ from ballu_mjx.common.errors import InputError
 _DEVICE_COUNT_FLAG = "--xla_force_host_platform_device_count"
 _VECTOR_WIDTH_FLAG = "--xla_cpu_prefer_vector_width"
 _MIN_COMPILE_SECONDS = 1.0
-"""Programs that compile faster than this are not worth a file in the cache."""
+"""Shortest compilation (s) whose program is stored in the cache."""
 _ALLOCATIONS = 100_000
-"""More objects made than freed, between two looks for garbage (Python's own: 700)."""
-_MOST_SAID = 300
-"""Characters of an unexpected error's message: XLA's fill pages."""
+"""Surplus of created over freed objects that starts a garbage collection (Python's default: 700)."""
+_LONGEST_MESSAGE = 300
+"""Largest number of characters that are shown of an unexpected error's message. XLA's messages fill pages."""
 _M_ARENA_MAX = -8
-"""Of glibc's `mallopt`."""
+"""Option of glibc's `mallopt` for the largest number of heaps."""
 
 
 def prepare() -> None:
-    """Settle JAX's environment for this process, then import MJX; call it before anything else imports JAX.
+    """Configure JAX for this process, then import MJX. Call this function before anything else imports JAX.
 
-    - The CPU is split into one host device per core: XLA does not spread these small operations over cores, a batch
-      sharded over host devices does. A count in the user's own `XLA_FLAGS` stays, and so do all other flags there.
-    - XLA is told to use vectors of 512 bits where the CPU has them (it prefers 256).
-    - Compiled programs are kept in `cache_dir()`, unless `JAX_COMPILATION_CACHE_DIR` says where.
-    - XLA's log is quietened on machines without an accelerator, unless `TF_CPP_MIN_LOG_LEVEL` is set: every program
-      loaded from the cache otherwise prints pages about tuning flags that are no fault. Failures still arrive as
+    - The CPU is split into one host device per core. XLA does not spread these small operations over cores, but a
+      batch that is sharded over host devices uses all of them. A device count in the user's `XLA_FLAGS` is kept, and
+      so are all other flags there.
+    - XLA uses vectors of 512 bits if the CPU has them (its default is 256).
+    - Compiled programs are cached in `cache_dir()`, unless `JAX_COMPILATION_CACHE_DIR` names another folder.
+    - XLA's log is silenced on machines without an accelerator, unless `TF_CPP_MIN_LOG_LEVEL` is set. Every program
+      loaded from the cache would otherwise print pages of harmless messages about tuning flags. Failures still raise
       exceptions.
-    - Python looks for garbage less often: tracing MJX makes millions of objects that stay, and looking through all of
-      them again and again takes time.
-    - glibc keeps one heap a core (its own limit: eight a core), unless `MALLOC_ARENA_MAX` is set. Every checkpoint is
-      written by threads of its own, which otherwise leave ever more heaps in pieces.
-    - The package's log shows warnings as plain lines, unless it has a handler already.
-    - A JAX that would hang is refused (`check_jax`), and MJX's report that Warp is not installed kept off the screen.
+    - Python's garbage collector runs less often. Tracing MJX creates millions of objects that stay alive, and scanning
+      all of them repeatedly takes time.
+    - glibc keeps at most one heap per core (its default is eight per core), unless `MALLOC_ARENA_MAX` is set. Every
+      checkpoint is written by new threads, which would otherwise leave more and more fragmented heaps.
+    - The package's log prints warnings as plain lines, unless it already has a handler.
+    - A JAX version that would hang is refused (`check_jax`).
+    - MJX's message that Warp is not installed is suppressed.
 
-    Where JAX is imported already (a notebook, say), its settings stay as they are.
+    If JAX is already imported (in a notebook, for example), its settings are not changed.
 
     **Raises**
 
@@ -65,7 +67,7 @@ def prepare() -> None:
         if not _accelerated():
             os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
         if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-            # Without a writable cache there is none: slower to start, no less right.
+            # Without a writable folder there is no cache: the start is slower, and results are the same.
             with contextlib.suppress(OSError):
                 cache_dir().mkdir(parents=True, exist_ok=True)
                 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache_dir())
@@ -82,7 +84,7 @@ def prepare() -> None:
 
 
 class _PlainHandler(logging.Handler):
-    """Shows messages on the standard error as they are."""
+    """Log handler that prints messages to standard error without decoration."""
 
     def emit(self, record: logging.LogRecord) -> None:
         print(self.format(record), file=sys.stderr)
@@ -93,15 +95,17 @@ class CommandOptions:
     """Options of every command."""
 
     debug: bool = False
-    """Show errors with their traceback: where in the code they came from."""
+    """Print the Python traceback of an error instead of one sentence, to see where in the code it occurred."""
 
 
 def exit_status(command: Callable[[], int | None], arguments: Sequence[str] | None = None) -> int:
-    """Run a command; returns its own exit status (None: 0), 2 for input that cannot be used, 1 for what the system
-    refuses and for faults of this package, 130 when interrupted, and 141 where nobody reads on.
+    """Run a command and return its exit status.
 
-    Errors are told on the terminal in a sentence, or by their traceback where `arguments` (None: the process's own)
-    hold --debug. That is read here, for options may fail before they are parsed.
+    The status is the command's own (0 for None), 2 for unusable input, or 1 for errors of the system or of this
+    package. It is 130 after an interrupt, and 141 if the reader of the output has closed it.
+
+    Errors are printed as one sentence, or with their traceback if `arguments` (None: those of this process) contain
+    --debug. This option is read here because parsing the options may itself fail.
     """
     debug = "--debug" in (sys.argv[1:] if arguments is None else arguments)
     try:
@@ -111,30 +115,30 @@ def exit_status(command: Callable[[], int | None], arguments: Sequence[str] | No
     except KeyboardInterrupt:
         print("Interrupted.", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # the reader, `head` say, has seen enough; Python must not flush the rest at exit
+    except BrokenPipeError:  # the reader, for example `head`, has ended; Python must not flush the rest at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except Exception as error:
         if debug:
             traceback.print_exc()
         else:
-            print(_told(error), file=sys.stderr)
+            print(_error_message(error), file=sys.stderr)
         return 2 if isinstance(error, InputError) else 1
 
 
 def check_jax() -> None:
     """Refuse a JAX that is known to deadlock on the backend in use.
 
-    JAX 0.10 never returns from `vmap(mjx.step)` at batch 512 on the CPU; its accelerator backends work.
+    JAX 0.10 never returns from `vmap(mjx.step)` with a batch of 512 on the CPU. Its accelerator backends work.
 
     **Raises**
 
-    `InputError` with the mend.
+    `InputError` with the fix.
     """
     version = importlib.metadata.version("jax")
     if version.split(".")[:2] != ["0", "10"]:
         return
-    import jax  # only now: asking for the backend starts it
+    import jax  # imported late, because asking for the backend starts it
 
     if jax.default_backend() == "cpu":
         raise InputError(
@@ -144,9 +148,9 @@ def check_jax() -> None:
 
 
 def cache_dir() -> Path:
-    """Folder for compiled programs: in the user's cache, one for each jaxlib and each kind of CPU.
+    """Return the folder for compiled programs: in the user's cache, one for each version of jaxlib and kind of CPU.
 
-    A program compiled on another CPU may die of an illegal instruction.
+    A program that was compiled on another CPU may crash with an illegal instruction.
     """
     if root := os.environ.get("XDG_CACHE_HOME"):
         base = Path(root)
@@ -159,30 +163,32 @@ def cache_dir() -> Path:
 
 
 def release_memory() -> None:
-    """Give memory that is free, such as compiling leaves, back to the system, where glibc otherwise keeps it."""
+    """Return free memory to the system. glibc would otherwise keep it, for example after compiling."""
     _libc("malloc_trim", 0)
 
 
 def _libc(name: str, *arguments: int) -> None:
-    """Call a function of glibc, where there is one."""
+    """Call a function of glibc, if it is the C library."""
     if platform.libc_ver()[0] == "glibc":
         getattr(ctypes.CDLL(None), name)(*arguments)
 
 
-def _told(error: Exception) -> str:
-    """An error in a sentence."""
+def _error_message(error: Exception) -> str:
+    """Return an error as one sentence."""
     if isinstance(error, InputError):
         return str(error)
-    said = " ".join(str(error).split())
+    text = " ".join(str(error).split())
     if isinstance(error, OSError):
-        return f"The system refused: {said}; mend that, or run again with --debug to see what asked for it."
-    what = f"{type(error).__name__}: {textwrap.shorten(said, _MOST_SAID)}" if said else type(error).__name__
+        return f"The operating system reports: {text}; fix that, or run again with --debug to see where it happened."
+    what = f"{type(error).__name__}: {textwrap.shorten(text, _LONGEST_MESSAGE)}" if text else type(error).__name__
     return f"This is a fault of ballu_mjx, not of your input: {what}; run again with --debug and report it."
 
 
 def _with_flags(flags: str, count: int, cpu: str) -> str:
-    """XLA's `flags` with `count` host devices and, where `cpu` (its description) has them, vectors of 512 bits added,
-    each unless the flags name it."""
+    """Return XLA's `flags` with `count` host devices, and with vectors of 512 bits if `cpu` (its description) has them.
+
+    Options that `flags` already set are not changed.
+    """
     wanted = {_DEVICE_COUNT_FLAG: count}
     if re.search(r"\bavx512f\b", cpu):
         wanted[_VECTOR_WIDTH_FLAG] = 512
@@ -190,21 +196,21 @@ def _with_flags(flags: str, count: int, cpu: str) -> str:
 
 
 def _cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def _accelerated() -> bool:
-    """Whether JAX may find an accelerator: a plugin for one is installed, and the user has not asked for the CPU."""
+    """Return whether JAX may find an accelerator: a plugin is installed, and the user has not chosen the CPU."""
     if os.environ.get("JAX_PLATFORMS") == "cpu":
         return False
     return bool(importlib.metadata.entry_points(group="jax_plugins"))
 
 
 def _cpu_description() -> str:
-    """Model and instruction sets of the CPU, as far as the system tells."""
+    """Return the model and the instruction sets of the CPU, as far as the system reports them."""
     with contextlib.suppress(OSError):
         text = Path("/proc/cpuinfo").read_text()
         fields = re.findall(r"^(?:model name|flags|CPU part|Features)\s*:.*$", text.split("\n\n")[0], re.MULTILINE)
@@ -214,14 +220,14 @@ def _cpu_description() -> str:
 
 
 def _import_mjx() -> None:
-    """Import MJX without the lines it prints where Warp, which this package does not use, is not installed."""
+    """Import MJX without its messages that Warp is not installed. This package does not use Warp."""
     if "mujoco.mjx" in sys.modules:
         return
-    said = io.StringIO()
+    output = io.StringIO()
     try:
-        with contextlib.redirect_stdout(said):
+        with contextlib.redirect_stdout(output):
             importlib.import_module("mujoco.mjx")
     finally:
-        for line in said.getvalue().splitlines():
+        for line in output.getvalue().splitlines():
             if not line.startswith(("Failed to import warp:", "Failed to import mujoco_warp:")):
                 print(line)

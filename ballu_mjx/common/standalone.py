@@ -1,4 +1,4 @@
-"""Source files of this package that also run alone, on another computer."""
+"""Source files of this package that also run without it, on another computer."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from importlib import resources
 _STAND_IN = '''
 
 class {name}:
-    """Stands in for jaxtyping's type of arrays, of which annotations here tell the shape."""
+    """Replacement for jaxtyping's array type. Annotations in this file use it to state shapes."""
 
     def __class_getitem__(cls, item):
         return item[0]
@@ -17,7 +17,10 @@ class {name}:
 
 
 def standalone_source(package: str, file: str) -> str:
-    """Return the text of a module of a package that imports its neighbours from beside it, and nothing of jaxtyping."""
+    """Return the source of a module, changed so that it runs without this package and without jaxtyping.
+
+    Imports from modules of `package` become imports of files beside it.
+    """
     source = resources.files(package).joinpath(file).read_text(encoding="utf-8")
     beside = rf"^from {re.escape(package)}\.(\w+) import"
     source = re.sub(beside, r"from \1 import", source, flags=re.MULTILINE)

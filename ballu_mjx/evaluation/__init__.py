@@ -1,1 +1,1 @@
-"""Stage 5: how well a simulator predicts, and how well a policy transfers."""
+"""Stage 5: evaluation of a simulator's predictions and of a policy's transfer to the robot."""

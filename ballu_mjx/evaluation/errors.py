@@ -1,4 +1,4 @@
-"""Errors of simulators over horizons, and the score that choices are made by."""
+"""Errors of simulators over horizons, and the score by which checkpoints are chosen."""
 
 from __future__ import annotations
 
@@ -12,55 +12,59 @@ from jaxtyping import Float
 from ballu_mjx.common.rotations import quaternion_conjugate, quaternion_product
 
 HORIZONS = (1.0, 2.0, 5.0, 10.0, 20.0)
-"""Seconds over which errors are taken, where neither robot nor recordings ask for others."""
+"""Default horizons (s) of errors. A robot may declare others, and short recordings have `_SHORT_HORIZONS`."""
 _SHORT_HORIZONS = (0.1, 0.2, 0.5)
-"""Those of recordings that last no longer than the first of `HORIZONS`."""
+"""Horizons (s) for recordings that last no longer than the first of `HORIZONS`."""
 SCORE_HORIZONS = (5.0, 10.0)
-"""Horizons (s) that the validation score looks at; where recordings are shorter, it looks at the longest."""
+"""Horizons (s) in the validation score. If recordings are too short for both, the score uses their longest horizon."""
 Angle = Literal["yaw", "orientation"]
-"""What errors of orientation are of: yaw, of upright robots, or the whole rotation."""
+"""Angle of the orientation errors: yaw for upright robots, or the angle of the whole rotation."""
 _LEAST = 1e-5
-"""m or deg: an error below is that of single precision."""
+"""Smallest error (m or deg) in ratios. Smaller errors are within single precision."""
 LARGEST = 1e6
-"""m or deg: whoever is farther off has diverged."""
+"""Error (m or deg) from which a simulation counts as diverged."""
 WHOLE = ("mean_com_error", "final_orientation_error", "mean_force")
-"""Errors of which a recording has one, over its whole length."""
+"""Quantities with one value for a whole recording."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Errors:
-    """Errors of one simulator on one recording; spread is the standard deviation over starts.
+    """Errors of one simulator on one recording.
 
-    Means are over the starts whose errors are finite. An error is infinite where no start's is. Medians are over all
-    starts: infinite where half of them diverged.
+    Means and spreads (standard deviations) are over the starts that did not diverge. If all starts diverged, the mean
+    is infinite. Medians are over all starts, so that a median is infinite if half of them diverged.
     """
 
     recording: str
     group: str
-    """Of the recording: see `groups.group_of`."""
+    """Group of the recording; see `groups.group_of`."""
     position: dict[float, tuple[float, float]]
-    """Horizon (s) to mean and spread of the tracked body's position RMSE (m)."""
+    """Mean and spread of the RMSE of the tracked body's position (m), by horizon (s)."""
     orientation: dict[float, tuple[float, float]]
-    """Horizon (s) to mean and spread of the RMSE (deg) of the tracked body's orientation: of its yaw, each difference
-    wrapped to 180 deg, where the robot is upright; else the angle of the rotation between simulated and recorded."""
+    """Mean and spread of the RMSE of the tracked body's orientation (deg), by horizon (s). For an upright robot, it is
+    the RMSE of yaw, with each difference wrapped to 180 deg. For other robots, it is the RMSE of the angle of the
+    rotation between simulated and recorded orientation."""
     mean_com_error: float
-    """Mean distance (m) of the centres of mass over the whole recording (paper, Table I, open loop)."""
+    """Mean distance (m) between the simulated and recorded centres of mass over the whole recording (paper, Table I,
+    open loop)."""
     final_orientation_error: float
-    """Error of orientation (deg) at the end of the recording; of an upright robot simulated less recorded yaw, wrapped
-    to 180 deg (paper, Table II, open loop)."""
+    """Orientation error (deg) at the end of the recording. For an upright robot, it is simulated minus recorded yaw,
+    wrapped to 180 deg (paper, Table II, open loop)."""
     mean_force: float
     """Mean magnitude of the residual force (N)."""
     diverged: dict[float, tuple[int, int]] = dataclasses.field(default_factory=dict)
-    """Horizon (s) to how many starts diverged before it, and of how many; where it is missing, none did."""
+    """Number of starts that diverged before a horizon, and number of all starts, by horizon (s). No start diverged if a
+    horizon is missing."""
     points: dict[float, tuple[float, float]] = dataclasses.field(default_factory=dict)
-    """Horizon (s) to mean and spread of the points' position RMSE (m), over all points; empty: there are none."""
+    """Mean and spread of the position RMSE over all points (m), by horizon (s). Empty without points."""
     joints: dict[float, tuple[float, float]] = dataclasses.field(default_factory=dict)
-    """Horizon (s) to mean and spread of the RMSE (deg) of the hinges' angles that the recording holds, each difference
-    wrapped to 180 deg; held joints count as commands, not as motion. Empty: there are none."""
+    """Mean and spread of the RMSE of the recorded hinge angles (deg), by horizon (s). Each difference is wrapped to 180
+    deg. Held joints are left out, because they are commands. Empty if no hinge angle is recorded."""
     medians: dict[str, dict[float, float]] = dataclasses.field(default_factory=dict)
-    """Quantity to horizon (s) to the median over starts (m, deg)."""
+    """Median over starts (m or deg), by quantity and horizon (s)."""
     first_diverged: tuple[int, int] | None = None
-    """Of the start that diverged soonest: its control step in the recording, and how many steps later; None: none."""
+    """Control step (in the recording) of the start that diverged soonest, and the number of control steps until it
+    diverged. None if no start diverged."""
 
     def num_diverged(self, horizon: float) -> int:
         """Return the number of starts that diverged before `horizon` (s)."""
@@ -68,21 +72,24 @@ class Errors:
 
 
 def summarize_starts(values: Sequence[float]) -> tuple[float, float]:
-    """Return mean and standard deviation of the errors (m or deg) that `has_diverged` is false of; infinity and 0 where
-    it is true of all."""
+    """Return mean and standard deviation of the errors (m or deg) that did not diverge (`has_diverged`).
+
+    Return infinity and 0 if all diverged.
+    """
     kept = [value for value in values if not has_diverged(value)]
     return (float(np.mean(kept)), float(np.std(kept))) if kept else (np.inf, 0.0)
 
 
 def median_of_starts(values: Sequence[float]) -> float:
-    """Return the median of errors (m or deg) over all starts: infinity where half of them diverged."""
+    """Return the median of errors (m or deg) over all starts. It is infinite if half of them diverged."""
     return float(np.median([np.inf if has_diverged(value) else value for value in values]))
 
 
 def choose_horizons(declared: Sequence[float], longest: float) -> tuple[float, ...]:
-    """Return the horizons (s) to take errors over: those that the robot declares, or the usual ones.
+    """Return the horizons (s) of errors: those `declared` by the robot, or the default ones.
 
-    Recordings of at most `longest` seconds, 1 s or less, get shorter ones, unless the robot declares some.
+    Without declared horizons, recordings of at most 1 s have shorter ones. `longest` is the length (s) of the longest
+    recording.
     """
     if declared:
         return tuple(declared)
@@ -90,23 +97,25 @@ def choose_horizons(declared: Sequence[float], longest: float) -> tuple[float, .
 
 
 def shortest_recording(declared: Sequence[float]) -> float:
-    """Return how long (s) a recording for validation or test has to be, with the horizons that the robot declares."""
+    """Return the least length (s) of a validation or test recording, given the horizons that the robot declares."""
     return (max(declared) if declared else min(SCORE_HORIZONS)) + 0.5
 
 
 def has_diverged(error: float) -> bool:
-    """Return whether an error (m or deg) is that of a simulation that broke down."""
+    """Return whether an error (m or deg) is not finite, or `LARGEST` or more."""
     return not abs(error) < LARGEST
 
 
 def base_name(identified: bool) -> str:
-    """Return what the simulator without residual forces is called, with identified or nominal actuators."""
+    """Return the name of the simulator without residual, with identified or nominal actuators."""
     return "vanilla+sysid" if identified else "vanilla"
 
 
 def quotient(with_it: float, without: float) -> float:
-    """Return error with a residual over error without; 1 where there is none either way, as of the yaw of a robot that
-    cannot turn, or both are infinite."""
+    """Return the error with a residual divided by the error without it.
+
+    The result is 1 if both errors are zero, as for the yaw of a robot that cannot turn, or if both are infinite.
+    """
     if np.isinf(with_it) and np.isinf(without):
         return 1.0
     return max(with_it, _LEAST) / max(without, _LEAST)
@@ -114,47 +123,54 @@ def quotient(with_it: float, without: float) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation:
-    """A simulator's errors beside vanilla's, on the same recordings and starts."""
+    """Errors of a simulator with and without its residual, on the same recordings and starts."""
 
     vanilla: tuple[Errors, ...]
+    """Errors without the residual, by recording."""
     residual: tuple[Errors, ...]
+    """Errors with the residual, by recording."""
     base: str = "vanilla"
-    """What the simulator without the residual is called."""
+    """Name of the simulator without the residual."""
     name: str = "envmimic"
-    """What the simulator with it is called."""
+    """Name of the simulator with the residual."""
     nominal: tuple[Errors, ...] = ()
-    """Errors of the nominal robot without the residual, where the actuators of both others are identified."""
+    """Errors of the simulator with nominal actuators and without the residual, by recording. Empty if the actuators of
+    the other two are nominal."""
     angle: Angle = "yaw"
-    """What errors of orientation are of."""
+    """Angle of the orientation errors."""
 
     @property
     def groups(self) -> tuple[str, ...]:
+        """Groups of the recordings, in their order."""
         return tuple(dict.fromkeys(errors.group for errors in self.vanilla))
 
     @property
     def simulators(self) -> dict[str, tuple[Errors, ...]]:
-        """Errors by simulator: without residual first."""
+        """Errors by the name of the simulator: nominal, then without the residual, then with it."""
         nominal = {base_name(False): self.nominal} if self.nominal else {}
         return nominal | {self.base: self.vanilla, self.name: self.residual}
 
     def ratio(self, group: str, quantity: str, horizon: float) -> float:
-        """Return `quotient` of the errors with the residual and without, each averaged over the group's recordings."""
+        """Return the ratio (`quotient`) of the errors with and without the residual.
+
+        Each is first averaged over the group's recordings.
+        """
         with_it, without = (group_mean(e, group, quantity, horizon) for e in (self.residual, self.vanilla))
         return quotient(with_it, without)
 
     def score_horizons(self, group: str) -> list[float]:
-        """Return the horizons (s) of a group that the score looks at."""
+        """Return the horizons (s) of a group that enter the score."""
         reached = reached_horizons(self.vanilla, group)
         return [horizon for horizon in reached if horizon in SCORE_HORIZONS] or [max(reached)]
 
     @property
     def score(self) -> float:
-        """What choices are made by, on validation recordings: the mean ratio to vanilla, of position, orientation and,
-        where recordings hold them, joint angles alike.
+        """Score by which checkpoints are chosen on validation recordings: the mean ratio of the errors to vanilla's.
 
-        Averaged over groups and over `SCORE_HORIZONS`, or over the longest horizon where there is none of these.
-        Infinite where more starts diverge with the residual than without. Worst cases stay out of it: at 20 s they are
-        a matter of luck, and choosing by them chose untrained policies.
+        The mean is over position, orientation and, if recorded, joint angles, with equal weights, over groups and over
+        `SCORE_HORIZONS`. A group without these horizons enters with its longest one. The score is infinite if more
+        starts diverge with the residual than without. It ignores worst cases: at 20 s they are a matter of chance, and
+        choosing by them chose untrained policies.
         """
         ratios = []
         for group in self.groups:
@@ -168,10 +184,11 @@ class Evaluation:
         return float(np.mean(ratios))
 
     def excess(self) -> tuple[float, str]:
-        """Worst case over recordings and horizons of the residual's error beyond 1.2 vanilla + (2 cm or 3 deg).
+        """Return the largest error with the residual relative to a bound, over recordings and horizons, and its place.
 
-        Given in units of that bound (0.1: ten per cent beyond it; negative: within), with where it is. Infinite where
-        more starts diverge with the residual than without.
+        The bound is 1.2 times vanilla's error plus 2 cm or 3 deg. The value is the error divided by the bound, minus 1:
+        0.1 is ten per cent beyond the bound, and a negative value is within it. It is infinite if more starts diverge
+        with the residual than without, or if only the residual's error diverged.
         """
         worst, place = -np.inf, ""
         for base, mimic in zip(self.vanilla, self.residual, strict=True):
@@ -189,35 +206,35 @@ class Evaluation:
         return float(worst), place
 
     def table(self) -> str:
-        """Return `errors_table.errors_table` of it: errors by group and horizon, in lines."""
-        from ballu_mjx.evaluation.errors_table import errors_table  # which imports this module
+        """Return the table of errors by group and horizon, as text (`errors_table.errors_table`)."""
+        from ballu_mjx.evaluation.errors_table import errors_table  # here, because it imports this module
 
         return errors_table(self)
 
     def called(self, quantity: str) -> str:
-        """Return what a quantity is called: errors of orientation by what they are of."""
+        """Return the name of a quantity in tables. For orientation, it is the angle of the errors."""
         return self.angle if quantity == "orientation" else quantity
 
 
 def share_diverged(errors: Errors, horizon: float) -> str:
-    """Return in words how many starts diverged before a horizon (s) that some did."""
+    """Return the number of starts that diverged before a horizon (s), as text. The horizon must be in `diverged`."""
     some, starts = errors.diverged[horizon]
     return f"diverged in {some} of {starts} starts"
 
 
 def reached_horizons(errors: Sequence[Errors], group: str) -> list[float]:
-    """Return the horizons (s) that recordings of a group are long enough for, in order."""
+    """Return the horizons (s) for which the recordings of a group are long enough, in increasing order."""
     return sorted({horizon for e in errors if e.group == group for horizon in e.position})
 
 
 def mean_by_group(errors: Sequence[Errors]) -> tuple[Errors, ...]:
-    """Return the means of each group's recordings, as one recording named after it."""
+    """Return the mean over each group's recordings, as the errors of one recording that has the group's name."""
     groups = dict.fromkeys(e.group for e in errors)
     return tuple(_mean([e for e in errors if e.group == group]) for group in groups)
 
 
 def _mean(errors: Sequence[Errors]) -> Errors:
-    """Of recordings of one group; named after it."""
+    """Return the mean over recordings of one group, which gives the result its name."""
     group = errors[0].group
 
     def over(quantity: str) -> dict[float, tuple[float, float]]:
@@ -250,7 +267,7 @@ def _mean(errors: Sequence[Errors]) -> Errors:
 
 
 def group_mean(errors: Sequence[Errors], group: str, quantity: str, horizon: float, place: int = 0) -> float:
-    """Return the mean over a group's recordings of their means, or with `place` 1 of their spreads (m or deg)."""
+    """Return the mean over a group's recordings of their means (`place` 0) or of their spreads (1), in m or deg."""
     values = [
         getattr(e, quantity)[horizon][place] for e in errors if e.group == group and horizon in getattr(e, quantity)
     ]
@@ -258,13 +275,13 @@ def group_mean(errors: Sequence[Errors], group: str, quantity: str, horizon: flo
 
 
 def group_median(errors: Sequence[Errors], group: str, quantity: str, horizon: float) -> float:
-    """Return the median over recordings of the medians over their starts."""
+    """Return the median over a group's recordings of the medians over their starts (m or deg)."""
     values = [e.medians[quantity][horizon] for e in errors if e.group == group and horizon in e.medians[quantity]]
     return float(np.median(values))
 
 
 def _mean_of_finite(values: Sequence[float]) -> float:
-    """Return the mean over those that are finite; infinity where none is."""
+    """Return the mean of the finite values, or infinity if there is none."""
     finite = [value for value in values if np.isfinite(value)]
     return float(np.mean(finite)) if finite else np.inf
 
@@ -272,9 +289,10 @@ def _mean_of_finite(values: Sequence[float]) -> float:
 def orientation_errors(
     simulated: Float[np.ndarray, "*states 3"], recorded: Float[np.ndarray, "*states 3"], upright: bool
 ) -> Float[np.ndarray, "*states"]:
-    """Return errors of orientation (deg) of roll, pitch and yaw (rad; intrinsic z-y-x).
+    """Return orientation errors (deg) between orientations given as roll, pitch and yaw (rad; intrinsic z-y-x).
 
-    Of an upright robot simulated less recorded yaw, wrapped to 180 deg. Else the angle of the rotation between both.
+    For an upright robot, the error is simulated minus recorded yaw, wrapped to 180 deg. For other robots, it is the
+    angle of the rotation between both orientations.
     """
     if upright:
         turn = simulated[..., 2] - recorded[..., 2]
@@ -285,7 +303,7 @@ def orientation_errors(
 
 
 def _quaternion(euler: Float[np.ndarray, "*states 3"]) -> Float[np.ndarray, "*states 4"]:
-    # SciPy's rotations raise where an angle is not finite; simulations that diverged have such states.
+    # SciPy's rotations raise for angles that are not finite, which diverged simulations have.
     halves = np.moveaxis(np.asarray(euler, np.float64), -1, 0) / 2
     (cr, cp, cy), (sr, sp, sy) = np.cos(halves), np.sin(halves)
     return np.stack(

@@ -1,4 +1,4 @@
-"""Errors of simulators in a file: as JSON, and checked when it is read."""
+"""JSON file of simulators' errors, which is checked when it is read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ballu_mjx.robots.description_fields import HORIZON_RANGE
 
 
 def evaluation_to_json(evaluation: Evaluation) -> dict[str, Any]:
-    """Return all figures, as plain lists and numbers; null for what is infinite."""
+    """Return all figures as JSON-compatible values, with None for infinity."""
     worst, place = evaluation.excess()
     return {
         "base": evaluation.base,
@@ -45,9 +45,9 @@ def _finite(value: float | int) -> float | int | None:
 
 
 def evaluation_from_json(content: Mapping[str, Any]) -> Evaluation:
-    """Return the inverse of `evaluation_to_json`.
+    """Return the evaluation from the values that `evaluation_to_json` returned.
 
-    **Raises** `ValueError`, `TypeError`, `KeyError` or `AttributeError` for what is none.
+    **Raises** `ValueError`, `TypeError`, `KeyError` or `AttributeError` for values that are no evaluation.
     """
 
     def number(value: Any) -> float:
@@ -85,7 +85,7 @@ def evaluation_from_json(content: Mapping[str, Any]) -> Evaluation:
             return None
         start, later = value
         if not type(start) is type(later) is int:
-            raise ValueError("a start that diverged is named by two numbers of control steps")
+            raise ValueError("a start that diverged is given by two numbers of control steps")
         return start, later
 
     def table(values: Any) -> dict[float, tuple[float, float]]:
@@ -99,7 +99,7 @@ def evaluation_from_json(content: Mapping[str, Any]) -> Evaluation:
     def counts(values: Any) -> dict[float, tuple[int, int]]:
         found = by_horizon(values)
         if not all(type(some) is type(starts) is int and 0 <= some <= starts for some, starts in found.values()):
-            raise ValueError("starts that diverged are a number of them, of how many")
+            raise ValueError("counts of diverged starts need two numbers: diverged starts, and all starts")
         return found
 
     def errors(row: Any) -> Errors:
@@ -120,18 +120,21 @@ def evaluation_from_json(content: Mapping[str, Any]) -> Evaluation:
         if found.group != group_of(found.recording):
             raise ValueError(f"{reprlib.repr(found.recording)} is not of the group {reprlib.repr(found.group)}")
         if not found.position or found.position.keys() != found.orientation.keys():
-            raise ValueError(f"{reprlib.repr(found.recording)} has not the same horizons for both")
+            raise ValueError(f"{reprlib.repr(found.recording)} needs the same horizons for position and orientation")
         for horizon in found.position:
             some, starts = found.diverged.get(horizon, (0, 0))
-            lost = some == starts > 0
-            if any(np.isinf(quantity[horizon][0]) != lost for quantity in (found.position, found.orientation)):
-                raise ValueError(f"{reprlib.repr(found.recording)} has no error at {horizon:g} s, or one too many")
+            all_diverged = some == starts > 0
+            if any(np.isinf(quantity[horizon][0]) != all_diverged for quantity in (found.position, found.orientation)):
+                raise ValueError(
+                    f"the errors of {reprlib.repr(found.recording)} at {horizon:g} s do not agree with its count of "
+                    "diverged starts"
+                )
         return found
 
     nominal, without, mimic = (tuple(map(errors, content[which])) for which in ("nominal", "vanilla", "residual"))
     compared = [[_compared(e) for e in side] for side in (without, mimic, *([nominal] if nominal else []))]
     if not without or any(side != compared[0] for side in compared):
-        raise ValueError("there are not the same recordings and horizons without the residual and with it")
+        raise ValueError("recordings or horizons differ between the simulators without and with the residual")
     angle = content["angle"]
     if angle not in get_args(Angle):
         raise ValueError(f"{reprlib.repr(angle)} is none of {', '.join(get_args(Angle))}")
@@ -143,9 +146,9 @@ def _compared(errors: Errors) -> tuple[str, str, set[float]]:
 
 
 def read_evaluation(path: Path) -> Evaluation:
-    """Return the evaluation in a file, `evaluation.json` of a run, say.
+    """Return the evaluation in a file, for example a run's `evaluation.json`.
 
-    **Raises** `InputError` where it is none.
+    **Raises** `InputError` if the file holds no valid evaluation.
     """
     mend = f"`python -m ballu_mjx evaluate {path.parent} --output {path.parent}` writes it again"
     content = files.read_json(path, mend)

@@ -1,4 +1,4 @@
-"""The table of errors: means, spreads and medians of simulators side by side, by group and horizon, in lines."""
+"""Table of errors as text: means, spreads and medians of simulators side by side, by group and horizon."""
 
 from __future__ import annotations
 
@@ -21,8 +21,11 @@ _MEDIANS = (("position", "m", 3), ("orientation", "deg", 1), ("points", "m", 3),
 
 
 def errors_table(evaluation: Evaluation) -> str:
-    """Return errors by group and horizon, without and with the residual, with the spread over starts; then the
-    whole recordings, and where starts diverged."""
+    """Return the table of an evaluation as text.
+
+    Its parts are: mean errors and their spread over starts, by group and horizon; errors over whole recordings;
+    medians over starts; and the starts that diverged.
+    """
     sides = evaluation.simulators
     wide = [max(16, len(name) + 2) for name in sides]
     final = f"final {evaluation.angle} error (deg)"
@@ -68,12 +71,12 @@ def errors_table(evaluation: Evaluation) -> str:
         if errors.num_diverged(horizon)
     ]
     if broken:
-        lines += ["", "Simulations that broke down, which the means leave out:", *broken]
+        lines += ["", "Simulations that diverged, which the means leave out:", *broken]
     return "\n".join(lines)
 
 
 def _median_lines(evaluation: Evaluation) -> list[str]:
-    """Medians over starts of every quantity, and the share of starts that stayed finite."""
+    """Return the lines with the medians over starts of every quantity, and the share of starts that stayed finite."""
     sides = evaluation.simulators
     if not any(errors.medians for errors in evaluation.vanilla):
         return []
@@ -111,7 +114,7 @@ def _soonest(errors: Errors) -> str:
 
 
 def _finite_share(errors: Sequence[Errors], group: str, horizon: float) -> float:
-    """Of all starts that reach a horizon, the share that did not diverge."""
+    """Return the share of a group's starts that reach a horizon (s) without diverging."""
     counts = [e.diverged[horizon] for e in errors if e.group == group and horizon in e.diverged]
     starts = sum(each for _, each in counts)
-    return 1 - sum(lost for lost, _ in counts) / starts if starts else 1.0
+    return 1 - sum(some for some, _ in counts) / starts if starts else 1.0

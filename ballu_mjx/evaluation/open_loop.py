@@ -1,7 +1,8 @@
-"""How well a simulator predicts recordings: open-loop replay of recorded commands from recorded states.
+"""Open-loop evaluation of a simulator: replay of recorded commands from recorded states.
 
-Every recording is started afresh every second and simulated to its end; errors are taken over horizons, for over
-a whole recording small errors only compound. The paper's whole-recording figures are reported beside them.
+A run begins every second of a recording, at the recorded state, and goes on to the recording's end. Errors are
+computed over horizons, because small errors compound over a whole recording. The paper's figures for whole recordings
+are also computed.
 """
 
 from __future__ import annotations
@@ -41,31 +42,34 @@ from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import PhysicsState
 
 START_INTERVAL = 1.0
-"""Seconds between two starts in the same recording, or the shortest horizon where that is shorter."""
+"""Time (s) between two starts in a recording. It is the shortest horizon if that is shorter."""
 _RUNS = {True: 64, False: 1024}
-"""Runs side by side on each device; on a CPU, and elsewhere. Fewer are filled up, more go batch after batch."""
+"""Batch size: runs in parallel on each device, on a CPU (True) and on other devices (False). A smaller number of runs
+is padded, and a larger one is split into batches."""
 _CHUNK = 100
-"""Control steps that the compiled program does at a time: one program for recordings of all lengths."""
+"""Control steps that the compiled program simulates at once. One program then serves recordings of all lengths."""
 
 
 class Replay(NamedTuple):
-    """Simulated runs from recorded states, time first point included; what stands behind a recording's end means
-    nothing."""
+    """Simulated runs from recorded states. The recorded starting state is the first state of each run.
+
+    All arrays have the length of the longest run. Values beyond the end of a run's recording have no meaning.
+    """
 
     position: Float[np.ndarray, "runs states 3"]
-    """Of the tracked body (m, world)."""
+    """Position of the tracked body (m, world frame)."""
     euler_angles: Float[np.ndarray, "runs states 3"]
     """Roll, pitch and yaw of the tracked body (rad), not unwrapped."""
     points: Float[np.ndarray, "runs states points 3"]
-    """Of the robot's points (m, world)."""
+    """Positions of the robot's points (m, world frame)."""
     joints: Float[np.ndarray, "runs states hinges"]
-    """Angles (rad) of the hinges that are measured (`measured_hinges`)."""
+    """Angles of the measured hinges (rad); see `measured_hinges`."""
     com: Float[np.ndarray, "runs states 3"]
-    """Centre of mass (m, world)."""
+    """Position of the centre of mass (m, world frame)."""
     force: Float[np.ndarray, "runs steps 3"]
-    """Residual force (N, world)."""
+    """Residual force on the tracked body (N, world frame)."""
     qpos: Float[np.ndarray, "recordings states nq"]
-    """Generalized positions from each recording's first start."""
+    """Generalized positions of the run from each recording's first start."""
 
     @property
     def yaw(self) -> Float[np.ndarray, "runs states"]:
@@ -74,7 +78,7 @@ class Replay(NamedTuple):
 
 
 def measured_hinges(robot: RobotDescription, model: mujoco.MjModel, motion: Motion) -> dict[str, int]:
-    """Return where `qpos` has the hinges whose angles a recording holds, by name; held ones are left out."""
+    """Return the indices in `qpos` of the hinges whose angles are recorded, by name. Held joints are left out."""
     found = {name: model.joint(name) for name in robot.joints if name in motion.joints and name not in robot.held}
     return {
         name: int(joint.qposadr[0]) for name, joint in found.items() if joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE
@@ -82,26 +86,26 @@ def measured_hinges(robot: RobotDescription, model: mujoco.MjModel, motion: Moti
 
 
 def evaluate(simulator: AugmentedSimulator, motions: Sequence[Motion]) -> Evaluation:
-    """Return how well a simulator with a residual predicts recorded motions, beside the one without it.
+    """Return the open-loop errors of a simulator with and without its residual on recorded motions.
 
-    **Raises** `ValueError` where the simulator has no residual.
+    **Raises** `ValueError` if the simulator has no residual.
     """
     if simulator.residual is None:
-        raise ValueError("The simulator has no residual; give one that `with_residual` made.")
+        raise ValueError("The simulator has no residual; give one from `with_residual`.")
     evaluator = Evaluators(simulator.without_residual()).of(simulator.residual.model, motions)
     return evaluator(simulator.residual.params)
 
 
 class Evaluators:
-    """Evaluators of one simulator: those of the same residual share a compiled program."""
+    """Evaluators of one simulator. Evaluators of the same residual share a compiled program."""
 
     def __init__(self, simulator: Simulator) -> None:
-        """`simulator` is the one without residual."""
+        """Prepare evaluators of `simulator`, which has no residual."""
         self._simulator = simulator
         self._made: list[tuple[Residual, Sequence[Motion], OpenLoopEvaluator]] = []
 
     def of(self, residual: Residual, motions: Sequence[Motion]) -> OpenLoopEvaluator:
-        """Return the evaluator of `residual` on `motions`; the same one for the same arguments."""
+        """Return the evaluator of `residual` on `motions`. The same arguments give the same evaluator."""
         made = None
         for known, on, evaluator in self._made:
             if known is residual and on is motions:
@@ -114,8 +118,11 @@ class Evaluators:
 
 
 def nominal_model(simulator: Simulator) -> mujoco.MjModel:
-    """Return the nominal robot, with dry friction of no effect where the simulated one has any, and as many iterations
-    of the solver: both share a program, and so their rows of constraints."""
+    """Return the nominal model in a form that shares a compiled program with the simulator's model.
+
+    Both need the same constraint rows and solver iterations. The nominal model therefore has negligible dry friction
+    where the simulator's model has any.
+    """
     model = simulator.robot.load_model()
     model.opt.iterations = simulator.mj_model.opt.iterations
     for name in ("dof_frictionloss", "tendon_frictionloss"):
@@ -125,8 +132,10 @@ def nominal_model(simulator: Simulator) -> mujoco.MjModel:
 
 
 class OpenLoopEvaluator:
-    """Replays a set of recordings; one compiled program for any parameters of the residual, any recordings and
-    actuators."""
+    """Open-loop evaluator of a simulator on a set of recordings.
+
+    One compiled program serves all parameters of the residual, all recordings and all actuators.
+    """
 
     def __init__(
         self,
@@ -135,7 +144,10 @@ class OpenLoopEvaluator:
         residual: Residual,
         base: str = "vanilla",
     ) -> None:
-        """Prepare to replay `motions` in `simulator` without and with `residual`; `base` is the name without it."""
+        """Prepare to replay `motions` in `simulator`, without and with `residual`.
+
+        `base` is the name of the simulator without it.
+        """
         self.base, self.name = base, residual.name
         self._residual = residual
         self._simulator = simulator
@@ -147,7 +159,7 @@ class OpenLoopEvaluator:
         self._look_at(motions)
 
     def on(self, motions: Sequence[Motion]) -> OpenLoopEvaluator:
-        """The same for other recordings, with the program that is compiled already."""
+        """Return an evaluator on other recordings that shares this one's compiled program."""
         other = copy.copy(self)
         other._look_at(motions)
         return other
@@ -172,16 +184,17 @@ class OpenLoopEvaluator:
             for start in range(HISTORY - 1, len(motion.command) - interval + 1, interval)
         ]
         recordings = [recording for recording, _ in self.starts]
-        # Of each recording, the place in `starts` of the run over (nearly) all of it.
+        # Index in `starts` of each recording's first start, whose run covers (nearly) the whole recording.
         self.first_runs = [recordings.index(index) for index in range(len(self.motions))]
         self._without: tuple[tuple[Errors, ...], tuple[Errors, ...]] | None = None
 
     def replay(self, params: Any, *, scale: float = 1.0, nominal: bool = False) -> Replay:
-        """Simulate every start to its recording's end.
+        """Simulate from every start to the end of its recording.
 
         **Arguments**
 
-        - `scale`: the residual's share (0: none, 1: all of it).
+        - `params`: parameters of the residual.
+        - `scale`: factor on the residual (0: no residual, 1: full residual).
         - `nominal`: simulate with nominal actuators instead of identified ones.
         """
         fixed = self._fixed
@@ -189,7 +202,7 @@ class OpenLoopEvaluator:
             model = jax.device_get(Simulator(self.robot, model=nominal_model(self._simulator)).model)
             unchanged = None if self._simulator.drivetrain is None else identity_drivetrain(len(self.robot.commands))
             fixed = jax.device_put((model, jax.device_get(unchanged), self._reference), self._everywhere)
-        params = jax.device_get(params)  # they may live on one device; the batch is spread over all
+        params = jax.device_get(params)  # they may be on one device, but the batch is spread over all devices
         starts = np.array(self.starts, np.int32)
         steps = np.array([len(self.motions[recording].command) - start for recording, start in self.starts])
         shape, longest = (len(starts),), int(steps.max())
@@ -200,7 +213,7 @@ class OpenLoopEvaluator:
         features[:, 0], com[:, 0] = self._recorded[recording, first], self._recorded_com[recording, first]
         qpos[:, 0] = self._reference.qpos[recording, first]
 
-        order = np.argsort(-steps, kind="stable")  # batches of runs that end at about the same time
+        order = np.argsort(-steps, kind="stable")  # runs of similar length share a batch
         for batch in np.split(order, range(self._size, len(order), self._size)):
             places = starts[batch[np.arange(self._size) % len(batch)]]
             carry = self._begin(places)
@@ -224,7 +237,7 @@ class OpenLoopEvaluator:
         )
 
     def _begin(self, places: Int[np.ndarray, "runs 2"]) -> RolloutState:
-        """Return the recorded states at their places (recording, control step)."""
+        """Return rollout states at recorded `places` (recording, control step)."""
         recording, first = places.T
         earlier = first[:, None] + np.arange(1 - HISTORY, 1)
         qpos, qvel = (np.asarray(x)[recording, first] for x in (self._reference.qpos, self._reference.qvel))
@@ -233,12 +246,13 @@ class OpenLoopEvaluator:
             for x, when in ((self._reference.features, earlier), (self._reference.command, earlier[:, :-1]))
         )
         physics = PhysicsState(qpos, qvel, np.zeros_like(qvel))  # pyright: ignore
-        # Nominal actuators, which pass commands on, read nothing of the drivetrain's state.
+        # Nominal actuators have an identity drivetrain, which does not read this state.
         drivetrain = self._reference.drivetrain_at(recording, first)
         return jax.device_put(RolloutState(physics, features, command, drivetrain), self._split)  # pyright: ignore
 
     def recorded(self, run: int) -> tuple[Float[np.ndarray, "states 3"], Float[np.ndarray, " states"]]:
-        """Return the tracked body's recorded position (m) and yaw (rad), from the start of `run` to the end."""
+        """Return the recorded position (m, world frame) and yaw (rad) of the tracked body, from the start of `run` to
+        the end of its recording."""
         states = self._recorded_features(run)
         return states[:, ObservationLayout.position], states[:, ObservationLayout.yaw]
 
@@ -251,7 +265,10 @@ class OpenLoopEvaluator:
         return features[..., ObservationLayout.first_point :].reshape(*features.shape[:-1], -1, 6)[..., :3]
 
     def __call__(self, params: Any) -> Evaluation:
-        """Return errors of the simulator with the residual, beside those of the ones without."""
+        """Return the errors with the residual, without it, and with nominal actuators.
+
+        The latter two are computed only once.
+        """
         if self._without is None:
             self._without = self.errors(self.replay(params, scale=0.0)), self.nominal_errors(params)
         vanilla, nominal = self._without
@@ -260,13 +277,19 @@ class OpenLoopEvaluator:
     def compared(
         self, vanilla: tuple[Errors, ...], residual: tuple[Errors, ...], nominal: tuple[Errors, ...]
     ) -> Evaluation:
-        """Return errors without and with the residual, and nominal ones (empty: the same), side by side."""
+        """Return an evaluation of given errors: without and with the residual, and with nominal actuators.
+
+        `nominal` is empty if the actuators of the other two are nominal.
+        """
         angle = "yaw" if self.robot.upright else "orientation"
         return Evaluation(vanilla, residual, self.base, self.name, nominal, angle)
 
     def nominal_errors(self, params: Any) -> tuple[Errors, ...]:
-        """Return errors with nominal actuators and without the residual, of which `params` are any; empty where the
-        simulator's own actuators are nominal."""
+        """Return the errors with nominal actuators and without the residual.
+
+        They do not depend on `params`, which may be any parameters of the residual. The result is empty if the
+        simulator's own actuators are nominal.
+        """
         if self._simulator.actuators is None:
             return ()
         return self.errors(self.replay(params, scale=0.0, nominal=True))
@@ -281,8 +304,11 @@ class OpenLoopEvaluator:
         rollout: RolloutState,
         place: Int[Array, " 2"],
     ) -> tuple[RolloutState, tuple[Array, Array, Array, Array]]:
-        """One run, on by `_CHUNK` control steps: what the next ones start from, and features, centre of mass, force and
-        generalized positions after each."""
+        """Simulate one run for `_CHUNK` control steps.
+
+        Return the final state, and for each step: features, centre of mass (m), residual force (N) and generalized
+        positions.
+        """
         recording, start = place
         own = self._simulator.with_model(model).with_drivetrain(drivetrain)
         simulator = own.with_residual(BoundResidual(self._residual, params), scale)
@@ -294,14 +320,16 @@ class OpenLoopEvaluator:
         return jax.lax.scan(step, rollout, start + jnp.arange(_CHUNK))
 
     def of_starts(self, motions: Sequence[Motion], params: Any) -> tuple[Errors, ...]:
-        """Return how far the simulator with the residual is from itself when it starts from the states of `motions`.
+        """Return the differences between two replays with the residual that differ only in their starting states.
 
-        `motions` are the same recordings, reconstructed otherwise, such as after `capture_noise.add_capture_noise`. A
-        simulator cannot be expected to be much nearer to what was recorded."""
+        One starts from `motions`, the other from this evaluator's motions. `motions` are the same recordings in another
+        reconstruction, for example after `capture_noise.add_capture_noise`. A simulator's errors cannot be expected to
+        be much smaller than these differences.
+        """
         return self.errors(self.on(motions).replay(params), self.replay(params))
 
     def errors(self, replay: Replay, against: Replay | None = None) -> tuple[Errors, ...]:
-        """Errors of a replay, by recording: beside what was recorded, or beside another replay."""
+        """Return the errors of a replay relative to the recordings, or to the replay `against`, by recording."""
         results = []
         for index, motion in enumerate(self.motions):
             runs = [run for run, (recording, _) in enumerate(self.starts) if recording == index]
@@ -314,17 +342,19 @@ class OpenLoopEvaluator:
                 states = len(motion.qpos) - start
                 series = self._differences(replay, run, against)
                 forces.append(float(np.linalg.norm(replay.force[run, : states - 1], axis=-1).mean()))
-                broken = np.flatnonzero(~(np.abs(series["position"]) < _LOST) | ~np.isfinite(series["orientation"]))
+                broken = np.flatnonzero(
+                    ~(np.abs(series["position"]) < _DIVERGED_DISTANCE) | ~np.isfinite(series["orientation"])
+                )
                 if len(broken) and (soonest is None or broken[0] < soonest[1]):
                     soonest = start, int(broken[0])
                 for horizon in self.horizons:
                     steps = round(horizon / self.robot.control_timestep)
                     if steps < states:
-                        # A start that diverged counts for none of them: its angles may still be numbers.
+                        # A start that diverged has no valid error of any quantity, even if its angles are finite.
                         errors = {q: _rms(series[q][1 : steps + 1]) for q in _QUANTITIES if q in series}
-                        lost = has_diverged(errors["position"]) or has_diverged(errors["orientation"])
+                        diverged = has_diverged(errors["position"]) or has_diverged(errors["orientation"])
                         for quantity, error in errors.items():
-                            found[quantity][horizon].append(np.inf if lost else error)
+                            found[quantity][horizon].append(np.inf if diverged else error)
                 if run == runs[0]:
                     com_error = _finite(float(series["com"].mean()))
                     final_turn = _finite(float(series["orientation"][-1]))
@@ -353,10 +383,10 @@ class OpenLoopEvaluator:
     def _differences(
         self, replay: Replay, run: int, against: Replay | None
     ) -> dict[str, Float[np.ndarray, " states"] | Float[np.ndarray, "states several"]]:
-        """Differences between a run and the recording, or the same run of another replay, by quantity.
+        """Return the differences between a run and its recording, or the same run of another replay, by quantity.
 
-        Of the tracked body and the centre of mass (m), of orientation (deg), of every point (m), of hinges (deg);
-        points and hinges that there are none of are left out.
+        Quantities are the position of the tracked body (m), its orientation (deg), the centre of mass (m), every point
+        (m) and every measured hinge (deg). Points and hinges are left out if there are none.
         """
         recording, start = self.starts[run]
         states = len(self.motions[recording].qpos) - start
@@ -388,8 +418,8 @@ class OpenLoopEvaluator:
 
 
 _QUANTITIES = ("position", "orientation", "points", "joints")
-_LOST = 1e6
-"""m: a tracked body farther off is lost."""
+_DIVERGED_DISTANCE = 1e6
+"""Position error of the tracked body (m) from which a run counts as diverged."""
 
 
 def _rms(values: np.ndarray) -> float:

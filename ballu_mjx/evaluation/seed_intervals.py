@@ -1,7 +1,8 @@
-"""Means over trainings, with intervals that hold what they promise with few seeds.
+"""Means over trainings, with confidence intervals that are valid for few seeds.
 
-A setting's seeds are the sample: trials of one trained policy say nothing about the next training. So the mean of each
-seed's trials is one value, and Student's t gives the interval. One seed has neither interval nor rank.
+The seeds of a setting are the sample, because trials of one trained policy say nothing about another training. The mean
+of each seed's trials is therefore one value, and Student's t gives the interval. A single seed has no interval and must
+not be ranked.
 """
 
 from __future__ import annotations
@@ -13,36 +14,36 @@ import numpy as np
 from scipy import stats
 
 LEVEL = 0.95
-"""Of the confidence intervals in all tables."""
+"""Confidence level of the intervals in all tables."""
 
 
 class Interval(NamedTuple):
-    """A mean with its confidence interval."""
+    """Mean with its confidence interval."""
 
     mean: float
     half: float | None
-    """Half the interval's width; None of a single value."""
+    """Half the width of the interval. None for a single value."""
 
     @property
     def low(self) -> float | None:
-        """Lower end."""
+        """Lower end of the interval. None for a single value."""
         return None if self.half is None else self.mean - self.half
 
     @property
     def high(self) -> float | None:
-        """Upper end."""
+        """Upper end of the interval. None for a single value."""
         return None if self.half is None else self.mean + self.half
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether the interval lies on one side of zero; never of a single value."""
+        """Whether the interval lies on one side of zero. False for a single value."""
         return self.half is not None and abs(self.mean) > self.half
 
 
 def t_interval(values: Sequence[float], level: float = LEVEL) -> Interval:
-    """Return mean and confidence interval of independent values, one a seed, by Student's t.
+    """Return mean and confidence interval (Student's t) of independent values, one for each seed.
 
-    **Raises** `ValueError` where there is no value, or one that is not finite.
+    **Raises** `ValueError` if there is no value, or if a value is not finite.
     """
     sample = np.asarray(values, np.float64)
     if not sample.size or not np.isfinite(sample).all():
@@ -55,9 +56,9 @@ def t_interval(values: Sequence[float], level: float = LEVEL) -> Interval:
 
 
 def seed_means(trials: Sequence[Sequence[float]]) -> list[float]:
-    """Return the mean of each seed's trials, `trials[seed][trial]`; numbers of trials may differ.
+    """Return the mean of each seed's trials, `trials[seed][trial]`. Numbers of trials may differ.
 
-    **Raises** `ValueError` where there is no seed, or one without trials.
+    **Raises** `ValueError` if there is no seed, or a seed without trials.
     """
     if not trials or not all(len(each) for each in trials):
         raise ValueError("A mean over trainings needs a seed or more, each with a trial or more.")
@@ -65,12 +66,12 @@ def seed_means(trials: Sequence[Sequence[float]]) -> list[float]:
 
 
 def paired_difference(one: Sequence[float], other: Sequence[float], level: float = LEVEL) -> Interval:
-    """Return the mean of `one` less `other`, value by value, and its interval.
+    """Return mean and confidence interval of the differences `one[i] - other[i]`.
 
     The values must be paired: the same seeds, or the same recordings and robots, in the same order. What both have in
-    common, such as a hard recording, cancels. Two settings are told apart where `excludes_zero` is true.
+    common, such as a hard recording, cancels. Two settings differ at this level if `excludes_zero` is true.
 
-    **Raises** `ValueError` where they differ in number, and as `t_interval`.
+    **Raises** `ValueError` if the numbers of values differ, or as `t_interval`.
     """
     if len(one) != len(other):
         raise ValueError(f"Paired values come in equal numbers, not {len(one)} and {len(other)}.")

@@ -1,6 +1,7 @@
-"""How well a policy transfers: the same policy in its simulator and on the robot, by the paper's figures.
+"""Transfer of a policy: its trajectories in its simulator and on the robot, compared by the paper's figures.
 
-All of section "Improved Sim-to-real Transfer": Table I (`fwd_walk`) for walking, Table II (`left_turn`) for turning.
+The figures are those of the paper's section "Improved Sim-to-real Transfer": Table I (`fwd_walk`) for walking, Table II
+(`left_turn`) for turning.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.seed_intervals import LEVEL, seed_means, t_interval
 
 STRIDE = 1.0
-"""Seconds between the points that the length of a path is taken over."""
+"""Time (s) between the points from which the length of a path is computed."""
 
 PAPER_WALKING: Mapping[str, tuple[float, float, float]] = {
     "vanilla+sysid": (2.01, 0.27, 1.24),
@@ -28,67 +29,71 @@ PAPER_WALKING: Mapping[str, tuple[float, float, float]] = {
     "vanilla+sysid+dr": (1.07, 0.56, 0.94),
     "envmimic": (0.90, 1.12, 1.28),
 }
-"""Paper, Table I, forward walking: mean CoM error, x-distance and total distance (m) by setting."""
+"""Values of the paper's Table I, forward walking: mean CoM error, x-distance and total distance (m), by setting."""
 PAPER_TURNING: Mapping[str, tuple[float, float, float]] = {
     "vanilla+sysid": (16.41, 0.20, 16.72),
     "vanilla+dr": (38.18, -0.04, -4.28),
     "vanilla+sysid+dr": (-8.50, 0.11, 39.77),
     "envmimic": (3.50, 0.29, 36.42),
 }
-"""Paper, Table II, turning left: final yaw error (deg, signed), y-distance (m) and change of yaw (deg) by setting."""
+"""Values of the paper's Table II, turning left: final yaw error (deg, signed), y-distance (m) and change of yaw (deg),
+by setting."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Trajectory:
-    """The way of a robot, simulated or not, at the control rate, the starting state first."""
+    """Trajectory of a simulated or real robot at the control rate. The starting state comes first."""
 
     com: Float[np.ndarray, "T 3"]
-    """Centre of mass (m, world)."""
+    """Position of the centre of mass (m, world frame)."""
     yaw: Float[np.ndarray, " T"]
-    """Of the tracked body (rad, world), not unwrapped."""
+    """Yaw of the tracked body (rad, world frame), not unwrapped."""
     steps: Int[np.ndarray, " T"]
-    """How many steps a walking robot has made by each state."""
+    """Number of footsteps of a walking robot up to each state."""
     control_timestep: float
-    """s between two states."""
+    """Time between two states (s)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Transfer:
-    """One trial: a policy on the robot, beside the same policy in simulation. World frame, last state less first."""
+    """Figures of one trial: a policy on the robot, compared with the same policy in simulation.
+
+    Distances and changes of yaw are from the first state to the last, in the world frame.
+    """
 
     com_error: float
     """Mean over time of the distance (m) between the centres of mass (paper, Table I, `(CoM_sim - CoM_hw) / T`)."""
     x_distance: float
-    """Robot (m, paper, Table I)."""
+    """Distance of the robot along x (m; paper, Table I)."""
     total_distance: float
-    """Robot (m, paper, Table I): see `path_length`."""
+    """Length of the robot's path (m; paper, Table I); see `path_length`."""
     y_distance: float
-    """Robot (m, paper, Table II)."""
+    """Distance of the robot along y (m; paper, Table II)."""
     yaw_error: float
-    """Final yaw in simulation less the robot's (deg, signed, paper, Table II); full turns count. Errors of yaw in
-    `errors` are wrapped to 180 deg instead."""
+    """Final yaw in simulation minus that of the robot (deg, signed; paper, Table II). Full turns count. In contrast,
+    yaw errors in `errors` are wrapped to 180 deg."""
     yaw_change: float
-    """Robot (deg, paper, Table II); full turns count."""
+    """Change of the robot's yaw (deg; paper, Table II). Full turns count."""
     sim_x_distance: float
-    """Simulation (m)."""
+    """Distance along x in simulation (m)."""
     sim_y_distance: float
-    """Simulation (m)."""
+    """Distance along y in simulation (m)."""
     sim_yaw_change: float
-    """Simulation (deg); full turns count."""
+    """Change of yaw in simulation (deg). Full turns count."""
     steps: float
-    """Robot: steps made."""
+    """Number of footsteps of the robot."""
     sim_steps: float
-    """Simulation."""
+    """Number of footsteps in simulation."""
 
     def to_json(self) -> dict[str, float]:
-        """All figures, as plain numbers."""
+        """Return all figures by name."""
         return dataclasses.asdict(self)
 
     @staticmethod
     def from_json(values: Mapping[str, Any]) -> Transfer:
-        """The inverse of `to_json`.
+        """Return the trial from the figures that `to_json` returned.
 
-        **Raises** `ValueError` where a figure is missing or is no number.
+        **Raises** `ValueError` if a figure is missing or is no number.
         """
         names = {field.name for field in dataclasses.fields(Transfer)}
         if values.keys() != names or not all(map(is_number, values.values())):
@@ -97,41 +102,41 @@ class Transfer:
 
 
 def write_transfer(path: pathlib.Path, transfers: Sequence[Transfer]) -> None:
-    """Write trials, as JSON."""
+    """Write trials to a JSON file."""
     files.write(path, json.dumps([each.to_json() for each in transfers], indent=2) + "\n")
 
 
 def read_transfer(path: pathlib.Path) -> list[Transfer]:
-    """The trials in a file that `write` wrote.
+    """Return the trials in a file that `write_transfer` wrote.
 
-    **Raises** `InputError` where it is none.
+    **Raises** `InputError` if the file holds no valid trials.
     """
-    mend = "delete its folder, and the trials will be made anew"
+    mend = "delete its folder, and the trials will be made again"
     found = files.parse_json(files.read_text(path), str(path), mend)
     try:
         if isinstance(found, list) and found:
             return [Transfer.from_json(each) for each in found]
         problem = "holds no trials"
     except (ValueError, AttributeError) as error:
-        problem = f"holds a trial that is none ({error})"
+        problem = f"holds an invalid trial ({error})"
     raise InputError(f"{path}: {problem}; {mend}.")
 
 
 def compare_trajectories(simulation: Trajectory, robot: Trajectory) -> Transfer:
-    """The paper's figures over the shorter of two paths.
+    """Return the paper's figures for two trajectories, over the length of the shorter one.
 
-    Both must start from (nearly) the same state: nothing is aligned, and an offset at the start counts as error. Only
-    yaws at the start on either side of the half turn are taken as the near neighbours that they are.
+    Both must start from (nearly) the same state. The trajectories are not aligned, so that an offset at the start
+    counts as error. Only the difference of the starting yaws is wrapped to 180 deg.
 
-    **Raises** `ValueError` where a path has fewer than 2 states, or not as many yaws or numbers of steps as centres of
-    mass.
+    **Raises** `ValueError` if a trajectory has fewer than 2 states, or if its numbers of yaws, step counts and centres
+    of mass differ.
     """
     for name, path in (("simulation", simulation), ("robot", robot)):
         for what, states in (("yaws", path.yaw), ("numbers of steps", path.steps)):
             if len(path.com) != len(states):
                 raise ValueError(f"The {name} has {len(path.com)} centres of mass, but {len(states)} {what}.")
         if len(path.com) < 2:
-            raise ValueError(f"The {name} has {len(path.com)} states: a path needs 2 or more.")
+            raise ValueError(f"The {name} has {len(path.com)} states; a trajectory needs 2 or more.")
     states = min(len(simulation.com), len(robot.com))
     sim_com, com = (path.com[:states].astype(np.float64) for path in (simulation, robot))
     sim_turn, turn = (np.rad2deg(_turn(path.yaw[:states])) for path in (simulation, robot))
@@ -153,12 +158,15 @@ def compare_trajectories(simulation: Trajectory, robot: Trajectory) -> Transfer:
 
 
 def path_length(com: Float[np.ndarray, "T 3"], control_timestep: float) -> float:
-    """Return the length (m) of the horizontal path through every `STRIDE`-th second's centre of mass, and the last.
+    """Return the length (m) of the horizontal path of the centre of mass.
 
-    Not through all: the centre of mass of a walking robot sways within each step, and noise of sensors adds length.
+    The path is sampled every `STRIDE` seconds and at the end.
+
+    A path through all states would be too long: the centre of mass of a walking robot sways within each step, and
+    sensor noise adds length.
     """
     points = com[:: round(STRIDE / control_timestep), :2]
-    points = np.concatenate([points, com[-1:, :2]])  # adds nothing where the last is there already
+    points = np.concatenate([points, com[-1:, :2]])  # a repeated last point adds no length
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
@@ -182,26 +190,26 @@ _TURNING = (
 
 
 def walking_table(results: Mapping[str, Sequence[Sequence[Transfer]]]) -> str:
-    """Return Table I in Markdown, `results[setting][seed][trial]`: `mean [low, high]`, and the paper's number.
+    """Return Table I of `results[setting][seed][trial]` in Markdown, with `mean [low, high]` and the paper's number.
 
-    The interval of the seeds' means is `seed_intervals.t_interval`; a single seed has none. Rows are in the order
-    given. A setting that the paper does not have shows `-` for its numbers. The last column, which the paper does not
-    have, tells gaits from what is none: mean and range of `gait.count_steps` over all trials, on the robot and in the
-    policies' own simulators. The caption says what the brackets are.
+    The interval is over the means of seeds (`seed_intervals.t_interval`); a single seed has none. Rows have the order
+    of `results`. Settings that are not in the paper show `-` for its numbers. The last column, which is not in the
+    paper, shows whether the robot walks: mean and range of `gait.count_steps` over all trials, on the robot and in the
+    policies' own simulators. The caption explains the brackets.
     """
     return _text(results, "walk")
 
 
 def turning_table(results: Mapping[str, Sequence[Sequence[Transfer]]]) -> str:
-    """Return Table II in Markdown, as `walking_table`.
+    """Return Table II in Markdown, in the form of `walking_table`.
 
-    The final yaw error is the mean of absolute values, for errors to either side cancel; the paper's is signed.
+    The final yaw error is a mean of absolute values, because signed errors cancel. The paper's values are signed.
     """
     return _text(results, "turn")
 
 
 def transfer_table(task: str, results: Mapping[str, Sequence[Sequence[Transfer]]]) -> Table:
-    """Return `walking_table` or `turning_table`, by the task `walk` or `turn`, as data."""
+    """Return the data of `walking_table` (task `walk`) or `turning_table` (task `turn`)."""
     columns, paper = {"walk": (_WALKING, PAPER_WALKING), "turn": (_TURNING, PAPER_TURNING)}[task]
     titles = ["setting", *(title for column in columns for title in (column.title, column.paper))]
     rows = []
@@ -240,6 +248,6 @@ def _range(values: Sequence[float]) -> str:
 
 
 def _turn(yaw: Float[np.ndarray, " T"]) -> float:
-    """Angle (rad) turned from the first state to the last, full turns included."""
+    """Return the change of yaw (rad) from the first state to the last, full turns included."""
     unwrapped = np.unwrap(yaw.astype(np.float64))
     return float(unwrapped[-1] - unwrapped[0])

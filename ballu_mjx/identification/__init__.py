@@ -1,1 +1,1 @@
-"""Stage 2, actuators: the parts of identification that no robot is needed for."""
+"""Stage 2, actuators: identification code that is not specific to one robot."""

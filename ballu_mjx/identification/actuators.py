@@ -1,7 +1,7 @@
-"""Identified actuators of any robot: by its adapter's method or by declared parameters, and the files they are in.
+"""Identification of any robot's actuators, by its adapter's method or from declared parameters, and the result files.
 
-A robot whose adapter has a method and a format of its own uses these. Every robot whose description declares `identify`
-has the format `ballu-identified/1` (`identification.write_back`).
+A robot whose adapter has a method uses the adapter's file format too. Any robot whose description declares `identify`
+can use the format `ballu-identified/1` (`identification.write_back`).
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 
 ACTUATORS_FILE = "actuators.json"
-"""The name under which a robot's identified actuators are found beside its recordings."""
+"""Name of the file of a robot's identified actuators beside its recordings."""
 
 AUTO, NOMINAL = Path("auto"), Path("nominal")
-"""What options that take a file of identified actuators take beside it."""
+"""Further values of options that take a file of identified actuators."""
 
 
 def identify_actuators(
@@ -35,47 +35,47 @@ def identify_actuators(
     levels: int | None = None,
     progress: IdentificationProgress | None = None,
 ) -> IdentifiedActuators:
-    """Identify the actuators of `robot`: by its adapter's method, or the parameters that its description declares.
+    """Identify the actuators of `robot`, by its adapter's method or from the parameters that its description declares.
 
     **Arguments**
 
-    - `recordings`: recordings of one robot, suspended ones for an adapter's method; by file, where errors shall name
-      these.
-    - `config`: of the method (of declared parameters `fit_robot.FitConfig`, for BALLU
-      `ballu.leg_parameters.IdentificationConfig`); None: its defaults.
-    - `levels`: fewest command levels of each actuator; None: the method's own.
-    - `progress`: is told of every iteration.
+    - `recordings`: recordings of one robot; suspended ones for an adapter's method. With a mapping from files, error
+      messages name the files.
+    - `config`: options of the method: `fit_robot.FitConfig` for declared parameters,
+      `ballu.leg_parameters.IdentificationConfig` for BALLU. None: its defaults.
+    - `levels`: smallest number of command levels of each actuator. None: the method's default.
+    - `progress`: called at every iteration.
 
-    **Raises** `InputError` where the recordings cannot be used, or the robot's adapter identifies nothing.
+    **Raises** `InputError` if the recordings cannot be used, or if this robot's actuators cannot be identified.
     """
     by_file = recordings if isinstance(recordings, Mapping) else {Path(each.name): each for each in recordings}
     if not by_file:
         raise InputError("There are no suspended recordings to identify actuators from; give some.")
     if declares_parameters(robot):
-        from ballu_mjx.identification.declared import identify_declared  # Optimistix: slow to import
+        from ballu_mjx.identification.declared import identify_declared  # slow to import
 
         return identify_declared(by_file, robot, config, progress=progress)
     return robot.adapter.identify_actuators(robot, by_file, config, levels, progress)
 
 
 def has_own_method(robot: RobotDescription) -> bool:
-    """Return whether the robot's adapter identifies its actuators by a method of its own."""
+    """Return whether the robot's adapter has a method that identifies its actuators."""
     return type(robot.adapter).identify_actuators is not RobotAdapter.identify_actuators
 
 
 def declares_parameters(robot: RobotDescription) -> bool:
-    """Return whether the robot's actuators are the parameters that its description declares."""
+    """Return whether identification fits the parameters that the robot's description declares."""
     return bool(robot.identify) and not has_own_method(robot)
 
 
 def read_actuators(robot: RobotDescription, path: Path) -> tuple[str, ModelParameters]:
-    """Return the specimen's name and the parameters in a file of identified actuators.
+    """Read a file of identified actuators, and return the specimen's name and the parameters.
 
-    **Raises** `InputError` where this robot's actuators cannot be identified, or the file is damaged; names file,
-    parameter and fix.
+    **Raises** `InputError` if this robot's actuators cannot be identified, or if the file is damaged. The message names
+    the file, the parameter and the fix.
     """
     if path.is_dir():
-        raise InputError(f"{path}: is a folder; give the file {ACTUATORS_FILE} of a run of `train sysid`.")
+        raise InputError(f"{path}: this is a folder; give the file {ACTUATORS_FILE} of a run of `train sysid`.")
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; `python -m ballu_mjx.train sysid` writes one.")
     if robot.identify:
@@ -86,18 +86,21 @@ def read_actuators(robot: RobotDescription, path: Path) -> tuple[str, ModelParam
 
 
 def validation_ratio(path: Path) -> float | None:
-    """Return how many times nominal's error on validation recordings the actuators in a file had when they were
-    identified; None: the file does not say."""
+    """Return the ratio of identified to nominal error on the validation recordings of the identification.
+
+    The ratio is read from the file of identified actuators. None if the file does not contain it.
+    """
     found = files.read_json(path, "restore it or identify again").get("validation")
     ratio = found.get("ratio") if isinstance(found, dict) else None
     return float(ratio) if ratio is not None and is_number(ratio) else None
 
 
 def find_actuators(robot: RobotDescription, recordings: Iterable[Path], specimen: str) -> Path | None:
-    """Return the file of identified actuators of a specimen beside its recordings, in their folder or the one above;
-    None: there is none, or this robot's actuators cannot be identified.
+    """Return the file of a specimen's identified actuators, from the folder of its recordings or the folder above.
 
-    **Raises** `InputError` where a file there is damaged.
+    None if there is no file, or if this robot's actuators cannot be identified.
+
+    **Raises** `InputError` if a file there is damaged.
     """
     if not (robot.identify or has_own_method(robot)):
         return None
@@ -109,16 +112,16 @@ def find_actuators(robot: RobotDescription, recordings: Iterable[Path], specimen
 
 
 def actuators_to_json(robot: RobotDescription, parameters: ModelParameters) -> dict[str, Any]:
-    """Return identified parameters as JSON's types, for `actuators_from_json`."""
+    """Return identified parameters as JSON types, for `actuators_from_json`."""
     if isinstance(parameters, IdentifiedParameters):
         return json.loads(identified_to_json(robot, parameters))
     return robot.adapter.actuators_to_json(parameters)
 
 
 def actuators_from_json(robot: RobotDescription, values: Mapping[str, Any], path: Path) -> ModelParameters:
-    """Return the inverse of `actuators_to_json`; `path` is the file that the values stand in.
+    """Return the parameters from the `values` that `actuators_to_json` made; `path` is the file with the values.
 
-    **Raises** `InputError` naming file, parameter and fix.
+    **Raises** `InputError` naming the file, the parameter and the fix.
     """
     if values.get("format") == IDENTIFIED_FORMAT:
         return identified_from_json(values, path, robot)

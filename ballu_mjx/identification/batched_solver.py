@@ -1,4 +1,4 @@
-"""Several Optimistix searches side by side in one compiled program."""
+"""Several Optimistix searches in parallel, in one compiled program."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def along_directions(
     directions: tuple[Float[Array, "n k _"] | Float[Array, "n k"], ...],
     held: tuple[Float[Array, "n ..."], ...],
 ) -> tuple[Float[Array, "n ..."], Float[Array, "n ... k"]]:
-    """Values of `function(*point, *held)` at n points, and how they change along k directions at each.
+    """Return the values of `function(*point, *held)` at n points, and its derivatives along k directions at each point.
 
-    In one batch of n k: batches within batches are traced once more each, and run in shorter loops.
+    All n k derivatives form one batch. Nested batches would be traced once more each, and would run in shorter loops.
     """
     n, k = directions[0].shape[:2]
     points, held = (tuple(jnp.repeat(x, k, axis=0) for x in group) for group in (points, held))
@@ -35,19 +35,18 @@ def along_directions(
 
 
 Evaluate = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Coordinates (batch, size) to values (batch, n) and Jacobians (batch, n, size)."""
+"""Function from coordinates (batch, size) to values (batch, n) and Jacobians (batch, n, size)."""
 
 
 class BatchedSolver:
-    """An Optimistix solver, for several starts side by side, one iteration at a time.
+    """An Optimistix solver that runs several searches in parallel, one iteration at a time.
 
-    The solver's program holds no physics: values and Jacobians at the points that it tries next are computed outside
-    and handed in. MJX, which takes by far the longest to compile, then stands in one program for all solvers and
-    stages.
+    The compiled solver contains no physics. The caller computes values and Jacobians at the points that the solver
+    tries next. MJX takes by far the longest to compile. It is thus compiled only once for all solvers and stages.
     """
 
     def __init__(self, solver: Any, worth: float = 1e-4) -> None:
-        """`worth`: share of the loss that an iteration gains at least, or it counts as idle."""
+        """`worth`: relative decrease of the loss below which an iteration counts as idle."""
         self._worth = worth
         least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
 
@@ -82,9 +81,16 @@ class BatchedSolver:
         report: Callable[[int, int, float], None],
         patience: int | None = None,
     ) -> tuple[Float[np.ndarray, "batch size"], Float[np.ndarray, " batch"]]:
-        """Coordinates and losses at the end of each search: sums of squares, or the minimized function itself.
+        """Return coordinates and losses at the end of each search.
 
-        After `patience` iterations in which no search gained anything worth it, they end.
+        Losses are sums of squares, or the minimized function itself. The searches end after `steps` iterations, when
+        all have converged, or after `patience` idle iterations in a row (None: no limit).
+
+        **Arguments**
+
+        - `evaluate`: values and Jacobians at given coordinates.
+        - `start`: coordinates at which the searches start.
+        - `report`: called with (iteration, `steps`, lowest loss) after every iteration.
         """
         evaluated = tuple(map(jnp.asarray, evaluate(start)))
         y, state, loss = jnp.asarray(start), self._init(jnp.asarray(start), evaluated), np.zeros(len(start))

@@ -1,7 +1,7 @@
-"""A body's mass distribution, deformed: any ten numbers give an inertia that a rigid body can have.
+"""Deformation of a body's mass distribution by ten numbers, which always gives an inertia that a rigid body can have.
 
 The distribution is scaled in mass, shifted, stretched and sheared along the nominal principal axes (a log-Cholesky
-factor relative to nominal; Rucker and Wensing, RA-L 7(2), 2022).
+factor relative to nominal; Rucker and Wensing, RA-L 7(2), 2022). Mass and stretches must be above 0.
 """
 
 from __future__ import annotations
@@ -23,8 +23,10 @@ BODY_QUANTITIES = (
     "shear_xz",
     "shear_yz",
 )
-"""Mass over nominal; shift (m) of the centre of mass along the nominal principal axes; then the deformation."""
+"""The ten numbers: mass relative to nominal, shift of the centre of mass along the nominal principal axes (m), and
+stretches and shears along them."""
 UNDEFORMED = (1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+"""Values of the nominal body, in the order of `BODY_QUANTITIES`."""
 
 
 def deform_body(
@@ -36,13 +38,13 @@ def deform_body(
     *,
     turned: bool = True,
 ) -> tuple[Float[Array, ""], Float[Array, " 3"], Float[Array, " 4"], Float[Array, " 3"]]:
-    """Return mass, centre, orientation and principal inertia of a body whose mass distribution is deformed.
+    """Return mass, centre of mass, principal axes and principal inertia of a body with a deformed mass distribution.
 
     **Arguments**
 
-    - `mass`, `ipos`, `iquat`, `inertia`: the nominal body's, as MuJoCo's `body_*` fields.
-    - `numbers`: in the order of `BODY_QUANTITIES`.
-    - `turned`: whether stretches and shears may differ from nominal, so that principal axes are sought anew.
+    - `mass`, `ipos`, `iquat`, `inertia`: MuJoCo's `body_*` fields of the nominal body.
+    - `numbers`: the ten numbers, in the order of `BODY_QUANTITIES`.
+    - `turned`: whether stretches and shears may differ from nominal, so that the principal axes must be recomputed.
     """
     axes = quaternion_to_matrix(iquat)
     ratio, shift, stretch, shear = numbers[0], numbers[1:4], numbers[4:7], numbers[7:]
@@ -53,7 +55,7 @@ def deform_body(
     moments = jnp.sum(inertia) / 2 - inertia
     factor = jnp.diag(stretch).at[jnp.array([0, 0, 1]), jnp.array([1, 2, 2])].set(shear)
     spread = factor @ jnp.diag(moments) @ factor.T
-    # Equal principal moments would have no derivative of their axes; so little apart, rounding loses nothing.
+    # The axes of equal principal moments have no derivative. This offset separates them, without loss of precision.
     split = jnp.diag(jnp.array([0.0, 1.0, 2.0]) * _SPLIT * jnp.trace(spread))
     own = jnp.trace(spread) * jnp.eye(3) - spread + split
     principal, vectors = jnp.linalg.eigh(own)
@@ -62,3 +64,4 @@ def deform_body(
 
 
 _SPLIT = 1e-6
+"""Offset between the principal moments, relative to the trace of the second moments of mass."""

@@ -1,7 +1,7 @@
-"""Levenberg-Marquardt within bounds, for functions whose Jacobian comes with their values.
+"""Levenberg-Marquardt within bounds, for functions that return their values together with their Jacobian.
 
-Every step minimizes the damped quadratic model within the bounds. A value may so arrive at a bound and leave it again,
-where coordinates that are bent to stay inside have no slope left.
+Every step minimizes the damped quadratic model within the bounds. A coordinate can therefore reach a bound and leave it
+again. A transformation that keeps coordinates inside would have a derivative of 0 at the bound.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import scipy.optimize
 from jaxtyping import Float
 
 Evaluate = Callable[[Float[np.ndarray, " size"]], tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows size"]]]
-"""Residuals and their Jacobian at a point."""
+"""Function from a point to residuals and their Jacobian."""
 
 
 def bounded_least_squares(
@@ -23,10 +23,10 @@ def bounded_least_squares(
     report: Callable[[int, int, float], None],
     patience: int,
 ) -> tuple[Float[np.ndarray, " size"], float]:
-    """Minimize the sum of squares within 0 and 1 from `start`, in at most `steps` evaluations.
+    """Minimize a sum of squares from `start`, with all coordinates between 0 and 1.
 
-    The search ends after `patience` evaluations in a row that gained nothing worth it, and where the quadratic model
-    promises nothing.
+    The search ends after `steps` evaluations, after `patience` evaluations in a row without a sufficient decrease, or
+    if the quadratic model predicts no decrease. `report` is called with (evaluation, `steps`, loss) after each.
 
     **Returns** the best point, and its sum of squares.
     """
@@ -61,22 +61,22 @@ def _step(
     damping: float,
     point: Float[np.ndarray, " size"],
 ) -> Float[np.ndarray, " size"]:
-    """Return the change that minimizes the damped model while the point stays between the bounds."""
+    """Return the change of the point that minimizes the damped model within the bounds."""
     held = np.sqrt(damping * np.mean(np.sum(slopes**2, axis=0)) + _TINY)
     rows = np.concatenate([slopes, held * np.eye(len(point))]), np.concatenate([-values, np.zeros(len(point))])
     return scipy.optimize.lsq_linear(*rows, bounds=(-point, 1 - point), method="bvls").x
 
 
 _DAMPING = 1e-6
-"""At first, in units of the mean square of the slopes: bold, and cautious only once a step has failed."""
+"""Initial damping, in units of the mean squared norm of the Jacobian's columns. It grows only after a failed step."""
 _BOLDER, _CAUTIOUS = 0.01, 10.0
-"""What multiplies the damping after a step that gained, and after one that did not (to the power of how many did not in
-a row)."""
+"""Factors of the damping after a step that decreased the loss, and after one that did not. The second is raised to the
+power of the number of failures in a row."""
 _LEAST = 1e-7
-"""Damping that a failed step begins to grow from."""
+"""Smallest damping to which the factor of a failed step is applied."""
 _TINY = 1e-300
-"""Where nothing depends on anything."""
+"""Damping that remains if the Jacobian is 0."""
 _WORTH = 1e-4
-"""Of the loss: what an evaluation gains at least."""
+"""Relative decrease of the loss below which an evaluation counts as idle."""
 _PROMISED = 1e-8
-"""Of the loss: a promise of less ends the search."""
+"""Predicted relative decrease of the loss below which the search ends."""

@@ -1,25 +1,27 @@
 """Declarations of parameters that recordings may identify.
 
-A description's key `identify` lists them. An entry names an element of the model and what of it is identified:
+They are listed under the key `identify` of a robot description. An entry names an element of the model, and the field
+to identify:
 
-- `{"joint": "hinge", "field": "damping"}`; fields are damping, armature, frictionloss, stiffness, springref;
-- `{"actuator": "motor", "field": "kp"}`; kp and kd (position and velocity feedback; kp scales gain and bias together),
-  strength (scales gain and bias), gain, bias, forcerange (symmetric);
-- `{"tendon": "cable", "field": "springlength"}`; stiffness, damping, frictionloss, springlength (upper end);
-- `{"geom": "tip", "field": "friction"}` (sliding);
-- `{"body": "arm", "field": "mass"}`; mass (inertia grows along), com (3 parameters), inertia (6), or all 10 by
-  mass_properties;
-- `{"command": "left", "field": "delay"}`; scale, offset, delay, backlash, rate_limit, lag (`sim.drivetrain`);
-- any other numeric field of an element by MuJoCo's name for it: `{"joint": "hinge", "field": "jnt_range", "index": 0}`.
+- `{"joint": "hinge", "field": "damping"}`. Fields: damping, armature, frictionloss, stiffness, springref.
+- `{"actuator": "motor", "field": "kp"}`. Fields: kp (position feedback; scales gain and position bias together), kd
+  (velocity feedback), strength (scales gain and bias), gain, bias, forcerange (upper end; the lower one in proportion).
+- `{"tendon": "cable", "field": "springlength"}`. Fields: stiffness, damping, frictionloss, springlength (upper end).
+- `{"geom": "tip", "field": "friction"}`. Field: friction (sliding).
+- `{"body": "arm", "field": "mass"}`. Fields: mass (scales the inertia too), com (3 parameters), inertia (6), or
+  mass_properties for all 10.
+- `{"command": "left", "field": "delay"}`. Fields: scale, offset, delay, backlash, rate_limit, lag (`sim.drivetrain`).
+- Any other numeric field of an element, by MuJoCo's name: `{"joint": "hinge", "field": "jnt_range", "index": 0}`.
 
-Several elements in a list, `{"joint": ["hinge_left", "hinge_right"], ...}`, share one value. `"targets"`, a list of
-such element-field pairs, each with an optional `"factor"`, ties anything to anything. Optional keys: `name`, `unit`,
-`bounds`, `prior` (standard deviation among robots), `nominal`.
+Elements in a list share one value: `{"joint": ["hinge_left", "hinge_right"], ...}`. `"targets"` is a list of
+element-field pairs, each with an optional `"factor"`. It ties different fields to one value. Optional keys: `name`,
+`unit`, `bounds`, `prior` (standard deviation among robots), `nominal`.
 
-Values of `mass` and of what a factor multiplies are those of the first element. A body's inertia is written as the
-nominal one deformed: its mass distribution is stretched by `stretch_x`, ... and sheared by `shear_xy`, ... along the
-nominal principal axes (a log-Cholesky factor relative to nominal; Rucker and Wensing, RA-L 7(2), 2022). Any mass above
-0 and any stretches above 0 then give an inertia that a rigid body can have.
+A shared `mass` has the value of the first body. With factors, the value is that of the first target over its factor.
+The inertia of a body is parametrized by a deformation of its nominal mass distribution. The parameters are stretches
+(`stretch_x`, ...) and shears (`shear_xy`, ...) along the nominal principal axes. They form a log-Cholesky factor
+relative to nominal (Rucker and Wensing, RA-L 7(2), 2022). Any mass above 0 and any stretches above 0 give an inertia
+that a rigid body can have.
 """
 
 from __future__ import annotations
@@ -52,7 +54,7 @@ def declared_parameters(robot: RobotDescription, model: mujoco.MjModel) -> Param
     **Raises** `InputError` naming the description, the entry and the fix.
     """
     if not robot.identify:
-        raise InputError(f'{robot.file}: "identify" is missing; list there which parameters to identify.')
+        raise InputError(f'{robot.file}: "identify" is missing; list the parameters to identify there.')
     found = parameters_of(robot, model, robot.identify)
     names = [parameter.name for parameter in found]
     for name in names:
@@ -70,7 +72,7 @@ def declared_parameters(robot: RobotDescription, model: mujoco.MjModel) -> Param
 def parameters_of(
     robot: RobotDescription, model: mujoco.MjModel, entries: Sequence[Mapping[str, Any]]
 ) -> list[Parameter]:
-    """Return the parameters of entries of the form that `identify` has.
+    """Return the parameters of entries that are written as under `identify`.
 
     **Raises** `InputError` naming the description, the entry and the fix.
     """
@@ -141,16 +143,16 @@ _UNITS_OF_LENGTHS = {
     "kd": "N s/m",
     "forcerange": "N",
 }
-"""Of slides and tendons."""
+"""Units of slides and tendons."""
 _SCALAR_JOINTS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
 _SIGNED = ("springref", "bias", "offset")
-"""Values may be below 0."""
+"""Fields whose values may be below 0."""
 _FACTOR = 4.0
-"""Bounds are the nominal value divided and multiplied by this, where a declaration does not say."""
+"""Default bounds are the nominal value divided and multiplied by this factor."""
 _SPREAD = 0.3
-"""Prior standard deviation over the nominal value, where a declaration does not say."""
+"""Default prior standard deviation, relative to the nominal value."""
 _RADIUS = 0.5
-"""Of a body's radius of gyration: how far its centre of mass is sought, where a declaration does not say."""
+"""Default bound on the shift of a body's centre of mass, relative to its radius of gyration, and on its shears."""
 
 
 class _Declaration:
@@ -161,14 +163,15 @@ class _Declaration:
         self.label = f'"identify" entry {number}'
         for key in entry:
             if key not in _KEYS:
-                self.refuse(f'has the key "{key}"', f"there are {', '.join(_KEYS)}")
+                self.refuse(f'has the key "{key}"', f"the keys are {', '.join(_KEYS)}")
         self._nominal = [entry["nominal"]] if "nominal" in entry else []
 
     def refuse(self, problem: str, fix: str) -> NoReturn:
+        """Raise `InputError` with the file, the entry, the problem and the fix."""
         raise InputError(f"{self.file}: {self.label} {problem}; {fix}.")
 
     def parameters(self) -> list[Parameter]:
-        """Return the parameters of this entry: one, or those of a body's group."""
+        """Return the parameters of this entry: one, or several of a body."""
         parts = self._parts()
         kind, _, field, _ = parts[0]
         if kind == "body" and field in _BODY_GROUPS:
@@ -176,23 +179,29 @@ class _Declaration:
         nominals, targets = [], []
         for kind, element, field, factor in parts:
             if kind == "body" and field in _BODY_GROUPS:
-                self.refuse("ties a body's mass properties to something else", "tie them among bodies alone")
+                self.refuse(
+                    "ties a body's mass properties to another quantity", "tie them to those of other bodies only"
+                )
             nominal, own = self._targets(kind, element, field)
             nominals.append(nominal / factor)
             targets += [target._replace(factor=target.factor * factor) for target in own]
         nominal = self._number("nominal", nominals[0])
         if any(not math.isclose(x, nominals[0], rel_tol=1e-6, abs_tol=1e-12) for x in nominals):
             shown = ", ".join(f"{x:g}" for x in nominals)
-            self.refuse(f"ties elements whose values differ ({shown})", 'write "targets", each with its "factor"')
+            self.refuse(
+                f"ties elements whose nominal values differ ({shown})", 'write "targets", each with its "factor"'
+            )
         name = "_and_".join(dict.fromkeys(str(part[1]) for part in parts)) + f"_{parts[0][2]}"
         return [self._parameter(name, parts[0], nominal, tuple(targets))]
 
     def _parts(self) -> list[tuple[str, str, str, float]]:
-        """Return (kind, element, field, factor) of everything that is set."""
+        """Return (kind, element, field, factor) of each target of the entry."""
         if "targets" in self.entry:
             targets = self.entry["targets"]
             if not isinstance(targets, list) or not targets or not all(isinstance(each, dict) for each in targets):
-                self.refuse('"targets" is no list of objects', 'write [{"joint": ..., "field": ..., "factor": 1}]')
+                self.refuse(
+                    'has "targets" that are not a list of objects', 'write [{"joint": ..., "field": ..., "factor": 1}]'
+                )
             return [part for target in targets for part in self._part(target)]
         return self._part(self.entry)
 
@@ -203,11 +212,11 @@ class _Declaration:
         elements, field, factor = entry[kinds[0]], entry.get("field"), entry.get("factor", 1.0)
         elements = elements if isinstance(elements, list) else [elements]
         if not elements or not all(isinstance(each, str) for each in elements):
-            self.refuse(f'"{kinds[0]}" is {elements!r}', "write a name, or a list of names that share the value")
+            self.refuse(f'has "{kinds[0]}" {elements!r}', "write a name, or a list of names that share the value")
         if not isinstance(field, str):
-            self.refuse('"field" is missing', f"write one of {', '.join(self._known(kinds[0]))}")
+            self.refuse('has no "field"', f"write one of {', '.join(self._known(kinds[0]))}")
         if not is_number(factor) or factor == 0:
-            self.refuse(f'"factor" is {factor!r}', "write a number other than 0")
+            self.refuse(f'has the "factor" {factor!r}', "write a number other than 0")
         if "index" in entry:
             field = f"{field}[{entry['index']}]"
         return [(kinds[0], each, field, float(factor)) for each in elements]
@@ -223,14 +232,17 @@ class _Declaration:
         if index < 0:
             count = {"joint": "njnt", "actuator": "nu", "tendon": "ntendon", "geom": "ngeom", "body": "nbody"}[kind]
             own = [getattr(self.model, kind)(number).name for number in range(getattr(self.model, count))]
-            self.refuse(f"names {element!r}, no {kind} of the model", f"there are {', '.join(filter(None, own)) or 0}")
+            self.refuse(
+                f"names {element!r}, which is no {kind} of the model",
+                f"there are {', '.join(filter(None, own)) or 'none'}",
+            )
         return int(index)
 
     def _targets(self, kind: str, element: str, field: str) -> tuple[float, tuple[Target, ...]]:
-        """Return the model's value and what carries it."""
+        """Return the nominal value of a field, and the targets that set it."""
         if kind == "command":
             if element not in self.robot.commands:
-                self.refuse(f"names {element!r}, no command", f"there are {', '.join(self.robot.commands)}")
+                self.refuse(f"names {element!r}, which is no command", f"there are {', '.join(self.robot.commands)}")
             if field not in QUANTITIES:
                 self.refuse(f'has the field "{field}"', f"there are {', '.join(QUANTITIES)}")
             command = self.robot.commands.index(element)
@@ -245,24 +257,24 @@ class _Declaration:
         else:
             own, rest = self._raw(kind, field)
         if own == "actuator_biasprm" and not self.model.actuator_biastype[index]:
-            self.refuse(f"has the bias of {element}, which has none", 'give the actuator biastype="affine"')
+            self.refuse(f"declares the bias of {element}, which has none", 'give the actuator biastype="affine"')
         if kind == "joint":
             address = {"dof_": self.model.jnt_dofadr, "qpos_": self.model.jnt_qposadr}.get(own.split("_")[0] + "_")
             if address is not None:
                 if int(self.model.jnt_type[index]) not in _SCALAR_JOINTS:
-                    self.refuse(f"names {element}, no hinge or slide", "name hinges and slides only")
+                    self.refuse(f"names {element}, which is no hinge or slide", "name hinges and slides only")
                 index = int(address[index])
         place = (index, *rest)
         array = np.asarray(getattr(self.model, own))
         if array[place].ndim or not np.issubdtype(array.dtype, np.floating):
-            self.refuse(f"has the field {own} of shape {array.shape[1:]}", 'add the "index" of the number in it')
+            self.refuse(f"has the field {own}, which has the shape {array.shape[1:]}", 'add the "index" of one number')
         targets = [FieldTarget(own, place, 1.0)]
         if field == "springlength" and array[index, 0] == array[index, 1]:
-            targets.append(FieldTarget(own, (index, 0), 1.0))  # no dead band: both ends are one
+            targets.append(FieldTarget(own, (index, 0), 1.0))  # without a dead band, both ends are equal
         return float(array[place]), tuple(targets)
 
     def _raw(self, kind: str, field: str) -> tuple[str, tuple[int, ...]]:
-        """Return a field of the model by MuJoCo's name, and the index that follows the element's."""
+        """Return MuJoCo's name of a field, and the index within the element's row (empty without one)."""
         name, _, rest = field.partition("[")
         known = name.startswith(_PREFIXES[kind]) and isinstance(getattr(self.model, name, None), np.ndarray)
         if not known or name in ("body_mass", "body_ipos", "body_iquat", "body_inertia"):
@@ -272,10 +284,11 @@ class _Declaration:
         if not rest:
             return name, ()
         if not number.isdecimal() or len(shape) != 1 or int(number) >= shape[0]:
-            self.refuse(f"has the index {number} in {name}, of shape {shape}", "give one that is there")
+            self.refuse(f"has the index {number} in {name}, which has the shape {shape}", "give an index within it")
         return name, (int(number),)
 
     def _position_control(self, index: int, element: str, field: str) -> tuple[float, tuple[Target, ...]]:
+        """Return the nominal value of an actuator's kp, kd, strength or forcerange, and the targets that set it."""
         model = self.model
         gain, bias = model.actuator_gainprm[index], model.actuator_biasprm[index]
         affine = model.actuator_biastype[index] == mujoco.mjtBias.mjBIAS_AFFINE
@@ -286,14 +299,14 @@ class _Declaration:
         if field == "forcerange":
             low, high = model.actuator_forcerange[index]
             if not model.actuator_forcelimited[index] or high <= 0:
-                self.refuse(f"has the forcerange of {element}, which has none", "give the actuator a forcerange")
+                self.refuse(f"declares the forcerange of {element}, which has none", "give the actuator a forcerange")
             return float(high), (of("forcerange", 0, float(low / high)), of("forcerange", 1, 1.0))
         if field == "strength":
             prms = [("gainprm", gain), *([("biasprm", bias)] if affine else [])]
             return 1.0, tuple(of(n, i, float(x)) for n, prm in prms for i, x in enumerate(prm[:3]) if x)
         place = {"kp": 1, "kd": 2}[field]
         if not affine or (field == "kp" and bias[place] == 0):
-            self.refuse(f"has {field} of {element}, which feeds back no such thing", "give a position actuator")
+            self.refuse(f"declares {field} of {element}, which has no such feedback", "use a position actuator")
         value = float(-bias[place])
         if field == "kd":
             return value, (of("biasprm", 2, -1.0),)
@@ -305,11 +318,18 @@ class _Declaration:
         first = self._id("body", parts[0][1])
         mass, inertia = float(self.model.body_mass[first]), self.model.body_inertia[first]
         if mass <= 0 or np.any(2 * inertia >= inertia.sum()):
-            problem = f"has mass properties of {parts[0][1]}, whose nominal mass or inertia no rigid body has"
-            self.refuse(problem, "give it a mass, and moments of inertia each smaller than the sum of the others")
+            problem = (
+                f"declares mass properties of {parts[0][1]}, whose nominal mass or inertia is not that of a rigid body"
+            )
+            self.refuse(
+                problem,
+                "give it a mass above 0, and moments of inertia that are each smaller than the sum of the other two",
+            )
         for kind, element, field, factor in parts:
             if kind != "body" or field != parts[0][2] or factor != 1.0:
-                self.refuse("ties a body's mass properties to something else", "tie them among bodies alone")
+                self.refuse(
+                    "ties a body's mass properties to another quantity", "tie them to those of other bodies only"
+                )
             body = self._id("body", element)
             targets.append(BodyTarget(body, place, 1 / mass if quantity == "mass" else 1.0))
         nominal = mass if quantity == "mass" else UNDEFORMED[place]
@@ -317,7 +337,7 @@ class _Declaration:
         group = len(_BODY_GROUPS[parts[0][2]]) > 1
         reach = _RADIUS * math.sqrt(float(inertia.sum()) / 2 / mass) if quantity.startswith("com_") else _RADIUS
         bounds = (-reach, reach) if nominal == 0 else (nominal / _FACTOR, nominal * _FACTOR)
-        if group:  # bounds and priors of one number are not those of ten
+        if group:  # one value does not suit several parameters
             for key in ("bounds", "prior", "nominal", "unit"):
                 if key in self.entry:
                     self.refuse(f'has "{key}" for several parameters', "leave it out")
@@ -352,11 +372,13 @@ class _Declaration:
         bounds = self._bounds(bounds)
         nominal = min(nominal, bounds[1]) if math.isinf(nominal) else nominal
         if not bounds[0] <= nominal <= bounds[1]:
-            self.refuse(f'has "bounds" {bounds[0]:g} to {bounds[1]:g} without the nominal {nominal:g}', "widen them")
+            self.refuse(
+                f'has "bounds" {bounds[0]:g} to {bounds[1]:g}, which exclude the nominal {nominal:g}', "widen them"
+            )
         if math.isnan(prior):
             prior = _SPREAD * nominal if nominal > 0 and field not in _SIGNED else (bounds[1] - bounds[0]) / 4
         if field not in _SIGNED and bounds[0] < 0 and field in self._known(kind):
-            self.refuse(f'has "bounds" that begin at {bounds[0]:g}', f"{field} is 0 or more")
+            self.refuse(f'has "bounds" that begin at {bounds[0]:g}', f"{field} must be 0 or more")
         return Parameter(
             name=self._text("name", name),
             unit=self._text("unit", self._unit(kind, element, field)),
@@ -385,7 +407,7 @@ class _Declaration:
     def _bounds(self, default: tuple[float, float] | None) -> tuple[float, float]:
         value = self.entry.get("bounds", default)
         if value is None:
-            self.refuse('has no "bounds", and a nominal value that suggests none', 'add "bounds": [low, high]')
+            self.refuse('has no "bounds", and its nominal value gives no default', 'add "bounds": [low, high]')
         if len(value) != 2 or not all(map(is_number, value)) or not value[0] < value[1]:
             self.refuse(f'has "bounds" {value!r}', "write two numbers, the smaller first")
         return float(value[0]), float(value[1])
@@ -405,5 +427,5 @@ class _Declaration:
     def _text(self, key: str, default: str) -> str:
         value = self.entry.get(key, default)
         if not isinstance(value, str) or (key == "name" and not value.isidentifier()):
-            self.refuse(f'has "{key}" {value!r}', "write a text of letters, digits and underscores")
+            self.refuse(f'has "{key}" {value!r}', "write text; a name has letters, digits and underscores only")
         return value

@@ -1,4 +1,4 @@
-"""Identification of the parameters that a robot's description declares, from recordings to a report."""
+"""Identification of the parameters that a robot description declares, from recordings to a report."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class IdentifiedByFit(IdentifiedActuators):
 
     **Fields**
 
-    - `fit`: values, errors, held-out windows.
-    - `held_out`: motions that the held-out windows are of.
-    - `choice`: replay of the validation recordings with nominal and with identified values; None: there were none, or
-      none as long as a second.
-    - `suggestions`: parameters that are not declared and would explain what is left.
+    - `fit`: values, standard errors, and errors on held-out windows.
+    - `held_out`: motions that the held-out windows are cut from.
+    - `choice`: replay of the validation recordings with nominal and with identified values. None if no validation
+      recording lasts a second.
+    - `suggestions`: undeclared parameters that would explain the remaining error.
     """
 
     fit: RobotFit
@@ -51,30 +51,38 @@ class IdentifiedByFit(IdentifiedActuators):
 
 
 def check_recordings(robot: RobotDescription, recordings: Mapping[Path, Recording], window_seconds: float) -> str:
-    """Check that recordings can be measured, some as long as a window, and are of one specimen, whose name is returned.
+    """Check that the recordings can be used, and return the name of their specimen (individual robot).
+
+    They must be of one specimen, and at least one must be as long as a window.
 
     **Raises** `InputError` naming the file and the fix.
     """
     specimens = {recording.robot: path for path, recording in recordings.items()}
     if len(specimens) != 1:
-        raise InputError(f"The recordings are of several robots ({', '.join(sorted(specimens))}); give those of one.")
+        raise InputError(
+            f"The recordings are of several robots ({', '.join(sorted(specimens))}); give recordings of one robot."
+        )
     for path, recording in recordings.items():
         if recording.kind != "free" and not robot.anchored:
             raise InputError(
-                f"{path}: is a suspended recording, and {robot.model.name} has a free joint; give free ones, or a "
-                "model whose root is held."
+                f"{path}: this recording is suspended, but {robot.model.name} has a free joint; give free recordings, "
+                "or a model without the free joint."
             )
     if all(recording.time[-1] - recording.time[0] < window_seconds for recording in recordings.values()):
         first = next(iter(recordings))
-        raise InputError(f"{first}: no recording lasts {window_seconds:g} s; give longer ones, or --window-seconds.")
+        raise InputError(
+            f"{first}: no recording lasts {window_seconds:g} s; give longer recordings, or a shorter --window-seconds."
+        )
     return next(iter(specimens))
 
 
 def recorded_motion(
     recording: Recording, robot: RobotDescription, model: mujoco.MjModel, sampling: SamplingConfig | None = None
 ) -> Motion:
-    """Return a recording's states at the control rate: as measured where all joints of a robot whose root is held are,
-    else reconstructed."""
+    """Return a recording's states at control steps.
+
+    They are measured if the recording has all joints of an anchored robot. Otherwise they are reconstructed.
+    """
     if _is_measured(recording, model):
         return held_motion(recording, robot, model, sampling)
     return reconstruct(recording, robot, model)
@@ -83,8 +91,9 @@ def recorded_motion(
 def measure_recording(
     recording: Recording, robot: RobotDescription, model: mujoco.MjModel, sampling: SamplingConfig | None = None
 ) -> MeasuredMotion:
-    """Return a recording as identification takes it: as measured where all joints of a robot whose root is held are,
-    else reconstructed.
+    """Return a recording in the form that identification takes.
+
+    States are measured if the recording has all joints of an anchored robot. Otherwise they are reconstructed.
 
     **Raises** `InputError` naming the joint that was not recorded, or a recording that is too short.
     """
@@ -94,7 +103,7 @@ def measure_recording(
 
 
 def _is_measured(recording: Recording, model: mujoco.MjModel) -> bool:
-    """Return whether the joints of a recording are its states, or else must be."""
+    """Return whether a recording has all joints of the model, or must have them because it is suspended."""
     joints = {model.joint(number).name for number in range(model.njnt)}
     return joints <= set(recording.joint_angles) or recording.kind == "suspended"
 
@@ -113,14 +122,15 @@ def identify_declared(
 
     **Arguments**
 
-    - `recordings`, `validation`: by file. Validation recordings have no part in the fit; without any, every fourth
-      window is held out.
-    - `sampling`: of recordings of a robot whose root is held.
-    - `progress`: is told of every iteration, `on_data_check` before the search of which parameters the data show.
-    - `suggest`: look for parameters that are not declared and would explain what is left.
+    - `recordings`, `validation`: recordings by file. The fit does not use validation recordings. If there are none,
+      every fourth window is held out.
+    - `sampling`: sampling of recordings of an anchored robot.
+    - `progress`: called at every iteration.
+    - `on_data_check`: called before the search, with the parameters that the data can show.
+    - `suggest`: whether to search for undeclared parameters that would explain the remaining error.
 
-    **Raises** `InputError` for options out of range, recordings that cannot be used, and declarations that do not fit
-    the model.
+    **Raises** `InputError` if an option is out of range, a recording cannot be used, or a declaration does not fit the
+    model.
     """
     config, sampling, validation = config or FitConfig(), sampling or SamplingConfig(), validation or {}
     check_fit_config(config)
@@ -140,9 +150,9 @@ def identify_declared(
     suggestions: tuple[Suggestion, ...] = ()
     if suggest:
         tell = progress or (lambda stage, iteration, steps, value: None)
-        tell("what is left", 0, 1, float("nan"))
+        tell("undeclared parameters", 0, 1, float("nan"))
         suggestions = suggest_parameters(robot, fit, training, config)
-        tell("what is left", 1, 1, float("nan"))
+        tell("undeclared parameters", 1, 1, float("nan"))
     report = fit_table(fit, model, config.window_seconds, "validation recordings" if held else "the same recordings")
     if suggestions:
         report += f"\n\n{suggestions_table(suggestions)}"

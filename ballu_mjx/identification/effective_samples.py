@@ -1,4 +1,4 @@
-"""How many independent samples errors that go together in time are worth."""
+"""Number of independent samples in errors that are correlated in time."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from jaxtyping import Bool, Float
 def integrated_autocorrelation_time(
     errors: Float[np.ndarray, "samples channels"], begins: Bool[np.ndarray, " samples"]
 ) -> Float[np.ndarray, " channels"]:
-    """Return the integrated autocorrelation time of each channel, in samples: n samples are worth n over it.
+    """Return the integrated autocorrelation time tau of each channel, in samples.
 
-    It is 1 + 2 sum(rho_k), with Geyer's initial monotone sequence: correlations are added in pairs of lags as long as
-    the pairs are positive, and no pair counts for more than the one before (Geyer, "Practical Markov chain Monte
-    Carlo", Statistical Science 7, 1992). The errors' mean is not taken off, so that a constant error correlates fully.
-    Never below 1: errors that alternate are not credited.
+    n samples count as n / tau independent ones. tau is 1 + 2 sum(rho_k), with Geyer's initial monotone sequence (Geyer,
+    "Practical Markov chain Monte Carlo", Statistical Science 7, 1992). Autocorrelations are added in pairs of lags
+    while the pairs are positive, and no pair counts more than the previous one. The mean of the errors is not
+    subtracted, so that a constant error is fully correlated. tau is at least 1: alternating errors do not count as
+    more samples than there are.
 
-    - `begins`: where a recording begins; errors of different recordings do not correlate.
+    - `begins`: true at the first sample of each recording. Errors of different recordings are uncorrelated.
     """
     count = len(errors)
     covariance = np.zeros((count, errors.shape[1]))

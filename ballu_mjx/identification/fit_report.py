@@ -1,4 +1,4 @@
-"""What came out of a fit of declared parameters: as text, as JSON's types, and as arrays for figures."""
+"""Reports of a fit of declared parameters: as text, as JSON types, and as arrays for figures."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from jaxtyping import Float
 from ballu_mjx.identification.fit_robot import HeldOut, RobotFit
 
 _NORMAL_95 = 1.96
-"""Standard errors to either side of a 95 % interval."""
+"""Half width of a 95 % interval, in standard errors."""
 
 
 def intervals(fit: RobotFit) -> Float[np.ndarray, "parameters 2"]:
-    """Return 95 % intervals by the robust standard errors, cut at the bounds."""
+    """Return 95 % intervals from the robust standard errors, clipped to the bounds."""
     half = _NORMAL_95 * fit.standard_errors
     both = np.stack([fit.values - half, fit.values + half], axis=1)
     return np.clip(both, fit.parameters.lower[:, None], fit.parameters.upper[:, None])
 
 
 def channel_names(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Return what the channels of a motion are called: one name for each direction of `qvel`."""
+    """Return the names of a motion's channels: one for each entry of `qvel`."""
     names = []
     for number in range(model.njnt):
         joint = model.joint(number)
@@ -35,7 +35,7 @@ def channel_names(model: mujoco.MjModel) -> tuple[str, ...]:
 
 
 def angular_channels(model: mujoco.MjModel) -> np.ndarray:
-    """Return which channels are in rad; the others are in m."""
+    """Return a mask of the channels in rad. The others are in m."""
     kinds = []
     for kind in model.jnt_type:
         free = kind == mujoco.mjtJoint.mjJNT_FREE
@@ -44,15 +44,17 @@ def angular_channels(model: mujoco.MjModel) -> np.ndarray:
 
 
 def channel_scales(model: mujoco.MjModel) -> tuple[Float[np.ndarray, " channels"], tuple[str, ...]]:
-    """Return what turns channels of positions into degrees and millimetres, and these units."""
+    """Return the factors that convert position channels to degrees or millimetres, and these units."""
     angular = angular_channels(model)
     return np.where(angular, 180 / np.pi, 1e3), tuple("deg" if each else "mm" for each in angular)
 
 
 def autocorrelation(errors: Float[np.ndarray, "windows samples channels"]) -> Float[np.ndarray, "lags channels"]:
-    """Return the correlation of errors with those so many samples later in the same window, from lag 0 to half a
-    window; the errors' mean is not taken off, so that a constant error correlates fully. Windows that diverged are left
-    out."""
+    """Return the autocorrelation of errors within a window, for lags from 0 to half a window.
+
+    The mean of the errors is not subtracted, so that a constant error is fully correlated. Windows that diverged are
+    left out.
+    """
     kept = errors[np.isfinite(errors).all(axis=(1, 2))]
     samples = errors.shape[1]
     power = np.mean(kept**2, axis=(0, 1)) + np.finfo(float).tiny
@@ -61,9 +63,9 @@ def autocorrelation(errors: Float[np.ndarray, "windows samples channels"]) -> Fl
 
 
 def fit_table(fit: RobotFit, model: mujoco.MjModel, window_seconds: float, held_out: str) -> str:
-    """Return values, standard errors, what the data leave open, and errors on held-out windows, in words.
+    """Return a text with values, standard errors, undetermined combinations, and errors on held-out windows.
 
-    `held_out` says which recordings the windows are of.
+    - `held_out`: recordings that the windows are cut from, in words.
     """
     parameters = fit.parameters
     width = max(map(len, (*parameters.names, "parameter"))) + 2
@@ -80,17 +82,21 @@ def fit_table(fit: RobotFit, model: mujoco.MjModel, window_seconds: float, held_
     lines.append("")
     lines += [f"Not determined: {direction}." for direction in fit.unidentified]
     lines += [
-        f"{one} and {other} pass for each other (correlation {r:.2f})." for one, other, r in fit.strong_correlations
+        f"{one} and {other} are strongly correlated ({r:.2f}): the data hardly distinguish their effects."
+        for one, other, r in fit.strong_correlations
     ]
     median = float(np.median(fit.scatter))
-    lines.append(f"What is left on training windows is {median:.1f} times the assumed noise (median over channels).")
+    lines.append(
+        f"The remaining error on training windows is {median:.1f} times the assumed noise (median over channels)."
+    )
     if median > _MUCH:
-        lines.append("The model leaves something out, or the assumed noise is too small.")
+        lines.append("The model lacks an effect, or the assumed noise is too small.")
     lines += ["", *_held_out_table(fit, model, window_seconds, held_out)]
     return "\n".join(lines)
 
 
 _MUCH = 2.0
+"""Error, in units of noise, above which the report warns of a missing effect."""
 
 
 def _held_out_table(fit: RobotFit, model: mujoco.MjModel, window_seconds: float, held_out: str) -> list[str]:
@@ -107,14 +113,14 @@ def _held_out_table(fit: RobotFit, model: mujoco.MjModel, window_seconds: float,
     lines.append(f"Identified values replay them {verdict} than nominal ones: errors are {scores}.")
     if fit.identified.score > _MUCH:
         lines.append(
-            f"More than {_MUCH:g} times the noise: the model may lack a force. Values can make up for it, and their "
-            "intervals do not count that."
+            f"The error is more than {_MUCH:g} times the noise, so the model may lack a force. Identified values can "
+            "compensate for it, and their intervals do not include that error."
         )
     return lines
 
 
 def fit_details(fit: RobotFit, model: mujoco.MjModel) -> dict[str, Any]:
-    """Return a fit as JSON's types: parameters with intervals, what is not determined, errors on held-out windows."""
+    """Return a fit as JSON types: parameters with intervals, undetermined combinations, errors on held-out windows."""
     rows = []
     for place, (one, (low, high)) in enumerate(zip(fit.parameters.parameters, intervals(fit), strict=True)):
         rows.append(

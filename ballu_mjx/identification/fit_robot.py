@@ -1,9 +1,9 @@
 """Identification of declared parameters from recordings, for any robot.
 
-Levenberg-Marquardt over windows of recordings (`identification.window_objective`), from several starts, with exact
-derivatives taken forwards through the simulation.
+The fit is Levenberg-Marquardt over windows of recordings (`identification.window_objective`), from several starts.
+Derivatives are exact, by forward-mode differentiation of the simulation.
 
-What comes out is always compared with the nominal parameters on held-out windows.
+The identified parameters are always compared with the nominal ones on held-out windows.
 """
 
 from __future__ import annotations
@@ -29,20 +29,21 @@ from ballu_mjx.identification.window_simulator import Windows, WindowSimulator, 
 
 @dataclasses.dataclass(frozen=True)
 class FitConfig(WindowConfig):
-    """How parameters are identified."""
+    """Options of the identification of declared parameters."""
 
     starts: int = 4
-    """Searches: one from the nominal values, the others from draws from the priors."""
+    """Number of searches: one from the nominal values, the others from samples of the priors."""
     steps: int = 20
-    """Most iterations of a search."""
+    """Maximum number of iterations of a search."""
     seed: int = 0
-    """Seeds the draws."""
+    """Seed of the samples of the priors."""
     reweigh: bool = True
-    """Weigh channels by the scatter that is left; without, by the measurements' noise alone, and in one search."""
+    """Weight channels by the scatter of their residuals. If false, channels are weighted by the measurements' noise
+    alone, and there is no second search."""
 
 
 def check_fit_config(config: FitConfig) -> None:
-    """Refuse sizes that make no sense.
+    """Check the ranges of the options.
 
     **Raises** `InputError` naming the option.
     """
@@ -50,9 +51,11 @@ def check_fit_config(config: FitConfig) -> None:
         if getattr(config, name) is not None and getattr(config, name) <= 0:
             raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name)}: it must be above 0.")
     if config.start_spread < 0:
-        raise InputError(f"--start-spread is {config.start_spread}: it must be 0 or more; 0 takes states as measured.")
+        raise InputError(
+            f"--start-spread is {config.start_spread}: it must be 0 or more; 0 takes starting states as measured."
+        )
     if config.seed < 0:
-        raise InputError(f"--seed is {config.seed}: it must be 0 or more; 0 is the nearest.")
+        raise InputError(f"--seed is {config.seed}: it must be 0 or more.")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -60,69 +63,69 @@ class HeldOut:
     """Errors on held-out windows, from measured starting states."""
 
     motion: Int[np.ndarray, " windows"]
-    """Number of the motion that each is of."""
+    """Index of each window's motion."""
     first: Int[np.ndarray, " windows"]
-    """Sample of the motion that each starts in."""
+    """Index of each window's first sample in its motion."""
     errors: Float[np.ndarray, "windows samples channels"]
-    """Simulated less recorded: positions, then velocities, along the velocities' directions (SI units)."""
+    """Simulated minus recorded positions, in the coordinates of generalized velocities, then velocities (SI units)."""
     noise: Float[np.ndarray, " channels"]
-    """What they are weighed by."""
+    """Noise that `score` divides the errors by (SI units): the mean over the motions."""
 
     @property
     def score(self) -> float:
-        """Return the median over windows of the root mean square error in units of noise; inf where most diverge."""
+        """Return the median over windows of the root mean square error, in units of noise. inf if most diverge."""
         squares = np.mean((self.errors / self.noise) ** 2, axis=(1, 2))
         return float(np.sqrt(np.median(np.where(np.isfinite(squares), squares, np.inf))))
 
     @property
     def final_median(self) -> Float[np.ndarray, " channels"]:
-        """Return the median absolute error at the windows' end."""
+        """Return the median over windows of the absolute error at their end (SI units)."""
         last = np.abs(self.errors[:, -1])
         return np.median(np.where(np.isfinite(last), last, np.inf), axis=0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RobotFit:
-    """What was identified, how well it is known, and whether it helps."""
+    """Result of an identification: values, their uncertainty, and errors on held-out windows."""
 
     parameters: ParameterSet
     values: Float[np.ndarray, " parameters"]
     standard_errors: Float[np.ndarray, " parameters"]
-    """Windows err independently, in whatever way (`analyse`)."""
+    """Robust standard errors. They assume only that windows err independently (`analyse`)."""
     white_noise_errors: Float[np.ndarray, " parameters"]
-    """Standard errors if what is left were white noise."""
+    """Standard errors if the residuals of the fit are white noise."""
     correlations: Float[np.ndarray, "parameters parameters"]
     directions: tuple[Direction, ...]
-    """From the best to the least determined."""
+    """Combinations of parameters, from the best to the least determined."""
     unseen: tuple[str, ...]
-    """Parameters that the data check says these recordings cannot show."""
+    """Parameters that these recordings cannot show, according to the data check."""
     at_bounds: tuple[str, ...]
     scatter: Float[np.ndarray, " positions"]
-    """Robust standard deviation of what is left, of positions, in units of the measurements' noise."""
+    """Robust standard deviation of the remaining position errors, in units of the measurements' noise."""
     losses: Float[np.ndarray, " starts"]
-    """Where the searches ended, in ascending order."""
+    """Final losses of the searches, in ascending order."""
     nominal: HeldOut
     identified: HeldOut
 
     @property
     def improves(self) -> bool:
-        """Return whether the identified values replay held-out windows better than the nominal ones."""
+        """Return whether the identified values have a lower score on held-out windows than the nominal ones."""
         return self.identified.score < self.nominal.score
 
     @property
     def best(self) -> IdentifiedParameters:
-        """Return the identified values, or the nominal ones where those replay held-out windows better."""
+        """Return the identified values, or the nominal ones if the identified values do not improve on them."""
         values = self.values if self.improves else self.parameters.nominal
         return IdentifiedParameters(jnp.asarray(values), self.parameters)
 
     @property
     def unidentified(self) -> tuple[str, ...]:
-        """Return the directions that the data leave open, in words."""
+        """Return the combinations of parameters that the data do not determine, in words."""
         return tuple(self._words(d) for d in self.directions if d.standard_error > 1)
 
     @property
     def strong_correlations(self) -> tuple[tuple[str, str, float], ...]:
-        """Return pairs of parameters with a correlation beyond 0.9 in size."""
+        """Return the pairs of parameters with an absolute correlation above 0.9, with their correlation."""
         names, found = self.parameters.names, self.correlations
         pairs = zip(*np.triu_indices(len(names), 1), strict=True)
         return tuple((names[i], names[j], float(found[i, j])) for i, j in pairs if abs(found[i, j]) > _STRONG)
@@ -135,30 +138,33 @@ class RobotFit:
 
 _STRONG = 0.9
 _NAMED = 0.3
+"""Smallest weight of a parameter that is named in a combination."""
 Report = Callable[[str, int, int, float], None]
-"""(stage, iteration, most iterations, the lowest loss among the searches)."""
+"""Callback with the arguments (stage, iteration, maximum number of iterations, lowest loss of all searches)."""
 
 
 class Visibility(NamedTuple):
-    """What the data check finds."""
+    """Result of the data check: the effect of each parameter on the data."""
 
     names: tuple[str, ...]
     signal: Float[np.ndarray, " parameters"]
-    """How much a change by the prior spread changes the data, in standard deviations of their noise, the best change of
-    starting states taken off."""
+    """Change of the data when a parameter changes by its prior standard deviation, in standard deviations of the noise.
+    The part that starting states can compensate is subtracted."""
 
     @property
     def unseen(self) -> tuple[str, ...]:
-        """Return the parameters whose prior spread hides in the noise."""
+        """Return the parameters whose prior standard deviation changes the data by less than their noise."""
         return tuple(name for name, signal in zip(self.names, self.signal, strict=True) if signal < 1)
 
 
 def check_data(
     parameters: ParameterSet, motions: Sequence[MeasuredMotion], config: FitConfig | None = None
 ) -> Visibility:
-    """Say which parameters these recordings can show, from the nominal values and two draws; the best of them counts.
+    """Check which parameters these recordings can show.
 
-    **Raises** `InputError` where no recording is as long as a window.
+    The signal of a parameter is the largest at the nominal values and at two samples of the priors.
+
+    **Raises** `InputError` if an option is out of range, or if no recording is as long as a window.
     """
     config = config or FitConfig()
     check_fit_config(config)
@@ -178,18 +184,20 @@ def fit_robot(
 ) -> RobotFit:
     """Fit parameters to recorded motions.
 
-    1. Check which parameters the data can show; the others stay near their priors.
-    2. Search from several starts, side by side.
-    3. Weigh each channel by the scatter that the best one leaves, and search on from there.
+    1. Check which parameters the data can show. The others stay near their nominal values, because of their priors.
+    2. Search from several starts, one after the other.
+    3. Weight each channel by its scatter at the best solution, and continue the search from there.
     4. Replay held-out windows with nominal and with identified values.
 
     **Arguments**
 
-    - `validation`: motions that the fit does not see; None: every fourth window is held out.
-    - `report`: is told of every iteration, `on_data_check` of what the first step finds, `on_evaluation` of the values
-      that a search has tried.
+    - `validation`: motions that the fit does not use. None: every fourth window is held out.
+    - `report`: called at every iteration.
+    - `on_data_check`: called with the result of the first step.
+    - `on_evaluation`: called with the values of each evaluation in a search.
 
-    **Raises** `InputError` for options out of range, and where no recording is as long as a window.
+    **Raises** `InputError` if an option is out of range, if no recording is as long as a window, or if there are too
+    few windows to hold some out.
     """
     config = config or FitConfig()
     check_fit_config(config)
@@ -198,7 +206,9 @@ def fit_robot(
         windows = cut_windows(training, config.window_seconds, config.interval_seconds)
         if validation is None:
             if len(windows.first) < _EVERY:
-                problem = f"{len(windows.first)} windows of {config.window_seconds:g} s are too few to hold some out"
+                problem = (
+                    f"{len(windows.first)} windows of {config.window_seconds:g} s are too few to hold out every fourth"
+                )
                 raise InputError(f"{training[0].name}: {problem}; give validation recordings, or shorter windows.")
             held = np.arange(len(windows.first)) % _EVERY == _EVERY - 1
             held_out = Windows(windows.motion[held], windows.first[held], windows.samples)
@@ -254,7 +264,9 @@ def fit_robot(
 
 
 _EVERY = 4
+"""Interval of the held-out windows if there are no validation motions."""
 _PATIENCE = 6
+"""Evaluations without a sufficient decrease of the loss after which a search ends."""
 
 
 def replay(
@@ -264,10 +276,11 @@ def replay(
     seconds: float,
     interval: float | None = None,
 ) -> tuple[HeldOut, ...]:
-    """Replay motions with several values of the parameters, in windows of `seconds`, one every `interval` (s; None: end
-    to end), from measured starting states.
+    """Replay motions with each of several parameter vectors (`points`), from measured starting states.
 
-    **Raises** `InputError` where no motion is as long.
+    Windows last `seconds` (s), and there is one every `interval` (s; None: end to end).
+
+    **Raises** `InputError` if no motion is long enough.
     """
     with jax.enable_x64(True):
         simulator = WindowSimulator(parameters, motions, cut_windows(motions, seconds, interval))
@@ -285,6 +298,7 @@ def _visibility(objective: WindowObjective, config: FitConfig) -> Visibility:
 
 
 _DRAWS = 3
+"""Number of parameter vectors in the data check: the nominal values, then samples of the priors."""
 
 
 def _held_out(simulator: WindowSimulator, values: Float[np.ndarray, " parameters"]) -> HeldOut:

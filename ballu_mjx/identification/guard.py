@@ -1,7 +1,7 @@
-"""Whether identified actuators help: recordings replayed open loop with nominal and with identified ones.
+"""Comparison of identified and nominal actuators by open-loop replays of recordings.
 
-Replays are C MuJoCo's, which need no compiling. Recordings must be ones that neither the identification nor a final
-test uses: the validation recordings.
+Replays run in C MuJoCo, which needs no compilation. The recordings must be validation recordings: neither the
+identification nor a final test may use them.
 """
 
 from __future__ import annotations
@@ -26,36 +26,40 @@ from ballu_mjx.sim.drivetrain import count_slots, drivetrain_of, filter_commands
 from ballu_mjx.sim.step import count_substeps
 
 HORIZONS = (1.0, 5.0)
-"""Seconds over which errors are taken, where recordings are as long."""
+"""Horizons of the errors (s). Horizons longer than all recordings are left out."""
 START_INTERVAL = 1.0
-"""Seconds between two starts in the same recording."""
+"""Time between two starts in the same recording (s)."""
 
 Quantity = Literal["position", "joints"]
 
 
 class ReplayErrors(NamedTuple):
-    """Root mean square errors over a horizon: means over the starts that did not diverge, inf where all did."""
+    """Root mean square errors over a horizon, as means over the starts that did not diverge. inf if all diverged."""
 
     position: float
-    """Of the tracked site (m)."""
+    """Position error of the tracked site (m)."""
     joints: float
-    """Of the robot's recorded hinges (rad); not a number where it has none."""
+    """Angle error of the robot's recorded hinges (rad). NaN if it has none."""
     diverged: int
-    """Starts."""
+    """Number of starts that diverged."""
 
 
 class ReplayRow(NamedTuple):
-    """A group of recordings over a horizon."""
+    """Errors of a group of recordings over one horizon."""
 
     group: str
     horizon: float
-    """s."""
+    """Horizon (s)."""
     starts: int
+    """Number of starts."""
     nominal: ReplayErrors
     identified: ReplayErrors
 
     def ratio(self, quantity: Quantity) -> float:
-        """Return identified over nominal error; inf where more starts diverge."""
+        """Return identified over nominal error.
+
+        It is inf if more starts diverge with identified actuators. It is 1 if there is no finite nominal error.
+        """
         if self.identified.diverged > self.nominal.diverged:
             return np.inf
         one, other = getattr(self.identified, quantity), getattr(self.nominal, quantity)
@@ -69,12 +73,13 @@ _WORDS: Mapping[Quantity, str] = {"position": "position", "joints": "joint angle
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Choice:
-    """Which of nominal and identified actuators replay recordings better."""
+    """Comparison of nominal and identified actuators in replays of recordings."""
 
     identified: ModelParameters
     rows: tuple[ReplayRow, ...]
     decides: Quantity
-    """What the choice is made by: the tracked site's position; of a robot without a free joint, the joints."""
+    """Quantity that decides: the tracked site's position, or the joint angles of an anchored robot with recorded
+    hinges."""
 
     @property
     def ratio(self) -> float:
@@ -88,12 +93,12 @@ class Choice:
 
     @property
     def actuators(self) -> ModelParameters | None:
-        """Return the better actuators; None: the nominal ones."""
+        """Return the better actuators. None for the nominal ones."""
         return self.identified if self.improves else None
 
     @property
     def worse(self) -> tuple[str, ...]:
-        """Return where identified actuators are worse, in words: one entry for each group, horizon and quantity."""
+        """Return the groups, horizons and quantities in which identified actuators are worse, in words."""
         return tuple(
             f"{words} of {row.group} recordings over {row.horizon:g} s ({row.ratio(quantity):.2f} times the error)"
             for row in self.rows
@@ -102,7 +107,7 @@ class Choice:
         )
 
     def table(self) -> str:
-        """Return errors and verdict as text."""
+        """Return the errors and the result of the comparison as text."""
         lines = [
             f"{'':8}{'horizon':>8}{'':8} | {'position RMSE (m)':^30} | {'joint RMSE (deg)':^30}",
             f"{'group':8}{'(s)':>8}{'starts':>8}" + f" | {'nominal':>10}{'identified':>12}{'ratio':>8}" * 2,
@@ -117,8 +122,8 @@ class Choice:
                 cells.append(cell if given else f"{'none':>10}{'none':>12}{'':>8}")
             lines.append(f"{row.group:8}{row.horizon:>8g}{row.starts:>8} | {' | '.join(cells)}")
             if row.nominal.diverged or row.identified.diverged:
-                lost = f"{row.nominal.diverged} nominal, {row.identified.diverged} identified"
-                lines.append(f"{'':24} | diverged: {lost}")
+                diverged = f"{row.nominal.diverged} nominal, {row.identified.diverged} identified"
+                lines.append(f"{'':24} | diverged: {diverged}")
         better = "better" if self.improves else "WORSE"
         what = {"position": "position", "joints": "joint"}[self.decides]
         lines.append(
@@ -134,19 +139,19 @@ def choose_actuators(
     motions: Sequence[Motion],
     horizons: Sequence[float] = HORIZONS,
 ) -> Choice:
-    """Replay recorded motions with nominal and with identified actuators, and say which are better.
+    """Replay recorded motions with nominal and with identified actuators, and compare the errors.
 
-    Each motion is started afresh every second from its recorded states. Both replays start from the same states; of
-    joints that nothing measures, these may hold what one of the models says.
+    Each motion is restarted from its recorded states every second. Both replays start from the same states. For joints
+    without measurements, these states may depend on one of the models.
 
-    **Raises** `InputError` where no motion is as long as the shortest horizon (s).
+    **Raises** `InputError` if no motion is as long as the shortest horizon (s).
     """
     identified = bare_parameters(actuators)
     assert identified is not None, "There are no actuators to choose."
     lasting = [h for h in horizons if any(len(_starts(motion, h, robot)) for motion in motions)]
     if not lasting:
         names = ", ".join(motion.name for motion in motions)
-        raise InputError(f"{names}: no validation recording lasts {min(horizons):g} s; give longer ones.")
+        raise InputError(f"{names}: no validation recording lasts {min(horizons):g} s; give longer recordings.")
     both = [_replay(robot, parameters, motions, lasting) for parameters in (None, identified)]
     rows = []
     for group in dict.fromkeys(group_of(motion.name) for motion in motions):
@@ -159,7 +164,7 @@ def choose_actuators(
 
 
 def _starts(motion: Motion, horizon: float, robot: RobotDescription) -> Int[np.ndarray, " starts"]:
-    """Return the control steps that a motion is started in to be followed over a horizon (s)."""
+    """Return the control steps at which replays of a motion over a horizon (s) start."""
     steps, every = (round(seconds / robot.control_timestep) for seconds in (horizon, START_INTERVAL))
     return np.arange(0, len(motion.command) - steps + 1, max(every, 1))
 
@@ -173,7 +178,7 @@ def _summary(errors: Float[np.ndarray, "starts 2"]) -> ReplayErrors:
 def _replay(
     robot: RobotDescription, parameters: ModelParameters | None, motions: Sequence[Motion], horizons: Sequence[float]
 ) -> dict[tuple[str, float], Float[np.ndarray, "starts 2"]]:
-    """Return position and joint error of every start, by group and horizon; inf where it diverged."""
+    """Return the position and joint errors of every start, by group and horizon. inf if the start diverged."""
     model = robot.load_model(parameters)
     substeps = count_substeps(model, robot.control_timestep)
     found: dict[tuple[str, float], list[np.ndarray]] = {}
@@ -206,7 +211,7 @@ def _replay(
 def physics_commands(
     parameters: ModelParameters | None, commands: Float[np.ndarray, "steps commands"], substeps: int, timestep: float
 ) -> Float[np.ndarray, "physics commands"]:
-    """Return what the actuators get in each physics step, the drivetrain at rest before the first."""
+    """Return the actuators' `ctrl` at each physics step. The drivetrain starts at rest under the first command."""
     fine, drivetrain = np.repeat(commands, substeps, axis=0), drivetrain_of(parameters)
     if drivetrain is None:
         return fine
@@ -222,7 +227,10 @@ def simulate_motion(
     steps: int,
     substeps: int,
 ) -> tuple[Float[np.ndarray, "starts steps nq"], np.ndarray]:
-    """Return generalized positions after each control step, and whether the simulation was intact by then."""
+    """Simulate a motion from several starts.
+
+    **Returns** the generalized positions after each control step, and a mask that is false once a start has diverged.
+    """
     data, kind = mujoco.MjData(model), mujoco.mjtState.mjSTATE_FULLPHYSICS
     initial = np.zeros((len(starts), mujoco.mj_stateSize(model, kind)))
     for row, start in zip(initial, starts, strict=True):
@@ -232,7 +240,7 @@ def simulate_motion(
     with _quiet():
         state, _ = mujoco.rollout.rollout(model, data, initial, ctrl[place])
     after = np.asarray(state, float)[:, substeps - 1 :: substeps]
-    # MuJoCo begins anew where a simulation breaks down, and its clock with it.
+    # MuJoCo resets a simulation that diverges. Its time then differs from the expected one.
     expected = np.arange(1, steps + 1) * substeps * model.opt.timestep
     intact = np.isfinite(after).all(axis=2) & (np.abs(after[..., 0] - expected) < 1e-6 * expected)
     return after[..., 1 : 1 + model.nq], intact
@@ -240,7 +248,7 @@ def simulate_motion(
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep MuJoCo's warnings of a breakdown off the screen, and out of a log file in the current folder."""
+    """Suppress MuJoCo's warnings of divergence, on the screen and in its log file in the current folder."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)
     try:
@@ -252,7 +260,7 @@ def _quiet() -> Iterator[None]:
 def _look(
     model: mujoco.MjModel, robot: RobotDescription, qpos: Float[np.ndarray, "states nq"]
 ) -> tuple[Float[np.ndarray, "states 3"], Float[np.ndarray, "states hinges"]]:
-    """Return the tracked site's place (m), and the recorded hinges' angles (rad)."""
+    """Return the position of the tracked site (m) and the angles of the recorded hinges (rad)."""
     data, site = mujoco.MjData(model), model.site(robot.tracked).id
     position = np.zeros((len(qpos), 3))
     for number, row in enumerate(qpos):

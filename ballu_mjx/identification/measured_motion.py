@@ -1,4 +1,4 @@
-"""Recordings as identification takes them: states at samples, commands at physics steps, and their noise."""
+"""Recordings in the form that identification takes: states at samples, commands at physics steps, and their noise."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ballu_mjx.robots.description import RobotDescription
 
 
 def check_sampling_config(config: SamplingConfig) -> None:
-    """Refuse sizes that make no sense.
+    """Check that all options are above 0 and finite.
 
     **Raises** `InputError` naming the option.
     """
@@ -29,59 +29,63 @@ def check_sampling_config(config: SamplingConfig) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class SamplingConfig:
-    """How recordings are sampled, and what is known of their noise."""
+    """Sampling of recordings, and noise of their measurements."""
 
     sample_timestep: float = 0.02
-    """Seconds between two compared samples; rounded to physics steps."""
+    """Time between two compared samples (s), rounded to physics steps."""
     angle_noise: float = float(np.deg2rad(0.3))
-    """Standard deviation of a recorded joint coordinate (rad, m)."""
+    """Standard deviation of a recorded joint coordinate (rad for a hinge, m for a slide)."""
     position_window: float = 0.09
-    """Width (s) of the Savitzky-Golay filter for starting positions."""
+    """Width of the Savitzky-Golay filter for starting positions (s)."""
     rate_window: float = 0.19
-    """The same for velocities."""
+    """Width of the Savitzky-Golay filter for velocities (s)."""
     order: int = 3
-    """Of the filters' polynomials."""
+    """Order of the filters' polynomials."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MeasuredMotion:
-    """A recording as identification takes it: states at samples, commands at physics steps, and their noise."""
+    """A recording in the form that identification takes: states at samples, their noise, commands at physics steps."""
 
     name: str
     model: mujoco.MjModel
-    """The robot as it was recorded; motions of one fit may differ in numbers (a load), not in structure."""
+    """Model of the robot as it was recorded. Models in one fit may differ in values (a load), but not in structure."""
     every: int
-    """Physics steps from one sample to the next."""
+    """Physics steps between two samples."""
     commands: Float[np.ndarray, "steps commands"]
-    """In the actuators' units, at each physics step."""
+    """Commands at each physics step, in the actuators' units."""
     qpos: Float[np.ndarray, "samples nq"]
-    """Measured."""
+    """Measured generalized positions."""
     start_qpos: Float[np.ndarray, "samples nq"]
-    """Smoothed."""
+    """Smoothed generalized positions, for starting states."""
     qvel: Float[np.ndarray, "samples nv"]
+    """Generalized velocities."""
     position_noise: Float[np.ndarray, " nv"]
-    """Standard deviations along the velocities' directions (m, rad)."""
+    """Standard deviations of positions, in the coordinates of generalized velocities (m, rad)."""
     velocity_noise: Float[np.ndarray, " nv"]
-    """Standard deviations (m/s, rad/s)."""
+    """Standard deviations of generalized velocities (m/s, rad/s)."""
 
     @property
     def sample_timestep(self) -> float:
+        """Return the time between two samples (s)."""
         return self.every * float(self.model.opt.timestep)
 
 
 def measure(
     recording: Recording, robot: RobotDescription, model: mujoco.MjModel, config: SamplingConfig | None = None
 ) -> MeasuredMotion:
-    """Return the states of a recording that has every joint of a model whose root is held.
+    """Return a recording of all joints of an anchored robot, in the form that identification takes.
 
-    The noise of velocities is the root mean square difference between filters of the full and of half the width. It
-    holds the noise that the narrow filter lets through and what the wide one smooths away.
+    The noise of velocities is the standard deviation of the difference between filters of the full and of half the
+    width. It contains the noise that the narrow filter passes and the motion that the wide filter removes.
 
-    **Raises** `InputError` naming the joint that was not recorded, or a recording that is too short.
+    **Raises** `InputError` naming a joint that was not recorded, or a recording that is too short.
     """
     config = config or SamplingConfig()
     if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE:
-        raise InputError(f"{recording.name}: {robot.name} has a free joint; reconstruct the motion, or hold the root.")
+        raise InputError(
+            f"{recording.name}: {robot.name} has a free joint; reconstruct its motion, or use a model without it."
+        )
     joints = [model.joint(number).name for number in range(model.njnt)]
     for joint in joints:
         if joint not in recording.joint_angles:
@@ -119,8 +123,9 @@ def measure(
 def held_motion(
     recording: Recording, robot: RobotDescription, model: mujoco.MjModel, config: SamplingConfig | None = None
 ) -> Motion:
-    """Return states at the control rate of a recording that has every joint of a model whose root is held: of what
-    `reconstruct` gives for free recordings, all but distances to measured places.
+    """Return the states of a recording of all joints of an anchored robot, at control steps.
+
+    The result has the fields that `reconstruct` returns for free recordings, except distances to measured positions.
 
     **Raises** `InputError` as `measure` does.
     """
@@ -141,7 +146,7 @@ def held_motion(
 
 
 _SURE = 1e-3
-"""Of the velocities' spread: no velocity is known better."""
+"""Smallest noise of a velocity, relative to the standard deviation of that velocity."""
 
 
 def measured_from_motion(
@@ -150,12 +155,12 @@ def measured_from_motion(
     parameters: ReconstructionParameters | None = None,
     velocity_noise: tuple[float, float, float] = (0.02, 0.1, 0.2),
 ) -> MeasuredMotion:
-    """Return a reconstructed motion (of any robot, at the control rate) as identification takes it.
+    """Return a reconstructed motion (of any robot, at control steps) in the form that identification takes.
 
     **Arguments**
 
-    - `velocity_noise`: standard deviations of a free joint's linear (m/s) and angular (rad/s) velocity, and of joints'
-      velocities (rad/s, m/s).
+    - `velocity_noise`: standard deviations of a free joint's linear velocity (m/s), of its angular velocity (rad/s),
+      and of the other joints' velocities (rad/s, m/s).
     """
     parameters = parameters or ReconstructionParameters()
     every = round(float(motion.time[1] - motion.time[0]) / float(model.opt.timestep))

@@ -1,5 +1,6 @@
-"""Parameters that recordings may identify: what they set in a model or a drivetrain, and the bounds that they are
-searched within. `identification.declarations` makes them from a robot description.
+"""Parameters that recordings may identify: the entries of a model or a drivetrain that they set, and their bounds.
+
+`identification.declarations` makes them from a robot description.
 """
 
 from __future__ import annotations
@@ -20,19 +21,21 @@ from ballu_mjx.sim.drivetrain import DrivetrainParameters, count_slots, identity
 
 
 class Direction(NamedTuple):
-    """A combination of parameters, each in units of its prior spread: of what robots differ by."""
+    """A linear combination of parameters, each in units of its prior standard deviation (among robots)."""
 
     weights: Float[np.ndarray, " parameters"]
     """Unit vector, in the order of the free parameters."""
     standard_error: float
-    """Of the combination, by the data alone: above 1 they say less than is known without them."""
+    """Standard error of the combination, from the data alone. Above 1, the data say less than the prior."""
 
 
 def principal_directions(slopes: Float[np.ndarray, "rows parameters"]) -> tuple[Direction, ...]:
-    """Return the combinations that data determine independently, from the best to the least determined; the largest
-    weight of each is positive.
+    """Return the combinations of parameters that data determine independently, from the best to the least determined.
 
-    `slopes`: how residuals, in units of their scatter, change by parameters in units of their prior spread.
+    The weight with the largest magnitude is positive in each.
+
+    - `slopes`: Jacobian of the fit's residuals, in units of their scatter, with respect to the parameters, in units of
+      their prior standard deviation.
     """
     _, singular, right = np.linalg.svd(slopes, full_matrices=False)
     signed = [row * np.sign(row[np.argmax(np.abs(row))]) for row in right]
@@ -40,7 +43,7 @@ def principal_directions(slopes: Float[np.ndarray, "rows parameters"]) -> tuple[
 
 
 class FieldTarget(NamedTuple):
-    """An entry of a model field, set to the parameter's value times a factor."""
+    """An entry of a model field. It is set to the parameter's value times `factor`."""
 
     field: str
     index: tuple[int, ...]
@@ -48,7 +51,10 @@ class FieldTarget(NamedTuple):
 
 
 class BodyTarget(NamedTuple):
-    """One of the ten numbers that deform a body's nominal mass distribution; `BODY_QUANTITIES` has their order."""
+    """One of the ten numbers that deform a body's nominal mass distribution, by its index `place` in `BODY_QUANTITIES`.
+
+    It is set to the parameter's value times `factor`.
+    """
 
     body: int
     place: int
@@ -56,7 +62,7 @@ class BodyTarget(NamedTuple):
 
 
 class CommandTarget(NamedTuple):
-    """A quantity of a command's drivetrain, set to the parameter's value times a factor."""
+    """A quantity of a command's drivetrain. It is set to the parameter's value times `factor`."""
 
     command: int
     quantity: str
@@ -68,31 +74,34 @@ Target = FieldTarget | BodyTarget | CommandTarget
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """A number that may be identified."""
+    """A parameter that may be identified."""
 
     name: str
     unit: str
     nominal: float
-    """Its value without identification."""
+    """Value without identification."""
     bounds: tuple[float, float]
     prior: float
-    """Standard deviation among robots, in its unit; inf: nothing is known but the bounds."""
+    """Standard deviation among robots, in the parameter's unit. inf if only the bounds are known."""
     logarithmic: bool
-    """Whether the search runs over its logarithm."""
+    """Whether the search uses the logarithm of the value."""
     targets: tuple[Target, ...]
-    """What it sets; several: they are tied."""
+    """Entries that the parameter sets. Several targets share its value."""
 
     def __post_init__(self) -> None:
         low, high = self.bounds
         if not low <= self.nominal <= high or low == high:
             raise ValueError(f"{self.name}: nominal {self.nominal:g} is not within bounds {low:g} to {high:g}")
         if self.logarithmic and low <= 0:
-            raise ValueError(f"{self.name}: bounds of a logarithmic parameter are above 0")
+            raise ValueError(f"{self.name}: bounds of a logarithmic parameter must be above 0")
 
 
 class Shares:
-    """Values as shares of the way from lower to upper bounds, 0 to 1; of the logarithm where the search is over that.
-    Units that differ by a factor of 30 would make a search worse."""
+    """Conversion between values and shares. A share is 0 at the lower bound and 1 at the upper bound.
+
+    It is linear in the value, or in the logarithm of a logarithmic parameter. Searches use shares, because units that
+    differ by a factor of 30 make a search worse.
+    """
 
     def __init__(
         self,
@@ -104,16 +113,16 @@ class Shares:
         self._low, self._high = self._scaled(lower), self._scaled(upper)
 
     def of(self, values: Float[np.ndarray, "*batch size"]) -> Float[np.ndarray, "*batch size"]:
-        """Return where values lie between their bounds."""
+        """Return the shares of values."""
         return (self._scaled(values) - self._low) / (self._high - self._low)
 
     def values(self, shares: Float[np.ndarray, "*batch size"]) -> Float[np.ndarray, "*batch size"]:
-        """Return the values there."""
+        """Return the values at shares."""
         scaled = self._low + shares * (self._high - self._low)
         return np.where(self._logarithmic, np.exp(np.where(self._logarithmic, scaled, 0.0)), scaled)
 
     def slopes(self, values: Float[np.ndarray, " size"]) -> Float[np.ndarray, " size"]:
-        """Return how values change by their shares."""
+        """Return the derivatives of values with respect to their shares."""
         return (self._high - self._low) * np.where(self._logarithmic, values, 1.0)
 
     def _scaled(self, values: np.ndarray) -> np.ndarray:
@@ -121,38 +130,41 @@ class Shares:
 
 
 class ParameterSet:
-    """Parameters of a model, as a vector in their units or as shares of the way from the lower to the upper bound."""
+    """Parameters of a model. Their values are a vector, in the parameters' units or as shares (see `Shares`)."""
 
     def __init__(self, parameters: Sequence[Parameter], commands: int) -> None:
         self.parameters = tuple(parameters)
         self.commands = commands
-        """Of the robot, with a drivetrain each."""
+        """Number of the robot's commands. Each has a drivetrain."""
         self.names = tuple(p.name for p in self.parameters)
         self.nominal = np.array([p.nominal for p in self.parameters])
         self.lower, self.upper = np.array([p.bounds for p in self.parameters]).reshape(-1, 2).T
         self.prior = np.array([p.prior for p in self.parameters])
         self.unit = np.where(np.isfinite(self.prior), self.prior, (self.upper - self.lower) / 2)
-        """What priors leave open of each parameter, or else bounds do."""
+        """Scale of each parameter: its prior standard deviation, or half its range if the prior is infinite."""
         self._span = Shares(self.lower, self.upper, np.array([p.logarithmic for p in self.parameters], bool))
 
     def __len__(self) -> int:
         return len(self.parameters)
 
     def shares(self, values: Float[np.ndarray, "*batch parameters"]) -> Float[np.ndarray, "*batch parameters"]:
-        """Return where values lie between their bounds, 0 to 1; logarithms where the search runs over those."""
+        """Return the shares of values: 0 at the lower bound, 1 at the upper bound."""
         return self._span.of(values)
 
     def at_shares(self, shares: Float[np.ndarray, "*batch parameters"]) -> Float[np.ndarray, "*batch parameters"]:
-        """Return the values there."""
+        """Return the values at shares."""
         return self._span.values(shares)
 
     def by_shares(self, values: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " parameters"]:
-        """Return how values change by their shares."""
+        """Return the derivatives of values with respect to their shares."""
         return self._span.slopes(values)
 
     def draw(self, seed: int, count: int) -> Float[np.ndarray, "count parameters"]:
-        """Return the nominal values, then draws from the priors within the bounds; what lies on or near a bound is
-        taken a little inside."""
+        """Return the nominal values, then samples of the priors.
+
+        A parameter is sampled uniformly over its shares if it has no prior, or if its sample is outside the bounds.
+        Values on or near a bound are moved inside.
+        """
         rng = np.random.default_rng(seed)
         spread = np.where(np.isfinite(self.prior), self.prior, 0.0)
         values = self.nominal + spread * rng.normal(size=(max(count - 1, 0), len(self)))
@@ -162,7 +174,7 @@ class ParameterSet:
         return self.at_shares(np.clip(self.shares(begins), _INSIDE, 1 - _INSIDE))
 
     def at_bounds(self, values: Float[np.ndarray, " parameters"]) -> tuple[str, ...]:
-        """Return the names of the parameters that lie on a bound, to one part in a hundred of what lies between."""
+        """Return the names of the parameters at a bound, within 1 % of the range between the bounds."""
         return tuple(
             name for name, s in zip(self.names, self.shares(values), strict=True) if s < _AT_BOUND or s > 1 - _AT_BOUND
         )
@@ -172,8 +184,8 @@ class ParameterSet:
     ) -> dict[str, Array]:
         """Return the fields of `model` that carry the values, by name, for `mjx.Model.replace`.
 
-        Bodies are deformed from what they are in `model`; everything else is set. Dry friction stays above 0: MJX takes
-        a row of friction 0 for one that never slips.
+        Bodies are deformed relative to `model`. All other entries are set. Dry friction stays above 0, because MJX
+        treats a friction row of 0 as one that never slips.
         """
         found: dict[str, Array] = {}
         deformed: dict[int, dict[int, Array]] = {}
@@ -183,7 +195,7 @@ class ParameterSet:
                     field = found.get(target.field, jnp.asarray(getattr(model, target.field)))
                     entry = value * target.factor
                     if target.field in ("dof_frictionloss", "tendon_frictionloss"):
-                        # Not `maximum`: at a bound of 0 a search must see that friction does something.
+                        # The derivative of `maximum` is 0 at a bound of 0, so that a search could not leave the bound.
                         entry = entry + jax.lax.stop_gradient(jnp.maximum(LEAST_FRICTION - entry, 0.0))
                     found[target.field] = field.at[target.index].set(entry)
                 elif isinstance(target, BodyTarget):
@@ -199,7 +211,7 @@ class ParameterSet:
         return found
 
     def drivetrain(self, values: Float[Array | np.ndarray, " parameters"]) -> DrivetrainParameters:
-        """Return the drivetrain of all commands; what is not identified is the identity's."""
+        """Return the drivetrain of all commands. Other quantities have the values of `identity_drivetrain`."""
         found = identity_drivetrain(self.commands)._asdict()
         for value, parameter in zip(jnp.asarray(values), self.parameters, strict=True):
             for target in parameter.targets:
@@ -220,22 +232,22 @@ class ParameterSet:
         return max(delays, default=0.0)
 
     def slots(self, timestep: float) -> int:
-        """Return how many commands `sim.drivetrain.DrivetrainState` must remember at this physics step (s)."""
+        """Return the number of commands that `sim.drivetrain.DrivetrainState` must store at this physics step (s)."""
         return count_slots(self.longest_delay, timestep)
 
     @property
     def in_drivetrain(self) -> np.ndarray:
-        """Return which parameters the drivetrain has, and the model has not."""
+        """Return a mask of the parameters that belong to the drivetrain, not to the model."""
         return np.array([all(isinstance(t, CommandTarget) for t in p.targets) for p in self.parameters], bool)
 
     @property
     def rubbing_dofs(self) -> np.ndarray:
-        """Return the degrees of freedom whose dry friction is a parameter."""
+        """Return the indices of the degrees of freedom whose dry friction is a parameter."""
         return self._indices("dof_frictionloss")
 
     @property
     def rubbing_tendons(self) -> np.ndarray:
-        """Return the tendons whose dry friction is a parameter."""
+        """Return the indices of the tendons whose dry friction is a parameter."""
         return self._indices("tendon_frictionloss")
 
     def _indices(self, field: str) -> np.ndarray:
@@ -244,16 +256,17 @@ class ParameterSet:
 
 
 LEAST_FRICTION = 1e-9
-"""N m, or N: of no effect."""
+"""Dry friction (N m or N) that is above 0 but has no effect."""
 _INSIDE = 0.02
-"""Share of the way from a bound at which a search begins at the nearest: on the bound itself nothing moves it."""
+"""Smallest distance of a search's start from a bound, as a share. A search does not move from the bound itself."""
 _AT_BOUND = 0.01
+"""Distance from a bound, as a share, below which a parameter counts as at the bound."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class IdentifiedParameters:
-    """Values of a `ParameterSet`, as simulators take them (`robots.model.ModelParameters`)."""
+    """Values of a `ParameterSet`, in the form that simulators take (`robots.model.ModelParameters`)."""
 
     values: Float[Array, " parameters"]
     declared: ParameterSet = dataclasses.field(metadata={"static": True})

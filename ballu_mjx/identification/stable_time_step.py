@@ -1,4 +1,4 @@
-"""Whether a model holds together by itself: replays of recorded motions in C MuJoCo, which need no compiling."""
+"""Check that a model does not diverge by itself: replays of recorded motions in C MuJoCo, which need no compilation."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from ballu_mjx.robots.model import ModelParameters, bare_parameters
 from ballu_mjx.sim.step import count_substeps
 
 HORIZON = 0.5
-"""Seconds that a model must hold together for."""
+"""Time in which a model must not diverge (s)."""
 _STARTS = 16
-"""States to start from, over all recordings."""
+"""Number of starts over all recordings."""
 _TOLERATED = 0.5
-"""Share of starts that may break down: single states may be at fault themselves."""
+"""Share of starts that may diverge, because single recorded states may be wrong."""
 _SHORTER = (2, 4, 8, 16)
-"""Parts of the time step that are tried as a cure."""
+"""Divisors of the time step that are tried as a fix."""
 
 
 def check_stability(robot: RobotDescription, motions: Sequence[Motion], parameters: ModelParameters | None) -> None:
-    """Replay recorded commands from recorded states, without residual forces.
+    """Check that replays of recorded commands from recorded states do not diverge, without residual forces.
 
-    **Raises** `InputError` where the model breaks down from most of them, with the time step at which it does not.
+    **Raises** `InputError` if the model diverges from most of these states, with a time step at which it does not.
     """
     parameters = bare_parameters(parameters)
     model = robot.load_model(parameters)
@@ -40,25 +40,26 @@ def check_stability(robot: RobotDescription, motions: Sequence[Motion], paramete
         f"the model diverges from its recorded states within {max(np.median(lasted), model.opt.timestep):.2g} s, "
         "without any residual forces"
     )
-    raise InputError(f"{robot.model}: {problem}; {_cure(robot, model, motions, parameters)}.")
+    raise InputError(f"{robot.model}: {problem}; {_fix(robot, model, motions, parameters)}.")
 
 
-def _cure(
+def _fix(
     robot: RobotDescription, model: mujoco.MjModel, motions: Sequence[Motion], parameters: ModelParameters | None
 ) -> str:
+    """Return a fix of a model that diverges, in words: a shorter time step, or else changes of the model."""
     own = float(model.opt.timestep)
     for parts in _SHORTER:
         finer = copy.copy(model)
         finer.opt.timestep = own / parts
         if np.mean(_lasted(robot, finer, motions, parameters) < HORIZON) <= _TOLERATED:
-            return f'write timestep="{own / parts:g}" in place of {own:g} s, at which it does not'
+            return f'write timestep="{own / parts:g}", at which it does not, in place of {own:g} s'
     return "soften its stiffest springs, gains or contacts, or correct masses and inertias that are too small"
 
 
 def _lasted(
     robot: RobotDescription, model: mujoco.MjModel, motions: Sequence[Motion], parameters: ModelParameters | None
 ) -> Float[np.ndarray, " starts"]:
-    """Seconds until each start breaks down, `HORIZON` at most."""
+    """Return the time until each start diverges (s), at most `HORIZON`."""
     substeps = count_substeps(model, robot.control_timestep)
     found = []
     for motion in motions:

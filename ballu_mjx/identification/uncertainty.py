@@ -1,4 +1,4 @@
-"""How well windows of recordings determine declared parameters: standard errors and directions."""
+"""Uncertainty of declared parameters that are fitted to windows of recordings: standard errors and directions."""
 
 from __future__ import annotations
 
@@ -12,25 +12,28 @@ from ballu_mjx.identification.window_objective import ReducedResiduals
 
 
 class Analysis(NamedTuple):
-    """How well residuals determine parameters: standard errors in the parameters' units."""
+    """Uncertainty of fitted parameters. Standard errors are in the parameters' units."""
 
     white: Float[np.ndarray, " parameters"]
+    """Standard errors if the fit's residuals are white noise."""
     robust: Float[np.ndarray, " parameters"]
+    """Standard errors if only the windows are independent."""
     correlations: Float[np.ndarray, "parameters parameters"]
+    """Correlations of the parameters' errors, for independent windows."""
     directions: tuple[Direction, ...]
+    """Combinations of parameters, from the best to the least determined."""
 
 
 def analyse(reduced: ReducedResiduals, parameters: ParameterSet) -> Analysis:
-    """Return standard errors at a minimum, if what is left were white noise and if windows err independently.
+    """Return standard errors at a minimum, for residuals that are white noise and for windows that err independently.
 
-    The latter are what leaving out one window at a time changes (jackknife, CR3). Products of scores come out too small
-    with few windows, because each window has pulled the fit towards itself (Bell & McCaffrey, Survey Methodology 28,
-    2002).
+    The second kind leaves out one window at a time (jackknife, CR3). The usual products of scores are too small for few
+    windows, because each window pulls the fit towards itself (Bell & McCaffrey, Survey Methodology 28, 2002).
     """
     size, windows = len(parameters), len(reduced.values)
-    # As many rows say where starting states begin as there are starting states.
+    # The residuals contain one prior row for each unknown of the starting states, so these rows cancel.
     variance = reduced.loss / max(reduced.values.size - reduced.start.size - size, 1)
-    # In units of what bounds or priors leave open, so that all are of a size.
+    # `ParameterSet.unit` scales all parameters to a similar size.
     slopes = reduced.slopes * parameters.unit
     flat = slopes.reshape(-1, size)
     known = np.diag(np.where(np.isfinite(parameters.prior), 1.0, 0.0) + _SLIGHT)
@@ -47,3 +50,4 @@ def analyse(reduced: ReducedResiduals, parameters: ParameterSet) -> Analysis:
 
 
 _SLIGHT = 1e-9
+"""Regularization that keeps the matrix invertible for parameters without prior that the data do not show."""

@@ -1,9 +1,9 @@
-"""What a fit leaves, and which parameter that is not declared would explain it.
+"""Search for undeclared parameters that would explain the remaining error of a fit.
 
-Standard errors cannot show what a model lacks: dry friction that no parameter has goes into damping, however many
-recordings there are. What is left shows it. Each candidate (friction, damping and armature of joints, gains of
-actuators, the drivetrain of commands) is tried as one step of Gauss-Newton beside the declared parameters: a score
-test, which takes no search.
+Standard errors do not show what a model lacks. Dry friction without a parameter is attributed to damping, however many
+recordings there are. The remaining error of the fit shows it. The candidates are friction, damping and armature of
+joints, gains of actuators, and the drivetrain of commands. Each is tried as one Gauss-Newton step beside the declared
+parameters. This is a score test, which needs no search.
 """
 
 from __future__ import annotations
@@ -28,43 +28,43 @@ from ballu_mjx.robots.description import RobotDescription
 
 
 class Suggestion(NamedTuple):
-    """A parameter that is worth declaring."""
+    """An undeclared parameter that the description should declare."""
 
     entry: Mapping[str, Any]
-    """For the key `identify` of the description; bounds and prior are rough."""
+    """Entry for the key `identify` of the description. Bounds and prior are rough."""
     parameter: Parameter
     value: float
-    """Where it would go, to first order, in its unit."""
+    """Estimate to first order, in the parameter's unit."""
     explained: float
-    """Share of the squares that are left which it would take away, beside the suggestions before it."""
+    """Share of the remaining sum of squares that it explains, in addition to the suggestions before it."""
 
     def details(self) -> dict[str, Any]:
-        """Return it as JSON's types."""
+        """Return the suggestion as JSON types."""
         name, unit = self.parameter.name, self.parameter.unit
         return {"name": name, "unit": unit, "value": self.value, "explained": self.explained, "entry": dict(self.entry)}
 
 
 def suggestions_table(suggestions: Sequence[Suggestion]) -> str:
-    """Return suggestions in words, with what to write in the description."""
-    lines = ["Not declared, and would explain what is left:"]
+    """Return the suggestions as text, with the lines to add to the description."""
+    lines = ["Undeclared parameters that would explain the remaining error:"]
     for each in suggestions:
         unit = "" if each.parameter.unit == "1" else each.parameter.unit
         value = f"{each.value:.2g} {unit}".strip()
-        lines.append(f"  {each.parameter.name}, about {value}: {each.explained:.0%} of the squares.")
+        lines.append(f"  {each.parameter.name}, about {value}: {each.explained:.0%} of the sum of squares.")
         lines.append(f'    Add to "identify": {json.dumps(dict(each.entry))}')
-    lines.append("Declare these and identify again: until then other parameters stand in for them.")
+    lines.append("Declare these and identify again. Until then other parameters compensate for them.")
     return "\n".join(lines)
 
 
 SMALL_EFFECT = 0.02
-"""Cohen's f^2 of a small effect: what is explained over what is left then (Cohen, "Statistical power analysis for the
-behavioral sciences", 1988)."""
+"""Smallest effect of a suggestion: Cohen's f^2, the explained sum of squares over the one that remains. 0.02 is a small
+effect (Cohen, "Statistical power analysis for the behavioral sciences", 1988)."""
 _CHANCE = 0.003
-"""Of a candidate that explains nothing to pass for one that does."""
+"""Probability that a candidate without effect passes the test."""
 
 
 def candidate_entries(robot: RobotDescription, model: mujoco.MjModel) -> list[dict[str, Any]]:
-    """Return declarations of what robots often have and models often lack."""
+    """Return declarations of effects that robots often have and models often lack."""
     entries: list[dict[str, Any]] = []
     for number in range(model.njnt):
         joint = model.joint(number)
@@ -72,7 +72,9 @@ def candidate_entries(robot: RobotDescription, model: mujoco.MjModel) -> list[di
             entries += [{"joint": joint.name, "field": field} for field in ("frictionloss", "damping", "armature")]
     for number in range(model.nu):
         if name := model.actuator(number).name:
-            entries += [{"actuator": name, "field": field} for field in ("kp", "kd", "strength")]  # of what it has
+            entries += [
+                {"actuator": name, "field": field} for field in ("kp", "kd", "strength")
+            ]  # inapplicable ones are dropped later
     for command in robot.commands:
         entries += [{"command": command, "field": field} for field in ("delay", "backlash", "lag", "scale", "offset")]
     return entries
@@ -87,15 +89,15 @@ def suggest_parameters(
     motions: Sequence[MeasuredMotion],
     config: WindowConfig | None = None,
 ) -> tuple[Suggestion, ...]:
-    """Return undeclared parameters that would explain what `fit` leaves.
+    """Return undeclared parameters that would explain the remaining error of `fit`.
 
-    The candidate that explains most comes first. The next ones explain what is left beside it (forward selection). A
-    candidate counts where all windows together tell it from nominal, each erring independently (Student's t). It may go
-    there (friction is not negative), and has at least a small effect.
+    The candidate that explains most comes first. The next ones explain the remainder (forward selection). A candidate
+    is suggested if it differs significantly from nominal over all windows, whose errors are independent (Student's t).
+    Its step must also be allowed (friction is not negative), and its effect must be at least small (`SMALL_EFFECT`).
 
     **Arguments**
 
-    - `motions`, `config`: those of the fit.
+    - `motions`, `config`: motions and options of the fit.
     """
     config, model = config or WindowConfig(), motions[0].model
     taken = {target[:2] for parameter in fit.parameters.parameters for target in parameter.targets}
@@ -126,12 +128,12 @@ def suggest_parameters(
 
 
 _SETTLING = 3
-"""Evaluations in which starting states move to their best."""
+"""Number of evaluations in which starting states converge to their optimum."""
 
 
 def _candidate(robot: RobotDescription, model: mujoco.MjModel, entry: Mapping[str, Any]) -> Parameter | None:
-    """Return the parameter of an entry, with bounds around 0 where its nominal value suggests none; None: the element
-    has no such thing."""
+    """Return the parameter of an entry, with the bounds 0 to 1 if its nominal value gives no default. None if the
+    element does not have it."""
     for bounds in ({}, {"bounds": [0, 1]}):
         try:
             return parameters_of(robot, model, [{**entry, **bounds}])[0]
@@ -141,21 +143,21 @@ def _candidate(robot: RobotDescription, model: mujoco.MjModel, entry: Mapping[st
 
 
 def _bounded(entry: Mapping[str, Any], candidate: Parameter, value: float) -> dict[str, Any]:
-    """Return an entry that can be declared: with bounds, where its nominal value suggests none."""
+    """Return an entry that can be declared, with bounds if its nominal value gives no default."""
     if candidate.nominal or "command" in entry:
         return dict(entry)
     return {**entry, "bounds": [0, float(f"{_ROOM * value:.1g}")]}
 
 
 _ROOM = 4.0
-"""Times the first guess: an upper bound."""
+"""Upper bound of a suggestion, relative to its estimate."""
 
 
 def _select(
     reduced: ReducedResiduals, declared: ParameterSet, candidates: Sequence[Parameter]
 ) -> list[tuple[int, float, float]]:
-    """Return numbers of candidates, where they would go, and the share of the squares that each takes away, one after
-    the other: what those before it can take up is theirs."""
+    """Return index, estimated value and explained share of the sum of squares of each selected candidate, in the order
+    of selection. Errors that earlier candidates can explain are not credited to later ones."""
     size, windows = len(declared), len(reduced.values)
     known, tried, left = reduced.slopes[..., :size], reduced.slopes[..., size:], reduced.values
     prior = declared.prior**-2.0

@@ -1,7 +1,7 @@
-"""What a fit of parameters to windows of recordings minimizes, for any robot.
+"""Objective of a fit of parameters to windows of recordings, for any robot.
 
-Each window's starting state is an unknown of its own. It is eliminated window by window (variable projection), so that
-a search sees the parameters alone, however many windows there are.
+The starting state of each window is a further unknown. It is eliminated window by window (variable projection). The
+parameters are then the only unknowns of a search, however many windows there are.
 """
 
 from __future__ import annotations
@@ -18,55 +18,61 @@ from ballu_mjx.identification.window_simulator import Simulated, WindowSimulator
 
 @dataclasses.dataclass(frozen=True)
 class WindowConfig:
-    """What recordings are cut into, and how they count."""
+    """Windows that recordings are cut into, and weights of their errors."""
 
     window_seconds: float = 1.0
-    """Length of a window, s."""
+    """Length of a window (s)."""
     interval_seconds: float | None = None
-    """Time between the starts of two windows, s. Without this option: a window's length."""
+    """Time between the starts of two windows (s). Without this option: the length of a window."""
     outlying: float = 3.0
-    """Differences beyond so many times their scatter count less (pseudo-Huber loss)."""
+    """Differences above this multiple of their scatter count less (pseudo-Huber loss)."""
     start_spread: float = 4.0
-    """How uncertain starting states are, in units of the measurements' noise; 0: they are as measured. Well above 1,
-    because filters make them from samples that the window compares too."""
+    """Standard deviation of starting states, in units of the measurements' noise. 0 takes them as measured. The default
+    is well above 1, because filters compute starting states from samples with which the window is compared too."""
 
 
 class ReducedResiduals(NamedTuple):
-    """Residuals, and how they change by the parameters while starting states move along to their best."""
+    """Residuals of the fit and their Jacobian, for starting states that follow the parameters to their optimum."""
 
     values: Float[np.ndarray, "windows rows"]
     slopes: Float[np.ndarray, "windows rows parameters"]
-    """In the parameters' units; at right angles to all that starting states can change."""
+    """Jacobian in the parameters' units, orthogonal to all changes by starting states."""
     start: Float[np.ndarray, "windows start"]
-    """The best starting states, to first order."""
+    """Optimal shifts of the starting states, to first order, in units of the measurements' noise."""
     start_slopes: Float[np.ndarray, "windows start parameters"]
+    """Derivatives of these shifts with respect to the parameters."""
 
     @property
     def loss(self) -> float:
+        """Return the sum of squares of the residuals."""
         return float(np.sum(self.values**2))
 
 
 class WindowObjective:
-    """Softened residuals of all windows: of positions alone. Velocities are filtered positions. Beside these they would
-    count the same noise twice, and smooth away what damping does."""
+    """Objective of a fit: pseudo-Huber residuals of the positions in all windows.
+
+    Velocities have no residuals, because they are filtered positions. They would count the same noise twice, and would
+    smooth away the effect of damping.
+    """
 
     def __init__(self, simulator: WindowSimulator, config: WindowConfig) -> None:
         self.simulator, self.config = simulator, config
         self.parameters = simulator.parameters
         self.scale = np.ones(simulator.nv)
-        """Of the positions' scatter, in units of their noise."""
+        """Scatter of the positions, in units of their noise."""
 
     def rescale(self, differences: Float[np.ndarray, "windows samples channels"]) -> None:
-        """Weigh positions by their robust scatter, and none by less than its noise."""
+        """Set the positions' scatter to the robust scatter of `differences`, but not below their noise."""
         self.scale = robust_scatter(differences[..., : self.simulator.nv])
 
     def measured_start(self) -> Float[np.ndarray, "windows start"]:
-        """Return starting states that are not moved; without columns where they are known."""
+        """Return zero shifts of the starting states. There are no columns if starting states are taken as measured."""
         return np.zeros((self.simulator.count, self.simulator.channels if self.config.start_spread else 0))
 
     def __call__(
         self, values: Float[np.ndarray, " parameters"], start: Float[np.ndarray, "windows start"]
     ) -> tuple[ReducedResiduals, Simulated]:
+        """Return the residuals at parameter values and starting states, and the simulated windows."""
         simulated, positions = self.simulator.linearize(values, start), slice(self.simulator.nv)
         soft, steepness = soften(simulated.values[..., positions] / self.scale, self.config.outlying)
         weight = (steepness / self.scale)[..., None]
@@ -93,25 +99,27 @@ class WindowObjective:
 
 
 def robust_scatter(differences: Float[np.ndarray, "windows samples channels"]) -> Float[np.ndarray, " channels"]:
-    """Return each channel's robust standard deviation, in units of its noise; none is below it."""
+    """Return each channel's robust standard deviation, in units of its noise, and at least 1."""
     return np.maximum(1.0, _NORMAL * np.median(np.abs(differences), axis=(0, 1)))
 
 
 _NORMAL = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
+"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
 
 
 def soften(values: Float[np.ndarray, "*shape"], outlying: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return what has the pseudo-Huber loss of `values` for its square, with their signs; and its slopes."""
+    """Return signed residuals whose squares are the pseudo-Huber loss of `values`, and their derivatives."""
     root = np.sqrt(1 + (values / outlying) ** 2)
     soft = values * np.sqrt(2 / (root + 1))
     return soft, np.sqrt((root + 1) / 2) / root
 
 
 class WindowSearch:
-    """What the solver evaluates: residuals and their Jacobian by the parameters' shares, compressed to as many rows as
-    there are parameters (and one), which keep all sums of squares. Starting states are remembered from the best point
-    so far, and moved along with the parameters."""
+    """Function that the solver evaluates: residuals and their Jacobian with respect to the parameters' shares.
+
+    A QR decomposition compresses them to one row more than there are parameters, which keeps all sums of squares. The
+    search stores the starting states at the best point so far, and extrapolates them as the parameters change.
+    """
 
     def __init__(
         self,
@@ -140,9 +148,9 @@ class WindowSearch:
         if self._best is None or loss < self._best[0]:
             self._best, self._refused = (loss, values, reduced), 0
             self.start, self.residuals = start, simulated.values
-        else:  # starting states may be what went too far
+        else:  # the starting states may have moved too far
             self._refused += 1
-        # Window by window first: one tall table is left to many threads of LAPACK, and takes a hundred times as long.
+        # Window by window first: LAPACK splits one tall table between many threads, and takes a hundred times as long.
         table = np.concatenate([reduced.slopes, reduced.values[..., None]], axis=2)
         windows = np.asarray(np.linalg.qr(table, mode="r")).reshape(-1, len(values) + 1)
         own = np.concatenate([np.diag(1 / parameters.prior), prior[:, None]], axis=1)
@@ -152,4 +160,4 @@ class WindowSearch:
 
 
 _FAR = 3.0
-"""Longest step of a starting state, in units of its uncertainty: the linearization holds no farther."""
+"""Largest step of a starting state, in units of the measurements' noise. The linearization is not valid beyond it."""

@@ -1,8 +1,8 @@
-"""Recordings cut into windows, and how far windows simulated with given parameters are from them.
+"""Windows of recordings, and their differences from simulations with given parameters.
 
 A window starts in a measured state, runs under the recorded commands, and is compared with the recording at every
-sample (multiple shooting). Its starting state is uncertain: a shift of it is a further unknown of each window.
-Differences are in units of the measurements' noise. All functions that simulate compute in double precision and are to
+sample (multiple shooting). Its starting state is uncertain, so the shift of this state is a further unknown of each
+window. Differences are in units of the measurements' noise. All functions that simulate use double precision, and must
 be called inside `jax.enable_x64(True)`.
 """
 
@@ -34,22 +34,22 @@ from ballu_mjx.sim.vmap_last import nested_vmap, vmap_with_trailing_batch
 
 
 class Windows(NamedTuple):
-    """Stretches of motions of the same length."""
+    """Windows of motions, all of the same length."""
 
     motion: Int[np.ndarray, " windows"]
-    """Number of the motion that each is of."""
+    """Index of each window's motion."""
     first: Int[np.ndarray, " windows"]
-    """Sample that each starts in."""
+    """Index of each window's first sample in its motion."""
     samples: int
-    """Compared in each, the first one included."""
+    """Number of compared samples in each window, including the first."""
 
 
 def cut_windows(
     motions: Sequence[MeasuredMotion], seconds: float, interval: float | None = None, skip: float = 0.0
 ) -> Windows:
-    """Return windows of a length (s), one every `interval` (s; None: end to end), from `skip` (s) on.
+    """Return windows of a given length (s), one every `interval` (s; None: end to end), after the first `skip` (s).
 
-    **Raises** `InputError` where no motion is as long.
+    **Raises** `InputError` if no motion is long enough.
     """
     found, samples = [], 0
     for number, motion in enumerate(motions):
@@ -59,34 +59,36 @@ def cut_windows(
         begin = round(skip / motion.sample_timestep)
         found += [(number, first) for first in range(begin, len(motion.qpos) - steps, every)]
     if not found:
-        raise InputError(f"No recording lasts {seconds:g} s; give longer ones, or shorter windows.")
+        raise InputError(f"No recording lasts {seconds:g} s; give longer recordings, or shorter windows.")
     motion, first = np.array(found).T
     return Windows(motion, first, samples)
 
 
 class Simulated(NamedTuple):
-    """Windows' differences to the recording, in units of noise, and how they change."""
+    """Differences between simulated windows and the recording, in units of noise, with derivatives."""
 
     values: Float[np.ndarray, "windows samples channels"]
-    """Channels are the velocities' directions of positions, then the velocities."""
+    """Channels are the positions, in the coordinates of generalized velocities, then these velocities."""
     by_parameters: Float[np.ndarray, "windows samples channels parameters"]
-    """In the parameters' units."""
+    """Derivatives with respect to the parameters, in their units."""
     by_start: Float[np.ndarray, "windows samples channels start"]
-    """By the starting state, in units of its uncertainty."""
+    """Derivatives with respect to the starting state, in units of the measurements' noise."""
 
 
 class WindowSimulator:
-    """Simulates windows of motions for any values of the parameters; compiles once for each kind of call."""
+    """Simulator of windows of motions for any values of the parameters. It compiles once for each kind of call."""
 
     def __init__(self, parameters: ParameterSet, motions: Sequence[MeasuredMotion], windows: Windows) -> None:
-        """To be called inside `jax.enable_x64(True)`."""
+        """Prepare the simulation of `windows`. Call this inside `jax.enable_x64(True)`."""
         self.parameters, self.motions, self.windows = parameters, tuple(motions), windows
         model = motions[0].model
         self.model, self.nv = model, model.nv
         self.timestep, self.every = float(model.opt.timestep), motions[0].every
         for motion in motions:
             if (motion.every, motion.model.opt.timestep) != (self.every, model.opt.timestep):
-                raise InputError(f"{motion.name}: its time step differs from {motions[0].name}'s; make them equal.")
+                raise InputError(
+                    f"{motion.name}: its time step differs from that of {motions[0].name}; make them equal."
+                )
         own = [put_model(_with_friction_rows(motion.model, parameters)) for motion in motions]
         self._mjx = own[0]
         self._pose = ReferencePose.of(model)
@@ -119,18 +121,18 @@ class WindowSimulator:
 
     @property
     def count(self) -> int:
-        """Of the windows."""
+        """Return the number of windows."""
         return len(self.windows.first)
 
     @property
     def channels(self) -> int:
-        """Compared at each sample."""
+        """Return the number of channels that are compared at each sample."""
         return 2 * self.nv
 
     def differences(
         self, values: Float[np.ndarray, " parameters"], start: Float[np.ndarray, "windows start"] | None = None
     ) -> Float[np.ndarray, "windows samples channels"]:
-        """Return the differences of all windows; `start` shifts starting states, in units of their uncertainty."""
+        """Return the differences of all windows. `start` shifts starting states, in units of the noise."""
         start = np.zeros((self.count, self.channels)) if start is None else start
         ctrl = self._of_windows(np.asarray(self._ctrl(jnp.asarray(values))))
         found = []
@@ -143,10 +145,11 @@ class WindowSimulator:
     def linearize(
         self, values: Float[np.ndarray, " parameters"], start: Float[np.ndarray, "windows start"]
     ) -> Simulated:
-        """Return the differences and their derivatives, taken forwards through the simulation.
+        """Return the differences and their derivatives, by forward-mode differentiation of the simulation.
 
-        `start` without columns: windows start as measured, and nothing is derived by that. Windows that diverge have no
-        finite derivatives; theirs are 0, and their differences a large number.
+        If `start` has no columns, windows start as measured, without derivatives with respect to the starting state.
+        Windows that diverge have no finite derivatives. Their derivatives are set to 0, and their differences to a
+        large number.
         """
         size, directions = len(self.parameters), len(self.parameters) + start.shape[1]
         start = start if start.shape[1] else np.zeros((self.count, self.channels))
@@ -159,8 +162,8 @@ class WindowSimulator:
             points = np.tile(values, (len(rows), 1)), start[rows], ctrl[rows], by_ctrl
             found.append([x[:kept] for x in self._linear(*points, *(x[rows] for x in self._held))])
         value, jacobian = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        lost = ~(np.isfinite(value).all(axis=(1, 2)) & np.isfinite(jacobian).all(axis=(1, 2, 3)))
-        value[lost], jacobian[lost] = _LOST, 0.0
+        diverged = ~(np.isfinite(value).all(axis=(1, 2)) & np.isfinite(jacobian).all(axis=(1, 2, 3)))
+        value[diverged], jacobian[diverged] = _DIVERGED, 0.0
         return Simulated(value, jacobian[..., :size], jacobian[..., size:])
 
     def _linearized(
@@ -171,8 +174,11 @@ class WindowSimulator:
         by_ctrl: Float[Array, "directions ctrl"],
         *held: Array,
     ) -> tuple[Float[Array, "samples channels"], Float[Array, "samples channels directions"]]:
-        """One window's differences, and how they change by the parameters and, where there are more directions, by the
-        starting state. The window itself is the same for all directions, and simulated once for all."""
+        """Return one window's differences, and their derivatives with respect to the parameters.
+
+        With more directions, derivatives with respect to the starting state follow. The window itself is the same for
+        all directions, and is simulated only once.
+        """
         units = jnp.eye(len(values) + len(start))[: len(by_ctrl)]
 
         def along(*moves: Array) -> tuple[Array, Array]:
@@ -193,7 +199,7 @@ class WindowSimulator:
         noise: Float[Array, " channels"],
         *own: Array,
     ) -> Float[Array, "samples channels"]:
-        """One window's differences, in units of noise."""
+        """Return one window's differences, in units of noise."""
 
         def path(values: Array, shift: Array, ctrl: Array, qpos: Array, qvel: Array, *own: Array) -> tuple:
             model = self._mjx.replace(**dict(zip(self._own_fields, own, strict=True)))  # pyright: ignore
@@ -218,22 +224,22 @@ class WindowSimulator:
         return jnp.concatenate([places, qvel - measured_qvel], axis=1) / noise
 
     def _moved(self, qpos: Float[Array, " nq"], change: Float[Array, " nv"]) -> Float[Array, " nq"]:
-        """Return `qpos` moved along the velocities' directions."""
+        """Return `qpos` moved by `change`, in the coordinates of generalized velocities."""
         if len(qpos) == len(change):
             return qpos + change
         turned = quaternion_integrate(qpos[3:7], change[3:6])
         return jnp.concatenate([qpos[:3] + change[:3], turned, qpos[7:] + change[6:]])
 
     def _difference(self, qpos: Float[Array, " nq"], other: Float[Array, " nq"]) -> Float[Array, " nv"]:
-        """Return what leads from `other` to `qpos`, along the velocities' directions."""
+        """Return the change from `other` to `qpos`, in the coordinates of generalized velocities."""
         if len(qpos) == self.nv:
             return qpos - other
         turn = quaternion_product(quaternion_conjugate(other[3:7]), qpos[3:7])
-        turn = 2 * turn[1:] * jnp.where(turn[0] < 0, -1.0, 1.0)  # the small angle between them
+        turn = 2 * turn[1:] * jnp.where(turn[0] < 0, -1.0, 1.0)  # rotation vector of a small angle
         return jnp.concatenate([qpos[:3] - other[:3], turn, qpos[7:] - other[7:]])
 
     def _filtered(self, values: Float[Array, " parameters"]) -> Float[Array, "motions steps commands"]:
-        """What the drivetrains make of all motions' commands, each from rest under its first."""
+        """Return the actuators' `ctrl` in all motions. Drivetrains start at rest under each motion's first command."""
         drivetrain = self.parameters.drivetrain(values)
         commands = jnp.asarray(self._commands)
         if not self.parameters.in_drivetrain.any():
@@ -243,6 +249,7 @@ class WindowSimulator:
     def _filtered_slopes(
         self, values: Float[Array, " parameters"]
     ) -> tuple[Float[Array, "motions steps commands"], Float[Array, "motions steps commands drivetrain"]]:
+        """Return `_filtered` and its derivatives with respect to the drivetrain's parameters."""
         units = jnp.eye(len(self.parameters))[np.flatnonzero(self.parameters.in_drivetrain)]
         if not len(units):
             return self._filtered(values), jnp.zeros((*self._commands.shape, 0))
@@ -250,24 +257,24 @@ class WindowSimulator:
         return along(units)
 
     def _of_windows(self, ctrl: Float[np.ndarray, "motions steps ..."]) -> Float[np.ndarray, "windows ctrl ..."]:
-        """Cut what is of all motions' physics steps into windows, steps and commands in one axis."""
+        """Cut `ctrl` of all motions into windows. Steps and commands become one axis."""
         cut = ctrl[self.windows.motion[:, None], self._steps]
         return cut.reshape(self.count, cut.shape[1] * cut.shape[2], *cut.shape[3:])
 
     def _chunks(self, most: int) -> Iterator[tuple[Int[np.ndarray, " chunk"], int]]:
-        """Return chunks of windows, all about as large: a program is compiled for these windows anyway."""
+        """Return chunks of equal size. It suits these windows, because the program is compiled for them anyway."""
         parts = -(-self.count // most)
         return chunks(self.count, -(-self.count // parts))
 
 
 _CHUNK = 1024
-"""Windows times directions that are simulated side by side."""
-_LOST = 1e3
-"""Difference, in units of noise, that a window counts as that diverged."""
+"""Largest number of windows times directions that are simulated in parallel."""
+_DIVERGED = 1e3
+"""Difference assigned to a window that diverged, in units of noise."""
 
 
 def _with_friction_rows(model: mujoco.MjModel, parameters: ParameterSet) -> mujoco.MjModel:
-    """Return a copy that has dry friction wherever it is a parameter: MJX leaves out what has none when it begins."""
+    """Return a copy with dry friction above 0 where it is a parameter. MJX omits friction rows that are 0 at first."""
     model = copy.copy(model)
     for field, places in (
         (model.dof_frictionloss, parameters.rubbing_dofs),
@@ -278,9 +285,9 @@ def _with_friction_rows(model: mujoco.MjModel, parameters: ParameterSet) -> mujo
 
 
 def _differing(models: Sequence[mjx.Model], names: Sequence[str]) -> tuple[tuple[str, ...], list[np.ndarray]]:
-    """Return the fields in which models differ, and their values, stacked.
+    """Return the fields in which models differ, and their stacked values.
 
-    **Raises** `InputError` where they differ in structure.
+    **Raises** `InputError` if they differ in structure.
     """
     fields, values = [], []
     for field in dataclasses.fields(models[0]):  # pyright: ignore
@@ -288,7 +295,9 @@ def _differing(models: Sequence[mjx.Model], names: Sequence[str]) -> tuple[tuple
         if isinstance(own[0], jax.Array):
             if any(x.shape != own[0].shape for x in own):
                 wrong = next(n for x, n in zip(own, names, strict=True) if x.shape != own[0].shape)
-                raise InputError(f"{wrong}: its model differs from {names[0]}'s in structure; give models alike.")
+                raise InputError(
+                    f"{wrong}: its model differs in structure from that of {names[0]}; give models of equal structure."
+                )
             stacked = np.stack([np.asarray(x) for x in own])
             if np.any(stacked != stacked[:1]):
                 fields.append(field.name)

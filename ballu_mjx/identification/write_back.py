@@ -1,4 +1,4 @@
-"""Identified values in files: JSON that this package reads, and the user's MJCF with the values in place."""
+"""Files of identified values: JSON that this package reads, and the user's MJCF with the values."""
 
 from __future__ import annotations
 
@@ -31,12 +31,13 @@ def identified_to_json(
     specimen: str | None = None,
     more: Mapping[str, Any] | None = None,
 ) -> str:
-    """Return identified values, by the names of a description's `identify`, as `read_identified` takes them.
+    """Return identified values as JSON text for `read_identified`, by the names of the declared parameters.
 
-    `specimen` is the name that the robot's recordings carry (None: the description's), `more` further keys.
+    - `specimen`: the robot's name in its recordings. None: the name in its description.
+    - `more`: further keys.
     """
     declared = identified.declared
-    # Single precision may be a little beyond a bound.
+    # Values in single precision may lie slightly outside the bounds.
     values = np.clip(np.asarray(identified.values, float), declared.lower, declared.upper)
     errors = np.full(len(values), np.nan) if standard_errors is None else standard_errors
     rows = {}
@@ -49,7 +50,7 @@ def identified_to_json(
 
 
 def read_identified(path: Path | str, robot: RobotDescription) -> IdentifiedParameters:
-    """Return the values in a file of `identified_to_json`; parameters that it leaves out are nominal.
+    """Read a file of `identified_to_json`. Parameters that are missing in it have their nominal values.
 
     **Raises** `InputError` naming the file, the parameter and the fix.
     """
@@ -58,13 +59,13 @@ def read_identified(path: Path | str, robot: RobotDescription) -> IdentifiedPara
 
 
 def identified_from_json(content: Mapping[str, Any], path: Path, robot: RobotDescription) -> IdentifiedParameters:
-    """Return the values in what `identified_to_json` makes, which stands in the file `path`; see `read_identified`.
+    """Return the values in the JSON of `identified_to_json`, which the file `path` contains; see `read_identified`.
 
     **Raises** `InputError` naming the file, the parameter and the fix.
     """
     rows = content.get("parameters")
     if content.get("format") != IDENTIFIED_FORMAT or not isinstance(rows, dict):
-        raise InputError(f'{path}: is not of the format "{IDENTIFIED_FORMAT}"; give one that identification wrote.')
+        raise InputError(f'{path}: is not of the format "{IDENTIFIED_FORMAT}"; give a file that identification wrote.')
     parameters = declared_parameters(robot, robot.load_model())
     values = parameters.nominal.copy()
     for name, row in rows.items():
@@ -83,10 +84,10 @@ def identified_from_json(content: Mapping[str, Any], path: Path, robot: RobotDes
 def identified_xml(robot: RobotDescription, identified: IdentifiedParameters) -> str:
     """Return the robot's MJCF with the identified values, for plain MuJoCo.
 
-    What MJCF cannot hold, the drivetrain, stands in a comment at the top. Paths of meshes and textures stay relative to
-    the robot's MJCF file. Numbers have six digits, as MuJoCo writes them.
+    MJCF cannot express the drivetrain, which is written in a comment at the top. Paths of meshes and textures stay
+    relative to the robot's MJCF file. Numbers have six digits, as MuJoCo writes them.
 
-    **Raises** `InputError` for a field that MuJoCo's specification of a model does not have.
+    **Raises** `InputError` for a field that cannot be set in MuJoCo's model specification (`mujoco.MjSpec`).
     """
     model = robot.load_model()
     with jax.enable_x64(True):
@@ -133,10 +134,11 @@ _SPEC_FIELDS: Mapping[str, str] = {
     "actuator_forcerange": "forcerange",
     "body_gravcomp": "gravcomp",
 }
+"""Attribute in MuJoCo's model specification, by field of the compiled model."""
 
 
 def _write(spec: mujoco.MjSpec, model: mujoco.MjModel, target: FieldTarget) -> None:
-    """Set what makes a field of the compiled model; others are left, and found out by comparing."""
+    """Set the attribute for a field of the compiled model. Unknown fields are skipped, and a comparison finds them."""
     own = _SPEC_FIELDS.get(target.field)
     if own is None:
         return
@@ -155,6 +157,7 @@ def _write(spec: mujoco.MjSpec, model: mujoco.MjModel, target: FieldTarget) -> N
 
 
 def _drivetrain_words(robot: RobotDescription, identified: IdentifiedParameters) -> str:
+    """Return the drivetrain quantities that differ from the identity, as text for a comment."""
     found = identified.drivetrain()
     nominal = {"scale": 1.0, "rate_limit": np.inf}
     words = []
@@ -163,4 +166,4 @@ def _drivetrain_words(robot: RobotDescription, identified: IdentifiedParameters)
         changed = [f"{name} {value:.6g}" for name, value in own.items() if value != nominal.get(name, 0.0)]
         if changed:
             words.append(f"{command}: {', '.join(changed)}")
-    return f"Drivetrain, which MJCF cannot hold: {'; '.join(words) or 'none'}"
+    return f"Drivetrain, which MJCF cannot express: {'; '.join(words) or 'none'}"

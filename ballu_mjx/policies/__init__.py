@@ -1,1 +1,1 @@
-"""Stage 4, policies: tasks, environments, trained policies, deployment."""
+"""Locomotion policies (stage 4): tasks, environments, training, trained policies, deployment."""

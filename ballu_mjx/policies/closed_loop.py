@@ -1,4 +1,4 @@
-"""Policies in their own simulator, in closed loop."""
+"""Closed-loop simulation of policies in their own simulator."""
 
 from __future__ import annotations
 
@@ -17,35 +17,38 @@ from ballu_mjx.sim.sharding import chunks
 
 
 class Rollout(NamedTuple):
-    """Closed-loop simulations at the control rate, the starting state first."""
+    """Closed-loop simulations, sampled at the control rate. The first state is the starting state."""
 
     qpos: Float[np.ndarray, "runs states nq"]
     features: Float[np.ndarray, "runs states features"]
-    """`observation.observe_features`."""
+    """Features (`observation.observe_features`)."""
     com: Float[np.ndarray, "runs states 3"]
     """Centre of mass (m, world)."""
     command: Float[np.ndarray, "runs steps commands"]
-    """In the actuators' units."""
+    """Commands, in the actuators' units."""
     outside: Float[np.ndarray, "runs steps"]
-    """1 where the residual's observation lay outside of what its training had seen."""
+    """1 if the residual's observation was outside its training range, else 0."""
     reward: Float[np.ndarray, "runs steps"]
-    """The task's."""
+    """Reward of the task."""
 
     @property
     def yaw(self) -> Float[np.ndarray, "runs states"]:
-        """Of the tracked body (rad), not unwrapped."""
+        """Yaw of the tracked body (rad), not unwrapped."""
         return self.features[..., ObservationLayout.yaw]
 
 
 _CHUNK = 100
-"""Control steps that the compiled program does at a time."""
+"""Number of control steps in one call of the compiled program."""
 _BATCH = 8
-"""Runs that it does side by side; fewer are filled up, more are done one batch after another."""
+"""Number of runs that it simulates in parallel. Fewer are filled up to this number; more are split into batches."""
 
 
 class ClosedLoop:
-    """Runs policies in closed loop; one compiled program for any number of runs and steps, any parameters, and all
-    simulators that differ in their contents alone (`LocomotionEnv.contents`)."""
+    """Closed-loop simulation of policies.
+
+    One compiled program serves any number of runs and steps, and any parameters of the policy. It also serves all
+    simulators that differ only in their contents (`LocomotionEnv.contents`).
+    """
 
     def __init__(self, env: LocomotionEnv, infer: Inference) -> None:
         self._contents = env.contents
@@ -103,7 +106,7 @@ class ClosedLoop:
         return Rollout(*states, *per_step)
 
     def standing(self, count: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Return `count` starting states, (qpos, qvel), as training draws them."""
+        """Return `count` starting states (qpos, qvel), drawn as in training."""
         state = self._reset(self._contents, jax.random.split(jax.random.key(seed), count))
         physics = locomotion_state(state).rollout.physics
         return np.asarray(physics.qpos), np.asarray(physics.qvel)

@@ -1,4 +1,4 @@
-"""Domain randomization: the distribution of friction and starting states, and draws from it."""
+"""Domain randomization: the distribution of friction and starting states, and samples of it."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from ballu_mjx.sim.drivetrain import DrivetrainParameters, drivetrain_of
 
 
 class StartSpread(NamedTuple):
-    """How starting states vary."""
+    """Spread of starting states."""
 
     turn: Float[Array, " 3"]
-    """Largest roll, pitch and yaw (rad)."""
+    """Largest roll, pitch and yaw (rad), with either sign."""
     joint: Float[Array, " joints"]
     """Standard deviation of each joint (rad, m)."""
     velocity: Float[Array, " nv"]
@@ -29,35 +29,38 @@ class StartSpread(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """What tells one simulator from another, as arrays; see `make_setting`."""
+    """Parameters that differ between simulators of the same task, as arrays; see `make_setting`."""
 
     fields: dict[str, Array]
-    """Fields of the MJX model that identified actuators change."""
+    """Fields of the MJX model that identified actuators change, by name."""
     drivetrain: DrivetrainParameters | None
-    """What commands meet on their way to the actuators; None: nothing."""
+    """Parameters of the drivetrain between command and actuator. None if there is no drivetrain."""
     initial: Float[Array, " nq"]
-    """Pose that episodes start from."""
+    """Generalized positions at which episodes start, before the spread is added."""
     joint_range: Float[Array, "joints 2"]
-    """Smallest and largest value of each joint (rad, m); infinite where it has no limit."""
+    """Smallest and largest value of each joint (rad, m). Infinite if the joint has no limit."""
     friction: Float[Array, "colliding 2"]
-    """Range of the sliding friction of each geom that collides."""
+    """Range of the sliding friction coefficient of each geom that collides."""
     spread: StartSpread
 
 
 def colliding_geoms(model: mujoco.MjModel) -> Int[np.ndarray, " colliding"]:
-    """Return the ids of the geoms that may touch others, the world's included."""
+    """Return the ids of the geoms that may touch others, including those of the world."""
     return np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0))
 
 
 def make_setting(
     robot: RobotDescription, model: mujoco.MjModel, config: LocomotionConfig, actuators: ModelParameters | None
 ) -> Setting:
-    """Return what tells a simulator from another; `model` is the nominal robot, `actuators` None: nominal ones."""
+    """Return the parameters that differ between simulators of the same task.
+
+    `model` is the nominal robot. `actuators` None: the nominal actuators.
+    """
     parameters = robot.adapter.nominal_actuators(model) if actuators is None else actuators
     improved = robot.load_model(actuators)
     on = 1.0 if config.domain_randomization else 0.0
     degree = np.pi / 180
-    # One program: thirty small ones take half a second of every start.
+    # One compiled program: thirty small ones would take half a second at every start.
     fields = {} if parameters is None else jax.jit(lambda parameters: parameters.fields(model))(parameters)
     first = 0 if robot.anchored else 1
     hinges = model.jnt_type[first:] == int(mujoco.mjtJoint.mjJNT_HINGE)
@@ -83,23 +86,23 @@ def make_setting(
 
 
 class Start(NamedTuple):
-    """Where an episode starts, drawn from a setting."""
+    """Starting state and friction of an episode, drawn from a setting."""
 
     qpos: Float[Array, " nq"]
     qvel: Float[Array, " nv"]
     friction: Float[Array, " colliding"]
-    """Sliding friction of the geoms that collide."""
+    """Sliding friction coefficients of the geoms that collide."""
     rng: Array
-    """Key for what is drawn next."""
+    """Random key for the next draws."""
 
 
 def draw_start(setting: Setting, robot: RobotDescription, rng: Array) -> Start:
-    """Draw friction and starting state; without domain randomization both are the setting's own."""
+    """Draw friction and starting state. Without domain randomization, both have the setting's own values."""
     key_friction, key_turn, key_joint, key_velocity, rng = jax.random.split(rng, 5)
     low, high = setting.friction.T
     friction = low + (high - low) * jax.random.uniform(key_friction)
     initial, spread = setting.initial, setting.spread
-    root = 0 if robot.anchored else 7  # numbers of the root's pose in `qpos`
+    root = 0 if robot.anchored else 7  # size of the root's pose in `qpos`
     joints = initial[root:] + spread.joint * jax.random.normal(key_joint, (len(initial) - root,))
     joints = jnp.clip(joints, *setting.joint_range.T)
     if root:

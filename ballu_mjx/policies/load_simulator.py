@@ -1,4 +1,4 @@
-"""The simulator of a run of whatever task, for whoever trains, exports or compares in it next."""
+"""The simulator of a run of any task, for training, export or comparison."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def load_simulator(run: Path | str | None = None, robot: str | Path | None = Non
 
     **Arguments**
 
-    - `run`: of a residual, of identified actuators, or of a policy (the simulator that it was trained in). None: the
-      nominal simulator of `robot`.
-    - `robot`: a name, or a description file; None: the run's, or the default one.
+    - `run`: run of a residual, of identified actuators, or of a policy (for the simulator of its training). None for
+      the nominal simulator of `robot`.
+    - `robot`: name of a robot, or its description file. None for the run's robot or, without a run, the default robot.
 
-    **Raises** `InputError` where `run` is none of these, or is damaged, and where both are given.
+    **Raises** `InputError` if `run` is none of these runs or is damaged, and if both `run` and `robot` are given.
     """
     if run is None:
         return Simulator(load_robot(DEFAULT_ROBOT if robot is None else robot)).with_residual(None)

@@ -1,4 +1,4 @@
-"""Options of the simulator that a locomotion policy is trained in."""
+"""Options of the simulator in which a locomotion policy is trained."""
 
 from __future__ import annotations
 
@@ -12,34 +12,38 @@ from ballu_mjx.robots.description import RobotDescription
 
 @dataclasses.dataclass(frozen=True)
 class LocomotionConfig:
-    """The simulator that a policy is trained in."""
+    """Options of the simulator in which a policy is trained."""
 
     domain_randomization: bool = False
-    """Draw friction and starting state anew for every episode, as the paper does (not masses, not buoyancy: gaits
-    depend on these too finely)."""
+    """Draw friction and the starting state anew for every episode, as in the paper. Without this option, --friction and
+    the options of the start have no effect. Masses and buoyancy are not drawn, because they change gaits too much."""
     friction: tuple[float, float] = (0.5, 1.1)
-    """Range of the coefficient of sliding friction, one for all geoms that collide."""
+    """Range of the coefficient of sliding friction. One value is drawn for all geoms that collide."""
     start_yaw: float = 20.0
-    """Starting headings are drawn from plus or minus this, deg."""
+    """Largest starting heading, deg. It is drawn between minus and plus this angle."""
     start_tilt: float = 2.0
-    """Starting roll and pitch of the base are drawn from plus or minus this, deg."""
+    """Largest starting roll and pitch of the base, deg. They are drawn between minus and plus this angle."""
     start_angle: float = 3.0
-    """Spread of the starting angles of hinges, deg, within their ranges; joints that the robot's description holds stay
-    where they are."""
+    """Standard deviation of the starting angles of hinges, deg. Angles stay within the joints' ranges. Joints that the
+    robot's description lists as held do not vary."""
     start_offset: float = 0.005
-    """Spread of the starting positions of slides, m, likewise."""
+    """Standard deviation of the starting positions of slides, m. Positions stay within the joints' ranges, and held
+    joints do not vary."""
     start_velocity: float = 0.03
-    """Spread of the starting velocity, m/s; hinges and base turn at five times as much, rad/s."""
+    """Standard deviation of the starting velocities, m/s. For rotations of hinges and base: five times as much,
+    rad/s."""
     episode_seconds: float = 12.0
-    """Mean length of an episode, s; each lasts between half and one and a half times as long."""
+    """Mean duration of an episode, s. Each one lasts between half and one and a half times as long."""
     sampled_residual: bool = False
-    """Draw the residual's forces from its policy's distribution, instead of taking the most likely ones."""
+    """Sample the residual forces from the policy's distribution instead of using its mode."""
     residual_decay: float = 0.0
-    """How fast the residual's force fades where its observation leaves the range seen in its training: it is
-    multiplied by exp(-decay x excess), the excess in widths of that range. 0: not at all."""
+    """Decay rate of the residual force outside the range of its training data, 0 or more. The force is multiplied by
+    exp(-decay x excess). The excess is the distance of the residual's observation from that range, in widths of the
+    range. 0 for no decay."""
     outside_cost: float = 0.0
-    """Reward (m/s) lost per width of that range by which the residual's observation leaves it: keeps the policy where
-    the residual knows what it does, which a policy paid for speed otherwise leaves. 0: nothing."""
+    """Cost (reward, m/s) for each width of the training range by which the residual's observation lies outside this
+    range, 0 or more. It keeps the policy where the residual is reliable. A policy that is rewarded for speed otherwise
+    leaves this range. 0 for no cost."""
 
 
 _STARTS = ("start_yaw", "start_tilt", "start_angle", "start_offset", "start_velocity")
@@ -47,9 +51,9 @@ _NOT_NEGATIVE = (*_STARTS, "residual_decay", "outside_cost")
 
 
 def check_locomotion_config(config: LocomotionConfig, control_timestep: float) -> None:
-    """Check the options for a robot with so many seconds between two commands.
+    """Check the options for a robot with control steps of `control_timestep` seconds.
 
-    **Raises** `InputError` for options out of range, naming the option and the fix.
+    **Raises** `InputError` if an option is out of range, naming the option and the fix.
     """
     low, high = config.friction
     if not 0 < low <= high < math.inf:
@@ -67,9 +71,9 @@ def check_locomotion_config(config: LocomotionConfig, control_timestep: float) -
 
 
 def check_task(task: Task, robot: RobotDescription) -> None:
-    """Check that a robot can do a task.
+    """Check that a robot can perform a task.
 
-    **Raises** `InputError` where it cannot.
+    **Raises** `InputError` if it cannot.
     """
     if robot.anchored:
         raise InputError(

@@ -1,9 +1,8 @@
-"""Learning to move: tasks in a simulator that is vanilla, identified, randomized, or improved by EnvMimic's forces
-(paper, section "Improved Sim-to-real Transfer").
+"""Locomotion tasks in a simulator that is vanilla, identified, randomized, or improved by a residual.
 
-What tells one simulator from another (actuators, friction, starting states) travels in the environment's state, as
-data: settings share a compiled program. A residual adds a network, and so makes another one, but one for all residuals
-of its kind.
+They are those of the paper's section "Improved Sim-to-real Transfer". The parameters that differ between simulators
+(actuators, friction, starting states) are data in the environment's state, so that all settings share one compiled
+program. A residual adds a network and needs another program, which serves all residuals of its kind.
 """
 
 from __future__ import annotations
@@ -32,26 +31,26 @@ from ballu_mjx.sim.step import state_at
 
 
 class Contents(NamedTuple):
-    """What tells one environment from another of the same task, configuration and kind of residual, as arrays."""
+    """Parameters that differ between environments of the same task, configuration and kind of residual, as arrays."""
 
     model: Any
     """The MJX model."""
     setting: Setting
     residual: Any
-    """Parameters of the residual, and the range of what it has seen; None: there is no residual."""
+    """Parameters of the residual, and the range of its training data. None if there is no residual."""
 
 
 class LocomotionState(NamedTuple):
-    """Where an episode stands, and in which simulator."""
+    """State of one episode, with the parameters of its simulator."""
 
     setting: Setting
     friction: Float[Array, " colliding"]
-    """Sliding friction of the geoms that collide."""
+    """Sliding friction coefficients of the geoms that collide."""
     rollout: RolloutState
     com: Float[Array, " 3"]
     """Centre of mass (m, world)."""
     remaining: Int[Array, ""]
-    """Control steps until the episode ends."""
+    """Number of control steps until the episode ends."""
     key: Array
 
 
@@ -59,7 +58,7 @@ _METRICS = ("velocity_x", "velocity_y", "force", "outside", "excess", "diverged"
 
 
 def locomotion_state(state: State) -> LocomotionState:
-    """Return what `LocomotionEnv` keeps in `state`: Brax types it as its own physics' state."""
+    """Return the `LocomotionState` in `state`. Brax's type for this field is that of its own physics."""
     return cast(LocomotionState, state.pipeline_state)
 
 
@@ -71,11 +70,11 @@ def num_observations(robot: RobotDescription) -> int:
 def locomotion_observation(
     features: Float[Array, " features"], anchored: bool = False
 ) -> Float[Array, " observations"]:
-    """Return what a locomotion policy sees of `observe_features`: the paper's state, of the current control step only.
+    """Return the observation of a locomotion policy: the paper's state, of the current control step only.
 
-    Of a free robot, horizontal positions are relative to the tracked body's and turned into its heading, like
-    velocities, for a gait is the same one wherever it goes. The heading itself stands at the end, as cosine and sine:
-    the task's direction is fixed in the world.
+    For a free robot, horizontal positions are relative to the tracked body's. Positions and velocities are rotated into
+    its heading, because a gait is the same everywhere. The heading itself comes last, as cosine and sine, because the
+    task's direction is fixed in the world.
     """
     yaw = features[ObservationLayout.yaw]
     relative = heading_observation(features[None], anchored)  # its last entry is the yaw
@@ -83,13 +82,13 @@ def locomotion_observation(
 
 
 def command_of(action: Float[Array, " commands"], robot: RobotDescription) -> Float[Array, " commands"]:
-    """Return the commands (in the actuators' units) for a policy's output: -1 to 1 is the whole range of each."""
+    """Return the commands (in the actuators' units) for a policy's output. -1 to 1 covers the range of each command."""
     low, high = (jnp.asarray(bound, jnp.float32) for bound in np.array(robot.command_ranges).T)
     return low + jnp.clip((action + 1) / 2, 0.0, 1.0) * (high - low)
 
 
 class LocomotionEnv(Env):
-    """A task in one of the simulators; Brax's environment interface, one robot, unbatched."""
+    """A task in one of the simulators, with Brax's interface of environments: one robot, not batched."""
 
     def __init__(
         self,
@@ -100,9 +99,9 @@ class LocomotionEnv(Env):
         actuators: ModelParameters | None = None,
         residual: TrainedResidual | None = None,
     ) -> None:
-        """Make the environment; `actuators` (None: nominal ones) and `residual` (None: none) improve the simulator.
+        """Make the environment. The simulator has `actuators` (None: nominal ones) and `residual` (None: none).
 
-        **Raises** `InputError` where the robot cannot do the task.
+        **Raises** `InputError` if the robot cannot perform the task.
         """
         check_task(task, robot)
         self.robot, self.task, self.config, self.residual = robot, task, config, residual
@@ -116,8 +115,10 @@ class LocomotionEnv(Env):
 
     @property
     def contents(self) -> Contents:
-        """The model's numbers, the setting, and what the residual has learned and seen. Programs that take them as an
-        argument serve all environments that differ in nothing else. Settings may differ from robot to robot of a batch.
+        """The MJX model, the setting, and the parameters and training range of the residual.
+
+        A program that takes them as an argument serves all environments that differ in nothing else. In a batch,
+        settings may differ between robots.
         """
         residual = None if self.residual is None else (self.residual.params, self.residual.observed)
         return Contents(self.simulator.simulator.model, self.setting, residual)
@@ -132,21 +133,24 @@ class LocomotionEnv(Env):
         return other
 
     def reset(self, rng: Array) -> State:
-        """Start from the initial pose, at the origin, facing x; with domain randomization, nearly so."""
+        """Start an episode from the initial pose, at the origin, facing x.
+
+        With domain randomization, the state varies around this pose.
+        """
         return self._start(self.setting, rng)
 
     def renew(self, state: State, rng: Array) -> State:
-        """`reset` into the simulator that `state` belongs to."""
+        """Start an episode like `reset`, with the setting of `state`."""
         return self._start(locomotion_state(state).setting, rng)
 
     def at(self, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], rng: Array) -> State:
-        """Start from a given state, with nominal friction, and without an end."""
+        """Start from a given state, with nominal friction. The episode has no time limit."""
         state = self._begin(self.setting, qpos, qvel, self._friction[self._colliding, 0], rng)
         endless = locomotion_state(state)._replace(remaining=jnp.asarray(2**30, jnp.int32))
         return dataclasses.replace(state, pipeline_state=cast(Any, endless))
 
     def step(self, state: State, action: Array) -> State:
-        """Advance one control step under the policy's commands and the residual's force."""
+        """Advance by one control step under the policy's commands and the residual."""
         before = locomotion_state(state)
         command = self.command_of(action)
         key, key_force = jax.random.split(before.key)
@@ -219,7 +223,7 @@ class LocomotionEnv(Env):
         return initial_state(now, self._observe(rollout), _METRICS)
 
     def _excess(self, rollout: RolloutState, command: Float[Array, " commands"]) -> Float[Array, ""]:
-        """Return how far the residual's observation lies outside of its data."""
+        """Return the distance of the residual's observation from its training range, in widths of the range."""
         if self.residual is None:
             return jnp.zeros(())
         return self.residual.out_of_range(rollout.history, rollout.with_command(command))
@@ -228,7 +232,7 @@ class LocomotionEnv(Env):
 def variant_of(
     config: LocomotionConfig, actuators: ModelParameters | None, residual: TrainedResidual | None
 ) -> SimulatorVariant:
-    """Return which of the paper's simulators this is."""
+    """Return the variant of the simulator."""
     if residual is not None:
         return SimulatorVariant(residual.model.name)
     return SimulatorVariant(identified=actuators is not None, randomized=config.domain_randomization)

@@ -1,7 +1,7 @@
-"""Simulators of the whole story (`train all`) by name, and where its folder keeps what.
+"""Names of the simulators of all experiments (`train all`), and the layout of their output folder.
 
-The folder holds `table-TASK.md` for each task and, for each seed, `seed-N/` with the runs of policies
-(`TASK-VARIANT/`), of residuals (`METHOD-TASK/`) and the trials (`trials-TASK-VARIANT/`).
+The folder holds `table-TASK.md` for each task and `seed-N/` for each seed. A seed's folder holds the runs of policies
+(`TASK-VARIANT/`), the runs of residuals (`METHOD-TASK/`), and the trials (`trials-TASK-VARIANT/`).
 """
 
 from __future__ import annotations
@@ -17,23 +17,26 @@ TABLES: Mapping[str, Callable[[Mapping[str, Sequence[Sequence[Transfer]]]], str]
     "walk": walking_table,
     "turn": turning_table,
 }
-"""The paper's tables, by task."""
+"""Functions that make the paper's tables, by task."""
 SETTINGS = ("vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic", "aerodynamic")
-"""The paper's four simulators, and one with the identified air instead of EnvMimic's forces."""
+"""The paper's four simulators, and one with identified aerodynamics instead of EnvMimic's forces."""
 SHARED = "envmimic-shared"
-"""One EnvMimic for all tasks."""
+"""Simulator with one EnvMimic residual for all tasks."""
 NEAR = "envmimic-near"
-"""EnvMimic's forces, and policies that pay for leaving what these were learned from."""
+"""Simulator with EnvMimic's forces, whose policies pay a cost outside the residual's training range."""
 WRENCH = "envmimic-wrench"
-"""An EnvMimic that pushes with a torque too."""
+"""Simulator with an EnvMimic residual that also applies a torque."""
 MORE_SETTINGS = (NEAR, SHARED, WRENCH, "supervised", "analytic")
-"""Simulators on request; the last two have networks that regression and gradients learn."""
+"""Optional simulators. The networks of the last two are learned by regression and by gradients."""
 ROUNDS = "envmimic"
-"""The residual that is learned again in each round. A later round has its number behind the name."""
+"""Residual that is learned again in each round. From the second round on, its name ends with the round's number."""
 
 
 def settings_beyond(folder: Path, task: str) -> tuple[str, ...]:
-    """Return the simulators beyond `SETTINGS` that a seed's folder has policies of: of later rounds, and on request."""
+    """Return the simulators besides `SETTINGS` of which a seed's folder has policies.
+
+    They are those of later rounds and the optional ones.
+    """
 
     def there(name: str) -> bool:
         return (folder / f"{task}-{name}").is_dir()
@@ -43,7 +46,7 @@ def settings_beyond(folder: Path, task: str) -> tuple[str, ...]:
 
 
 def residual_folder(seed: Path, task: str, setting: str) -> Path:
-    """Return where, in a seed's folder, the residual of a simulator is learned."""
+    """Return the folder, in a seed's folder, in which the residual of a simulator is learned."""
     if setting == SHARED:
         return seed / SHARED
     variant = SimulatorVariant.parse(ROUNDS if setting == NEAR else setting)
@@ -51,5 +54,5 @@ def residual_folder(seed: Path, task: str, setting: str) -> Path:
 
 
 def table_file(output: Path, task: str) -> Path:
-    """Return where the table of a task is written."""
+    """Return the file of a task's table."""
     return output / f"table-{task}.md"

@@ -1,4 +1,4 @@
-"""A trained locomotion policy: its commands, and its own simulator in closed loop."""
+"""A trained locomotion policy: its commands, and the closed loop in its own simulator."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ from ballu_mjx.sim.drivetrain import drivetrain_of
 
 @dataclasses.dataclass(frozen=True)
 class Policy:
-    """A deterministic policy, and what it was trained in.
+    """A deterministic policy, and the simulator of its training.
 
     **Fields**
 
-    - `task`, `config`, `robot`, `actuators` (None: nominal), `residual` (or its run's folder; None: none): its
-      simulator.
+    - `task`, `config`, `robot`, `actuators` (None: nominal), `residual` (or the folder of its run; None: none): parts
+      of its simulator.
     - `network`: options of its networks.
-    - `params`: what `training_state.params` gave.
-    - `infer`: (parameters, observation) to action.
-    - `step`: control steps of training behind it.
+    - `params`: parameters that `training_state.params` returned.
+    - `infer`: function from parameters and observation to the action.
+    - `step`: number of control steps of its training.
     """
 
     task: Task
@@ -59,14 +59,15 @@ class Policy:
     infer: Inference
     step: int
     loop: ClosedLoop | None = dataclasses.field(default=None, repr=False, compare=False)
-    """Its simulator, where that is compiled already."""
+    """Its simulator in closed loop, if it is already compiled."""
 
     @staticmethod
     def load(folder: Path | str, which: Which = "best") -> Policy:
-        """Return the policy in a run's best checkpoint, by its reward without exploration; in the last, or that of a
-        step.
+        """Return the policy in a checkpoint of a run: the best one, the last one, or that of a step.
 
-        **Raises** `InputError` where `folder` is no run of a locomotion task, or has no such checkpoint.
+        The best checkpoint has the highest reward without exploration.
+
+        **Raises** `InputError` if `folder` is not a run of a locomotion task, or has no such checkpoint.
         """
         folder = Path(folder)
         stored = read_config(folder, *TASKS)
@@ -84,7 +85,7 @@ class Policy:
         params = ppo.from_tree(tree)
         if not ppo.fits(infer, params, num_observations(robot)):
             raise InputError(
-                f"{folder}: the stored parameters are not of the network in its config.json; restore one of the two."
+                f"{folder}: the stored parameters do not fit the network in its config.json; restore one of the two."
             )
         return Policy(
             task=TASKS[stored["task"]],
@@ -98,11 +99,11 @@ class Policy:
             step=step,
         )
 
-    @functools.cached_property  # reading a run takes time, and its commands do without
+    @functools.cached_property  # reading a run takes time, and commands do not need it
     def trained_residual(self) -> TrainedResidual | None:
-        """The residual in its simulator.
+        """Residual in the policy's simulator. None if there is none.
 
-        **Raises** `InputError` where its run is gone, damaged, or of other actuators.
+        **Raises** `InputError` if the residual's run is missing, damaged, or of other actuators.
         """
         if not isinstance(self.residual, Path):
             return self.residual
@@ -112,27 +113,26 @@ class Policy:
 
     @property
     def variant(self) -> SimulatorVariant:
-        """Which of the paper's simulators the policy was trained in."""
+        """The variant of the simulator in which the policy was trained."""
         return variant_of(self.config, self.actuators, self.trained_residual)
 
     @property
     def latency(self) -> float:
-        """Seconds from a command to the actuators in the simulator that the policy was trained in; the longest of the
-        commands'."""
+        """Largest delay (s) from a command to its actuator in the simulator in which the policy was trained."""
         drivetrain = drivetrain_of(bare_parameters(self.actuators))
         own = 0.0 if drivetrain is None else float(np.max(drivetrain.delay))
         return own if self.trained_residual is None else own + self.trained_residual.latency
 
     def environment(self) -> LocomotionEnv:
-        """Return the simulator that the policy was trained in."""
+        """Return the simulator in which the policy was trained."""
         return environment_of(self.robot, self.task, self.config, self.actuators, self.trained_residual)
 
     def closed_loop(self) -> ClosedLoop:
-        """Return that simulator in closed loop, for any parameters of the policy."""
+        """Return the closed loop in that simulator, for any parameters of the policy."""
         return ClosedLoop(self.environment(), self.infer) if self.loop is None else self.loop
 
     def act(self) -> Callable[[Float[np.ndarray, " features"]], Float[np.ndarray, " commands"]]:
-        """Return what turns `observation.observe_features` into commands, for use outside of JAX, step by step."""
+        """Return a function from `observation.observe_features` to commands, for step-by-step use outside of JAX."""
 
         @jax.jit
         def command(features: Array) -> Array:
@@ -149,20 +149,20 @@ def environment_of(
     actuators: ModelParameters | None = None,
     residual: TrainedResidual | None = None,
 ) -> LocomotionEnv:
-    """Return a task's simulator.
+    """Return the simulator of a task.
 
-    **Raises** `InputError` where the robot cannot do the task.
+    **Raises** `InputError` if the robot cannot perform the task.
     """
     return LocomotionEnv(robot, task, config, actuators=actuators, residual=residual)
 
 
 def check_belongs(residual: TrainedResidual | None, actuators: ModelParameters | None, run: Path | None) -> None:
-    """Check that the residual (None: none) of `run` was learned beside these actuators.
+    """Check that the residual (None: none) of `run` was learned with these actuators.
 
-    **Raises** `InputError` where it was not.
+    **Raises** `InputError` if it was learned with others.
     """
     if residual is not None and not same_parameters(residual.actuators, actuators):
         raise InputError(
-            f"{run}: its forces were learned beside other actuators; give --actuators the same file, or leave it "
-            "out to take the residual's."
+            f"{run}: this residual was learned with other actuators; give --actuators the same file, or omit the "
+            "option to use those of the residual."
         )

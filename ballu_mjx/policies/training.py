@@ -1,4 +1,4 @@
-"""Training of policies: from a simulator and a task to a policy."""
+"""Training of locomotion policies in a simulator, for a task."""
 
 from __future__ import annotations
 
@@ -24,10 +24,12 @@ from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 KEEP_EVERY = 500_000
-"""Control steps between two checkpoints."""
+"""Number of control steps between two checkpoints."""
 VALIDATION_METRIC = "validation_reward"
-"""The metric that tells the best checkpoint: the reward without exploration. Training's own says too little:
-exploration frees a robot that would rest without."""
+"""Metric that selects the best checkpoint: the reward without exploration.
+
+The training reward does not suffice. Exploration can free a robot that would otherwise stay at rest.
+"""
 _LOCOMOTION: Mapping[str, Any] = {
     "num_timesteps": 3_000_000,
     "learning_rate": 3e-4,
@@ -45,7 +47,7 @@ _VALIDATION_STARTS = 16
 def locomotion_ppo(**changes: Any) -> PPOConfig:
     """Return `PPOConfig` for locomotion, with `changes`.
 
-    Rewards are of the order of 0.1 m/s, and a turn pays only after seconds.
+    Its defaults suit rewards of the order of 0.1 m/s. In turning, rewards follow only after seconds.
     """
     return PPOConfig(**{**_LOCOMOTION, **changes})
 
@@ -61,21 +63,23 @@ def train_policy(
     progress: Progress | None = None,
     start: ResumePoint | None = None,
 ) -> Policy:
-    """Train a policy for a task, and return the one that earns most in whole trials without exploration.
+    """Train a policy for a task, and return that of the best checkpoint.
+
+    It has the highest reward in whole trials without exploration.
 
     **Arguments**
 
-    - `simulator`: what to train in, alone or with a residual.
+    - `simulator`: simulator of the training, with or without a residual.
     - `task`: a name in `tasks.TASKS`, or a task.
-    - `config`, `ppo_config`: what episodes are like, and how to learn; None: the defaults, of `locomotion_ppo`. The
-      seed is `ppo_config.seed`.
-    - `keep_every`: control steps between two checkpoints, each of which is validated.
-    - `run`: takes measurements and checkpoints, in a folder say; None: memory.
-    - `progress`: is told of every training step.
-    - `start`: where to go on; None: from the beginning.
+    - `config`: options of the simulator and of its episodes. None for the defaults.
+    - `ppo_config`: options of the learning, with the seed. None for the defaults of `locomotion_ppo`.
+    - `keep_every`: number of control steps between two checkpoints. Each checkpoint is validated.
+    - `run`: record of measurements and checkpoints, for example in a folder. None to keep them in memory.
+    - `progress`: display of the progress, updated after every training step. None for no display.
+    - `start`: state from which to resume. None to start from the beginning.
 
-    **Raises** `InputError` for options that do not fit, an unknown task, and where learning breaks down;
-    `TrainingInterrupted` after SIGINT or SIGTERM, the last state saved.
+    **Raises** `InputError` if options do not fit, the task is unknown, or learning breaks down. Raises
+    `TrainingInterrupted` after SIGINT or SIGTERM, with the last state saved.
     """
     config, ppo_config = config or LocomotionConfig(), ppo_config or locomotion_ppo()
     start = start or ResumePoint()
@@ -112,7 +116,10 @@ def train_policy(
 def check_policy_options(
     config: LocomotionConfig, ppo_config: PPOConfig, keep_every: int, robot: RobotDescription
 ) -> None:
-    """**Raises** `InputError` for options of `train_policy` that are out of range, or do not fit the devices."""
+    """Check the options of `train_policy`.
+
+    **Raises** `InputError` if they are out of range, or do not fit the devices.
+    """
     ppo.check(ppo_config, len(jax.devices()))
     check_locomotion_config(config, robot.control_timestep)
     if keep_every < 1:
@@ -120,5 +127,5 @@ def check_policy_options(
 
 
 def validation_trials(loop: ClosedLoop, params: Params, task: Task, control_timestep: float) -> Rollout:
-    """Simulate whole trials of a policy without exploration, each from a starting state of its own."""
+    """Simulate whole trials of a policy without exploration, each from its own starting state."""
     return loop(params, *loop.standing(_VALIDATION_STARTS), round(task.trial_seconds / control_timestep))

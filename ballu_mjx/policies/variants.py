@@ -1,4 +1,4 @@
-"""Simulators that policies are trained in, as records, with the names that tables, folders and figures give them."""
+"""Variants of the simulator in which policies are trained, with their names in tables, folders and figures."""
 
 from __future__ import annotations
 
@@ -6,32 +6,32 @@ import dataclasses
 
 _VANILLA = "vanilla"
 _ROUNDS = "envmimic"
-"""The residual that is learned again in each round."""
+"""Residual that is learned again in each round."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SimulatorVariant:
-    """A simulator that policies are trained in: `vanilla`, as it may be improved, or one with a residual."""
+    """A variant of the simulator in which policies are trained: vanilla, possibly improved, or with a residual."""
 
     residual: str | None = None
-    """How the residual was learned; None: there is none."""
+    """Method by which the residual was learned. None if there is no residual."""
     identified: bool = False
     """Whether a vanilla simulator has identified actuators (`+sysid`)."""
     randomized: bool = False
-    """Whether a vanilla simulator is randomized (`+dr`)."""
+    """Whether a vanilla simulator has domain randomization (`+dr`)."""
     round: int = 1
-    """In which round the residual was learned."""
+    """Number of the round in which the residual was learned, from 1."""
 
     @property
     def name(self) -> str:
-        """What the simulator is called in tables and folders."""
+        """Name of the simulator in tables and folders."""
         if self.residual is None:
             return _VANILLA + "+sysid" * self.identified + "+dr" * self.randomized
         return self.residual if self.round == 1 else f"{self.residual}-{self.round}"
 
     @staticmethod
     def parse(name: str) -> SimulatorVariant:
-        """Return the simulator that is called `name`."""
+        """Return the variant with the given name."""
         base, *improvements = name.split("+")
         if base == _VANILLA and set(improvements) <= {"sysid", "dr"}:
             return SimulatorVariant(identified="sysid" in improvements, randomized="dr" in improvements)

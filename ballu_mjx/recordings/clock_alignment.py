@@ -1,4 +1,7 @@
-"""Two clocks: at which offset a log of commands fits a recorded motion, and how sure that is. NumPy and SciPy alone."""
+"""Offset between two clocks: that of a log of commands and that of a recorded motion, with its confidence.
+
+This module needs only NumPy and SciPy.
+"""
 
 from __future__ import annotations
 
@@ -10,39 +13,42 @@ from jaxtyping import Float
 from scipy.signal import correlate, find_peaks
 
 TIMESTEP = 0.01
-"""s, of the grid on which signals are compared; offsets are interpolated between its points."""
+"""Step (s) of the grid on which signals are compared. Offsets are interpolated between grid points."""
 _PEAK_DISTANCE = 0.2
-"""s; two offsets closer than that are one."""
+"""Distance (s) below which two offsets count as the same."""
 _FILLED_GAP = 0.1
-"""s; longer gaps of the motion are left out of the comparison."""
+"""Longest gap (s) that is interpolated. Longer gaps of the motion are left out of the comparison."""
 _RESTING = 0.2
-"""A signal that moves by less of what the other does is not scaled up any further."""
+"""Smallest standard deviation by which a signal is divided, relative to that of the signal that varies most. It keeps
+signals at rest small."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Match:
-    """One offset, and how well it fits."""
+    """An offset between the clocks, and its correlation."""
 
     offset: float
-    """s, to add to the log's times for the capture's."""
+    """Time (s) to add to the log's times to get the capture's times."""
     correlation: float
-    """Over all signals, in [-1, 1]; negative where they move against the prediction."""
+    """Correlation over all signals, in [-1, 1]. Negative if they move against the prediction."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Alignment:
-    """The best offset, and the next best one that is another."""
+    """The best offset, and the next best offset that differs from it."""
 
     best: Match
     second: Match | None
-    """With the same sign; None where no other offset has a peak."""
+    """Next best offset, with a correlation of the same sign. None if no other offset has a peak."""
     overlap: float
-    """Seconds that the best is judged by."""
+    """Duration (s) of the overlap at the best offset."""
 
     @property
     def confidence(self) -> float:
-        """From 0, where the second fits as well as the best, to 1, where there is none: one less the ratio of their
-        unexplained to explained parts (r^2 / (1 - r^2))."""
+        """Return the confidence in the best offset, from 0 (the second fits as well) to 1 (there is no second).
+
+        It is 1 - q(second) / q(best), where q = r^2 / (1 - r^2) is the ratio of explained to unexplained variance.
+        """
         if self.second is None:
             return 1.0
         return 1.0 - min(_odds(self.second.correlation) / max(_odds(self.best.correlation), 1e-12), 1.0)
@@ -57,19 +63,19 @@ def align(
     within: tuple[float, float] | None = None,
     overlap: float = 0.7,
 ) -> Alignment | None:
-    """The offset of the log's clock at which `predicted` correlates best with `motion`.
+    """Return the offset of the log's clock at which `predicted` correlates best with `motion`.
 
-    Normalized cross-correlation, over all offsets at which the two overlap by `overlap` of the shorter one at least;
-    covariances and variances are summed over signals, each scaled to the same variance. The sign is free. The peak is
-    interpolated by a parabola.
+    The criterion is the normalized cross-correlation. Signals are scaled to the same variance, and their covariances
+    and variances are summed. The correlation may have either sign. A parabola interpolates the peak.
 
     **Arguments**
 
-    - `time`, `motion`: s and any unit; what moved on commands, NaN where not seen.
-    - `log_time`, `predicted`: s, on the log's clock; what should have.
-    - `within`: the offsets (s) to search. None: all with enough overlap.
+    - `time`, `motion`: times (s) and recorded signals (any unit) that respond to commands, NaN where not seen.
+    - `log_time`, `predicted`: times (s, log's clock) and the same signals as a model predicts them from the commands.
+    - `within`: smallest and largest offset (s) of the search. None for all offsets with enough overlap.
+    - `overlap`: smallest overlap, as a fraction of the shorter of the two.
 
-    **Returns** None where nothing moves, or no offset in question leaves enough overlap.
+    **Returns** None if nothing moves, or if no offset of the search leaves enough overlap.
     """
     x, seen = _on_grid(time, motion)
     y, known = _on_grid(log_time, predicted)
@@ -108,7 +114,7 @@ def align(
 
 
 def _match(lags: Float[np.ndarray, " L"], correlation: Float[np.ndarray, " L"], peak: int) -> Match:
-    """The peak between grid points."""
+    """Return the offset and correlation of a peak, with the offset interpolated between grid points."""
     shift = 0.0
     if 0 < peak < len(lags) - 1:
         before, here, after = correlation[peak - 1 : peak + 2]
@@ -119,6 +125,7 @@ def _match(lags: Float[np.ndarray, " L"], correlation: Float[np.ndarray, " L"], 
 
 
 def _odds(correlation: float) -> float:
+    """Return the ratio of explained to unexplained variance."""
     return correlation**2 / max(1.0 - correlation**2, 1e-9)
 
 
@@ -129,7 +136,7 @@ def _correlate(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " m"]) -> Float[
 def _on_grid(
     time: Float[np.ndarray, " T"], values: Float[np.ndarray, "T signals"]
 ) -> tuple[Float[np.ndarray, "n signals"], Float[np.ndarray, "n signals"]]:
-    """Values every `TIMESTEP` from the first time on, and 1 where they are known, else 0."""
+    """Return values every `TIMESTEP` from the first time on, and a mask: 1 where they are known, else 0."""
     grid = time[0] + TIMESTEP * np.arange(int((time[-1] - time[0]) / TIMESTEP + 1e-6) + 1)
     columns, known = np.zeros((len(grid), values.shape[1])), np.zeros((len(grid), values.shape[1]))
     for signal, column in enumerate(values.T):
@@ -147,7 +154,7 @@ def _on_grid(
 def _scaled(
     values: Float[np.ndarray, "n signals"], known: Float[np.ndarray, "n signals"]
 ) -> Float[np.ndarray, "n signals"]:
-    """Values with mean 0 and variance 1 where they are known, else 0; one that rests beside another stays small."""
+    """Return values with mean 0 and variance 1 where they are known, else 0. Signals at rest stay small."""
     count = np.maximum(known.sum(axis=0), 1.0)
     centred = (values - (values * known).sum(axis=0) / count) * known
     deviation = np.sqrt((centred**2).sum(axis=0) / count)

@@ -1,4 +1,4 @@
-"""Closed loops of a model, as measurements: `connect` and `joint` equalities."""
+"""Closed loops of a model (`connect` and `joint` equalities) as measurements."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 End = tuple[int, Float[np.ndarray, " 3"]]
+"""Body id, and a position (m) in the body's frame."""
 
 
 def closed_loops(model: mujoco.MjModel) -> list[tuple[End, End]]:
-    """Pairs of points that `connect` equalities hold together: bodies, and places in their frames."""
+    """Return the pairs of points that active `connect` equalities hold together."""
     loops = []
     for number in np.flatnonzero(model.eq_active0):
         if model.eq_type[number] != mujoco.mjtEq.mjEQ_CONNECT:
@@ -28,29 +29,36 @@ def closed_loops(model: mujoco.MjModel) -> list[tuple[End, End]]:
 
 @dataclasses.dataclass(frozen=True)
 class Coupling:
-    """A `joint` equality: one joint's deviation from its reference is a polynomial of another's (or constant)."""
+    """A `joint` equality. One joint's deviation from its reference is a polynomial of another's, or constant."""
 
     address: int
+    """Address of the first joint in qpos."""
     dof: int
+    """Address of the first joint in qvel."""
     reference: float
+    """Reference position (rad or m) of the first joint."""
     other: tuple[int, int, float] | None
+    """Address, dof and reference of the other joint. None if the first joint is constant."""
     coefficients: Float[np.ndarray, " 5"]
+    """Coefficients of the polynomial, the constant first."""
 
     def misfit(
         self, qpos: Float[np.ndarray, "N nq"], nv: int
     ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N nv"]]:
-        slope = np.zeros((len(qpos), nv))
-        slope[:, self.dof] = 1.0
+        """Return the error (rad or m) of the equality in N poses, and its Jacobian."""
+        jacobian = np.zeros((len(qpos), nv))
+        jacobian[:, self.dof] = 1.0
         polynomial = np.polynomial.Polynomial(self.coefficients)
         if self.other is None:
-            return qpos[:, self.address] - self.reference - self.coefficients[0], slope
+            return qpos[:, self.address] - self.reference - self.coefficients[0], jacobian
         address, dof, reference = self.other
         moved = qpos[:, address] - reference
-        slope[:, dof] = -polynomial.deriv()(moved)
-        return qpos[:, self.address] - self.reference - polynomial(moved), slope
+        jacobian[:, dof] = -polynomial.deriv()(moved)
+        return qpos[:, self.address] - self.reference - polynomial(moved), jacobian
 
 
 def joint_couplings(model: mujoco.MjModel) -> list[Coupling]:
+    """Return the active `joint` equalities of a model."""
     found = []
     for number in np.flatnonzero(model.eq_active0):
         if model.eq_type[number] != mujoco.mjtEq.mjEQ_JOINT:

@@ -1,4 +1,4 @@
-"""Recordings as files, format `ballu-recording/1`: a CSV with a row a sample, and a JSON description beside it."""
+"""Recording files, format `ballu-recording/1`: a CSV with one row per sample, and a JSON description beside it."""
 
 from __future__ import annotations
 
@@ -39,13 +39,14 @@ _COMMAND_DECIMALS = 4
 
 
 def read_recording(path: Path | str, robot: RobotDescription) -> Recording:
-    """Read, validate and fill in the recording of `robot` at `path`, a `.csv` or `.csv.gz` with its `.json` beside it.
+    """Read the recording of `robot` at `path`, validate it, and fill its gaps.
 
-    Gaps of up to 0.5 s are interpolated, linearly or, for orientations, along the shortest rotation. A pose that
-    repeats to the last digit is a gap too: streaming clients hold what they do not see.
+    `path` is a `.csv` or `.csv.gz` file with its `.json` description beside it. Gaps of up to 0.5 s are interpolated
+    linearly, orientations along the shortest rotation. A pose that repeats to the last digit is a gap too, since
+    streaming clients repeat the last pose of a body that they do not see.
 
-    **Raises** `InputError` at the first fault found, with file, column, row (as a spreadsheet counts them, the header
-    being row 1) and fix.
+    **Raises** `InputError` for the first fault found, with file, column, row and fix. The header is row 1, as in a
+    spreadsheet.
     """
     path = Path(path)
     description, known = sidecar_path(path), column_groups(robot)
@@ -83,14 +84,20 @@ def read_recording(path: Path | str, robot: RobotDescription) -> Recording:
 
 
 def write_recording(recording: Recording, path: Path | str, robot: RobotDescription, *, decimals: int = 5) -> None:
-    """Write `recording` of `robot` to `path` (`.csv`, or `.csv.gz`: compressed) and its description to the `.json`
-    beside it.
+    """Write `recording` of `robot` to `path`, and its description to a `.json` file beside it.
 
-    Positions and angles get `decimals`, quaternions one fewer, commands 4 behind their range's first digit (at least
-    4), time 3 to 6, as it needs; NaN becomes an empty cell. The same recording always gives the same bytes (compressed
-    ones: with the same zlib).
+    `path` ends in `.csv`, or in `.csv.gz` for a compressed file. Numbers of decimals are:
 
-    **Raises** `ValueError` for infinite values or shapes that do not fit; `InputError` for another ending of `path`.
+    - positions and angles: `decimals`;
+    - quaternions: one fewer;
+    - commands: 4 after the first digit of the width of their range, and at least 4;
+    - time: 3 to 6, as few as represent it exactly.
+
+    NaN becomes an empty cell. The same recording always gives the same bytes. Those of compressed files also depend on
+    the version of zlib.
+
+    **Raises** `ValueError` for infinite values or shapes that do not fit. **Raises** `InputError` for another ending of
+    `path`.
     """
     path = Path(path)
     description = sidecar_path(path)
@@ -103,7 +110,7 @@ def write_recording(recording: Recording, path: Path | str, robot: RobotDescript
             continue
         value = np.asarray(value, float).reshape(length, len(group.names))
         if np.isinf(value).any():
-            raise ValueError(f"{', '.join(group.names)}: infinite somewhere")
+            raise ValueError(f"{', '.join(group.names)}: a value is infinite")
         if group.quantity == "time":
             places = [_time_decimals(value)]
         elif group.quantity == "command":
@@ -125,19 +132,19 @@ def write_recording(recording: Recording, path: Path | str, robot: RobotDescript
 
 
 def list_recordings(paths: Iterable[Path | str]) -> list[Path]:
-    """The recordings that `paths` name, each a CSV or a folder of them (sorted by name), every one once.
+    """Return the recordings in `paths`, each once. A path is a recording or a folder of recordings (sorted by name).
 
-    **Raises** `InputError` for a path that is missing, is no recording, or is a folder without any.
+    **Raises** `InputError` for a path that does not exist, is not a recording, or is a folder without recordings.
     """
     found: dict[Path, Path] = {}
     for path in map(Path, paths):
         if path.is_dir():
             inside = sorted(p for p in path.iterdir() if p.name.endswith(_ENDINGS) and not p.name.startswith("."))
             if not inside:
-                raise InputError(f"{path}: the folder holds no recording (.csv or .csv.gz); name one that does.")
+                raise InputError(f"{path}: the folder holds no recording (.csv or .csv.gz); give a folder that does.")
             twice = [b for a, b in zip(inside, inside[1:], strict=False) if recording_name(a) == recording_name(b)]
             if twice:
-                raise InputError(f"{twice[0]}: stands there a second time, without .gz; delete one of the two.")
+                raise InputError(f"{twice[0]}: the same recording exists without .gz; delete one of the two files.")
         elif path.exists():
             sidecar_path(path)
             inside = [path]
@@ -149,41 +156,43 @@ def list_recordings(paths: Iterable[Path | str]) -> list[Path]:
 
 
 def list_bundled(split: Split) -> list[Path]:
-    """The recordings that come with the package, sorted by name."""
+    """Return the recordings of a bundled set, sorted by name."""
     return list_recordings([assets() / "recordings" / split])
 
 
 def check_new(path: Path) -> None:
-    """Refuse a name that is none of a recording's, or taken, and a folder that cannot be written to.
+    """Check that a new recording can be written to `path`.
 
-    **Raises** `InputError` with the fix."""
+    **Raises** `InputError` with the fix if `path` is not the name of a recording, if it exists, or if its folder cannot
+    be written to.
+    """
     for each in (path, sidecar_path(path)):
         if each.exists():
-            raise InputError(f"{each}: stands there already; delete it, or give another --output.")
+            raise InputError(f"{each}: exists already; delete it, or give another --output.")
     files.check_folder(path.parent)
 
 
 def recording_name(path: Path) -> str:
-    """The name of the recording in a file: the file's, without its ending."""
+    """Return the name of the recording in a file, which is the file's name without its ending."""
     return path.name.removesuffix(".gz").removesuffix(".csv")
 
 
 def sidecar_path(path: Path) -> Path:
-    """Where the description of the recording in `path` stands.
+    """Return the path of the description of the recording in `path`.
 
-    **Raises** `InputError` where that is not a recording's name.
+    **Raises** `InputError` if `path` is not the name of a recording.
     """
     if not path.name.endswith(_ENDINGS) or not recording_name(path):
-        raise InputError(f"{path}: not a recording's name; it must end in .csv or .csv.gz.")
+        raise InputError(f"{path}: not the name of a recording; it must end in .csv or .csv.gz.")
     return path.with_name(recording_name(path) + ".json")
 
 
 def _read_description(path: Path) -> tuple[Kind, str, str]:
-    """Kind, robot and notes."""
+    """Read a description, and return kind, robot and notes."""
     example = f'{{"format": "{RECORDING_FORMAT}", "kind": "free", "robot": "...", "notes": "..."}}'
     if not path.is_file():
-        refuse_recording(path, "there is no description beside the recording", f"write one such as {example}")
-    keys = files.read_json(path, f"write it such as {example}")
+        refuse_recording(path, "there is no description beside the recording", f"write one like {example}")
+    keys = files.read_json(path, f"write it like {example}")
     if keys.get("format") != RECORDING_FORMAT:
         refuse_recording(
             path,
@@ -194,7 +203,7 @@ def _read_description(path: Path) -> tuple[Kind, str, str]:
     if kind not in ("free", "suspended"):
         refuse_recording(path, f'"kind" is {_quote(keys, "kind")}', 'write "free", or "suspended" if the root is held')
     if not isinstance(made_by, str) or not made_by.strip():
-        refuse_recording(path, f'"robot" is {_quote(keys, "robot")}', "write which robot was recorded, as text")
+        refuse_recording(path, f'"robot" is {_quote(keys, "robot")}', "write the name of the recorded robot, as text")
     if not isinstance(notes, str):
         refuse_recording(path, f'"notes" is {_quote(keys, "notes")}', "write text there")
     return kind, made_by, notes
@@ -208,7 +217,7 @@ def _quote(keys: dict, key: str) -> str:
 
 
 def _read_columns(path: Path, groups: Sequence[ColumnGroup]) -> dict[str, Column]:
-    """The CSV's columns by name, missing samples as NaN."""
+    """Read the CSV's columns by name, with NaN for missing samples."""
     text = files.read_text(path)
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     values = array.array("d")
@@ -220,7 +229,7 @@ def _read_columns(path: Path, groups: Sequence[ColumnGroup]) -> dict[str, Column
                 header = _check_header(path, groups, [name.strip() for name in cells])
                 continue
             if not any(map(str.strip, cells)):
-                blank += 1  # Blank lines at the end are no fault; one further up lacks its time.
+                blank += 1  # Blank lines are allowed only at the end of the file.
                 continue
             if blank:
                 refuse_recording(path, "the row is blank", "delete it or fill it in", column="time", row=rows)
@@ -241,7 +250,7 @@ def _check_header(path: Path, groups: Sequence[ColumnGroup], header: list[str]) 
     known = [name for group in groups for name in group.names]
     if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
         refuse_recording(
-            path, "the header has no commas", "save it with commas between cells and points in numbers", row=-1
+            path, "the header has no commas", "save it with commas between cells and decimal points in numbers", row=-1
         )
     foreign = sum(name not in known for name in header) > 1
     for i, name in enumerate(header):
@@ -250,7 +259,7 @@ def _check_header(path: Path, groups: Sequence[ColumnGroup], header: list[str]) 
             fix = (
                 f"rename it to {close[0]} or delete it"
                 if close
-                else "the robot's description does not have it, delete it"
+                else "delete it, since the robot's description does not have it"
             )
             if foreign:
                 fix += ", or give the recording's own robot (--robot)"
@@ -258,7 +267,7 @@ def _check_header(path: Path, groups: Sequence[ColumnGroup], header: list[str]) 
                 path, "unknown column", fix, column=_shorten(name) if name else f"{i + 1} (no name)", row=-1
             )
         if name in header[:i]:
-            refuse_recording(path, "the column stands there twice", "delete one", column=name, row=-1)
+            refuse_recording(path, "the column appears twice", "delete one", column=name, row=-1)
     return header
 
 
@@ -269,7 +278,11 @@ def _parse_row(path: Path, header: list[str], cells: list[str], row: int) -> lis
     if any(cell.strip() for cell in cells[len(header) :]):
         name = f"{len(header) + 1} (no name)"
         refuse_recording(
-            path, "the row has more cells than the header", "write points in numbers, not commas", column=name, row=row
+            path,
+            "the row has more cells than the header",
+            "write decimal points in numbers, not commas",
+            column=name,
+            row=row,
         )
     numbers = []
     for name, cell in zip(header, cells, strict=False):
@@ -311,7 +324,7 @@ def _time_decimals(time: np.ndarray) -> int:
 def _fill(
     columns: dict[str, Column], groups: Sequence[ColumnGroup], rows: slice
 ) -> tuple[dict[ColumnGroup, Float[np.ndarray, "_ _"]], dict[str, int]]:
-    """Groups without gaps over `rows`, and the number of samples filled in by column."""
+    """Fill gaps. Return the values of each group in `rows`, and the number of interpolated samples by column."""
     time = columns["time"]
     values: dict[ColumnGroup, np.ndarray] = {}
     interpolated: dict[str, int] = {}
@@ -335,7 +348,10 @@ def _fill(
 def _fill_quaternions(
     time: Column, quaternion: Float[np.ndarray, "T 4"], seen: Bool[np.ndarray, " T"]
 ) -> Float[np.ndarray, "T 4"]:
-    """Unit quaternions (w, x, y, z) without gaps between the first and last seen, continuous in sign, first w >= 0."""
+    """Return unit quaternions (w, x, y, z), interpolated between the first and the last sample seen.
+
+    Signs do not jump, and the first w is not negative.
+    """
     known = np.flatnonzero(seen)
     inside = ~seen & (np.arange(len(time)) >= known[0]) & (np.arange(len(time)) <= known[-1])
     quaternion = quaternion.copy()

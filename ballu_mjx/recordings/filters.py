@@ -1,4 +1,4 @@
-"""Resampling, held commands, and Savitzky-Golay filters of places and rotations."""
+"""Resampling, means of held commands, and Savitzky-Golay filters of positions and rotations."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from ballu_mjx.recordings.recording import Recording
 def interpolate(
     grid: Float[np.ndarray, " T"], time: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples ..."]
 ) -> Float[np.ndarray, "T ..."]:
-    """Samples at `time` (s), linearly at the times of `grid`."""
+    """Return `values`, sampled at `time` (s), interpolated linearly at the times in `grid` (s)."""
     columns = [np.interp(grid, time, column) for column in values.reshape(len(time), -1).T]
     return np.stack(columns, axis=-1).reshape(len(grid), *values.shape[1:])
 
 
 def control_grid(recording: Recording, control_timestep: float) -> tuple[int, Float[np.ndarray, " T"]]:
-    """Return how many samples make a control step (s), and uniform times (s from the recording's start) at that rate,
-    which is about the recording's own.
+    """Return the number of samples per control step, and uniform sample times (s from the recording's start).
 
-    **Raises** `ValueError` for a recording of less than two control steps.
+    The sample rate is close to the recording's own. There are at least two samples per control step.
+
+    **Raises** `ValueError` for a recording shorter than two control steps.
     """
     time = recording.time - recording.time[0]
     control_steps = int(np.floor(time[-1] / control_timestep + 1e-6))
@@ -34,22 +35,25 @@ def control_grid(recording: Recording, control_timestep: float) -> tuple[int, Fl
 
 
 def mean_command(recording: Recording, edges: Float[np.ndarray, " edges"]) -> Float[np.ndarray, "intervals commands"]:
-    """Mean of the held commands between neighbouring `edges` (s from the recording's start)."""
+    """Return the mean of the held commands between neighbouring `edges` (s from the recording's start)."""
     time = recording.time - recording.time[0]
     integral = np.cumsum(np.diff(time)[:, None] * recording.command[:-1], axis=0)
     integral = np.concatenate([np.zeros((1, integral.shape[1])), integral])
     at_edges = np.stack([np.interp(edges, time, column) for column in integral.T], axis=-1)
     mean = np.diff(at_edges, axis=0) / np.diff(edges)[:, None]
-    return np.clip(mean, recording.command.min(axis=0), recording.command.max(axis=0))  # rounding
+    return np.clip(mean, recording.command.min(axis=0), recording.command.max(axis=0))  # Rounding can exceed the range.
 
 
 def odd_window(width: float, step: float, order: int, count: int) -> int:
-    """Odd number of samples nearest to `width` (s), enough for the polynomial and within the recording."""
+    """Return the odd number of samples nearest to `width` (s), at most `count`, but always above `order`."""
     return max(order + 1 + order % 2, min(2 * round((width / step - 1) / 2) + 1, (count - 1) // 2 * 2 + 1))
 
 
 def savitzky_golay(values: np.ndarray, width: float, step: float, order: int, derivative: int) -> np.ndarray:
-    """Savitzky-Golay smoothing (or a derivative) along the first axis; centred, so that nothing lags."""
+    """Return values smoothed along the first axis by a Savitzky-Golay filter, or a derivative of them.
+
+    The filter has the given `width` (s) and is centred, so it adds no lag. Samples are `step` (s) apart.
+    """
     window = odd_window(width, step, order, len(values))
     return np.asarray(savgol_filter(values, window, order, deriv=derivative, delta=step, axis=0))
 
@@ -57,8 +61,8 @@ def savitzky_golay(values: np.ndarray, width: float, step: float, order: int, de
 def smooth_rotation(
     quaternion: Float[np.ndarray, "T 4"], width: float, step: float, order: int
 ) -> tuple[Float[np.ndarray, "T 4"], Float[np.ndarray, "T 3"]]:
-    """Smoothed quaternions, not of unit length, and the angular velocity (rad/s) in the body's frame."""
-    # Components of a quaternion are as smooth as the motion; the norm is restored after, and drops out of the rate.
+    """Return smoothed quaternions, not of unit length, and the angular velocity (rad/s, body frame)."""
+    # The components are as smooth as the motion. Their norm cancels in the angular velocity; callers normalize it.
     rate = savitzky_golay(quaternion, width, step, order, 1)
     quaternion = savitzky_golay(quaternion, width, step, order, 0)
     w, v, w_rate, v_rate = quaternion[:, :1], quaternion[:, 1:], rate[:, :1], rate[:, 1:]
@@ -67,6 +71,6 @@ def smooth_rotation(
 
 
 def sign_continuous(quaternion: Float[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 4"]:
-    """The same orientations without jumps to the opposite sign."""
+    """Return the same orientations without jumps of a quaternion to its negative."""
     flips = np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0
     return quaternion * np.concatenate([[1.0], np.cumprod(np.where(flips, -1.0, 1.0))])[:, None]

@@ -1,15 +1,15 @@
-"""Groups that recordings are reported in."""
+"""Groups in which recordings are reported."""
 
 from __future__ import annotations
 
 OTHER = "other"
-"""The group of recordings whose name has no prefix."""
+"""Group of recordings without a prefix in their name."""
 
 
 def group_of(name: str) -> str:
-    """Return the group that a recording is reported in: what stands before the first hyphen of its name.
+    """Return a recording's group, which is the part of its name before the first hyphen.
 
-    `near-3` is of the group `near`; `policy`, without a hyphen, of the group `other`.
+    `near-3` belongs to the group `near`. `policy` has no hyphen and belongs to the group `other`.
     """
     prefix, hyphen, _ = name.partition("-")
     return prefix if prefix and hyphen else OTHER

@@ -1,4 +1,4 @@
-"""What a robot's adapter adds to the recording stage: hooks for what no general code can know of its recordings."""
+"""Hooks by which a robot's adapter extends the recording stage with knowledge of this robot's recordings."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 
 class RecordingHooks:
-    """The general answers. An adapter of a robot with specialities derives from this beside `RobotAdapter`."""
+    """Default hooks. An adapter that changes some of them derives from this class and from `RobotAdapter`."""
 
     def check_recording(self, path: Path, recording: Recording) -> None:
-        """Check what only this robot's recordings must satisfy.
+        """Check conditions that only this robot's recordings must satisfy.
 
-        **Raises** `InputError` naming file, column, row and fix (`validation.refuse_recording`).
+        **Raises** `InputError` that names file, column, row and fix (`validation.refuse_recording`).
         """
         del path, recording
 
@@ -32,11 +32,11 @@ class RecordingHooks:
 
     @property
     def completed_joints(self) -> tuple[str, ...]:
-        """Return the joints that `complete_joints` finds where nothing that is measured shows them."""
+        """Return the joints that `complete_joints` infers. No measurement needs to show them."""
         return ()
 
     def complete_positions(self, fit: KinematicFit) -> KinematicFit:
-        """Return a fit that agrees with more than single samples' measurements, before it is smoothed."""
+        """Return a fit that uses more than the measurements of single samples. Smoothing follows."""
         return fit
 
     def complete_joints(
@@ -46,7 +46,7 @@ class RecordingHooks:
         qpos: Float[np.ndarray, "T nq"],
         qvel: Float[np.ndarray, "T nv"],
     ) -> tuple[Float[np.ndarray, "T nq"], Float[np.ndarray, "T nv"]]:
-        """Return smoothed states with the joints filled in that follow from the commands."""
+        """Return smoothed states in which joints that follow from the commands are filled in."""
         del model, grid
         return qpos, qvel
 
@@ -54,26 +54,29 @@ class RecordingHooks:
 
     @property
     def origin(self) -> str | None:
-        """Return the site that imported recordings start above the origin with; None: the tracked one."""
+        """Return the site that is above the origin when an imported recording starts. None for the tracked site."""
         return None
 
     @property
     def floors(self) -> Mapping[str, Mapping[str, float]]:
-        """Return ways to find the floor, by the name that mapping files give: sites, and how high (m) each is above
-        the floor when it touches it."""
+        """Return ways to locate the floor, by their name in mapping files.
+
+        Each way lists sites, with the height (m) of each above the floor while it touches the floor.
+        """
         return {}
 
     def response(
         self, recording: Recording, time: Float[np.ndarray, " N"], command: Float[np.ndarray, "N commands"]
     ) -> tuple[Float[np.ndarray, "T signals"], Float[np.ndarray, " n"], Float[np.ndarray, "n signals"]] | None:
-        """Return recorded signals that commands move, and, with their times (s), the same as a model predicts them for
-        `command` sent at `time` (s): what the offset between two clocks is found by.
+        """Return recorded and predicted signals that respond to commands, to find the offset between two clocks.
 
-        None where this robot has no such model, or the recording no such signal.
+        `command` was sent at `time` (s, log's clock). The result consists of the recorded signals at the recording's
+        times, the times (s, log's clock) of the prediction, and the same signals as a model predicts them. It is None
+        if the robot has no model of these signals, or if the recording lacks them.
         """
         del recording, time, command
 
 
 def hooks_of(robot: RobotDescription) -> RecordingHooks:
-    """Return the hooks of a robot's adapter, or the general ones."""
+    """Return the hooks of a robot's adapter, or the default hooks."""
     return robot.adapter if isinstance(robot.adapter, RecordingHooks) else RecordingHooks()

@@ -1,6 +1,7 @@
-"""Inverse kinematics: a recording's poses, checked for joints that nothing shows and for measurements that fit no pose.
+"""Inverse kinematics: poses that fit a recording's measurements, and checks of the fit.
 
-`posture_search` finds where `pose_solver` begins, which fits the poses to the measurements.
+`posture_search` finds starting poses, from which `pose_solver` fits poses to the measurements. The checks refuse joints
+that no measurement shows, and measurements that fit no pose.
 """
 
 from __future__ import annotations
@@ -20,26 +21,29 @@ from ballu_mjx.recordings.posture_search import PostureSearch
 from ballu_mjx.robots.description import RobotDescription
 
 _WORST_FIT = 0.05
-"""RMS distance (m) between measured and fitted places beyond which the recording is not of this model."""
+"""Largest RMS distance (m) between measured and fitted positions. Above it, the recording does not fit the model."""
 _UNSEEN = 1e-9
-"""Of the best seen direction's information: what a direction shows that no measurement sees."""
+"""Information about a direction of motion, relative to the best seen direction, below which no measurement shows it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KinematicFit:
-    """Generalized positions of all samples that fit what was measured."""
+    """Generalized positions of all samples, fitted to the measurements."""
 
     problem: KinematicProblem
     qpos: Float[np.ndarray, "T nq"]
     information: Float[np.ndarray, "T nv nv"]
-    """Inverse covariance by each sample's measurements, Gauss-Newton."""
+    """Inverse covariance of each sample from its measurements and the prior, in the Gauss-Newton approximation."""
     uncertainty: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """What an adapter states about its own part of the fit, by name."""
+    """Uncertainties that the robot's adapter reports for its part of the fit, by name."""
 
     def refit(
         self, site: str, quaternion: Float[np.ndarray, "T 4"], weight: Float[np.ndarray, " 3"], **uncertainty: float
     ) -> KinematicFit:
-        """Return the fit with an orientation of a site's body held, with a weight (1/rad) about each of its axes."""
+        """Return the fit with one more measurement, the orientation of a site's body.
+
+        `weight` (1/rad) applies about each of the body's axes. `uncertainty` is added to the fit's.
+        """
         orientations = {**self.problem.orientations, site: (quaternion, weight)}
         problem = dataclasses.replace(self.problem, orientations=orientations)
         solver = PoseSolver(problem)
@@ -55,9 +59,9 @@ def solve_inverse_kinematics(
     parameters: ReconstructionParameters,
     name: str,
 ) -> tuple[KinematicFit, dict[str, float]]:
-    """Return generalized positions that fit the measurements, and the RMS distance (mm) that is left, by site.
+    """Return generalized positions that fit the measurements, and the remaining RMS distance (mm) by site.
 
-    **Raises** `InputError`, with the recording's `name`, where a joint is not seen, or measurements fit no pose.
+    **Raises** `InputError`, with the recording's `name`, if no measurement shows a joint or they fit no pose.
     """
     weight = np.full(3, 1.0 / parameters.rotation_noise)
     orientations = {site: (quaternion, weight) for site, quaternion in grid.orientations.items()}
@@ -70,14 +74,14 @@ def solve_inverse_kinematics(
     worst = max(distance, key=lambda site: distance[site])
     if distance[worst] > 1e3 * _WORST_FIT:
         raise InputError(
-            f"{name}: {worst} is {distance[worst]:.0f} mm (RMS) from where the model can have it; measure places at "
-            f"the sites of {robot.model.name}, in its frame."
+            f"{name}: the recorded {worst} is {distance[worst]:.0f} mm (RMS) from the model's best fit; measure "
+            f"positions at the sites of {robot.model.name}, in its frame."
         )
     return hooks_of(robot).complete_positions(fit), distance
 
 
 def site_distances(fit: KinematicFit) -> dict[str, float]:
-    """Return the RMS distance (mm) between measured and fitted places, by site."""
+    """Return the RMS distance (mm) between measured and fitted positions, by site."""
     solver = PoseSolver(fit.problem)
     points = solver.tree.pose(fit.qpos).points
     places = fit.problem.grid.positions
@@ -88,7 +92,10 @@ def site_distances(fit: KinematicFit) -> dict[str, float]:
 
 
 def _check_seen(solver: PoseSolver, fit: KinematicFit, name: str) -> None:
-    """**Raises** `InputError` naming the joint that most samples leave open, each taken alone."""
+    """Check that single samples determine all joints that the adapter does not complete.
+
+    **Raises** `InputError` naming the joint that the median sample determines least.
+    """
     model, robot = fit.problem.model, fit.problem.robot
     completed = [model.joint(joint).dofadr[0] for joint in hooks_of(robot).completed_joints]
     kept = np.setdiff1d(np.arange(model.nv), completed)

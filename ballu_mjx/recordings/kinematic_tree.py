@@ -1,4 +1,4 @@
-"""Forward kinematics and Jacobians of many poses at once, in NumPy and double precision: as MuJoCo has them."""
+"""Forward kinematics and Jacobians of many poses at once, in NumPy and double precision, with MuJoCo's conventions."""
 
 from __future__ import annotations
 
@@ -16,25 +16,29 @@ _JOINT = mujoco.mjtJoint
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Poses:
-    """Places of a tree's points, orientations of its bodies and lines of its joints, in N poses; world frame."""
+    """Positions of a tree's points, orientations of its bodies, and axes of its joints, for N poses (world frame)."""
 
     points: tuple[Float[np.ndarray, "N 3"], ...]
-    """m."""
+    """Positions of the points (m)."""
     rotations: tuple[Float[np.ndarray, "N 3 3"], ...]
-    """Bodies' axes in the columns."""
+    """Rotation matrices of the bodies. Their columns are the bodies' axes."""
     axes: Float[np.ndarray, "N nv 3"]
-    """Unit vectors along slides and about hinges."""
+    """Unit vector of each degree of freedom: direction of a translation, or axis of a rotation."""
     anchors: Float[np.ndarray, "N nv 3"]
-    """m, points on these lines."""
+    """Point (m) on each of these axes."""
 
 
 class KinematicTree:
-    """The part of a model that moves some points and bodies: one free joint at the root or none, hinges and slides."""
+    """Part of a model that moves given points and bodies: hinges, slides, and at most one free joint at the root."""
 
     def __init__(
         self, model: mujoco.MjModel, points: Sequence[tuple[int, Float[np.ndarray, " 3"]]], bodies: Sequence[int]
     ) -> None:
-        """Take bodies with the places (m) of points in their frames, and bodies whose orientation is asked for."""
+        """Select the points and bodies.
+
+        `points`: body id and position (m) in the body's frame of each point. `bodies`: ids of the bodies whose
+        orientation is needed.
+        """
         self.model = model
         self.points = [(body, np.array(place, float)) for body, place in points]
         self.bodies = list(bodies)
@@ -43,9 +47,9 @@ class KinematicTree:
         self.point_dofs = [self._dofs(lineages[body]) for body, _ in points]
         """Degrees of freedom that move each point."""
         self.body_dofs = [self._dofs(lineages[body]) for body in bodies]
-        """Degrees of freedom that turn or shift each body."""
+        """Degrees of freedom that rotate or translate each body."""
         self.rotates = np.ones(model.nv, bool)
-        """Degrees of freedom in radians; the others are in metres."""
+        """Mask of the degrees of freedom in radians. The others are in metres."""
         for joint, kind in enumerate(model.jnt_type):
             first = model.jnt_dofadr[joint]
             if kind == _JOINT.mjJNT_FREE:
@@ -54,7 +58,7 @@ class KinematicTree:
                 self.rotates[first] = False
 
     def _lineage(self, body: int) -> list[int]:
-        """`body` and its ancestors, without the world."""
+        """Return `body` and its ancestors, without the world body."""
         found = []
         while body:
             found.append(int(body))
@@ -66,7 +70,7 @@ class KinematicTree:
         return np.array(sorted(d for body in bodies for d in range(first[body], first[body] + count[body])), int)
 
     def pose(self, qpos: Float[np.ndarray, "N nq"]) -> Poses:
-        """Return places, orientations and joint lines; quaternions in `qpos` have unit length."""
+        """Return the kinematics of poses. Quaternions in `qpos` must have unit length."""
         model, count = self.model, len(qpos)
         positions = {0: np.zeros((count, 3))}
         rotations = {0: np.broadcast_to(np.eye(3), (count, 3, 3))}
@@ -99,7 +103,7 @@ class KinematicTree:
         return Poses(points, tuple(rotations[body] for body in self.bodies), axes, anchors)
 
     def point_jacobian(self, poses: Poses, point: int) -> Float[np.ndarray, "N 3 nv"]:
-        """Return how a point moves with each degree of freedom."""
+        """Return the Jacobian of a point's position (world frame) with respect to generalized velocities."""
         dofs = self.point_dofs[point]
         axes = poses.axes[:, dofs]
         arms = poses.points[point][:, None] - poses.anchors[:, dofs]
@@ -111,7 +115,7 @@ class KinematicTree:
         return jacobian
 
     def turn_jacobian(self, poses: Poses, number: int) -> Float[np.ndarray, "N 3 nv"]:
-        """Return how the body of that number turns (rotation vectors in the world) with each degree of freedom."""
+        """Return the rotational Jacobian of body `number` of `bodies` (rotation vectors in the world frame)."""
         dofs = self.body_dofs[number]
         dofs = dofs[self.rotates[dofs]]
         jacobian = np.zeros((len(poses.axes), 3, self.model.nv))
@@ -119,7 +123,7 @@ class KinematicTree:
         return jacobian
 
     def move(self, qpos: Float[np.ndarray, "N nq"], step: Float[np.ndarray, "N nv"]) -> Float[np.ndarray, "N nq"]:
-        """Return `qpos` moved along generalized velocities, as `mj_integratePos` does."""
+        """Return `qpos` after a displacement `step` along generalized velocities, as `mj_integratePos` does."""
         if self.model.jnt_type[0] != _JOINT.mjJNT_FREE:
             return qpos + step
         moved = np.concatenate([qpos[:, :3] + step[:, :3], qpos[:, 3:7], qpos[:, 7:] + step[:, 6:]], axis=1)

@@ -1,4 +1,4 @@
-"""A recording as simulator states at the control rate, and the noise and filters of its reconstruction."""
+"""Recordings as simulator states at the control rate (motions), and the parameters of their reconstruction."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from jaxtyping import Float
 
 @dataclasses.dataclass(frozen=True)
 class ReconstructionParameters:
-    """Noise that weighs the measurements, and widths of the filters.
+    """Measurement noise, which weighs the measurements, and widths of the filters.
 
-    The widths were chosen on noisy recordings of the nominal BALLU by how far a simulator, started from the states
-    found, goes astray (`benchmarks/inverse_kinematics.py`). Errors of velocity cost far more than those of position.
+    The widths were chosen on noisy recordings of the nominal BALLU (`benchmarks/inverse_kinematics.py`). The
+    criterion was the error of a simulation that starts from the reconstructed states. Velocity errors harm it far more
+    than position errors.
     """
 
     position_noise: float = 5e-4
@@ -22,58 +23,61 @@ class ReconstructionParameters:
     rotation_noise: float = float(np.deg2rad(0.3))
     """Standard deviation (rad) of a measured orientation, per axis."""
     joint_noise: float = float(np.deg2rad(0.3))
-    """Standard deviation of a measured joint angle (rad; of a slide, m)."""
+    """Standard deviation of a measured joint angle (rad), or of a slide's displacement (m)."""
     position_window: float = 0.09
-    """Width (s) of the Savitzky-Golay filter for the root's place and all joints."""
+    """Width (s) of the Savitzky-Golay filter of the root's position and of all joints."""
     rate_window: float = 0.19
-    """The same for their velocities. One width for the root and all joints, so that a point in contact with the ground
-    has a velocity of 0. A narrower filter follows sudden stops better, but noise in a velocity does more harm."""
+    """Width (s) of the filter of their velocities. The root and all joints share it, so that a point in contact with
+    the ground has zero velocity. A narrower filter follows sudden stops better, but velocity noise does more harm."""
     rotation_window: float = 0.31
-    """The same for the tracked body's orientation and its rate."""
+    """Width (s) of the filter of the tracked body's orientation and angular velocity."""
     order: int = 3
-    """Order of the filters' polynomials."""
+    """Polynomial order of the filters."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MeasurementGrid:
-    """A free recording at uniform times from 0, `step` (s) apart; `samples_per_step` of them to a control step."""
+    """Measurements of a free recording at uniform times from 0."""
 
     step: float
+    """Time (s) between samples."""
     samples_per_step: int
+    """Number of samples per control step."""
     command: Float[np.ndarray, "T commands"]
-    """Mean of the held commands until the next sample."""
+    """Mean of the held commands until the next sample, in the actuators' units."""
     positions: Mapping[str, Float[np.ndarray, "T 3"]]
-    """m, by site, the tracked one first."""
+    """Positions (m) by site, the tracked one first."""
     orientations: Mapping[str, Float[np.ndarray, "T 4"]]
-    """w, x, y, z, by site, the tracked one first."""
+    """Orientations (w, x, y, z) by site, the tracked one first."""
     joint_angles: Mapping[str, Float[np.ndarray, " T"]]
-    """rad or m, by joint; continuous where the recording counts turns from 0 again."""
+    """Joint angles (rad) or displacements (m) by joint, without jumps where the recording counts turns from 0 again."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
     """A recording as states and commands at the control rate.
 
-    A simulator set to `(qpos[k], qvel[k])` and driven by `command[k]` goes from `time[k]` to `time[k + 1]`.
+    A simulator set to `(qpos[k], qvel[k])` and driven by `command[k]` moves from `time[k]` to `time[k + 1]`.
     """
 
     name: str
-    """The recording's."""
+    """Name of the recording."""
     time: Float[np.ndarray, " states"]
-    """s, from 0 in control steps; one more entry than commands."""
+    """Times (s) from 0, one control step apart. There is one more than commands."""
     command: Float[np.ndarray, "steps commands"]
-    """Mean over each control step of the held commands, in the actuators' units."""
+    """Mean of the held commands over each control step, in the actuators' units."""
     qpos: Float[np.ndarray, "states nq"]
     """MuJoCo's generalized positions (m, unit quaternion w x y z, rad)."""
     qvel: Float[np.ndarray, "states nv"]
-    """MuJoCo's generalized velocities; the free joint's linear one in the world's frame, the angular in the body's."""
+    """MuJoCo's generalized velocities. The free joint's linear velocity is in the world frame, its angular one in the
+    body frame."""
     residual_mm: Mapping[str, float]
-    """Root-mean-square distance (mm) between measured and fitted places before smoothing, by site."""
+    """RMS distance (mm) between measured and fitted positions before smoothing, by site."""
     interpolated: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """Samples that the recording's reader filled in, by column."""
+    """Number of samples that were interpolated when the recording was read, by column."""
     robot: str = ""
-    """Which robot was recorded."""
+    """Robot that was recorded."""
     joints: tuple[str, ...] = ()
-    """The joints whose positions the recording holds; others are inferred."""
+    """Joints whose positions were recorded. Others are inferred."""
     uncertainty: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """What the robot's adapter states about its own part of the reconstruction, by name."""
+    """Uncertainties that the robot's adapter reports for its part of the reconstruction, by name."""

@@ -1,8 +1,8 @@
-"""Short windows of recorded motion, and their simulation: what residuals are fitted to by derivatives.
+"""Short windows of recorded motion, and their simulation. Residuals are fitted to them with derivatives.
 
-A window starts in a recorded state and runs under the recorded commands. It is short enough for errors not to compound,
-and long enough for a force of hundredths of a newton to move the tracked body by more than the starting state's
-uncertainty.
+A window starts in a recorded state and runs under the recorded commands. It is short, so that errors do not compound.
+It is long enough for a force of hundredths of a newton to move the tracked body by more than the uncertainty of the
+starting state.
 """
 
 from __future__ import annotations
@@ -27,37 +27,41 @@ from ballu_mjx.sim.step import state_at
 
 
 class MotionWindows(NamedTuple):
-    """Windows of recorded motions; `windowsteps` control steps each."""
+    """Windows of recorded motions, each of `windowsteps` control steps."""
 
     qpos: Float[Array | np.ndarray, "windows nq"]
-    """First states."""
+    """Generalized positions at the windows' starts."""
     qvel: Float[Array | np.ndarray, "windows nv"]
+    """Generalized velocities at the windows' starts."""
     history: Float[Array | np.ndarray, "windows steps features"]
-    """`observation.observe_features` of the first state and the two before."""
+    """`observation.observe_features` of the first state and of the two states before it."""
     commands: Float[Array | np.ndarray, "windows allsteps commands"]
-    """From two control steps before the first on."""
+    """Commands, from two control steps before the window's start to its end."""
     features: Float[Array | np.ndarray, "windows windowsteps features"]
-    """Recorded, after each control step."""
+    """Recorded `observe_features` after each control step."""
     drivetrain: DrivetrainState | None = None
-    """In the first states; None where the simulator has no drivetrain."""
+    """State of the drivetrain at the windows' starts. None if the simulator has no drivetrain."""
 
 
 def check_motion_windows(window_seconds: float, interval_seconds: float, control_timestep: float) -> None:
-    """Check the windows' length and distance, at least two control steps (s).
+    """Check that the windows' length and interval (s) are finite and at least two control steps.
 
-    **Raises** `InputError` for lengths out of range, naming the option."""
+    **Raises** `InputError` that names the option otherwise.
+    """
     for name, value in (("--window-seconds", window_seconds), ("--interval-seconds", interval_seconds)):
         shortest = 2 * control_timestep
         if not shortest <= value < math.inf:
-            raise InputError(f"{name} is {value:g}: it must be {shortest:g} or more; {shortest:g} is the nearest.")
+            raise InputError(
+                f"{name} is {value:g} s; give a finite time of {shortest:g} s (two control steps) or more."
+            )
 
 
 def cut_motion_windows(
     simulator: Simulator, motions: Sequence[Motion], window_seconds: float, interval_seconds: float
 ) -> MotionWindows:
-    """Windows of the given length, one every `interval_seconds`.
+    """Return windows of `window_seconds` that start every `interval_seconds` in each motion.
 
-    **Raises** `InputError` where no recording is as long as a window.
+    **Raises** `InputError` if no recording is as long as a window.
     """
     steps, every = (round(s / simulator.robot.control_timestep) for s in (window_seconds, interval_seconds))
     history = HISTORY
@@ -67,7 +71,11 @@ def cut_motion_windows(
         for start in range(history - 1, len(motion.command) - steps + 1, every)
     ]
     if not places:
-        raise InputError(f"No recording lasts {window_seconds:g} s; give longer ones, or --window-seconds.")
+        needed = window_seconds + (history - 1) * simulator.robot.control_timestep
+        raise InputError(
+            f"No recording lasts {needed:g} s, a window and the {history - 1} control steps before it; give longer "
+            "recordings, or reduce --window-seconds."
+        )
     reference, _ = stack_motions(simulator, motions)
     qpos, qvel, features, command = (np.asarray(x) for x in reference[:4])
 
@@ -85,7 +93,7 @@ def cut_motion_windows(
 
 
 def start_motion_window(window: MotionWindows) -> tuple[RolloutState, Float[Array, "windowsteps commands"]]:
-    """Return where one window starts, and the commands of its control steps."""
+    """Return the state at the start of one window, and the commands of its control steps."""
     physics = state_at(jnp.asarray(window.qpos), jnp.asarray(window.qvel))
     past = HISTORY - 1
     history, commands = jnp.asarray(window.history), jnp.asarray(window.commands)
@@ -94,7 +102,7 @@ def start_motion_window(window: MotionWindows) -> tuple[RolloutState, Float[Arra
 
 
 def simulate_motion_window(simulator: AugmentedSimulator, window: MotionWindows) -> Float[Array, "windowsteps errors"]:
-    """Return `window_errors` of one window, simulated from its start; JAX's own transformations apply."""
+    """Return `window_errors` of one window, simulated from its start. JAX's transformations apply to this function."""
     state, commands = start_motion_window(window)
 
     def step(state: RolloutState, command: Array) -> tuple[RolloutState, Array]:

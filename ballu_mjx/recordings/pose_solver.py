@@ -1,7 +1,7 @@
-"""The least squares of inverse kinematics: poses near a guess that fit what was measured, many at once.
+"""Least squares of inverse kinematics: many poses at once, each fitted to the measurements near a guess.
 
-Joints keep their ranges, unless no pose within them fits. A closed loop (a model's `connect` or `joint` equality) is a
-measurement like others.
+Joints stay within their ranges, unless no pose within them fits. A closed loop (a `connect` or `joint` equality of the
+model) counts as one more measurement.
 """
 
 from __future__ import annotations
@@ -21,37 +21,38 @@ from ballu_mjx.recordings.motion import MeasurementGrid, ReconstructionParameter
 from ballu_mjx.robots.description import RobotDescription
 
 _MAX_STEPS = 100
-"""Levenberg-Marquardt steps: a handful, but from far away."""
+"""Maximum number of Levenberg-Marquardt steps. A few suffice, except from a distant guess."""
 _CONVERGED = 1e-6
-"""Step (rad or m) of no consequence."""
+"""Step (rad or m) below which a fit has converged."""
 _NO_GAIN = 1e-6
-"""Of the squared misfit: where measurements do not fit the model, steps shrink slowly."""
+"""Relative decrease of the squared misfit below which a fit has converged. If measurements do not fit the model, steps
+shrink only slowly."""
 _LONGEST_STEP = 0.5
-"""rad: longer ones wind joints up."""
-_RANGE_GIVE = (0.05, 0.005)
-"""How far beyond its range a hinge (rad) or a slide (m) may be: measurements are noisy, and stops soft."""
+"""Longest step of a rotation (rad). Longer steps could add full turns to joints."""
+_RANGE_TOLERANCE = (0.05, 0.005)
+"""Distance by which a hinge (rad) or a slide (m) may exceed its range. Measurements are noisy, and stops are soft."""
 _LOOP_NOISE = 0.1
-"""Of a measured position's noise: how far a closed loop may be open."""
+"""Standard deviation of a closed loop's error, relative to the noise of a measured position or joint angle."""
 _PRIOR = float(np.deg2rad(60.0))
-"""Standard deviation (rad, m) of a joint about its guess: keeps the problem of a single sample well posed."""
+"""Standard deviation (rad, m) of a hidden joint about its guess. It keeps the fit of a single sample well posed."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KinematicProblem:
-    """What was measured, and of which model."""
+    """Measurements of a recording, and the model to which they are fitted."""
 
     model: mujoco.MjModel
     robot: RobotDescription
     grid: MeasurementGrid
     parameters: ReconstructionParameters
     orientations: Mapping[str, tuple[Float[np.ndarray, "T 4"], Float[np.ndarray, " 3"]]]
-    """Quaternions (w, x, y, z) by site, and weights (1/rad) about the body's axes."""
+    """Orientations by site: quaternions (w, x, y, z) of the site's body, and weights (1/rad) about the body's axes."""
 
 
 class PoseSolver:
-    """Differences to the measurements in units of their noise, their derivatives, and the poses that make them least.
+    """Solver for the poses of least misfit. The misfit is the difference to the measurements in units of their noise.
 
-    `rows` are the samples that poses belong to: several poses may belong to one.
+    In all methods, `rows` are the samples to which the poses belong. Several poses may belong to one sample.
     """
 
     def __init__(self, problem: KinematicProblem) -> None:
@@ -67,24 +68,24 @@ class PoseSolver:
         self._turn_weights = [weight for _, weight in problem.orientations.values()]
 
         self.addresses, self.dofs = _scalar_joints(model)
-        """Places of hinges and slides in qpos and qvel."""
+        """Addresses of hinges and slides in qpos and qvel."""
         index = {model.joint(int(joint)).name: i for i, joint in enumerate(model.dof_jntid[self.dofs])}
         self.recorded = np.array([index[joint] for joint in grid.joint_angles], int)
-        """Joints, by their place among these, whose angles were recorded; the others are `hidden`."""
+        """Indices, among hinges and slides, of the joints with recorded angles. The other joints are `hidden`."""
         self._angles = np.stack(list(grid.joint_angles.values()), 1) if grid.joint_angles else np.zeros((0, 0))
         self.hidden = np.setdiff1d(np.arange(len(self.dofs)), self.recorded)
         joints = model.dof_jntid[self.dofs]
         low, high = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.inf, np.inf]).T
-        give = np.where(self.tree.rotates[self.dofs], *_RANGE_GIVE)
+        give = np.where(self.tree.rotates[self.dofs], *_RANGE_TOLERANCE)
         self.low, self.high = low, high
         self._lowest, self._highest = low - give, high + give
         self.bounded = True
-        """Whether poses keep within the joints' ranges."""
+        """True if poses must stay within the joints' ranges."""
         self.turns = self.tree.rotates[self.dofs] & ~(np.isfinite(self.low) & np.isfinite(self.high))
-        """Hinges that may turn on and on."""
+        """Mask of hinges without a finite range, which may turn several times."""
         places = 3 * (len(grid.positions) + len(problem.orientations) + len(self._loops))
         self.measurements = places + len(self._couplings) + len(self.recorded)
-        """Numbers that were measured in each sample."""
+        """Number of scalar measurements of each sample, including closed loops."""
         self.joint_weight, self.prior_weight = np.zeros(model.nv), np.zeros(model.nv)
         self.joint_weight[self.dofs[self.recorded]] = 1.0 / parameters.joint_noise
         self.prior_weight[self.dofs[self.hidden]] = 1.0 / _PRIOR
@@ -94,32 +95,35 @@ class PoseSolver:
     def misfit(
         self, qpos: Float[np.ndarray, "N nq"], rows: Int[np.ndarray, " N"]
     ) -> tuple[Float[np.ndarray, "N m"], Float[np.ndarray, "N m nv"]]:
-        """Differences to all measurements but joint angles, and their derivatives along velocities."""
+        """Return the differences to all measurements except joint angles, and their Jacobians, in units of the noise.
+
+        The Jacobians are derivatives with respect to generalized velocities.
+        """
         parameters, grid = self.problem.parameters, self.problem.grid
         poses = self.tree.pose(qpos)
-        errors, slopes = [], []
+        errors, jacobians = [], []
         for number, places in enumerate(grid.positions.values()):
             errors.append((poses.points[number] - places[rows]) / parameters.position_noise)
-            slopes.append(self.tree.point_jacobian(poses, number) / parameters.position_noise)
+            jacobians.append(self.tree.point_jacobian(poses, number) / parameters.position_noise)
         for number, (turned, weight) in enumerate(zip(self._turned, self._turn_weights, strict=True)):
             back = turned[rows].transpose(0, 2, 1)
             errors.append(matrix_to_rotation_vector(back @ poses.rotations[number]) * weight)
-            slopes.append(back @ self.tree.turn_jacobian(poses, number) * weight[:, None])
+            jacobians.append(back @ self.tree.turn_jacobian(poses, number) * weight[:, None])
         noise, first = _LOOP_NOISE * parameters.position_noise, len(grid.positions)
         for number in range(len(self._loops)):
             one, other = first + 2 * number, first + 2 * number + 1
             errors.append((poses.points[one] - poses.points[other]) / noise)
-            slopes.append((self.tree.point_jacobian(poses, one) - self.tree.point_jacobian(poses, other)) / noise)
+            jacobians.append((self.tree.point_jacobian(poses, one) - self.tree.point_jacobian(poses, other)) / noise)
         for coupling in self._couplings:
-            error, slope = coupling.misfit(qpos, self.problem.model.nv)
+            error, jacobian = coupling.misfit(qpos, self.problem.model.nv)
             errors.append(error[:, None] / (_LOOP_NOISE * parameters.joint_noise))
-            slopes.append(slope[:, None] / (_LOOP_NOISE * parameters.joint_noise))
-        return np.concatenate(errors, axis=1), np.concatenate(slopes, axis=1)
+            jacobians.append(jacobian[:, None] / (_LOOP_NOISE * parameters.joint_noise))
+        return np.concatenate(errors, axis=1), np.concatenate(jacobians, axis=1)
 
     def information(self, qpos: Float[np.ndarray, "T nq"], rows: Int[np.ndarray, " T"]) -> np.ndarray:
-        """What each sample's measurements show, the prior included."""
-        _, slope = self.misfit(qpos, rows)
-        information = slope.transpose(0, 2, 1) @ slope
+        """Return each sample's information matrix (inverse covariance) from its measurements and the prior."""
+        _, jacobian = self.misfit(qpos, rows)
+        information = jacobian.transpose(0, 2, 1) @ jacobian
         diagonal = np.arange(information.shape[1])
         information[:, diagonal, diagonal] += self.joint_weight**2 + self.prior_weight**2
         return information
@@ -129,7 +133,7 @@ class PoseSolver:
     def fit(
         self, guess: Float[np.ndarray, "N nq"], rows: Int[np.ndarray, " N"]
     ) -> tuple[Float[np.ndarray, "N nq"], Float[np.ndarray, " N"]]:
-        """Poses of the least misfit near `guess`, and their squared misfit to what was measured."""
+        """Return the poses of least misfit near `guess`, and their squared misfit without the prior."""
         nv, diagonal = self.problem.model.nv, np.arange(self.problem.model.nv)
         wanted = np.zeros((len(guess), nv))
         wanted[:, self.dofs] = guess[:, self.addresses]
@@ -146,12 +150,12 @@ class PoseSolver:
 
         qpos, active = guess.copy(), np.arange(len(guess))
         damping, cost = np.full(len(guess), 1e-6), np.empty(len(guess))
-        error, slope = self.misfit(qpos, rows)
+        error, jacobian = self.misfit(qpos, rows)
         joint_error = joint_errors(qpos, active)
         cost[:] = square(error, joint_error)
         for _ in range(_MAX_STEPS):
-            transposed = slope.transpose(0, 2, 1)
-            curvature = transposed @ slope
+            transposed = jacobian.transpose(0, 2, 1)
+            curvature = transposed @ jacobian
             curvature[:, diagonal, diagonal] += weight
             gradient = (transposed @ error[..., None])[..., 0] + weight * joint_error
             if self.bounded:
@@ -165,7 +169,7 @@ class PoseSolver:
             moved = self.tree.move(qpos[active], step)
             if self.bounded:
                 moved[:, self.addresses] = np.clip(moved[:, self.addresses], self._lowest, self._highest)
-            error_there, slope_there = self.misfit(moved, rows[active])
+            error_there, jacobian_there = self.misfit(moved, rows[active])
             joint_error_there = joint_errors(moved, active)
             there = square(error_there, joint_error_there)
             gain = cost[active] - there
@@ -177,7 +181,7 @@ class PoseSolver:
             going = ~np.where(better, small, damping[active] > 1e6)
             chosen = better[:, None]
             error = np.where(chosen, error_there, error)[going]
-            slope = np.where(chosen[..., None], slope_there, slope)[going]
+            jacobian = np.where(chosen[..., None], jacobian_there, jacobian)[going]
             joint_error = np.where(chosen, joint_error_there, joint_error)[going]
             active = active[going]
             if not len(active):
@@ -186,9 +190,9 @@ class PoseSolver:
         return qpos, cost - np.einsum("ij,ij,j->i", away, away, self.prior_weight**2)
 
     def _hold_stops(self, qpos: np.ndarray, curvature: np.ndarray, gradient: np.ndarray) -> None:
-        """Take joints at a stop, and pushed against it, out of the step, in place."""
-        angles, slope = qpos[:, self.addresses], gradient[:, self.dofs]
-        held = ((angles <= self._lowest) & (slope > 0)) | ((angles >= self._highest) & (slope < 0))
+        """Exclude joints from the step, in place, if they are at a stop and the step would push them against it."""
+        angles, joint_gradient = qpos[:, self.addresses], gradient[:, self.dofs]
+        held = ((angles <= self._lowest) & (joint_gradient > 0)) | ((angles >= self._highest) & (joint_gradient < 0))
         for joint in np.flatnonzero(held.any(axis=0)):
             lanes, dof = np.flatnonzero(held[:, joint]), self.dofs[joint]
             own = curvature[lanes, dof, dof]
@@ -198,7 +202,10 @@ class PoseSolver:
     def guess(
         self, start: Float[np.ndarray, " nq"], joints: Float[np.ndarray, "N joints"], rows: Int[np.ndarray, " N"]
     ) -> Float[np.ndarray, "N nq"]:
-        """Poses with these joints, or recorded ones, and a free root where the tracked body then is as recorded."""
+        """Return poses with the given `joints`, except that recorded joints take their recorded angles.
+
+        A free root is placed so that the tracked body has its recorded pose.
+        """
         qpos = np.tile(start, (len(rows), 1))
         qpos[:, self.addresses] = joints
         if len(self.recorded):
@@ -217,6 +224,6 @@ class PoseSolver:
 
 
 def _scalar_joints(model: mujoco.MjModel) -> tuple[Int[np.ndarray, " joints"], Int[np.ndarray, " joints"]]:
-    """Addresses of hinges and slides in qpos and in qvel."""
+    """Return the addresses of hinges and slides in qpos and in qvel."""
     scalar = model.jnt_type != mujoco.mjtJoint.mjJNT_FREE
     return model.jnt_qposadr[scalar].astype(int), model.jnt_dofadr[scalar].astype(int)

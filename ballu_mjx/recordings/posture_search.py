@@ -1,7 +1,7 @@
-"""The posture of each sample, where measurements fit several: which joints inverse kinematics begins with.
+"""Search for the posture of each sample, if its measurements fit several. Inverse kinematics starts from the result.
 
-Some samples along the recording are fitted from several starts. Of what is found, the sequence that fits best and moves
-least is taken (dynamic programming). Other samples begin between their neighbours.
+Some samples along the recording, the anchors, are fitted from several starting poses. Dynamic programming selects the
+sequence of results that fits best and moves least. Other samples start between their neighbouring anchors.
 """
 
 from __future__ import annotations
@@ -12,33 +12,36 @@ from jaxtyping import Float, Int
 from ballu_mjx.recordings.pose_solver import PoseSolver
 
 _ANCHOR_INTERVAL = 0.2
-"""s between samples that are fitted from several starts."""
+"""Time (s) between anchors, the samples that are fitted from several starting poses."""
 _STARTS, _FITS = 6, 60
-"""Random starts of each, and fits in all, at least, where the starting pose does not lead to what was measured."""
-_LOST = 25.0
-"""Squared misfit a measurement, in units of its noise, beyond which a sample's posture may not have been found."""
+"""Minimum numbers of random starts per anchor, and of random starts in all. They are for anchors whose measurements the
+fit from the starting pose does not reach."""
+_LARGEST_MISFIT = 25.0
+"""Squared misfit per measurement, in units of its noise, above which a sample's posture counts as not found."""
 _SAME = 0.1
-"""rad, m: what joints differ by at most in one posture."""
+"""Largest distance of joints (rad, m) within one posture."""
 _MOVED = 0.3
-"""rad, m: what a joint moves between such samples, where two sequences of postures are told apart by it."""
+"""Movement of joints (rad, m) between anchors that costs a sequence as much as a squared misfit of one."""
 _MOST_JUMPS = 8
+"""Maximum number of changes of posture from which further fits start."""
 _OUTSTANDING = 3.0
-"""Of what the quietest fifth of such samples moves at most: what a change of posture moves at least."""
+"""Smallest movement at a change of posture, relative to the 20th percentile of movements between anchors."""
 _AWAY = (1.0, 0.3)
-"""rad, m: the same from the starting pose, where two first postures are. From the reference pose; from a keyframe."""
+"""Distance of joints (rad, m) between starting pose and first anchor that costs as much as a squared misfit of one. The
+first number is for the reference pose, the second for a keyframe."""
 
 
 class PostureSearch:
-    """The search for postures that a `PoseSolver` fits all samples from."""
+    """Search for the postures from which a `PoseSolver` fits all samples."""
 
     def __init__(self, solver: PoseSolver) -> None:
         self._solver = solver
         self._has_keyframe = solver.problem.robot.keyframe is not None or solver.problem.model.nkey > 0
 
     def solve(self) -> Float[np.ndarray, "T nq"]:
-        """Return poses of all samples.
+        """Return the poses of all samples.
 
-        The solver is not `bounded` afterwards where some sample fits no pose within the joints' ranges.
+        The solver's `bounded` is False afterwards if some sample fits no pose within the joints' ranges.
         """
         grid = self._solver.problem.grid
         count = len(next(iter(grid.positions.values())))
@@ -54,7 +57,7 @@ class PostureSearch:
     def _anchor_joints(
         self, start: Float[np.ndarray, " nq"], anchors: Int[np.ndarray, " A"]
     ) -> Float[np.ndarray, "A joints"]:
-        """Joints of some samples, of which no posture is known, continuous in time."""
+        """Return the joints of the anchors, continuous in time. No posture is known beforehand."""
         own, count = start[self._solver.addresses], len(anchors)
         everywhere = np.arange(count)
         candidates: list[tuple[np.ndarray, np.ndarray]] = []
@@ -68,15 +71,15 @@ class PostureSearch:
             return found, cost
 
         def add(joints: Float[np.ndarray, "starts n joints"], which: Int[np.ndarray, " n"]) -> None:
-            """Fit the samples in `which` from several starts each."""
+            """Fit the anchors in `which`, each from several starts."""
             found, cost = fitted(joints.reshape(-1, len(own)), np.tile(which, len(joints)))
             rows = np.zeros((len(joints), count, len(own))), np.full((len(joints), count), np.inf)
             rows[0][:, which], rows[1][:, which] = found.reshape(joints.shape), cost.reshape(joints.shape[:2])
             candidates.append(rows)
 
         def carry(path: np.ndarray, places: np.ndarray, ways: np.ndarray) -> None:
-            """Fit sample after sample from the one before, from each place on in its way (1 or -1), to
-            where this leads to what is known."""
+            """Fit one anchor after another, each from the one before. Start at each of `places`, and go forwards or
+            backwards (`ways`, 1 or -1). Stop where the result equals `path`."""
             rows = np.zeros((len(places), count, len(own))), np.full((len(places), count), np.inf)
             joints, going = path[places], np.arange(len(places))
             for step in range(1, count):
@@ -92,20 +95,20 @@ class PostureSearch:
         def best() -> tuple[np.ndarray, np.ndarray]:
             return self._best_path(own, *(np.concatenate(each) for each in zip(*candidates, strict=True)))
 
-        def lost(cost: np.ndarray) -> np.ndarray:
-            return np.flatnonzero(cost > _LOST * self._solver.measurements)
+        def not_found(cost: np.ndarray) -> np.ndarray:
+            return np.flatnonzero(cost > _LARGEST_MISFIT * self._solver.measurements)
 
         add(np.tile(own, (1, count, 1)), everywhere)
-        if len(which := lost(candidates[0][1][0])):
+        if len(which := not_found(candidates[0][1][0])):
             add(self._starts(start, len(which)), which)
         path, cost = best()
         apart = 1
-        while apart < count and len(lost(cost)):  # Others may have found what one has not.
+        while apart < count and len(not_found(cost)):  # Neighbours may have found the posture.
             before, after = np.maximum(everywhere - apart, 0), np.minimum(everywhere + apart, count - 1)
             add(np.stack([path[before], path[after]]), everywhere)
             path, cost = best()
             apart *= 2
-        if len(which := lost(cost)):  # What is measured clearly is believed, against the model's ranges.
+        if len(which := not_found(cost)):  # Clear measurements override joint ranges.
             self._solver.bounded = False
             add(np.concatenate([self._starts(start, len(which)), path[None, which]]), which)
             path, cost = best()
@@ -116,13 +119,13 @@ class PostureSearch:
         return path
 
     def _jumps(self, path: Float[np.ndarray, "A joints"]) -> Int[np.ndarray, " jumps"]:
-        """Samples after which joints move by much more than elsewhere: from one posture to another. The largest few."""
+        """Return the anchors before the largest changes of posture. Joints move much more there than elsewhere."""
         moved = np.sqrt(self._apart(path[1:], path[:-1]))
         largest = np.argsort(-moved)[:_MOST_JUMPS]
         return largest[moved[largest] > _SAME + _OUTSTANDING * np.percentile(moved, 20)]
 
     def _apart(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Squared distances (rad, m) of joints, turns aside."""
+        """Return squared distances (rad, m) of joints. Full turns of hinges without a range do not count."""
         difference = a - b
         difference[..., self._solver.turns] = _wrapped(difference[..., self._solver.turns])
         return np.sum(difference**2, axis=-1)
@@ -133,7 +136,7 @@ class PostureSearch:
         joints: Float[np.ndarray, "candidates A joints"],
         cost: Float[np.ndarray, "candidates A"],
     ) -> tuple[Float[np.ndarray, "A joints"], Float[np.ndarray, " A"]]:
-        """One candidate of each sample, so that misfits and movements are least in all, and their misfits."""
+        """Return one candidate per anchor that minimizes the sum of misfits and movements, and the misfits."""
         total = cost[:, 0] + self._apart(joints[:, 0], own) / _AWAY[self._has_keyframe] ** 2
         came = []
         for sample in range(1, joints.shape[1]):
@@ -147,8 +150,10 @@ class PostureSearch:
         return joints[places], cost[places]
 
     def _starting_pose(self) -> Float[np.ndarray, " nq"]:
-        """Where the description or else the model's first keyframe says that the robot starts. Without any: the
-        reference pose, with joints whose ranges do not hold it in the middle of these."""
+        """Return the starting pose of the description, or else the model's first keyframe.
+
+        Without either, it is the reference pose. Joints outside their range are then set to the range's middle.
+        """
         problem, model = self._solver.problem, self._solver.problem.model
         start = problem.robot.adapter.initial_qpos(problem.robot, model)
         if self._has_keyframe:
@@ -159,13 +164,16 @@ class PostureSearch:
         return start
 
     def _middle(self, otherwise: Float[np.ndarray, " joints"]) -> Float[np.ndarray, " joints"]:
+        """Return the middles of the joints' ranges, and `otherwise` for joints without a finite range."""
         limited = np.isfinite(self._solver.low) & np.isfinite(self._solver.high)
         with np.errstate(invalid="ignore"):
             return np.where(limited, (self._solver.low + self._solver.high) / 2, otherwise)
 
     def _starts(self, start: Float[np.ndarray, " nq"], count: int) -> Float[np.ndarray, "starts n joints"]:
-        """Joints to begin with beside the starting pose: the model's keyframes, the middles of the ranges, and others
-        at random, more of them where few samples need them."""
+        """Return further starting joints for `count` anchors: keyframes, middles of the ranges, and random joints.
+
+        The fewer the anchors, the more random joints each of them gets.
+        """
         own, model = start[self._solver.addresses], self._solver.problem.model
         spread = np.where(self._solver.tree.rotates[self._solver.dofs], np.pi, 0.1)
         low = np.where(np.isfinite(self._solver.low), self._solver.low, own - spread)

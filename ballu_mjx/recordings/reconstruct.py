@@ -1,11 +1,12 @@
-"""From a recording to generalized states at the control rate, for robots of any build.
+"""Reconstruction of simulator states at the control rate from a recording, for any robot.
 
-1. Measurements are brought to a uniform grid at their own rate, of which the control grid is a part.
-2. Positions: least-squares inverse kinematics over all joints at once (`inverse_kinematics`). Joints that no
-   measurement shows are refused.
-3. The robot's adapter completes what single samples show badly (`hooks.RecordingHooks.complete_positions`).
-4. Velocities: a centred (hence lag-free) Savitzky-Golay differentiator, widest for the tracked body's rotation: its
-   rates matter most to what a simulator does next.
+1. Measurements are interpolated on a uniform grid, at about their own rate. The control grid is a subset of it.
+2. Positions follow from least-squares inverse kinematics over all joints at once (`inverse_kinematics`). A joint that
+   no measurement shows is an error.
+3. The robot's adapter refines positions that single samples determine badly
+   (`hooks.RecordingHooks.complete_positions`).
+4. Velocities follow from a centred (hence lag-free) Savitzky-Golay differentiator. Its window is widest for the tracked
+   body's rotation, whose rates matter most to a simulation that starts from the state.
 5. The adapter fills in joints that follow from the commands (`complete_joints`).
 """
 
@@ -37,12 +38,14 @@ from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.drivetrain import DrivetrainParameters, count_slots, filter_commands
 
-_STOP_GIVE = {False: float(np.deg2rad(0.5)), True: 5e-4}
-"""How far beyond its range a hinge (rad) or a slide (m) may be: stops are soft, and springs hold joints inside."""
+_STOP_TOLERANCE = {False: float(np.deg2rad(0.5)), True: 5e-4}
+"""Distance by which a hinge (False, rad) or a slide (True, m) may exceed its range. Stops are soft, and springs press
+joints into them."""
 _OVERSHOOT = {False: 0.05, True: 5e-3}
-"""How far noise and filters take a hinge (rad) or a slide (m) beyond; what is farther was measured."""
+"""Largest distance beyond the range that noise and filters explain, for a hinge (False, rad) or a slide (True, m).
+Joints farther beyond their range keep their fitted values."""
 _TURN_TOLERANCE = 0.1
-"""rad over a full turn that angles counted from 0 again may span."""
+"""Tolerance (rad) by which angles that restart from 0 each turn may span more than a full turn."""
 
 
 def reconstruct(
@@ -56,21 +59,22 @@ def reconstruct(
 
     **Arguments**
 
-    - `recording`: as `csv_format.read_recording` gives it: no missing values.
-    - `model`: the robot to be simulated from these states, with its identified actuators, say; None: the nominal one.
-    - `parameters`: noise and filters; the defaults suit motion capture of 0.5 mm and 0.3 deg.
-    - `drivetrain`: what commands meet on their way to that robot's actuators; joints that follow from commands follow
-      from what arrives.
+    - `recording`: a free recording without missing values, as `csv_format.read_recording` returns it.
+    - `model`: the model to be simulated from these states, for example with identified actuators. None for the nominal
+      model.
+    - `parameters`: noise and filters. The defaults suit motion capture with noise of 0.5 mm and 0.3 deg.
+    - `drivetrain`: parameters of the drivetrain (delay, lag, backlash) between commands and actuators. Joints that
+      follow from the commands are computed from its output. None if there is no drivetrain.
 
-    **Raises** `InputError` where measurements leave a joint open, or do not fit the model; `ValueError` for a suspended
-    recording, and for one shorter than two control steps.
+    **Raises** `InputError` if the measurements do not determine a joint or do not fit the model. **Raises**
+    `ValueError` for a suspended recording, and for one shorter than two control steps.
     """
     parameters, hooks = parameters or ReconstructionParameters(), hooks_of(robot)
     simulated = robot.load_model() if model is None else model
     grid = resample(recording, simulated, robot)
     fit, distance = solve_inverse_kinematics(simulated, robot, grid, parameters, recording.name)
     qpos, qvel = differentiate(fit.qpos, simulated, robot, grid.step, parameters)
-    # A semi-implicit integrator's velocity is the mean over the time step that led to the position.
+    # A semi-implicit integrator's velocity is the mean over the physics step before the position.
     qvel -= np.gradient(qvel, grid.step, axis=0) * simulated.opt.timestep / 2
     _keep_ranges(simulated, qpos)
     qpos, qvel = hooks.complete_joints(simulated, _driven(grid, drivetrain), qpos, qvel)
@@ -91,7 +95,7 @@ def reconstruct(
 
 
 def _driven(grid: MeasurementGrid, drivetrain: DrivetrainParameters | None) -> MeasurementGrid:
-    """Return the measurements with the commands as they arrive at the actuators."""
+    """Return the measurements with commands replaced by the drivetrain's output."""
     if drivetrain is None:
         return grid
     slots = count_slots(float(np.max(drivetrain.delay)), grid.step)
@@ -100,8 +104,9 @@ def _driven(grid: MeasurementGrid, drivetrain: DrivetrainParameters | None) -> M
 
 
 def resample(recording: Recording, model: mujoco.MjModel, robot: RobotDescription) -> MeasurementGrid:
-    """Return the measurements at uniform times, by linear interpolation: with noise, jittered samples close together
-    would make a spline overshoot.
+    """Return the measurements at uniform times, interpolated linearly.
+
+    A spline would overshoot where jitter brings noisy samples close together.
 
     **Raises** `ValueError` for a suspended recording, and for one shorter than two control steps.
     """
@@ -129,7 +134,7 @@ def resample(recording: Recording, model: mujoco.MjModel, robot: RobotDescriptio
 
 
 def _unwound(model: mujoco.MjModel, joint: str, angle: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
-    """A wheel's angle without jumps, where the recording counts each turn from 0 again."""
+    """Return an unlimited hinge's angle without jumps, if the recording counts each turn from 0 again."""
     hinge = model.joint(joint)
     turns = hinge.type[0] == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_limited[hinge.id]
     return np.unwrap(angle) if turns and np.ptp(angle) < 2 * np.pi + _TURN_TOLERANCE else angle
@@ -142,11 +147,11 @@ def differentiate(
     step: float,
     parameters: ReconstructionParameters,
 ) -> tuple[Float[np.ndarray, "T nq"], Float[np.ndarray, "T nv"]]:
-    """Return smoothed generalized positions, `step` (s) apart, and their velocities at the same instants, in MuJoCo's
-    conventions.
+    """Return smoothed generalized positions and their velocities at the same instants, in MuJoCo's conventions.
 
-    Filtered are the root's place, the tracked body's orientation and all joints. A root that is another body than the
-    tracked one follows from this and the joints between them.
+    The positions `qpos` are `step` (s) apart. The filters act on the root's position, the tracked body's orientation
+    and all joints. If the root is not the tracked body, its orientation follows from that of the tracked body and the
+    joints between them.
     """
     order = parameters.order
     smooth = savitzky_golay(qpos, parameters.position_window, step, order, 0)
@@ -159,9 +164,9 @@ def differentiate(
     tracked = _to_quaternions(quaternion_to_matrix(qpos[:, 3:7]) @ relative)
     quaternion, angular = smooth_rotation(sign_continuous(tracked), parameters.rotation_window, step, order)
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-    relative, slope = _from_root(tree, smooth)
+    relative, jacobian = _from_root(tree, smooth)
     root = _to_quaternions(quaternion_to_matrix(quaternion) @ relative.transpose(0, 2, 1))
-    turning = (slope[:, :, 6:] @ rates[:, 7:, None])[..., 0]
+    turning = (jacobian[:, :, 6:] @ rates[:, 7:, None])[..., 0]
     angular = (relative @ angular[..., None])[..., 0] - turning
     return (
         np.concatenate([smooth[:, :3], sign_continuous(root), smooth[:, 7:]], axis=1),
@@ -172,7 +177,7 @@ def differentiate(
 def _from_root(
     tree: KinematicTree, qpos: Float[np.ndarray, "T nq"]
 ) -> tuple[Float[np.ndarray, "T 3 3"], Float[np.ndarray, "T 3 nv"]]:
-    """The tracked body's orientation in the root's frame, and how the joints turn it there."""
+    """Return the tracked body's orientation in the root's frame, and its rotational Jacobian there."""
     placed = np.concatenate([np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(qpos), 1)), qpos[:, 7:]], axis=1)
     poses = tree.pose(placed)
     return poses.rotations[0], tree.turn_jacobian(poses, 0)
@@ -183,10 +188,10 @@ def _to_quaternions(matrices: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, "
 
 
 def _keep_ranges(model: mujoco.MjModel, qpos: Float[np.ndarray, "T nq"]) -> None:
-    """Bring joints that are a little beyond their ranges back, in place."""
+    """Move joints that are slightly beyond their ranges back to them, in place."""
     for joint in np.flatnonzero(model.jnt_limited):
         slides = bool(model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE)
         angle, (low, high) = qpos[:, model.jnt_qposadr[joint]], model.jnt_range[joint]
-        kept = np.clip(angle, low - _STOP_GIVE[slides], high + _STOP_GIVE[slides])
+        kept = np.clip(angle, low - _STOP_TOLERANCE[slides], high + _STOP_TOLERANCE[slides])
         beyond = np.abs(angle - np.clip(angle, low, high)) > _OVERSHOOT[slides]
         qpos[:, model.jnt_qposadr[joint]] = np.where(beyond, angle, kept)

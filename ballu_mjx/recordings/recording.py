@@ -1,6 +1,6 @@
-"""The recording of a robot's motion: commands, places, orientations and joint angles over time.
+"""Recordings of a robot's motion: commands, positions, orientations and joint angles over time.
 
-A robot's description says which columns its recordings have. The file format is `csv_format`'s.
+The robot's description defines which columns its recordings have. `csv_format` defines the file format.
 """
 
 from __future__ import annotations
@@ -23,42 +23,44 @@ Column = Float[np.ndarray, " T"]
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
-    """One recording of a robot, T samples. World frame (z up), SI units, radians.
+    """A recording of a robot with T samples, in the world frame (z up), in SI units and radians.
 
-    `read_recording` promises: time strictly increasing, no missing values, quaternions of unit length and continuous
-    in sign. A recording that is to be written may hold NaN for missing samples.
+    A recording from `read_recording` has strictly increasing times, no missing values, and unit quaternions without
+    jumps of sign. A recording to be written may hold NaN for missing samples.
     """
 
     name: str
+    """Name. For a recording from a file, the file's name without its extension."""
     kind: Kind
-    """free: the robot moves about. suspended: its root is held, and joint angles alone must be recorded."""
+    """free: the robot moves. suspended: its root is held. A suspended recording needs no position or orientation."""
     robot: str
-    """Which specimen was recorded."""
+    """Specimen that was recorded."""
     notes: str = ""
     time: Float[np.ndarray, " T"]
-    """s, from any origin."""
+    """Times (s) from any origin."""
     command: Float[np.ndarray, "T commands"]
-    """In the units of the description's actuators, held until the next sample."""
+    """Commands in the units of the description's actuators. Each is held until the next sample."""
     tracked_position: Float[np.ndarray, "T 3"] | None = None
-    """m, of the tracked site. None only in suspended recordings, as is the orientation."""
+    """Positions of the tracked site (m). None only in suspended recordings."""
     tracked_quaternion: Float[np.ndarray, "T 4"] | None = None
-    """w, x, y, z: the tracked site's body in the world."""
+    """Orientations (w, x, y, z) of the tracked site's body. None only in suspended recordings."""
     points: Mapping[str, Float[np.ndarray, "T 3"]] = dataclasses.field(default_factory=dict)
-    """m, by site: all of the description's, but in suspended recordings."""
+    """Positions of points (m), by site. Free recordings hold all points of the description."""
     orientations: Mapping[str, Float[np.ndarray, "T 4"]] = dataclasses.field(default_factory=dict)
-    """w, x, y, z, by site: of some of the description's `oriented_points`."""
+    """Orientations (w, x, y, z) of some of the description's `oriented_points`, by site."""
     joint_angles: Mapping[str, Float[np.ndarray, " T"]] = dataclasses.field(default_factory=dict)
-    """rad (hinges) or m (slides), by joint: of some of the description's, of all in suspended recordings."""
+    """Angles of hinges (rad) and displacements of slides (m), by joint. Free recordings hold some of the description's
+    joints, suspended recordings all."""
     interpolated: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """Samples filled in, by column; columns without any are left out."""
+    """Number of interpolated samples, by column. Columns without any are left out."""
     held: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """Samples that repeat the one before, and so were not seen, by site; sites without any are left out."""
+    """Number of samples that repeat the one before, so they were not seen, by site. Sites without any are left out."""
     trimmed: tuple[int, int] = (0, 0)
-    """Rows cut off the file's start and end, where some column has a gap with a sample on one side only."""
+    """Number of rows cut off at the file's start and at its end, where a column has no sample."""
 
 
 def cut(recording: Recording, rows: slice) -> Recording:
-    """Return the samples in `rows`."""
+    """Return the recording with only the samples in `rows`."""
 
     def some(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         return {name: value[rows] for name, value in values.items()}
@@ -81,14 +83,14 @@ def cut(recording: Recording, rows: slice) -> Recording:
 
 @dataclasses.dataclass(frozen=True)
 class ColumnGroup:
-    """Columns that a file holds together or not at all."""
+    """Columns of which a file holds all or none."""
 
     quantity: Quantity
     part: str
-    """The site or joint; empty for time and commands."""
+    """Site or joint of the columns. Empty for time and commands."""
     names: tuple[str, ...]
     mandatory: tuple[Kind, ...]
-    """Kinds of recordings that need them."""
+    """Kinds of recordings that must have these columns."""
 
 
 def column_groups(robot: RobotDescription) -> tuple[ColumnGroup, ...]:
@@ -117,7 +119,7 @@ def column_groups(robot: RobotDescription) -> tuple[ColumnGroup, ...]:
 def values_of(
     recording: Recording, group: ColumnGroup, robot: RobotDescription
 ) -> Float[np.ndarray, "T columns"] | None:
-    """Return a group's columns; None where the recording does not hold them."""
+    """Return the values of a column group, or None if the recording does not hold it."""
     tracked = group.part == robot.tracked
     if group.quantity == "position":
         return recording.tracked_position if tracked else recording.points.get(group.part)

@@ -1,4 +1,4 @@
-"""Recorded motions as padded arrays: what episodes start from and are compared with."""
+"""Recorded motions as padded arrays. Episodes start from them and are compared with them."""
 
 from __future__ import annotations
 
@@ -16,29 +16,36 @@ from ballu_mjx.sim.simulator import Simulator
 
 
 class ReferenceMotions(NamedTuple):
-    """Recorded motions, stacked and padded to the longest: what an episode starts from and is compared with."""
+    """Recorded motions, stacked and padded to the longest one. Episodes start from them and are compared with them."""
 
     qpos: Float[Array, "recordings states nq"]
+    """MuJoCo's generalized positions."""
     qvel: Float[Array, "recordings states nv"]
+    """MuJoCo's generalized velocities."""
     features: Float[Array, "recordings states features"]
+    """`observation.observe_features` of each state."""
     command: Float[Array, "recordings steps commands"]
+    """Command of each control step, in the actuators' units."""
     steps: Int[Array, " recordings"]
-    """Control steps of each recording."""
+    """Number of control steps of each recording."""
     drivetrain: DrivetrainState | None = None
-    """Of the simulator's drivetrain before each control step, axes of recordings and control steps in front; None where
-    it has none."""
+    """State of the simulator's drivetrain before each control step, with leading axes (recordings, control steps). None
+    if the simulator has no drivetrain."""
 
     def drivetrain_at(
         self, recording: Int[Array, "*batch"] | np.ndarray, step: Int[Array, "*batch"] | np.ndarray
     ) -> DrivetrainState | None:
-        """Return the drivetrain's state before control steps of recordings; None where there is no drivetrain."""
+        """Return the drivetrain's state before the given control steps, or None without a drivetrain."""
         return jax.tree.map(lambda x: x[recording, step], self.drivetrain)
 
 
 def stack_motions(
     simulator: Simulator, motions: Sequence[Motion]
 ) -> tuple[ReferenceMotions, Float[Array, "recordings states 3"]]:
-    """Motions as one `Reference`, and their centres of mass (m, world)."""
+    """Return the motions as `ReferenceMotions`, and their centres of mass (m, world frame).
+
+    Shorter motions are padded with copies of their last state and command.
+    """
     longest = max(len(motion.qpos) for motion in motions)
 
     def pad(arrays: list[np.ndarray], length: int) -> Array:
@@ -57,12 +64,15 @@ def stack_motions(
 
 
 def pad_to_bucket(reference: ReferenceMotions) -> ReferenceMotions:
-    """`reference` with room for more: recordings of no steps, and states behind the last ones, up to the next powers of
-    two. Programs are compiled for sizes, and recordings made anew are seldom just as many and as long."""
+    """Return `reference`, padded to powers of two in recordings and in states.
+
+    The sizes are at least 16 recordings and 512 states. Added recordings have no control steps, and added states repeat
+    the last one. JAX compiles a program for each array size, and new recordings seldom have the same number and length.
+    """
     recordings, states = reference.qpos.shape[:2]
     more = (
-        max(1 << (recordings - 1).bit_length(), _ROOM[0]) - recordings,
-        max(1 << (states - 1).bit_length(), _ROOM[1]) - states,
+        max(1 << (recordings - 1).bit_length(), _MIN_SIZES[0]) - recordings,
+        max(1 << (states - 1).bit_length(), _MIN_SIZES[1]) - states,
     )
 
     def filled(x: Array) -> Array:
@@ -72,5 +82,5 @@ def pad_to_bucket(reference: ReferenceMotions) -> ReferenceMotions:
     return jax.tree.map(filled, reference._replace(steps=None))._replace(steps=steps)
 
 
-_ROOM = (16, 512)
-"""Recordings and states (25 s) that there is always room for."""
+_MIN_SIZES = (16, 512)
+"""Smallest padded numbers of recordings and of states. 512 states are 25 s at a control step of 0.05 s."""

@@ -1,4 +1,4 @@
-"""What a recording holds, in lines of text: length, rate, drop-outs, ranges and commands."""
+"""Summary of a recording in lines of text: length, rate, drop-outs, ranges and commands."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ballu_mjx.robots.description import RobotDescription
 
 
 def find_gaps(path: Path) -> dict[str, list[tuple[float, float]]]:
-    """Return the drop-outs by column of a recording's CSV: first and last time (s) without a sample."""
+    """Return the drop-outs of a recording's CSV by column, each as the first and last time (s) without a sample."""
     table = Table(path)
     time = table.column("time")
     found: dict[str, list[tuple[float, float]]] = {}
@@ -28,7 +28,7 @@ def find_gaps(path: Path) -> dict[str, list[tuple[float, float]]]:
 def summarize_recording(
     path: Path, recording: Recording, robot: RobotDescription, gaps: dict[str, list[tuple[float, float]]]
 ) -> str:
-    """Return what a recording holds, in lines: length, rate, gaps (see `find_gaps`), ranges and commands."""
+    """Return a summary in lines of text: length, rate, drop-outs (`gaps` from `find_gaps`), ranges and commands."""
     time = recording.time
     steps = np.diff(time)
     step = float(np.median(steps))
@@ -39,7 +39,7 @@ def summarize_recording(
         f"longest step {1e3 * steps.max():.3g} ms",
     ]
     if any(recording.trimmed):
-        lines.append(f"  rows left out, for something is not seen there: {recording.trimmed[0]} at the start, "
+        lines.append(f"  rows left out, since a column has no sample there: {recording.trimmed[0]} at the start, "
                      f"{recording.trimmed[1]} at the end")  # fmt: skip
     groups: dict[tuple[tuple[float, float], ...], list[str]] = {}
     for name, spans in gaps.items():
@@ -50,7 +50,7 @@ def summarize_recording(
         told = f"{len(spans)} drop-outs, {sum(lengths):.2f} s in all, the longest {max(lengths):.2f} s"
         lines.append(f"  {shown}: " + (told if len(spans) > 1 else f"1 drop-out of {lengths[0]:.2f} s"))
     for sites, count in held_sites(recording):
-        lines.append(f"  {sites}: {count} samples repeat the one before to the last digit; taken as not seen")
+        lines.append(f"  {sites}: {count} samples repeat the one before to the last digit; they count as not seen")
     if not gaps and not recording.held:
         lines.append("  no drop-outs")
     for label, value in _ranges(recording, robot):
@@ -67,7 +67,7 @@ def summarize_recording(
 
 
 def held_sites(recording: Recording) -> list[tuple[str, int]]:
-    """Return sites that were held alike, and for how many samples."""
+    """Return sites with equal numbers of held samples, joined to one text, and these numbers."""
     alike: dict[int, list[str]] = {}
     for site, count in recording.held.items():
         alike.setdefault(count, []).append(site)
@@ -75,7 +75,7 @@ def held_sites(recording: Recording) -> list[tuple[str, int]]:
 
 
 def _ranges(recording: Recording, robot: RobotDescription) -> list[tuple[str, np.ndarray]]:
-    """Columns by what they are called in a report; orientations are unwound."""
+    """Return columns with their labels in the summary. Angles of orientations are unwrapped."""
 
     def degrees(quaternion: np.ndarray) -> np.ndarray:
         angles = Rotation.from_quat(quaternion, scalar_first=True).as_euler("ZYX", degrees=True)

@@ -1,4 +1,4 @@
-"""Checks of a recording's columns, each with the file, the row and the fix in its message."""
+"""Checks of a recording's columns. Their messages name the file, the row and the fix."""
 
 from __future__ import annotations
 
@@ -15,23 +15,25 @@ from ballu_mjx.recordings.recording import Column, ColumnGroup, Kind, Quantity
 from ballu_mjx.robots.description import RobotDescription
 
 LONGEST_GAP = 0.5
-"""Longest stretch (s) without a sample that is filled in."""
+"""Longest time (s) without a sample that is interpolated."""
 SHORTEST = 1.0
-"""Shortest recording (s)."""
+"""Minimum duration of a recording (s)."""
 _LARGEST_STEP = 0.02
-"""m along an axis: noise between two samples, beside what the robot's speed explains."""
+"""Largest change of a position between two samples (m, per axis) due to noise. The robot's motion adds to it."""
 _LARGEST_BEND = {"position": (0.1, 1000.0), "quaternion": (0.5, 600.0)}
-"""By how much (m, rad) a sample may be off the straight way of those beside it; more only where an acceleration below
-the second number (m/s^2, rad/s^2) explains it. Markers that were mixed up go beyond."""
+"""Largest deviation of a sample from motion at constant velocity (m, rad), and largest acceleration (m/s^2, rad/s^2). A
+sample must exceed both to be refused, as samples with mixed-up markers do."""
 _BURST = 3.0
-"""Median steps: longer ones are gaps between bursts."""
+"""Time between two samples above which it is a gap between bursts, in units of the median."""
 _LARGEST_BURST_SHARE = 0.5
-"""Of the recording's time, in such gaps."""
+"""Largest share of the recording's time in gaps between bursts."""
 _LARGEST_RECURRING = 0.02
-"""Share of poses that recur to the last digit; above it, digits are too coarse to tell what was held."""
+"""Share of poses that recur to the last digit above which digits are too coarse to detect held poses."""
 _HELD_JUMP = 2.0
-"""Times the 95th percentile of the movement between two samples: what ends a pose that was held, but not a rest."""
+"""Smallest jump at the end of a held pose, in units of the 95th percentile of movements between samples. A rest ends
+with a smaller movement."""
 _QUATERNION_TOLERANCE = 0.02
+"""Largest deviation of a quaternion's length from 1."""
 
 
 # ---- files ----
@@ -40,7 +42,10 @@ _QUATERNION_TOLERANCE = 0.02
 def refuse_recording(
     path: Path, problem: str, fix: str, *, column: str | None = None, row: int | None = None
 ) -> NoReturn:
-    """Raise the sentence; `row` counts samples from 0."""
+    """Raise an `InputError` with place, problem and fix.
+
+    `row` counts samples from 0, and -1 is the header. The message counts as a spreadsheet does: the header is row 1.
+    """
     place = [str(path)]
     if column is not None:
         place.append(f"column {column}")
@@ -55,7 +60,10 @@ def refuse_recording(
 def present_groups(
     path: Path, columns: dict[str, Column], known: Sequence[ColumnGroup], kind: Kind
 ) -> list[ColumnGroup]:
-    """The groups that the file holds, each with all its columns."""
+    """Return the column groups that the file holds.
+
+    **Raises** `InputError` for a mandatory group that is missing, and for a group that is incomplete.
+    """
     present = []
     for group in known:
         missing = [name for name in group.names if name not in columns]
@@ -72,7 +80,10 @@ def present_groups(
 
 
 def check_time(path: Path, time: Column, robot: RobotDescription) -> None:
-    """Refuse times that do not increase, less than one sample a control step, and less than `SHORTEST`."""
+    """Check that times increase, do not come in bursts, are dense enough, and last `SHORTEST`.
+
+    A recording needs at least one sample per control step. **Raises** `InputError` otherwise.
+    """
     row = first_true(np.isnan(time))
     if row is not None:
         refuse_recording(path, "the time is missing", "fill it in or delete the row", column="time", row=row)
@@ -85,7 +96,7 @@ def check_time(path: Path, time: Column, robot: RobotDescription) -> None:
         refuse_recording(path, problem, "sort the rows by time and delete repeated ones", column="time", row=row + 1)
     if len(steps) and np.median(steps) > 1.001 * robot.control_timestep:
         problem = (
-            f"{1 / np.median(steps):.3g} samples per second are fewer than {1 / robot.control_timestep:.3g}, one a "
+            f"{1 / np.median(steps):.3g} samples per second are fewer than {1 / robot.control_timestep:.3g}, one per "
             "control step"
         )
         refuse_recording(path, problem, "record faster, or convert to seconds if this is milliseconds", column="time")
@@ -95,7 +106,7 @@ def check_time(path: Path, time: Column, robot: RobotDescription) -> None:
             f"samples come in bursts: half of the steps are of {1e3 * np.median(steps):.3g} ms or less, and "
             f"{len(long)} of {1e3 * long.min():.3g} ms or more make up most of the time"
         )
-        fix = "record the capture's own times, not those of arrival"
+        fix = "record the times of capture, not the times of arrival"
         row = first_true(steps > _BURST * np.median(steps))
         refuse_recording(path, problem, fix, column="time", row=None if row is None else row + 1)
     if time[-1] - time[0] < SHORTEST * (1 - 1e-6):
@@ -106,7 +117,10 @@ def check_time(path: Path, time: Column, robot: RobotDescription) -> None:
 def check_cells(
     path: Path, columns: dict[str, Column], groups: Sequence[ColumnGroup], robot: RobotDescription, kind: Kind
 ) -> None:
-    """Refuse values that only wrong units or a wrong order explain, by the description's limits. NaN passes."""
+    """Check values against the description's limits. NaN passes, except in commands.
+
+    **Raises** `InputError` for a missing command, and for values that only wrong units or a wrong order explain.
+    """
 
     def check(name: str, bad: np.ndarray, problem: str, fix: str) -> None:
         row = first_true(bad)
@@ -120,7 +134,9 @@ def check_cells(
         value = columns[name]
         row = first_true(np.isnan(value))
         if row is not None:
-            refuse_recording(path, "the command is missing", "fill in what was being sent", column=name, row=row)
+            refuse_recording(
+                path, "the command is missing", "fill in the command that was being sent", column=name, row=row
+            )
         fix = "convert it to the actuator's units, or give its range in the robot's description"
         check(name, (value < low) | (value > high), f"is outside {low:g} to {high:g}", fix)
     bounds = _angle_bounds(robot)
@@ -151,6 +167,7 @@ def check_cells(
 
 
 def _check_jumps(path: Path, name: str, columns: dict[str, Column], speed: float) -> None:
+    """Refuse jumps of a position that are farther than the robot's speed (m/s) and noise explain."""
     value = columns[name]
     seen = np.flatnonzero(~np.isnan(value))
     steps = np.abs(np.diff(value[seen]))
@@ -162,7 +179,7 @@ def _check_jumps(path: Path, name: str, columns: dict[str, Column], speed: float
 
 
 def _check_bends(path: Path, group: ColumnGroup, columns: dict[str, Column]) -> None:
-    """Refuse jumps that no robot's motion explains, of places and of orientations."""
+    """Refuse jumps of positions and orientations that no robot's motion explains."""
     seen = np.flatnonzero(has_sample(columns, group.names))
     moved = _movements(np.stack([columns[name][seen] for name in group.names], axis=1), group.quantity)
     if len(moved) < 2:
@@ -176,18 +193,18 @@ def _check_bends(path: Path, group: ColumnGroup, columns: dict[str, Column]) -> 
     if sample is None:
         return
     size = np.linalg.norm(moved, axis=1)
-    step = sample + int(size[sample + 1] > 2 * size[sample])  # at a single sample that is off, both are large
-    within = f"within {1e3 * steps[step]:.3g} ms, as no robot does"
+    step = sample + int(size[sample + 1] > 2 * size[sample])  # Around a single outlier, both steps are large.
+    within = f"within {1e3 * steps[step]:.3g} ms, which no robot does"
     name, row = group.names[0], int(seen[step + 1])
     if group.quantity == "quaternion":
-        fix = "empty the cells where the body was taken for itself turned"
+        fix = "empty the cells where the capture confused the body's orientation"
         refuse_recording(path, f"turned by {np.rad2deg(size[step]):.0f} deg {within}", fix, column=name, row=row)
     fix = "empty the cells where markers were mixed up, or convert millimetres to metres"
     refuse_recording(path, f"jumps by {size[step]:.3g} m {within}", fix, column=name, row=row)
 
 
 def _movements(values: Float[np.ndarray, "T columns"], quantity: Quantity) -> Float[np.ndarray, "steps 3"]:
-    """From each sample to the next: m, or rotation vectors (rad)."""
+    """Return the movement from each sample to the next: displacements (m), or rotation vectors (rad, body frame)."""
     if quantity != "quaternion":
         return np.diff(values, axis=0)
     turned = Rotation.from_quat(values, scalar_first=True)
@@ -195,6 +212,7 @@ def _movements(values: Float[np.ndarray, "T columns"], quantity: Quantity) -> Fl
 
 
 def _check_lengths(path: Path, names: Sequence[str], columns: dict[str, Column]) -> None:
+    """Refuse quaternions that do not have unit length."""
     with np.errstate(over="ignore"):
         length = np.linalg.norm(np.stack([columns[name] for name in names], 1), axis=1)
     row = first_true(np.abs(length - 1) > _QUATERNION_TOLERANCE)
@@ -204,8 +222,11 @@ def _check_lengths(path: Path, names: Sequence[str], columns: dict[str, Column])
 
 
 def _angle_bounds(robot: RobotDescription) -> dict[str, tuple[float, float]]:
-    """By joint: the description's limit; else the model's range, widened by its own width: degrees taken for radians
-    are far outside, a zero that is a little off is not."""
+    """Return bounds (rad or m) by joint.
+
+    They are the description's limit, or else the model's range, widened on both sides by its own width. Degrees taken
+    for radians are far outside these bounds. A slightly wrong zero is inside.
+    """
     if robot.limits.angle is not None:
         return dict.fromkeys(robot.joints, (-robot.limits.angle, robot.limits.angle))
     model = robot.load_model()
@@ -215,13 +236,13 @@ def _angle_bounds(robot: RobotDescription) -> dict[str, tuple[float, float]]:
 
 
 def blank_held(path: Path, columns: dict[str, Column], groups: Sequence[ColumnGroup]) -> dict[str, int]:
-    """Take samples that a streaming client held for not seen: NaN, in place. Returns how many, by site.
+    """Replace samples that a streaming client held by NaN, in place, and return their number by site.
 
-    They repeat the one before to the last digit in all columns of a body, as noise never lets them. Where digits are
-    coarse (poses from encoders, say), and where a robot rests without noise for long (a simulated one), samples are
-    kept unless the body moves on with a jump.
+    A held sample repeats the one before to the last digit in all columns of a body. Measurement noise prevents this for
+    new samples, with two exceptions: coarse digits (poses from encoders, for example), and a long rest without noise
+    (in a simulation). Repeated samples are kept in these cases unless the body then moves on with a jump.
 
-    **Raises** `InputError` for what was held for longer than `LONGEST_GAP`.
+    **Raises** `InputError` for a pose that was held for longer than `LONGEST_GAP`.
     """
     time, counts = columns["time"], {}
     bodies: dict[str, list[ColumnGroup]] = {}
@@ -253,7 +274,7 @@ def blank_held(path: Path, columns: dict[str, Column], groups: Sequence[ColumnGr
 
 
 def _repeats(values: Float[np.ndarray, "T columns"]) -> Bool[np.ndarray, " T"]:
-    """Samples equal to the one before in all columns, as chance does not explain."""
+    """Return a mask of samples that equal the one before in all columns, unless chance explains this."""
     moving = values[:, ~(values[1:] == values[:-1]).all(axis=0)]
     found = np.zeros(len(values), bool)
     if not moving.shape[1]:
@@ -261,20 +282,24 @@ def _repeats(values: Float[np.ndarray, "T columns"]) -> Bool[np.ndarray, " T"]:
     equal = (moving[1:] == moving[:-1]).sum(axis=1)
     found[1:] = equal == moving.shape[1]
     if found.sum() <= (equal == moving.shape[1] - 1).sum():
-        # Coarse digits: single repeats in all columns are no more frequent than in all but one.
+        # Digits are coarse if repeats in all columns are no more frequent than in all but one. Runs of one are chance.
         for start, end in _runs(found):
             found[start:end] &= end - start > 1
     return found
 
 
 def _recurring(values: Float[np.ndarray, "T columns"]) -> float:
-    """Share of poses that the body was in before, other than in the sample before: none where there is noise."""
+    """Return the share of poses that equal an earlier one. Repeats of the sample before do not count.
+
+    The share is zero if there is measurement noise.
+    """
     seen = values[~np.isnan(values).any(axis=1)]
     left = seen[np.concatenate([[True], (seen[1:] != seen[:-1]).any(axis=1)])] if len(seen) else seen
     return 1 - len(np.unique(left, axis=0)) / len(left) if len(left) else 0.0
 
 
 def _runs(chosen: Bool[np.ndarray, " T"]) -> list[tuple[int, int]]:
+    """Return start and end (exclusive) of each run of true entries."""
     edges = np.diff(np.concatenate([[0], chosen, [0]]))
     return list(zip(np.flatnonzero(edges > 0).tolist(), np.flatnonzero(edges < 0).tolist(), strict=True))
 
@@ -282,8 +307,10 @@ def _runs(chosen: Bool[np.ndarray, " T"]) -> list[tuple[int, int]]:
 def _goes_on_with_a_jump(
     columns: dict[str, Column], parts: Sequence[ColumnGroup], start: int, end: int, coarse: bool
 ) -> bool:
-    """Whether the sample after a run of repeats (`start` to `end`) is farther than samples are; at the recording's end,
-    whether the body stopped within a sample."""
+    """Return whether the movement after a run of repeats (`start` to `end`) is larger than is usual between samples.
+
+    For a run at the recording's end, return whether the body stopped from one sample to the next.
+    """
     ends_there = end == len(columns["time"])
     for group in parts:
         values = np.stack([columns[name] for name in group.names], axis=1)
@@ -305,7 +332,10 @@ def _goes_on_with_a_jump(
 
 
 def check_gaps(path: Path, columns: dict[str, Column], groups: Sequence[ColumnGroup], kind: Kind) -> tuple[int, int]:
-    """First and last row between which every column can be interpolated."""
+    """Return the first and last row between which every column can be interpolated.
+
+    **Raises** `InputError` for gaps longer than `LONGEST_GAP`, and if less than `SHORTEST` is left.
+    """
     time = columns["time"]
     spacing = float(np.median(np.diff(time)))
     longest = LONGEST_GAP + 1e-6
@@ -319,10 +349,10 @@ def check_gaps(path: Path, columns: dict[str, Column], groups: Sequence[ColumnGr
         fix = "cut the recording there"
         if kind not in group.mandatory:
             fix += f", or delete {', '.join(names)}"
-        # A quaternion is seen or missing as a whole, all else column by column.
+        # A quaternion is seen or missing as a whole, other quantities column by column.
         for together in [names] if group.quantity == "quaternion" else [(name,) for name in names]:
             seen = np.flatnonzero(has_sample(columns, together))
-            # The time that each gap lacks: from the sample before to the sample after, less one spacing.
+            # Duration of each gap: the time from the sample before to the sample after, minus one spacing.
             edges = np.concatenate([[time[0] - spacing], time[seen], [time[-1] + spacing]])
             lacking = np.diff(edges) - spacing
             gap = first_true(lacking > longest)
@@ -339,9 +369,10 @@ def check_gaps(path: Path, columns: dict[str, Column], groups: Sequence[ColumnGr
 
 
 def has_sample(columns: dict[str, Column], names: Iterable[str]) -> Bool[np.ndarray, " T"]:
+    """Return a mask of the rows in which all named columns have a sample."""
     return ~np.any([np.isnan(columns[name]) for name in names], axis=0)
 
 
 def first_true(bad: np.ndarray) -> int | None:
-    """Index of the first true entry."""
+    """Return the index of the first true entry, or None."""
     return int(bad.argmax()) if bad.any() else None

@@ -1,4 +1,4 @@
-"""Errors of simulated windows beside recorded ones, in expected errors, and the loss that fits make of them."""
+"""Errors of simulated windows against recorded ones, in units of the expected error, and the loss used by fits."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.observation import ObservationLayout, euler_to_matrix, wrap_angle
 
 POSITION = (0.002, 0.01)
-"""Expected error of the tracked body's position (m) at a window's start, and what each second adds."""
+"""Expected error of the tracked body's position: value at a window's start (m), and growth rate (m/s)."""
 ANGLE = (np.deg2rad(0.3), np.deg2rad(0.6))
-"""Likewise of its orientation (rad)."""
-_LOST = 20.0
-"""What a window counts as that diverged in simulation, in expected errors."""
+"""Expected error of the tracked body's orientation: value at a window's start (rad), and growth rate (rad/s)."""
+_DIVERGED = 20.0
+"""Norm of the errors assigned to a window that diverged in simulation, in units of the expected error."""
 OUTLYING = 3.0
-"""Expected errors beyond which a window counts less: a contact point slipped there, for example."""
+"""Norm of a window's errors above which the loss grows linearly, in units of the expected error. It limits the weight
+of windows in which, for example, a contact point slipped."""
 
 
 def window_errors(
@@ -28,12 +29,14 @@ def window_errors(
     recorded: Float[Array | np.ndarray, "windowsteps features"],
     robot: RobotDescription,
 ) -> Float[Array, "windowsteps errors"]:
-    """Return errors of the tracked body's position and orientation, in expected errors.
+    """Return errors of the tracked body's position and orientation, in units of the expected error.
 
-    Errors of orientation are those of roll, pitch and yaw of an upright robot. Of others they are the nine differences
-    of the rotation matrices over sqrt(2), whose length is the angle between small rotations and grows up to 180 deg.
-    Neighbours in time say the same: all of a window's squares add up to one for each of the six degrees of freedom
-    where errors are as expected.
+    For an upright robot, the orientation errors are differences of roll, pitch and yaw. For other robots they are the
+    nine differences of the rotation matrices, divided by sqrt(2). Their norm equals the angle between the orientations
+    if this is small, and grows with it up to 180 deg.
+
+    Errors at neighbouring times are correlated, so all errors are divided by the square root of the number of steps. If
+    errors are as expected, the squares of a window add up to one for each of the six degrees of freedom.
     """
     steps, layout = len(recorded), ObservationLayout
     time = np.arange(1, steps + 1)[:, None] * robot.control_timestep
@@ -49,11 +52,14 @@ def window_errors(
 
 
 def pseudo_huber(squared: Any) -> Any:
-    """Pseudo-Huber loss of windows, by their errors' squared length: that itself below `OUTLYING`, linear above."""
+    """Return the pseudo-Huber loss of windows from the squared norms of their errors.
+
+    For norms below `OUTLYING` the loss is about the squared norm. Above, it grows linearly with the norm.
+    """
     return 2 * OUTLYING**2 * ((1 + squared / OUTLYING**2) ** 0.5 - 1)
 
 
 def count_lost(errors: Float[np.ndarray, "windows entries"]) -> Float[np.ndarray, "windows entries"]:
-    """Return errors of windows in which those that diverged have `_LOST` in all."""
+    """Return errors of windows in which each diverged (non-finite) window has errors of norm `_DIVERGED`."""
     finite = np.isfinite(errors).all(axis=1, keepdims=True)
-    return np.where(finite, errors, _LOST / math.sqrt(errors.shape[1]))
+    return np.where(finite, errors, _DIVERGED / math.sqrt(errors.shape[1]))

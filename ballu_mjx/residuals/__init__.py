@@ -1,1 +1,1 @@
-"""Stage 3, residual forces: what the simulator lacks, learned or identified."""
+"""Residuals (stage 3): learned or identified forces, model fields and command changes that correct the simulator."""

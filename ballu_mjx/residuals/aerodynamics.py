@@ -1,8 +1,8 @@
-"""The white-box residual: what the air does to a buoyant body, in sixteen numbers.
+"""Aerodynamic residual: a physical model of the air around a buoyant body, with sixteen parameters.
 
-The body is the tracked one of the robot, and has `gravcomp` in its model. It drags half its displaced air
-along, is slowed by it, and is lifted at a point that need not be where the model has it. Each of these is a textbook's
-formula with a constant or two to find; none needs a network.
+The body is the tracked body of the robot and has `gravcomp` in its model. It drags along half of the air that it
+displaces (added mass), and drag slows it. The lift may act at another point than in the model. Each effect is a
+textbook formula with one or two unknown constants.
 """
 
 from __future__ import annotations
@@ -33,32 +33,33 @@ from ballu_mjx.sim.step import count_substeps
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class AirParameters:
-    """What the nominal model leaves out of the air's effect on the tracked body; all 0: nothing.
+    """Parameters of the air's effect on the tracked body that the nominal model lacks. 0 means no effect.
 
-    Axes are the body's.
+    Vectors are in the body frame.
     """
 
     added_mass: Float[Array, ""]
-    """Mass of air that the body drags along (kg); weightless."""
+    """Added mass: mass of the air that the body drags along (kg). It has no weight."""
     added_inertia: Float[Array, ""]
-    """Moment of inertia of that air (kg m^2)."""
+    """Moment of inertia of this air (kg m^2)."""
     lift: Float[Array, ""]
-    """Lift beyond the model's (N)."""
+    """Lift in addition to the model's (N)."""
     centre: Float[Array, " 3"]
-    """Where mass, lift and drag act, off the model's centre of mass of the body (m)."""
+    """Offset of the point at which mass, lift and drag act from the body's centre of mass in the model (m)."""
     linear_drag: Float[Array, " 3"]
-    """Force for each m/s along each axis (N s/m)."""
+    """Linear drag: force per velocity along each axis (N s/m)."""
     quadratic_drag: Float[Array, " 3"]
-    """Force for each m/s along each axis, times the speed (N s^2/m^2): half density times area times coefficient."""
+    """Quadratic drag: force per velocity along each axis and per speed (N s^2/m^2). It is half the density times area
+    times drag coefficient."""
     turning_drag: Float[Array, " 3"]
-    """Torque for each rad/s about each axis (N m s)."""
+    """Rotary drag: torque per angular velocity about each axis (N m s)."""
     delay: Float[Array, ""]
-    """How late commands reach the actuators (s, at most `longest_delay`). No air, but what moves late passes for heavy:
-    left out, it is laid at the added mass's door."""
+    """Delay between commands and actuators (s), at most `longest_delay`. It is no effect of the air. But a late motion
+    looks like that of a heavier body, so a fit without the delay would overestimate the added mass."""
 
     @staticmethod
     def none() -> AirParameters:
-        """The nominal model's air."""
+        """Return the parameters of the nominal model: all are 0."""
         zero = jnp.zeros(())
         three = jnp.zeros(3)
         return AirParameters(zero, zero, zero, three, three, three, three, zero)
@@ -68,30 +69,30 @@ AERODYNAMICS_FORMAT = "ballu-air/1"
 AERODYNAMICS_FILE = "air.json"
 AIR_PARAMETERS = tuple(field.name for field in dataclasses.fields(AirParameters))
 SIGNED_AIR_PARAMETERS = ("lift", "centre")
-"""All others are 0 or more."""
-_MOST = 100.0
-"""No parameter comes near, in SI units."""
+"""Parameters that may be negative."""
+_LARGEST = 100.0
+"""Largest magnitude of a parameter other than the delay (SI units), far above all realistic values."""
 
 
 def longest_delay(robot: RobotDescription) -> float:
-    """Return the longest delay of commands (s): older commands are not remembered."""
+    """Return the longest possible delay of commands (s). The history of a rollout has no older commands."""
     return (HISTORY - 1) * robot.control_timestep
 
 
 class Aerodynamics(Residual):
-    """The force model (see `residual.Residual`) whose parameters are `AirParameters`."""
+    """Aerodynamic residual (`sim.residual.Residual`). Its parameters are `AirParameters`."""
 
     def __init__(self, robot: RobotDescription, model: mujoco.MjModel) -> None:
-        """Prepare for `robot`; `model` is its C model without the residual.
+        """Prepare the residual for `robot`, whose C model without the residual is `model`.
 
-        **Raises** `InputError` where the tracked body has no buoyancy.
+        **Raises** `InputError` if the tracked body has no buoyancy.
         """
         self._robot, self._body = robot, int(model.site_bodyid[model.site(robot.tracked).id])
         if not model.body_gravcomp[self._body] > 0:
-            name = model.body(self._body).name or "that the tracked site is on"
+            name = model.body(self._body).name or "of the tracked site"
             raise InputError(
-                f"{robot.model}: the body {name} has no buoyancy, which aerodynamics are identified for; give it "
-                'gravcomp="LIFT / WEIGHT".'
+                f"{robot.model}: the body {name} has no buoyancy, but the aerodynamic residual is for buoyant bodies; "
+                'give the body gravcomp="LIFT / WEIGHT".'
             )
         self._control_timestep, self._longest_delay = robot.control_timestep, longest_delay(robot)
         self._mass, self._inertia = jnp.asarray(model.body_mass), jnp.asarray(model.body_inertia)
@@ -101,14 +102,18 @@ class Aerodynamics(Residual):
 
     @property
     def name(self) -> str:
-        """Return what a simulator improved by it is called."""
+        """Return the name of a simulator with this residual."""
         return "aerodynamic"
 
     def inputs(self, history: History, commands: Commands) -> Float[Array, " inputs"]:
+        """Return `network_input` with default options. It only serves for the training range; loads do not use it."""
         return network_input(history, commands, ForceNetworkConfig(), self._robot)
 
     def fields(self, params: AirParameters) -> Fields:
-        """Return the tracked body's mass, inertia, centre and lift. The lift carries the added mass."""
+        """Return model fields with the tracked body's mass, inertia, centre of mass and lift.
+
+        The lift compensates the weight of the added mass.
+        """
         body = self._body
         mass = self._mass.at[body].add(params.added_mass)
         lift = (self._gravcomp[body] * self._mass[body] + params.added_mass) * self._gravity + params.lift
@@ -120,16 +125,16 @@ class Aerodynamics(Residual):
         }
 
     def command(self, params: AirParameters, commands: Commands) -> Float[Array, "parts commands"]:
-        """What has arrived by the start of each physics step, `delay` late.
+        """Return the command that has arrived at the start of each physics step, after the delay.
 
-        Not a mean of old and new command: an actuator that saturates would turn at once as fast as it can.
+        Commands are not interpolated. A saturated actuator would otherwise move at full speed too early.
         """
         late = jnp.clip(params.delay, 0.0, self._longest_delay) - self._timestep * jnp.arange(self._substeps)
-        age = jnp.ceil(late / self._control_timestep - _JUST)
+        age = jnp.ceil(late / self._control_timestep - _ROUNDING)
         return commands[HISTORY - 1 - jnp.maximum(age, 0).astype(int)]
 
     def act(self, params: AirParameters, history: History, commands: Commands, key: Array | None = None) -> Action:
-        """Return the drag in still air, by the velocities in the middle of the coming control step."""
+        """Return the drag in still air, for the velocities in the middle of the coming control step."""
         del commands, key
         now, velocity, rate = body_motion(history, self._control_timestep)
         speed = smooth_speed(velocity)
@@ -138,14 +143,15 @@ class Aerodynamics(Residual):
         return Action(jnp.concatenate([now @ force, now @ torque])[None])
 
 
-_JUST = 1e-3
-"""Of a control step: a delay of just so many physics steps is over when they are."""
+_ROUNDING = 1e-3
+"""Tolerance for rounding errors of a delay (control steps). Without it, a command whose delay is a whole number of
+physics steps could arrive one physics step late."""
 
 
 def read_air_parameters(path: Path, robot: RobotDescription) -> AirParameters:
-    """The parameters in a file of the format `ballu-air/1`, which `train aerodynamic` writes.
+    """Read parameters from a file of the format `ballu-air/1`, which `train aerodynamic` writes.
 
-    **Raises** `InputError` naming file, key and mend.
+    **Raises** `InputError` if the file is damaged. The message names file, parameter and fix.
     """
     content = files.read_json(path, "restore it or identify again")
     if content.get("format") != AERODYNAMICS_FORMAT or not isinstance(content.get("parameters"), dict):
@@ -154,19 +160,19 @@ def read_air_parameters(path: Path, robot: RobotDescription) -> AirParameters:
 
 
 def air_parameters_to_json(params: AirParameters) -> dict[str, Any]:
-    """Numbers and lists of three by name."""
+    """Return parameters as JSON types: numbers and lists of three numbers, by name."""
     return {name: np.asarray(getattr(params, name), np.float64).round(9).tolist() for name in AIR_PARAMETERS}
 
 
 def air_parameters_from_json(values: Mapping[str, Any], path: Path, robot: RobotDescription) -> AirParameters:
-    """Return the inverse of `air_parameters_to_json`.
+    """Return the parameters that `air_parameters_to_json` has turned into JSON types. `path` is their file.
 
-    **Raises** `InputError` naming `path`, the parameter and the mend.
+    **Raises** `InputError` for a wrong value. The message names file, parameter and allowed values.
     """
     unknown = sorted(set(values) - set(AIR_PARAMETERS))
     if unknown:
         raise InputError(
-            f"{path}: there is no parameter {reprlib.repr(unknown[0])}; there are {', '.join(AIR_PARAMETERS)}."
+            f"{path}: there is no parameter {reprlib.repr(unknown[0])}; parameters are {', '.join(AIR_PARAMETERS)}."
         )
     read = {}
     for name, like in AirParameters.none().__dict__.items():
@@ -177,8 +183,8 @@ def air_parameters_from_json(values: Mapping[str, Any], path: Path, robot: Robot
             raise InputError(f"{path}: {name} must be {needed}, not {reprlib.repr(value)}.")
         if name not in SIGNED_AIR_PARAMETERS and min(numbers) < 0:
             raise InputError(f"{path}: {name} is {value}; it must be 0 or more.")
-        most = longest_delay(robot) if name == "delay" else _MOST
-        if max(map(abs, numbers)) > most:
-            raise InputError(f"{path}: {name} is {value}; it must be {most:g} or less.")
+        largest = longest_delay(robot) if name == "delay" else _LARGEST
+        if max(map(abs, numbers)) > largest:
+            raise InputError(f"{path}: {name} is {value}; its magnitude must be {largest:g} or less.")
         read[name] = jnp.asarray(numbers, jnp.float32).reshape(like.shape)
     return AirParameters(**read)

@@ -1,12 +1,12 @@
-"""Identifying the air from recordings of free motion, by least squares through MJX.
+"""Fit of the aerodynamic parameters to recordings of free motion, by least squares through MJX.
 
-The recordings are cut into short windows. Each is simulated from its recorded first state under its recorded commands;
-what the place and orientation of the simulated tracked body differ by from the recorded ones is made small, by
-nonlinear least squares with a loss that single bad windows, such as one with a slipping contact, do not dominate.
+The recordings are cut into short windows. Each window is simulated from its recorded first state under its recorded
+commands. Nonlinear least squares minimizes the errors of the tracked body's position and orientation. The loss is
+robust, so that single bad windows, for example with a slipping contact, do not dominate.
 
-Slopes are taken over a parameter's order of magnitude, not at a point. Where contacts begin at other times than in the
-recording, derivatives hold for less than a millinewton of lift and point nowhere beyond, while errors over thirty
-change smoothly (`docs/white_box.md`, "Why not derivatives").
+Finite differences over a parameter's order of magnitude replace derivatives. If contacts begin at other times than in
+the recording, derivatives with respect to the lift hold for less than 1 mN. The errors change smoothly over 30 mN
+(`docs/white_box.md`, "Why not derivatives").
 """
 
 from __future__ import annotations
@@ -45,24 +45,26 @@ from ballu_mjx.sim.simulator import Simulator
 
 @dataclasses.dataclass(frozen=True)
 class AirConfig:
-    """How to identify the air."""
+    """Options of the fit of the aerodynamic parameters."""
 
     window_seconds: float = 2.0
-    """Length of a window, s. Shorter ones leave more to the starting state, and gave the added mass a half too high."""
+    """Length of a window, s. Shorter windows depend more on the starting state. With them, the fitted added mass was
+    too high by half."""
     interval_seconds: float = 2.0
     """Time between the starts of two windows, s."""
     evaluations: int = 15
-    """Most steps of the least-squares solver with all parameters free; with fewer free, which cost less a step,
-    accordingly more."""
+    """Largest number of evaluations of the least-squares solver with all parameters free. With fewer free parameters,
+    which take less time for an evaluation, it is proportionally larger."""
 
 
 class Scale(NamedTuple):
-    """A parameter's order of magnitude: where the solver looks first, over what it takes slopes, and how far a weak
-    prior lets it go."""
+    """Order of magnitude of a parameter, with its prior."""
 
     typical: float
+    """Order of magnitude (SI units): step of the finite differences, scale of the solver's first step, and starting
+    value of parameters that cannot be negative."""
     prior: float = 3.0
-    """Standard deviation of the prior, in multiples of `typical`."""
+    """Standard deviation of the weak prior, in multiples of `typical`."""
 
 
 SCALES: dict[str, Scale] = {
@@ -75,38 +77,44 @@ SCALES: dict[str, Scale] = {
     "turning_drag": Scale(3e-3),
     "delay": Scale(0.05),
 }
-"""By name; SI units."""
-_AGAIN = 4
-"""Most steps of the solver at each of the two whole delays next to the best."""
-_INSIDE = 0.01
-"""Of `typical`: so far from its bounds a search begins. On one, the solver takes its first steps for nothing."""
+"""Scales of the parameters by name."""
+_DELAY_EVALUATIONS = 4
+"""Largest number of evaluations of the solver at each of the two whole delays next to the fitted delay."""
+_MARGIN = 0.01
+"""Distance of a starting value from its bounds, in multiples of `typical`. A solver that starts on a bound wastes its
+first steps."""
 _GAIN, _STEP = 1e-4, 1e-3
-"""Steps that gain less than that share of the cost, or are that short, are the contacts' noise."""
+"""Relative gain in cost and relative length of a step at which the solver stops. Smaller ones are noise of contacts."""
 
 
 @dataclasses.dataclass(frozen=True)
 class AirFit:
-    """What came out."""
+    """Result of a fit of the aerodynamic parameters."""
 
     parameters: AirParameters
     standard_errors: AirParameters
-    """Of windows that err independently, by as much as expected; 0 for what was not free."""
+    """Standard errors, for windows with independent errors of the expected size. 0 for parameters that were fixed."""
     cost: tuple[float, float]
-    """Half the sum of squares, softened, without the residual and at the end."""
+    """Half the robust sum of squares before and after the fit. Before the fit there is no residual, or that of
+    `fixed_from`."""
     windows: int
+    """Number of windows."""
     control_steps: int
-    """Simulated for it."""
+    """Number of control steps that were simulated."""
 
 
 Report = Callable[[int, float], None]
-"""(evaluations so far, cost)."""
+"""Function of the number of evaluations so far and of the cost."""
 
 
 def check_air_config(config: AirConfig, control_timestep: float) -> None:
-    """**Raises** `InputError` for options out of range, naming the option."""
+    """Check options for a robot with a control step of `control_timestep` (s).
+
+    **Raises** `InputError` for an option out of range. The message names it.
+    """
     check_motion_windows(config.window_seconds, config.interval_seconds, control_timestep)
     if config.evaluations < 1:
-        raise InputError(f"--evaluations is {config.evaluations}: it must be 1 or more; 1 is the nearest.")
+        raise InputError(f"--evaluations is {config.evaluations}: it must be 1 or more.")
 
 
 def identify_air(
@@ -122,12 +130,15 @@ def identify_air(
 
     **Arguments**
 
-    - `simulator`: the robot without the residual, its actuators identified.
-    - `report`: told of every evaluation.
-    - `fixed_from`: where to start, and the values of what is not `free`; None: no air.
+    - `simulator`: simulator of the robot with identified actuators, without the residual.
+    - `motions`: training motions.
+    - `config`: options of the fit.
+    - `report`: function that is called after every evaluation.
+    - `fixed_from`: starting values, and values of the parameters that are not in `free`. If None, the fixed parameters
+      are 0. Free ones then start at their order of magnitude, or at 0 if they may be negative.
     - `free`: names of the parameters to fit.
 
-    **Raises** `InputError` where no recording is as long as a window.
+    **Raises** `InputError` for options out of range, and if no motion is as long as a window.
     """
     check_air_config(config, simulator.robot.control_timestep)
     simulated = AirWindows(simulator, motions, config)
@@ -142,10 +153,11 @@ def identify_air(
     evaluations = 0
 
     def fitted(vector: np.ndarray, places: Int[np.ndarray, " free"], most: int) -> Optimum:
-        """The best of the parameters at `places`, in so many steps at most."""
-        spread, middle = scale[places], np.clip(vector, low + _INSIDE * scale, high - _INSIDE * scale)[places]
+        """Fit the parameters at the indices `places` of `vector`, in about `most` evaluations."""
+        spread, middle = scale[places], np.clip(vector, low + _MARGIN * scale, high - _MARGIN * scale)[places]
 
-        # Counted from the start: the solver first trusts a region as large as what it starts with, 1 where that is 0.
+        # The solver's variables are differences from the start, in units of the scales. The solver takes the norm of
+        # its starting point as the size of its first trust region, or 1 if that norm is 0, as it is here.
         def whole(x: np.ndarray) -> np.ndarray:
             moved = vector.copy()
             moved[places] = middle + x * spread
@@ -181,12 +193,15 @@ def identify_air(
 
     without = fitted(start, np.zeros(0, int), 1).cost
     places = np.flatnonzero(np.isin(owner, list(free)))
-    if fixed_from is None:  # not from the bounds, where what must be positive has nowhere to go but up
+    if fixed_from is None:  # Parameters that cannot be negative do not start at their bound 0.
         start[places] = np.where(np.isin(owner, SIGNED_AIR_PARAMETERS), 0.0, scale)[places]
     found = fitted(start, places, config.evaluations)
     if "delay" in free:
         found = at_whole_delay(
-            found, is_delay, simulated.timestep, lambda vector: fitted(vector, places[~is_delay[places]], _AGAIN)
+            found,
+            is_delay,
+            simulated.timestep,
+            lambda vector: fitted(vector, places[~is_delay[places]], _DELAY_EVALUATIONS),
         )
     return AirFit(
         parameters=unravel(jnp.asarray(found.vector, jnp.float32)),
@@ -198,28 +213,40 @@ def identify_air(
 
 
 class Optimum(NamedTuple):
-    """Of a fit: all parameters, their covariance, and the cost."""
+    """Optimum of a fit: all parameters, their covariance, and the cost."""
 
     vector: Float[np.ndarray, " parameters"]
     covariance: Float[np.ndarray, "parameters parameters"]
+    """Covariance of the parameters. 0 for parameters that were fixed."""
     cost: float
 
 
 def at_whole_delay(
     found: Optimum, delay: Bool[np.ndarray, " parameters"], step: float, fitted: Callable[[np.ndarray], Optimum]
 ) -> Optimum:
-    """The better one of the two whole delays next to the one `found`, with all else fitted again. To the covariance of
-    `found` comes what rounding the delay does to it and to what passes for it."""
+    """Round the delay of an optimum to a whole number of physics steps, and fit the other parameters again.
+
+    Both whole delays next to the delay of `found` are tried, and the one with the lower cost is kept. The covariance is
+    that of `found`, plus the effect of rounding on the delay and on the parameters that are correlated with it.
+
+    **Arguments**
+
+    - `found`: optimum with any delay.
+    - `delay`: mask of the delay in the vector of parameters.
+    - `step`: duration of a physics step (s).
+    - `fitted`: function that fits the other parameters, from a vector with a whole delay.
+    """
     place = int(np.flatnonzero(delay)[0])
     steps = found.vector[place] / step
-    neighbours = {int(np.floor(steps + _JUST)), int(np.ceil(steps - _JUST))}
+    neighbours = {int(np.floor(steps + _ROUNDING)), int(np.ceil(steps - _ROUNDING))}
     best = min((fitted(np.where(delay, step * whole, found.vector)) for whole in neighbours), key=lambda fit: fit.cost)
-    with_it = found.covariance[place] / max(found.covariance[place, place], np.finfo(float).tiny)
-    return best._replace(covariance=found.covariance + np.outer(with_it, with_it) * step**2 / 12)
+    # A rounding error is uniformly distributed over a physics step, so its variance is step^2 / 12.
+    regression = found.covariance[place] / max(found.covariance[place, place], np.finfo(float).tiny)
+    return best._replace(covariance=found.covariance + np.outer(regression, regression) * step**2 / 12)
 
 
-_JUST = 1e-3
-"""Physics steps: so near, a delay is whole."""
+_ROUNDING = 1e-3
+"""Tolerance within which a delay counts as whole (physics steps)."""
 
 
 def _cost(residuals: np.ndarray) -> float:
@@ -229,15 +256,16 @@ def _cost(residuals: np.ndarray) -> float:
 def _soften(
     errors: Float[np.ndarray, "windows entries"], slopes: Float[np.ndarray, "windows entries directions"] | None = None
 ) -> tuple[Float[np.ndarray, "windows entries"], Float[np.ndarray, "windows entries directions"]]:
-    """Scale errors (and their derivatives), window by window.
+    """Scale the errors of each window, and their finite differences `slopes`.
 
-    The sum of squares becomes `window_errors.pseudo_huber` of each window's whole error."""
+    The sum of squares of a window's scaled errors is its robust loss, `window_errors.pseudo_huber`.
+    """
     squared = np.sum(errors**2, axis=1)[:, None] + 1e-12
     loss = pseudo_huber(squared)
     factor = np.sqrt(loss / squared)
     if slopes is None:
         return factor * errors, np.zeros((*errors.shape, 0))
-    # The factor's derivative by the squared error, along each direction.
+    # The derivative of the factor with respect to the squared error, times the change of that along each direction.
     steepness = 1 / np.sqrt(1 + squared / OUTLYING**2)
     change = (steepness - loss / squared) / (2 * factor * squared)
     along = 2 * np.einsum("we,wed->wd", errors, slopes)[:, None, :]
@@ -245,42 +273,47 @@ def _soften(
 
 
 class AirWindows:
-    """Windows of recorded motions, and their simulation in any air; compiles once. A vector is a flattened
-    `AirParameters`."""
+    """Windows of recorded motions, and their simulation with any aerodynamic parameters.
+
+    The simulation compiles once. A `vector` is a flattened `AirParameters`.
+    """
 
     def __init__(self, simulator: Simulator, motions: Sequence[Motion], config: AirConfig) -> None:
+        """Cut the windows, and prepare their simulation in `simulator`."""
         self._simulator = simulator
         self._air = Aerodynamics(simulator.robot, simulator.mj_model)
         self.longest_delay = longest_delay(simulator.robot)
-        """s."""
+        """Longest possible delay (s)."""
         none, self._unravel = ravel_pytree(AirParameters.none())
         self._delay = int(self._unravel(jnp.arange(len(none), dtype=none.dtype)).delay)
         self.windows = cut_motion_windows(self._simulator, motions, config.window_seconds, config.interval_seconds)
         self._run = shard_over_devices(self.simulate, shared=1)
         self.timestep = float(simulator.mj_model.opt.timestep)
         self.control_steps = 0
-        """Simulated so far, in all windows."""
+        """Number of control steps simulated so far, in all windows."""
 
     @property
     def count(self) -> int:
-        """Of the windows."""
+        """Return the number of windows."""
         return len(self.windows.qpos)
 
     def errors(self, vector: np.ndarray) -> Float[np.ndarray, "windows entries"]:
-        """Errors of the simulated windows, in expected ones."""
+        """Return the errors of the simulated windows, in units of the expected error."""
         return self.linear(vector, np.zeros(0, int), np.zeros(0))[0]
 
     def linear(
         self, vector: np.ndarray, places: Int[np.ndarray, " free"], steps: Float[np.ndarray, " free"]
     ) -> tuple[Float[np.ndarray, "windows entries"], Float[np.ndarray, "windows entries free"]]:
-        """`errors`, and their slopes along the parameters at `places`, each over a step of so much.
+        """Return `errors`, and their finite differences with respect to the parameters at the indices `places`.
 
-        Commands arrive with a physics step; for a delay between two, errors are a mean of what the one and the other
-        give, and change by it as from the one to the other. Along other parameters: at the nearest whole delay.
+        Each finite difference is over the parameter's step in `steps`. Commands arrive at the start of a physics step.
+        The errors for a delay between two physics steps are therefore interpolated between the errors at both. Finite
+        differences with respect to the delay are over one physics step; those with respect to other parameters are at
+        the nearest whole delay.
         """
         before, after, share = self._neighbours(vector)
         nearest = before if share < 0.5 else after
-        between, is_delay = share >= _JUST, places == self._delay
+        between, is_delay = share >= _ROUNDING, places == self._delay
         first = self._whole(before)
         second = self._whole(after) if between or is_delay.any() else first
         near = first if share < 0.5 else second
@@ -295,21 +328,21 @@ class AirWindows:
         return (1 - share) * first + share * second if between else first, slopes
 
     def _neighbours(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """With the two whole delays next to that of `vector`, and how far it is from the first to the second."""
+        """Return `vector` with each of the two whole delays next to its own, and the fraction between them (0 to 1)."""
         most = round(self.longest_delay / self.timestep)
         steps = vector[self._delay] / self.timestep
-        first = min(int(steps + _JUST), most - 1)
+        first = min(int(steps + _ROUNDING), most - 1)
         before, after = vector.copy(), vector.copy()
         before[self._delay], after[self._delay] = first * self.timestep, (first + 1) * self.timestep
         return before, after, float(np.clip(steps - first, 0.0, 1.0))
 
     def _whole(self, vector: np.ndarray) -> Float[np.ndarray, "windows entries"]:
-        """`errors`, at a whole delay."""
+        """Return `errors` for a vector with a whole delay."""
         self.control_steps += math.prod(np.shape(self.windows.features)[:2])
         return count_lost(np.array(self._run(np.float32(vector), self.windows), np.float64))
 
     def simulate(self, vector: Float[Array, " parameters"], window: MotionWindows) -> Float[Array, " entries"]:
-        """`errors` of one window, at a whole delay; JAX's own transformations apply."""
+        """Return `errors` of one window for a vector with a whole delay. JAX transformations apply."""
         air = self._unravel(vector)
         simulator = self._simulator.with_residual(BoundResidual(self._air, air))
         return simulate_motion_window(simulator, window).ravel()

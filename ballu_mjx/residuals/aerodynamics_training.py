@@ -1,4 +1,4 @@
-"""Identification of the air: from a simulator and recorded motions to a residual."""
+"""Fit of the aerodynamic residual: from a simulator and recorded motions to a residual."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
 from ballu_mjx.sim.simulator import Simulator
 
-_BESIDE = 9
-"""Most evaluations beside those of the first fit: one without air, and a fit at each whole delay beside the best."""
+_FURTHER_EVALUATIONS = 9
+"""Largest number of evaluations in addition to the first fit: one before it, and two fits at whole delays after it."""
 
 
 def fit_aerodynamics(
@@ -40,33 +40,40 @@ def fit_aerodynamics(
     run: TrainingRecord | None = None,
     progress: PhaseProgress | None = None,
 ) -> TrainedResidual:
-    """Identify the air around the robot; the result's report has the parameters with their standard errors.
+    """Fit the parameters of the aerodynamic residual.
+
+    The report of the result has the parameters with their standard errors.
 
     **Arguments**
 
-    - `motions`: what the simulator is to follow.
-    - `config`: how to identify; None: the defaults.
-    - `fixed_from`: an earlier result, whose parameters are kept but for those that are `free`; None: none are kept.
-    - `free`: names of the parameters to identify. Where the simulator's drivetrain has a delay, the delay is known and
-      not among them.
-    - `run`: takes measurements and files, in a folder say; None: memory.
-    - `progress`: is told of every evaluation.
+    - `simulator`: the simulator to correct.
+    - `motions`: training motions.
+    - `config`: options of the fit. None for the defaults.
+    - `fixed_from`: an earlier result. Its parameters are kept, except those in `free`. If None, they are 0.
+    - `free`: names of the parameters to fit. If the simulator's drivetrain has a delay, the delay is known and is not
+      fitted.
+    - `run`: record of metrics and files, for example a run's folder. None to keep them in memory.
+    - `progress`: display that is updated after every evaluation.
 
-    **Raises** `InputError` for options out of range, where `fixed_from` is no such result or belongs to another
-    simulator, and where no motion is as long as a window.
+    **Raises** `InputError` for options out of range, if `fixed_from` is of another kind or of another simulator, and if
+    no motion is as long as a window.
     """
     config = config or AirConfig()
     check_air_config(config, simulator.control_timestep)
     if has_delay(simulator):
         free = [name for name in free if name != "delay"]
     if not free:
-        raise InputError(f"--free names no parameter that is unknown; there are {', '.join(AIR_PARAMETERS)}.")
+        raise InputError(f"--free names no parameter that is unknown; give one or more of {', '.join(AIR_PARAMETERS)}.")
     if fixed_from is not None and not same_parameters(fixed_from.actuators, simulator.actuators):
-        raise InputError("The earlier residual belongs to other actuators than the simulator's; take the same.")
+        raise InputError(
+            "The earlier residual was fitted with other actuators than the simulator's; give the same actuators."
+        )
     if fixed_from is not None and not isinstance(fixed_from.model, Aerodynamics):
-        raise InputError(f"The earlier residual is of kind {fixed_from.model.name}, not aerodynamic; give another.")
+        raise InputError(
+            f"The earlier residual is of the kind {fixed_from.model.name}, not aerodynamic; give an aerodynamic one."
+        )
     record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run
-    report, most = FitReport(record, progress, "cost"), _BESIDE + config.evaluations
+    report, most = FitReport(record, progress, "cost"), _FURTHER_EVALUATIONS + config.evaluations
     values = None if fixed_from is None else fixed_from.params
     found = identify_air(
         simulator,
@@ -88,7 +95,7 @@ def has_delay(simulator: Simulator) -> bool:
 
 
 def air_details(found: AirFit) -> dict[str, Any]:
-    """Return what the file `AERODYNAMICS_FILE` holds."""
+    """Return the content of the file `AERODYNAMICS_FILE`."""
     return {
         "format": AERODYNAMICS_FORMAT,
         "parameters": air_parameters_to_json(found.parameters),
@@ -111,7 +118,7 @@ _UNITS = {
 
 
 def air_table(found: AirFit) -> str:
-    """Return the parameters with their standard errors, as text."""
+    """Return a table of the parameters with their standard errors, as text."""
     lines = [f"{'':18}{'':4}{'value':>12}{'std. error':>12}"]
     values, errors = (air_parameters_to_json(each) for each in (found.parameters, found.standard_errors))
     for name, unit in _UNITS.items():
@@ -120,7 +127,7 @@ def air_table(found: AirFit) -> str:
         for axis, (value, error) in zip("xyz", rows, strict=False):
             lines.append(f"{name:18}{'' if single else axis:4}{value:>12.5f}{error:>12.5f}  {unit}")
     lines.append(
-        f"{found.windows} windows; robust cost {found.cost[0]:.1f} without, {found.cost[1]:.1f} with. Axes are the "
-        "buoyant body's."
+        f"{found.windows} windows; robust cost {found.cost[0]:.1f} before the fit, {found.cost[1]:.1f} after it. Axes "
+        "are those of the buoyant body."
     )
     return "\n".join(lines)

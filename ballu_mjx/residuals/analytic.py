@@ -1,9 +1,9 @@
 """Residual forces by the gradient of the tracking error through the simulation.
 
-Windows of the recordings are simulated with the network's forces, and every control step of them is linearized
-(`sim.linearize`). Backpropagation through these derivatives, in time order, is backpropagation through the accurate
-simulator, contacts included; and for small changes of the forces the linearized windows go on standing in for it, so
-that one simulation serves some gradient steps. Then other windows are simulated and linearized.
+Windows of the recordings are simulated with the network's forces, and each control step is linearized
+(`sim.linearize`). Backpropagation through these derivatives is backpropagation through the accurate simulator,
+contacts included. For small changes of the forces, the linearized windows remain valid, so one simulation serves
+several gradient steps. Then other windows are simulated and linearized.
 """
 
 from __future__ import annotations
@@ -35,39 +35,44 @@ from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState
 
 @dataclasses.dataclass(frozen=True)
 class AnalyticConfig:
-    """How to learn by gradients through the simulation."""
+    """Options of learning by gradients through the simulation."""
 
     window_seconds: float = 8.0
     """Length of a window, s."""
     interval_seconds: float = 8.0
     """Time between the starts of two windows, s."""
     relinearizations: int = 8
-    """Simulations of windows, each linearized and then learned on."""
+    """Number of simulations. Each simulation is followed by a linearization and `updates` gradient steps."""
     windows: int = 16
-    """Windows in a simulation, drawn anew for each."""
+    """Number of windows in a simulation, drawn anew for each simulation."""
     updates: int = 20
-    """Gradient steps after each linearization, each on all its windows."""
+    """Gradient steps after each linearization. Each uses all windows of the simulation."""
     validate_every: int = 20
-    """Gradient steps between two validations, each of which leaves a checkpoint."""
+    """Gradient steps between two validations, at most. Each validation saves a checkpoint."""
     learning_rate: float = 1e-3
-    """Adam's."""
+    """Learning rate of Adam."""
     max_grad_norm: float = 1.0
-    """Gradients longer than this are shortened to it: contacts make some windows' derivatives a thousand times longer
-    than others'."""
+    """Largest norm of a gradient; longer gradients are scaled down to it. Contacts make the derivatives of some windows
+    a thousand times larger than those of others."""
     averaging: int = 50
-    """Gradient steps over which the network that is handed out is averaged (exponentially)."""
+    """Time constant of the exponential average of the network's parameters, in gradient steps. The averaged network is
+    validated and saved."""
     force_cost: float = 0.0
-    """Loss for each N^2 of force."""
+    """Cost of force, in loss per N^2."""
     observation_noise: float = 1.0
-    """Noise on what the network sees in training, in multiples of each entry's spread over the recordings."""
+    """Standard deviation of noise on the network's input in training, in multiples of each input's standard deviation
+    over the recordings."""
     start_noise: float = 0.0
-    """Perturbation of a window's first state, in multiples of what reconstruction leaves uncertain."""
+    """Perturbation of a window's first state, in multiples of the uncertainty of the reconstruction."""
     seed: int = 0
-    """Seeds network, batches and noise."""
+    """Seed of the network's initial parameters, of the choice of windows, and of the noise."""
 
 
 def check_analytic_config(config: AnalyticConfig, control_timestep: float) -> None:
-    """**Raises** `InputError` for options out of range, naming the option."""
+    """Check options for a robot with a control step of `control_timestep` (s).
+
+    **Raises** `InputError` for an option out of range. The message names it.
+    """
     check_motion_windows(config.window_seconds, config.interval_seconds, control_timestep)
     positive = "relinearizations", "windows", "updates", "validate_every", "learning_rate", "max_grad_norm", "averaging"
     for name in positive:
@@ -78,18 +83,18 @@ def check_analytic_config(config: AnalyticConfig, control_timestep: float) -> No
 def compile_rollout(
     simulator: AugmentedSimulator, forces: NetworkResidual
 ) -> Callable[[Any, MotionWindows], tuple[ControlSteps, Float[np.ndarray, "windows windowsteps features"]]]:
-    """Return a compiled simulation of windows under `forces`, in `simulator`.
+    """Return a compiled function that simulates windows in `simulator` under the loads of `forces`.
 
-    It takes the parameters of `forces` and windows, and returns all control steps, window after window, and the
-    features after each.
+    The function takes the parameters of `forces` and the windows. It returns the control steps of all windows in one
+    axis, window after window, and the features after each control step.
     """
 
     def run(params: Any, window: MotionWindows) -> tuple[ControlSteps, Array]:
         def step(state: RolloutState, command: Array) -> tuple[RolloutState, tuple[ControlSteps, Array]]:
             seen = forces.inputs(state.history, state.with_command(command))
             loads = forces.loads(params, seen, state.features[ObservationLayout.yaw])
-            does = FORCE_SETS[forces.config.forces].act(loads, forces.robot)
-            after = simulator.step(state, command, does).state
+            action = FORCE_SETS[forces.config.forces].act(loads, forces.robot)
+            after = simulator.step(state, command, action).state
             return after, (ControlSteps(state, command, loads), after.features)
 
         return jax.lax.scan(step, *start_motion_window(window))[1]
@@ -104,7 +109,7 @@ def compile_rollout(
 
 
 Report = Callable[[int, Any, dict[str, float]], None]
-"""(gradient steps so far, the averaged parameters, measurements)."""
+"""Function of the number of gradient steps so far, the averaged parameters, and metrics."""
 
 
 def train(
@@ -121,13 +126,15 @@ def train(
 
     **Arguments**
 
-    - `wrap`: what is learned to what `forces` takes.
-    - `start`: what is learned, to begin with.
+    - `forces`: the network.
+    - `wrap`: function that turns the learned parameters into parameters of `forces`.
+    - `start`: initial values of the learned parameters.
     - `recorded`: windows of the training recordings.
-    - `spread`: of each of the network's inputs over the recordings.
-    - `report`: told every `validate_every` gradient steps.
-    - `linearize`: of the same force set and the simulator to learn in, its base residual included; joints' torques
-      are left alone.
+    - `spread`: standard deviation of each input of the network over the recordings.
+    - `config`: options of the method.
+    - `report`: function that is called every `config.validate_every` gradient steps.
+    - `linearize`: linearization of the simulator to correct, including its base residual, for the force set of
+      `forces`. Derivatives with respect to joint torques are ignored.
     """
     simulate = compile_rollout(linearize.simulator, forces)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
@@ -157,6 +164,7 @@ def train(
 def _in_windows(
     linearized: Linearized, loads: Float[Array | np.ndarray, "steps loads"], recorded: MotionWindows
 ) -> tuple[Linearized, Float[Array, "windows windowsteps loads"], MotionWindows]:
+    """Return linearized control steps and loads with separate axes of windows and steps, and the windows as arrays."""
     shape, inputs = recorded.features.shape[:2], linearized.state.shape[1] + loads.shape[1]
     linearized = linearized._replace(state=linearized.state[..., :inputs], seen=linearized.seen[..., :inputs])
     parts = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32).reshape(*shape, *x.shape[1:]), (linearized, loads))
@@ -168,7 +176,7 @@ def _loss(
     recorded: Float[Array | np.ndarray, "windowsteps features"],
     robot: RobotDescription,
 ) -> Float[Array, ""]:
-    """Of a whole window's error."""
+    """Return the pseudo-Huber loss of the error of a whole window."""
     return pseudo_huber(jnp.sum(window_errors(features, recorded, robot) ** 2))
 
 
@@ -181,7 +189,7 @@ def _updates(
     config: AnalyticConfig,
     robot: RobotDescription,
 ) -> Callable[..., Any]:
-    """Gradient steps on linearized windows, compiled."""
+    """Return a compiled function that makes gradient steps on linearized windows, one for each random key."""
 
     def window_loss(
         params: Any, key: Array, linear: Linearized, about: Float[Array, "windowsteps loads"], window: MotionWindows
@@ -218,11 +226,11 @@ def _updates(
                 both = jax.vmap(lambda key, *own: window_loss(params, key, *own))(jax.random.split(key, count), *data)
                 return jnp.mean(both[0]), jnp.mean(both[1])
 
-            (_, tracking), slope = jax.value_and_grad(loss, has_aux=True)(params)
-            change, state = optimizer.update(slope, state, params)
+            (_, tracking), gradient = jax.value_and_grad(loss, has_aux=True)(params)
+            change, state = optimizer.update(gradient, state, params)
             params = optax.apply_updates(params, change)
             average = jax.tree.map(lambda a, p: a + (p - a) / config.averaging, average, params)
-            return (params, state, average), (tracking, optax.tree.norm(slope))
+            return (params, state, average), (tracking, optax.tree.norm(gradient))
 
         return jax.lax.scan(update, carry, keys)
 

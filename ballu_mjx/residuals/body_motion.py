@@ -1,4 +1,4 @@
-"""How the tracked body moves, in its own axes, as residuals of the air or water see it."""
+"""Motion of the tracked body in its body frame, the input of residuals for air and water."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from ballu_mjx.sim.observation import ObservationLayout, euler_to_matrix
 
 
 def turn(matrix: Float[Array, "3 3"]) -> Float[Array, " 3"]:
-    """Return the rotation vector (rad) of a small rotation, to second order."""
+    """Return the rotation vector (rad) of a small rotation matrix, accurate to second order."""
     return jnp.stack([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2
 
 
 def body_motion(
     history: Float[Array, "steps features"], control_timestep: float
 ) -> tuple[Float[Array, "3 3"], Float[Array, " 3"], Float[Array, " 3"]]:
-    """Return the tracked body's rotation (body to world), velocity (m/s) and angular velocity (rad/s; body axes).
+    """Return the tracked body's rotation matrix (body to world), velocity (m/s) and angular velocity (rad/s).
 
-    The rotation is the current one. The velocities are those in the middle of the coming control step, extrapolated
-    from the last features (`sim.observation.observe_features`): a force is held over that step.
+    The rotation is the current one. Both velocities are in the body frame. They are extrapolated from the last features
+    (`sim.observation.observe_features`) to the middle of the coming control step, over which forces are held.
     """
     layout = ObservationLayout
     earlier, before, now = (euler_to_matrix(seen[layout.euler_angles]) for seen in history[-3:])
@@ -29,9 +29,9 @@ def body_motion(
 
 
 def smooth_speed(velocity: Float[Array, " 3"]) -> Float[Array, ""]:
-    """Return the speed (m/s), rounded off at rest, where the norm of a vector has no derivative."""
-    return jnp.sqrt(jnp.sum(velocity**2) + _SLOW**2)
+    """Return the speed (m/s), smoothed so that it has a derivative at rest."""
+    return jnp.sqrt(jnp.sum(velocity**2) + _SPEED_AT_REST**2)
 
 
-_SLOW = 1e-3
-"""m/s."""
+_SPEED_AT_REST = 1e-3
+"""Smoothed speed of a body at rest (m/s)."""

@@ -1,4 +1,4 @@
-"""Recordings for a residual: which, read and found fit, and the simulator's states in them."""
+"""Recordings of a residual's training: their choice, their check, and the reconstruction of their states."""
 
 from __future__ import annotations
 
@@ -24,63 +24,67 @@ from ballu_mjx.runs.folder import read_config
 from ballu_mjx.sim.simulator import Simulator
 
 USES: tuple[Split, ...] = ("training", "validation", "test")
+"""Uses of recordings."""
 QUICK_RECORDINGS = 2
-"""Recordings of each kind that `--quick` reads."""
+"""Largest number of recordings for each use with `--quick`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RecordingsData(loggers.LoggingOptions):
-    """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
+    """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of recordings."""
 
     recordings: tuple[Path, ...] = ()
-    """Recordings to learn from. Without this option: the bundled ones, for validation and test too."""
+    """Recordings to learn from. Without this option: the bundled recordings, also for validation and test."""
     validation: tuple[Path, ...] = ()
-    """Recordings that measure progress and choose the best checkpoint. Without this option, where --recordings are
-    your own: those."""
+    """Recordings that measure progress and choose the best checkpoint. Without this option: those of --recordings, if
+    given."""
     test: tuple[Path, ...] = ()
-    """Recordings for the final table. Without this option, where --recordings are your own: those for validation."""
+    """Recordings for the final table. Without this option: those for validation, if --recordings is given."""
     robot: str | None = None
-    """Whose recordings these are: the name of a robot that comes with the package, or the file of a description
-    (docs/own_robot.md). Without this option: the robot of --resume or --residual, where given, or else ballu."""
+    """Robot of the recordings: the name of a bundled robot, or the file of a robot's description (docs/own_robot.md).
+    Without this option: the robot of --resume or --residual, if given, or else ballu."""
     actuators: Path = AUTO
-    """File of identified actuators (`train sysid` writes it), or the word nominal, or auto: of actuators.json beside
-    the recordings or in the folder above, if it names their robot, and nominal ones, those that replay the validation
-    recordings better. With --resume, auto: the run's."""
+    """File of identified actuators (`train sysid` writes it), nominal, or auto. auto looks for actuators.json of the
+    same robot beside the recordings or in the folder above. It takes these or the nominal actuators, whichever replay
+    the validation recordings better. With --resume, auto takes the actuators of the run."""
     output: Path | None = None
-    """Folder of the run, new or empty. Without this option: one under runs/, named after the time."""
+    """Folder of the run, new or empty. Without this option: a new folder under runs/, named after the time."""
     quick: bool = False
-    """See everything work within two minutes, on a few recordings; the numbers mean little."""
+    """Run everything within two minutes, on a few recordings. The resulting numbers mean little."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ResidualDataset:
-    """What a residual is learned from and measured on.
+    """Recordings from which a residual is learned and on which it is measured, with robot and actuators.
 
     **Fields**
 
-    - `files`, `recordings`: by use, a key of `USES`.
-    - `identified`: the simulator's actuators (None: nominal).
-    - `robot`: whose recordings they are.
+    - `files`: files of the recordings, by use (`USES`).
+    - `recordings`: the recordings, by use.
+    - `identified`: identified actuators of the simulator. None for nominal actuators.
+    - `robot`: the robot of the recordings.
     """
 
     files: Mapping[str, list[Path]]
     recordings: Mapping[str, list[Recording]]
     identified: ModelParameters | None
     where: str
-    """Where the actuators come from, for the user to read."""
+    """Source of the actuators, as text for the user."""
     robot: RobotDescription
     undecided: bool = False
-    """Whether the better ones of the identified and the nominal actuators are to be taken."""
+    """Whether to compare the identified with the nominal actuators and take the better ones."""
 
     def with_actuators(self, identified: ModelParameters | None, where: str) -> ResidualDataset:
-        """Return the same with actuators that are decided on (None: nominal), and where they come from."""
+        """Return the dataset with actuators that are decided on (None for nominal ones). `where` names their source."""
         return dataclasses.replace(self, identified=identified, where=where, undecided=False)
 
     @staticmethod
     def read(data: RecordingsData, robot: RobotDescription, earlier: Path | None = None) -> ResidualDataset:
-        """Find and read everything, so that nothing wrong with it comes up later; `earlier` is the run that goes on.
+        """Find, read and check recordings and actuators, so that faults appear before the training.
 
-        **Raises** `InputError` for recordings or actuators that cannot be used, naming them.
+        `earlier` is the run that is resumed. None for a new run.
+
+        **Raises** `InputError` for recordings or actuators that cannot be used. The message names them.
         """
         files = _choose(data, robot, earlier)
         recordings = _read(files, robot)
@@ -89,32 +93,41 @@ class ResidualDataset:
         return ResidualDataset(files, recordings, *found, robot, undecided)
 
     def check_base_residual(self, learned_with: ModelParameters | None, run: Path | None) -> None:
-        """**Raises** `InputError` where the base residual, of `run`, was learned with other actuators than these."""
+        """Check that the base residual of `run` was learned with the actuators of this dataset.
+
+        **Raises** `InputError` if it was not.
+        """
         if not same_parameters(learned_with, self.identified):
-            raise InputError(f"{run}: was learned with other actuators than {self.where}; give --actuators the same.")
+            raise InputError(
+                f"{run}: was learned with other actuators than {self.where}; give the same actuators by --actuators."
+            )
 
     @property
     def one_set(self) -> bool:
-        """Whether test and validation are the same recordings."""
+        """Return whether test and validation recordings are the same."""
         return self._same("test", "validation")
 
     @property
     def reused(self) -> list[str]:
-        """Return a sentence for each use whose recordings serve an earlier one too."""
-        said = []
+        """Return a warning for each use with the same recordings as an earlier use."""
+        warnings = []
         if self._same("validation", "training"):
-            said.append("Validation is on the training recordings: it will not show how well the residual generalizes.")
+            warnings.append(
+                "Validation is on the training recordings: it will not show how well the residual generalizes."
+            )
         if self._same("test", "training"):
-            said.append("The test is on the training recordings: it will not show how well the residual generalizes.")
+            warnings.append(
+                "The test is on the training recordings: it will not show how well the residual generalizes."
+            )
         elif self.one_set:
-            said.append("The test is on the validation recordings, which make the choices: expect low errors.")
-        return said
+            warnings.append("The test is on the validation recordings, which choose the checkpoint: expect low errors.")
+        return warnings
 
     @property
     def replayed(self) -> str:
-        """Return what the final table is of, in words."""
+        """Return the title of the final table, which names its recordings."""
         if self._same("test", "training"):
-            return "Open-loop replay of the training recordings (they were learned from)"
+            return "Open-loop replay of the training recordings (the residual was learned from them)"
         if self.one_set:
             return "Open-loop replay of the validation recordings (they chose the checkpoint)"
         return "Open-loop replay of the test recordings"
@@ -124,7 +137,7 @@ class ResidualDataset:
         return first == second
 
     def reconstruct(self, simulator: Simulator) -> dict[str, list[Motion]]:
-        """Return states of the simulator's robot at the control rate, by use; uses of the same files share a list."""
+        """Return the motions of all recordings, by use. Uses of the same files share one list."""
         motions: dict[str, list[Motion]] = {}
         for use in USES:
             same = next((other for other in motions if self.files[other] == self.files[use]), None)
@@ -139,7 +152,7 @@ class ResidualDataset:
 
 
 def _choose(data: RecordingsData, robot: RobotDescription, earlier: Path | None) -> dict[str, list[Path]]:
-    """The files for each use."""
+    """Return the files of the recordings, by use."""
     own = dict(zip(USES, (data.recordings, data.validation, data.test), strict=True))
     files = {use: list_recordings(paths) for use, paths in own.items() if paths}
     if earlier is not None:
@@ -153,9 +166,9 @@ def _choose(data: RecordingsData, robot: RobotDescription, earlier: Path | None)
     if data.quick:
         few = files["training"][:QUICK_RECORDINGS]
         on_training = files["validation"] == files["training"]
-        validation = few if on_training else _one_a_group(files["validation"])
-        # Of bundled recordings a second set would be a second program to compile.
-        test = _one_a_group(files["test"]) if data.test else validation
+        validation = few if on_training else _one_per_group(files["validation"])
+        # Bundled recordings: one set for validation and test, because a second set needs a second compilation.
+        test = _one_per_group(files["test"]) if data.test else validation
         files = {"training": few, "validation": validation, "test": test}
     return files
 
@@ -167,7 +180,7 @@ def _actuators(
     recordings: Sequence[Recording],
     description: RobotDescription,
 ) -> tuple[ModelParameters | None, str]:
-    """The simulator's actuators (None: nominal), and where they come from, for the user to read."""
+    """Return the identified actuators (None for nominal ones), and their source as text for the user."""
     if data.actuators == AUTO and earlier is not None:
         identified = run_actuators(read_config(earlier, "envmimic"), earlier, description)
         return identified, f"{'nominal' if identified is None else 'identified'}, as before"
@@ -178,23 +191,24 @@ def _actuators(
     if path == AUTO:
         path = find_actuators(description, files, next(iter(robots))) if len(robots) == 1 else None
     if path is None:
-        return None, "nominal (the recordings' robot has no actuators.json; `train sysid` identifies one from a sweep)"
+        return None, "nominal (the robot has no actuators.json beside the recordings; `train sysid` writes one)"
     robot, identified = read_actuators(description, path)
     if robots != {robot}:
         raise InputError(
-            f"{path}: these are the actuators of {robot!r}, the recordings are of {', '.join(sorted(robots))}; give "
-            "the file of the same robot, or --actuators nominal."
+            f"{path}: these are the actuators of {robot!r}, but the recordings are of {', '.join(sorted(robots))}; "
+            "give the actuators of the same robot, or --actuators nominal."
         )
     return identified, str(path)
 
 
-def _one_a_group(paths: Sequence[Path]) -> list[Path]:
+def _one_per_group(paths: Sequence[Path]) -> list[Path]:
+    """Return the first recording of each group, at most `QUICK_RECORDINGS`."""
     first = {group_of(path.name): path for path in reversed(paths)}
     return sorted(first.values())[:QUICK_RECORDINGS]
 
 
 def _read(files: Mapping[str, Sequence[Path]], description: RobotDescription) -> dict[str, list[Recording]]:
-    """All recordings, read and found fit for their use."""
+    """Read all recordings, check them for their use, and return them by use."""
     check_overlap(files)
     read = {path: read_recording(path, description) for paths in files.values() for path in paths}
     for path, recording in read.items():
@@ -203,7 +217,10 @@ def _read(files: Mapping[str, Sequence[Path]], description: RobotDescription) ->
 
 
 def check_overlap(files: Mapping[str, Sequence[Path]]) -> None:
-    """**Raises** `InputError` where two uses share some of their recordings, but not all."""
+    """Check that two uses share all of their recordings or none.
+
+    **Raises** `InputError` if they share only some. The message names one of them.
+    """
     places = {use: {path.resolve(): path for path in paths} for use, paths in files.items()}
     for one, other in itertools.combinations(USES, 2):
         shared = places[one].keys() & places[other].keys()
@@ -213,9 +230,12 @@ def check_overlap(files: Mapping[str, Sequence[Path]]) -> None:
 
 
 def check_recording(path: Path, recording: Recording, robot: RobotDescription, *, long_enough: bool) -> None:
-    """Refuse, with an `InputError`, a recording that EnvMimic cannot use: `long_enough` for an evaluation or not."""
+    """Check that a residual can be learned from a recording and, with `long_enough`, evaluated on it.
+
+    **Raises** `InputError` if the recording is not free, or too short for an evaluation.
+    """
     if recording.kind != "free":
-        raise InputError(f"{path}: is a {recording.kind} recording; EnvMimic takes free ones only, leave it out.")
+        raise InputError(f"{path}: is a {recording.kind} recording; residuals need free recordings, leave it out.")
     shortest = shortest_recording(robot.horizons)
     duration = recording.time[-1] - recording.time[0]
     if long_enough and duration < shortest:

@@ -1,7 +1,7 @@
-"""EnvMimic: the residual-force policy's Markov decision process (paper, section "Residual Dynamics Learning").
+"""EnvMimic: the Markov decision process of the residual-force policy (paper, section "Residual Dynamics Learning").
 
-The actuators replay a recording's commands; the policy pushes on the tracked body; the reward is high
-while the simulated body follows the recorded one. What the policy learns is the part of the physics that the simulator
+The actuators replay the commands of a recording, and the policy exerts forces on the robot. The reward is high while
+the simulated body follows the recorded body. The policy thereby learns the part of the physics that the simulator
 lacks.
 """
 
@@ -39,8 +39,11 @@ from ballu_mjx.sim.step import state_at
 
 @dataclasses.dataclass(frozen=True)
 class EnvMimicConfig(ForceNetworkConfig):
-    """The residual-force task. Defaults of the reward are the paper's; the rest was chosen by ablation
-    (docs/envmimic.md)."""
+    """Options of the residual-force task.
+
+    Weights and sharpness of the position and orientation terms have the paper's values as defaults. The other defaults
+    were chosen by ablation (docs/envmimic.md).
+    """
 
     forces: ForceSet = "wrench"
     position_weight: float = 0.7
@@ -52,37 +55,38 @@ class EnvMimicConfig(ForceNetworkConfig):
     orientation_scale: float = 2.0
     """Sharpness of the orientation term, 1/rad^2 (paper: 2)."""
     orientation_axes: tuple[float, float, float] = (0.2, 0.4, 0.4)
-    """Diagonal of W: roll, pitch, yaw (paper: 0.2, 0.4, 0.4)."""
+    """Weights of roll, pitch and yaw in the orientation error, the diagonal of the paper's W (paper: 0.2, 0.4, 0.4)."""
     fine_position_weight: float = 0.3
-    """Weight of a sharper position term, added to the paper's reward. The paper's own pays 0.97 for 5 cm of error, and
-    so cannot tell a good force from none within a second or two; with both fine weights 0 it stands alone."""
+    """Weight of an additional, sharper position term. The paper's position term is still 0.97 at an error of 5 cm, so
+    it hardly rewards a good force within a second or two. With both fine weights 0, the reward is the paper's."""
     fine_orientation_weight: float = 1.0
-    """Weight of a sharper orientation term, likewise."""
+    """Weight of an additional, sharper orientation term."""
     fine_position_scale: float = 100.0
-    """Sharpness of the added position term, 1/m^2."""
+    """Sharpness of the additional position term, 1/m^2."""
     fine_orientation_scale: float = 200.0
-    """Sharpness of the added orientation term, 1/rad^2: at 20 it still pays 0.92 for 6 deg of yaw."""
+    """Sharpness of the additional orientation term, 1/rad^2. At 20, the term is still 0.92 at 6 deg of yaw."""
     force_cost: float | None = None
-    """Reward lost per N^2 of force. Without this option: the robot's own, or 0.05 for a squared unit."""
+    """Cost of force, in reward per N^2. Without this option: the robot's own value, or 0.05 per squared unit of the
+    network's output."""
     episode_seconds: float = 3.0
-    """Mean length of an episode, s; a recording's end cuts it short."""
+    """Mean length of an episode, s. An episode also ends at the end of its recording."""
     episode_spread: float = 0.5
-    """Lengths of episodes are drawn from the mean less and plus this share of it: robots that are reset together would
-    stay in step, and every batch show one phase of the episode. 0 makes all episodes alike."""
+    """Half the range of episode lengths, as a fraction of the mean length (0 to 1). Lengths are drawn uniformly. With
+    0, robots that are reset together stay in phase, and every batch shows only one phase of the episode."""
     critic_sees_error: bool = True
-    """Let the value function (never the policy) see how far off the recording the robot is."""
+    """Include the deviation from the recording in the input of the value function. The policy never has it."""
     observation_noise: float = 0.3
-    """Noise on what the policy sees in training, in multiples of each entry's spread over the recordings: forces must
-    then vary smoothly with the state, which carries them further from the data."""
+    """Standard deviation of noise on the policy's input in training, in multiples of each input's standard deviation
+    over the recordings. With noise, forces vary smoothly with the state and generalize further from the data."""
     start_noise: float = 1.0
-    """Perturbation of the starting state, in multiples of what reconstruction from motion capture leaves uncertain
-    (1 mm and 0.5 deg; 1 cm/s, 2 deg/s for base and 5 deg/s for joints)."""
+    """Perturbation of the starting state, in multiples of the uncertainty of the reconstruction from motion capture
+    (1 mm and 0.5 deg; 1 cm/s, 2 deg/s for the base and 5 deg/s for joints)."""
 
 
 def check_envmimic_config(config: EnvMimicConfig, control_timestep: float) -> None:
-    """Check the options for a robot with so many seconds between two commands.
+    """Check the options for a robot with a control step of `control_timestep` (s).
 
-    **Raises** `InputError` for options out of range, naming the option and the nearest value that fits.
+    **Raises** `InputError` for an option out of range. The message names the option and the nearest allowed value.
     """
     for field in dataclasses.fields(config):
         option, value = f"--{field.name.replace('_', '-')}", getattr(config, field.name)
@@ -90,7 +94,7 @@ def check_envmimic_config(config: EnvMimicConfig, control_timestep: float) -> No
             continue
         if field.name in ("force_limit", "force_scale", "torque_scale", "scales"):
             if not all(x > 0 and math.isfinite(x) for x in (value if isinstance(value, tuple) else (value,))):
-                raise InputError(f"{option} is {value}: it must be greater than 0; leave it out for the usual one.")
+                raise InputError(f"{option} is {value}: it must be greater than 0; leave it out for the default.")
         elif field.name == "episode_seconds":
             least = 2 * control_timestep
             if not (value >= least and math.isfinite(value)):
@@ -106,11 +110,14 @@ def check_envmimic_config(config: EnvMimicConfig, control_timestep: float) -> No
 def reward_terms(
     seen: Float[Array, " features"], target: Float[Array, " features"], config: EnvMimicConfig, upright: bool = True
 ) -> dict[str, Float[Array, ""]]:
-    """The paper's `r_pos` and `r_orn` (`position`, `orientation`) for simulated and recorded features, and the weighted
-    sum of these and of their sharper twins (`tracking`).
+    """Return the reward's terms for simulated features `seen` and recorded features `target`.
 
-    Of a robot that is not `upright`, Euler angles jump. Its orientation term takes the squared sine of half the angle
-    of the rotation between both, times four, with the mean weight of the three axes."""
+    `position` and `orientation` are the paper's `r_pos` and `r_orn`. `tracking` is the weighted sum of these and of the
+    additional, sharper terms.
+
+    Euler angles of a robot that is not `upright` jump. Its squared orientation error is therefore 4 sin^2(angle / 2) of
+    the rotation between both orientations, times the mean weight of the three axes.
+    """
     layout = ObservationLayout
     position_error = jnp.sum((target[layout.position] - seen[layout.position]) ** 2)
     if upright:
@@ -137,26 +144,26 @@ _METRICS = ("reward_position", "reward_orientation", "force", "diverged")
 
 
 class TrackingState(NamedTuple):
-    """Where an episode stands."""
+    """State of one episode of `EnvMimicEnv`."""
 
     rollout: RolloutState
     recording: Int[Array, ""]
-    """Number of the recording that the episode follows."""
+    """Index of the recording that the episode follows."""
     time: Int[Array, ""]
-    """Control steps since the recording's start."""
+    """Control steps since the start of the recording."""
     remaining: Int[Array, ""]
-    """Control steps until the episode is cut short."""
+    """Control steps until the end of the episode."""
     key: Array
-    """Of the noise on the observation."""
+    """Random key of the noise on the policy's input."""
 
 
 def tracking_state(state: State) -> TrackingState:
-    """Return what `EnvMimicEnv` keeps in `state`: Brax types it as its own physics' state."""
+    """Return the `TrackingState` in `state`. Brax declares it as a state of its own physics."""
     return cast(TrackingState, state.pipeline_state)
 
 
 class EnvMimicEnv(Env):
-    """Tracking of recorded motions by forces on the robot; Brax's environment interface, one robot, unbatched."""
+    """Brax environment in which a policy makes one robot follow recorded motions by residual forces; unbatched."""
 
     def __init__(
         self,
@@ -164,7 +171,10 @@ class EnvMimicEnv(Env):
         motions: Sequence[Motion],
         config: EnvMimicConfig,
     ) -> None:
-        """Make the task of following `motions`. Where `simulator` has a residual, the policy learns what it leaves."""
+        """Make the environment for `motions`.
+
+        If `simulator` has a residual, that residual also acts, and the policy learns the remaining forces.
+        """
         self.simulator = simulator.with_residual(None)
         self.config = settle_scales(config, self.simulator, motions)
         plain = self.simulator.simulator
@@ -181,9 +191,11 @@ class EnvMimicEnv(Env):
 
     @property
     def contents(self) -> dict[str, Any]:
-        """What tells one environment from another of the same configuration, as arrays: the model's numbers, the
-        recordings, and what a base residual has learned. Programs that take it as an argument (see
-        `training_env.wrap_for_training`) serve them all."""
+        """Return the parameters that differ between environments of the same configuration, as arrays.
+
+        They are the model's numbers, the recordings, and the parameters of a base residual. A compiled program that
+        takes them as an argument (see `training_env.wrap_for_training`) can run all of these environments.
+        """
         return {
             "model": self.simulator.simulator.model,
             "drivetrain": self.simulator.simulator.drivetrain,
@@ -194,7 +206,7 @@ class EnvMimicEnv(Env):
         }
 
     def with_contents(self, contents: Mapping[str, Any]) -> EnvMimicEnv:
-        """The same with other contents, which may be traced."""
+        """Return the same environment with other contents, which may be traced."""
         other = copy.copy(self)
         simulator = self.simulator.with_model(contents["model"], contents["base residual"])
         other.simulator = simulator.with_drivetrain(contents["drivetrain"])
@@ -203,7 +215,10 @@ class EnvMimicEnv(Env):
         return other
 
     def reset(self, rng: Array) -> State:
-        """Reference state initialization: a uniformly drawn time of a uniformly drawn recording, history included."""
+        """Start an episode by reference state initialization.
+
+        The episode starts at a uniformly drawn time of a uniformly drawn recording, with the recorded history.
+        """
         key_recording, key_time, key_noise, key_sensor, key_length = jax.random.split(rng, 5)
         reference = self.reference
         recording = jax.random.randint(key_recording, (), 0, jnp.sum(reference.steps > 0))
@@ -222,7 +237,7 @@ class EnvMimicEnv(Env):
         return initial_state(tracking, self._observe(tracking), _METRICS)
 
     def step(self, state: State, action: Array) -> State:
-        """Advance one control step under the recording's command and the policy's force."""
+        """Advance by one control step under the recorded command and the policy's loads."""
         before = tracking_state(state)
         recording, time = before.recording, before.time
         loads = world_loads(action, before.rollout.features[ObservationLayout.yaw], self.config, self.robot)
@@ -258,7 +273,7 @@ class EnvMimicEnv(Env):
     def _perturb(
         self, key: Array, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], scale: float
     ) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
-        """A state within the reconstruction's uncertainty of the recorded one."""
+        """Return a recorded state with noise of `scale` times the uncertainty of the reconstruction."""
         key_base, key_turn, key_hinge, key_velocity = jax.random.split(key, 4)
         position, velocity = jnp.split(scale * self._spread_of_starts, 2)
         free = 0 if self.robot.anchored else 6
@@ -287,10 +302,12 @@ class EnvMimicEnv(Env):
         return "mjx"
 
     def _observe(self, tracking: TrackingState) -> dict[str, Array]:
-        """The policy's state, and for the value function also what the policy must not see: how far off it is.
+        """Return the inputs of the policy (`state`) and of the value function (`critic`).
 
-        Why (`critic_sees_error`): an error once made lowers the reward for the rest of the episode whatever the policy
-        does now. A value function blind to it leaves that in the advantages, where it drowns the force's own effect.
+        With `critic_sees_error`, the value function also has the deviation from the recording, which the policy must
+        not see. A past error lowers the reward for the rest of the episode, independently of the present force. Without
+        the deviation, the value function cannot predict this, and it outweighs the effect of the force in the
+        advantages.
         """
         rollout, recording, time = tracking.rollout, tracking.recording, tracking.time
         commands = rollout.with_command(self.reference.command[recording, time])
@@ -307,10 +324,11 @@ class EnvMimicEnv(Env):
 
 
 def start_spread(model: mujoco.MjModel, robot: RobotDescription) -> Float[np.ndarray, " directions"]:
-    """Return what reconstruction leaves uncertain of a state, as standard deviations along the directions of `qvel`.
+    """Return the uncertainty of reconstructed states, as standard deviations along the directions of `qvel`.
 
     Positions come first (1 mm and 0.5 deg), then velocities (1 cm/s, 2 deg/s for a free base and 5 deg/s for joints).
-    The robot's held joints hardly vary: behind a stiff transmission a degree is a push that no reconstruction error is.
+    The positions of held joints have 0.001 deg: through a stiff transmission, a degree would mean a large force, which
+    no reconstruction error causes.
     """
     degree, along = np.pi / 180, translations(model)
     position, velocity = np.where(along, 1e-3, 0.5 * degree), np.where(along, 0.01, 5 * degree)

@@ -1,4 +1,4 @@
-"""Training of EnvMimic's forces: from a simulator and recorded motions to a residual."""
+"""Training of EnvMimic: from a simulator and recorded motions to a residual."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ballu_mjx.sim.residual import add_to_base
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 VALIDATE_EVERY = 400_000
-"""Control steps between two validations, each of which leaves a checkpoint."""
+"""Default number of control steps between two validations. Each validation saves a checkpoint."""
 
 
 def train_envmimic(
@@ -42,22 +42,24 @@ def train_envmimic(
     start: ResumePoint | None = None,
     evaluators: Evaluators | None = None,
 ) -> TrainedResidual:
-    """Learn residual forces by reinforcement learning, and return those that validate best.
+    """Learn residual forces by reinforcement learning, and return those with the smallest validation error.
 
     **Arguments**
 
-    - `simulator`: what is to follow the motions. Where it has a residual already, the forces learn what that leaves,
-      and the result is both together.
-    - `motions`: recorded ones.
-    - `config`, `ppo_config`: the task, and how it is learned; None: their defaults. The seed is `ppo_config.seed`.
-    - `validation`: motions that choose the best; None: `motions`.
-    - `run`: takes measurements and checkpoints, in a folder say; None: memory.
-    - `progress`: is told of every training step.
-    - `start`: where to go on; None: from the beginning.
-    - `evaluators`: of this simulator without residual, where they are needed further; they share compiled programs.
+    - `simulator`: the simulator to correct. If it has a residual, that residual also acts, and the new forces add to
+      it. The result is the sum of both residuals.
+    - `motions`: training motions.
+    - `config`: options of the task. None for the defaults.
+    - `ppo_config`: options of PPO, with the seed. None for the defaults.
+    - `validation`: motions that choose the checkpoint. None for `motions`.
+    - `validate_every`: control steps between two validations.
+    - `run`: record of metrics and checkpoints, for example a run's folder. None to keep them in memory.
+    - `progress`: display that is updated after every training step.
+    - `start`: point at which to resume. None to start anew.
+    - `evaluators`: evaluators of this simulator without residual, to share their compiled programs.
 
-    **Raises** `InputError` for options that do not fit, and where learning breaks down; `TrainingInterrupted` after
-    SIGINT or SIGTERM, the last state saved.
+    **Raises** `InputError` for options that do not fit, and if learning breaks down. Raises `TrainingInterrupted` after
+    SIGINT or SIGTERM, when the last state is saved.
     """
     config, ppo_config, start = config or EnvMimicConfig(), ppo_config or PPOConfig(), start or ResumePoint()
     augmented = simulator.with_residual(None)
@@ -73,9 +75,9 @@ def train_envmimic(
     forces = NetworkResidual(config, robot, infer, ppo.make_sampler(*sizes), network=ppo_config)
     model, all_params = add_to_base(augmented.residual, forces)
     measure = (evaluators or Evaluators(plain)).of(model, motions if validation is None else validation)
-    tells_best = Validation(lambda params: measure(all_params(params)).score)
+    validate = Validation(lambda params: measure(all_params(params)).score)
     write_observed(record, env.recorded_inputs)
-    TrainingLoop(record, progress, validate_every, tells_best).train(env, ppo_config, start, record.config)
+    TrainingLoop(record, progress, validate_every, validate).train(env, ppo_config, start, record.config)
     step, tree = record.best()
     observed = observed_range(env.recorded_inputs)
     return TrainedResidual(model, all_params(ppo.from_tree(tree)), observed, step, plain.actuators)
@@ -84,7 +86,10 @@ def train_envmimic(
 def check_envmimic_options(
     config: EnvMimicConfig, ppo_config: PPOConfig, validate_every: int, control_timestep: float
 ) -> None:
-    """**Raises** `InputError` for options of `train_envmimic` that are out of range, or do not fit the devices."""
+    """Check the options of `train_envmimic`.
+
+    **Raises** `InputError` for options that are out of range or do not fit the number of devices.
+    """
     check_envmimic_config(config, control_timestep)
     ppo.check(ppo_config, len(jax.devices()))
     if validate_every < 1:
@@ -92,8 +97,11 @@ def check_envmimic_options(
 
 
 def check_resumes(start: ResumePoint, config: EnvMimicConfig, robot: RobotDescription) -> None:
-    """**Raises** `InputError` where the policy that goes on was trained on other observations than these."""
+    """Check that the policy of a resumed training has the input of these options.
+
+    **Raises** `InputError` if its number of inputs differs.
+    """
     if start.params is not None and start.params.normalizer.mean["state"].shape != (num_inputs(config, robot),):
         raise InputError(
-            f"{start.folder}: its policy was trained on other observations; leave the options of env as they were."
+            f"{start.folder}: its policy was trained with another input; leave the options of env as they were."
         )

@@ -1,9 +1,9 @@
-"""The fluid residual: force and torque on the tracked body as polynomials of its motion, for any body in air or water.
+"""Fluid residual: force and torque on the tracked body as polynomials of its motion, for any body in air or water.
 
-In the body's axes, the wrench is a linear combination of terms. Terms are products of the velocity v, the angular
-velocity w, the speed |v| and the direction of gravity. Lift, drag, side force and moments over angle of attack and
-sideslip are such terms: |v|^2 alpha is v_x v_z for small angles. Rotary damping is linear in w. A wrong weight or
-centre of mass is linear in the direction of gravity.
+In the body frame, the wrench is a linear combination of terms. Terms are products of the velocity v, the angular
+velocity w, the speed |v| and the direction of gravity. These terms include lift, drag, side force and moments as
+functions of angle of attack and sideslip: |v|^2 alpha is v_x v_z for small angles. Rotary damping is linear in w. The
+effect of a wrong weight or centre of mass is linear in the direction of gravity.
 """
 
 from __future__ import annotations
@@ -33,39 +33,45 @@ FLUID_FILE = "fluid.json"
 
 TermSet = Literal["linear", "drag", "quadratic", "cubic"]
 TERM_SETS: tuple[TermSet, ...] = ("linear", "drag", "quadratic", "cubic")
-"""Each has the terms of those before it. `linear`: gravity's direction, velocities. `drag`: these times the speed.
-`quadratic`: products of two velocities. `cubic`: products of three velocities over the speed, at least two of them
-linear."""
+"""Sets of terms. Each set also has the terms of the sets before it.
+
+- `linear`: direction of gravity, and velocities (linear and angular).
+- `drag`: velocities times the speed.
+- `quadratic`: products of two velocities.
+- `cubic`: products of three velocities divided by the speed. At least two of the three are linear velocities.
+"""
 AXES = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z")
-"""Of a wrench (N, N m)."""
+"""Components of a wrench (N, N m), in the body frame."""
 _MOTION = ("vx", "vy", "vz", "wx", "wy", "wz")
 _GRAVITY = ("gx", "gy", "gz")
 _ODD = ("vy", "wx", "wz", "gy")
-"""What changes its sign in the mirror image about the xz plane."""
+"""Components of the motion whose sign changes under reflection at the xz plane."""
 _ODD_AXES = np.array([False, True, False, True, False, True])
+"""Mask of the components of a wrench whose sign changes under this reflection."""
 
 
 class Term(NamedTuple):
-    """A product of components of the motion, times a power of the speed."""
+    """A term: a product of components of the motion, times a power of the speed."""
 
     factors: tuple[str, ...]
-    """Of `vx` ... `vz` (m/s), `wx` ... `wz` (rad/s), `gx` ... `gz` (unit vector along gravity)."""
+    """Names of the components: `vx`, `vy`, `vz` (velocity, m/s), `wx`, `wy`, `wz` (angular velocity, rad/s), `gx`,
+    `gy`, `gz` (unit vector along gravity)."""
     power: int
-    """Of the speed (m/s)."""
+    """Exponent of the speed (m/s)."""
 
     @property
     def name(self) -> str:
-        """Return the term in words, such as `vx*vz` or `wy*|v|`."""
+        """Return the name of the term, for example `vx*vz` or `wy*|v|`."""
         return "*".join(self.factors) + {1: "*|v|", 0: "", -1: "/|v|"}[self.power]
 
     @property
     def odd(self) -> bool:
-        """Return whether it changes its sign in the mirror image about the xz plane."""
+        """Return whether the sign of the term changes under reflection at the xz plane."""
         return sum(factor in _ODD for factor in self.factors) % 2 == 1
 
 
 def terms_of(name: TermSet) -> tuple[Term, ...]:
-    """Return the terms of a set."""
+    """Return the terms of a set, including those of the sets before it."""
     products = itertools.combinations_with_replacement
     groups: dict[TermSet, list[Term]] = {
         "linear": [Term((factor,), 0) for factor in (*_GRAVITY, *_MOTION)],
@@ -74,74 +80,76 @@ def terms_of(name: TermSet) -> tuple[Term, ...]:
         "cubic": [
             Term(triple, -1)
             for triple in products(_MOTION, 3)
-            if sum(factor.startswith("v") for factor in triple) >= _LEAST_LINEAR
+            if sum(factor.startswith("v") for factor in triple) >= _MIN_LINEAR
         ],
     }
     return tuple(term for each in TERM_SETS[: TERM_SETS.index(name) + 1] for term in groups[each])
 
 
-_LEAST_LINEAR = 2
+_MIN_LINEAR = 2
+"""Smallest number of linear velocities in a cubic term."""
 
 
 def mirrored(terms: Sequence[Term]) -> Bool[np.ndarray, "terms 6"]:
-    """Return which coefficients a body may have that is its own mirror image about the xz plane."""
+    """Return a mask of the coefficients that may differ from 0 for a body that is symmetric about the xz plane."""
     return np.array([term.odd for term in terms])[:, None] == _ODD_AXES
 
 
 class FluidResidual(Residual):
-    """The force model (see `sim.residual.Residual`) whose parameters are coefficients, (terms, 6), in SI units."""
+    """Fluid residual (`sim.residual.Residual`). Its parameters are coefficients, (terms, 6), in SI units."""
 
     def __init__(self, robot: RobotDescription, model: mujoco.MjModel, term_set: TermSet) -> None:
-        """Prepare for `robot`, whose C model is `model`."""
+        """Prepare the residual for `robot`, whose C model is `model`."""
         self.robot, self.term_set, self.terms = robot, term_set, terms_of(term_set)
         gravity = np.asarray(model.opt.gravity)
         size = float(np.linalg.norm(gravity))
         self._down = jnp.asarray(gravity / size if size > 0 else gravity)
         every = [*_MOTION, *_GRAVITY]
         most = max(len(term.factors) for term in self.terms)
-        # One past the components stands for 1.
-        self._places = np.array(
+        # Terms with fewer factors are filled up with the index after the last component, whose value is 1.
+        self._factors = np.array(
             [[*map(every.index, term.factors), *[len(every)] * (most - len(term.factors))] for term in self.terms]
         )
         self._power = np.array([term.power for term in self.terms])
 
     @property
     def name(self) -> str:
-        """Return what a simulator improved by it is called."""
+        """Return the name of a simulator with this residual."""
         return "fluid"
 
     def inputs(self, history: History, commands: Commands) -> Float[Array, " inputs"]:
-        """Return what networks see, for the range of what was recorded."""
+        """Return `network_input` with default options. It only serves for the training range; loads do not use it."""
         return network_input(history, commands, ForceNetworkConfig(), self.robot)
 
     def values(self, history: History) -> tuple[Float[Array, "3 3"], Float[Array, " terms"]]:
-        """Return the body's rotation (to the world), and what the terms are."""
+        """Return the body's rotation matrix (body to world), and the values of the terms."""
         frame, velocity, rate = body_motion(history, self.robot.control_timestep)
         speed = smooth_speed(velocity)
         components = jnp.concatenate([velocity, rate, frame.T @ self._down, jnp.ones(1)])
-        return frame, jnp.prod(components[self._places], axis=1) * speed**self._power
+        return frame, jnp.prod(components[self._factors], axis=1) * speed**self._power
 
     def act(
         self, params: Float[Array, "terms 6"], history: History, commands: Commands, key: Array | None = None
     ) -> Action:
-        """Return the wrench by the motion in the middle of the coming control step."""
+        """Return the wrench for the motion in the middle of the coming control step."""
         del commands, key
         frame, values = self.values(history)
-        own = values @ params
-        return Action(jnp.concatenate([frame @ own[:3], frame @ own[3:]])[None])
+        wrench = values @ params
+        return Action(jnp.concatenate([frame @ wrench[:3], frame @ wrench[3:]])[None])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FluidCoefficients:
-    """What a fit found."""
+    """Coefficients of a fluid residual, with their standard errors."""
 
     term_set: TermSet
     values: Float[np.ndarray, "terms 6"]
+    """Coefficients (SI units) of each term, for the components of the wrench (`AXES`)."""
     standard_errors: Float[np.ndarray, "terms 6"]
-    """0 where a coefficient is held at 0."""
+    """Standard errors of the coefficients. 0 for coefficients that are fixed at 0."""
 
     def to_json(self) -> str:
-        """Return the content of `FLUID_FILE`: coefficients by axis and term."""
+        """Return the content of `FLUID_FILE`: coefficients by component of the wrench and by term."""
         rows = {
             axis: {
                 term.name: {"value": float(value), "standard_error": float(error)}
@@ -153,22 +161,22 @@ class FluidCoefficients:
         return json.dumps({"format": FLUID_FORMAT, "terms": self.term_set, "coefficients": rows}, indent=2) + "\n"
 
     def table(self) -> str:
-        """Return the coefficients that differ from 0 by two standard errors or more, as text."""
+        """Return a table of the coefficients that differ from 0 by two standard errors or more, as text."""
         lines = [f"{'':10}{'term':12}{'value':>12}{'std. error':>12}"]
         for axis, values, errors in zip(AXES, self.values.T, self.standard_errors.T, strict=True):
             for term, value, error in zip(terms_of(self.term_set), values, errors, strict=True):
                 if abs(value) >= 2 * error > 0:
                     lines.append(f"{axis:10}{term.name:12}{value:>12.5f}{error:>12.5f}")
         lines.append(
-            f"Terms: {self.term_set}; SI units, the body's axes. Coefficients within two std. errors are left out."
+            f"Terms: {self.term_set}; SI units, body frame. Coefficients within two standard errors of 0 are left out."
         )
         return "\n".join(lines)
 
 
 def read_fluid(path: Path) -> FluidCoefficients:
-    """Return the coefficients in a file of the format `ballu-fluid/1`, which `train fluid` writes.
+    """Read coefficients from a file of the format `ballu-fluid/1`, which `train fluid` writes.
 
-    **Raises** `InputError` naming file, key and fix.
+    **Raises** `InputError` if the file is damaged. The message names file, key and fix.
     """
     fix = "restore it or identify again"
     content = files.read_json(path, fix)
@@ -184,6 +192,8 @@ def read_fluid(path: Path) -> FluidCoefficients:
         for name, entry in row.items() if isinstance(row, dict) else [("", None)]:
             numbers = [entry.get(key) for key in ("value", "standard_error")] if isinstance(entry, dict) else [None]
             if name not in names or not all(map(is_number, numbers)):
-                raise InputError(f"{path}: {axis} of {name!r} is no term with value and standard_error; {fix}.")
+                raise InputError(
+                    f'{path}: {axis} has the entry {name!r}, which is no term with "value" and "standard_error"; {fix}.'
+                )
             found[:, names.index(name), AXES.index(axis)] = numbers
     return FluidCoefficients(content["terms"], *found)

@@ -1,14 +1,18 @@
-"""What a fit of fluid forces searches: vectors, and the tables of coefficients that they stand for.
+"""Parametrizations of the fluid residual: the search vector of a fit, and the coefficients that it stands for.
 
-Free coefficients may take any value. Passive ones are those of a still fluid: the wrench takes energy from the body, or
-leaves it as it is, at every velocity. With the motion x = (v, w) of the tracked site, and the wrench about that site,
+Free coefficients may have any value. Passive coefficients are those of a still fluid: at every velocity, the wrench,
+without its gravity part, does no positive work on the body. With the motion x = (v, w) of the tracked site, and the
+wrench about that site,
 
-    wrench = -(A + |v| B) x + Q(x, x) + gravity's part
+    wrench = -(A + |v| B) x + Q(x, x) + gravity part
 
-where A and B have positive semidefinite symmetric parts: drag and damping. Their skew parts are the lift of a cambered
-body, and couplings that do no work. Q has x . Q(x, x) = 0: lift and moments over angle of attack and sideslip. The
-part of gravity is a wrong weight and a wrong centre of mass. Simulations under such forces stay bounded far from the
-recordings. The wrench acts at the centre of mass: coefficients are shifted there.
+- A and B have positive semidefinite symmetric parts, which are drag and damping. Their skew parts are the lift of a
+  cambered body, and couplings that do no work.
+- Q satisfies x . Q(x, x) = 0. It contains lift and moments as functions of angle of attack and sideslip.
+- The gravity part corrects a wrong weight and a wrong centre of mass.
+
+Simulations with passive coefficients stay bounded, even far from the recordings. Residuals apply the wrench at the
+centre of mass, so the coefficients are transformed to that point.
 """
 
 from __future__ import annotations
@@ -25,33 +29,41 @@ from jaxtyping import Array, Bool, Float
 from ballu_mjx.residuals.fluid import TERM_SETS, TermSet, mirrored, terms_of
 
 PASSIVE_SETS: tuple[TermSet, ...] = ("linear", "drag", "quadratic")
-"""Sets of terms that passive coefficients have."""
+"""Sets of terms for which passive coefficients exist."""
 _GRAVITY, _MOTION = 3, 6
-"""Numbers of linear terms: gravity's direction first, then velocities."""
+"""Numbers of the linear terms of gravity, which come first, and of the velocities."""
 _START = 0.3
-"""Of the damping's root, in units of its prior: at 0 it has no derivative."""
+"""Starting value of the diagonal of the damping's square root, in units of its prior. At 0, the damping would have no
+derivative with respect to its root."""
 
 
 class Parametrization(Protocol):
-    """A set of terms as a vector whose entries have standard normal priors."""
+    """Parametrization of the coefficients of a set of terms by a vector whose entries have standard normal priors."""
 
     start: Float[np.ndarray, " size"]
-    """Where a search starts."""
+    """Starting vector of a search."""
 
     def table(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, "terms 6"]:
-        """Return coefficients of all terms of the largest set (SI units)."""
+        """Return the coefficients of all terms of the largest set (SI units)."""
         ...
 
     def directions(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, "size terms 6"]:
-        """Return the table's derivatives."""
+        """Return the derivatives of the coefficients with respect to the entries of the vector."""
         ...
 
 
 class FreeCoefficients:
-    """Coefficients that may take any value: the table is linear in the vector."""
+    """Parametrization of coefficients that may have any value. Coefficients are linear in the vector."""
 
     def __init__(self, name: TermSet, prior: Float[np.ndarray, "terms 6"], *, symmetric: bool) -> None:
-        """`prior`: each coefficient's standard deviation. `symmetric`: about the xz plane."""
+        """Prepare the parametrization of a set of terms.
+
+        **Arguments**
+
+        - `name`: set of terms.
+        - `prior`: standard deviation of each coefficient's prior (SI units).
+        - `symmetric`: whether the body is symmetric about the xz plane, so that some coefficients are 0.
+        """
         terms = terms_of(TERM_SETS[-1])
         free = mirrored(terms) if symmetric else np.ones(prior.shape, bool)
         free[len(terms_of(name)) :] = False
@@ -60,17 +72,17 @@ class FreeCoefficients:
         self.start = np.zeros(len(self._directions))
 
     def table(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, "terms 6"]:
-        """Return coefficients of all terms of the largest set (SI units)."""
+        """Return the coefficients of all terms of the largest set (SI units)."""
         return np.tensordot(vector, self._directions, 1)
 
     def directions(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, "size terms 6"]:
-        """Return the table's derivatives, the same everywhere."""
+        """Return the derivatives of the coefficients, which are the same for all vectors."""
         del vector
         return self._directions
 
 
 class PassiveCoefficients:
-    """Coefficients of a wrench that takes energy from the body, or leaves it as it is."""
+    """Parametrization of coefficients whose wrench, without its gravity part, does no positive work on the body."""
 
     def __init__(
         self,
@@ -80,8 +92,15 @@ class PassiveCoefficients:
         *,
         symmetric: bool,
     ) -> None:
-        """`prior`: each coefficient's standard deviation. `centre`: the body's centre of mass from the tracked site, in
-        the body's axes (m). `symmetric`: about the xz plane."""
+        """Prepare the parametrization of a set of terms.
+
+        **Arguments**
+
+        - `name`: set of terms.
+        - `prior`: standard deviation of each coefficient's prior (SI units).
+        - `centre`: position of the body's centre of mass relative to the tracked site (m, body frame).
+        - `symmetric`: whether the body is symmetric about the xz plane, so that some coefficients are 0.
+        """
         terms = terms_of(TERM_SETS[-1])
         allowed = mirrored(terms) if symmetric else np.ones(prior.shape, bool)
         linear, drag, quadratic = (len(terms_of(each)) for each in PASSIVE_SETS)
@@ -98,33 +117,39 @@ class PassiveCoefficients:
             for part, first, last in zip(parts, places[:-1], places[1:], strict=True):
                 about_site = about_site.at[part.rows].set(part.table(vector[first:last]))
             force, torque = about_site[:, :3], about_site[:, 3:]
-            # About the centre of mass: plus force x centre.
+            # The torque about the centre of mass is the torque about the site plus force x centre.
             return jnp.concatenate([force, torque + force @ lever], axis=1)
 
-        self._table, self._slopes = jax.jit(table), jax.jit(jax.jacfwd(table))
+        self._table, self._jacobian = jax.jit(table), jax.jit(jax.jacfwd(table))
         self.start = np.concatenate([part.start for part in parts])
 
     def table(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, "terms 6"]:
-        """Return coefficients of all terms of the largest set (SI units)."""
+        """Return the coefficients of all terms of the largest set (SI units)."""
         with jax.enable_x64(True):
             return np.asarray(self._table(jnp.asarray(vector)))
 
     def directions(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, "size terms 6"]:
-        """Return the table's derivatives."""
+        """Return the derivatives of the coefficients with respect to the entries of the vector."""
         with jax.enable_x64(True):
-            return np.moveaxis(np.asarray(self._slopes(jnp.asarray(vector))), -1, 0)
+            return np.moveaxis(np.asarray(self._jacobian(jnp.asarray(vector))), -1, 0)
 
 
 class _Part(NamedTuple):
-    """Some rows of the table, about the tracked site."""
+    """Parametrization of some terms, with the wrench about the tracked site."""
 
     rows: slice
+    """Indices of the terms."""
     start: Float[np.ndarray, " size"]
+    """Starting values of the part's entries of the vector."""
     table: Callable[[Float[Array, " size"]], Float[Array, "rows 6"]]
+    """Function from these entries to the coefficients."""
 
 
 def _gravity_part(prior: Float[np.ndarray, "terms 6"], allowed: Bool[np.ndarray, "terms 6"]) -> _Part:
-    """Return a wrong weight, and a wrong centre of mass: force c g, torque p x g, by the direction of gravity g."""
+    """Return the gravity part: force c g and torque p x g, where g is the direction of gravity.
+
+    The scalar c corrects the weight, and the vector p the centre of mass.
+    """
     entries = np.zeros((1 + 3, _GRAVITY, 6))
     entries[0, :, :3] = np.eye(3)
     entries[1:, :, 3:] = np.cross(np.eye(3)[:, None], np.eye(3)[None])
@@ -135,7 +160,10 @@ def _gravity_part(prior: Float[np.ndarray, "terms 6"], allowed: Bool[np.ndarray,
 
 
 def _damping_part(prior: Float[np.ndarray, "terms 6"], allowed: Bool[np.ndarray, "terms 6"], first: int) -> _Part:
-    """Return minus a matrix with a positive semidefinite symmetric part, of the terms from `first` on."""
+    """Return a damping part, -A x or -|v| B x, for the terms from the index `first` on.
+
+    The matrix has a positive semidefinite symmetric part, which is parametrized by its lower triangular root.
+    """
     rows = slice(first, first + _MOTION)
     scale = np.sqrt(np.diag(prior[rows]))
     root = np.argwhere(np.tril(allowed[rows]))
@@ -143,15 +171,18 @@ def _damping_part(prior: Float[np.ndarray, "terms 6"], allowed: Bool[np.ndarray,
 
     def table(vector: Array) -> Array:
         lower = jnp.zeros((_MOTION, _MOTION)).at[*root.T].set(vector[: len(root)])
-        turning = jnp.zeros((_MOTION, _MOTION)).at[*skew.T].set(vector[len(root) :])
-        return -(lower @ lower.T + turning - turning.T) * scale * scale[:, None]
+        strict = jnp.zeros((_MOTION, _MOTION)).at[*skew.T].set(vector[len(root) :])
+        return -(lower @ lower.T + strict - strict.T) * scale * scale[:, None]
 
     start = np.concatenate([_START * (root[:, 0] == root[:, 1]), np.zeros(len(skew))])
     return _Part(rows, start, table)
 
 
 def _workless_part(prior: Float[np.ndarray, "terms 6"], allowed: Bool[np.ndarray, "terms 6"], rows: slice) -> _Part:
-    """Return products of two velocities that do no work: the sum of motion times wrench is 0 at every motion."""
+    """Return the part Q of products of two velocities that do no work: x . Q(x, x) = 0 for every motion x.
+
+    Its entries are coordinates in the null space of the power x . Q(x, x), which is linear in the coefficients.
+    """
     pairs = list(itertools.combinations_with_replacement(range(_MOTION), 2))
     free = np.argwhere(allowed[rows])
     triples = [tuple(sorted((*pairs[row], axis))) for row, axis in free]
@@ -167,4 +198,4 @@ def _workless_part(prior: Float[np.ndarray, "terms 6"], allowed: Bool[np.ndarray
 
 
 _NO_WORK = 1e-10
-"""Of the largest singular value."""
+"""Singular values below this fraction of the largest one count as 0."""

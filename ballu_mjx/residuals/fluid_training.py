@@ -1,4 +1,4 @@
-"""Fit of fluid forces: from a simulator and recorded motions to a residual."""
+"""Fit of the fluid residual: from a simulator and recorded motions to a residual."""
 
 from __future__ import annotations
 
@@ -26,17 +26,20 @@ def fit_fluid(
     run: TrainingRecord | None = None,
     progress: PhaseProgress | None = None,
 ) -> TrainedResidual:
-    """Fit fluid forces; the result's report has the coefficients with their standard errors.
+    """Fit the coefficients of the fluid residual.
+
+    The report of the result has the coefficients with their standard errors.
 
     **Arguments**
 
-    - `motions`: what the simulator is to follow.
-    - `validation`: other motions, which choose the terms.
-    - `config`: how to fit; None: the defaults.
-    - `run`: takes measurements and files, for example in a folder; None: memory.
-    - `progress`: is told of every iteration.
+    - `simulator`: the simulator to correct.
+    - `motions`: training motions.
+    - `validation`: other motions, which choose the set of terms.
+    - `config`: options of the fit. None for the defaults.
+    - `run`: record of metrics and files, for example a run's folder. None to keep them in memory.
+    - `progress`: display that is updated after every iteration.
 
-    **Raises** `InputError` for options out of range, and where no motion is as long as a window.
+    **Raises** `InputError` for options out of range, and if no motion is as long as a window.
     """
     config = config or FluidConfig()
     record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run
@@ -50,10 +53,10 @@ def fit_fluid(
 
 
 def fluid_table(found: FluidFit) -> str:
-    """Return coefficients and validation errors, as text."""
+    """Return the coefficients and the validation error of each set of terms, as text."""
     scores = ", ".join(f"{name} {score:.3g}" for name, score in found.scores.items())
     symmetric = "symmetric about the xz plane" if found.symmetric else "without symmetry"
     return (
         f"{found.coefficients.table()}\n{found.windows} training windows; {symmetric}. "
-        f"Validation error by set of terms, in expected errors: {scores}."
+        f"Validation error by set of terms, in units of the expected error: {scores}."
     )

@@ -1,4 +1,4 @@
-"""Residual forces without reinforcement learning: from a simulator and recorded motions to a residual."""
+"""Training of supervised and analytic residuals: from a simulator and recorded motions to a residual."""
 
 from __future__ import annotations
 
@@ -51,16 +51,16 @@ def fit_supervised(
 
     **Arguments**
 
-    - `simulator`: what is to follow the motions. Where it has a residual already, the forces learn what that leaves,
-      and the result is both together.
-    - `motions`: recorded ones.
-    - `config`: how to label and regress; None: the defaults.
-    - `forces`: what the network acts with, or options that say so, with its scales. Scales that are not given are the
-      robot's own, or follow from the motions (`scales.settle_scales`).
-    - `validation`: motions that choose the best; None: `motions`.
-    - `run`: takes measurements and checkpoints, in a folder say; None: memory.
-    - `progress`: is told of every step.
-    - `evaluators`: of this simulator without residual, where they are needed further; they share compiled programs.
+    - `simulator`: the simulator to correct. If it has a residual, that residual also acts, and the new forces add to
+      it. The result is the sum of both residuals.
+    - `motions`: training motions.
+    - `config`: options of labels and regression. None for the defaults.
+    - `forces`: force set of the network, or options with the force set and its scales. Scales that are not given are
+      the robot's own, or are estimated from the motions (`scales.settle_scales`).
+    - `validation`: motions that choose the network. None for `motions`.
+    - `run`: record of metrics and checkpoints, for example a run's folder. None to keep them in memory.
+    - `progress`: display that is updated after every step.
+    - `evaluators`: evaluators of this simulator without residual, to share their compiled programs.
 
     **Raises** `InputError` for options out of range.
     """
@@ -83,7 +83,7 @@ def fit_analytic(
 ) -> TrainedResidual:
     """Learn residual forces by gradients of the tracking error through the simulation.
 
-    Arguments and errors are those of `fit_supervised`.
+    `config` has the options of this method. The other arguments and the errors are those of `fit_supervised`.
     """
     config = config or AnalyticConfig()
     analytic.check_analytic_config(config, simulator.robot.control_timestep)
@@ -92,20 +92,20 @@ def fit_analytic(
 
 
 def network_sections(forces: ForceSet | EnvMimicConfig, seed: int) -> tuple[EnvMimicConfig, PPOConfig]:
-    """Return what the network sees and means, and its sizes: both methods learn EnvMimic's."""
+    """Return the options of the network's input and output, and of its layers. They are those of EnvMimic's network."""
     return EnvMimicConfig(forces=forces) if isinstance(forces, str) else forces, PPOConfig(seed=seed)
 
 
 def free_torques(forces: ForceSet, robot: RobotDescription) -> tuple[str, ...]:
-    """Return the joints whose torques are unknowns beside the forces that labels are of.
+    """Return the joints whose torques are unknowns of the labelling, in addition to the loads.
 
-    Forces along joints and changes of commands are torques themselves.
+    There are none if the loads are forces along joints or changes of commands, which cause such torques themselves.
     """
     return robot.joints if FORCE_SETS[forces].turns else ()
 
 
 class _Uses(NamedTuple):
-    """Motions by their use."""
+    """Motions by use."""
 
     training: Sequence[Motion]
     validation: Sequence[Motion]
@@ -113,21 +113,23 @@ class _Uses(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class _Setup:
-    """What both methods learn with."""
+    """Simulator, motions and network with which both methods learn."""
 
     simulator: AugmentedSimulator
     motions: _Uses
     forces: NetworkResidual
     start: Params
+    """Initial parameters of `forces`."""
     inputs: Float[np.ndarray, "states inputs"]
+    """Inputs of the network for all recorded training states."""
 
     def with_policy(self, policy: Any) -> Params:
-        """Return parameters of `forces`."""
+        """Return parameters of `forces` with the policy network `policy`."""
         return self.start._replace(policy=policy)
 
 
 class _Fit:
-    """A method at work, which logs and saves what it learns."""
+    """Base class of both methods: it logs metrics, and saves networks."""
 
     def __init__(
         self,
@@ -140,34 +142,34 @@ class _Fit:
         self.setup, self.config, self.record, self.validate = setup, config, record, validate
         self.progress, self.began = progress, time.perf_counter()
         self.notes: list[str] = []
-        """Sentences of the report."""
+        """Lines of the report for the user."""
 
     def learn(self) -> None:
-        """From beginning to end."""
+        """Learn the network and save it."""
         raise NotImplementedError
 
     @property
-    def still(self) -> Any:
-        """A policy without force, which whatever is learned has to beat."""
+    def zero_policy(self) -> Any:
+        """Return a policy whose loads are 0. It is the first candidate for the best policy."""
         return jax.tree.map(np.zeros_like, jax.device_get(self.setup.start.policy))
 
     def show(self, stage: str, iteration: int, steps: int, loss: float) -> None:
-        """Tell the progress, where there is one."""
+        """Update the progress display, if there is one."""
         if self.progress is not None:
             self.progress.update(stage, iteration, steps, loss)
 
     def log(self, step: int, metrics: Mapping[str, float]) -> None:
-        """With the time so far."""
+        """Add metrics and the time since the start (s) to the record."""
         self.record.log(step, {**metrics, "seconds": time.perf_counter() - self.began})
 
     def save(self, step: int, policy: Any, error: float) -> None:
-        """Keep what was learned; `error` is the validation's, open loop."""
+        """Save a policy with its open-loop validation error."""
         self.record.save(step, ppo.as_tree(self.setup.with_policy(jax.device_get(policy))), error)
 
 
 class _Supervised(_Fit):
     def learn(self) -> None:
-        """Labels for training and validation, the regression, and which share of its forces to take."""
+        """Label the motions, fit the network, and choose the share of its forces that acts."""
         setup, config = self.setup, self.config
         assert isinstance(config, SupervisedConfig)
         robot, env = setup.simulator.robot, setup.forces.config
@@ -190,7 +192,7 @@ class _Supervised(_Fit):
             self.notes.append(f"Labels, {use}: {_sizes(np.concatenate(loads), env.forces, robot)}.")
         infer = jax.jit(lambda policy, seen: setup.forces.infer(setup.with_policy(policy), seen))
         seen, actions = found.get("validation", found["training"])
-        best = math.inf, 0, self.still
+        best = math.inf, 0, self.zero_policy
 
         def validate(step: int, policy: Any, loss: float) -> None:
             nonlocal best
@@ -199,16 +201,16 @@ class _Supervised(_Fit):
             self.log(step, {"loss": loss, "force_error": error})
             self.show("learning", step, config.updates, error)
 
-        validate(0, self.still, float(np.mean(found["training"][1] ** 2)))
+        validate(0, self.zero_policy, float(np.mean(found["training"][1] ** 2)))
         supervised.regress(infer, setup.start.policy, found["training"], config, validate)
         _, step, policy = best
         parts = {share: ppo.with_share(policy, share) for share in config.force_scales}
         errors = {share: self.validate(setup.with_policy(part)) for share, part in parts.items()}
         told = ", ".join(f"{share:.0%}: {error:.2f}" for share, error in errors.items())
-        self.notes.append(f"Validation error by the share of the forces that acts (ratio): {told}.")
+        self.notes.append(f"Validation error by share of the forces (ratio): {told}.")
         share = min(errors, key=lambda share: errors[share])
         if share == 0.0:
-            self.notes.append("No share of them is better than none: the residual is without force.")
+            self.notes.append("No share of the forces improves the validation error: the residual is 0.")
         labelled = sum(len(motion.command) for motions in uses.values() for motion in motions)
         simulated = labelled * (1 + linearize.directions)
         self.log(config.updates + 1, {"share": share, "validation_error": errors[share], "control_steps": simulated})
@@ -217,7 +219,7 @@ class _Supervised(_Fit):
 
 class _Analytic(_Fit):
     def learn(self) -> None:
-        """Gradients through the simulation; the validation is open loop."""
+        """Fit the network by gradients through the simulation, with open-loop validations."""
         setup, config = self.setup, self.config
         assert isinstance(config, AnalyticConfig)
         cut = cut_motion_windows(
@@ -231,7 +233,7 @@ class _Analytic(_Fit):
             self.save(step, policy, error)
             self.show("learning", step, total, error)
 
-        report(0, self.still, {})
+        report(0, self.zero_policy, {})
         analytic.train(
             setup.forces,
             setup.with_policy,
@@ -245,6 +247,7 @@ class _Analytic(_Fit):
 
 
 def _sizes(loads: Float[np.ndarray, "steps loads"], forces: ForceSet, robot: RobotDescription) -> str:
+    """Return the RMS values of labels, as text."""
     if FORCE_SETS[forces].turns:
         return f"{_rms(loads[:, :3]) * 1e3:.1f} mN on the {robot.tracked} (RMS of an axis)"
     sizes = zip(FORCE_SETS[forces].names(robot), np.sqrt(np.mean(loads**2, axis=0)), strict=True)
@@ -268,6 +271,7 @@ def _fit(
     progress: PhaseProgress | None,
     evaluators: Evaluators | None,
 ) -> TrainedResidual:
+    """Learn a network by `method`, and return it together with the base residual of `simulator`."""
     augmented = simulator.with_residual(None)
     plain, robot = augmented.without_residual(), augmented.robot
     record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run

@@ -1,4 +1,4 @@
-"""A residual whose loads are the output of a neural network."""
+"""Residual whose loads are the output of a neural network."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ from ballu_mjx.sim.residual import Action, Commands, History, Residual
 
 @dataclasses.dataclass(frozen=True)
 class NetworkResidual(Residual):
-    """EnvMimic's kind of residual (see `residual.Residual`): a policy's action is what pushes the robot.
+    """Residual (`sim.residual.Residual`) whose loads are the output of a neural network, as in EnvMimic.
 
     **Fields**
 
-    - `config`: what the policy sees, and what its actions mean.
-    - `robot`: which it pushes.
-    - `infer`: (parameters, observation) to the most likely action.
-    - `sample`: (parameters, observation, key) to a drawn one; None: there is none to be had.
-    - `network`: the network's options; None: unknown, and the residual cannot be exported.
+    - `config`: options of the network's input and output.
+    - `robot`: the robot on which the loads act.
+    - `infer`: function of parameters and input that returns the mode of the output's distribution.
+    - `sample`: function of parameters, input and key that returns a sample of this distribution. None if the network
+      cannot be sampled.
+    - `name`: name of a simulator with this residual.
+    - `network`: options of the network. None if unknown; the residual then cannot be exported.
     """
 
     config: ForceNetworkConfig
@@ -39,11 +41,15 @@ class NetworkResidual(Residual):
     network: PPOConfig | None = None
 
     def inputs(self, history: History, commands: Commands) -> Float[Array, " inputs"]:
-        """Return what the policy sees."""
+        """Return the input of the network."""
         return network_input(history, commands, self.config, self.robot)
 
     def act(self, params: Any, history: History, commands: Commands, key: Array | None = None) -> Action:
-        """Return the policy's loads, where they act."""
+        """Return the network's loads over the coming control step.
+
+        With `key`, they are sampled from the network's distribution, if it can be sampled. Without `key`, they are the
+        distribution's mode.
+        """
         seen, yaw = self.inputs(history, commands), history[-1, ObservationLayout.yaw]
         if key is None or self.sample is None:
             loads = self.loads(params, seen, yaw)
@@ -52,5 +58,5 @@ class NetworkResidual(Residual):
         return FORCE_SETS[self.config.forces].act(loads, self.robot)
 
     def loads(self, params: Any, seen: Float[Array, " inputs"], yaw: Float[Array, ""]) -> Float[Array, " loads"]:
-        """The most likely loads (N, N m, commands' units; world) for what the policy sees, at a heading."""
+        """Return the mode of the loads (N, N m, commands' units; world frame) for an input `seen` and a yaw (rad)."""
         return world_loads(self.infer(params, seen), yaw, self.config, self.robot)

@@ -1,4 +1,4 @@
-"""Options of a network that gives residual forces: what it sees, and what its output means."""
+"""Options of a network that computes residual forces: its input, and the loads of its output."""
 
 from __future__ import annotations
 
@@ -9,30 +9,33 @@ from ballu_mjx.sim.force_sets import ForceSet
 
 @dataclasses.dataclass(frozen=True)
 class ForceNetworkConfig:
-    """What a force network sees, and what its output means."""
+    """Options of the input and output of a network that computes residual forces."""
 
     forces: ForceSet = "force"
-    """What the policy acts with: a force on the tracked body (the paper's), a force and a torque there (wrench), forces
-    there and at all measured points (multi), forces and torques along joints (joints), or changes of the commands
-    (commands)."""
+    """Loads that the network's output stands for: a force on the tracked body (force, as in the paper), a force and a
+    torque on it (wrench), forces on it and at all measured points (multi), forces and torques along joints (joints), or
+    changes of the commands (commands)."""
     force_limit: float | None = None
-    """Largest force along each axis, N (paper: 1). Other loads may be as many units. Without this option: the robot's
-    own, or 20 units."""
+    """Largest force along each axis, N (paper: 1). Other loads have the same limit in units of the network's output.
+    Without this option: the robot's own value, or 20 units."""
     force_scale: float | None = None
-    """Force, N, that one unit of the policy's output stands for. Without this option: the robot's own, or the size of
-    what the model leaves unexplained in the training recordings. Joints and commands have `scales`: for limit and cost
-    one of their units counts as this force."""
+    """Force for one unit of the network's output, N. Without this option: the robot's own value, or the RMS force that
+    the model leaves unexplained in the training recordings. Joints and commands have `--scales` instead; for limit and
+    cost, one of their units counts as this force."""
     torque_scale: float | None = None
-    """Torque, N m, that one unit of the policy's output stands for, where it pushes with one. Without this option:
-    likewise. Limit and cost are, unit for unit, those of a force."""
+    """Torque for one unit of the network's output, N m, with `--forces wrench`. Without this option: the robot's own
+    value, or the RMS torque that the model leaves unexplained in the training recordings. For limit and cost, a unit of
+    torque counts as a unit of force."""
     scales: tuple[float, ...] = ()
-    """What one unit of each output stands for, with `--forces joints` (N m, of slides N) and `commands` (their units),
-    in their order. Without this option: from the training recordings."""
+    """Load for one unit of each output, in order, with `--forces joints` (N m, for slides N) or `--forces commands`
+    (the commands' units). Without this option: the RMS loads that the model leaves unexplained in the training
+    recordings."""
     observe_command: bool = True
-    """Let the policy see the commands (now and the last two), which the paper's state leaves out."""
+    """Include the coming command and the last two commands in the network's input. The paper's state has none."""
     relative_observation: bool = True
-    """Horizontal positions that the policy sees are from the tracked body, so that forces do not depend on the place in
-    the room. The paper's are the room's. Those of an anchored robot always are."""
+    """Take horizontal positions in the network's input relative to the tracked body, so that the forces do not depend
+    on the place in the room. The paper takes them in the world frame. For an anchored robot they are always in the
+    world frame."""
     heading_frame: bool = True
-    """Directions that the policy sees, yaw and forces are in the tracked body's heading frame. The paper's are the
-    world's. Those of an anchored robot always are."""
+    """Express vectors and yaw in the network's input, and its forces, in the heading frame of the tracked body. The
+    paper uses the world frame. For an anchored robot it is always the world frame."""

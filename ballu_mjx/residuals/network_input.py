@@ -1,4 +1,4 @@
-"""What a residual network sees: motion and commands of the last control steps."""
+"""Input of a residual network: motion and commands of the last control steps."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def network_input(
     config: ForceNetworkConfig,
     robot: RobotDescription,
 ) -> Float[Array, " inputs"]:
-    """Return `heading_observation`, with the commands (the coming one last) where the configuration asks for them.
+    """Return the input of a residual network: `heading_observation`, and the commands if `config.observe_command`.
 
-    Commands come as fractions of their ranges, 0 to 1, whatever their units.
+    Commands are fractions of their ranges (0 to 1), the coming command last.
     """
     seen = heading_observation(
         history, robot.anchored, relative=config.relative_observation, turned=config.heading_frame
@@ -39,7 +39,7 @@ def network_input(
 
 
 def network_input_names(config: ForceNetworkConfig, robot: RobotDescription) -> list[str]:
-    """Return the names of `network_input`, each with its unit and control step."""
+    """Return the names of the numbers of `network_input`, each with its unit and control step."""
     steps = ["now", "one control step ago", "two control steps ago"][:HISTORY][::-1]
     seen = heading_observation_names((robot.tracked, *robot.points))
     names = [f"{name}, {step}" for step in steps for name in seen]
@@ -50,14 +50,14 @@ def network_input_names(config: ForceNetworkConfig, robot: RobotDescription) -> 
 
 
 def num_inputs(config: ForceNetworkConfig, robot: RobotDescription) -> int:
-    """Return the size of `network_input`."""
+    """Return the number of entries of `network_input`."""
     return HISTORY * (ObservationLayout.of(robot).size + len(robot.commands) * config.observe_command)
 
 
 def recorded_inputs(
     reference: ReferenceMotions, config: ForceNetworkConfig, robot: RobotDescription
 ) -> Float[Array, "states inputs"]:
-    """What the policy would see of every recorded state."""
+    """Return `network_input` for every recorded state that has a history."""
 
     def inputs(recording: Array, time: Array) -> Array:
         history = jax.lax.dynamic_slice_in_dim(reference.features[recording], time - HISTORY + 1, HISTORY)

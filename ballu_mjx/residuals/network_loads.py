@@ -1,4 +1,4 @@
-"""What the output of a residual network stands for: loads, their units, limit, frame and cost."""
+"""Output of a residual network as loads: their names, units, limit, frame and cost."""
 
 from __future__ import annotations
 
@@ -21,25 +21,25 @@ def load_names(config: ForceNetworkConfig, robot: RobotDescription) -> list[str]
 
 
 def num_loads(config: ForceNetworkConfig, robot: RobotDescription) -> int:
-    """Return the size of an action."""
+    """Return the number of a network's loads."""
     return force_sets.num_loads(config.forces, robot)
 
 
 class LoadScales(NamedTuple):
-    """What a network's outputs stand for."""
+    """Scales of a network's outputs. An output of 1 is called one unit."""
 
     units: Float[np.ndarray, " loads"]
-    """One unit of each output (N, N m, commands' units)."""
+    """Load for one unit of each output (N, N m, commands' units)."""
     newtons: float
-    """Force (N) that a unit counts as, for limit and cost."""
+    """Force that counts as one unit, for limit and cost (N)."""
     limit: float
-    """Largest output, in units."""
+    """Largest magnitude of an output (units)."""
 
 
 def load_scales(config: ForceNetworkConfig, robot: RobotDescription) -> LoadScales:
-    """Return what the outputs of a network stand for; what the configuration leaves open is the robot's own.
+    """Return the scales of a network's outputs. Values that `config` lacks are the robot's own.
 
-    **Raises** `ValueError` where nothing tells (`scales.settle_scales` asks the recordings).
+    **Raises** `ValueError` if a value is in neither. `scales.settle_scales` estimates it from recordings.
     """
     own, size = robot.adapter.residual_scales(), num_loads(config, robot)
     names = ("force_scale", "torque_scale", "force_limit")
@@ -53,19 +53,22 @@ def load_scales(config: ForceNetworkConfig, robot: RobotDescription) -> LoadScal
     else:
         scales = list(config.scales) if len(config.scales) == size else None
     if force is None or limit is None or scales is None or None in scales:
-        raise ValueError("The scales of the forces are open; give them, or let settle_scales find them.")
+        raise ValueError("The scales of the forces are open; set them, or call settle_scales.")
     return LoadScales(np.array(scales, float), float(force), float(limit / force))
 
 
 def load_units(config: ForceNetworkConfig, robot: RobotDescription) -> Float[np.ndarray, " loads"]:
-    """What one unit of each number of an action stands for (N, N m, commands' units)."""
+    """Return the load for one unit of each output (N, N m, commands' units)."""
     return load_scales(config, robot).units
 
 
 def square_newtons(
     loads: Float[Array, "*batch loads"], config: ForceNetworkConfig, robot: RobotDescription
 ) -> Float[Array, "*batch"]:
-    """What loads cost force for (N^2): their squares, another load counted as the force that takes as many units."""
+    """Return the sum of the squared loads, as squared force (N^2), for the force cost.
+
+    A load that is no force counts as a force with the same number of units.
+    """
     scales = load_scales(config, robot)
     in_newtons = loads / scales.units * scales.newtons
     return jnp.sum(in_newtons**2, axis=-1)
@@ -74,11 +77,11 @@ def square_newtons(
 def world_loads(
     action: Float[Array, " loads"], yaw: Float[Array, ""], config: ForceNetworkConfig, robot: RobotDescription
 ) -> Float[Array, " loads"]:
-    """Return the loads (N, N m, commands' units; world) that an action stands for, within the limit on each.
+    """Return the loads (N, N m, commands' units; world frame) of a network's output, each clipped to the limit.
 
-    Vectors of actions are in the tracked body's heading frame, like the observation: the same situation met in another
-    direction calls for the same force, turned. Those on an anchored robot, or without `heading_frame`, are in the
-    world's.
+    Vectors of the output are in the tracked body's heading frame, as in the network's input. The same situation with
+    another heading therefore has the same force, rotated by the heading. For an anchored robot, or without
+    `config.heading_frame`, vectors of the output are in the world frame.
     """
     scales = load_scales(config, robot)
     loads = jnp.asarray(scales.units) * jnp.clip(action, -scales.limit, scales.limit)
@@ -88,5 +91,5 @@ def world_loads(
 
 
 def force_frame(yaw: Float[Array, ""], config: ForceNetworkConfig, robot: RobotDescription) -> Float[Array, "3 3"]:
-    """Return the rotation that takes vectors in the frame of a network's actions to the world."""
+    """Return the rotation matrix, frame of a network's output to world frame, for a yaw (rad)."""
     return world_rotation(yaw, robot.anchored or not config.heading_frame)

@@ -13,10 +13,11 @@ PresetName = Literal["paper"]
 
 
 class Setting(NamedTuple):
-    """An option's value, and where it is from."""
+    """Value of an option in a preset, with its source."""
 
     value: Any
     source: str
+    """Source of the value, as text for the user."""
 
 
 _PAPER = "paper"
@@ -24,7 +25,7 @@ _SB3 = "Stable-Baselines3's default"
 _NONE = "the paper has none"
 _OPEN = "not in the paper"
 _TO_THE_END = 1000.0
-"""s: longer than recordings are."""
+"""Length of an episode that always lasts to the end of the recording (s)."""
 
 PRESETS: Mapping[PresetName, Mapping[str, Mapping[str, Setting]]] = {
     "paper": {
@@ -47,13 +48,13 @@ PRESETS: Mapping[PresetName, Mapping[str, Mapping[str, Setting]]] = {
             "observation_noise": Setting(0.0, _NONE),
             "start_noise": Setting(0.0, "paper: starts are recorded states"),
             "episode_seconds": Setting(_TO_THE_END, f"{_OPEN}: to the recording's end"),
-            "episode_spread": Setting(0.0, f"{_OPEN}: likewise"),
+            "episode_spread": Setting(0.0, f"{_OPEN}: to the recording's end"),
         },
         "ppo": {
             "num_envs": Setting(64, f"{_SB3}: with unroll_length, 2048 steps for an update"),
-            "unroll_length": Setting(32, "likewise"),
+            "unroll_length": Setting(32, f"{_SB3}: with num_envs, 2048 steps for an update"),
             "batch_size": Setting(2, f"{_SB3}: with unroll_length, 64 steps in a minibatch"),
-            "num_minibatches": Setting(32, "likewise"),
+            "num_minibatches": Setting(32, f"{_SB3}: 32 minibatches of 64 steps for an update"),
             "num_updates_per_batch": Setting(10, _SB3),
             "learning_rate": Setting(3e-4, _SB3),
             "desired_kl": Setting(0.0, f"{_SB3}: the learning rate is constant"),
@@ -75,10 +76,11 @@ PRESETS: Mapping[PresetName, Mapping[str, Mapping[str, Setting]]] = {
         },
     },
 }
-"""By name, the configuration's section and option.
+"""Presets by name, section of the configuration, and option.
 
-`paper` is Sontakke et al. (2023, section "Residual Dynamics Learning via Reinforcement Learning") with the defaults of
-the PPO that it names, Stable-Baselines3's. Options that are missing here (num_timesteps, seed) neither states.
+`paper` has the values of Sontakke et al. (2023, section "Residual Dynamics Learning via Reinforcement Learning"). The
+paper uses the PPO of Stable-Baselines3, so values that it does not state are that library's defaults. Options without a
+value here (num_timesteps, seed) are stated by neither.
 """
 
 
@@ -88,13 +90,16 @@ def preset_values(name: PresetName) -> dict[str, dict[str, Any]]:
 
 
 def preset_configs(name: PresetName, **changes: Any) -> tuple[EnvMimicConfig, PPOConfig]:
-    """Return a preset's configurations; `changes` are of PPO's."""
+    """Return the configurations of a preset. `changes` replace options of the PPO configuration."""
     values = preset_values(name)
     return EnvMimicConfig(**values["env"]), PPOConfig(**{**values["ppo"], **changes})
 
 
 def describe_preset(name: PresetName, env: EnvMimicConfig, ppo: PPOConfig) -> str:
-    """Return a table of what a preset sets and why, with the options that `env` and `ppo` have otherwise."""
+    """Return a table of a preset's options, their values and their sources, as text.
+
+    The table also shows the values in `env` and `ppo` that differ from the preset.
+    """
     rows = []
     for section, config in (("env", env), ("ppo", ppo)):
         assert dataclasses.is_dataclass(config)

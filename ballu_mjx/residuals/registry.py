@@ -1,6 +1,6 @@
-"""The kinds of residual by name, each said once: what a run of it leaves, and how that is read.
+"""Registry of the kinds of residual, with the function that loads each kind from a run's folder.
 
-A new kind is a class with the interface `sim.residual.Residual`, a function that loads it from a run's folder, and
+A new kind needs a class with the interface `sim.residual.Residual`, a function that loads it from a run's folder, and
 an entry in `KINDS`.
 """
 
@@ -21,27 +21,27 @@ if TYPE_CHECKING:
 
 
 class StoredRun(NamedTuple):
-    """A run's folder, and what it says of itself."""
+    """A run of a residual, with its configuration."""
 
     folder: Path
     config: Mapping[str, Any]
     """Content of `config.json`."""
     robot: RobotDescription
     actuators: ModelParameters | None
-    """Identified actuators of its simulator; None: the nominal ones."""
+    """Identified actuators of the run's simulator. None if they are nominal."""
     which: Literal["best", "last"]
-    """The checkpoint to read, where there are any."""
+    """Checkpoint to read, for kinds with checkpoints."""
 
 
 class LoadedResidual(NamedTuple):
-    """What a run has learned, without its base residual."""
+    """Residual that a run has learned, without its base residual."""
 
     model: Residual
     params: Any
     inputs: int
-    """Size of the model's inputs."""
+    """Number of inputs of the residual."""
     step: int
-    """Control steps or gradient steps of training behind it; 0 where there are no checkpoints."""
+    """Control steps or gradient steps of training until the checkpoint. 0 for kinds without checkpoints."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,13 +49,14 @@ class ResidualKind:
     """A kind of residual."""
 
     name: str
-    """The task of its runs, and the name of the simulator that it improves."""
+    """Name of the task of its runs, and of a simulator with this residual."""
     label: str
-    """In figures and tables."""
+    """Label in figures and tables."""
     network: bool
-    """Whether it is a network of forces, with checkpoints and perhaps a base residual, or a white box."""
+    """Whether the residual is a network of forces. Runs of a network have checkpoints and may have a base residual.
+    Other kinds are physical models, without either."""
     load: Callable[[StoredRun], LoadedResidual]
-    """**Raises** `InputError` where the run's files are damaged."""
+    """Function that loads a run. **Raises** `InputError` if files of the run are damaged."""
 
 
 def _load_network(run: StoredRun) -> LoadedResidual:
@@ -77,12 +78,13 @@ def _load_network(run: StoredRun) -> LoadedResidual:
     try:
         load_scales(config, robot)
     except ValueError as error:
-        raise InputError(f"{folder}: its config.json lacks the scales of the forces; restore it.") from error
+        raise InputError(f"{folder}: its config.json has no scales of the forces; restore it.") from error
     sizes = inputs, num_loads(config, robot), network
     infer = ppo.make_inference(*sizes)
     if not (inputs == num_inputs(config, robot) and ppo.fits(infer, params, inputs)):
         raise InputError(
-            f"{folder}: the stored parameters do not fit the networks in its config.json; restore one of them."
+            f"{folder}: the stored parameters do not fit the network in its config.json; restore the checkpoint or "
+            "config.json."
         )
     sample = ppo.make_sampler(*sizes) if task == "envmimic" else None
     return LoadedResidual(NetworkResidual(config, robot, infer, sample, task, network), params, inputs, step)
@@ -121,8 +123,8 @@ KINDS: Mapping[str, ResidualKind] = {
         ResidualKind("fluid", "fluid forces", False, _load_fluid),
     )
 }
-"""By name."""
+"""All kinds of residual, by name."""
 RESIDUAL_TASKS = tuple(KINDS)
-"""Runs that leave a residual."""
+"""Tasks whose runs have a residual."""
 NETWORK_TASKS = tuple(name for name, kind in KINDS.items() if kind.network)
-"""Runs that leave a network of forces."""
+"""Tasks whose runs have a network of forces."""

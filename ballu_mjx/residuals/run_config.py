@@ -1,4 +1,4 @@
-"""What a run's `config.json` says of robot, actuators, residual and recordings."""
+"""Robot, actuators, residual and recordings in a run's `config.json`."""
 
 from __future__ import annotations
 
@@ -26,35 +26,35 @@ _LONGEST_PATH = 300
 
 
 def run_actuators(config: Mapping[str, Any], folder: Path, robot: RobotDescription) -> ModelParameters | None:
-    """The actuators of a run's simulator; None for the nominal ones.
+    """Return the identified actuators of a run's simulator. None if they are nominal.
 
-    **Raises** `InputError` where they are damaged.
+    **Raises** `InputError` if the entry in `config.json` is damaged.
     """
     stored = config_section(config, "actuators", folder)
     return None if stored is None else actuators_from_json(robot, stored, folder / CONFIG_FILE)
 
 
 def run_robot(config: Mapping[str, Any], folder: Path) -> RobotDescription:
-    """The robot of a run; the default one where it names none.
+    """Return the robot of a run, or the default robot if `config.json` names none.
 
-    **Raises** `InputError` where its description is gone, has changed, or its model has.
+    **Raises** `InputError` if the robot's description is missing, or if its description or its model has changed.
     """
     stored = config.get("robot_description")
     return load_robot() if stored is None else find_robot(stored, folder / CONFIG_FILE)
 
 
 def check_stands_in(robot: RobotDescription, own: RobotDescription, folder: Path) -> None:
-    """Check that what was learned for the robot `own` of a run can act on another model.
+    """Check that a residual that was learned for the robot `own` of a run can act on `robot`.
 
-    **Raises** `InputError` where the two differ in what residuals see or act on, naming it.
+    **Raises** `InputError` if the robots differ in a quantity of a residual's input or loads. The message names it.
     """
     for name, words in _SHARED.items():
         one, other = getattr(robot, name), getattr(own, name)
         if one != other:
             shown = [reprlib.repr(dict(x) if isinstance(x, Mapping) else x) for x in (one, other)]
             raise InputError(
-                f"{robot.file}: cannot stand in for {own.name}, the robot of {folder}: its {words} differ ({shown[0]}, "
-                f"there {shown[1]}); give a model that differs in its numbers only."
+                f"{robot.file}: cannot stand in for {own.name}, the robot of {folder}: its {words} differ ({shown[0]} "
+                f"instead of {shown[1]}); give a robot whose model differs in numbers only."
             )
 
 
@@ -68,13 +68,13 @@ _SHARED = {
     "directions": "directions of motion",
     "force_joints": "joints that forces act along",
 }
-"""What residuals see and act on, by the description's field."""
+"""Fields of the description that determine inputs and loads of residuals, with their names in messages."""
 
 
 def run_residual(config: Mapping[str, Any], folder: Path) -> Path | None:
-    """The run of the residual in a run's simulator; None where there is none.
+    """Return the folder of the run whose residual is in a run's simulator. None if the simulator has no residual.
 
-    **Raises** `InputError` where the key is missing.
+    **Raises** `InputError` if `config.json` lacks the key.
     """
     stored = config_section(config, "residual", folder)
     return None if stored is None else Path(stored)
@@ -88,9 +88,17 @@ def describe_run(
     identified: ModelParameters | None = None,
     description: RobotDescription | None = None,
 ) -> dict[str, Any]:
-    """What `config.json` holds: `sections` are configurations (dataclasses) by name, `recordings` files by use,
-    `identified` the simulator's actuators where they are not the nominal ones, `description` the robot (None: the
-    default one)."""
+    """Return the content of a run's `config.json`.
+
+    **Arguments**
+
+    - `task`: name of the task.
+    - `sections`: configurations (dataclasses) by name.
+    - `recordings`: files of recordings by use.
+    - `devices`: names of the devices of the run.
+    - `identified`: identified actuators of the simulator. None if they are nominal.
+    - `description`: the robot. None for the default robot.
+    """
     description = description or load_robot()
     return {
         "format": RUN_FORMAT,
@@ -113,32 +121,34 @@ def describe_run(
 
 
 def describe_recording(path: Path) -> dict[str, str]:
-    """Where a recording lies (bundled ones independently of the installation), and the SHA-256 of its content and of
-    the JSON beside it."""
+    """Return the path of a recording, and the SHA-256 of its content and of the JSON beside it.
+
+    The path of a bundled recording does not depend on the place of the installation.
+    """
     place, sidecar = portable_path(path, assets() / "recordings"), sidecar_path(path)
     described = sidecar.read_bytes() if sidecar.is_file() else b""
     return {"path": place, "sha256": hashlib.sha256(path.read_bytes() + b"\0" + described).hexdigest()}
 
 
 def find_recordings(config: Mapping[str, Any], use: str, folder: Path) -> list[Path]:
-    """The files that `describe_recording` described under `use`.
+    """Return the recordings that a run's `config.json` names under `use`.
 
-    **Raises** `InputError` where one is missing or has changed.
+    **Raises** `InputError` if a recording is missing or has changed.
     """
     paths = []
     described = config_section(config, "recordings", folder).get(use)
     if not described:
-        raise InputError(f"{folder / CONFIG_FILE}: names no recordings for {use}; give some by options.")
+        raise InputError(f"{folder / CONFIG_FILE}: names no recordings for {use}; give some on the command line.")
     for entry in described:
         place = entry["path"]
         path, there = Path(place), False
         if place.startswith(BUNDLED):
             path = assets() / "recordings" / place.removeprefix(BUNDLED)
-        with contextlib.suppress(OSError):  # a name that no file can have
+        with contextlib.suppress(OSError):  # The file system may not allow this name.
             there = path.is_file()
         if not there:
             raise InputError(
-                f"{_cut(place)}: the recording, which {folder / CONFIG_FILE} names, is gone; restore it or give "
+                f"{_cut(place)}: the recording is missing, but {folder / CONFIG_FILE} names it; restore it or give "
                 "--recordings."
             )
         if describe_recording(path)["sha256"] != entry["sha256"]:

@@ -1,10 +1,13 @@
-"""Scales, limits and costs of residual forces: the robot's own, or the size of what the model leaves unexplained.
+"""Scales, limits and costs of residual loads: the robot's own, or the RMS of the loads that the model lacks.
 
-That size is told by one-step inverse dynamics along the training recordings. Each control step is simulated in C MuJoCo
-from its recorded state, under what the model and a base residual explain. What the velocities after it lack is averaged
-over a quarter of a second, for single steps show noise. It is then shared out to the loads of a force set by least
-squares in kinetic energy. What a load does to the velocities is measured by a second simulation: by mass and time alone
-what acts on a stiffly driven joint, whose actuator undoes most of it within the step, would look like a small load.
+The lacking loads are estimated by one-step inverse dynamics along the training recordings:
+
+1. Each control step is simulated in C MuJoCo from its recorded state, with the base residual if there is one.
+2. The error of the velocities after the step is averaged over 0.25 s, because single steps are dominated by noise.
+3. The loads of the force set that explain the averaged error are found by least squares in kinetic energy.
+
+The effect of a load on the velocities is measured by a second simulation with this load. Mass and time alone do not
+give it: a stiff actuator undoes most of a load on its joint within the step, so the load would be underestimated.
 """
 
 from __future__ import annotations
@@ -34,32 +37,33 @@ from ballu_mjx.sim.residual import BoundResidual
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 LIMIT_UNITS = 20.0
-"""Largest output of a network, in units, where neither robot nor user says."""
+"""Default limit of a network's outputs, in units."""
 UNIT_COST = 0.05
-"""Reward lost per squared unit, likewise."""
-_AVERAGED = 0.25
-"""s."""
+"""Default cost of a squared unit of a network's output, in reward."""
+_AVERAGING_TIME = 0.25
+"""Time over which errors of velocities are averaged (s)."""
 _STATES = 2000
-"""Most states that loads are found for."""
-_SHARE = 0.95
-"""Larger loads count as this quantile: contacts and gaps make single ones huge."""
-_LEAST = 1e-6
-"""Smallest scale, as of a model that explains everything."""
-_WEAK = 0.05
-"""Directions that loads act in with less of the strongest one's effect are left alone."""
-_NUDGE = 0.1
-"""Share of a command's range by which its effect is measured; of a force, it is its size by mass and time."""
+"""Number of states for which loads are estimated, if the recordings have as many. Up to twice as many are used."""
+_QUANTILE = 0.95
+"""Quantile to which larger loads are clipped. Contacts and gaps in recordings make single loads huge."""
+_SMALLEST_SCALE = 1e-6
+"""Smallest scale of a load, for a model that explains everything."""
+_WEAKEST = 0.05
+"""Smallest singular value of the loads' effects that counts, as a fraction of the largest one. Combinations of loads
+with a smaller effect are set to 0."""
+_PERTURBATION = 0.1
+"""Change of a command for the measurement of its effect, as a fraction of its range."""
 
 Config = TypeVar("Config", bound=ForceNetworkConfig)
 
 
 def settle_scales(config: Config, simulator: Simulator | AugmentedSimulator, motions: Sequence[Motion]) -> Config:
-    """Return the configuration with all scales, limit and cost as numbers.
+    """Return the configuration with numbers for all scales, the limit and the cost.
 
-    What is given stays. The rest is the robot's own (`RobotAdapter.residual_scales`), or follows from what
-    `simulator`, with its base residual, leaves unexplained in `motions`.
+    Values that are given stay. The others are the robot's own (`RobotAdapter.residual_scales`), or are derived from the
+    loads that `simulator`, with its base residual, leaves unexplained in `motions`.
 
-    **Raises** `InputError` where the robot has nothing that the force set acts on.
+    **Raises** `InputError` if the robot has nothing on which the force set can act.
     """
     augmented = simulator.with_residual(None)
     robot, forces = augmented.robot, config.forces
@@ -78,7 +82,7 @@ def settle_scales(config: Config, simulator: Simulator | AugmentedSimulator, mot
 
 
 def _filled(config: Config, own: ResidualScales | None, found: dict[str, Any]) -> Config:
-    """Return the configuration with what it leaves open filled in."""
+    """Return the configuration with its open values filled in from the robot's `own` scales or from `found` ones."""
     usual = {} if own is None else dataclasses.asdict(own)
     force = config.force_scale or usual.get("force_scale") or found.get("force_scale") or 1.0
     values = {"force_scale": force, "force_limit": LIMIT_UNITS * force, "force_cost": UNIT_COST / force**2}
@@ -91,7 +95,7 @@ def _filled(config: Config, own: ResidualScales | None, found: dict[str, Any]) -
 
 
 def describe_scales(config: ForceNetworkConfig, robot: RobotDescription) -> str:
-    """Return what the outputs of a network stand for, in words."""
+    """Return the scales, limit and cost of a network's outputs, as text."""
     scales = load_scales(config, robot)
     loads = ", ".join(
         f"{name.rpartition(',')[0]} {unit:.3g}{name.rpartition(',')[2]}"
@@ -105,47 +109,50 @@ def describe_scales(config: ForceNetworkConfig, robot: RobotDescription) -> str:
 def missing_loads(
     simulator: Simulator | AugmentedSimulator, motions: Sequence[Motion], forces: ForceSet
 ) -> Float[np.ndarray, " loads"]:
-    """Return the root mean square of the loads (N, N m, commands' units) that the model leaves unexplained in recorded
-    motions, as it stands and with its base residual."""
+    """Return the RMS of the loads (N, N m, commands' units) that a simulator leaves unexplained in recorded motions.
+
+    A base residual of the simulator acts, too.
+    """
     augmented = simulator.with_residual(None)
     plain, robot, model = augmented.simulator, augmented.robot, improved_model(augmented)
     every = max(sum(len(motion.command) for motion in motions) // _STATES, 1)
-    window = max(round(_AVERAGED / robot.control_timestep), 1)
+    window = max(round(_AVERAGING_TIME / robot.control_timestep), 1)
     reference, _ = stack_motions(plain, motions)
     found = []
     for number, motion in enumerate(motions):
         applied, sent = _base_residual(augmented, model, reference, number, motion)
         after = _step(plain, model, motion, sent, applied)
-        lacking = _averaged(motion.qvel[1:] - after, window)[::every]
+        missing = _averaged(motion.qvel[1:] - after, window)[::every]
         here = np.arange(0, len(motion.command), every)
         mass, acts = _inertia(robot, model, motion.qpos[here], forces)
         root = np.linalg.cholesky(mass).swapaxes(1, 2)
         if acts is None:
             low, high = np.array(robot.command_ranges).T
-            nudges = _NUDGE * (high - low) * np.where(sent > (low + high) / 2, -1.0, 1.0)
+            changes = _PERTURBATION * (high - low) * np.where(sent > (low + high) / 2, -1.0, 1.0)
         else:
-            guess = _shared_out(root, np.linalg.solve(mass, acts) * robot.control_timestep, lacking)
-            nudges = np.broadcast_to(_size(guess), (len(motion.command), acts.shape[2]))
+            # The loads are perturbed by their size according to mass and time alone.
+            guess = _solve_loads(root, np.linalg.solve(mass, acts) * robot.control_timestep, missing)
+            changes = np.broadcast_to(_size(guess), (len(motion.command), acts.shape[2]))
         effects = []
-        for place, nudge in enumerate(nudges.T):
-            command, pushed = sent.copy(), applied.copy()
+        for load, change in enumerate(changes.T):
+            command, force = sent.copy(), applied.copy()
             if acts is None:
-                command[:, place] += nudge
+                command[:, load] += change
             else:
-                pushed[here] += acts[:, :, place] * nudge[here, None]
-            moved = _step(plain, model, motion, command, pushed, here)
-            effects.append((moved - after[here]) / nudge[here, None])
-        found.append(_shared_out(root, np.stack(effects, axis=2), lacking))
+                force[here] += acts[:, :, load] * change[here, None]
+            moved = _step(plain, model, motion, command, force, here)
+            effects.append((moved - after[here]) / change[here, None])
+        found.append(_solve_loads(root, np.stack(effects, axis=2), missing))
     return _size(np.concatenate(found))
 
 
 def _size(loads: Float[np.ndarray, "states loads"]) -> Float[np.ndarray, " loads"]:
-    """Return root mean squares over states, large values cut off and missing ones left out."""
+    """Return the RMS of each load over the states. Large values are clipped, and states with NaN are left out."""
     size = np.abs(loads[np.isfinite(loads).all(axis=1)])
     if not len(size):
-        return np.full(loads.shape[1], _LEAST)
-    size = np.minimum(size, np.quantile(size, _SHARE, axis=0))
-    return np.maximum(np.sqrt(np.mean(size**2, axis=0)), _LEAST)
+        return np.full(loads.shape[1], _SMALLEST_SCALE)
+    size = np.minimum(size, np.quantile(size, _QUANTILE, axis=0))
+    return np.maximum(np.sqrt(np.mean(size**2, axis=0)), _SMALLEST_SCALE)
 
 
 def _rms(values: Float[np.ndarray, " loads"]) -> float:
@@ -160,8 +167,10 @@ def _step(
     applied: Float[np.ndarray, "steps nv"],
     here: Int[np.ndarray, " chosen"] | slice = slice(None),
 ) -> Float[np.ndarray, "chosen nv"]:
-    """Return velocities after the control steps `here`, from the recorded state before; NaN where a simulation broke
-    down."""
+    """Simulate the control steps `here` from their recorded states, and return the velocities after them.
+
+    Velocities are NaN if a simulation diverged.
+    """
     substeps, kind = simulator.substeps, mujoco.mjtState
     ctrl = physics_commands(simulator.actuators, command, substeps, float(model.opt.timestep))
     forces = np.repeat(applied[:, None], substeps, axis=1)
@@ -175,13 +184,13 @@ def _step(
     state, _ = mujoco.rollout.rollout(model, data, initial, control, control_spec=specification)
     last = np.asarray(state, float)[:, -1]
     expected = substeps * model.opt.timestep
-    # MuJoCo begins anew where a simulation breaks down, and its clock with it.
+    # MuJoCo resets a simulation that diverges, so its time is then too short.
     last[np.abs(last[:, 0] - expected) > 1e-6 * expected] = np.nan
     return last[:, 1 + model.nq : 1 + model.nq + model.nv]
 
 
 def _averaged(values: Float[np.ndarray, "steps nv"], window: int) -> Float[np.ndarray, "steps nv"]:
-    """Return running means over so many steps, of what is finite."""
+    """Return running means over `window` steps. Steps with values that are not finite are left out."""
     good = np.asarray(np.isfinite(values).all(axis=1))
     ones = np.ones(min(window, len(values)))
     count = np.convolve(good, ones, mode="same")
@@ -193,8 +202,11 @@ def _averaged(values: Float[np.ndarray, "steps nv"], window: int) -> Float[np.nd
 def _base_residual(
     simulator: AugmentedSimulator, model: mujoco.MjModel, reference: ReferenceMotions, number: int, motion: Motion
 ) -> tuple[Float[np.ndarray, "steps nv"], Float[np.ndarray, "steps commands"]]:
-    """Return what the base residual does in recorded states that have a history: generalized forces, and the commands
-    that it makes of the recorded ones, as their mean over each control step."""
+    """Return the generalized forces and the commands with the base residual, for each recorded control step.
+
+    Commands are means over a control step. For states without a history, forces are 0 and commands are the recorded
+    ones.
+    """
     applied, sent = np.zeros((len(motion.command), model.nv)), motion.command.copy()
     if simulator.residual is None:
         return applied, sent
@@ -220,7 +232,11 @@ def _base_residual(
 def _jacobians(
     robot: RobotDescription, model: mujoco.MjModel, data: mujoco.MjData, loaded: int
 ) -> Float[np.ndarray, "loads nv"]:
-    """Return the Jacobian of forces and torques, six rows for the tracked body and for each point."""
+    """Return the Jacobian of the tracked body and of the points, in the state `data.qpos`.
+
+    It has six rows for the tracked body and for each point: three translations (world frame) and three rotations.
+    `loaded` is the number of rows of the wrench: 1 for the tracked body alone.
+    """
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     found = np.zeros((loaded, 2, 3, model.nv))
@@ -236,7 +252,7 @@ def _jacobians(
 def _inertia(
     robot: RobotDescription, model: mujoco.MjModel, qpos: Float[np.ndarray, "states nq"], forces: ForceSet
 ) -> tuple[Float[np.ndarray, "states nv nv"], Float[np.ndarray, "states nv loads"] | None]:
-    """Return mass matrices, and the generalized forces of unit loads; None of changes of commands."""
+    """Return mass matrices, and the generalized forces of unit loads. The latter are None for changes of commands."""
     data, mass, acts = mujoco.MjData(model), np.zeros((len(qpos), model.nv, model.nv)), []
     along = np.eye(model.nv)[[joint.place for joint in robot.force_joints.values()]]
     for state, own in zip(qpos, mass, strict=True):
@@ -249,15 +265,23 @@ def _inertia(
     return mass, None if forces == "commands" else np.array(acts)
 
 
-def _shared_out(
+def _solve_loads(
     root: Float[np.ndarray, "states nv nv"],
     effects: Float[np.ndarray, "states nv loads"],
-    lacking: Float[np.ndarray, "states nv"],
+    missing: Float[np.ndarray, "states nv"],
 ) -> Float[np.ndarray, "states loads"]:
-    """Return the loads that explain best, by kinetic energy, what velocities lack after control steps; NaN where that
-    or the loads' `effects` on velocities are unknown. `root` times its transpose is the mass matrix, transposed."""
-    good = np.isfinite(lacking).all(axis=1) & np.isfinite(effects).all(axis=(1, 2))
-    found = np.full((len(lacking), effects.shape[2]), np.nan)
-    inverse = np.linalg.pinv(root[good] @ effects[good], rcond=_WEAK)
-    found[good] = (inverse @ (root[good] @ lacking[good, :, None]))[..., 0]
+    """Return the loads that best explain the errors of velocities after control steps, by kinetic energy.
+
+    **Arguments**
+
+    - `root`: transposed Cholesky factors of the mass matrices.
+    - `effects`: derivatives of the velocities with respect to the loads.
+    - `missing`: recorded velocities minus simulated velocities.
+
+    **Returns** the loads. They are NaN if `effects` or `missing` are not finite.
+    """
+    good = np.isfinite(missing).all(axis=1) & np.isfinite(effects).all(axis=(1, 2))
+    found = np.full((len(missing), effects.shape[2]), np.nan)
+    inverse = np.linalg.pinv(root[good] @ effects[good], rcond=_WEAKEST)
+    found[good] = (inverse @ (root[good] @ missing[good, :, None]))[..., 0]
     return found

@@ -1,10 +1,11 @@
-"""Residual forces by regression, the paper's baseline: which force explains each recorded control step, and a network
-for it.
+"""Residual forces by regression, the paper's baseline: labels for the recorded control steps, and a network for them.
 
-One control step alone says little: half a millimetre of motion capture's noise over 0.05 s looks like a tenth of a
-newton. And not all that a recorded step differs in from the simulated one is a matter of the force: actuators are late,
-contacts slip, air turns the tracked body. A label is therefore the most likely force given the whole recording, where
-capture, joints' torques and the motion itself err as well: a smoothing problem, linear along the recorded motion.
+A label is the force that explains a recorded control step. A single control step determines it poorly: motion-capture
+noise of 0.5 mm over 0.05 s looks like 0.1 N. Moreover, the force is not the only difference between a recorded and a
+simulated step: actuators are late, contacts slip, and air rotates the tracked body.
+
+A label is therefore the most likely force given the whole recording. Recorded positions, joint torques and the
+simulated motion have errors too. This is a smoothing problem, linearized along the recorded motion.
 """
 
 from __future__ import annotations
@@ -38,50 +39,57 @@ from ballu_mjx.sim.step import state_at
 
 @dataclasses.dataclass(frozen=True)
 class SupervisedConfig:
-    """Labels and regression."""
+    """Options of the labels and of the regression."""
 
     force_spread: float | None = None
-    """Standard deviation of the prior on the force along each axis, N. That on another load is, in units of the
-    network's output, as wide. Without this option: the robot's own, or 6 units."""
+    """Standard deviation of the prior on the force along each axis, N. Other loads have the same prior in units of the
+    network's output. Without this option: the robot's own value, or 6 units."""
     force_change: float | None = None
-    """Standard deviation of the prior on how it changes from one control step to the next, N. A body that drags air
-    along is pushed back at every contact: a smoother prior removes most of that force. Without this option: the robot's
-    own, or 2 units."""
+    """Standard deviation of the prior on the change of the force between two control steps, N. Smaller values smooth
+    the labels. They also remove most of the force by which dragged-along air pushes a body back at every contact.
+    Without this option: the robot's own value, or 2 units."""
     torque_spread: float | None = None
-    """Standard deviation of what the robot's joints pull beyond the model, N m. Without this option: the robot's own,
-    or the size of what the model leaves unexplained at joints in the training recordings."""
+    """Standard deviation of the joint torques that the model lacks, N m. Without this option: the robot's own value, or
+    the largest RMS torque that the model leaves unexplained at a joint in the training recordings."""
     position_noise: float = 0.0005
-    """Standard deviation of the recorded place, m."""
+    """Standard deviation of the error of recorded positions, m."""
     angle_noise: float = 0.3
-    """Likewise of recorded angles, deg."""
+    """Standard deviation of the error of recorded angles, deg."""
     held_angle_noise: float = 10.0
-    """Likewise of the robot's held joints, which motion capture hardly shows, deg."""
+    """Standard deviation of the error of the angles of held joints, which motion capture hardly measures, deg."""
     velocity_noise: float = 0.01
-    """Standard deviation of what a control step changes the root's velocity by beyond all this, m/s."""
+    """Standard deviation of the change of the root's velocity in a control step that neither loads nor joint torques
+    explain, m/s."""
     rotation_noise: float = 3.0
-    """Likewise of angular velocities from the root to the tracked body, deg/s."""
+    """Standard deviation of the same unexplained change of the angular velocities of the bodies from the root to the
+    tracked body, deg/s."""
     joint_noise: float = 20.0
-    """Likewise of all other joints, deg/s."""
+    """Standard deviation of the same unexplained change of the angular velocities of all other joints, deg/s."""
     observation_noise: float = 1.0
-    """Noise on what the network sees in training, in multiples of each entry's spread over the recordings."""
+    """Standard deviation of noise on the network's input in training, in multiples of each input's standard deviation
+    over the recordings."""
     updates: int = 4000
-    """Gradient steps."""
+    """Number of gradient steps."""
     validate_every: int = 200
-    """Gradient steps between two looks at the validation recordings' labels, whose smallest error ends the search."""
+    """Gradient steps between two validations on the labels of the validation recordings. The network with the smallest
+    error there is kept."""
     batch_size: int = 256
-    """Labels in a gradient step."""
+    """Number of labels in a gradient step."""
     learning_rate: float = 1e-3
-    """Adam's."""
+    """Learning rate of Adam."""
     force_scales: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
-    """Fractions of the forces, of which the one that acts is chosen: whose simulation follows the validation recordings
-    best. A force that is right in recorded states may lead astray in simulated ones. `--force-scales 1`: all of them,
-    as in the paper."""
+    """Shares of the forces to try (0 to 1). The share with the smallest open-loop error on the validation recordings is
+    kept, because forces that are right in recorded states may be wrong in simulated states. `--force-scales 1` keeps
+    the whole forces, as in the paper."""
     seed: int = 0
-    """Seeds network and batches."""
+    """Seed of the network's initial parameters and of the batches."""
 
 
 def check_supervised_config(config: SupervisedConfig) -> None:
-    """**Raises** `InputError` for options out of range, naming the option."""
+    """Check options.
+
+    **Raises** `InputError` for an option out of range. The message names it.
+    """
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if value is None or field.name in ("observation_noise", "force_scales", "seed"):
@@ -93,14 +101,18 @@ def check_supervised_config(config: SupervisedConfig) -> None:
 
 
 class _Priors(NamedTuple):
-    """Standard deviations: of forces, of their change in a control step (N), of joints' torques (N m)."""
+    """Standard deviations of the priors."""
 
     spread: float
+    """Of forces (N)."""
     change: float
+    """Of the change of forces in a control step (N)."""
     torque: float | None
+    """Of joint torques (N m). None if unknown."""
 
 
 def _priors(config: SupervisedConfig, unit: float, robot: RobotDescription) -> _Priors:
+    """Return the priors of the options, or else of the robot, or else in units (N) of the network's output."""
     own = robot.adapter.residual_scales()
     names = "force_spread", "force_change", "torque_spread"
     given = [getattr(own, name, None) if getattr(config, name) is None else getattr(config, name) for name in names]
@@ -109,11 +121,11 @@ def _priors(config: SupervisedConfig, unit: float, robot: RobotDescription) -> _
 
 
 _SPREAD, _CHANGE = 6.0, 2.0
-"""Of the priors, in units of the network's output."""
+"""Standard deviations of the priors on forces and on their change, in units of the network's output."""
 
 
 class ForceLabeller:
-    """Labels recorded motions."""
+    """Estimator of the loads that explain recorded motions."""
 
     def __init__(
         self,
@@ -121,10 +133,14 @@ class ForceLabeller:
         config: SupervisedConfig,
         env: ForceNetworkConfig | None = None,
     ) -> None:
-        """Prepare to label motions of the robot that `linearize` simulates.
+        """Prepare the estimation.
 
-        `linearize` has the network's force set, and the torques of the robot's joints; where its simulator has a
-        residual, labels are what that leaves. `env` is of the network to be (None: its defaults).
+        **Arguments**
+
+        - `linearize`: linearization of the robot's simulator, for the loads of the network's force set and for joint
+          torques. If the simulator has a residual, the labels are the loads in addition to it.
+        - `config`: options of the labels.
+        - `env`: options of the network's output. None for the defaults.
         """
         env = env or ForceNetworkConfig()
         self._simulator = linearize.simulator.simulator
@@ -133,11 +149,11 @@ class ForceLabeller:
         self._in_newtons = scales.units / scales.newtons
         self._priors = _priors(config, scales.newtons, self._simulator.robot)
         if self._priors.torque is None and linearize.directions > 2 * self._model.nv + linearize.loads:
-            raise ValueError("Nothing tells the spread of the joints' torques; give torque_spread.")
+            raise ValueError("The spread of the joint torques is unknown; set torque_spread.")
         self._measured, self._process = _noise(self._model, self._simulator.robot, config)
 
     def __call__(self, motion: Motion) -> Float[np.ndarray, "steps loads"]:
-        """The loads (N, N m; world) over each control step that explain the recorded motion."""
+        """Return the loads (N, N m, commands' units; world frame) that explain each control step of a motion."""
         count, past = len(motion.command), HISTORY - 1
         reference, _ = stack_motions(self._simulator, [motion])
         states = state_at(reference.qpos[0, :-1], reference.qvel[0, :-1])
@@ -157,14 +173,15 @@ class ForceLabeller:
     def _explain(
         self, state: Float[np.ndarray, "steps states directions"], defect: Float[np.ndarray, "steps states"]
     ) -> Float[np.ndarray, "steps loads"]:
-        """The most likely loads of control steps that end `defect` off the recorded state after, to first order.
+        """Return the most likely loads of all control steps of a recording, to first order.
 
-        Unknown at each time are the state's deviation from the recorded one and the step's inputs; each time is tied to
-        the next alone, so that one banded factorization solves for a whole recording.
+        `defect` is the difference between the simulated and the recorded state after each step. The unknowns at each
+        time are the deviation of the state from the recorded state, and the inputs of the step. Each time is coupled
+        only to the next, so one banded factorization solves for a whole recording.
         """
         (count, after, every), loads = state.shape, self._linearize.loads
         force = np.arange(after, after + loads)
-        known = np.any(state, axis=(1, 2), keepdims=True)[:, 0]  # zeros where there are no derivatives
+        known = np.any(state, axis=(1, 2), keepdims=True)[:, 0]  # The linearizer returns zeros without derivatives.
         weight = known / self._process**2
         spread = np.r_[
             self._measured,
@@ -175,17 +192,17 @@ class ForceLabeller:
         here = np.tile(np.diag(spread**-2.0), (count + 1, 1, 1))
         here[:-1] += state.transpose(0, 2, 1) @ (weight[:, :, None] * state)
         here[1:, range(after), range(after)] += weight
-        towards = np.zeros_like(here)  # rows of the time after, columns of this one
-        towards[:-1, :after] -= weight[:, :, None] * state
+        coupling = np.zeros_like(here)  # Rows belong to the next time, columns to this time.
+        coupling[:-1, :after] -= weight[:, :, None] * state
         change = (self._priors.change * self._in_newtons) ** -2.0
         here[:-1, force, force] += change
         here[1:, force, force] += change
-        towards[:-1, force, force] -= change
+        coupling[:-1, force, force] -= change
         right = np.zeros((count + 1, every))
         right[:-1] -= np.einsum("tsd,ts->td", state, weight * defect)
         right[1:, :after] += weight * defect
 
-        columns = np.concatenate([here, towards], axis=1)
+        columns = np.concatenate([here, coupling], axis=1)
         lower = np.zeros((2 * every, count + 1, every))
         for place in range(every):
             lower[: 2 * every - place, :, place] = columns[:, place:, place].T
@@ -194,20 +211,21 @@ class ForceLabeller:
 
 
 _ANY_VELOCITY = 10.0
-"""m/s and rad/s: recorded velocities are differences of recorded places, and say nothing of their own."""
+"""Standard deviation of the error of recorded velocities (m/s, rad/s). It is large, because these velocities are
+derived from recorded positions and carry no further information."""
 
 
 def _noise(
     model: mujoco.MjModel, robot: RobotDescription, config: SupervisedConfig
 ) -> tuple[Float[np.ndarray, " nv"], Float[np.ndarray, " 2*nv"]]:
-    """Return standard deviations of recorded positions, and of what a control step is off by beyond its inputs.
+    """Return the standard deviations of errors of recorded positions, and of unexplained changes in a control step.
 
-    Both are along the directions of `mjx.Data.qvel`, the second also along the velocities'. Slides count as
-    translations. A held slide is as many times less certain than others as a held hinge.
+    Both are along the directions of `mjx.Data.qvel`. The second has the changes of positions, then those of velocities.
+    Slides count as translations. Held slides have a larger error than other slides, by the same factor as held hinges.
     """
     degree = np.pi / 180
     trunk, body = [], int(model.site_bodyid[model.site(robot.tracked).id])
-    while body:  # from the tracked body down to the root
+    while body:  # From the tracked body down to the root.
         trunk.append(body)
         body = int(model.body_parentid[body])
     velocity = np.where(np.isin(model.dof_bodyid, trunk), config.rotation_noise, config.joint_noise) * degree
@@ -229,9 +247,9 @@ def examples(
     loads: Sequence[Float[np.ndarray, "steps loads"]],
     config: ForceNetworkConfig,
 ) -> tuple[Float[np.ndarray, "examples inputs"], Float[np.ndarray, "examples loads"]]:
-    """Return what the network sees of each recorded state that has a history, and the action that is its label.
+    """Return examples for the regression, one for each recorded state that has a history.
 
-    Actions are those of `network_loads.world_loads`.
+    **Returns** the inputs of the network, and the labels as outputs of the network (see `network_loads.world_loads`).
     """
     reference, _ = stack_motions(simulator, motions)
     first = HISTORY - 1
@@ -249,7 +267,8 @@ def examples(
 
 
 Validate = Callable[[int, Any, float], None]
-"""(gradient steps so far, the policy network's parameters, mean squared error of training since the last)."""
+"""Function of the number of gradient steps so far, the parameters of the policy network, and the mean squared training
+error since the last call."""
 
 
 def regress(
@@ -259,8 +278,16 @@ def regress(
     config: SupervisedConfig,
     validate: Validate,
 ) -> None:
-    """Fit the parameters of `infer`, from `start`, to `examples` by squared error; every `validate_every` steps
-    `validate` is told."""
+    """Fit the parameters of a network to examples by least squares.
+
+    **Arguments**
+
+    - `infer`: function of parameters and inputs that returns the network's outputs.
+    - `start`: initial parameters.
+    - `learned`: inputs and outputs to learn, from `examples`.
+    - `config`: options of the regression.
+    - `validate`: function that is called every `config.validate_every` gradient steps.
+    """
     inputs, actions = learned
     optimizer = optax.adam(config.learning_rate)
     spread = np.std(inputs, axis=0)
@@ -277,8 +304,8 @@ def regress(
             def error(params: Any) -> Array:
                 return jnp.mean((infer(params, seen) - jnp.asarray(actions)[chosen]) ** 2)
 
-            value, slope = jax.value_and_grad(error)(params)
-            change, state = optimizer.update(slope, state, params)
+            value, gradient = jax.value_and_grad(error)(params)
+            change, state = optimizer.update(gradient, state, params)
             return (optax.apply_updates(params, change), state), value
 
         return jax.lax.scan(update, carry, keys)

@@ -1,4 +1,4 @@
-"""A learned residual, of whatever kind, for whoever simulates next."""
+"""Residual of any kind with its learned parameters, and its training range."""
 
 from __future__ import annotations
 
@@ -24,25 +24,27 @@ from ballu_mjx.sim.residual import BoundResidual, Commands, History, Residual, S
 from ballu_mjx.sim.simulator import AugmentedSimulator
 
 MARGIN = 0.1
-"""How far beyond the recorded range, in its widths, an observation still counts as inside: the range is that of a
-finite sample."""
+"""Margin around the training range, as a fraction of its width. Inputs within the margin count as inside, because the
+range is that of a finite sample."""
 _OBSERVED = "observed.json"
-_NARROW = 1e-3
-_ANYTHING = 1e30
+_NARROWEST = 1e-3
+"""Smallest width of the training range of an input, in the input's unit."""
+_UNBOUNDED = 1e30
+"""Bound of an input whose training range is unknown."""
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainedResidual:
-    """The residual of a run. All methods are pure: they may be jitted and vmapped.
+    """A residual with its learned parameters. All methods are pure: they may be jitted and vmapped.
 
     **Fields**
 
-    - `model`: its kind.
-    - `params`: what was learned.
-    - `observed`: smallest and largest of each of the model's inputs over the recordings it was learned from.
-    - `step`: control steps of training behind it.
-    - `actuators`: of the simulator that it belongs to; None for the nominal ones.
-    - `report`: what the training says of it, for the user; empty where that is nothing.
+    - `model`: the residual without parameters.
+    - `params`: the learned parameters.
+    - `observed`: training range: the smallest and the largest value of each input over the training recordings.
+    - `step`: control steps or gradient steps of training. 0 for kinds without checkpoints.
+    - `actuators`: identified actuators of the simulator that the residual corrects. None if they are nominal.
+    - `report`: report of the training for the user. Empty if there is none.
     """
 
     model: Residual
@@ -54,13 +56,13 @@ class TrainedResidual:
 
     @staticmethod
     def of(simulator: AugmentedSimulator) -> TrainedResidual | None:
-        """Return the residual in a simulator; None where it has none."""
+        """Return the residual of a simulator. None if the simulator has no residual."""
         bound = simulator.residual
         if bound is None:
             return None
         observed = bound.observed
         if observed is None:
-            observed = np.array(-_ANYTHING, np.float32), np.array(_ANYTHING, np.float32)
+            observed = np.array(-_UNBOUNDED, np.float32), np.array(_UNBOUNDED, np.float32)
         return TrainedResidual(bound.model, bound.params, observed, 0, simulator.actuators)
 
     @staticmethod
@@ -72,12 +74,17 @@ class TrainedResidual:
         other_model: bool = False,
         loading: frozenset[Path] = frozenset(),
     ) -> TrainedResidual:
-        """Load the residual of a run; of a network that in the best (by validation error) or last checkpoint.
+        """Load the residual of a run, including its base residual.
 
-        `robot` is the one that it has to be of; with `other_model` one whose model may differ in its numbers, such as a
-        load. `loading` are the runs whose base residual it is.
+        **Arguments**
 
-        **Raises** `InputError` where `folder` is no such run, is of another robot or has no such checkpoint.
+        - `folder`: folder of the run.
+        - `robot`: robot of the run.
+        - `which`: checkpoint of a network: the best one (by validation error) or the last one.
+        - `other_model`: allow a `robot` whose model differs from the run's in its numbers, for example by a payload.
+        - `loading`: folders of the runs that have this run as base residual.
+
+        **Raises** `InputError` if `folder` is no run of a residual, is of another robot, or lacks the checkpoint.
         """
         folder = Path(folder)
         loading |= {folder.resolve()}
@@ -100,22 +107,22 @@ class TrainedResidual:
 
     @property
     def bound(self) -> BoundResidual:
-        """Return the model with its parameters."""
+        """Return the residual with its parameters bound, as simulators take it."""
         return BoundResidual(self.model, self.params, self.observed)
 
     @property
     def latency(self) -> float:
-        """Seconds by which commands are delayed on their way to the actuators."""
+        """Return the delay between commands and actuators that the residual adds (s)."""
         return _latency(self.model, self.params)
 
     def out_of_range(self, history: History, commands: Commands) -> Float[Array, ""]:
-        """Return how far an observation lies outside of what the recordings showed.
+        """Return the distance of the residual's input from its training range. It is 0 in the training range.
 
-        It is that of the worst entry, in widths of the entry's range, `MARGIN` taken off; 0 inside.
+        The distance of an input is in widths of its range, less `MARGIN`. The result is that of the farthest input.
         """
         seen = self.model.inputs(history, commands)
         low, high = (jnp.asarray(bound) for bound in self.observed)
-        beyond = jnp.maximum(low - seen, seen - high) / jnp.maximum(high - low, _NARROW)
+        beyond = jnp.maximum(low - seen, seen - high) / jnp.maximum(high - low, _NARROWEST)
         return jnp.maximum(jnp.max(beyond) - MARGIN, 0.0)
 
 
@@ -128,23 +135,24 @@ def _latency(model: Residual, params: Any) -> float:
 def observed_range(
     inputs: Float[Array | np.ndarray, "states inputs"],
 ) -> tuple[Float[np.ndarray, " inputs"], Float[np.ndarray, " inputs"]]:
-    """Return the smallest and the largest of each input."""
+    """Return the smallest and the largest value of each input."""
     seen = np.asarray(inputs, np.float32)
     return seen.min(axis=0), seen.max(axis=0)
 
 
 def write_observed(run: TrainingRecord, inputs: Float[Array | np.ndarray, "states inputs"]) -> None:
-    """Leave in the run's folder the range of what its policy saw in the recordings."""
+    """Write the training range of a residual's inputs to its run."""
     low, high = observed_range(inputs)
     run.write(_OBSERVED, json.dumps({"low": low.tolist(), "high": high.tolist()}) + "\n")
 
 
 def _read_observed(path: Path, size: int) -> tuple[np.ndarray, np.ndarray]:
-    mend = "train the residual again"
-    content = files.read_json(path, mend)
+    """Read the training range of `size` inputs. **Raises** `InputError` if the file is damaged."""
+    fix = "train the residual again"
+    content = files.read_json(path, fix)
     bounds = [content.get(name) for name in ("low", "high")]
     if all(isinstance(bound, list) and len(bound) == size and all(map(is_number, bound)) for bound in bounds):
         low, high = (np.asarray(bound, np.float32) for bound in bounds)
         if np.all(low <= high):
             return low, high
-    raise InputError(f"{path}: low and high are not {size} numbers each, low at most high; {mend}.")
+    raise InputError(f"{path}: low and high must have {size} numbers each, with low at most high; {fix}.")

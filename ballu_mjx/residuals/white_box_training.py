@@ -1,4 +1,4 @@
-"""What fits of physical models (the air, fluid forces) share: reports to a run and to the user, and the residual."""
+"""Common parts of fits of physical models (aerodynamic and fluid residuals): reports, and the resulting residual."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from ballu_mjx.sim.simulator import Simulator
 
 
 class FitReport:
-    """Takes every evaluation of a fit, for a record and a progress."""
+    """Report of a fit's iterations to a run's record and to a progress display."""
 
     def __init__(self, record: TrainingRecord, progress: PhaseProgress | None, metric: str) -> None:
-        """`metric` is what the record calls the number that the fit makes small."""
+        """Start the report. `metric` is the name in the record of the quantity that the fit minimizes."""
         self._record, self._progress, self._metric = record, progress, metric
         self._began, self._done = time.perf_counter(), 0
 
     def __call__(self, stage: str, iteration: int, steps: int, loss: float) -> None:
-        """Take an iteration, of at most `steps` in its stage."""
+        """Report an iteration of a stage with at most `steps` iterations."""
         self._done += 1
         if self._progress is not None:
             self._progress.update(stage, iteration, steps, loss)
         self._record.log(self._done, {self._metric: loss, "seconds": time.perf_counter() - self._began})
 
     def close(self, control_steps: int) -> None:
-        """End with the number of control steps that were simulated."""
+        """End the report with the number of control steps that were simulated."""
         if self._progress is not None:
             self._progress.close()
         self._record.log(self._done, {"control_steps": control_steps})
@@ -44,7 +44,7 @@ class FitReport:
 def fitted_residual(
     simulator: Simulator, motions: Sequence[Motion], model: Residual, params: Any, record: TrainingRecord, text: str
 ) -> TrainedResidual:
-    """Return the residual of a fit to `motions`, with its report in words; `record` takes the range of its inputs."""
+    """Return the residual of a fit to `motions` with the report `text`, and write its training range to `record`."""
     reference, _ = stack_motions(simulator, motions)
     inputs = np.asarray(recorded_inputs(reference, ForceNetworkConfig(), simulator.robot))
     write_observed(record, inputs)

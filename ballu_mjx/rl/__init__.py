@@ -1,1 +1,1 @@
-"""PPO: networks, the learning loop, several processes."""
+"""Proximal policy optimization (PPO): networks, training loop, and training in several processes."""

@@ -1,7 +1,8 @@
-"""One training on several machines, or by several processes of one, through `jax.distributed`.
+"""Training in several processes, on one machine or on several, with `jax.distributed`.
 
-Every process runs the same command and the same program. Each has its share of the environments on its own devices, and
-gradients and statistics are means over all of them. Process 0 alone writes: metrics, checkpoints, figures.
+Every process runs the same command and the same program. Each simulates its share of the environments on its own
+devices. Gradients and statistics are averaged over all processes. Only process 0 writes metrics, checkpoints and
+figures.
 """
 
 from __future__ import annotations
@@ -20,52 +21,55 @@ from ballu_mjx.common import runtime
 from ballu_mjx.common.errors import InputError
 
 _PATIENCE = 3_600_000
-"""Milliseconds that processes wait for each other; one that died is missed after 100 s."""
+"""Timeout (ms) of processes that wait for each other. JAX notices a dead process after 100 s."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DistributedOptions(runtime.CommandOptions):
-    """Options of trainings that may run in several processes."""
+    """Options of a training that can run in several processes."""
 
     coordinator: str | None = None
-    """Train in several processes, on one machine or many: host:port of process 0, where the others find it. All get the
-    same command but for --process-id. Without this option: one process."""
+    """Train in several processes, on one machine or on several. The value is host:port of process 0, to which the
+    others connect. Start all processes with the same command except for --process-id. Default: one process."""
     num_processes: int | None = None
-    """How many processes there are, with --coordinator."""
+    """Number of processes. Required with --coordinator."""
     process_id: int | None = None
-    """Which of them this is, from 0 on, with --coordinator. Process 0 alone writes the run's folder."""
+    """Index of this process, from 0 on. Required with --coordinator. Only process 0 writes the run's folder."""
 
 
 def join(options: DistributedOptions) -> None:
-    """Find the other processes, where there are any; before anything asks JAX for its devices.
+    """Connect to the other processes, if there are any. Call this before anything asks JAX for its devices.
 
-    **Raises** `InputError` for options that do not go together, and where the others cannot be found.
+    **Raises** `InputError` if options contradict each other, or if the processes cannot connect.
     """
     number, count = options.process_id, options.num_processes
     if options.coordinator is None:
         for name, given in (("--num-processes", count), ("--process-id", number)):
             if given is not None:
-                raise InputError(f"{name} goes with --coordinator, where the processes meet; give that too.")
+                raise InputError(f"{name} needs --coordinator, the address of process 0; give that too.")
         return
     if count is None or number is None:
         raise InputError("--coordinator needs --num-processes and --process-id too.")
     if not 0 <= number < count:
-        raise InputError(f"--process-id is {number}: it must be 0 to {count - 1}, for --num-processes is {count}.")
+        raise InputError(f"--process-id is {number}: it must be 0 to {count - 1}, because --num-processes is {count}.")
     if ":" not in options.coordinator:
-        raise InputError(f"--coordinator is {options.coordinator}: give host:port, node1:29500 say.")
+        raise InputError(f"--coordinator is {options.coordinator}: give host:port, for example node1:29500.")
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
         jax.distributed.initialize(options.coordinator, count, number)
     except RuntimeError as error:
         raise InputError(
-            f"--coordinator {options.coordinator}: the processes did not find each other ({error}); look whether all "
-            f"{count} are running, and whether the others reach that port."
+            f"--coordinator {options.coordinator}: the processes could not connect ({error}); check that all {count} "
+            "are running, and that the others can reach that port."
         ) from error
 
 
 def leave(status: int) -> None:
-    """End this process at once after an error, where it trains with others: JAX's own way out waits for these, and they
-    wait for it. They end when they miss it."""
+    """End this process at once after an error if it trains together with others, with exit status `status`.
+
+    A normal exit would deadlock: JAX waits for the other processes, and these wait for this one. The others end when
+    JAX notices that this process is gone.
+    """
     if jax.distributed.is_initialized():
         sys.stdout.flush()
         sys.stderr.flush()
@@ -73,18 +77,21 @@ def leave(status: int) -> None:
 
 
 def is_first() -> bool:
-    """Whether this is the process that writes; also where there is no other."""
+    """Return whether this is process 0, which writes. True also in a training with one process."""
     return jax.process_index() == 0
 
 
 def meet() -> None:
-    """Wait until all processes are here. Do so before they exchange anything after work of unequal length: one may find
-    compiled what another must compile, and an exchange begun alone gives up after half a minute."""
+    """Wait until all processes have called this function.
+
+    Call it before an exchange that follows work of unequal length. For example, one process may find a program in the
+    cache that another must compile. An exchange times out after half a minute if a process is late.
+    """
     multihost.get_barrier_sync_fn()(key="ballu_mjx", timeout_ms=_PATIENCE)
 
 
 def anywhere(flag: bool) -> bool:
-    """Whether `flag` is set in any process. All of them must ask."""
+    """Return whether `flag` is true in any process. All processes must call this function."""
     if jax.process_count() == 1:
         return flag
     meet()
@@ -92,7 +99,10 @@ def anywhere(flag: bool) -> bool:
 
 
 def on_host(value: Any) -> np.ndarray:
-    """A copy of an array on the host, of all its parts. All processes must ask for one that is spread over them."""
+    """Return a copy of the whole array on the host.
+
+    If the array is distributed over processes, all of them must call this function.
+    """
     if isinstance(value, jax.Array) and not (value.is_fully_addressable or value.is_fully_replicated):
         meet()
         return np.asarray(multihost_utils.process_allgather(value, tiled=True))

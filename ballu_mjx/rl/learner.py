@@ -1,8 +1,8 @@
-"""The loop that learns: PPO out of Brax's parts, in one program that is compiled once.
+"""PPO's training algorithm from Brax's components, in one program that is compiled once.
 
-`brax.training.agents.ppo.train` does the same sums on the same random numbers (a test holds the two side by side), but
-keeps the optimizer and the environments to itself. Here they are in a `TrainingState`, which can be written to disk at
-any training step and gone on from as if nothing had happened.
+`brax.training.agents.ppo.train` computes the same from the same random numbers (a test compares the two), but does not
+expose the optimizer and the environments. Here they are part of a `TrainingState`. It can be saved after any training
+step, and a resumed training continues exactly.
 """
 
 from __future__ import annotations
@@ -37,40 +37,43 @@ from ballu_mjx.rl.training_env import MEASURED, wrap_for_training
 from ballu_mjx.rl.training_state import Stored, TrainingState, array_name, to_uint64, with_own_memory
 
 Callback = Callable[[int, TrainingState, dict[str, float]], None]
-"""(control steps done, the state, means since the last call: empty before the first training step).
+"""Function of the control steps done, the state, and metrics (means since the last call).
 
-The next training step reuses the state's memory: take `params` or `stored` of it before returning."""
+Metrics are empty before the first training step. The next training step reuses the state's memory: copy what you need
+with `training_state.params` or `training_state.stored` before you return."""
 
 _AXIS = "devices"
 _MAX_CALLS = 400
 
 
 class Learner:
-    """PPO for one environment and configuration, on all devices, those of other processes included (see
-    `ballu_mjx.rl.distributed`).
+    """PPO for one environment and configuration, on all devices of all processes (see `ballu_mjx.rl.distributed`).
 
-    Each device has its share of the environments, and collects and learns from their experience; gradients and
-    statistics are means over all of them.
+    Each device simulates its share of the environments and learns from their experience. Gradients and statistics are
+    averaged over all devices.
     """
 
     def __init__(self, env: Env, config: PPOConfig) -> None:
-        """**Raises** `InputError` from `ppo.check`."""
+        """Build networks, optimizer and the program of a training step; nothing is compiled yet.
+
+        **Raises** `InputError` from `ppo.check`.
+        """
         self._devices = jax.device_count()
         ppo.check(config, self._devices)
         self._config, self._env = config, env
         mesh = Mesh(np.array(jax.devices()), (_AXIS,))
         each: Any = PartitionSpec()
         everywhere = NamedSharding(mesh, each)
-        # From the host: an array of one device is not for all processes.
+        # From the host, because an array on one device cannot be placed on the devices of all processes.
         self._contents = jax.device_put(jax.device_get(getattr(env, "contents", ())), everywhere)
-        # A program of its own, for its shapes are asked for before it is part of another: traced once.
+        # A separate program, because its shapes are needed before another program uses it. So it is traced once.
         self._reset = jax.jit(lambda keys, contents: self._with_contents(contents).reset(keys))
         keys = jax.ShapeDtypeStruct((config.num_envs, 2), jnp.uint32)
         shapes = jax.eval_shape(self._reset, keys, self._contents).obs
         self._observation = {name: jax.ShapeDtypeStruct(x.shape[1:], jnp.float32) for name, x in shapes.items()}
         sizes = {name: x.shape for name, x in self._observation.items()}
         self._networks = ppo.make_networks(sizes, env.action_size, config)
-        # The learning rate is part of the state also where it stays: one program for all of them.
+        # The learning rate is in the state even if it is constant, so that one program serves all learning rates.
         self._optimizer = optax.chain(
             optax.clip_by_global_norm(config.max_grad_norm),
             optax.inject_hyperparams(optax.adam)(learning_rate=config.learning_rate, eps=config.adam_epsilon),
@@ -83,7 +86,7 @@ class Learner:
             reward_scaling=config.reward_scaling,
             gae_lambda=config.gae_lambda,
             clipping_epsilon=config.clipping_epsilon,
-            vf_coefficient=2 * config.value_cost,  # Brax halves it
+            vf_coefficient=2 * config.value_cost,  # Brax halves it.
         )
         self._gradient = jax.grad(loss, has_aux=True)
 
@@ -93,16 +96,16 @@ class Learner:
         step = jax.shard_map(
             self._make_step, mesh=mesh, in_specs=(specs, each), out_specs=(specs, each), check_vma=False
         )
-        # Placed as they go in; on one device they would come back with another description, and compile a second time.
+        # Outputs keep the shardings of the inputs. On one device they would differ, and the step would compile twice.
         self._step = jax.jit(step, donate_argnums=0, out_shardings=(self._shardings, everywhere))
 
     @property
     def steps_each(self) -> int:
-        """Control steps of a training step."""
+        """Control steps of one training step, summed over all environments."""
         return _step_size(self._config)
 
     def init(self, seed: int) -> TrainingState:
-        """Return a fresh state; Brax's with this seed."""
+        """Return the initial state for `seed`, the same as in Brax."""
         arguments = np.array(jax.random.PRNGKey(seed)), self._contents
         first = self._first.lower(*arguments)
         state = jax.tree.map(
@@ -118,17 +121,19 @@ class Learner:
         return self._first(*arguments)
 
     def step(self, state: TrainingState) -> tuple[TrainingState, dict[str, Array]]:
-        """Take a training step; return the next state, and means of reward, metrics and losses. The memory of the state
-        that goes in is used again."""
+        """Take a training step. Return the next state, and the means of reward, metrics and losses.
+
+        The memory of `state` is reused, so do not read `state` afterwards.
+        """
         return self._step(state, self._contents)
 
     def resume(self, stored: Stored, *, environments: bool = True) -> tuple[TrainingState, bool]:
-        """Return the state that `stored` was made of, and whether all of it could be used.
+        """Return the state that `stored` holds, and whether all of it was used.
 
-        With `environments` False, or where theirs do not fit (another number of them, say), environments and random
-        numbers are fresh ones, drawn from the configuration's seed and the steps done.
+        If `environments` is False, or if the stored environments do not fit (for example, their number differs),
+        environments and random key are new. They are drawn from the configuration's seed and the steps done.
 
-        **Raises** `ValueError` naming what is missing or has another shape in the rest of it.
+        **Raises** `ValueError` if any other array is missing or has another shape.
         """
         shapes = jax.eval_shape(self._first, jax.random.PRNGKey(0), self._contents)
         leaves = jax.tree.leaves_with_path(shapes)
@@ -156,7 +161,7 @@ class Learner:
         return self._placed(jax.tree.map_with_path(choose, template)), whole
 
     def init_from(self, params: Params, steps: int) -> TrainingState:
-        """Return a state with what was learned in `steps` control steps, the optimizer and all else fresh."""
+        """Return a state with `params`, learned in `steps` control steps. The optimizer and everything else are new."""
         state = self.init(_seed(self._config, steps))
         known = params.normalizer
         normalizer = dataclasses.replace(
@@ -177,7 +182,7 @@ class Learner:
         return self._placed(jax.tree.map(placeable, filled, state))
 
     def _placed(self, state: TrainingState) -> TrainingState:
-        """From the host to where `step` wants it."""
+        """Move a state from the host to the devices, as `step` needs it."""
         return jax.device_put(state, self._shardings)
 
     def _with_contents(self, contents: Any) -> Wrapper:
@@ -206,7 +211,7 @@ class Learner:
         )
 
     def _make_step(self, state: TrainingState, contents: Any) -> tuple[TrainingState, dict[str, Array]]:
-        """On one device, with its share of the environments; random numbers are split as Brax splits them."""
+        """Take a training step on one device, with its share of the environments. Random keys are split as in Brax."""
         config = self._config
         key_step, key = jax.random.split(state.key)
         key_device = jax.random.split(key_step, self._devices)[jax.lax.axis_index(_AXIS)]
@@ -214,7 +219,7 @@ class Learner:
 
         environments, data, measured = self._collect(self._with_contents(contents), state, key_act)
 
-        # Where the learning rate adapts, the old policy must still be what acted when the change is measured.
+        # An adaptive learning rate compares with the policy that acted, so its normalizer is updated afterwards.
         adaptive = config.desired_kl > 0
         observe = functools.partial(running_statistics.update, batch=data.observation, pmap_axis_name=_AXIS)
         normalizer = state.normalizer if adaptive else observe(state.normalizer)
@@ -242,8 +247,11 @@ class Learner:
         return with_own_memory(after), jax.lax.pmean(jax.tree.map(jnp.mean, measured | losses), _AXIS)
 
     def _collect(self, env: Wrapper, state: TrainingState, key: Array) -> tuple[State, Transition, dict[str, Array]]:
-        """Environments one unroll or several on, the pieces of experience, leaves (pieces, unroll_length, ...), and
-        rewards and metrics."""
+        """Collect experience with the current policy.
+
+        **Returns** the environments' states after it, the trajectory segments (leaves of shape (segments,
+        unroll_length, ...)), and rewards and metrics.
+        """
         config = self._config
         make_policy = brax_networks.make_inference_fn(self._networks)
         policy = make_policy((state.normalizer, state.networks.policy, state.networks.value))
@@ -266,10 +274,10 @@ class Learner:
     def _epoch(
         self, carry: tuple[Any, Any, Array], nothing: None, *, data: Transition, normalizer: RunningStatisticsState
     ) -> tuple[tuple[Any, Any, Array], dict[str, Array]]:
-        """Learn once from all that was collected, in minibatches drawn anew."""
+        """Take one pass over the collected experience, in newly shuffled minibatches."""
         optimizer, networks, key = carry
         key, key_shuffle, key_loss = jax.random.split(key, 3)
-        # Once for all arrays: each shuffle is a sort and a dozen kernels to compile.
+        # One permutation for all arrays, because each shuffle is a sort and compiles a dozen kernels.
         order = jax.random.permutation(key_shuffle, len(data.reward))
 
         def minibatches(x: Array) -> Array:
@@ -285,10 +293,10 @@ class Learner:
     def _minibatch(
         self, carry: tuple[Any, Any, Array], data: Transition, *, normalizer: RunningStatisticsState
     ) -> tuple[tuple[Any, Any, Array], dict[str, Array]]:
-        """Learn from one minibatch."""
+        """Take one gradient step on a minibatch."""
         optimizer, networks, key = carry
         key, key_loss = jax.random.split(key)
-        # All that devices must tell each other, in one exchange: each has its price, small or large.
+        # One exchange for all that devices average, because each exchange has a fixed cost.
         own, losses = self._gradient(networks, normalizer, data, key_loss)
         flat, apart = jax.flatten_util.ravel_pytree((own, losses["kl_mean"]))
         gradient, change = apart(jax.lax.pmean(flat, _AXIS))
@@ -306,19 +314,19 @@ def train(
     *,
     start: Callable[[Learner], TrainingState] | None = None,
 ) -> tuple[TrainingState, dict[str, float]]:
-    """Learn a policy for `env`, on all devices, until `config.num_timesteps` control steps are done.
+    """Train a policy for `env`, on all devices, until `config.num_timesteps` control steps are done.
 
     **Arguments**
 
-    - `env`: unbatched; see `wrap_for_training` for what it must do.
-    - `callback`: called before the first training step and then after every one, or every few of many. It may raise to
-      stop.
-    - `start`: makes the state to go on from (see `Learner.resume` and `Learner.init_from`); without it a fresh one. A
-      training that goes on from a stored state, on the same machine with the same number of devices, ends in the same
-      numbers to the last bit as one that was never interrupted.
+    - `env`: one unbatched environment. `wrap_for_training` lists its requirements.
+    - `callback`: called before the first training step, and then after every training step, or every few in a long
+      training. It may raise an exception to stop.
+    - `start`: returns the initial state (see `Learner.resume` and `Learner.init_from`). By default the state is new. A
+      training that resumes from a stored state, on the same machine with the same number of devices, gives the same
+      result to the last bit as an uninterrupted one.
 
-    **Returns** the last state, and the last call's means: `reward` and the environment's metrics per control step,
-    `steps_per_second`, and Brax's losses.
+    **Returns** the last state, and the metrics of the last callback: `reward` and the environment's metrics per control
+    step, `steps_per_second`, and Brax's losses.
 
     **Raises** `InputError` from `ppo.check`.
     """
@@ -335,7 +343,7 @@ def train(
         for _ in range(per_call):
             state, mean = learner.step(state)
             means.append(mean)
-        means = jax.device_get(means)  # waits for them
+        means = jax.device_get(means)  # Waits until they are computed.
         rate = per_call * learner.steps_each / (time.perf_counter() - began)
         step += per_call * learner.steps_each
         metrics = {name: float(np.mean([mean[name] for mean in means])) for name in means[0]}
@@ -345,25 +353,25 @@ def train(
 
 
 def total_timesteps(config: PPOConfig, first_step: int = 0) -> int:
-    """Control steps done when `train` ends, gone on from `first_step`: `num_timesteps` rounded up."""
+    """Return the control steps done when `train`, started at `first_step`, ends: `num_timesteps` rounded up."""
     per_call, calls = _schedule(config, first_step)
     return first_step + calls * per_call * _step_size(config)
 
 
 def _seed(config: PPOConfig, steps: int) -> int:
-    """The configuration's own at the start; a continued run must not draw the same numbers again."""
+    """Return the seed after `steps` control steps. A resumed run must not draw the same random numbers again."""
     if not steps:
         return config.seed
     return int(np.random.SeedSequence([config.seed, steps]).generate_state(1)[0] >> 1)
 
 
 def _step_size(config: PPOConfig) -> int:
-    """Control steps of a training step."""
+    """Return the number of control steps in a training step."""
     return config.batch_size * config.unroll_length * config.num_minibatches
 
 
 def _schedule(config: PPOConfig, first_step: int) -> tuple[int, int]:
-    """Training steps between two calls of the callback, and the number of calls from `first_step` on."""
+    """Return the training steps between two callbacks, and the number of callbacks from `first_step` on."""
     size = _step_size(config)
     per_call = math.ceil(math.ceil(config.num_timesteps / size) / _MAX_CALLS)
     return per_call, max(math.ceil((config.num_timesteps - first_step) / (per_call * size)), 0)

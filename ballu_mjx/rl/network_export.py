@@ -1,4 +1,4 @@
-"""A trained network outside of JAX: as named arrays for NumPy, and as an ONNX graph."""
+"""Export of a trained network from JAX: as named arrays for NumPy, and as an ONNX graph."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from ballu_mjx.rl.ppo import STATE, Params, PPOConfig
 
 
 class NetworkPort(NamedTuple):
-    """An input or output of an ONNX graph, float32 [batch, len(names)]."""
+    """An input or output of an ONNX graph (float32, shape [batch, len(names)])."""
 
     name: str
     names: Sequence[str]
-    """Of its numbers, in order, each with its unit behind a comma."""
+    """Name and unit of each number, in order, separated by a comma."""
 
 
 class OutputScale(NamedTuple):
-    """What a network's output means: `clip(scale * output + shift, low, high)`."""
+    """Scaling of a network's output to physical units: `clip(scale * output + shift, low, high)`."""
 
     scale: Float[np.ndarray, " outputs"]
     shift: Float[np.ndarray, " outputs"]
@@ -33,11 +33,11 @@ class OutputScale(NamedTuple):
 
 
 def network_arrays(params: Params, config: PPOConfig) -> dict[str, np.ndarray]:
-    """Return a policy's network as arrays by name: `mean`, `std`, `observation_clip`, `activation`, and `kernel_0`,
-    `bias_0` and so on, layer after layer.
+    """Return a policy's network as arrays by name.
 
-    The most likely action is the mean of the policy's Gaussian: the last layer's output. The deviation is a parameter
-    of its own and is left out.
+    The names are `mean`, `std`, `observation_clip`, `activation`, and `kernel_0`, `bias_0` and so on for each layer.
+    The output of the last layer is the mean of the policy's Gaussian, which is also its mode. The standard deviation is
+    a separate parameter and is left out.
     """
     mean, std = (np.asarray(moment[STATE]) for moment in (params.normalizer.mean, params.normalizer.std))
     clip = config.observation_clip
@@ -55,17 +55,21 @@ def network_arrays(params: Params, config: PPOConfig) -> dict[str, np.ndarray]:
 
 
 def check_onnx() -> None:
-    """**Raises** `InputError` where the package onnx is not installed."""
+    """Check that the package onnx is installed.
+
+    **Raises** `InputError` if it is not.
+    """
     if importlib.util.find_spec("onnx") is None:
-        raise InputError('--onnx: the package onnx is not installed; `pip install "ballu-mjx[onnx]"` brings it.')
+        raise InputError('--onnx: the package onnx is not installed; install it by `pip install "ballu-mjx[onnx]"`.')
 
 
 def onnx_model(
     stored: Mapping[str, np.ndarray], source: NetworkPort, target: NetworkPort, output: OutputScale, title: str
 ) -> bytes:
-    """Return `network_arrays` as an ONNX graph from `source` to `target`.
+    """Return the serialized ONNX model of a network with input `source` and output `target`.
 
-    The names and units of both stand in the model's properties `inputs` and `outputs`, as JSON lists.
+    `stored` is the result of `network_arrays`. The model's properties `inputs` and `outputs` hold the names and units
+    of both as JSON lists.
     """
     from onnx import TensorProto, checker, helper, numpy_helper
 
@@ -109,7 +113,7 @@ def onnx_model(
 
 
 def _layers(tree: Mapping) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Kernel and bias of each layer of Brax's policy network, `PolicyModuleWithStd`."""
+    """Return kernel and bias of each layer of Brax's policy network, `PolicyModuleWithStd`."""
     hidden = tree["MLP_0"]
     assert set(tree) == {"MLP_0", "Dense_0", "std_logparam"}, set(tree)
     assert set(hidden) == {f"hidden_{i}" for i in range(len(hidden))}, set(hidden)

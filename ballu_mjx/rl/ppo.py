@@ -1,6 +1,6 @@
-"""Proximal policy optimization: options, networks for training and for use, and what is kept of them.
+"""Proximal policy optimization (PPO): options, networks for training and inference, and their parameters.
 
-The learning itself is `ballu_mjx.rl.learner`'s.
+The training algorithm is in `ballu_mjx.rl.learner`.
 """
 
 from __future__ import annotations
@@ -22,45 +22,48 @@ from ballu_mjx.common.errors import InputError
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig:
-    """How to learn. A control step is one environment advanced by one action."""
+    """Options of PPO. A control step advances one environment by one action."""
 
     num_timesteps: int = 3_000_000
-    """Control steps to train for, all environments together; rounded up to whole training steps."""
+    """Length of the training in control steps, summed over all environments. Rounded up to whole training steps."""
     num_envs: int = 1024
-    """Environments simulated side by side, over all devices together."""
+    """Number of environments simulated in parallel, summed over all devices."""
     unroll_length: int = 20
-    """Control steps of an environment in one piece of experience."""
+    """Length of one trajectory segment: consecutive control steps of one environment."""
     batch_size: int = 128
-    """Pieces of experience in a minibatch."""
+    """Number of trajectory segments in a minibatch."""
     num_minibatches: int = 8
-    """Minibatches that a training step collects; times batch size, a multiple of the environments."""
+    """Number of minibatches that a training step collects. Its product with the batch size must be a multiple of the
+    number of environments."""
     num_updates_per_batch: int = 4
-    """Passes over the collected minibatches in a training step."""
+    """Number of epochs of a training step: passes over the collected minibatches."""
     learning_rate: float = 1e-4
-    """Adam's, to start with (see desired_kl)."""
+    """Initial learning rate of Adam. It stays constant only if desired_kl is 0."""
     desired_kl: float = 0.01
-    """Change of the policy per minibatch (Kullback-Leibler divergence) that the learning rate adapts to, by factors of
-    1.5; 0 keeps it constant."""
+    """Target for the change of the policy per minibatch (Kullback-Leibler divergence). The learning rate is adapted to
+    reach it, in factors of 1.5. With 0 the learning rate is constant."""
     entropy_cost: float = 0.0
     """Weight of the policy's entropy in the objective."""
     discounting: float = 0.95
-    """Discount per control step."""
+    """Discount factor per control step."""
     gae_lambda: float = 0.95
-    """Decay of generalized advantage estimation."""
+    """Decay factor (lambda) of generalized advantage estimation."""
     clipping_epsilon: float = 0.2
-    """Largest relative change of an action's probability that is rewarded."""
+    """Clipping range of PPO: a larger relative change of an action's probability brings no further gain."""
     reward_scaling: float = 1.0
-    """Factor on rewards. A fresh value function gives numbers of order 1: returns should not be small beside that."""
+    """Factor on rewards. An untrained value function returns numbers of order 1. Scaled returns should not be much
+    smaller."""
     value_cost: float = 0.25
     """Weight of the value function's mean squared error in the objective."""
     max_grad_norm: float = 1.0
-    """Gradients longer than this are shortened to it."""
+    """Largest norm of the gradient. Longer gradients are scaled down to it."""
     adam_epsilon: float = 1e-8
-    """What Adam adds to the root of its second moment."""
+    """Term that Adam adds to the root of its second moment, for numerical stability."""
     normalize_observations: bool = True
-    """Shift and scale observations by their running mean and standard deviation."""
+    """Normalize observations by their running mean and standard deviation."""
     observation_clip: float = 10.0
-    """Largest normalized observation that the networks see: bounds what they do far outside the data."""
+    """Magnitude to which normalized observations are clipped. It bounds the networks' inputs far outside the training
+    range."""
     policy_layers: tuple[int, ...] = (64, 64)
     """Widths of the policy's hidden layers."""
     value_layers: tuple[int, ...] = (64, 64)
@@ -68,18 +71,18 @@ class PPOConfig:
     activation: Literal["swish", "tanh"] = "swish"
     """Activation of the hidden layers."""
     orthogonal_init: bool = False
-    """Draw the hidden layers' weights as orthogonal matrices times the root of 2, instead of uniformly (LeCun)."""
+    """Initialize the hidden layers with orthogonal matrices times the root of 2, instead of uniform numbers (LeCun)."""
     initial_std: float = 0.5
-    """Standard deviation of a fresh policy's actions, in the environment's units; the mean starts near 0."""
+    """Standard deviation of an untrained policy's actions, in the environment's units. Their mean starts near 0."""
     averaging: int = 25
-    """Training steps over which the policy that is handed out is averaged (exponentially); 1 hands out the last. Single
+    """Training steps over which the saved policy is averaged (exponentially). With 1 the last policy is saved. Single
     iterates of PPO scatter: their validation errors differ by a factor of two from one step to the next."""
     seed: int = 0
-    """Seeds all of it: networks, initial states, exploration."""
+    """Seed of all random numbers: initial networks, initial states and exploration."""
 
 
 class Normalizer(NamedTuple):
-    """Running statistics of the observations; all but the count by the observation's name."""
+    """Running statistics of the observations. All but the count are by name of the observation's part."""
 
     count: Float[Array | np.ndarray, ""]
     mean: Mapping[str, Float[Array | np.ndarray, " n"]]
@@ -88,7 +91,7 @@ class Normalizer(NamedTuple):
 
 
 class Params(NamedTuple):
-    """All it takes to use what was learned, on the host."""
+    """Trained parameters on the host: normalizer, policy network and value network."""
 
     normalizer: Normalizer
     policy: Any
@@ -100,11 +103,11 @@ Inference = Callable[[Params, Float[Array, "*batch observations"]], Float[Array,
 Sampler = Callable[[Params, Float[Array, " observations"], Array], Float[Array, " actions"]]
 
 STATE, CRITIC = "state", "critic"
-"""Names of an observation's parts: what the policy sees and, where there is one of its own, the value function."""
+"""Names of an observation's parts: the policy's input, and the value function's input if it differs."""
 
 _INITIAL_MEAN_SCALE = 0.01
 _NARROWEST = 1e-4
-"""Smallest standard deviation that an observation is divided by."""
+"""Lower bound of the standard deviation by which an observation is divided."""
 
 
 _COUNTS = (
@@ -129,13 +132,13 @@ _WIDEST, _LARGEST = 2**14, 2**31 - 1
 
 
 def check_values(config: PPOConfig) -> None:
-    """Refuse values that no option may have, each for itself.
+    """Check that each option's value is in its range.
 
-    **Raises** `InputError` naming the option, and the nearest value that it may have.
+    **Raises** `InputError` naming the option and the nearest valid value (or the default).
     """
     for name in (*_COUNTS, "seed"):
         value, least = getattr(config, name), int(name != "seed")
-        # 64 bits count the control steps; all else is XLA's, whose sizes and seeds have 32.
+        # The control steps are counted with 64 bits. All other numbers are sizes or seeds in XLA, which have 32.
         most = 2**62 if name == "num_timesteps" else _LARGEST
         if not least <= value <= most:
             said, nearest = (f"{least} or more", least) if value < least else (f"{most} or less", most)
@@ -163,9 +166,9 @@ def check_values(config: PPOConfig) -> None:
 
 
 def check(config: PPOConfig, devices: int) -> None:
-    """Refuse sizes that do not fit each other or the number of devices, before anything is compiled.
+    """Check that sizes fit each other and the number of devices, before anything is compiled.
 
-    **Raises** `InputError` naming the option, and the nearest value that fits; also from `check_values`.
+    **Raises** `InputError` naming the option and the nearest valid value, also from `check_values`.
     """
     check_values(config)
     if config.batch_size % devices:
@@ -185,7 +188,7 @@ def check(config: PPOConfig, devices: int) -> None:
 
 
 def make_networks(observation_size: ObservationSize, action_size: int, config: PPOConfig) -> brax_networks.PPONetworks:
-    """Policy and value networks; the Gaussian's deviation is one number an action."""
+    """Return policy and value networks. Each action's standard deviation is one parameter, the same in all states."""
 
     def preprocess(observation: Any, preprocessor_params: Any) -> Array:
         if not config.normalize_observations:
@@ -217,9 +220,10 @@ def make_networks(observation_size: ObservationSize, action_size: int, config: P
 
 
 def make_inference(observation_size: ObservationSize, action_size: int, config: PPOConfig) -> Inference:
-    """The deterministic policy: (parameters, the policy's observation) to the most likely action.
+    """Return the deterministic policy, a function of parameters and observation.
 
-    Pure, for any number of leading axes of the observation.
+    It returns the mode of the policy's distribution. It is pure, and the observation may have any number of leading
+    axes.
     """
     networks = make_networks(observation_size, action_size, config)
 
@@ -231,7 +235,7 @@ def make_inference(observation_size: ObservationSize, action_size: int, config: 
 
 
 def make_sampler(observation_size: ObservationSize, action_size: int, config: PPOConfig) -> Sampler:
-    """The policy as it explores: (parameters, the policy's observation, key) to a drawn action."""
+    """Return the stochastic policy, a function of parameters, observation and random key that samples an action."""
     networks = make_networks(observation_size, action_size, config)
 
     def sample(params: Params, observation: Float[Array, " observations"], key: Array) -> Float[Array, " actions"]:
@@ -242,7 +246,7 @@ def make_sampler(observation_size: ObservationSize, action_size: int, config: PP
 
 
 def fits(infer: Inference, params: Params, inputs: int) -> bool:
-    """Whether `params` are of the network that `infer` evaluates for so many inputs."""
+    """Return whether `params` have the shapes of the network that `infer` evaluates, with `inputs` inputs."""
     observation = jax.ShapeDtypeStruct((inputs,), jnp.float32)
     try:
         jax.eval_shape(infer, params, observation)
@@ -252,7 +256,7 @@ def fits(infer: Inference, params: Params, inputs: int) -> bool:
 
 
 def initial_policy(inputs: Float[Array | np.ndarray, "states inputs"], action_size: int, config: PPOConfig) -> Params:
-    """A fresh policy whose normalizer knows the observations `inputs`; it has no value function."""
+    """Return an untrained policy, with a normalizer from the observations `inputs` and without value function."""
     inputs = np.asarray(inputs, np.float64)
     std = np.maximum(inputs.std(axis=0), _NARROWEST)
     mean, std, summed = (np.asarray(x, np.float32) for x in (inputs.mean(axis=0), std, std**2 * len(inputs)))
@@ -262,22 +266,22 @@ def initial_policy(inputs: Float[Array | np.ndarray, "states inputs"], action_si
 
 
 def with_share(policy: Mapping[str, Any], share: float) -> Mapping[str, Any]:
-    """A policy network whose most likely actions are `share` times those of `policy`."""
+    """Return a policy network whose mean actions are `share` times those of `policy`."""
     layers = policy["params"]
     return {**policy, "params": {**layers, _MEAN: jax.tree.map(lambda x: share * x, layers[_MEAN])}}
 
 
 _MEAN = "Dense_0"
-"""Brax's name for the layer that makes the mean of the actions' distribution."""
+"""Brax's name of the layer whose output is the mean of the action distribution."""
 
 
 def as_tree(params: Params) -> dict[str, Any]:
-    """Nested dictionaries of arrays, for writing."""
+    """Return `params` as nested dictionaries of arrays, for checkpoints."""
     return {"normalizer": params.normalizer._asdict(), "policy": params.policy, "value": params.value}
 
 
 def from_tree(tree: Mapping[str, Any]) -> Params:
-    """The inverse of `as_tree`."""
+    """Return parameters from nested dictionaries, the inverse of `as_tree`."""
     return Params(Normalizer(**tree["normalizer"]), tree["policy"], tree["value"])
 
 

@@ -1,4 +1,4 @@
-"""Where a training begins: anew, or where a run stopped."""
+"""Starting point of a training: a new training, or the last checkpoint of a run that is resumed."""
 
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ from ballu_mjx.runs.rollout_file import ROLLOUT_FILE
 
 @dataclasses.dataclass(frozen=True)
 class ResumePoint:
-    """Where a training begins: anew, or where a run stopped."""
+    """Starting point of a training: a new training, or the last checkpoint of a run that is resumed."""
 
     folder: Path | None = None
-    """The run that goes on."""
+    """Folder of the resumed run. None for a new training."""
     checkpoint: Checkpoint | None = None
-    """None: the run was stopped before it had one."""
+    """Checkpoint to resume from. None for a new training, or if the run stopped before its first checkpoint."""
 
     @property
     def resumed_at(self) -> int | None:
-        """What `Run` wants to know."""
+        """Argument `resumed_at` of `Run`: the resumed control step, -1 without checkpoint, None for a new training."""
         if self.folder is None:
             return None
         return -1 if self.checkpoint is None else self.checkpoint.step
 
     @property
     def step(self) -> int:
-        """Control steps done before."""
+        """Control steps done before this training starts."""
         return 0 if self.checkpoint is None else self.checkpoint.step
 
     @property
     def params(self) -> Params | None:
-        """What was learned before."""
+        """Parameters of the checkpoint. None without checkpoint."""
         return None if self.checkpoint is None else ppo.from_tree(self.checkpoint.params)
 
     @property
     def seconds(self) -> float:
-        """Wall time trained before, validations included."""
+        """Wall time (s) of the earlier training up to the checkpoint, validations included."""
         if self.checkpoint is None or self.folder is None:
             return 0.0
         found = 0.0
@@ -59,22 +59,29 @@ class ResumePoint:
 
     @property
     def notice(self) -> str | None:
-        """What the user should know before training begins; None: nothing."""
+        """Message for the user before training starts. None if there is none."""
         if self.folder is None or self.checkpoint is not None:
             return None
-        return f"{self.folder}: was stopped before its first checkpoint; starting from the beginning."
+        return f"{self.folder}: the run stopped before its first checkpoint; starting from the beginning."
 
     def state(
         self, new: Learner, ppo_config: PPOConfig, made_with: Mapping[str, Any], tell: Callable[[str], None]
     ) -> TrainingState:
-        """Return the state to go on from with what `training_facts` says; `tell` takes sentences on what of the old
-        one cannot go on."""
+        """Return the training state to start with.
+
+        **Arguments**
+
+        - `new`: the learner that will train from this state.
+        - `ppo_config`: the options of this training.
+        - `made_with`: the result of `training_facts` for this training, to compare with the checkpoint's.
+        - `tell`: receives messages about parts of the stored state that cannot be used.
+        """
         if self.checkpoint is None or self.folder is None:
             return new.init(ppo_config.seed)
         stored, before = self.checkpoint.training, self.checkpoint.notes
-        anew = "the optimizer and the environments start anew"
+        anew = "the optimizer and the environments are reset"
         if stored is None:
-            tell(f"{self.folder}: {anew}: an older version kept parameters alone.")
+            tell(f"{self.folder}: {anew}, because an older version saved only the parameters.")
         else:
             if ppo_config.learning_rate != before["learning_rate"]:
                 stored = training_state.with_learning_rate(stored, ppo_config.learning_rate)
@@ -82,10 +89,10 @@ class ResumePoint:
             try:
                 state, whole = new.resume(stored, environments=same)
             except ValueError as error:
-                tell(f"{self.folder}: {anew}: the stored ones do not fit ({error}).")
+                tell(f"{self.folder}: {anew}, because the stored ones do not fit ({error}).")
             else:
                 if not whole:
-                    tell(f"{self.folder}: the environments start anew, for the options changed; the optimizer goes on.")
+                    tell(f"{self.folder}: options have changed; the environments are reset, the optimizer continues.")
                 return state
         return new.init_from(ppo.from_tree(self.checkpoint.params), self.step)
 
@@ -93,9 +100,9 @@ class ResumePoint:
 def find_resume_point(
     task: str, folder: Path | None, config: PPOConfig, *, output: Path | None, quick: bool
 ) -> ResumePoint:
-    """Return where training starts from: anew, where `folder` is None.
+    """Return the starting point of a training: the last checkpoint of the run in `folder`, or a new training if None.
 
-    **Raises** `InputError` where the run to go on with is none, has ended, or does not go with the options.
+    **Raises** `InputError` if `folder` holds no run, if the run has ended, or if the options contradict it.
     """
     if folder is None:
         return ResumePoint()
@@ -114,18 +121,18 @@ def find_resume_point(
     if not list_checkpoints(folder):
         return ResumePoint(folder)
     checkpoint = last_checkpoint(folder, training=True)
-    # Whoever was stopped between the last checkpoint and the results still needs these.
+    # A run that stopped between its last checkpoint and its results still needs the results.
     if checkpoint.step >= config.num_timesteps and (folder / ROLLOUT_FILE).exists():
         raise InputError(
-            f"{folder}: is at step {checkpoint.step:,} already; give a --num-timesteps above that to train for longer."
+            f"{folder}: the run is already at step {checkpoint.step:,}; give a larger --num-timesteps to train longer."
         )
     return ResumePoint(folder, checkpoint)
 
 
 def training_facts(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what of a run's `config.json` a training state depends on beyond its shapes.
+    """Return the parts of a run's `config.json` on which a training state depends, apart from its shapes.
 
-    It is kept with every checkpoint: the `config.json` beside it may be that of a later start.
+    They are saved with every checkpoint, because a later start may overwrite `config.json`.
     """
     recordings = [entry["sha256"] for entry in config.get("recordings", {}).get("training", [])]
     parts = {name: config.get(name) for name in ("env", "actuators", "residual")} | {"recordings": recordings}

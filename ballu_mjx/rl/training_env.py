@@ -1,4 +1,4 @@
-"""Environments as PPO trains in them: vectorized, reset when an episode ends, and without numbers that are none."""
+"""Wrapper of environments for PPO: vectorization, reset at the end of an episode, and handling of NaN and infinity."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from jaxtyping import Array
 from ballu_mjx.rl.ppo import STATE
 
 MEASURED = "measured"
-"""Where `State.info` has a step's reward and metrics, before any reset."""
+"""Key in `State.info` of a step's reward and metrics, before any reset."""
 _DIVERGED = "diverged"
 
 
 def initial_state(inner: Any, observation: Any, metrics: Iterable[str]) -> State:
-    """Return an environment's state at the start of an episode: not done, reward and metrics (by name) 0."""
+    """Return an environment's state at the start of an episode: not done, with reward and named `metrics` 0."""
     zero = jnp.zeros(())
     return State(
         pipeline_state=inner,
@@ -33,35 +33,38 @@ def initial_state(inner: Any, observation: Any, metrics: Iterable[str]) -> State
 
 
 def wrap_for_training(env: Env) -> Wrapper:
-    """`env` vectorized, with every finished environment reset to a newly drawn state.
+    """Return `env` vectorized, with each environment reset to a newly drawn state at the end of its episode.
 
-    Brax's own auto-reset goes back to a cached first state for ever. Here all environments are reset in every step,
-    and the finished ones take the result: for environments whose reset costs nothing beside their step.
+    **Reset.** Brax's auto-reset always returns to a cached first state. Here all environments are reset in every step,
+    and only the finished ones use the result. This suits environments whose reset costs little compared with a step.
 
-    An `env` may have `contents`, a tree of arrays, and a method `with_contents(contents)` that gives the same with
-    others: a `Learner` hands them to its program, which so serves all environments that differ in nothing else.
+    **Contents.** `env` may have an attribute `contents`, a tree of arrays, and a method `with_contents(contents)` that
+    returns the same environment with other contents. A `Learner` passes them to its program as arguments. So one
+    compiled program serves all environments that differ only in their contents.
 
-    An `env` with a method `renew(state, key)` is reset by it: what tells one variant of an environment from another can
-    then be handed on from state to state, instead of being a constant of the compiled program.
+    **Variants.** If `env` has a method `renew(state, key)`, it is used for resets. The parameters of a variant of the
+    environment can then be part of the state, instead of constants of the compiled program.
 
-    `env` ends its episodes itself, by time also: it sets `done` and, where only time ran out,
-    `info["truncation"]`, in both `reset` and `step`. What Brax's `compute_gae` makes of a truncated transition
-    `t`: its advantage is 0 and its value's target the value itself, so that it teaches nothing; the transition before
-    bootstraps from `V(s_t)`, as if the episode went on; the fresh state behind it never enters. So values are unbiased
-    at the price of one transition in an episode. A `done` without truncation is a termination, with 0 to come.
+    **End of an episode.** `env` itself ends its episodes, also after a time limit. It sets `done` and, at a time limit,
+    `info["truncation"]`, in both `reset` and `step`. Brax's `compute_gae` treats a truncated transition `t` as follows.
+    Its advantage is 0 and the target of its value is the value itself, so it contributes no gradient. The transition
+    before it bootstraps from `V(s_t)`, as if the episode continued. The new state after it is not used. So values are
+    unbiased, at the cost of one transition in each episode. A `done` without truncation is a termination, after which
+    the return is 0.
 
-    A step whose observation, reward or metrics are not all finite ends its episode with a reward of 0, and the numbers
-    that are none become 0: one robot that explodes must not spoil what all learn. The metric `diverged` is 1 there, and
-    otherwise the environment's own, if it has one.
+    **Divergence.** If the observation, a reward or a metric of a step is not finite, the episode ends with a reward of
+    0, and rewards and metrics that are not finite become 0. So one diverged simulation does not corrupt the training.
+    The metric `diverged` is then 1. Otherwise it is that of `env`, or 0 if `env` has none.
 
-    The observation becomes a dictionary: `state` for the policy, `critic` for the value function where `env` gives both
-    by these names (else `state` serves both). `info["measured"]` has the step's reward and metrics, before any reset.
+    **Observation.** The observation becomes a dictionary: `state` for the policy and `critic` for the value function,
+    if `env` returns both by these names. Otherwise `state` serves both. `info["measured"]` has the reward and the
+    metrics of the step, before any reset.
     """
     return _Training(env)
 
 
 class _Training(Wrapper):
-    """See `wrap_for_training`."""
+    """Wrapper that `wrap_for_training` describes."""
 
     def reset(self, rng: Array) -> State:
         keys = jax.vmap(jax.random.split)(rng)
@@ -88,7 +91,7 @@ class _Training(Wrapper):
         return self._with_extras(shown, after, keys[:, 1])
 
     def _with_extras(self, shown: State, outcome: State, keys: Array) -> State:
-        """Name the observations, and add the keys of the resets and the outcome's reward and metrics."""
+        """Return `shown` with named observations, the keys of the resets, and the reward and metrics of `outcome`."""
         measured = {"reward": outcome.reward} | outcome.metrics
         info = shown.info | {"reset_key": keys, MEASURED: jax.tree.map(jnp.float32, measured)}
         named = dict(shown.obs) if isinstance(shown.obs, Mapping) else {STATE: shown.obs}
@@ -96,7 +99,7 @@ class _Training(Wrapper):
 
 
 def _only_finite(state: State) -> State:
-    """What `wrap_for_training` says of numbers that are none; `state` is a batch."""
+    """Return a batch of states with diverged episodes ended, as `wrap_for_training` describes."""
     parts = jax.tree.leaves((state.obs, state.reward, state.metrics))
     good = functools.reduce(jnp.logical_and, (jnp.isfinite(x).reshape(len(x), -1).all(axis=1) for x in parts))
     metrics = {name: jnp.where(jnp.isfinite(x), x, 0.0) for name, x in state.metrics.items()}
@@ -110,7 +113,7 @@ def _only_finite(state: State) -> State:
 
 
 def _where(done: Array, new: Any, old: Any) -> Any:
-    """`new` for the environments that are done, `old` for the others."""
+    """Return `new` for the environments that are done, `old` for the others."""
 
     def select(new: Array, old: Array) -> Array:
         return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - 1)), new, old)

@@ -1,4 +1,4 @@
-"""A training with what surrounds PPO: measurements, validations, checkpoints, progress, and Ctrl-C."""
+"""Training loop around PPO: metrics, validations, checkpoints, progress messages and interruption by signals."""
 
 from __future__ import annotations
 
@@ -24,34 +24,35 @@ from ballu_mjx.runs.progress import Progress
 from ballu_mjx.runs.record import TrainingRecord
 
 _DIVERGED = 1e-3
-"""Share of control steps in which physics may break down before the user is told."""
+"""Share of control steps whose physics may diverge before the user is warned."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Validation:
-    """What tells the best checkpoint."""
+    """Validation, whose result selects the best checkpoint."""
 
     measure: Callable[[Params], float]
+    """Function that returns the validation result of the parameters."""
     name: str = "validation_error"
-    """Of the metric."""
+    """Name of the metric."""
     greatest: bool = False
-    """Whether the greatest is the best, not the smallest."""
+    """Whether a greater result is better. By default a smaller one is."""
 
 
 class TrainingInterrupted(KeyboardInterrupt):
-    """A signal ended a training, whose last state is saved."""
+    """Interruption of a training by a signal, after its last state was saved."""
 
     def __init__(self, status: int, step: int) -> None:
-        """`status` is a shell's for the signal, `step` the control step that is saved."""
+        """Create it with the exit `status` of a shell for the signal, and the saved control `step`."""
         super().__init__()
         self.status, self.step = status, step
 
 
 class TrainingLoop:
-    """One stretch of training."""
+    """One training from its start, or from a checkpoint, to its end or interruption."""
 
     interrupted: int | None = None
-    """The signal that came, set by its handler: the next finished training step is the last."""
+    """Number of the received signal, set by its handler. Training then ends after the current training step."""
 
     def __init__(
         self,
@@ -60,11 +61,18 @@ class TrainingLoop:
         keep_every: int,
         validation: Validation,
     ) -> None:
-        """A checkpoint is kept every `keep_every` control steps, with what `validation` measures, which tells the best.
-        Without `progress` nothing is told on the terminal, of trouble neither."""
+        """Prepare a training.
+
+        **Arguments**
+
+        - `run`: receives metrics and checkpoints. None to write nothing.
+        - `progress`: shows progress and warnings on the terminal. None to show neither.
+        - `keep_every`: control steps between two checkpoints.
+        - `validation`: the measurement at each checkpoint, which selects the best.
+        """
         self._run, self._progress, self._validation = run, progress, validation
         self._every = keep_every
-        self._due: int | None = None  # step of the last checkpoint that was not an interruption's
+        self._due: int | None = None  # Step of the last checkpoint, not counting one that an interruption saved.
         self._made_with: dict[str, Any] = {}
         self._saved = 0
         self._validated: float | None = None
@@ -75,10 +83,10 @@ class TrainingLoop:
         self._watchdog = Watchdog(folder or Path("RUN"), self._tell)
 
     def train(self, env: Env, config: PPOConfig, start: ResumePoint, content: Mapping[str, Any]) -> None:
-        """Train `env` from `start` on; `content` is the run's `config.json`.
+        """Train `env` from `start`. `content` is the content of the run's `config.json`.
 
-        **Raises** `TrainingInterrupted` after SIGINT (Ctrl-C) or SIGTERM, the last state saved, and `InputError`
-        where learning broke down, with the last good checkpoint named.
+        **Raises** `TrainingInterrupted` after SIGINT (Ctrl-C) or SIGTERM, when the last state is saved. Raises
+        `InputError` if a loss or metric is not finite, naming the last good checkpoint.
         """
         self._made_with = training_facts(content)
         if start.checkpoint is not None:
@@ -99,7 +107,7 @@ class TrainingLoop:
 
     @property
     def exit_status(self) -> int:
-        """A shell's for the signal that ended the training."""
+        """Exit status that a shell reports for the signal that ended the training."""
         return 128 + (self.interrupted or signal.SIGINT)
 
     def _step_done(self, step: int, state: TrainingState, metrics: dict[str, float]) -> None:
@@ -108,15 +116,15 @@ class TrainingLoop:
             self._close()
             broken = ", ".join(name for name, value in metrics.items() if not math.isfinite(value))
             raise InputError(
-                f"Learning broke down before step {step:,}: {broken} is not a number any more. The last good "
-                f"checkpoint is that of step {self._saved:,}; go on from it with --resume and a smaller "
-                "--learning-rate, or look for recordings or options that throw the robot about."
+                f"Training diverged before step {step:,}: {broken} is no longer finite. The last good checkpoint is "
+                f"that of step {self._saved:,}; resume from it with --resume and a smaller --learning-rate, or look "
+                "for recordings or options that cause extreme motions."
             )
         if metrics.get("diverged", 0.0) > _DIVERGED and not self._warned:
             self._warned = True
             self._tell(
-                f"Physics diverged in {metrics['diverged']:.2%} of the control steps (these robots were reset); the "
-                "forces or starting states are too violent for the simulator's time step."
+                f"Physics diverged in {metrics['diverged']:.2%} of the control steps (these robots were reset). The "
+                "forces or starting states are too extreme for the simulator's time step."
             )
         if metrics:
             seconds = self._seconds_before + time.perf_counter() - self._started
@@ -161,10 +169,10 @@ class TrainingLoop:
 
     @contextlib.contextmanager
     def _interrupts_noted(self) -> Iterator[None]:
-        """Let the first SIGINT or SIGTERM end training after its current step; the second interrupts at once.
+        """Let the first SIGINT or SIGTERM end training after the current training step, and the second at once.
 
-        An exception raised wherever Python happens to be can land in a callback of JAX's that swallows it. Handlers
-        that are somebody else's stay, and so do signals that are ignored, as in the background of a shell.
+        A signal handler that raises an exception at once can interrupt a callback of JAX, which swallows it. Handlers
+        that other code has installed stay. Ignored signals stay ignored, as for a job in the background of a shell.
         """
 
         def note(number: int, frame: Any) -> None:

@@ -1,4 +1,4 @@
-"""What a training step of PPO hands to the next: one tree on the devices, and its arrays on the host."""
+"""State of a PPO training between two training steps, as a tree on the devices and as arrays on the host."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from ballu_mjx.rl.ppo import Normalizer, Params
 
 
 class TrainingState(NamedTuple):
-    """All that a training step hands to the next, on the devices: environments spread over them, the rest on each.
+    """State of a training on the devices. The environments are distributed over the devices, the rest is on each.
 
-    - `networks`: policy and value function as they learn.
-    - `averaged`: the policy that is handed out (see `PPOConfig.averaging`), in the shape of `networks.policy`.
-    - `averaged_steps`: training steps in that average, the starting point not counted.
-    - `optimizer`: optax's; Adam's moments, and the learning rate where it has got to.
+    - `networks`: current parameters of policy and value function.
+    - `averaged`: the averaged policy, which is saved (see `PPOConfig.averaging`), in the shape of `networks.policy`.
+    - `averaged_steps`: number of training steps in this average, without the initial policy.
+    - `optimizer`: state of the optax optimizer, with Adam's moments and the current learning rate.
     - `normalizer`: running statistics of the observations, by name.
-    - `environments`: every environment's state, leaves of shape (num_envs, ...), with the keys of its resets.
-    - `key`: all randomness of the training steps to come.
-    - `steps`: control steps done, all environments together.
+    - `environments`: states of all environments (leaves of shape (num_envs, ...)), with the keys of their resets.
+    - `key`: random key of all later training steps.
+    - `steps`: control steps done, summed over all environments.
     """
 
     networks: PPONetworkParams
@@ -43,11 +43,11 @@ class TrainingState(NamedTuple):
 
 
 Stored = Mapping[str, np.ndarray]
-"""A `TrainingState` on the host: its arrays by their place in it."""
+"""A `TrainingState` on the host: arrays by `array_name` of their place in the tree."""
 
 
 def params(state: TrainingState) -> Params:
-    """What `state` has learned so far, with the averaged policy, copied to the host."""
+    """Return the parameters of `state`, with the averaged policy, copied to the host."""
     statistics = state.normalizer
     count = np.array(int(statistics.count), np.float32)  # pyright: ignore[reportArgumentType]
     moments = _copied((statistics.mean, statistics.std, statistics.summed_variance))
@@ -55,35 +55,39 @@ def params(state: TrainingState) -> Params:
 
 
 def stored(state: TrainingState) -> dict[str, np.ndarray]:
-    """All of `state`, copied to the host, for `Learner.resume`; all processes must ask for it. Arrays without entries
-    are left out, which checkpoints cannot hold."""
+    """Return all arrays of `state`, copied to the host, for `Learner.resume`. All processes must call this function.
+
+    Empty arrays are left out, because checkpoints cannot hold them.
+    """
     arrays = {array_name(path): distributed.on_host(leaf) for path, leaf in jax.tree.leaves_with_path(state)}
     return {name: array for name, array in arrays.items() if array.size}
 
 
 def with_learning_rate(stored: Stored, rate: float) -> dict[str, np.ndarray]:
-    """`stored` with another learning rate to go on with."""
+    """Return `stored` with another learning rate."""
     name = next(name for name in stored if name.endswith("hyperparams.learning_rate"))
     return {**stored, name: np.full_like(stored[name], rate)}
 
 
 def with_own_memory(state: TrainingState) -> TrainingState:
-    """`state` as the compiled step takes it: no two arrays the same one (memory given away twice), and no type that
-    only Python's numbers have (a second program)."""
+    """Return `state` with a separate buffer for each array and without weak types, as the compiled step needs it.
+
+    A shared buffer would be donated twice, and weak types would compile a second program.
+    """
     return jax.tree.map(lambda x: jnp.array(x, jnp.asarray(x).dtype, copy=True), state)
 
 
 def _copied(tree: Any) -> Any:
-    """On the host, in memory of its own."""
+    """Return a copy of all arrays on the host."""
     return jax.tree.map(np.array, tree)
 
 
 def array_name(path: Any) -> str:
-    """Return what the array at a place of a tree is called when it is stored."""
+    """Return the stored name of the array at `path` in a tree."""
     return jax.tree_util.keystr(path, simple=True, separator=".")
 
 
 def to_uint64(count: int) -> UInt64:
-    """Return a count as Brax keeps it: in two numbers of 32 bits."""
+    """Return a count as two numbers of 32 bits, as Brax stores it."""
     high, low = divmod(count, 2**32)
     return UInt64(hi=high, lo=low)  # pyright: ignore[reportCallIssue]

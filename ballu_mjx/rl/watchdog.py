@@ -1,4 +1,4 @@
-"""A thread that notices when a training stands still."""
+"""Thread that warns if a training makes no progress."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from pathlib import Path
 
 
 class Watchdog:
-    """Tell the user when no training step has finished for long: a context manager around the training.
+    """Context manager around a training that warns if no training step finishes for a long time.
 
-    It watches from a thread, which holds nothing up and ends with the process.
+    It runs in a daemon thread, which ends with the process.
     """
 
     def __init__(self, folder: Path, tell: Callable[[str], None], limit: float = 300.0) -> None:
-        """`tell` takes sentences for the user; `limit` is in s."""
+        """Prepare to warn by `tell` after `limit` (s) without progress. `folder` is the run's, for the message."""
         self._folder, self._tell, self._limit = folder, tell, limit
         self._step: int | None = None
         self._last = time.monotonic()
-        self._told: float | None = None  # when the standstill began that has been told of
+        self._told: float | None = None  # Start of the standstill for which the last warning was given.
         self._woken = threading.Condition()
         self._over = False
 
     def step_done(self, step: int | None) -> None:
-        """Training has got to control step `step`; None: it is about to take its first step."""
+        """Note that training has reached control step `step`. None: its first training step is about to start."""
         with self._woken:
             self._step, self._last = step, time.monotonic()
 
@@ -40,8 +40,10 @@ class Watchdog:
             self._woken.notify()
 
     def look(self, now: float) -> float:
-        """Tell of a standstill that has lasted for the limit at `now` (s, of `time.monotonic`), unless it has been told
-        of; return in how many seconds to look again."""
+        """Warn if the standstill has lasted for the limit at `now` (s, of `time.monotonic`), once for each standstill.
+
+        **Returns** the seconds until the next check.
+        """
         left = self._last + self._limit - now
         if left <= 0 and self._told != self._last:
             self._told = self._last
@@ -57,17 +59,17 @@ class Watchdog:
         minutes = f"{self._limit / 60:.3g} minutes"
         if self._step is None:
             return (
-                f"No training step has finished for {minutes}: a first compilation takes one or two, more where other "
-                "work keeps the machine busy. If nothing comes of it, end the process and try fewer --num-envs, "
+                f"No training step has finished for {minutes}: a first compilation takes one or two, or longer on a "
+                "busy machine. If it does not end, stop the process and try fewer --num-envs, "
                 f"or delete the cache of compiled programs{_cache()}."
             )
         return (
-            f"No training step has finished for {minutes}, since step {self._step:,}: look whether the machine sleeps, "
-            "has run out of memory or does other work. If it does not go on, end the process, and go on with "
-            f"--resume {self._folder}: what is saved stays."
+            f"No training step has finished for {minutes}, since step {self._step:,}: check whether the machine "
+            "sleeps, has run out of memory or is busy. If training does not continue, stop the process and resume with "
+            f"--resume {self._folder}: saved checkpoints are kept."
         )
 
 
 def _cache() -> str:
-    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")  # `runtime.prepare` sets it
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")  # Set by `runtime.prepare`.
     return f", {folder}" if folder else ""

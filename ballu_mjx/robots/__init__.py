@@ -1,1 +1,1 @@
-"""What a robot is: an MJCF model and a description of what is measured and driven."""
+"""Robots: MJCF models, and descriptions of their measured and actuated parts."""

@@ -1,7 +1,7 @@
-"""What a robot adds to its description: hooks for what no general code can know.
+"""Robot adapters: hooks for code that only one robot needs.
 
-A description names its adapter as `"adapter": "module:Class"`. Robots without one get `RobotAdapter`, whose methods
-are the general answers.
+A description names its adapter as `"adapter": "module:Class"`. A robot without an adapter uses `RobotAdapter`, whose
+methods are general defaults.
 """
 
 from __future__ import annotations
@@ -23,53 +23,50 @@ if TYPE_CHECKING:
 
 
 class DeploymentNotes(NamedTuple):
-    """What an exported controller tells of a robot, beyond what its description says."""
+    """Notes on a robot that an exported controller contains, beyond the robot's description."""
 
     markers: Mapping[str, str] = {}
-    """What each name that motion capture sees stands for on the robot."""
+    """Location on the robot of each site that motion capture measures, by the site's name."""
     commands: str = ""
-    """What the smallest and largest commands do, and why they are limited in rate."""
+    """Effect of the smallest and of the largest command, and the reason for their rate limit."""
     measure: tuple[str, ...] = ()
-    """What to measure before the first run."""
+    """Quantities to measure before the first run."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ResidualScales:
-    """Sizes of residual forces, for a robot whose own were chosen by experiment; see `residuals.scales`.
-
-    Forces are in N, torques in N m.
-    """
+    """Scales of residual forces that were chosen by experiment for one robot; see `residuals.scales`."""
 
     force_scale: float
-    """What one unit of a network's output stands for, of a force."""
+    """Force (N) per unit of a network's output."""
     torque_scale: float
-    """Likewise of a torque."""
+    """Torque (N m) per unit of a network's output."""
     force_limit: float
-    """Largest force along each axis."""
+    """Largest force along each axis (N)."""
     force_cost: float
-    """Reward lost per N^2 of force."""
+    """Penalty on the squared force, in units of the reward (1/N^2)."""
     force_spread: float
-    """Standard deviation of the prior on forces in labels."""
+    """Standard deviation of the prior on the force in labels (N)."""
     force_change: float
-    """Standard deviation of the prior on how they change from one control step to the next."""
+    """Standard deviation of the prior on the change of this force in a control step (N)."""
     torque_spread: float
-    """Standard deviation of what joints pull beyond the model."""
+    """Standard deviation of the joint torques that the model lacks (N m)."""
 
 
 IdentificationProgress = Callable[[str, int, int, float], None]
-"""(stage, iteration, most iterations, the lowest loss so far)."""
+"""Callback with the arguments (stage, iteration, maximum number of iterations, lowest loss so far)."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class IdentifiedActuators:
-    """Actuator parameters with what is known of them; `Simulator` takes it for the parameters.
+    """Identified actuator parameters with a report. `Simulator` accepts them in place of the bare parameters.
 
     **Fields**
 
-    - `robot`: the name that the recordings carry.
-    - `parameters`: what was identified.
-    - `report`: values, standard errors and fit, as text.
-    - `details`: the same as JSON's types, to stand beside the parameters in a file.
+    - `robot`: the robot's name in the recordings.
+    - `parameters`: the identified parameters.
+    - `report`: values, standard errors and quality of the fit, as text.
+    - `details`: the same as JSON types, for the file of the parameters.
     """
 
     robot: str
@@ -83,56 +80,56 @@ class IdentifiedActuators:
 
 
 class RobotAdapter:
-    """The general answers, which serve a robot without specialities. Adapters hold no state."""
+    """General defaults of the hooks, for a robot without code of its own. Adapters hold no state."""
 
     def check(self, robot: RobotDescription, model: mujoco.MjModel) -> str | None:
-        """Return what is wrong with a description for this adapter, in words; None where nothing is."""
+        """Return a description's first problem with this adapter, in words. None if there is no problem."""
         del robot, model
 
     def initial_qpos(self, robot: RobotDescription, model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:
-        """Return the pose that simulations start from: the description's keyframe, or the model's reference pose."""
+        """Return the initial pose of simulations: the description's keyframe, or the model's reference pose."""
         if robot.keyframe is None:
             return model.qpos0.copy()
         return model.key(robot.keyframe).qpos.copy()
 
     def rest_command(self, robot: RobotDescription, model: mujoco.MjModel) -> Float[np.ndarray, " commands"]:
-        """Return the commands of a robot at rest: those of its keyframe, or as near to 0 as their ranges go."""
+        """Return the commands of a robot at rest: those of its keyframe, or 0, clipped to their ranges."""
         given = np.zeros(model.nu) if robot.keyframe is None else model.key(robot.keyframe).ctrl
         low, high = np.array(robot.command_ranges).T
         return np.clip(given, low, high)
 
     def residual_scales(self) -> ResidualScales | None:
-        """Return sizes of residual forces that were chosen by experiment; None: the recordings tell them."""
+        """Return scales of residual forces that were chosen by experiment. None: estimate them from the recordings."""
 
     # ---- deployment ----
 
     def full_travel(self, robot: RobotDescription) -> float:
-        """Return the seconds in which a command may go through the whole of its range on the robot; 0: no limit."""
+        """Return the shortest time (s) in which a command may pass through its range on the robot. 0: no limit."""
         del robot
         return 0.0
 
     def deployment_notes(self, robot: RobotDescription) -> DeploymentNotes:
-        """Return what an exported controller tells whoever puts it on the robot."""
+        """Return notes on the robot for the users of an exported controller."""
         del robot
         return DeploymentNotes()
 
     # ---- rollouts of policies ----
 
     def rollout_counts(self, features: Float[np.ndarray, "runs states features"]) -> Mapping[str, list[int]]:
-        """Return what else is to be counted in rollouts of a policy, such as steps: numbers by name, one a run."""
+        """Return further counts in a policy's rollouts, such as steps, by name. Each has one number per run."""
         del features
         return {}
 
     def draw_rollout(
         self, folder: Path, qpos: Float[np.ndarray, "states nq"], command: Float[np.ndarray, "steps commands"]
     ) -> None:
-        """Draw what only this robot has to show of a rollout into PNG files in `folder`."""
+        """Draw figures of a rollout that are specific to this robot, as PNG files in `folder`."""
         del folder, qpos, command
 
     # ---- identified actuators ----
 
     def nominal_actuators(self, model: mujoco.MjModel) -> ModelParameters | None:
-        """Return the actuator parameters that stand in `model`; None where this robot has none to identify."""
+        """Return the actuator parameters of `model`. None if this robot has no actuators to identify."""
         del model
 
     def identify_actuators(
@@ -143,10 +140,10 @@ class RobotAdapter:
         levels: int | None = None,
         progress: IdentificationProgress | None = None,
     ) -> IdentifiedActuators:
-        """Return the actuators identified from suspended `recordings` (`recordings.recording.Recording`, by file);
-        see `identification.actuators.identify_actuators`.
+        """Identify the actuators from suspended `recordings` (`recordings.recording.Recording`, by file); see
+        `identification.actuators.identify_actuators`.
 
-        **Raises** `InputError` where the recordings cannot be used, or this robot's actuators cannot be identified.
+        **Raises** `InputError` if the recordings cannot be used, or if this robot's actuators cannot be identified.
         """
         self.check_sweep(robot, recordings, levels)
         raise NotImplementedError
@@ -154,35 +151,35 @@ class RobotAdapter:
     def check_sweep(self, robot: RobotDescription, recordings: Mapping[Path, Any], levels: int | None = None) -> None:
         """Check that `identify_actuators` can use the recordings.
 
-        **Raises** `InputError` where it cannot, or this robot's actuators cannot be identified.
+        **Raises** `InputError` if it cannot, or if this robot's actuators cannot be identified.
         """
         del recordings, levels
         raise InputError(
-            f"{robot.file}: the actuators of {robot.name} cannot be identified; declare what to identify under "
-            '"identify" (docs/identify.md), or give it an adapter with `identify_actuators`.'
+            f"{robot.file}: the actuators of {robot.name} cannot be identified; declare parameters under "
+            '"identify" (docs/identify.md), or write an adapter with `identify_actuators`.'
         )
 
     def read_actuators(self, robot: RobotDescription, path: Path) -> tuple[str, ModelParameters]:
-        """Return the robot's name and the parameters in a file of identified actuators.
+        """Read a file of identified actuators, and return the robot's name and the parameters.
 
-        **Raises** `InputError` where this robot's actuators cannot be identified, or the file is damaged.
+        **Raises** `InputError` if this robot's actuators cannot be identified, or if the file is damaged.
         """
         raise InputError(
             f"{path}: the actuators of {robot.name} cannot be identified yet ({robot.file.name} declares no "
-            '"identify"); leave --actuators out.'
+            '"identify"); remove --actuators.'
         )
 
     def write_actuators(self, path: Path, found: IdentifiedActuators, more: Mapping[str, Any]) -> None:
-        """Write a file that `read_actuators` reads, with the details, and `more` keys beside them."""
+        """Write a file that `read_actuators` reads, with the details and the further keys `more`."""
         raise NotImplementedError
 
     def actuators_to_json(self, parameters: ModelParameters) -> dict[str, Any]:
-        """Return identified parameters as JSON's types."""
+        """Return identified parameters as JSON types."""
         raise NotImplementedError
 
     def actuators_from_json(self, robot: RobotDescription, values: Mapping[str, Any], path: Path) -> ModelParameters:
-        """Return the inverse of `actuators_to_json`; `path` is the file that they stand in.
+        """Return the parameters from the `values` that `actuators_to_json` made; `path` is the file with the values.
 
-        **Raises** `InputError` naming file, parameter and fix.
+        **Raises** `InputError` naming the file, the parameter and the fix.
         """
         raise InputError(f"{path}: {robot.name} has no actuators to identify; restore the file.")

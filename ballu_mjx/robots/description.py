@@ -1,33 +1,35 @@
-"""Robot descriptions, format `ballu-robot/1`: which parts of an MJCF model motion capture sees, and which are driven.
+"""Robot descriptions (format `ballu-robot/1`): the parts of an MJCF model that are measured, and its commands.
 
-JSON with the keys
+A description is a JSON file with the keys
 
-- `format`; `name`, what the robot is called;
+- `format`: `ballu-robot/1`;
+- `name`: the robot's name;
 - `model`: the MJCF file, relative to the description;
-- `tracked`: the site whose place and orientation are followed; forces act on its body, at the centre of mass;
-- `points`: further sites whose places are measured and observed; may be empty;
-- `commands`: the model's actuators, all of them in its order, each under the name that follows `command_` in
-  recordings: `"left": "servo_left"`, or, for an actuator without a `ctrlrange`,
+- `tracked`: the site whose position and orientation are tracked. Residual forces act on its body, at the centre of
+  mass;
+- `points`: further sites whose positions are measured and observed; may be empty;
+- `commands`: all actuators of the model, in its order. Each key is the name that follows `command_` in recordings:
+  `"left": "servo_left"`. An actuator without a `ctrlrange` is written
   `"left": {"actuator": "servo_left", "range": [-1, 1]}`. Commands are in the actuators' own units;
-- `control_timestep` (optional): seconds between two commands, a multiple of the model's time step; 0.05 without it;
-- `joints` (optional): hinges (rad) and slides (m) that recordings may hold, as columns of their names;
-- `oriented_points` (optional): points whose orientation recordings may hold too;
-- `held` (optional): joints that no noise on starting states moves;
-- `force_joints` (optional): hinges and slides that residual forces may act along (the force set `joints`); without it,
-  all that have names and are not held;
-- `keyframe` (optional): the model's keyframe that simulations and inverse kinematics start from;
-- `limits` (optional): what no recording of this robot exceeds: `height` ([low, high], m), `distance` (m),
+- `control_timestep` (optional): the control step (s), a multiple of the model's time step; default 0.05;
+- `joints` (optional): hinges (rad) and slides (m) that recordings may contain, in columns with the joints' names;
+- `oriented_points` (optional): points whose orientation recordings may contain too;
+- `held` (optional): joints that get no noise in starting states;
+- `force_joints` (optional): hinges and slides on which residual forces may act (the force set `joints`). By default,
+  all that have valid names and are not held;
+- `keyframe` (optional): the model's keyframe at which simulations and inverse kinematics start;
+- `limits` (optional): bounds that no recording of this robot exceeds: `height` ([low, high], m), `distance` (m),
   `speed` (m/s), `angle` (rad or m);
-- `mirror` (optional): for a robot that is its own mirror image about the xz plane, pairs of names (points, commands,
-  joints) that change places, as `{"foot_left": "foot_right"}`; {} where nothing does;
-- `adapter` (optional): `module:Class`, a `robots.adapter.RobotAdapter` with what only this robot has;
-- `identify` (optional): parameters that recordings may identify, a list; see `identification.parameters`;
-- `upright` (optional): true for a robot whose tracked body never tilts far, so that its yaw says how it is turned;
-  false, the default: errors of orientation are the angle of the rotation between two orientations;
-- `horizons` (optional): seconds over which errors are taken, 0.05 to 100, for a robot that the default ones do not fit.
+- `mirror` (optional): for a robot that is symmetric about the xz plane, pairs of names (points, commands, joints) that
+  the mirror image swaps, as `{"foot_left": "foot_right"}`; `{}` if it swaps none;
+- `adapter` (optional): `module:Class`, a `robots.adapter.RobotAdapter` with code that only this robot needs;
+- `identify` (optional): list of the parameters that recordings may identify; see `identification.declarations`;
+- `upright` (optional): `true` if the tracked body never tilts far. Orientation errors are then errors of yaw. With
+  `false`, the default, they are the angle of the rotation between two orientations;
+- `horizons` (optional): horizons of the errors (s), 0.05 to 100, in place of the default ones.
 
-Joints are one free joint at the root or none, then hinges and slides. A robot without a free joint is anchored: what it
-sees and how it is pushed are told in the world's frame, for where it stands and how it is turned then matter.
+A model has at most one free joint, at the root. Its other joints are hinges and slides. A robot without a free joint is
+anchored. Its observations and residual forces are in the world frame, because its position and heading matter.
 """
 
 from __future__ import annotations
@@ -72,7 +74,7 @@ from ballu_mjx.robots.model import ModelParameters, load_model
 
 DESCRIPTION_FORMAT = "ballu-robot/1"
 DEFAULT_CONTROL_TIMESTEP = 0.05
-"""Seconds between two commands (20 Hz) where a description does not say."""
+"""Default control step (s), which is 20 Hz."""
 _MANDATORY = ("format", "name", "model", "tracked", "points", "commands")
 _OPTIONAL = (
     "control_timestep",
@@ -92,17 +94,17 @@ _LONGEST_STEP = 1.0
 
 
 class ForceJoint(NamedTuple):
-    """A joint that residual forces may act along."""
+    """A joint on which residual forces may act."""
 
     place: int
-    """In generalized velocities."""
+    """Index in generalized velocities."""
     unit: str
-    """Of what acts along it: `N m` of a hinge, `N` of a slide."""
+    """Unit of the load on it: `N m` for a hinge, `N` for a slide."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RobotDescription:
-    """What `read` found; keys of the format are explained at the module's head."""
+    """A robot description that agrees with its MJCF model. The module's docstring explains the keys of the format."""
 
     file: Path
     name: str
@@ -111,67 +113,68 @@ class RobotDescription:
     tracked: str
     points: tuple[str, ...]
     commands: tuple[str, ...]
-    """Their names in recordings, in the order of the model's actuators."""
+    """Names of the commands in recordings, in the order of the model's actuators."""
     joints: tuple[str, ...]
     held: tuple[str, ...]
     anchored: bool
     """Whether the model has no free joint."""
     sha256: str
-    """Of description, MJCF file, and all files that it names: included ones, meshes, height fields, textures."""
+    """SHA-256 of the description, the MJCF file and all files that it names: included files, meshes, height fields,
+    textures and skins."""
     command_ranges: tuple[tuple[float, float], ...]
     """Smallest and largest value of each command, in its actuator's units."""
     control_timestep: float = DEFAULT_CONTROL_TIMESTEP
-    """Seconds between two commands."""
+    """Control step (s)."""
     oriented_points: tuple[str, ...] = ()
-    """Points whose orientation recordings may hold."""
+    """Points whose orientation recordings may contain."""
     keyframe: str | None = None
-    """The model's keyframe to start from."""
+    """Keyframe of the model at which simulations and inverse kinematics start."""
     limits: Limits = Limits()
-    """What no recording exceeds."""
+    """Bounds that no recording exceeds."""
     mirror: Mapping[str, str] | None = None
-    """Names that change places in the mirror image about the xz plane, both ways; None: the robot is not symmetric."""
+    """Names that the mirror image about the xz plane swaps, in both directions. None if the robot is not symmetric."""
     adapter: RobotAdapter = dataclasses.field(default_factory=RobotAdapter)
-    """What only this robot has."""
+    """Code that only this robot needs."""
     identify: tuple[Mapping[str, Any], ...] = ()
-    """Parameters that recordings may identify, as declared; `identification.parameters` reads them."""
+    """Parameters that recordings may identify, as declared. `identification.declarations` reads them."""
     upright: bool = False
-    """Whether yaw says how the tracked body is turned; errors of orientation are then those of yaw."""
+    """Whether the tracked body never tilts far. Orientation errors are then errors of yaw."""
     horizons: tuple[float, ...] = ()
-    """Seconds over which errors are taken, increasing; empty: the default ones."""
+    """Horizons of the errors (s), in increasing order. Empty for the default ones."""
     force_joints: Mapping[str, ForceJoint] = dataclasses.field(default_factory=dict)
-    """Joints that residual forces may act along."""
+    """Joints on which residual forces may act, by name."""
     directions: int = 0
-    """Size of generalized velocities."""
+    """Number of generalized velocities."""
 
     @property
     def features(self) -> int:
-        """Return the size of `observe_features`: place, velocity and Euler angles of the tracked body, place
+        """Return the size of `observe_features`: position, velocity and Euler angles of the tracked body, then position
         and velocity of each point."""
         return 9 + 6 * len(self.points)
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Columns that its recordings may have."""
+        """Return the columns that recordings of this robot may have."""
         sites = (self.tracked, *self.points)
         places = [f"{site}_{axis}" for site in sites for axis in "xyz"]
         turns = [f"{site}_q{axis}" for site in (self.tracked, *self.oriented_points) for axis in "wxyz"]
         return ("time", *(f"command_{name}" for name in self.commands), *places, *turns, *self.joints)
 
     def load_model(self, actuators: ModelParameters | None = None) -> mujoco.MjModel:
-        """Return the robot for C MuJoCo: the nominal one, or with identified actuators."""
+        """Load the model for C MuJoCo, nominal or with identified actuators."""
         return load_model(self.model, actuators)
 
 
 def read_description(path: Path | str) -> RobotDescription:
-    """The description in a file, found to agree with its model.
+    """Read a description file, and check it against its model.
 
-    **Raises** `InputError` naming file, key and mend.
+    **Raises** `InputError` naming the file, the key and the fix.
     """
     path = Path(path)
     content = files.read_json(path, "write one as docs/own_robot.md shows")
     for key in content:
         if key not in (*_MANDATORY, *_OPTIONAL):
-            refuse(path, f"there is no key {shown(key)}", f"there are {', '.join((*_MANDATORY, *_OPTIONAL))}")
+            refuse(path, f"there is no key {shown(key)}", f"the keys are {', '.join((*_MANDATORY, *_OPTIONAL))}")
     for key in _MANDATORY:
         if key not in content:
             refuse(path, f'"{key}" is missing', "add it")
@@ -186,7 +189,11 @@ def read_description(path: Path | str) -> RobotDescription:
     driven = {read_name(path, "commands", key): read_actuator(path, key, value) for key, value in commands.items()}
     step = content.get("control_timestep", DEFAULT_CONTROL_TIMESTEP)
     if not is_number(step) or not 0 < step <= _LONGEST_STEP:
-        refuse(path, f'"control_timestep" is {shown(step)}', f"write seconds, above 0 and at most {_LONGEST_STEP:g}")
+        refuse(
+            path,
+            f'"control_timestep" is {shown(step)}',
+            f"write a number of seconds above 0 and at most {_LONGEST_STEP:g}",
+        )
     place = path.parent / file
     model = read_model(path, place)
     check_joints(path, model, step)
@@ -201,7 +208,7 @@ def read_description(path: Path | str) -> RobotDescription:
                 refuse(path, f'"{key}" names {shown(joint)}, a free joint', "name hinges and slides only")
     for point in (oriented := read_names(path, "oriented_points", content.get("oriented_points", []))):
         if point not in points:
-            refuse(path, f'"oriented_points" names {shown(point)}, none of "points"', "name some of these")
+            refuse(path, f'"oriented_points" names {shown(point)}, which is not among "points"', "name some of these")
     keyframe = content.get("keyframe")
     if keyframe is not None:
         check_keyframe(path, model, read_text(path, content, "keyframe"))
@@ -231,14 +238,17 @@ def read_description(path: Path | str) -> RobotDescription:
     )
     twice = [column for number, column in enumerate(found.columns) if column in found.columns[:number]]
     if twice:
-        refuse(path, f"recordings would have two columns {twice[0]}", "name sites, commands and joints apart")
+        refuse(path, f"recordings would have two columns {twice[0]}", "give sites, commands and joints different names")
     if (problem := found.adapter.check(found, model)) is not None:
         refuse(path, f'"adapter" is {shown(content["adapter"])}, but {problem}', "leave it out, or rename the parts")
     return found
 
 
 def check_simulates(description: RobotDescription) -> None:
-    """**Raises** `InputError` where MJX cannot simulate the model, with the reason."""
+    """Check that MJX can simulate the model.
+
+    **Raises** `InputError` with the reason if it cannot.
+    """
     found = check_mjx(description.load_model())
     if found is not None:
         refuse(description.file, f"MJX cannot simulate {description.model.name}: {found[0]}", found[1])

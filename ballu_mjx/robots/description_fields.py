@@ -1,6 +1,7 @@
-"""Single fields of a robot description in JSON: each is read with its type, or refused with place and mend.
+"""Readers of single fields of a robot description in JSON. They check the type and the value of each field.
 
-The readers take the description's path and the field's key for messages, and raise `InputError`.
+The readers take the description's path and the field's key for their messages. All of them raise `InputError` naming
+the file, the field and the fix.
 """
 
 from __future__ import annotations
@@ -19,30 +20,34 @@ from ballu_mjx.robots.adapter import RobotAdapter
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 _LONGEST = 60
 HORIZON_RANGE = (0.05, 100.0)
-"""Seconds that errors may be taken over."""
+"""Shortest and longest horizon of errors (s)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """What no recording of a robot exceeds; None: no limit."""
+    """Bounds that no recording of a robot exceeds. None if there is no bound."""
 
     height: tuple[float, float] | None = None
-    """m, along z."""
+    """Lowest and highest z (m)."""
     distance: float | None = None
-    """m, along x and y."""
+    """Largest distance from the origin along x and along y (m)."""
     speed: float | None = None
-    """m/s, between two samples along an axis."""
+    """Largest speed between two samples along an axis (m/s)."""
     angle: float | None = None
-    """rad of a hinge, m of a slide."""
+    """Largest absolute joint coordinate (rad for a hinge, m for a slide)."""
 
 
 def read_actuator(path: Path, key: str, value: Any) -> tuple[str, tuple[float, float] | None]:
-    """Return the actuator of a command, and its range where the description gives one."""
+    """Return the actuator of a command, and its range. The range is None if the description gives none."""
     if isinstance(value, str):
         return value, None
     if isinstance(value, dict) and set(value) == {"actuator", "range"} and isinstance(value["actuator"], str):
         return value["actuator"], read_pair(path, f"range of {key}", value["range"])
-    refuse(path, f'"commands" has {shown(value)} for {key}', 'write the actuator\'s name, or {"actuator", "range"}')
+    refuse(
+        path,
+        f'"commands" has {shown(value)} for {key}',
+        'write the actuator\'s name, or {"actuator": ..., "range": [...]}',
+    )
 
 
 def read_pair(path: Path, key: str, value: Any) -> tuple[float, float]:
@@ -53,7 +58,7 @@ def read_pair(path: Path, key: str, value: Any) -> tuple[float, float]:
 
 
 def read_limits(path: Path, value: Any) -> Limits:
-    """Return what no recording exceeds."""
+    """Return the bounds that no recording exceeds."""
     names = [field.name for field in dataclasses.fields(Limits)]
     if not isinstance(value, dict) or not set(value) <= set(names):
         refuse(path, f'"limits" is {shown(value)}', f"write an object with some of {', '.join(names)}")
@@ -69,7 +74,7 @@ def read_limits(path: Path, value: Any) -> Limits:
 
 
 def read_mirror(path: Path, value: Any, known: tuple[str, ...]) -> Mapping[str, str] | None:
-    """Return the `known` names that change places in the mirror image, both ways; None where there is no mirror."""
+    """Return the `known` names that the mirror image swaps, in both directions. None if the key is missing."""
     if value is None:
         return None
     if not isinstance(value, dict) or not all(isinstance(each, str) for each in value.values()):
@@ -79,12 +84,12 @@ def read_mirror(path: Path, value: Any, known: tuple[str, ...]) -> Mapping[str, 
     if unknown:
         refuse(path, f'"mirror" names {shown(unknown[0])}', "name points, commands and joints of the description")
     if len(pairs) != 2 * len(value):
-        refuse(path, '"mirror" names one twice', "name each once")
+        refuse(path, '"mirror" has a name twice', "write each name once")
     return pairs
 
 
 def read_adapter(path: Path, value: Any) -> RobotAdapter:
-    """Return the adapter that `module:Class` names; the plain one where there is none."""
+    """Return an instance of the adapter that `module:Class` names, or of `RobotAdapter` if the key is missing."""
     if value is None:
         return RobotAdapter()
     module, _, name = value.partition(":") if isinstance(value, str) else ("", "", "")
@@ -93,7 +98,7 @@ def read_adapter(path: Path, value: Any) -> RobotAdapter:
     except (ImportError, AttributeError, ValueError) as error:
         refuse(path, f'"adapter" is {shown(value)}, which cannot be imported ({said(error)})', "write module:Class")
     if not (isinstance(found, type) and issubclass(found, RobotAdapter)):
-        refuse(path, f'"adapter" is {shown(value)}, no RobotAdapter', "derive it from ballu_mjx.robots.adapter")
+        refuse(path, f'"adapter" is {shown(value)}, which is no RobotAdapter', "derive it from RobotAdapter")
     return found()
 
 
@@ -101,24 +106,24 @@ def read_text(path: Path, content: dict[str, Any], key: str) -> str:
     """Return a printable text that is not empty."""
     value = content[key]
     if not isinstance(value, str) or not value.strip() or not value.isprintable():
-        refuse(path, f'"{key}" is {shown(value)}', "write a text there")
+        refuse(path, f'"{key}" is {shown(value)}', "write printable text")
     return value
 
 
 def is_name(text: str) -> bool:
-    """Return whether a text is a name fit for recordings: letters, digits and underscores, a letter first."""
+    """Return whether a text is a valid name in recordings: up to 60 letters, digits and underscores, a letter first."""
     return _NAME.fullmatch(text) is not None and len(text) <= _LONGEST
 
 
 def read_name(path: Path, key: str, value: Any) -> str:
-    """Return a name fit for recordings."""
+    """Return a valid name in recordings (see `is_name`)."""
     if not isinstance(value, str) or not is_name(value):
         refuse(path, f'"{key}" has {shown(value)}', "give names of letters, digits and underscores, a letter first")
     return value
 
 
 def read_entries(path: Path, key: str, value: Any) -> tuple[Mapping[str, Any], ...]:
-    """Return a list of objects, as it is."""
+    """Return a list of objects, whose content is not checked."""
     if not isinstance(value, list) or not all(isinstance(each, dict) for each in value):
         refuse(path, f'"{key}" is {shown(value)}', "write a list of objects")
     return tuple(value)
@@ -132,7 +137,7 @@ def read_flag(path: Path, key: str, value: Any) -> bool:
 
 
 def read_horizons(path: Path, value: Any) -> tuple[float, ...]:
-    """Return seconds within `HORIZON_RANGE`, increasing, each once."""
+    """Return horizons (s) within `HORIZON_RANGE`, in increasing order and without duplicates."""
     low, high = HORIZON_RANGE
     if not isinstance(value, list) or not all(is_number(each) and low <= each <= high for each in value):
         refuse(path, f'"horizons" is {shown(value)}', f"write a list of seconds from {low:g} to {high:g}")
@@ -140,26 +145,26 @@ def read_horizons(path: Path, value: Any) -> tuple[float, ...]:
 
 
 def read_names(path: Path, key: str, value: Any) -> tuple[str, ...]:
-    """Return names fit for recordings, each once."""
+    """Return valid names in recordings (see `is_name`), all different."""
     if not isinstance(value, list):
         refuse(path, f'"{key}" is {shown(value)}', "write a list of names")
     names = tuple(read_name(path, key, each) for each in value)
     if len(set(names)) < len(names):
-        refuse(path, f'"{key}" names one twice', "name each once")
+        refuse(path, f'"{key}" has a name twice', "write each name once")
     return names
 
 
 def shown(value: Any) -> str:
-    """Return a value as messages show it."""
+    """Return a value as text for a message, shortened if it is long."""
     text = repr(value)
     return text if len(text) <= _LONGEST else text[:_LONGEST] + "..."
 
 
 def said(error: Exception) -> str:
-    """Return in one line what an error says."""
+    """Return the message of an error in one line, shortened if it is long."""
     return textwrap.shorten(re.sub(r"[^\x20-\x7e]+", " ", str(error)), 200) or type(error).__name__
 
 
 def refuse(path: Path, problem: str, mend: str) -> NoReturn:
-    """Raise `InputError` that names the file, what is wrong with it, and what mends that."""
+    """Raise `InputError` with the file, the problem and the fix."""
     raise InputError(f"{path}: {problem}; {mend}.")

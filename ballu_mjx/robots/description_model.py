@@ -1,4 +1,4 @@
-"""The MJCF model of a robot description: it is read, and found to have the sites, joints and actuators named there."""
+"""Read the MJCF model of a robot description, and check that it has the named sites, joints and actuators."""
 
 from __future__ import annotations
 
@@ -14,14 +14,17 @@ from ballu_mjx.robots.description_fields import is_name, refuse, said, shown
 
 
 def read_model(path: Path, place: Path) -> mujoco.MjModel:
-    """Return the model at `place`, which a description at `path` names; **raises** `InputError` where it is none."""
+    """Return the model at `place`, which the description at `path` names.
+
+    **Raises** `InputError` if there is no model that MuJoCo can read.
+    """
     mend = "give an MJCF file, relative to the description"
     try:
         there = place.is_file()
-    except (OSError, ValueError):  # a name that no file can have
+    except (OSError, ValueError):  # the name is not a valid path
         there = False
     if not there:
-        refuse(path, f'"model" is {shown(place.name)}, where there is no file', mend)
+        refuse(path, f'"model" is {shown(place.name)}, but there is no file of this name', mend)
     try:
         return mujoco.MjModel.from_xml_path(str(place))
     except (ValueError, mujoco.FatalError) as error:
@@ -29,13 +32,13 @@ def read_model(path: Path, place: Path) -> mujoco.MjModel:
 
 
 def checksum(path: Path, place: Path) -> str:
-    """Return the SHA-256 of a description and of all files of its model."""
+    """Return one SHA-256 of a description and all files of its model."""
     parts = [path, place, *_named_files(place)]
     return hashlib.sha256(b"\0".join(part.read_bytes() for part in parts)).hexdigest()
 
 
 def file_checksums(path: Path, place: Path) -> dict[str, str]:
-    """Return the SHA-256 of each of these files, by its path relative to the description's folder."""
+    """Return the SHA-256 of each of these files, by path relative to the description's folder."""
     folder = path.resolve().parent
     return {
         Path(os.path.relpath(part.resolve(), folder)).as_posix(): hashlib.sha256(part.read_bytes()).hexdigest()
@@ -44,10 +47,10 @@ def file_checksums(path: Path, place: Path) -> dict[str, str]:
 
 
 def _named_files(place: Path) -> list[Path]:
-    """Return the files that an MJCF file names, at any depth, but for itself.
+    """Return the files that an MJCF file names, at any depth, without the file itself.
 
-    MuJoCo looks for an asset in its compiler's folders and beside the file that names it, whichever it finds first. All
-    that it could find belong to the model.
+    MuJoCo searches for an asset in the compiler's folders and beside the file that names it, and takes the first match.
+    Here all matches count as files of the model.
     """
     found = [Path(name) for name in mujoco.mju_getXMLDependencies(str(place))]
     spec = mujoco.MjSpec.from_file(str(place))
@@ -64,10 +67,14 @@ def _named_files(place: Path) -> list[Path]:
 
 
 def check_joints(path: Path, model: mujoco.MjModel, control_timestep: float) -> None:
-    """**Raises** `InputError` where joints are of a kind that no robot may have, or time steps do not divide."""
+    """Check the joints and the time step of a model.
+
+    **Raises** `InputError` if a joint is of a kind that is not supported, or if the time step does not divide the
+    control step.
+    """
     kinds = mujoco.mjtJoint
     if not model.njnt:
-        refuse(path, '"model" has no joints', "give a robot that moves")
+        refuse(path, '"model" has no joints', "give a model of a robot that moves")
     for index, kind in enumerate(model.jnt_type):
         if kind == kinds.mjJNT_BALL or (kind == kinds.mjJNT_FREE and index > 0):
             if kind == kinds.mjJNT_BALL:
@@ -75,7 +82,7 @@ def check_joints(path: Path, model: mujoco.MjModel, control_timestep: float) -> 
             else:
                 later = model.jnt_type[0] != kinds.mjJNT_FREE
                 called = "a free joint that is not the first joint" if later else "a second free joint"
-            mend = "make it of hinges and slides; one free joint may come first"
+            mend = "use hinges and slides; only the first joint may be free"
             refuse(path, f'"model" has {called}, {shown(model.joint(index).name)}', mend)
     count = control_timestep / model.opt.timestep
     if abs(count - round(count)) > 1e-6 or count < 1:
@@ -84,7 +91,7 @@ def check_joints(path: Path, model: mujoco.MjModel, control_timestep: float) -> 
 
 
 def free_joints(model: mujoco.MjModel, held: tuple[str, ...]) -> list[str]:
-    """Return the hinges and slides that have names fit for recordings and are not held."""
+    """Return the hinges and slides that have valid names in recordings and are not held."""
     names = (model.joint(index).name for index in range(model.njnt) if model.jnt_type[index] in _ONE_DIRECTION)
     return [name for name in names if is_name(name) and name not in held]
 
@@ -93,7 +100,10 @@ _ONE_DIRECTION = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SL
 
 
 def check_sites(path: Path, model: mujoco.MjModel, tracked: str, points: tuple[str, ...]) -> None:
-    """**Raises** `InputError` where a site is missing, does not move, or is of another robot."""
+    """Check the tracked site and the points.
+
+    **Raises** `InputError` if a site is missing, does not move, or belongs to another robot than the tracked site.
+    """
     linked, roots = _linked_roots(model), []
     for key, site in (("tracked", tracked), *(("points", point) for point in points)):
         body = model.site_bodyid[find_part(path, model, mujoco.mjtObj.mjOBJ_SITE, key, site)]
@@ -101,13 +111,13 @@ def check_sites(path: Path, model: mujoco.MjModel, tracked: str, points: tuple[s
         if model.body_weldid[body] == 0:
             refuse(path, f'"{key}" names {shown(site)}, a site that does not move', "name sites of the robot only")
         if roots[-1] != roots[0]:
-            problem = f'"{key}" names {shown(site)}, which is of another robot than {tracked}'
-            fix = "give sites below one body of the world, or close the loop between them by an equality"
+            problem = f'"{key}" names {shown(site)}, which belongs to another robot than {tracked}'
+            fix = "name sites below one child of the world body, or connect their bodies by an equality"
             refuse(path, problem, fix)
 
 
 def _linked_roots(model: mujoco.MjModel) -> dict[int, int]:
-    """By body of the world: one that stands for it and all that equalities (closed loops) link it with."""
+    """Return a representative of each root body. Root bodies that equalities (closed loops) connect share one."""
     linked = {int(root): int(root) for root in model.body_rootid}
     for number in range(model.neq):
         ends = [int(model.eq_obj1id[number]), int(model.eq_obj2id[number])]
@@ -124,14 +134,21 @@ def _linked_roots(model: mujoco.MjModel) -> dict[int, int]:
 def check_actuators(
     path: Path, model: mujoco.MjModel, driven: Mapping[str, tuple[str, tuple[float, float] | None]]
 ) -> tuple[tuple[float, float], ...]:
-    """Return the range of each command; **raises** `InputError` where the model's actuators are not those named."""
+    """Return the range of each command.
+
+    **Raises** `InputError` if the actuators in `driven` are not those of the model.
+    """
     own = [model.actuator(index).name for index in range(model.nu)]
     named = [name for name, _ in driven.values()]
     if named != own:
         problem = f'"commands" has the actuators {shown(named)}'
-        refuse(path, problem, f"name the model's, all in its order: {textwrap.shorten(', '.join(own), 200) or 'none'}")
+        refuse(
+            path,
+            problem,
+            f"name the model's actuators, all in its order: {textwrap.shorten(', '.join(own), 200) or 'none'}",
+        )
     if model.na:
-        refuse(path, '"model" has actuators with states of their own', "give actuators without activation")
+        refuse(path, '"model" has actuators with activation states', "use actuators without them")
     ranges = []
     for index, (name, given) in enumerate(driven.values()):
         if given is None and not model.actuator_ctrllimited[index]:
@@ -145,18 +162,28 @@ def check_actuators(
 
 
 def check_keyframe(path: Path, model: mujoco.MjModel, name: str) -> None:
-    """**Raises** `InputError` where the model has no keyframe of that name."""
+    """Check that the model has a keyframe of this name.
+
+    **Raises** `InputError` if it does not.
+    """
     if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name) < 0:
         own = ", ".join(model.key(index).name for index in range(model.nkey)) or "none"
-        refuse(path, f'"keyframe" is {shown(name)}, no keyframe of the model', f"there are {own}")
+        refuse(path, f'"keyframe" is {shown(name)}, which is no keyframe of the model', f"there are {own}")
 
 
 def find_part(path: Path, model: mujoco.MjModel, kind: mujoco.mjtObj, key: str, name: str) -> int:
-    """Return the index of a site or joint that a key names; **raises** `InputError` where the model has none."""
+    """Return the index of a site or joint that the description names under `key`.
+
+    **Raises** `InputError` if the model does not have it.
+    """
     index = mujoco.mj_name2id(model, kind, name)
     if index < 0:
         what = "site" if kind == mujoco.mjtObj.mjOBJ_SITE else "joint"
         count, named = (model.nsite, model.site) if what == "site" else (model.njnt, model.joint)
         own = ", ".join(named(number).name for number in range(count)) or "none"
-        refuse(path, f'"{key}" names {shown(name)}, no {what} of the model', f"there are {textwrap.shorten(own, 200)}")
+        refuse(
+            path,
+            f'"{key}" names {shown(name)}, which is no {what} of the model',
+            f"there are {textwrap.shorten(own, 200)}",
+        )
     return int(index)

@@ -1,4 +1,4 @@
-"""A robot's model with other numbers, as an MJCF file with its assets in one folder."""
+"""Write a robot's model with changed values as an MJCF file, with its assets in one folder."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ _ELEMENTS: Mapping[str, tuple[str, str]] = {
     "actuator_forcerange": ("actuators", "forcerange"),
     "body_gravcomp": ("bodies", "gravcomp"),
 }
-"""Where MuJoCo's specification of a model has a field of the compiled one."""
+"""Elements and attribute in MuJoCo's model specification (`mujoco.MjSpec`), by field of the compiled model."""
 _INERTIAL = ("body_mass", "body_ipos", "body_iquat", "body_inertia")
 _ASSETS = "assets"
 
 
 def write_mjcf(file: Path, wanted: mujoco.MjModel, folder: Path, name: str) -> dict[str, np.ndarray]:
-    """Write the model in `file` with the numbers of `wanted` as `folder / name`; its assets go into `folder / assets`.
+    """Write the model in `file` with the values of `wanted` as `folder / name`, and its assets into `folder / assets`.
 
-    **Returns** what MJCF's text, which has six digits, leaves out: `model/FIELD` and `option/FIELD` by name, whole
-    fields, with the values of `wanted`.
+    **Returns** the fields that the MJCF file does not reproduce exactly, since its numbers have six digits. Names are
+    `model/FIELD` and `option/FIELD`. Each is a whole field with the values of `wanted`.
 
-    **Raises** `InputError` where MuJoCo does not read again what it writes.
+    **Raises** `InputError` if an asset is missing, or if MuJoCo cannot read the file that it wrote.
     """
     spec = mujoco.MjSpec.from_file(str(file))
     _write_fields(spec, wanted)
@@ -57,6 +57,7 @@ def write_mjcf(file: Path, wanted: mujoco.MjModel, folder: Path, name: str) -> d
 
 
 def _write_fields(spec: mujoco.MjSpec, wanted: mujoco.MjModel) -> None:
+    """Set the values in which `wanted` differs from the compiled specification, in place."""
     base = spec.compile()
     spec.option.iterations = wanted.opt.iterations
     for field, (kind, own) in _ELEMENTS.items():
@@ -85,7 +86,7 @@ def _write_fields(spec: mujoco.MjSpec, wanted: mujoco.MjModel) -> None:
 
 
 def _copy_assets(spec: mujoco.MjSpec, file: Path, folder: Path) -> None:
-    """Copy what the model names into one folder, and have the specification name it there."""
+    """Copy the model's assets into one folder, and refer to the copies in the specification."""
     included = [Path(each).parent for each in mujoco.mju_getXMLDependencies(str(file)) if each.endswith(".xml")]
     places = [place / sub for place in (file.parent, *included) for sub in (spec.meshdir, spec.texturedir, "")]
     taken: dict[str, Path] = {}
@@ -93,7 +94,7 @@ def _copy_assets(spec: mujoco.MjSpec, file: Path, folder: Path) -> None:
     def copy(named: str) -> str:
         found = next((place / named for place in places if (place / named).is_file()), None)
         if found is None:
-            raise InputError(f"{file}: names {named}, which is not there; restore it.")
+            raise InputError(f"{file}: its asset {named} is missing; restore it.")
         name, number = found.name, 0
         while taken.setdefault(name, found.resolve()) != found.resolve():
             number += 1
@@ -114,6 +115,7 @@ def _copy_assets(spec: mujoco.MjSpec, file: Path, folder: Path) -> None:
 
 
 def _differences(written: mujoco.MjModel, wanted: mujoco.MjModel, file: Path) -> dict[str, np.ndarray]:
+    """Return the floating-point fields in which `written` differs from `wanted`, with the values of `wanted`."""
     found: dict[str, np.ndarray] = {}
     for owner, one, other in (("model", written, wanted), ("option", written.opt, wanted.opt)):
         for name in dir(other):
@@ -124,7 +126,9 @@ def _differences(written: mujoco.MjModel, wanted: mujoco.MjModel, file: Path) ->
                 continue
             own = np.asarray(getattr(one, name))
             if own.shape != value.shape:
-                raise InputError(f"{file}: MuJoCo writes this model with other parts ({name}); simplify it.")
+                raise InputError(
+                    f"{file}: MuJoCo changes the size of {name} when it writes this model; simplify the model."
+                )
             if not np.array_equal(own, value, equal_nan=True):
                 found[f"{owner}/{name}"] = value.copy()
     return found

@@ -1,4 +1,4 @@
-"""What MJX cannot simulate of a model, or not in reasonable time, in words that say where and what to do."""
+"""Check that MJX can simulate a model in reasonable time. Problems are given in words, with their place and a fix."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from mujoco import mjx
 from mujoco.mjx._src import collision_driver
 
 LARGEST_HULL = 200
-"""Vertices of a collision mesh's hull, as MJX's documentation advises; against a box or another mesh: `LARGEST_PAIR`.
-Compiling and stepping take minutes and gigabytes beyond."""
+"""Largest number of vertices of a collision mesh's convex hull, as MJX's documentation advises. Compiling and stepping
+take minutes and gigabytes beyond it."""
 LARGEST_PAIR = 32
+"""The same for a mesh that may collide with a box or with another mesh."""
 _MESH, _BOX = int(mujoco.mjtGeom.mjGEOM_MESH), int(mujoco.mjtGeom.mjGEOM_BOX)
-_LOOKS_ALONE = 'contype="0" conaffinity="0"'
+_VISUAL_ONLY = 'contype="0" conaffinity="0"'
 
 
 def find_unsupported(model: mujoco.MjModel) -> tuple[str, str] | None:
-    """Return the first problem of a model in MJX, and its fix; None where there is none."""
+    """Return the first problem of a model in MJX, and its fix. None if there is no problem."""
     for check in _CHECKS:
         found = check(model)
         if found is not None:
@@ -27,6 +28,7 @@ def find_unsupported(model: mujoco.MjModel) -> tuple[str, str] | None:
 
 
 def _options(model: mujoco.MjModel) -> tuple[str, str] | None:
+    """Check integrator, solver, fluid and friction cones."""
     option = model.opt
     for name, value, kind, known in (
         ("integrator", option.integrator, mujoco.mjtIntegrator, mjx.IntegratorType),
@@ -37,16 +39,17 @@ def _options(model: mujoco.MjModel) -> tuple[str, str] | None:
             return f'it has the {name} "{_word(kind(value))}"', f'write {name}="{usual.split()[0]}" ({usual})'
     fluid = option.density > 0 or option.viscosity > 0 or np.any(option.wind)
     if fluid and option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
-        problem = 'it has a fluid (density, viscosity or wind) beside integrator="implicitfast"'
-        return problem, 'write integrator="Euler", or leave the fluid out and identify it by `train fluid`'
+        problem = 'it has a fluid (density, viscosity or wind) together with integrator="implicitfast"'
+        return problem, 'write integrator="Euler", or remove the fluid and identify it with `train fluid`'
     if option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and np.any(model.geom_condim[_colliding(model)] == 1):
-        return 'it has elliptic cones beside condim="1"', 'write cone="pyramidal", or condim="3"'
+        return 'it has elliptic cones together with condim="1"', 'write cone="pyramidal", or condim="3"'
     return None
 
 
 def _parts(model: mujoco.MjModel) -> tuple[str, str] | None:
+    """Check deformable parts, equalities, sensors and actuators."""
     if model.nflex:
-        return "it has deformable parts (flex)", "make them of rigid bodies"
+        return "it has deformable parts (flex)", "replace them by rigid bodies"
     own, actuator = mujoco.mjtObj, mujoco.mjtObj.mjOBJ_ACTUATOR
     for what, kinds, known, kind, named, fix in (
         ("an equality", model.eq_type, mjx.EqType, mujoco.mjtEq, own.mjOBJ_EQUALITY, "use connect, weld or joint"),
@@ -64,19 +67,20 @@ def _parts(model: mujoco.MjModel) -> tuple[str, str] | None:
         np.concatenate([model.sensor_objtype[contact], model.sensor_reftype[contact]]),
         [int(own.mjOBJ_SITE), int(own.mjOBJ_BODY), int(own.mjOBJ_XBODY)],
     ).any():  # fmt: skip
-        return "it has a contact sensor of sites or bodies", "name geoms there, or leave it out"
+        return "it has a contact sensor of sites or bodies", "name geoms there, or remove the sensor"
     return None
 
 
 def _collisions(model: mujoco.MjModel) -> tuple[str, str] | None:
+    """Check the kinds of colliding geoms, the margins of meshes, and the size of their convex hulls."""
     largest: tuple[float, str] | None = None
     for one, other, pair in collision_driver.geom_pairs(model):
         kinds = model.geom_type[[one, other]]
         names = f"{_geom(model, one)} and {_geom(model, other)}"
         if not collision_driver.has_collision_fn(*kinds):
             shapes = " and ".join(_word(mujoco.mjtGeom(kind)) for kind in kinds)
-            fix = f"exclude the pair, give one of them {_LOOKS_ALONE}, or use spheres, capsules or boxes"
-            return f"{names} collide, and for {shapes} it has no collisions", fix
+            fix = f"exclude the pair, give one of them {_VISUAL_ONLY}, or use spheres, capsules or boxes"
+            return f"{names} collide, but MJX has no collisions of {shapes}", fix
         if not np.isin(kinds, [_MESH, int(mujoco.mjtGeom.mjGEOM_HFIELD)]).any():
             continue
         margin = model.pair_margin[pair] if pair >= 0 else model.geom_margin[one] + model.geom_margin[other]
@@ -94,13 +98,13 @@ def _collisions(model: mujoco.MjModel) -> tuple[str, str] | None:
                 largest = (
                     count / limit,
                     (
-                        f"the hull of the mesh {mesh} ({_geom(model, geom)}) has {count:,} vertices, and {what}: more "
+                        f"the hull of the mesh {mesh} ({_geom(model, geom)}) has {count:,} vertices, and {what}; more "
                         f"than {limit} are too many"
                     ),
                 )
     if largest is None:
         return None
-    fix = f'give the mesh maxhullvert="{LARGEST_PAIR}", or its geoms {_LOOKS_ALONE} and primitives beside them'
+    fix = f'give the mesh maxhullvert="{LARGEST_PAIR}", or give its geoms {_VISUAL_ONLY} and add primitive geoms'
     return largest[1], fix
 
 
@@ -108,14 +112,14 @@ _CHECKS: tuple[Callable[[mujoco.MjModel], tuple[str, str] | None], ...] = (_opti
 
 
 def check_mjx(model: mujoco.MjModel) -> tuple[str, str] | None:
-    """Return why MJX does not take a model, and a fix; None where it does."""
+    """Return the reason why MJX cannot simulate a model, and a fix. None if MJX can simulate it."""
     found = find_unsupported(model)
     if found is not None:
         return found
     try:
         mjx.put_model(model)
     except (NotImplementedError, ValueError) as error:
-        return f"it says: {' '.join(str(error).split())[:200]}", "take out of the model what it names"
+        return f"MJX says: {' '.join(str(error).split())[:200]}", "remove from the model the feature that MJX names"
     return None
 
 
@@ -124,7 +128,7 @@ def _colliding(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _hull_vertices(model: mujoco.MjModel, mesh: int) -> int:
-    """Vertices of a mesh's convex hull."""
+    """Return the number of vertices of a mesh's convex hull."""
     graph = int(model.mesh_graphadr[mesh])
     return int(model.mesh_graph[graph] if graph >= 0 else model.mesh_vertnum[mesh])
 
@@ -134,5 +138,5 @@ def _geom(model: mujoco.MjModel, geom: int) -> str:
 
 
 def _word(value: object) -> str:
-    """Return what the MJCF calls a value of MuJoCo's enumerations."""
+    """Return the MJCF keyword of a value of MuJoCo's enumerations."""
     return str(getattr(value, "name", value)).rpartition("_")[2].lower()

@@ -1,4 +1,4 @@
-"""Robots by name or file."""
+"""Robots, loaded by name or from a description file."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from ballu_mjx.robots.description_model import file_checksums
 from ballu_mjx.robots.model import assets
 
 DEFAULT_ROBOT = "ballu"
-"""The robot of commands without `--robot`, and of runs whose configuration names none."""
+"""Robot of commands without `--robot`, and of runs whose configuration names no robot."""
 BUNDLED = "bundled:"
-"""Begins the path of a file that comes with the package."""
+"""Prefix of the path of a file that comes with the package."""
 _ENDING = ".robot.json"
 _LONGEST_PATH = 300
 _MOST_NAMED = 3
-"""Files that have changed, in a message."""
+"""Largest number of changed files that a message names."""
 
 
 def load_robot(robot: str | Path = DEFAULT_ROBOT) -> RobotDescription:
-    """Return the robot of a name (one that comes with the package) or of a description file.
+    """Load a robot by its name, if it comes with the package, or from a description file.
 
-    **Raises** `InputError` where there is no such robot, or its description is at fault.
+    **Raises** `InputError` if the robot does not exist, or if its description is invalid.
     """
     name = str(robot)
     return _bundled(name) if name in bundled_robots() else read_description(_file(name))
@@ -43,8 +43,8 @@ def _bundled(name: str) -> RobotDescription:
 
 
 def describe_robot(robot: RobotDescription) -> dict[str, Any]:
-    """Return what files say of the robot that they are of: path of its description, and hashes of all and of each
-    file."""
+    """Return the entry that identifies a robot in files of results: the path of its description, one SHA-256 of all its
+    files, and the SHA-256 of each file."""
     files = file_checksums(robot.file, robot.model)
     return {"path": portable_path(robot.file, assets()), "sha256": robot.sha256, "files": files}
 
@@ -52,18 +52,19 @@ def describe_robot(robot: RobotDescription) -> dict[str, Any]:
 def find_robot(described: Mapping[str, Any], named_in: Path) -> RobotDescription:
     """Return the robot that `describe_robot` described in the file `named_in`.
 
-    **Raises** `InputError` where its description is gone, has changed, or its model has.
+    **Raises** `InputError` if the entry is damaged, if the description is missing, or if the description or its model
+    has changed.
     """
-    fix = f"restore it: {named_in} names it"
+    fix = f"restore it, because {named_in} refers to it"
     if not isinstance(described, Mapping) or not all(isinstance(described.get(key), str) for key in ("path", "sha256")):
-        raise InputError(f"{named_in}: does not say of which robot it is; restore it.")
+        raise InputError(f"{named_in}: the entry of its robot is missing or damaged; restore the file.")
     stored, there = described["path"], False
     path = assets() / stored.removeprefix(BUNDLED) if stored.startswith(BUNDLED) else Path(stored)
-    with contextlib.suppress(OSError, ValueError):  # a name that no file can have
+    with contextlib.suppress(OSError, ValueError):  # the name is not a valid path
         there = path.is_file()
     if not there:
         shown = stored if len(stored) < _LONGEST_PATH else stored[:_LONGEST_PATH] + "..."
-        raise InputError(f"{shown}: the robot description is gone; {fix}.")
+        raise InputError(f"{shown}: the robot description is missing; {fix}.")
     found = read_description(path)
     if found.sha256 != described["sha256"]:
         problem = f"the robot description, or its model, has changed since {named_in} was written"
@@ -72,7 +73,7 @@ def find_robot(described: Mapping[str, Any], named_in: Path) -> RobotDescription
 
 
 def _name_changes(stored: Any, robot: RobotDescription) -> str:
-    """Which files differ from what `describe_robot` stored of them; nothing where it stored none."""
+    """Return the names of files whose stored hash differs, in words. Empty if no hashes of single files are stored."""
     if not isinstance(stored, Mapping):
         return ""
     now = file_checksums(robot.file, robot.model)
@@ -83,7 +84,7 @@ def _name_changes(stored: Any, robot: RobotDescription) -> str:
 
 
 def portable_path(path: Path, bundled: Path) -> str:
-    """Return where a file lies; of one below the folder `bundled`, independently of the installation."""
+    """Return the absolute path of a file. Below the folder `bundled`, return `BUNDLED` and the relative path."""
     absolute, bundled = path.resolve(), bundled.resolve()
     return BUNDLED + absolute.relative_to(bundled).as_posix() if absolute.is_relative_to(bundled) else str(absolute)
 
@@ -92,5 +93,5 @@ def _file(name: str) -> Path:
     path = Path(name)
     if not path.suffix and not path.exists():
         known = ", ".join(bundled_robots())
-        raise InputError(f"--robot {name}: there is no robot of this name; there is {known}, or give a .robot.json.")
+        raise InputError(f"--robot {name}: no bundled robot has this name; give one of {known}, or a .robot.json file.")
     return path

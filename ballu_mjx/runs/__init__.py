@@ -1,1 +1,1 @@
-"""A run: its folder, checkpoints, metrics and what it shows on the terminal."""
+"""A run: its folder, checkpoints, metrics, and progress on the terminal."""

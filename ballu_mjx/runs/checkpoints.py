@@ -20,26 +20,20 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 
-try:
-    import fcntl
-except ImportError:  # Windows, where runs are not locked
-    fcntl = None
-
-
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.runs.layout import CHECKPOINTS_FOLDER, KEPT, PARAMS_FOLDER, RECORD_FILE, TRAINING_FOLDER
 
 _LOG = logging.getLogger(__name__)
 CHECKPOINT_OVERHEAD = 2**20
-"""Bytes of a checkpoint beside its arrays, at most."""
+"""Upper bound of a checkpoint's size without its arrays (bytes)."""
 
 Which = Literal["best", "last"] | int
 
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """What `Run.save` wrote; see there."""
+    """Checkpoint as `folder.Run.save` writes it."""
 
     step: int
     params: dict[str, Any]
@@ -48,11 +42,11 @@ class Checkpoint:
 
 
 def restore_checkpoint(folder: Path, which: Which) -> tuple[int, dict[str, Any]]:
-    """Step and parameters of a run's best or last checkpoint, or of that of a step.
+    """Return step and parameters of a run's checkpoint: the best, the last, or that of a given step.
 
-    A damaged last checkpoint is told on the terminal, and the one before taken.
+    If the last checkpoint is damaged, the one before is read, and the terminal shows a warning.
 
-    **Raises** `InputError` where there is none, or that which was asked for is damaged.
+    **Raises** `InputError` if there is no checkpoint, or if the requested one is damaged.
     """
     if which == "last":
         checkpoint = last_checkpoint(folder)
@@ -66,14 +60,14 @@ def restore_checkpoint(folder: Path, which: Which) -> tuple[int, dict[str, Any]]
             raise _no_checkpoint(folder, "validated checkpoint" if which == "best" else "checkpoint")
         return step, _read(folder, step, training=False).params
     except _DamagedError as error:
-        mend = "restore it from a copy, or delete its folder: then the next best is taken"
+        mend = "restore it from a copy, or delete its folder to use the next best"
         raise InputError(f"{error}; {mend}.") from error
 
 
 def last_checkpoint(folder: Path, *, training: bool = False) -> Checkpoint:
-    """A run's last checkpoint that is whole, with or without what it takes to go on; damaged ones are logged.
+    """Return a run's last intact checkpoint, with or without the training state. Damaged ones are logged.
 
-    **Raises** `InputError` where there is none.
+    **Raises** `InputError` if there is none.
     """
     steps = list_checkpoints(folder)
     for step in reversed(steps):
@@ -82,42 +76,49 @@ def last_checkpoint(folder: Path, *, training: bool = False) -> Checkpoint:
         except _DamagedError as error:
             _LOG.warning("%s; taking the one before.", error)
     if steps:
-        raise InputError(f"{folder}: all checkpoints of the run are damaged; restore one from a copy or start anew.")
+        raise InputError(
+            f"{folder}: all checkpoints of the run are damaged; restore one from a copy, or start a new run."
+        )
     raise _no_checkpoint(folder, "checkpoint")
 
 
 def list_checkpoints(folder: Path) -> list[int]:
-    """Steps of the checkpoints that a run has kept, in order."""
+    """Return the steps of the checkpoints in a run's folder, in order."""
     place = folder / CHECKPOINTS_FOLDER
     return sorted(ocp.utils.checkpoint_steps(place)) if place.is_dir() else []
 
 
 class _DamagedError(Exception):
-    """A checkpoint that does not hold what was written."""
+    """Error for a checkpoint whose content is not what was written."""
 
 
 def _read(folder: Path, step: int, *, training: bool) -> Checkpoint:
-    """**Raises** `_DamagedError`."""
+    """Read a checkpoint.
+
+    **Raises** `_DamagedError` if it is damaged.
+    """
     place = (folder / CHECKPOINTS_FOLDER / str(step)).resolve()
     record = _record(folder, step)
-    old = place / "default"  # of version 1
+    old = place / "default"  # format version 1
     try:
         params = _standard(old if old.is_dir() else place / PARAMS_FOLDER)
         more = _standard(place / TRAINING_FOLDER) if training and (place / TRAINING_FOLDER).is_dir() else None
-    except Exception as error:  # orbax, tensorstore and the decoders raise whatever damage brings them to
+    except Exception as error:  # damage causes many kinds of errors in orbax, tensorstore and decoders
         raise _DamagedError(f"{place}: the checkpoint cannot be read ({type(error).__name__})") from error
     return Checkpoint(step, params, more, record["notes"])
 
 
 def _record(folder: Path, step: int) -> dict[str, Any]:
-    """What is written beside a checkpoint of it. Before orbax sees the checkpoint: it does not take damage quietly.
+    """Return a checkpoint's record (score, notes, checksums) after a check that the checkpoint is as it was written.
 
-    **Raises** `_DamagedError` where the checkpoint is not as it was written.
+    The check comes before orbax reads the checkpoint, since orbax does not handle damage quietly.
+
+    **Raises** `_DamagedError` if the checkpoint has changed or is incomplete.
     """
     place = folder / CHECKPOINTS_FOLDER / str(step)
     path = place / RECORD_FILE
     try:
-        if (place / "default").is_dir():  # of version 1, which has no checksums
+        if (place / "default").is_dir():  # format version 1, without checksums
             score = place / "metrics" / "metrics"
             return {"score": json.loads(score.read_bytes())["score"] if score.exists() else None, "notes": {}}
         record = json.loads(path.read_bytes())
@@ -128,7 +129,7 @@ def _record(folder: Path, step: int) -> dict[str, Any]:
         raise _DamagedError(f"{path}: the checkpoint is damaged") from error
     if not intact:
         raise _DamagedError(f"{path}: the checkpoint is damaged")
-    if record.get("step", step) != step:  # older ones do not say
+    if record.get("step", step) != step:  # older records have no step
         raise _DamagedError(f"{place}: the checkpoint is that of step {record['step']}")
     now = file_checksums(place)
     for name, checksum in record["files"].items():
@@ -138,12 +139,13 @@ def _record(folder: Path, step: int) -> dict[str, Any]:
 
 
 def file_checksums(place: Path) -> dict[str, str]:
-    """SHA-256 of every file of a checkpoint but its record."""
+    """Return the SHA-256 of every file of a checkpoint except its record."""
     files = sorted(path for path in place.rglob("*") if path.is_file() and not path.name.startswith(RECORD_FILE))
     return {path.relative_to(place).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 def record_checksum(record: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a checkpoint's record without its own checksum."""
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
@@ -153,7 +155,7 @@ def _standard(place: Path) -> dict[str, Any]:
 
 
 def drop_checkpoints(folder: Path, after: int) -> None:
-    """Remove checkpoints after a step, and all that are damaged or half-written, over which orbax would stumble."""
+    """Remove checkpoints after a step, and all that are damaged or incomplete, with which orbax would fail."""
 
     def keep(step: int) -> bool:
         try:
@@ -173,6 +175,7 @@ def _no_checkpoint(folder: Path, kind: str) -> InputError:
 
 
 def checkpoint_manager(folder: Path) -> ocp.CheckpointManager:
+    """Return the orbax manager of a run's checkpoints, which keeps the last `KEPT` and the best."""
     best = policies.BestN(get_metric_fn=_score, reverse=True, n=1, keep_checkpoints_without_metrics=False)
     options = ocp.CheckpointManagerOptions(
         best_fn=_score,
@@ -183,12 +186,12 @@ def checkpoint_manager(folder: Path) -> ocp.CheckpointManager:
         multiprocessing_options=_alone(),
     )
     place = (folder / CHECKPOINTS_FOLDER).resolve()
-    place.mkdir(parents=True, exist_ok=True)  # which the manager would do only if all processes had one
+    place.mkdir(parents=True, exist_ok=True)  # The manager creates it only if all processes have one.
     return ocp.CheckpointManager(place, options=options)
 
 
 def _alone() -> ocp.options.MultiprocessingOptions:
-    """This process reads and writes by itself, whatever others train with it."""
+    """Return options by which this process reads and writes alone, even if several processes train together."""
     if jax.process_count() == 1:
         return ocp.options.MultiprocessingOptions()
     number = jax.process_index()
@@ -199,7 +202,7 @@ def _alone() -> ocp.options.MultiprocessingOptions:
 
 @contextlib.contextmanager
 def quiet_when_full(manager: ocp.CheckpointManager) -> Iterator[None]:
-    """Keep what orbax says of a full disk off the terminal: each of its threads fills pages. The exception stays."""
+    """Suppress orbax's output about a full disk: each of its threads fills pages. The exception still propagates."""
     stderr, before = sys.stderr, logging.root.manager.disable
     sys.stderr = said = io.StringIO()
     logging.disable(logging.CRITICAL)
@@ -209,11 +212,11 @@ def quiet_when_full(manager: ocp.CheckpointManager) -> Iterator[None]:
     except Exception as error:
         full = files.is_full(error)
         if full:
-            with contextlib.suppress(Exception):  # the same once more
-                manager.close()  # and with it, its threads
+            with contextlib.suppress(Exception):  # the disk is still full
+                manager.close()  # ends its threads
         raise
     finally:
-        if full:  # tensorstore's threads go on complaining until the process ends
+        if full:  # tensorstore's threads print errors until the process ends
             sys.stderr = _OfThisThread(stderr)
         else:
             sys.stderr = stderr
@@ -222,7 +225,7 @@ def quiet_when_full(manager: ocp.CheckpointManager) -> Iterator[None]:
 
 
 class _OfThisThread(io.TextIOBase):
-    """A stream that takes what the thread which made it says, and drops what others do."""
+    """Text stream that passes on output of the thread that created it, and drops output of other threads."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream, self._thread = stream, threading.get_ident()

@@ -1,13 +1,13 @@
-"""A run: its folder, and what it shows of itself on the terminal.
+"""The folder of a run, which holds these files:
 
-config.json         all it takes to repeat the run
-metrics.jsonl       one JSON object a line: `step` (control steps) and what was measured there
-tensorboard/        the same for TensorBoard
-wandb/              the same for Weights & Biases, on demand
-checkpoints/STEP/   the last three, and the best by validation (orbax): `params`, all it takes to use what was
-                    learned; `training`, what else it takes to go on; `record.json`, checksums of all files
+config.json         everything needed to repeat the run
+metrics.jsonl       one JSON object per line: `step` (control steps) and the measurements at that step
+tensorboard/        the same measurements for TensorBoard
+wandb/              the same measurements for Weights & Biases, on request
+checkpoints/STEP/   the last three, and the best by validation (orbax): `params`, everything needed to use the
+                    result; `training`, the further state needed to resume; `record.json`, checksums of all files
 evaluation.txt, evaluation.json, learning_curve.png, tracking.png
-replay.npz          what the robots did, for `ballu_mjx report` and `ballu_mjx view`
+replay.npz          motions of the robots, for `ballu_mjx report` and `ballu_mjx view`
 """
 
 from __future__ import annotations
@@ -64,29 +64,31 @@ Config = TypeVar("Config")
 
 
 def new_folder(output: Path | None, task: str) -> Path:
-    """The folder of a new run, empty or not there yet: `output`, or one under `runs/` named after task and time.
+    """Return the folder of a new run: `output`, or a folder in `runs/` that is named after task and time.
 
-    **Raises** `InputError` where `output` holds something, or cannot be written to.
+    The folder is empty or does not exist yet.
+
+    **Raises** `InputError` if `output` is not empty, or if it cannot be written to.
     """
     if output is None:
         stem = f"{task}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         names = (stem if not number else f"{stem}-{number + 1}" for number in range(1000))
         output = next(folder for name in names if not (folder := Path("runs") / name).exists())
     if output.exists() and not output.is_dir():
-        raise InputError(f"{output}: is a file; give --output a folder that is new or empty.")
+        raise InputError(f"{output}: this is a file; give --output a folder that is new or empty.")
     if output.exists() and any(output.iterdir()):
         mend = "give --output a folder that is new or empty"
-        if any((output / CHECKPOINTS_FOLDER).glob(f"*/{TRAINING_FOLDER}")):  # others cannot go on
-            mend = f"--resume {output} goes on with it, or give --output another folder"
+        if any((output / CHECKPOINTS_FOLDER).glob(f"*/{TRAINING_FOLDER}")):  # others cannot be resumed
+            mend = f"resume the run with --resume {output}, or give --output another folder"
         raise InputError(f"{output}: the folder is not empty; {mend}.")
     files.check_folder(output)
     return output
 
 
 def read_config(folder: Path, *tasks: str) -> dict[str, Any]:
-    """The content of a run's `config.json`.
+    """Return the content of a run's `config.json`.
 
-    **Raises** `InputError` where `folder` is no run of one of `tasks`.
+    **Raises** `InputError` if `folder` is not a run of one of `tasks`, or if the file is damaged.
     """
     path = folder / CONFIG_FILE
     if not path.is_file():
@@ -94,15 +96,15 @@ def read_config(folder: Path, *tasks: str) -> dict[str, Any]:
     mend = "restore it or start a new run"
     content = files.read_json(path, mend)
     if content.get("format") not in READABLE_FORMATS:
-        raise InputError(f"{path}: is not of the format {RUN_FORMAT}; use the version of ballu_mjx that wrote it.")
+        raise InputError(f"{path}: the format is not {RUN_FORMAT}; use the version of ballu_mjx that wrote it.")
     if content.get("task") not in tasks:
         needed = " or ".join(repr(task) for task in tasks)
         raise InputError(
-            f"{path}: is of a run of {shorten_value(content.get('task'))}; one of {needed} is needed here."
+            f"{path}: the task of this run is {shorten_value(content.get('task'))}; give a run of {needed}."
         )
     for name, fits in _SHAPES.items():
         if name in content and not fits(content[name]):
-            raise InputError(f'{path}: "{name}" is not what a run keeps there, {shorten_value(content[name])}; {mend}.')
+            raise InputError(f'{path}: "{name}" has an invalid value, {shorten_value(content[name])}; {mend}.')
     return content
 
 
@@ -128,7 +130,7 @@ _SHAPES: Mapping[str, Callable[[Any], bool]] = {
     ),
     "starts": lambda value: _is_list_of(value, _is_start),
 }
-"""What stands under the keys of a `config.json`, as far as anybody looks into it."""
+"""Checks of the values in a `config.json`, by key."""
 
 
 def typed_config(
@@ -138,11 +140,12 @@ def typed_config(
     folder: Path,
     check: Callable[[Config], None] = lambda config: None,
 ) -> Config:
-    """The configuration of class `cls`, a dataclass, in a section of the `config.json` of the run in `folder`; fields
-    that are missing take their default.
+    """Return a section of the `config.json` of the run in `folder` as the dataclass `cls`.
 
-    **Raises** `InputError` naming the file and the field for fields that `cls` does not have, for values of other
-    types, and where `check` raises it.
+    Missing fields take their default.
+
+    **Raises** `InputError` that names the file and the field, if `cls` does not have a field, if a value has another
+    type, or if `check` raises it.
     """
     path = folder / CONFIG_FILE
     fields = {field.name: field for field in dataclasses.fields(cls)}  # pyright: ignore[reportArgumentType]
@@ -156,7 +159,7 @@ def typed_config(
             )
         if not _is_of_type(hints[name], value):
             raise InputError(
-                f"{path}: {name} of {section} is {shorten_value(value)}, which it cannot be; restore it or start a new "
+                f"{path}: {name} of {section} has an invalid value, {shorten_value(value)}; restore it or start a new "
                 "run."
             )
     found = cls(**{name: _as_type(hints[name], value) for name, value in values.items()})
@@ -168,35 +171,38 @@ def typed_config(
 
 
 def config_section(config: Mapping[str, Any], key: str, folder: Path) -> Any:
-    """What stands under a key; None in runs of version 1, which had not all of them."""
+    """Return the value of a key, or None if a run of format version 1 lacks it.
+
+    **Raises** `InputError` if a run of the present format lacks it.
+    """
     if key not in config and config.get("format") == RUN_FORMAT:
         raise InputError(f'{folder / CONFIG_FILE}: "{key}" is missing; restore it or start a new run.')
     return config.get(key)
 
 
 class Run:
-    """An open run folder, for writing. A context manager: leaving it closes the files."""
+    """Run folder that is open for writing. It is a context manager, which closes the files at its end."""
 
     def __init__(
         self, folder: Path, config: Mapping[str, Any], *, resumed_at: int | None = None, wandb: str | None = None
     ) -> None:
-        """Open `folder`, new unless `resumed_at` says at which control step an old run goes on; -1 is from its very
-        beginning.
+        """Open `folder` for a new run, or to resume a run.
 
-        `wandb`: a project of Weights & Biases to log to as well.
+        - `resumed_at`: control step from which the run resumes, or -1 for its beginning. Measurements and checkpoints
+          after this step are deleted, since they will be made again. None for a new run.
+        - `wandb`: project of Weights & Biases to log to as well.
 
-        **Raises** `InputError` where another process has it open, it cannot be written to, or Weights & Biases refuses.
-
-        What an old run measured and saved after that step is dropped: it will be measured again.
+        **Raises** `InputError` if another process has the folder open, if the folder cannot be written to, or if
+        Weights & Biases refuses.
         """
         self.folder, self.config = folder, config
-        self._whole = None if resumed_at == -1 else resumed_at
-        """Step of the last checkpoint that was written to the end."""
+        self._last_complete = None if resumed_at == -1 else resumed_at
+        """Step of the last checkpoint that was written completely."""
         self._loggers: list[loggers.Logger] = []
         self._manager: ocp.CheckpointManager | None = None
         files.check_folder(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        self._lock = _locked(folder / LOCK_FILE)
+        self._lock = _open_locked(folder / LOCK_FILE)
         try:
             self._open(config, resumed_at, wandb)
         except Exception as error:
@@ -224,31 +230,31 @@ class Run:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
         """Close the files.
 
-        **Raises** `InputError` where the disk is full, instead of whatever came of that.
+        **Raises** `InputError` if the disk is full, instead of the error that this caused.
         """
         with contextlib.ExitStack() as closing:
-            closing.callback(self._told_of_full_disk, error)
+            closing.callback(self._raise_if_disk_is_full, error)
             if self._manager is not None:
-                # Closed already where the disk is full; whatever it says now comes of that.
+                # If the disk is full, it is closed already, and further errors have the same cause.
                 closing.enter_context(contextlib.suppress(Exception) if error else contextlib.nullcontext())
                 closing.callback(self._manager.close)
             closing.callback(self._lock.close)
             for logger in self._loggers:
-                # What a logger could not write before, it cannot now.
+                # A logger that could not write before fails again.
                 closing.enter_context(contextlib.suppress(OSError) if error is not None else contextlib.nullcontext())
                 closing.callback(logger.close, failed=error is not None)
 
-    def _told_of_full_disk(self, error: BaseException | None) -> None:
-        """Raise an `InputError` instead of an exception that comes of a full disk."""
+    def _raise_if_disk_is_full(self, error: BaseException | None) -> None:
+        """Raise an `InputError` if the cause of `error` is a full disk."""
         if error is None or not files.is_full(error):
             return
         then = "start again"
-        if self._whole is not None:
-            then = f"go on with --resume {self.folder}: the checkpoint of step {self._whole:,} is whole"
+        if self._last_complete is not None:
+            then = f"resume with --resume {self.folder}: the checkpoint of step {self._last_complete:,} is intact"
         raise InputError(f"{self.folder}: its disk is full; make room there, then {then}.") from error
 
     def log(self, step: int, metrics: Mapping[str, float | int]) -> None:
-        """Add a line of measurements at `step`."""
+        """Log measurements at `step`."""
         for logger in self._loggers:
             logger.log(step, metrics)
 
@@ -261,14 +267,14 @@ class Run:
         training: Mapping[str, np.ndarray] | None = None,
         notes: Mapping[str, Any] | None = None,
     ) -> None:
-        """Write a checkpoint, unless that of `step` stands there already.
+        """Write a checkpoint, unless the one of `step` exists already.
 
         **Arguments**
 
-        - `params`: nested dictionaries of arrays.
-        - `score`: by validation, the smallest is the best; None where there is none.
-        - `training`: what else it takes to go on.
-        - `notes`: what whoever goes on wants to know beside it; goes into JSON and back.
+        - `params`: learned parameters, as nested dictionaries of arrays.
+        - `score`: validation score, of which the smallest is the best. None if there is none.
+        - `training`: further state that is needed to resume.
+        - `notes`: further values for the resumed run, stored as JSON.
         """
         if self._manager is None:
             self._manager = checkpoint_manager(self.folder)
@@ -284,13 +290,13 @@ class Run:
         with quiet_when_full(self._manager):
             self._manager.save(step, args=ocp.args.Composite(**items), metrics=metrics)
             self._manager.wait_until_finished()
-        # Last of all: what has no record was not written to the end.
+        # The record comes last: a checkpoint without a record is incomplete.
         place = self.folder / CHECKPOINTS_FOLDER / str(step)
         files.sync(self.folder / METRICS_FILE)
         files.sync_all(place)
         record = {"step": step, "score": finite, "notes": dict(notes or {}), "files": file_checksums(place)}
         files.write(place / RECORD_FILE, json.dumps({**record, "sha256": record_checksum(record)}, indent=2) + "\n")
-        self._whole = step
+        self._last_complete = step
         runtime.release_memory()
 
     def write(self, name: str, text: str) -> None:
@@ -300,13 +306,13 @@ class Run:
     def best(self) -> tuple[int, dict[str, Any]]:
         """Return step and parameters of the best checkpoint.
 
-        **Raises** `InputError` where there is none, or it is damaged.
+        **Raises** `InputError` if there is none, or if it is damaged.
         """
         return restore_checkpoint(self.folder, "best")
 
 
-def _locked(path: Path) -> IO[str]:
-    """The file at `path`, open and locked; the system gives the lock up with its owner, however that ends."""
+def _open_locked(path: Path) -> IO[str]:
+    """Open and lock the file at `path`. The system releases the lock when the process ends, even by a crash."""
     file = path.open("a", encoding="utf-8")
     if fcntl is not None:
         try:
@@ -320,7 +326,7 @@ def _locked(path: Path) -> IO[str]:
 
 
 def _is_of_type(hint: Any, value: Any) -> bool:
-    """Whether a value from JSON can be one of a field's type."""
+    """Return whether a value from JSON is valid for a field's type."""
     kind, inner = typing.get_origin(hint), typing.get_args(hint)
     if kind is types.UnionType:
         return any(_is_of_type(each, value) for each in inner)
@@ -334,5 +340,5 @@ def _is_of_type(hint: Any, value: Any) -> bool:
 
 
 def _as_type(hint: Any, value: Any) -> Any:
-    """JSON has no tuples."""
+    """Return a value from JSON in a field's type. JSON has no tuples, so lists become tuples."""
     return tuple(value) if typing.get_origin(hint) is tuple and isinstance(value, list) else value

@@ -1,28 +1,24 @@
-"""Names and formats within a run's folder."""
+"""Names and formats of the files in a run's folder."""
 
 from __future__ import annotations
 
 import reprlib
 from typing import Any
 
-try:
-    import fcntl
-except ImportError:  # Windows, where runs are not locked
-    fcntl = None
-
-
 RUN_FORMAT = "ballu-run/2"
-"""Version 1 had checkpoints of parameters alone."""
+"""Format of a run's folder. Checkpoints of version 1 held only parameters."""
 KEPT = 3
-"""Latest checkpoints that are kept."""
+"""Number of latest checkpoints that are kept."""
 
 READABLE_FORMATS = ("ballu-run/1", RUN_FORMAT)
 CONFIG_FILE, METRICS_FILE, LOCK_FILE, CHECKPOINTS_FOLDER = "config.json", "metrics.jsonl", ".lock", "checkpoints"
 PARAMS_FOLDER, TRAINING_FOLDER, RECORD_FILE = "params", "training", "record.json"
 NO_SCORE = 1e30
+"""Score of a checkpoint whose validation score is not finite."""
 MOST_STEPS = 2**63
+"""Upper bound of a step number (exclusive)."""
 
 
 def shorten_value(value: Any) -> str:
-    """A value from JSON in a sentence."""
+    """Return a value from JSON as short text for a message."""
     return reprlib.repr(value)

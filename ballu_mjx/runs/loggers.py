@@ -1,4 +1,4 @@
-"""Where the measurements of a run go: JSON lines and TensorBoard always, Weights & Biases on demand."""
+"""Loggers of a run's measurements: JSON lines and TensorBoard always, Weights & Biases on request."""
 
 from __future__ import annotations
 
@@ -20,24 +20,25 @@ _WANDB_ID = "wandb-id.txt"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LoggingOptions(runtime.CommandOptions):
-    """Options of every training."""
+    """Options of every training command."""
 
     wandb: str | None = None
-    """Project of Weights & Biases to log to as well (extra wandb); WANDB_MODE=offline keeps it on this machine."""
+    """Weights & Biases project to log to as well (needs the extra wandb). WANDB_MODE=offline keeps the log on this
+    machine."""
 
 
 class Logger(Protocol):
-    """A place for measurements."""
+    """Interface of loggers."""
 
     def log(self, step: int, metrics: Mapping[str, float | int]) -> None:
-        """Add what was measured at `step`, by name; steps do not decrease."""
+        """Log measurements at `step`, by name. Steps must not decrease."""
 
     def close(self, *, failed: bool = False) -> None:
-        """Write the rest; `failed` where an error ended the run."""
+        """Write the rest and close. `failed`: an error ended the run."""
 
 
 class JsonLines:
-    """One JSON object a line: `step`, and the measurements; null for what is no finite number."""
+    """Logger that writes one JSON object per line: `step` and the measurements. Non-finite numbers are null."""
 
     def __init__(self, path: Path) -> None:
         """Append to `path`."""
@@ -53,12 +54,15 @@ class JsonLines:
 
 
 class TensorBoard:
-    """Event files, of what is finite. Written at once, and not by tensorboardX's thread: a full disk kills that, and
-    whoever writes next waits for ever."""
+    """Logger that writes finite measurements to event files of TensorBoard.
+
+    It writes at once, without tensorboardX's thread. A full disk ends that thread, and the next write would then wait
+    forever.
+    """
 
     def __init__(self, folder: Path, first_step: int | None = None) -> None:
-        """Write into `folder`; `first_step` of a run that goes on: what is there from that step on is hidden."""
-        # Brings PyTorch along where that is installed: most of a second that commands without a log need not wait.
+        """Write into `folder`. `first_step`: first step of a resumed run; older events from this step on are hidden."""
+        # This import loads PyTorch if it is installed, which takes most of a second. Commands without a log skip it.
         from tensorboardX import summary
         from tensorboardX.event_file_writer import EventsWriter
         from tensorboardX.proto import event_pb2
@@ -83,15 +87,15 @@ class TensorBoard:
 
 
 class WeightsAndBiases:
-    """A run of a project of Weights & Biases.
+    """Logger to a run in a project of Weights & Biases.
 
-    A run that is opened again goes on there too; what it measures again, at steps that are there already, is ignored.
+    A resumed run continues its run there. Repeated measurements, at steps that are there already, are ignored.
     """
 
     def __init__(self, project: str, folder: Path, config: Mapping[str, Any]) -> None:
-        """Begin, with the local files in the run's `folder`.
+        """Start or continue the run, with local files in the run's `folder`.
 
-        **Raises** `InputError` where Weights & Biases refuses: nobody is logged in, or there is no network.
+        **Raises** `InputError` if Weights & Biases refuses, since nobody is logged in or there is no network.
         """
         import wandb  # an extra, and slow to import
 
@@ -119,10 +123,14 @@ class WeightsAndBiases:
 
 
 def check(project: str | None) -> None:
-    """**Raises** `InputError` where there is a project of Weights & Biases, and the package to log to it is missing."""
+    """Check that the package wandb is installed if a `project` of Weights & Biases is given.
+
+    **Raises** `InputError` if it is missing.
+    """
     if project is not None and importlib.util.find_spec("wandb") is None:
         raise InputError(
-            f'--wandb {project}: the package wandb is not installed; `pip install "ballu-mjx[wandb]"`, or leave it out.'
+            f'--wandb {project}: the package wandb is not installed; run `pip install "ballu-mjx[wandb]"`, or leave '
+            "this option out."
         )
 
 

@@ -7,21 +7,17 @@ from typing import Any
 
 import numpy as np
 
-try:
-    import fcntl
-except ImportError:  # Windows, where runs are not locked
-    fcntl = None
-
-
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.runs.layout import METRICS_FILE, MOST_STEPS, shorten_value
 
 
 def read_metrics(folder: Path, last: int | None = None) -> list[dict[str, Any]]:
-    """The rows of a run's `metrics.jsonl`, up to the step `last` where it is given; a last line cut off is left out.
+    """Return the rows of a run's `metrics.jsonl`, up to the step `last` if it is given.
 
-    **Raises** `InputError` naming the line where it is damaged.
+    An incomplete last line is left out.
+
+    **Raises** `InputError` that names a damaged line.
     """
     path = folder / METRICS_FILE
     lines = files.read_text(path).split("\n")[:-1] if path.exists() else []
@@ -31,11 +27,11 @@ def read_metrics(folder: Path, last: int | None = None) -> list[dict[str, Any]]:
         row = files.parse_object(line, f"{path}, line {number}", mend)
         step, before = row.get("step"), rows[-1]["step"] if rows else 0
         if type(step) is not int or not before <= step < MOST_STEPS:
-            raise InputError(f'{path}, line {number}: "step" is no step after the one before; {mend}.')
+            raise InputError(f'{path}, line {number}: "step" must be an integer, and not below the one before; {mend}.')
         for name, value in row.items():
             if value is not None and not is_number(value):
                 raise InputError(
-                    f"{path}, line {number}: {shorten_value(name)} is {shorten_value(value)}, no number; {mend}."
+                    f"{path}, line {number}: {shorten_value(name)} is {shorten_value(value)}, not a number; {mend}."
                 )
         if last is not None and step > last:
             break
@@ -44,7 +40,7 @@ def read_metrics(folder: Path, last: int | None = None) -> list[dict[str, Any]]:
 
 
 def read_column(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Control steps, and what was measured there under `name`."""
+    """Return the control steps at which `name` was measured, and its values there."""
     pairs = [(row["step"], row[name]) for row in read_metrics(folder) if row.get(name) is not None]
     steps, values = np.array(pairs, float).reshape(-1, 2).T
     return steps, values

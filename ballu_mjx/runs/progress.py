@@ -10,19 +10,15 @@ from typing import TextIO
 
 from tqdm import tqdm
 
-try:
-    import fcntl
-except ImportError:  # Windows, where runs are not locked
-    fcntl = None
-
 
 class Progress:
-    """What a training run says while it runs: a bar on a terminal, a line every ten seconds elsewhere."""
+    """Progress of a training run: a bar on a terminal, or a line every ten seconds elsewhere."""
 
     interval = 10.0
+    """Time between two lines (s)."""
 
     def __init__(self, total: int, first: int = 0, stream: TextIO | None = None) -> None:
-        """`total` and `first`: control steps at the run's end and at its start."""
+        """Show progress on `stream`. `total` and `first` are the control steps at the run's end and at its start."""
         self._total = total
         self._stream = stream or sys.stderr
         self._bar = None
@@ -35,9 +31,9 @@ class Progress:
         self._said = -math.inf
 
     def update(self, step: int, rate: float, metric: str) -> None:
-        """Show where training is: control step, steps/s, and the metric that matters, in words."""
+        """Show the control step, the speed `rate` (control steps/s), and the text `metric` of the main metric."""
         now = time.perf_counter()
-        # The time left is judged by the last minute's pace, validation included, compiling not.
+        # The time left follows from the speed of the last minute, including validation but not compilation.
         self._marks = [mark for mark in self._marks if now - mark[0] < 60.0] + [(now, step)]
         (then, before), left = self._marks[0], "?"
         if step > before:
@@ -52,20 +48,20 @@ class Progress:
             print(f"{step:,} of {self._total:,} steps, {text}", file=self._stream, flush=True)
 
     def tell(self, text: str) -> None:
-        """Show a line that stays."""
+        """Show a line that stays on the terminal."""
         if self._bar is not None:
             self._bar.write(text, file=self._stream)
         else:
             print(text, file=self._stream, flush=True)
 
     def close(self) -> None:
-        """Leave the bar as it stands."""
+        """Close the bar, which stays on the terminal."""
         if self._bar is not None:
             self._bar.close()
 
 
 class PhaseProgress:
-    """What a fit says while it runs: a line when a stage begins, and a bar for its iterations on a terminal."""
+    """Progress of a fit: a line when a stage begins, and a bar of its iterations on a terminal."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self._stream = stream or sys.stderr
@@ -73,7 +69,7 @@ class PhaseProgress:
         self._bar: tqdm | None = None
 
     def update(self, stage: str, iteration: int, steps: int, loss: float) -> int:
-        """Show an iteration of a stage; returns how many there were in all."""
+        """Show an iteration of a stage, and return the number of updates so far in all stages."""
         self._count += 1
         if stage != self._stage:
             self.close()
@@ -89,6 +85,6 @@ class PhaseProgress:
         return self._count
 
     def close(self) -> None:
-        """Leave the last bar as it stands."""
+        """Close the last bar, which stays on the terminal."""
         if self._bar is not None:
             self._bar.close()

@@ -1,4 +1,4 @@
-"""Where a training leaves what it measures and learns: a run's folder, or memory."""
+"""Storage of a training's measurements and checkpoints, in a run's folder or in memory."""
 
 from __future__ import annotations
 
@@ -14,20 +14,23 @@ from ballu_mjx.runs.layout import NO_SCORE
 
 @runtime_checkable
 class TrainingRecord(Protocol):
-    """Measurements and checkpoints of a training: `folder.Run` writes them to disk, `MemoryRecord` keeps them."""
+    """Interface for measurements and checkpoints of a training.
+
+    `folder.Run` writes them to disk, and `MemoryRecord` keeps them in memory.
+    """
 
     @property
     def folder(self) -> Path | None:
-        """The run's folder; None: there is none."""
+        """Return the run's folder, or None if there is none."""
         ...
 
     @property
     def config(self) -> Mapping[str, Any]:
-        """What a run's `config.json` holds; see `residuals.run_config.describe_run`."""
+        """Return the content of the run's `config.json`; see `residuals.run_config.describe_run`."""
         ...
 
     def log(self, step: int, metrics: Mapping[str, float | int]) -> None:
-        """Add measurements at `step`; steps do not decrease."""
+        """Log measurements at `step`. Steps must not decrease."""
         ...
 
     def save(
@@ -39,20 +42,20 @@ class TrainingRecord(Protocol):
         training: Mapping[str, np.ndarray] | None = None,
         notes: Mapping[str, Any] | None = None,
     ) -> None:
-        """Keep what was learned until `step`; see `folder.Run.save`."""
+        """Save the parameters that were learned until `step`; see `folder.Run.save`."""
         ...
 
     def write(self, name: str, text: str) -> None:
-        """Keep a text under a file's name."""
+        """Save a text under a file name."""
         ...
 
     def best(self) -> tuple[int, dict[str, Any]]:
-        """Return step and parameters of what was saved with the smallest score; of equal ones the last."""
+        """Return step and parameters with the smallest score. Of equal scores, the last one counts."""
         ...
 
 
 class MemoryRecord:
-    """A record without a folder: all measurements, and the parameters with the best score."""
+    """Record without a folder. It keeps all measurements and texts, and the parameters with the best score."""
 
     folder: Path | None = None
 
@@ -85,7 +88,10 @@ class MemoryRecord:
         self.texts[name] = text
 
     def best(self) -> tuple[int, dict[str, Any]]:
-        """**Raises** `ValueError` where nothing was saved with a score."""
+        """Return step and parameters with the smallest score.
+
+        **Raises** `ValueError` if nothing was saved with a score.
+        """
         if self._best is None:
             raise ValueError("Nothing was saved with a score.")
         return self._best[1:]

@@ -1,11 +1,11 @@
-"""Rollouts kept for looking at: `replay.npz` in a run's folder, format `ballu-replay/2`.
+"""Rollouts for reports and views: `replay.npz` in a run's folder, format `ballu-replay/2`.
 
-An archive of NumPy arrays without pickled objects. `format`, `robot/path` and `robot/sha256` (the description of the
-robot, as in `config.json`) and `names` (one a rollout) are strings. The arrays of rollout number i are `i/time`,
-`i/qpos/NAME` for each of its robots (`recording`, or a simulator), and where they are known `i/command` and `i/force`;
-`i/robot` says which robot was recorded.
+The file is an archive of NumPy arrays without pickled objects. It has the strings `format`, `robot/path` and
+`robot/sha256` (the description of the robot, as in `config.json`), and `names` (one per rollout). Rollout number i has
+the arrays `i/time`, and `i/qpos/NAME` for each of its robots (`recording`, or a simulator). It has `i/command` and
+`i/force` if they are known. `i/robot` is the robot that was recorded.
 
-JAX and MuJoCo are imported inside functions: commands read this module before `runtime.prepare`.
+JAX and MuJoCo are imported inside functions, because commands import this module before `runtime.prepare`.
 """
 
 from __future__ import annotations
@@ -30,42 +30,46 @@ if TYPE_CHECKING:
 ROLLOUT_FORMAT = "ballu-replay/2"
 ROLLOUT_FILE = "replay.npz"
 
-_MEND = "python -m ballu_mjx evaluate RUN --output RUN writes it anew"
+_MEND = "write it again with `python -m ballu_mjx evaluate RUN --output RUN`"
 _TOLERANCE = 0.02
-"""Of a quaternion's length, and of commands in widths of their ranges."""
+"""Tolerance of a quaternion's length, and of commands in units of their range's width."""
 _LARGEST = 1e6
-"""m, rad and s; what is beyond is no motion."""
+"""Largest valid number (m, rad, s) in a rollout."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class StoredRollout:
-    """Robots that start alike and get the same commands, or one alone, at the control rate. SI units, radians."""
+    """One robot, or several that start in the same state and get the same commands, at the control rate.
+
+    Units are SI units and radians.
+    """
 
     name: str
-    """The recording's, or the task's."""
+    """Name of the recording or of the task."""
     description: RobotDescription
-    """What kind of robot they are."""
+    """Description of the robots."""
     robot: str = ""
-    """Which robot was recorded, where one was."""
+    """Robot that was recorded. Empty if none was."""
     time: Float[np.ndarray, " states"]
-    """s, of the recording."""
+    """Times of the recording (s)."""
     qpos: Mapping[str, Float[np.ndarray, "states nq"]]
     """MuJoCo's generalized positions of each robot, by its name."""
     command: Float[np.ndarray, "steps commands"] | None = None
-    """Commands, in the actuators' units, from each state to the next; one fewer than states."""
+    """Commands (in the actuators' units) from each state to the next, one fewer than states. None if unknown."""
     force: Float[np.ndarray, "steps 3"] | None = None
-    """Residual force (N, world) on the tracked body of the last robot, likewise."""
+    """Residual force (N, world frame) on the tracked body of the last robot, from each state to the next. None if
+    unknown."""
 
 
 def write_rollouts(path: Path, rollouts: Sequence[StoredRollout]) -> None:
-    """Write rollouts of one robot in single precision, compressed.
+    """Write rollouts of one robot to a compressed file, in single precision.
 
-    **Raises** `ValueError` where there are none, or they are of several robots.
+    **Raises** `ValueError` if there are no rollouts, or if their robots have different descriptions.
     """
     from ballu_mjx.robots.registry import describe_robot
 
     if len({rollout.description.sha256 for rollout in rollouts}) != 1:
-        raise ValueError("Rollouts in a file must be of one robot.")
+        raise ValueError("A file needs at least one rollout, and all must be of one robot.")
     described = describe_robot(rollouts[0].description)
     arrays: dict[str, np.ndarray] = {
         "format": np.array(ROLLOUT_FORMAT),
@@ -89,27 +93,27 @@ def write_rollouts(path: Path, rollouts: Sequence[StoredRollout]) -> None:
 def read_rollouts(path: Path) -> list[StoredRollout]:
     """Return the rollouts in a file.
 
-    **Raises** `InputError` where it is none of the format, damaged, or holds pickled objects, which are never loaded;
-    and where the robot's description is gone or has changed.
+    **Raises** `InputError` if the file has another format, is damaged, or holds pickled objects, which are never
+    loaded. It does so too if the robot's description is missing or has changed.
     """
     from ballu_mjx.robots.registry import find_robot
 
     if not path.exists():
-        raise InputError(f"{path}: there is no replay; {_MEND}.")
+        raise InputError(f"{path}: there is no such file; {_MEND}.")
     try:
         with zipfile.ZipFile(path) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > files.LARGEST:
                 raise ValueError(f"more than {files.LARGEST >> 20} MiB")
             arrays = {name.removesuffix(".npy"): _array(archive.read(name)) for name in archive.namelist()}
-    except Exception as error:  # what unpacking and NumPy make of damage is of many kinds
+    except Exception as error:  # damage causes many kinds of errors
         said = textwrap.shorten(str(error), 80) or type(error).__name__
-        raise InputError(f"{path}: is no archive of plain arrays ({said}); {_MEND}.") from None
+        raise InputError(f"{path}: not an archive of plain arrays ({said}); {_MEND}.") from None
     found = arrays.pop("format", None)
     if found is None or str(found) != ROLLOUT_FORMAT:
-        raise InputError(f"{path}: is not of the format {ROLLOUT_FORMAT}; {_MEND}.")
+        raise InputError(f"{path}: the format is not {ROLLOUT_FORMAT}; {_MEND}.")
     said = {key: arrays.pop(f"robot/{key}", np.zeros(1)) for key in ("path", "sha256")}
     if any(value.dtype.kind != "U" or value.ndim for value in said.values()):
-        raise InputError(f"{path}: does not say of which robot it is; {_MEND}.")
+        raise InputError(f"{path}: does not name its robot; {_MEND}.")
     robot = find_robot({key: str(value) for key, value in said.items()}, path)
     names, nq = arrays.pop("names", np.array([], str)), robot.load_model().nq
     return [_rollout(path, str(name), f"{index}/", arrays, robot, nq) for index, name in enumerate(names.ravel())]
@@ -135,19 +139,19 @@ def _rollout(
         if value is None or value.dtype.kind != "f" or value.shape != shape or not (np.abs(value) < _LARGEST).all():
             raise InputError(f"{path}: {prefix}{key} is not an array of {shape} finite numbers; {_MEND}.")
     if time is None or states < 2 or not qpos:
-        raise InputError(f"{path}: rollout {name!r} has no robot, or less than two states; {_MEND}.")
+        raise InputError(f"{path}: rollout {name!r} has no robot, or fewer than two states; {_MEND}.")
     problem = None
     if not (np.diff(time) > 0).all():
-        problem = "times that run back"
+        problem = "times that do not increase"
     elif not robot.anchored and any(
         np.abs(np.linalg.norm(value[:, 3:7], axis=1) - 1).max() > _TOLERANCE for value in qpos.values()
     ):
-        problem = "quaternions that are none"
+        problem = "quaternions without unit length"
     elif (command := own.get("command")) is not None:
         low, high = np.array(robot.command_ranges).T
         slack = _TOLERANCE * (high - low)
         if ((command < low - slack) | (command > high + slack)).any():
-            problem = "commands outside of their ranges"
+            problem = "commands outside their ranges"
     if problem is not None:
         raise InputError(f"{path}: rollout {name!r} has {problem}; {_MEND}.")
     return StoredRollout(

@@ -1,1 +1,1 @@
-"""MJX: states in, states and observations out."""
+"""Simulation in MJX: control steps, observations, drivetrains, the interface of residuals, and derivatives."""

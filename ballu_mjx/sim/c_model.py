@@ -1,4 +1,4 @@
-"""A simulator's model for C MuJoCo, with the numbers that the MJX simulator has changed, and its sites."""
+"""A simulator's model for C MuJoCo, with the values that the MJX simulator has changed, and poses of its sites."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from jaxtyping import Float
 from ballu_mjx.sim.simulator import AugmentedSimulator
 
 DERIVED_FIELDS = ("body_invweight0", "body_subtreemass", "dof_invweight0", "tendon_invweight0")
-"""Fields that C MuJoCo derives from the others."""
+"""Fields that C MuJoCo derives from other fields."""
 
 
 def improved_model(simulator: AugmentedSimulator) -> mujoco.MjModel:
-    """Return the simulator's model for C MuJoCo: with identified actuators, and the residual's fields."""
+    """Return the simulator's model for C MuJoCo, with the identified actuators and the residual's model fields."""
     plain = simulator.simulator
     model = mujoco.MjModel.from_xml_path(str(simulator.robot.model))
-    for name in dir(model):  # a copy, but for what copies forget
+    for name in dir(model):  # instead of copy.copy, which loses part of a model
         value = None if name.startswith("_") else getattr(plain.mj_model, name, None)
         if isinstance(value, np.ndarray) and value.dtype.kind == "f":
             getattr(model, name)[...] = value
@@ -29,7 +29,7 @@ def improved_model(simulator: AugmentedSimulator) -> mujoco.MjModel:
         now = np.asarray(getattr(plain.model, name))
         if now.shape != own.shape or now.dtype.kind != "f":
             continue
-        # In MJX's precision, so that what it only rounds stays as it is.
+        # Compare in MJX's precision, so that values that it merely rounds stay unchanged.
         different = now != own.astype(now.dtype)
         own[different] = now[different]
         changed = changed or bool(different.any())
@@ -41,7 +41,10 @@ def improved_model(simulator: AugmentedSimulator) -> mujoco.MjModel:
 def site_poses(
     model: mujoco.MjModel, name: str, qpos: Float[np.ndarray, "*states nq"]
 ) -> tuple[Float[np.ndarray, "*states 3"], Float[np.ndarray, "*states 4"]]:
-    """Return where a site is (m, world), and the quaternion of its body, by generalized positions."""
+    """Return the position of a site (m, world frame) and the quaternion (w, x, y, z) of its body.
+
+    `qpos` are generalized positions of any number of states.
+    """
     data, site = mujoco.MjData(model), model.site(name).id
     states = qpos.shape[:-1]
     positions, quaternions = np.zeros((*states, 3)), np.zeros((*states, 4))

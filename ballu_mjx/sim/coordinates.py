@@ -1,7 +1,7 @@
-"""Generalized coordinates of a robot: one free joint at the root or none, then hinges and slides.
+"""Generalized coordinates of a robot: at most one free joint, at the root, then hinges and slides.
 
-Directions are those of `mjx.Data.qvel`: of a free joint, the translation along the world's axes and the rotation about
-the body's own; then the joints.
+Directions are those of `mjx.Data.qvel`. A free joint has translations along the world's axes and rotations about the
+body's own axes. The other joints follow.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ _TRANSLATIONS = {
 
 
 def translations(model: mujoco.MjModel) -> Bool[np.ndarray, " nv"]:
-    """Return which directions are translations (m), not rotations (rad)."""
+    """Return which directions are translations (m) and not rotations (rad)."""
     return np.concatenate([_TRANSLATIONS[int(kind)] for kind in model.jnt_type])
 
 
 def has_free_joint(model: mujoco.MjModel) -> bool:
-    """Return whether the root is free."""
+    """Return whether the root has a free joint."""
     return bool(model.jnt_type[0] == _KINDS.mjJNT_FREE)
 
 
 def expand(qpos: Float[Array, " nq"], change: Float[Array, " nv"], free: bool) -> Float[Array, " nq"]:
-    """Return the rates of generalized positions at velocities `change`: of a quaternion q, q (0, omega) / 2.
+    """Return the rates of generalized positions for the generalized velocities `change`.
 
-    `free` says whether the first joint is free.
+    The rate of a quaternion q is q (0, omega) / 2. `free` says whether the first joint is free.
     """
     if not free:
         return change
@@ -43,7 +43,7 @@ def expand(qpos: Float[Array, " nq"], change: Float[Array, " nv"], free: bool) -
 
 
 def compress(qpos: Float[Array, " nq"], change: Float[Array, " nq"], free: bool) -> Float[Array, " nv"]:
-    """Return the inverse of `expand`."""
+    """Return the generalized velocities for the rates of generalized positions `change`: the inverse of `expand`."""
     if not free:
         return change
     return jnp.concatenate(

@@ -1,4 +1,4 @@
-"""Derivatives by rule, of functions of trees of arrays of which few change."""
+"""Custom forward derivatives of functions of trees of arrays, only few of which vary."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from jaxtyping import Array, PyTree
 
 
 def nonzero_tangents(changes: Sequence[Any]) -> list[int]:
-    """Which tangents, of those that a `custom_jvp` with `symbolic_zeros=True` is given, are not known to be zero."""
+    """Return the indices of the tangents that are not known to be zero.
+
+    `changes` are the tangents that a `custom_jvp` with `symbolic_zeros=True` receives.
+    """
     return [place for place, change in enumerate(changes) if not isinstance(change, SymbolicZero)]
 
 
@@ -22,7 +25,10 @@ def directional_derivative(
     places: Sequence[int],
     changes: Sequence[Array],
 ) -> tuple[PyTree, PyTree]:
-    """Value of `function(leaves)`, and how it changes where the leaves at `places` change so, and no other."""
+    """Return `function(leaves)` and its directional derivative.
+
+    Only the leaves at `places` vary, along the tangents `changes`.
+    """
 
     def of(*moved: Array) -> PyTree:
         new = dict(zip(places, moved, strict=True))
@@ -32,13 +38,16 @@ def directional_derivative(
 
 
 DirectionalDerivative = Callable[[Callable[..., PyTree]], tuple[PyTree, PyTree]]
-"""Of a function: its value at the arguments at hand, and how it changes where they change as they do."""
+"""Function that maps a function of the given arguments to its value and its derivative along their tangents."""
 
 
 def with_custom_jvp(
     function: Callable[..., PyTree], rule: Callable[[DirectionalDerivative, PyTree], PyTree]
 ) -> Callable[..., PyTree]:
-    """`function` with another derivative: `rule(along, result)`, `result` being what `function` returns."""
+    """Return `function` with the derivative `rule(along, result)`.
+
+    `result` is the result of `function`. `along` differentiates another function of the same arguments.
+    """
 
     def whole(*arguments: PyTree) -> PyTree:
         leaves, tree = jax.tree.flatten(arguments)

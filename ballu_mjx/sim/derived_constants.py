@@ -1,8 +1,8 @@
-"""Constants that MuJoCo's compiler derives from masses and inertias, for models whose masses are altered in MJX.
+"""Constants that MuJoCo's compiler derives from masses and inertias, for models whose masses change in MJX.
 
-Contacts, joint limits and friction losses are as soft as the inverse weights `body_invweight0`, `dof_invweight0` and
-`tendon_invweight0` say. In C, `mj_setConst` derives these from the inertia matrix at the reference pose. A model whose
-masses alone are replaced keeps the constants of the old ones.
+The inverse weights `body_invweight0`, `dof_invweight0` and `tendon_invweight0` determine the softness of contacts,
+joint limits and friction losses. In C, `mj_setConst` derives them from the inertia matrix at the reference pose. A
+model in which only the masses are replaced keeps the constants of the old masses.
 
 Source: MuJoCo, `engine_setconst.c`, `mj_setConst`.
 """
@@ -20,18 +20,18 @@ from jaxtyping import Array, Float
 from mujoco import mjx
 
 INERTIAL_FIELDS = ("body_mass", "body_inertia", "body_ipos", "dof_armature")
-"""Fields that the constants are derived from, and that residuals or identified parameters alter."""
+"""Fields from which the constants are derived, and which residuals or identified parameters change."""
 
 
 _TRIPLES = {int(mujoco.mjtJoint.mjJNT_FREE): (0, 3), int(mujoco.mjtJoint.mjJNT_BALL): (0,)}
-"""Where a joint has three axes whose weights are averaged, from its first on."""
+"""Offsets from a joint's first degree of freedom at which three axes start whose weights are averaged."""
 
 
 class ReferencePose(NamedTuple):
-    """What of a model at its reference pose does not depend on masses; world frame."""
+    """Quantities of a model at its reference pose that do not depend on masses; world frame."""
 
     translation: Float[np.ndarray, "bodies 3 nv"]
-    """Jacobian of each body's origin (m)."""
+    """Jacobian of the position of each body's origin (m)."""
     rotation: Float[np.ndarray, "bodies 3 nv"]
     """Jacobian of each body's orientation (rad)."""
     frame: Float[np.ndarray, "bodies 3 3"]
@@ -39,15 +39,15 @@ class ReferencePose(NamedTuple):
     inertial_frame: Float[np.ndarray, "bodies 3 3"]
     """Orientation of each body's principal axes of inertia."""
     tendons: Float[np.ndarray, "tendons nv"]
-    """Jacobian of the tendons' lengths (m)."""
+    """Jacobian of the lengths of tendons (m)."""
     below: Float[np.ndarray, "bodies bodies"]
-    """1 where the second body is the first or below it."""
+    """1 if the second body is the first body or one of its descendants, else 0."""
     averages: Float[np.ndarray, "nv nv"]
-    """Averages over the translations, and over the rotations, of each free joint; over the axes of each ball joint."""
+    """Matrix that averages over translations and rotations of each free joint, and over axes of each ball joint."""
 
     @staticmethod
     def of(model: mujoco.MjModel) -> ReferencePose:
-        """Return the reference pose of `model`."""
+        """Compute the quantities of `model`."""
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         bodies, nv = model.nbody, model.nv
@@ -70,16 +70,17 @@ class ReferencePose(NamedTuple):
 
 
 def with_derived_constants(pose: ReferencePose, model: mjx.Model, fields: Mapping[str, Array]) -> dict[str, Array]:
-    """Return `fields` with the constants that follow from them; `fields` itself where it alters no mass.
+    """Return `fields` with the constants that follow from them, or only `fields` if it changes no mass or inertia.
 
-    Constants are the model's own, times what the altered masses make of them over what the model's masses do: rounding
-    errors cancel, and equal masses leave equal constants. Differentiable by `fields`, which may be traced.
+    Each constant is the model's own, multiplied by a ratio: its computed value for the changed masses over that for the
+    model's masses. Rounding errors cancel in the ratio, and equal masses give equal constants. The result is
+    differentiable with respect to `fields`, which may be traced.
 
     **Arguments**
 
-    - `pose`: of the model.
-    - `model`: with the constants of its own masses.
-    - `fields`: fields of `mjx.Model` by name, altered.
+    - `pose`: quantities of the model at its reference pose.
+    - `model`: model with the constants of its own masses.
+    - `fields`: changed fields of `mjx.Model` by name.
     """
     if not set(INERTIAL_FIELDS).intersection(fields):
         return dict(fields)
@@ -95,7 +96,7 @@ def with_derived_constants(pose: ReferencePose, model: mjx.Model, fields: Mappin
 
 
 def _constants(pose: ReferencePose, model: mjx.Model, fields: Mapping[str, Array]) -> dict[str, Array]:
-    """Return the constants by their definition, in the precision of `model`."""
+    """Compute the constants from their definition, in the precision of `model`."""
     mass, inertia, centre, armature = (jnp.asarray(fields.get(name, getattr(model, name))) for name in INERTIAL_FIELDS)
     with jax.default_matmul_precision("highest"):
         arm = jnp.einsum("bij,bj->bi", pose.frame, centre)
@@ -105,7 +106,7 @@ def _constants(pose: ReferencePose, model: mjx.Model, fields: Mapping[str, Array
         matrix += jnp.einsum("bi,bij,bik->jk", inertia, turned, turned)
         matrix += jnp.einsum("t,ti,tj->ij", model.tendon_armature, pose.tendons, pose.tendons)
         matrix += jnp.diag(armature)
-        # A chain's inertia matrix is badly scaled: metres beside radians, the heaviest body beside the lightest.
+        # The inertia matrix of a chain is badly scaled: it mixes metres and radians, and heavy and light bodies.
         scale = 1 / jnp.sqrt(jnp.diag(matrix))
         factor = jax.scipy.linalg.cho_factor(scale[:, None] * matrix * scale)
         inverse = scale[:, None] * jax.scipy.linalg.cho_solve(factor, jnp.eye(len(scale), dtype=scale.dtype)) * scale

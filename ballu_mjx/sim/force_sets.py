@@ -1,4 +1,4 @@
-"""Force sets: what the outputs of a network stand for, and what they do on a robot."""
+"""Force sets: the meaning of a network's outputs, and their effect on a robot."""
 
 from __future__ import annotations
 
@@ -14,19 +14,22 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.residual import Action
 
 ForceSet = Literal["force", "wrench", "multi", "joints", "commands"]
-"""What a network acts with: a force on the tracked body (the paper's), a force and a torque on it, forces on it and at
-every measured point, forces and torques along joints, or changes of the commands. `FORCE_SETS` says all of each."""
+"""Loads that a network outputs. `FORCE_SETS` has the details.
+
+`force`: a force on the tracked body (as in the paper). `wrench`: a force and a torque on it. `multi`: forces on it and
+at every measured point. `joints`: forces and torques along joints. `commands`: changes of the commands.
+"""
 
 
 class ForceSetKind(NamedTuple):
-    """A force set."""
+    """Definition of a force set."""
 
     names: Callable[[RobotDescription], list[str]]
-    """Its loads, each with its unit."""
+    """Names of its loads, each with its unit."""
     turns: bool
-    """Whether loads are vectors, three numbers each, that turn with the robot's heading."""
+    """Whether the loads are vectors, three numbers each, that rotate with the robot's heading."""
     act: Callable[[Float[Array, " loads"], RobotDescription], Action]
-    """Loads, vectors in the world frame, as what they do."""
+    """Function that returns the action of loads on a robot. Vectors are in the world frame."""
 
 
 def _vectors(*heads: str) -> list[str]:
@@ -73,18 +76,21 @@ FORCE_SETS: Mapping[ForceSet, ForceSetKind] = {
         lambda loads, robot: Action.none()._replace(command_change=loads),
     ),
 }
-"""By name. All methods that learn a network take all of them."""
+"""Force sets by name. Every method that learns a network supports all of them."""
 
 
 def num_loads(forces: ForceSet, robot: RobotDescription) -> int:
-    """Return the number of a force set's loads on a robot."""
+    """Return the number of loads that a force set has on a robot."""
     return len(FORCE_SETS[forces].names(robot))
 
 
 def check_force_set(forces: ForceSet, robot: RobotDescription) -> None:
-    """**Raises** `InputError` where the robot has nothing that the force set acts on."""
+    """Check that a robot has something on which a force set acts.
+
+    **Raises** `InputError` if it does not.
+    """
     if not num_loads(forces, robot):
         raise InputError(
-            f'--forces {forces}: {robot.name} has no hinge or slide to act along; name some under "force_joints" in '
-            f"{robot.file}, or give another force set."
+            f"--forces {forces}: {robot.name} has no hinge or slide joint that forces may act along; list joints "
+            f'under "force_joints" in {robot.file}, or give another force set.'
         )

@@ -1,9 +1,9 @@
-"""Control steps to first order: what a small change of the state before, of the forces on the robot, or of joints'
-torques changes after.
+"""Linearization of control steps: derivatives of the next state by the state before, the loads, and torques of joints.
 
-Derivatives are taken forward, direction by direction, through the same accurate physics that everything else is
-simulated with: the solver's loop has no reverse mode, and a reverse mode of its own would be that of another model.
-Some thirty directions a control step are few beside the thousands of gradients that can then be had without simulating.
+Derivatives are computed forwards, direction by direction, through the same accurate physics as in every simulation. The
+solver's loop has no reverse mode, and a separate implementation of it would differentiate a different model. A control
+step has about thirty directions. These are few, because the result then gives thousands of gradients without
+simulation.
 """
 
 from __future__ import annotations
@@ -26,41 +26,41 @@ from ballu_mjx.sim.step import PhysicsState
 from ballu_mjx.sim.vmap_last import nested_vmap
 
 _CHUNK = 64
-"""Control steps that are linearized in one go."""
+"""Number of control steps that are linearized at a time."""
 
 
 class ControlSteps(NamedTuple):
-    """Control steps to linearize about: states before, and what acts over them."""
+    """Control steps to linearize about: the states before them, the commands and the loads."""
 
     state: RolloutState
-    """Before the step; a base residual sees its history and commands."""
+    """State before the step. A base residual observes its history and commands."""
     command: Float[Array | np.ndarray, "steps commands"]
-    """Of the coming control step."""
+    """Command of the upcoming control step (the actuators' own units)."""
     loads: Float[Array | np.ndarray, "steps loads"]
-    """What acts on the robot (N, N m, commands' units; world), of the linearizer's force set."""
+    """Loads on the robot of the linearizer's force set (N, N m, command units; world frame)."""
 
 
 class Linearized(NamedTuple):
-    """Control steps to first order.
+    """Linearization of control steps.
 
-    The state's directions are those of `mjx.Data.qvel` for positions (a free body turns about its own axes), then the
-    velocities'. The inputs are the loads (N, N m) and then the joints' torques (N m).
+    The directions of the state are those of `mjx.Data.qvel`, first for the positions (a free body rotates about its own
+    axes), then for the velocities. The inputs are the loads (N, N m, command units), then the torques of joints (N m).
     """
 
     qpos: Float[Array | np.ndarray, "steps nq"]
-    """After the step."""
+    """Generalized positions after the step."""
     qvel: Float[Array | np.ndarray, "steps nv"]
-    """After the step."""
+    """Generalized velocities after the step."""
     features: Float[Array | np.ndarray, "steps features"]
-    """After the step."""
+    """Features (`observation.observe_features`) after the step."""
     state: Float[Array | np.ndarray, "steps 2nv 2nv+inputs"]
-    """Derivative of the state after by the state before and the inputs."""
+    """Derivative of the state after the step with respect to the state before it and the inputs."""
     seen: Float[Array | np.ndarray, "steps features 2nv+inputs"]
-    """Derivative of the features after, likewise."""
+    """Derivative of the features after the step with respect to the state before it and the inputs."""
 
 
 class Linearizer:
-    """The robot's control steps, to first order; compiles once."""
+    """Linearizer of a robot's control steps. It compiles once."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class Linearizer:
         joints: Sequence[str] = (),
         forces: ForceSet = "force",
     ) -> None:
-        """Prepare to linearize control steps of `simulator`; `joints` are those whose torques are inputs too."""
+        """Prepare to linearize control steps of `simulator`. Torques of the joints named in `joints` are inputs too."""
         self.simulator = simulator.with_residual(None)
         plain = self.simulator.simulator
         self._nv, self._free = plain.nv, has_free_joint(plain.mj_model)
@@ -80,11 +80,11 @@ class Linearizer:
 
     @property
     def directions(self) -> int:
-        """Of the state before and the inputs."""
+        """Number of directions of the state before a step and of the inputs."""
         return 2 * self._nv + self.loads + len(self._joints)
 
     def __call__(self, steps: ControlSteps) -> Linearized:
-        """Linearize; a step whose derivatives are no numbers comes back with zeros."""
+        """Return the linearization of control steps. Derivatives of a step become 0 if any of them is not finite."""
         count = len(steps.loads)
         found = []
         for rows, _ in chunks(count, _CHUNK):
@@ -95,7 +95,7 @@ class Linearizer:
         return Linearized(qpos, qvel, features, state, seen)
 
     def _one(self, step: ControlSteps) -> tuple[Array, ...]:
-        """A control step and its derivatives, those along one direction in a row."""
+        """Return the result of a control step and its derivatives, one row for each direction."""
         nv, physics = self._nv, step.state.physics
         units = jnp.eye(self.directions)
         rates = jax.vmap(lambda change: expand(physics.qpos, change, self._free))(units[:, :nv])
@@ -107,14 +107,14 @@ class Linearizer:
             does = FORCE_SETS[self._forces].act(loads, self.simulator.robot)
             torques = jnp.zeros(nv).at[self._joints].set(inputs[self.loads :])
             history = jnp.asarray(step.state.history)
-            if self.simulator.residual is not None:  # which sees the moved state
+            if self.simulator.residual is not None:  # the residual observes the perturbed state
                 history = history.at[-1].set(self.simulator.simulator.observe(moved)[0])
             state = jax.tree.map(jnp.asarray, step.state._replace(physics=moved, history=history))
             simulator = self.simulator.with_generalized_force(torques)
             done = simulator.step(state, jnp.asarray(step.command), does).state
             return done.physics, done.features
 
-        # The step itself is the same for all directions, and simulated once for all.
+        # The step itself does not depend on the direction, so that it is simulated once for all directions.
         (state, features), (change, seen) = jax.vmap(lambda *move: jax.jvp(after, start, move))(*moves)
         positions = jax.vmap(lambda qpos, rate: compress(qpos, rate, self._free))(state.qpos, change.qpos)
         moved = jnp.concatenate([positions, change.qvel], axis=1)
@@ -127,7 +127,10 @@ def step_defects(
     qpos: Float[np.ndarray, "steps nq"],
     qvel: Float[np.ndarray, "steps nv"],
 ) -> Float[np.ndarray, "steps 2*nv"]:
-    """Return how far each control step ends from a motion's states after it, along the state's directions."""
+    """Return the state after each control step minus the motion's state after it, along the directions of the state.
+
+    `qpos` and `qvel` are the motion's states after the control steps.
+    """
     defect = np.zeros((len(qpos), 2 * model.nv))
     for own, recorded, after in zip(defect, qpos, np.asarray(steps.qpos, np.float64), strict=True):
         mujoco.mj_differentiatePos(model, own[: model.nv], 1.0, recorded, after)

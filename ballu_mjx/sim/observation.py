@@ -1,4 +1,4 @@
-"""What motion capture shows of a state, and the heading frame in which residuals and policies see it."""
+"""Features of a state that motion capture measures, and the heading frame of residuals' and policies' observations."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from mujoco import mjx
 from ballu_mjx.robots.description import RobotDescription
 
 HISTORY = 3
-"""Control steps that the policy sees: the current one and the last two (paper)."""
+"""Number of control steps that a residual's policy observes: the current one and the last two (paper)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ObservationLayout:
-    """Where `observe_features` has what: slices and indices of its last axis; m, m/s, rad, world frame.
+    """Layout of `observe_features`: slices and indices of its last axis. Units are m, m/s and rad, in the world frame.
 
-    What is said of the tracked body comes first, for all robots in the same places.
+    The features of the tracked body come first and have the same positions for all robots.
     """
 
     points: tuple[str, ...]
-    """The robot's points, in order."""
+    """Names of the robot's points, in order."""
 
     position: ClassVar[slice] = slice(0, 3)
-    """Of the tracked body."""
+    """Position of the tracked body (m)."""
     velocity: ClassVar[slice] = slice(3, 6)
-    """Of the tracked body."""
+    """Velocity of the tracked body (m/s)."""
     euler_angles: ClassVar[slice] = slice(6, 9)
-    """Roll, pitch and yaw of the tracked body."""
+    """Roll, pitch and yaw of the tracked body (rad)."""
     yaw: ClassVar[int] = 8
-    """Of the tracked body: its heading."""
+    """Index of the tracked body's yaw (rad), which is its heading."""
     first_point: ClassVar[int] = 9
-    """Where the points begin."""
+    """Index of the first feature of the points."""
 
     @staticmethod
     def of(robot: RobotDescription) -> ObservationLayout:
@@ -50,12 +50,12 @@ class ObservationLayout:
         return self.first_point + 6 * len(self.points)
 
     def point_position(self, point: str) -> slice:
-        """Return where the position of a point stands."""
+        """Return the slice of a point's position (m)."""
         first = self.first_point + 6 * self.points.index(point)
         return slice(first, first + 3)
 
     def point_velocity(self, point: str) -> slice:
-        """Return where the velocity of a point stands."""
+        """Return the slice of a point's velocity (m/s)."""
         first = self.point_position(point).stop
         return slice(first, first + 3)
 
@@ -63,11 +63,12 @@ class ObservationLayout:
 def observe_features(
     data: mjx.Data, sites: Int[np.ndarray, " sites"], bodies: Int[np.ndarray, " sites"], root: int = 1
 ) -> Float[Array, " features"]:
-    """Return what motion capture sees of a state, in the world frame; `ObservationLayout` says what stands where.
+    """Return the features of a state that motion capture measures, in the world frame.
 
-    Position, velocity and Euler angles (roll, pitch, yaw) of the tracked body, position and velocity of each point; m,
-    m/s, rad. `sites`, of `bodies` below the body `root` of the world, begin with the tracked one. `data` must hold
-    current `com_vel`.
+    In the order of `ObservationLayout`, they are position (m), velocity (m/s) and Euler angles (roll, pitch, yaw; rad)
+    of the tracked body, then position and velocity of each point. `sites` are the ids of the measured sites, the
+    tracked one first. `bodies` are the ids of their bodies, all in the kinematic tree whose root is the body `root`.
+    `data` must hold current results of `com_vel`.
     """
     position = data.site_xpos[sites]
     offset = position - data.subtree_com[root]
@@ -79,7 +80,7 @@ def observe_features(
 
 
 def euler_angles(quaternion: Float[Array, " 4"]) -> Float[Array, " 3"]:
-    """Roll, pitch and yaw (rad; intrinsic z-y-x) of a unit quaternion (w, x, y, z)."""
+    """Return roll, pitch and yaw (rad; intrinsic z-y-x) of a unit quaternion (w, x, y, z)."""
     w, x, y, z = quaternion
     roll = jnp.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = jnp.arcsin(jnp.clip(2 * (w * y - z * x), -1.0, 1.0))
@@ -88,7 +89,7 @@ def euler_angles(quaternion: Float[Array, " 4"]) -> Float[Array, " 3"]:
 
 
 def euler_to_matrix(euler: Float[Array, " 3"]) -> Float[Array, "3 3"]:
-    """Return the rotation matrix, body to world, of roll, pitch and yaw (rad; intrinsic z-y-x)."""
+    """Return the rotation matrix, body to world frame, for roll, pitch and yaw (rad; intrinsic z-y-x)."""
     roll, pitch, yaw = euler
     cr, sr, cp, sp = jnp.cos(roll), jnp.sin(roll), jnp.cos(pitch), jnp.sin(pitch)
     tilt = jnp.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
@@ -96,20 +97,20 @@ def euler_to_matrix(euler: Float[Array, " 3"]) -> Float[Array, "3 3"]:
 
 
 def wrap_angle(angle: Array) -> Array:
-    """The same angle in (-pi, pi]."""
+    """Return the equivalent angle in [-pi, pi] (rad)."""
     return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
 
 
 def heading_rotation(yaw: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Return the rotation about z that takes vectors in the tracked body's heading frame to the world."""
+    """Return the rotation about z that transforms vectors from the tracked body's heading frame to the world frame."""
     c, s = jnp.cos(yaw), jnp.sin(yaw)
     return jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def world_rotation(yaw: Float[Array, ""], anchored: bool) -> Float[Array, "3 3"]:
-    """Return the rotation that takes vectors in the frame of observations and forces to the world.
+    """Return the rotation that transforms vectors from the frame of observations and forces to the world frame.
 
-    It is the one by the heading, or, of an anchored robot, none.
+    For a free robot it is the rotation by the heading `yaw` (rad). For an anchored robot it is the identity.
     """
     return heading_rotation(jnp.zeros_like(yaw) if anchored else yaw)
 
@@ -117,13 +118,15 @@ def world_rotation(yaw: Float[Array, ""], anchored: bool) -> Float[Array, "3 3"]
 def heading_observation(
     history: Float[Array, "steps features"], anchored: bool = False, *, relative: bool = True, turned: bool = True
 ) -> Float[Array, " observations"]:
-    """Return what policies see of the features of the last control steps (three in the paper; the current one last).
+    """Return the observation of policies and residuals for the features of the last control steps.
 
-    It is the paper's state, made independent of place and heading: horizontal positions are taken from the tracked
-    body's current one, and positions, velocities and yaw from its heading. A force that depends on where in the room
-    the robot stands would fit the recordings and nothing else. Heights stay absolute, for the floor is. Of an anchored
-    robot everything is absolute: its place and heading are part of its physics. Without `relative` and `turned`, places
-    and headings of any robot stay absolute (the paper's state).
+    The current control step is the last one; the paper has three. The observation is the paper's state, made
+    independent of horizontal position and heading. Horizontal positions are relative to the tracked body's current one.
+    Positions, velocities and yaw are relative to its heading. A force that depended on the position in the room would
+    fit the recordings and nothing else. Heights stay absolute, because the floor has a fixed height.
+
+    For an anchored robot everything is absolute: position and heading are part of its physics. Without `relative`,
+    positions of any robot stay absolute. Without `turned`, headings do. Without both, it is the paper's state.
     """
     now, layout = history[-1], ObservationLayout
     origin = now[layout.position] * jnp.array([1.0, 1.0, 0.0] if relative and not anchored else [0.0, 0.0, 0.0])
@@ -142,9 +145,9 @@ def heading_observation(
 
 
 def heading_observation_names(names: Sequence[str]) -> list[str]:
-    """Return the names, with units, of one control step of `heading_observation`, in order.
+    """Return the names, with units, of the entries of `heading_observation` for one control step, in order.
 
-    `names` are the tracked body and the points.
+    `names` are the names of the tracked body and of the points.
     """
     kinematics = [
         f"{name} {quantity} {axis}, {unit}"
@@ -156,6 +159,9 @@ def heading_observation_names(names: Sequence[str]) -> list[str]:
 
 
 def commands_seen(commands: Float[Array, "steps commands"], time: Int[Array, ""]) -> Float[Array, "3 commands"]:
-    """The commands of the last two control steps and the coming one."""
+    """Return the commands of the last two control steps and of the upcoming one, whose index is `time`.
+
+    At the ends of `commands`, return the first or the last three.
+    """
     start = jnp.clip(time - HISTORY + 1, 0, commands.shape[0] - HISTORY)
     return jax.lax.dynamic_slice_in_dim(commands, start, HISTORY)

@@ -1,4 +1,4 @@
-"""Batches over all devices, and long batches in chunks of one size, for which one program is compiled."""
+"""Batches spread over all devices, and long batches in chunks of equal size, which share one compiled program."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from jaxtyping import Int
 
 
 def device_shardings(devices: Sequence[Any] | None = None) -> tuple[NamedSharding, NamedSharding]:
-    """Return where arrays lie that every device has, and those whose first axis is spread over them; None: all local
-    devices."""
+    """Return two shardings: for arrays that every device holds, and for arrays split over the devices by the first
+    axis.
+
+    `devices` None: all local devices.
+    """
     mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("batch",))
     return NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec("batch"))
 
@@ -24,10 +27,11 @@ def compile_for_devices(
     over: Callable[[Callable[..., Any]], Callable[..., Any]] = jax.vmap,
     devices: Sequence[Any] | None = None,
 ) -> jax.stages.Wrapped:
-    """Return `function`, compiled for batches (by `over`) and spread over the devices: one core a device, on the CPU.
+    """Return `function`, compiled for batches (by `over`) that are spread over the devices.
 
-    Of its arguments the first `shared` are the same for all. The others, like what it returns, are arrays (or trees of
-    them), along whose first axis it runs; their length is a multiple of the number of devices.
+    On the CPU, a device is a core. The first `shared` arguments of the returned function are the same for the whole
+    batch. The other arguments and the results are arrays, or trees of arrays, whose first axis is the batch. The batch
+    size must be a multiple of the number of devices.
     """
     everywhere, split = device_shardings(devices)
 
@@ -47,7 +51,7 @@ def compile_for_devices(
 def shard_over_devices(
     function: Callable[..., Any], shared: int, over: Callable[[Callable[..., Any]], Callable[..., Any]] = jax.vmap
 ) -> Callable[..., Any]:
-    """Return the same as `compile_for_devices` for batches of any length, on the host before and after."""
+    """Return a function like that of `compile_for_devices`, for batches of any size in host memory."""
     run, devices = compile_for_devices(function, shared, over), len(jax.local_devices())
 
     def whole(*arguments: Any) -> Any:
@@ -61,6 +65,9 @@ def shard_over_devices(
 
 
 def chunks(count: int, size: int) -> Iterator[tuple[Int[np.ndarray, " size"], int]]:
-    """Yield a batch's rows in chunks of one size, the last filled up from the start, and how many of each count."""
+    """Yield the rows of each chunk of a batch, and how many of these rows count.
+
+    All chunks have `size` rows. The last one is filled up with rows from the start of the batch.
+    """
     for first in range(0, count, size):
         yield np.arange(first, first + size) % count, min(size, count - first)

@@ -1,4 +1,4 @@
-"""The MJX robot between control steps, alone and improved by a residual."""
+"""Simulators of a robot in MJX that advance by control steps, without and with a residual."""
 
 from __future__ import annotations
 
@@ -35,10 +35,11 @@ from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 
 
 class Simulator:
-    """The MJX robot between control steps: states in, states and features out.
+    """A robot in MJX, simulated in control steps.
 
-    Commands are in the actuators' own units. `model` is the MJX model, `mj_model` the C model that it was made from,
-    `drivetrain` what commands meet on their way to the actuators; None: nothing.
+    The methods map states to states and features. Commands are in the actuators' own units. `model` is the MJX model,
+    and `mj_model` is the C model from which it was made. `drivetrain` holds the parameters of the drivetrain (delay,
+    lag, backlash) between command and actuator. It is None if there is no drivetrain.
     """
 
     def __init__(
@@ -48,23 +49,23 @@ class Simulator:
         *,
         model: mujoco.MjModel | None = None,
     ) -> None:
-        """Put the robot on this process's first device.
+        """Create the simulator on this process's first device.
 
         **Arguments**
 
-        - `actuators`: identified actuators, with a drivetrain (`drivetrain.HasDrivetrain`) or without; None: the
-          nominal ones.
-        - `model`: a model of this robot to simulate instead of `robot.load_model(actuators)`.
+        - `actuators`: identified actuators, with a drivetrain (`drivetrain.HasDrivetrain`) or without. None for the
+          nominal actuators.
+        - `model`: model of this robot to simulate instead of `robot.load_model(actuators)`.
 
-        **Raises** `ValueError` where the model's time step does not divide the robot's control time step.
+        **Raises** `ValueError` if the model's time step does not divide the robot's control step.
         """
         self.robot, self.actuators = robot, bare_parameters(actuators)
         self.mj_model = robot.load_model(actuators) if model is None else model
         self.control_timestep = robot.control_timestep
-        """Seconds between two commands."""
+        """Duration of a control step (s)."""
         self.nv = self.mj_model.nv
         self.substeps = count_substeps(self.mj_model, robot.control_timestep)
-        """Physics steps in a control step."""
+        """Number of physics steps in a control step."""
         self.drivetrain = drivetrain_of(self.actuators)
         self._slots = 0 if self.drivetrain is None else self._count_slots(self.drivetrain)
         self.model = put_model(self.mj_model)
@@ -77,46 +78,54 @@ class Simulator:
         self._masses = jnp.asarray(self.mj_model.body_mass / self.mj_model.body_mass.sum())
 
     def with_fields(self, fields: Mapping[str, Array]) -> Simulator:
-        """Return the same simulator with other model fields, which may be traced, and the constants that follow.
+        """Return a copy of the simulator with other model fields, and with the constants that MuJoCo derives from them.
 
-        The centre of mass stays that of the model's own masses: air that the robot drags along is no part of it.
+        The fields may be traced. The centre of mass is still computed with the masses of `mj_model`: the added mass of
+        the surrounding air is not part of it.
         """
         return self.with_model(
             with_fields(self.model, with_derived_constants(self._reference_pose, self.model, fields))
         )
 
     def with_model(self, model: mjx.Model) -> Simulator:
-        """Return the same simulator of another MJX model of this structure, which may be traced."""
+        """Return a copy of the simulator with another MJX model of the same structure, which may be traced."""
         other = copy.copy(self)
         other.model = model
         return other
 
     def with_drivetrain(self, drivetrain: DrivetrainParameters | None) -> Simulator:
-        """Return the same simulator with another drivetrain, which may be traced.
+        """Return a copy of the simulator with another drivetrain, which may be traced.
 
-        Its delays may be as long as those of the drivetrain that it takes the place of, rounded up to whole control
-        steps; a simulator without a drivetrain takes none.
+        Delays are limited to the longest delay of the drivetrain given to the constructor, rounded up to whole control
+        steps. A simulator without a drivetrain accepts only None.
+
+        **Raises** `ValueError` if exactly one of the present and the new drivetrain is None.
         """
         if (drivetrain is None) != (self.drivetrain is None):
-            raise ValueError("One simulator has a drivetrain, the other has none; make both with actuators alike.")
+            raise ValueError(
+                "Exactly one of the present and the new drivetrain is None; use actuators of the same kind for both."
+            )
         other = copy.copy(self)
         other.drivetrain = drivetrain
         return other
 
     def with_generalized_force(self, force: Float[Array, " nv"]) -> Simulator:
-        """Return the same simulator under generalized forces (N, N m, along `mjx.Data.qvel`), which may be traced."""
+        """Return a copy of the simulator with generalized forces (N, N m, along `qvel`), which may be traced."""
         other = copy.copy(self)
         other._template = self._template.replace(qfrc_applied=force)  # pyright: ignore
         return other
 
     def observe(self, state: PhysicsState) -> tuple[Float[Array, " features"], Float[Array, " 3"]]:
-        """Features and centre of mass (m, world) of a state."""
+        """Return the features and the centre of mass (m, world frame) of a state."""
         return _observe(self.model, self._template, state, self._masses, self._sites, self._root)
 
     def observe_all(
         self, qpos: Float[Array, "... nq"], qvel: Float[Array, "... nv"]
     ) -> tuple[Float[Array, "... features"], Float[Array, "... 3"]]:
-        """`observe`, of any number of states; one compiled program serves them all."""
+        """Return the features and centres of mass (m, world frame) of any number of states; see `observe`.
+
+        One compiled program serves all numbers of states.
+        """
         shape, count = qpos.shape[:-1], math.prod(qpos.shape[:-1])
         flat = state_at(qpos.reshape(count, -1), qvel.reshape(count, -1))
         parts = [PhysicsState(*(x[rows] for x in flat)) for rows, _ in chunks(count, _CHUNK)]
@@ -126,12 +135,15 @@ class Simulator:
         return features.reshape(*shape, -1), com.reshape(*shape, -1)
 
     def drivetrain_at_rest(self, command: Float[Array, " commands"]) -> DrivetrainState | None:
-        """Return the drivetrain's state long after the same command; None where there is no drivetrain."""
+        """Return the drivetrain's state after a long time under a constant command. None if there is no drivetrain."""
         return None if self.drivetrain is None else init_drivetrain(self.drivetrain, command, self._slots)
 
     def drivetrain_along(self, commands: Float[Array, "steps commands"]) -> DrivetrainState | None:
-        """Return the drivetrain's state before each of the control steps under `commands`, from rest under the first;
-        all arrays have an axis of control steps in front. None where there is no drivetrain."""
+        """Return the drivetrain's state before each control step under `commands`.
+
+        The first state is at rest under the first command. All arrays have a leading axis of control steps. None if
+        there is no drivetrain.
+        """
 
         def step(state: DrivetrainState, command: Array) -> tuple[Any, DrivetrainState]:
             return self.drive(state, command)[0], state
@@ -142,13 +154,18 @@ class Simulator:
     def drive(
         self, state: DrivetrainState | None, command: Float[Array, "*parts commands"]
     ) -> tuple[DrivetrainState | None, Float[Array, "*substeps commands"]]:
-        """Return the drivetrain's state after a control step under a command, or one for each of equal parts of it; and
-        the actuators' `ctrl` in each physics step. Without a drivetrain: None, and the command itself.
+        """Return the drivetrain's state after a control step, and the actuators' `ctrl` in each physics step.
 
-        **Raises** `ValueError` where one of drivetrain and state is there without the other.
+        `command` is held over the control step, or has one row for each of equal parts of it. Without a drivetrain,
+        return None and `command` itself.
+
+        **Raises** `ValueError` if only one of simulator and state has a drivetrain.
         """
         if (state is None) != (self.drivetrain is None):
-            raise ValueError("The simulator has a drivetrain and the state has none, or the other way round.")
+            raise ValueError(
+                "The simulator has a drivetrain and the state has none, or the reverse; make the state with "
+                "`drivetrain_at_rest` of this simulator."
+            )
         if state is None or self.drivetrain is None:
             return None, command
         return scan_drivetrain(self.drivetrain, state, self._in_substeps(command), self._timestep)
@@ -160,8 +177,15 @@ class Simulator:
         wrench: Float[Array, "loaded 6"],
         joint_force: Float[Array, " nv"] | None = None,
     ) -> PhysicsState:
-        """One control step under the actuators' `ctrl`, or one for each of equal parts of it; wrenches are on the
-        tracked body and, if more, at the robot's points. See `step.control_step`."""
+        """Advance by one control step; see `step.control_step`.
+
+        **Arguments**
+
+        - `ctrl`: the actuators' `ctrl`, held over the control step, or one row for each of equal parts of it.
+        - `wrench`: force (N) and torque (N m), world frame, on the tracked body and, in further rows, at the robot's
+          points.
+        - `joint_force`: generalized forces (N, N m, along `mjx.Data.qvel`). None if there are none.
+        """
         commands = self._in_substeps(ctrl)
         sites, bodies = zip(*self._sites[: len(wrench)], strict=True)
         template = self._template
@@ -176,7 +200,7 @@ class Simulator:
         return float(self.mj_model.opt.timestep)
 
     def _count_slots(self, drivetrain: DrivetrainParameters) -> int:
-        # Whole control steps: robots of nearly the same delay share a compiled program.
+        # Round up to whole control steps, so that robots with similar delays share a compiled program.
         steps = math.ceil(float(np.max(drivetrain.delay)) / self.control_timestep - 1e-6)
         return count_slots(steps * self.control_timestep, self._timestep)
 
@@ -187,10 +211,10 @@ class Simulator:
     def with_residual(
         self, residual: HasResidual | None, scale: Float[Array, ""] | float | None = None
     ) -> AugmentedSimulator:
-        """Return the simulator that the residual improves, its model fields included.
+        """Return the simulator with a residual and with the residual's model fields.
 
-        `scale` is the fraction of the residual that acts (0: nothing); None: all of it. `residual` None: a simulator
-        with the same interface that nothing improves.
+        `scale` is the fraction of the residual that is applied: 0 for nothing, None for all of it. If `residual` is
+        None, return a simulator with the same interface and without a residual.
         """
         if residual is None:
             return AugmentedSimulator(self)
@@ -203,35 +227,35 @@ class Simulator:
 
 
 class RolloutState(NamedTuple):
-    """A simulation between two control steps: the physics, and what a residual and the drivetrain remember.
+    """State of a simulation between two control steps: physics, inputs of the residual, and drivetrain.
 
-    With B leading batch axes it is a batch of simulations.
+    Leading axes of the arrays, if any, are batch axes.
     """
 
     physics: PhysicsState
     history: Float[Array, "steps features"]
-    """`observe_features` of the last `HISTORY` control steps, the current one last."""
+    """Features (`observe_features`) of the last `HISTORY` control steps, the current one last."""
     commands: Float[Array, "earlier commands"]
-    """Commands of the `HISTORY` - 1 control steps before the coming one, the latest last."""
+    """Commands of the last `HISTORY` - 1 control steps, the most recent one last."""
     drivetrain: DrivetrainState | None = None
-    """Of the simulator's drivetrain; None where it has none."""
+    """State of the drivetrain. None if the simulator has no drivetrain."""
 
     @property
     def features(self) -> Float[Array, "*batch features"]:
-        """`observe_features` of the current state."""
+        """Features (`observe_features`) of the current state."""
         return self.history[..., -1, :]
 
     def with_command(self, command: Float[Array, " commands"]) -> Float[Array, "steps commands"]:
-        """Return the commands that residuals see: the earlier ones and the coming one."""
+        """Return the commands that residuals observe: the earlier ones and the upcoming `command`."""
         return jnp.concatenate([self.commands, command[None]])
 
     def keep_finite(
         self, before: RolloutState, features: Float[Array, " features"]
     ) -> tuple[RolloutState, Bool[Array, ""]]:
-        """Return this state, the successor of `before`, and whether all its numbers are finite.
+        """Return a finite version of this state, the successor of `before`, and whether this state is finite.
 
-        Where they are not, physics and drivetrain are those of `before`, and `features` stand for the current
-        observation.
+        A state is finite if its current features and its velocities are. Otherwise the returned state has the physics
+        and the drivetrain of `before`, and `features` as its current observation.
         """
         finite = jnp.all(jnp.isfinite(self.features)) & jnp.all(jnp.isfinite(self.physics.qvel))
         seen = jnp.where(finite, self.features, features)
@@ -242,14 +266,14 @@ class RolloutState(NamedTuple):
 
 
 class RolloutStep(NamedTuple):
-    """What one control step gives."""
+    """Result of one control step."""
 
     state: RolloutState
-    """After the step."""
+    """State after the step."""
     com: Float[Array, " 3"]
     """Centre of mass (m, world) after the step."""
     action: Action
-    """What acted over the step: the residual, and what was beside it."""
+    """Action over the step: the sum of the residual's action and the further action."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -258,11 +282,11 @@ class AugmentedSimulator:
 
     **Fields**
 
-    - `simulator`: the robot, with the residual's model fields.
-    - `residual`: the residual with its parameters, which may be traced; None: none.
-    - `scale`: the fraction of the residual that acts; None: all of it.
+    - `simulator`: the robot's simulator, with the residual's model fields.
+    - `residual`: the residual with its parameters, which may be traced. None if there is no residual.
+    - `scale`: the fraction of the residual that is applied. None for all of it.
 
-    `Simulator.with_residual` makes one. The constructor takes the simulator as it is.
+    `Simulator.with_residual` creates an instance. The constructor does not apply the residual's model fields.
     """
 
     simulator: Simulator
@@ -271,25 +295,28 @@ class AugmentedSimulator:
 
     @property
     def robot(self) -> RobotDescription:
-        """Whose simulator it is."""
+        """Description of the simulated robot."""
         return self.simulator.robot
 
     @property
     def actuators(self) -> ModelParameters | None:
-        """The simulator's actuators; None: the nominal ones."""
+        """Identified actuators of the simulator. None for the nominal actuators."""
         return self.simulator.actuators
 
     @property
     def control_timestep(self) -> float:
-        """Seconds between two commands."""
+        """Duration of a control step (s)."""
         return self.simulator.control_timestep
 
     def without_residual(self) -> Simulator:
-        """Return the simulator that the residual improves."""
+        """Return the simulator without the residual and without its model fields."""
         return Simulator(self.robot, self.actuators, model=self.simulator.mj_model)
 
     def with_residual(self, residual: HasResidual | None) -> AugmentedSimulator:
-        """Return the simulator with a further residual, which acts together with its own (`SumOfResiduals`)."""
+        """Return the simulator with a further residual, which acts together with the present one (`SumOfResiduals`).
+
+        If `residual` is None, return the simulator itself.
+        """
         if residual is None:
             return self
         assert self.scale is None, "A scaled residual takes no further one."
@@ -297,23 +324,23 @@ class AugmentedSimulator:
         return AugmentedSimulator(self.simulator.with_fields(both.fields), both)
 
     def with_fields(self, fields: Mapping[str, Array]) -> AugmentedSimulator:
-        """Return the same with other model fields; see `Simulator.with_fields`."""
+        """Return a copy with other model fields; see `Simulator.with_fields`."""
         return dataclasses.replace(self, simulator=self.simulator.with_fields(fields))
 
     def with_model(self, model: mjx.Model, params: Any) -> AugmentedSimulator:
-        """Return the same of another MJX model, and with other parameters of the residual; both may be traced.
+        """Return a copy with another MJX model, and with other parameters of the residual; both may be traced.
 
-        `model` has the residual's fields already. Without a residual, `params` are of no influence.
+        `model` must already contain the residual's fields. `params` is ignored if there is no residual.
         """
         residual = None if self.residual is None else self.residual._replace(params=params)
         return dataclasses.replace(self, simulator=self.simulator.with_model(model), residual=residual)
 
     def with_drivetrain(self, drivetrain: DrivetrainParameters | None) -> AugmentedSimulator:
-        """Return the same with another drivetrain; see `Simulator.with_drivetrain`."""
+        """Return a copy with another drivetrain; see `Simulator.with_drivetrain`."""
         return dataclasses.replace(self, simulator=self.simulator.with_drivetrain(drivetrain))
 
     def with_generalized_force(self, force: Float[Array, " nv"]) -> AugmentedSimulator:
-        """Return the same under generalized forces; see `Simulator.with_generalized_force`."""
+        """Return a copy with generalized forces; see `Simulator.with_generalized_force`."""
         return dataclasses.replace(self, simulator=self.simulator.with_generalized_force(force))
 
     def step(
@@ -325,23 +352,25 @@ class AugmentedSimulator:
         action_scale: Float[Array, ""] | float | None = None,
         key: Array | None = None,
     ) -> RolloutStep:
-        """Advance by one control step: ask the residual, step drivetrain and physics, observe, shift the history.
+        """Advance by one control step.
 
-        The residual's commands are what the drivetrain takes.
+        The residual is evaluated first. Then drivetrain and physics advance, and the new state is observed and appended
+        to the history. The drivetrain receives the commands that the residual returns.
 
         **Arguments**
 
-        - `state`: where the simulation stands; the residual sees its history and commands.
-        - `command`: of the coming control step, in the actuators' own units.
-        - `further`: what acts beside the residual.
-        - `action_scale`: multiplies what the residual does (`Residual.act`), not its delays and model fields.
-        - `key`: to draw what the residual does; None: the most likely.
+        - `state`: current state. The residual observes its history and commands.
+        - `command`: command of the upcoming control step, in the actuators' own units.
+        - `further`: action in addition to that of the residual. None if there is none.
+        - `action_scale`: factor on the residual's action (`Residual.act`). It does not scale the residual's delays and
+          model fields.
+        - `key`: random key to sample the residual's action. None for the mode of its distribution.
         """
         commands = state.with_command(command)
         if self.residual is None:
             sent, action = command, Action.none() if further is None else further
         else:
-            sent, action = self._ask(state.history, commands, key)
+            sent, action = self._evaluate_residual(state.history, commands, key)
             if action_scale is not None:
                 action = action.scaled(action_scale)
             action = action if further is None else further.plus(action)
@@ -354,10 +383,10 @@ class AugmentedSimulator:
         history = jnp.concatenate([state.history[1:], features[None]])
         return RolloutStep(RolloutState(physics, history, commands[1:], drivetrain), com, action)
 
-    def _ask(
+    def _evaluate_residual(
         self, history: History, commands: Commands, key: Array | None
     ) -> tuple[Float[Array, "*parts commands"], Action]:
-        """Return the residual's commands before it changes them, and what it does."""
+        """Return the residual's commands before its command change is added, and its action."""
         assert self.residual is not None
         action = self.residual.act(history, commands, key)
         sent = self.residual.model.command(self.residual.params, commands)
@@ -375,7 +404,7 @@ def _observe(
     sites: tuple[tuple[int, int], ...],
     root: int,
 ) -> tuple[Float[Array, " features"], Float[Array, " 3"]]:
-    """`Simulator.observe`; `masses` are shares of the whole, `sites` ids of sites and of their bodies."""
+    """Implement `Simulator.observe`. `masses` are fractions of the total; `sites` are pairs of site id and body id."""
     site, body = np.array(sites).T
 
     def seen(model: mjx.Model, template: mjx.Data, state: PhysicsState, masses: Array) -> tuple[Array, Array]:
@@ -387,7 +416,7 @@ def _observe(
 
 
 _CHUNK = 1024
-"""States that `Simulator.observe_all` looks at in one go."""
+"""Number of states that `Simulator.observe_all` processes at a time."""
 
 
 @functools.partial(jax.jit, static_argnames=("sites", "root"))

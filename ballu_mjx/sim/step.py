@@ -19,44 +19,48 @@ from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 def count_substeps(model: mujoco.MjModel, control_timestep: float) -> int:
     """Return the number of physics steps in a control step of `control_timestep` seconds.
 
-    **Raises** `ValueError` where the control step is no whole number of them.
+    **Raises** `ValueError` if the control step is not a whole number of physics steps.
     """
     count = control_timestep / model.opt.timestep
     if abs(count - round(count)) > 1e-6 or count < 1 - 1e-6:
         raise ValueError(
-            f"The model's timestep {model.opt.timestep} s does not divide the control step of {control_timestep} s."
+            f"The model's timestep {model.opt.timestep} s does not divide the control step of {control_timestep} s; "
+            "change one of them."
         )
     return round(count)
 
 
 class PhysicsState(NamedTuple):
-    """All that one physics step hands to the next: every other field of `mjx.Data` follows from it.
+    """The part of `mjx.Data` that one physics step passes to the next. All other fields follow from it.
 
-    Loops carry this alone. With all of `mjx.Data`, whose constants turn into batches one by one, JAX traces the nested
-    loops of a vmapped step many times over, and every physics step copies what nobody reads.
+    Loops carry these arrays only. The constants in a complete `mjx.Data` become batched one by one. JAX then traces the
+    nested loops of a vmapped step many times, and every physics step copies unused arrays.
     """
 
     qpos: Float[Array, " nq"]
     qvel: Float[Array, " nv"]
     warmstart: Float[Array, " nv"]
-    """`qacc_warmstart`: where the solver starts."""
+    """`qacc_warmstart`: initial guess of the solver (m/s^2, rad/s^2)."""
 
 
 def state_at(qpos: Float[Array, "*batch nq"], qvel: Float[Array, "*batch nv"]) -> PhysicsState:
-    """The state that nothing went before."""
+    """Return the state with the given positions and velocities, and with a warm start of zero."""
     return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
 
 
 def load_state(template: mjx.Data, state: PhysicsState) -> mjx.Data:
-    """`template` (of the same model, for its sizes) in another state; what follows from it is not computed yet."""
+    """Return `template`, data of the same model, with another state. Derived quantities are not computed yet."""
     return template.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart)  # pyright: ignore
 
 
 def physics_step(
     model: mjx.Model, inputs: mjx.Data, state: PhysicsState, load_by_place: Callable[[mjx.Data], mjx.Data] | None = None
 ) -> PhysicsState:
-    """One physics step under the commands and forces of `inputs`, data of the model: `mjx.step`. `load_by_place` adds
-    external forces that depend on where bodies are."""
+    """Advance by one physics step, as `mjx.step` does.
+
+    `inputs` are data of the model with commands and external forces. `load_by_place` adds external forces that depend
+    on the positions of bodies.
+    """
     data = mjx.fwd_position(model, load_state(inputs, state))
     if load_by_place is not None:
         data = load_by_place(data)
@@ -73,10 +77,10 @@ _INTEGRATORS = {
     mujoco.mjtIntegrator.mjINT_RK4: mjx.rungekutta4,
     mujoco.mjtIntegrator.mjINT_IMPLICITFAST: mjx.implicit,
 }
-"""All that MJX has; it refuses models with others."""
+"""All integrators of MJX, which rejects models with others."""
 
 
-# Compiled as part of whatever calls it; jitted to be traced once, not once a program.
+# Callers compile this into their own programs. With `jit` it is traced once, instead of once for each program.
 @functools.partial(jax.jit, static_argnames=("bodies", "points", "count"))
 def control_step(
     model: mjx.Model,
@@ -89,17 +93,23 @@ def control_step(
     points: tuple[int, ...] = (),
     count: int,
 ) -> PhysicsState:
-    """Advance by `count` physics steps, the external wrenches held.
+    """Advance by `count` physics steps with constant external wrenches.
 
     **Arguments**
 
-    - `template`: data of the model, from `make_data`; of no influence but for what no step changes.
-    - `command`: commands in the actuators' own units, held, or a row for each physics step.
-    - `wrench`: force (N) and torque (N m), world frame, on the bodies of the ids `bodies`: at the first one's centre of
-      mass, and on each of the others at the site of its id in `points`, wherever that moves.
+    - `template`: data of the model, from `make_data`. Only fields that a step does not change have an effect.
+    - `command`: commands in the actuators' own units: one row that is held, or one row for each physics step.
+    - `wrench`: force (N) and torque (N m), world frame, on each of the bodies with the ids `bodies`. The first wrench
+      acts at its body's centre of mass. Each other wrench acts at the body's site with the id in `points`, and moves
+      with it.
+
+    **Raises** `ValueError` if the numbers of wrenches, bodies and points do not match.
     """
     if not len(bodies) == len(points) + 1 == wrench.shape[0]:
-        raise ValueError(f"{wrench.shape[0]} wrenches for {len(bodies)} bodies with {len(points)} points.")
+        raise ValueError(
+            f"There are {wrench.shape[0]} wrenches, {len(bodies)} bodies and {len(points)} points; give one wrench for "
+            "each body, and one point for each body after the first."
+        )
     commands = jnp.broadcast_to(command, (count, command.shape[-1]))
 
     def steps(
@@ -109,17 +119,17 @@ def control_step(
         commands: Float[Array, "count commands"],
         wrench: Float[Array, "loaded 6"],
     ) -> PhysicsState:
-        # Added one by one: two points may be of the same body.
-        pushed = template.xfrc_applied
+        # Wrenches are added one by one, because two points may belong to the same body.
+        applied = template.xfrc_applied
         for number, body in enumerate(bodies):
-            pushed = pushed.at[body].add(wrench[number])
-        loaded = template.replace(xfrc_applied=pushed)  # pyright: ignore
+            applied = applied.at[body].add(wrench[number])
+        loaded = template.replace(xfrc_applied=applied)  # pyright: ignore
 
         def at_points(data: mjx.Data) -> mjx.Data:
-            pushed = data.xfrc_applied
+            applied = data.xfrc_applied
             for force, body, site in zip(wrench[1:, :3], bodies[1:], points, strict=True):
-                pushed = pushed.at[body, 3:].add(jnp.cross(data.site_xpos[site] - data.xipos[body], force))
-            return data.replace(xfrc_applied=pushed)  # pyright: ignore
+                applied = applied.at[body, 3:].add(jnp.cross(data.site_xpos[site] - data.xipos[body], force))
+            return data.replace(xfrc_applied=applied)  # pyright: ignore
 
         def step(number: Array, state: PhysicsState) -> PhysicsState:
             now = loaded.replace(ctrl=commands[number])  # pyright: ignore
@@ -131,11 +141,14 @@ def control_step(
 
 
 def put_model(model: mujoco.MjModel) -> mjx.Model:
-    """`model` for MJX, on this process's first device: MJX's own choice is the first of all processes that train
-    together (see `ballu_mjx.rl.distributed`), whose memory the others cannot read."""
+    """Return `model` for MJX, on this process's first device.
+
+    MJX's default is the first device of all processes that train together (see `ballu_mjx.rl.distributed`). Other
+    processes cannot read its memory.
+    """
     return mjx.put_model(model, device=jax.local_devices()[0])
 
 
 def make_data(model: mujoco.MjModel) -> mjx.Data:
-    """MJX data of `model` at its reference pose, on this process's first device."""
+    """Return MJX data of `model` at its reference pose, on this process's first device."""
     return mjx.make_data(model, device=jax.local_devices()[0])

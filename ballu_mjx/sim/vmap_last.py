@@ -1,11 +1,12 @@
 """`vmap` with the batch along the last axis, for CPUs.
 
-A robot's arrays are small: 13 velocities, 3x3 rotations. `jax.vmap` puts the batch first, and XLA's loops on a CPU then
-run over those short axes, three or thirteen numbers at a time. With the batch last every loop runs over hundreds of
-robots that lie side by side, as many a time as the processor's vectors hold. The function stays as it is: what JAX
-recorded of it is evaluated again, operation by operation, on arrays with one axis more.
+A robot's arrays are small, for example 13 velocities or a 3x3 rotation. `jax.vmap` puts the batch axis first. XLA's
+loops on a CPU then run over the short axes, three or thirteen numbers at a time. With the batch axis last, every loop
+runs over hundreds of robots that are adjacent in memory, and vector instructions process several robots at once. The
+function itself does not change. JAX's record of it (the jaxpr) is evaluated again, operation by operation, on arrays
+with one more axis.
 
-Operations without a rule (`vmap_last_rules`) are left to `jax.vmap`, which is as right and slower.
+Operations without a rule (`vmap_last_rules`) are left to `jax.vmap`, which is equally correct and slower.
 """
 
 from __future__ import annotations
@@ -29,16 +30,18 @@ from ballu_mjx.sim.vmap_last_rules import Batched, depends_on_batch, evaluate, u
 def vmap(
     function: Callable[..., Any], in_batched: Sequence[PyTree[bool]], size: int, widest: int | None = None
 ) -> Callable[..., Any]:
-    """Like `jax.vmap(function)`, for functions of arrays and trees of them.
+    """Return a batched version of `function`, like `jax.vmap(function)`, for functions of arrays and trees of arrays.
 
     **Arguments**
 
-    - `in_batched`: of each argument a tree of the same structure; which leaves have a batch, along their first axis.
-    - `size`: of the batch.
-    - `widest`: more than so many run one part after the other; None: 512.
+    - `in_batched`: for each argument, a tree of the same structure. It says which leaves have a batch along their first
+      axis.
+    - `size`: batch size.
+    - `widest`: largest batch that is evaluated at once. Larger batches are split into parts that run one after another.
+      None for 512.
 
-    **Returns** a function of the results, and of a tree that tells which of them have a batch, along their first axis:
-    those that depend on an argument that has one.
+    **Returns** a function that returns the results, and a tree that says which results have a batch along their first
+    axis. These are the results that depend on a batched argument.
     """
     flags, widest = jax.tree.leaves(list(in_batched)), widest or _WIDEST
 
@@ -74,12 +77,15 @@ def vmap(
 
 
 _WIDEST = 512
-"""What a robot's step keeps at hand then stays in a core's cache (`benchmarks/step_profile.py`)."""
+"""Largest batch whose working data in a robot's step stay in a core's cache (`benchmarks/step_profile.py`)."""
 
 
 def nested_vmap(function: Callable[..., PyTree], inner: int = 1) -> Callable[..., PyTree]:
-    """`jax.vmap(function)`; on the CPU with the batch last, also of what `function` has batches of itself (of about
-    `inner`)."""
+    """Return `jax.vmap(function)`; on the CPU, a version with the batch along the last axis.
+
+    Operations that `function` itself batches have the new batch axis last as well. Their batch size is about `inner`,
+    and the largest batch that is evaluated at once is smaller by this factor.
+    """
     if jax.default_backend() != "cpu":
         return jax.vmap(function)
 
@@ -93,9 +99,10 @@ def nested_vmap(function: Callable[..., PyTree], inner: int = 1) -> Callable[...
 
 
 def vmap_with_trailing_batch(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """`function`, of which `jax.vmap` makes a program with the batch last; of its forward derivatives too.
+    """Return `function` with a rule that makes `jax.vmap` put the batch along the last axis.
 
-    On the CPU alone: elsewhere it is `function` itself. There is no reverse mode.
+    The rule applies to forward derivatives too. It exists on the CPU only: on other devices, the result calls
+    `function` unchanged. Reverse mode is not supported.
     """
 
     def whole(*arguments: PyTree) -> PyTree:
@@ -111,7 +118,7 @@ def vmap_with_trailing_batch(function: Callable[..., PyTree]) -> Callable[..., P
 
         @functools.partial(apply.defjvp, symbolic_zeros=True)
         def _(leaves: Sequence[Array], changes: Sequence[Any]) -> tuple[PyTree, PyTree]:
-            # Most of a model does not change, and needs no derivatives.
+            # Most fields of a model are constant and need no derivatives.
             places = nonzero_tangents(changes)
 
             def along(leaves: list[Array], changes: list[Array]) -> tuple[PyTree, PyTree]:
@@ -126,8 +133,11 @@ def vmap_with_trailing_batch(function: Callable[..., PyTree]) -> Callable[..., P
 
 
 def _recorded(function: Callable[..., PyTree], *arguments: PyTree) -> Callable[..., PyTree]:
-    """`function` for arguments of these shapes, run by JAX's record of it: MJX takes long to trace, and is traced more
-    than once here. What its results do not need, a third of a physics step, is left out."""
+    """Return a function that runs JAX's record of `function` for arguments of these shapes.
+
+    Tracing MJX takes long, and it would be traced several times here. Operations that the results do not need, a third
+    of a physics step, are left out.
+    """
     record, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
     needed, _ = dce_jaxpr(record.jaxpr, [True] * len(record.jaxpr.outvars), instantiate=True)
     run, tree = jaxpr_as_fun(ClosedJaxpr(needed, record.consts)), jax.tree.structure(shape)

@@ -1,6 +1,6 @@
-"""Recorded functions of JAX, evaluated with the batch along the last axis: one rule for each operation.
+"""Evaluation of JAX's records of functions (jaxprs) with the batch along the last axis: one rule for each operation.
 
-`vmap_last` says what for. Operations without a rule are left to `jax.vmap`.
+`vmap_last` gives the reason. Operations without a rule are left to `jax.vmap`.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from jaxtyping import Array
 
 @dataclasses.dataclass(frozen=True)
 class Batched:
-    """Hold a value that has a batch."""
+    """A value that has a batch."""
 
     array: Array
-    """Its last axis is the batch."""
+    """Array whose last axis is the batch."""
 
 
 def _bare(value: Any) -> Any:
@@ -35,7 +35,7 @@ def _is_batched(value: Any) -> bool:
 
 
 def _full(value: Any, size: int) -> Array:
-    """With a batch, whether it had one or not."""
+    """Return the array of a value, repeated over the batch if the value has none."""
     if isinstance(value, Batched):
         return value.array
     array = jnp.asarray(value)
@@ -43,12 +43,15 @@ def _full(value: Any, size: int) -> Array:
 
 
 def _ranked(array: Array, like: Array) -> Array:
-    """One number for each of the batch, repeated over the other axes of `like`: JAX lets scalars pass for any shape."""
+    """Return `array`, repeated over the axes of `like` if it has only one number for each element of the batch.
+
+    JAX's operations accept scalars in place of arrays of any shape.
+    """
     return array if array.ndim == like.ndim else lax.broadcast_in_dim(array, like.shape, (like.ndim - 1,))
 
 
 def evaluate(closed: ClosedJaxpr, arguments: Iterable[Any], size: int) -> list[Any]:
-    """What the recorded function returns."""
+    """Return the results of a recorded function. `size` is the batch size."""
     known: dict[Any, Any] = dict(zip(closed.jaxpr.constvars, closed.consts, strict=True))
     known.update(zip(closed.jaxpr.invars, arguments, strict=True))
 
@@ -62,7 +65,7 @@ def evaluate(closed: ClosedJaxpr, arguments: Iterable[Any], size: int) -> list[A
 
 
 def _apply(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
-    """One operation."""
+    """Return the results of one operation."""
     name, bind, params = equation.primitive.name, equation.primitive.bind, equation.params
     if name in _CALLS:
         return evaluate(params[_CALLS[name]], inputs, size)
@@ -88,14 +91,14 @@ def _as_list(found: Any, equation: JaxprEqn) -> list[Any]:
 
 
 def _result(equation: JaxprEqn) -> ShapedArray:
-    """Shape and type of what an operation returns for one of the batch."""
+    """Return shape and type of an operation's result for one element of the batch."""
     aval = equation.outvars[0].aval
     assert isinstance(aval, ShapedArray)
     return aval
 
 
 _CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
-"""Functions within functions, and which parameter holds them."""
+"""Operations that call another recorded function, and the name of the parameter that holds it."""
 _ELEMENTWISE = frozenset(
     "abs acos add add_any and asin atan atan2 cbrt ceil clamp convert_element_type copy cos div eq erf exp exp2 floor "
     "ge gt integer_pow is_finite le log log1p logistic lt max min mul ne neg nextafter not or pow rem round rsqrt sign "
@@ -104,7 +107,8 @@ _ELEMENTWISE = frozenset(
 _REDUCTIONS = frozenset("argmax argmin reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum".split())
 
 Rule = Callable[[JaxprEqn, list[Any], int], list[Any] | None]
-"""Of an operation, its inputs and the batch's size: the results, or None where this case is left to `jax.vmap`."""
+"""Function of an operation, its inputs and the batch size. It returns the results, or None if `jax.vmap` has to do
+it."""
 _RULES: dict[str, Rule] = {}
 
 
@@ -175,7 +179,10 @@ def _pad(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any] | None:
 
 @_rule("dynamic_slice")
 def _dynamic_slice(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
-    """A place that differs over the batch is chosen among all there are: few, and no loop over the batch."""
+    """Select among all possible start positions if they differ over the batch.
+
+    There are few positions, and the selection needs no loop over the batch.
+    """
     array, sizes = _full(inputs[0], size), equation.params["slice_sizes"]
     for axis, (start, width) in enumerate(zip(inputs[1:], sizes, strict=True)):
         places = array.shape[axis] - width + 1
@@ -222,7 +229,7 @@ def _scatter(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any] | No
     return [Batched(equation.primitive.bind(_full(array, size), indices, updates, **params))]
 
 
-# 2. Linear algebra: matrices of a dozen rows, one column at a time for the whole batch
+# 2. Linear algebra: matrices with about a dozen rows, processed column by column for the whole batch
 
 
 @_rule("dot_general")
@@ -231,7 +238,8 @@ def _dot(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
     dtype = _result(equation).dtype
 
     def arranged(value: Any, contracted: Sequence[int], together: Sequence[int]) -> tuple[Array, int]:
-        """Axes: contracted (one), together, others, batch; and how many others."""
+        """Return the operand with axes contracted (merged into one), `together`, others, batch; and the count of
+        others."""
         array = _bare(value) if _is_batched(value) else jnp.asarray(value)[..., None]
         others = [axis for axis in range(array.ndim - 1) if axis not in (*contracted, *together)]
         array = lax.transpose(array, (*contracted, *together, *others, array.ndim - 1))
@@ -246,7 +254,7 @@ def _dot(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
     return [Batched(jnp.sum(left * right, axis=0, dtype=dtype))]  # pyright: ignore[reportArgumentType]
 
 
-# Sums over what is solved already keep XLA from working out every earlier row again in each later one.
+# Explicit sums over the rows solved so far keep XLA from recomputing every earlier row in each later row.
 
 
 @_rule("cholesky")
@@ -269,7 +277,7 @@ def _triangular_solve(equation: JaxprEqn, inputs: list[Any], size: int) -> list[
     if matrix.ndim != 3 or params["unit_diagonal"]:
         return None
     lower, on_left = params["lower"], params["left_side"]
-    if params["transpose_a"] == on_left:  # the equation transposed has its matrix on the other side
+    if params["transpose_a"] == on_left:  # transposing the equation moves the matrix to its other side
         matrix, lower = jnp.swapaxes(matrix, 0, 1), not lower
     if not on_left:
         right = jnp.swapaxes(right, 0, 1)
@@ -282,11 +290,11 @@ def _triangular_solve(equation: JaxprEqn, inputs: list[Any], size: int) -> list[
     return [Batched(solved if on_left else jnp.swapaxes(solved, 0, 1))]
 
 
-# 3. Control flow: a robot that is done keeps its values while others go on
+# 3. Control flow: elements of the batch that have finished a loop keep their values while others continue
 
 
 def depends_on_batch(closed: ClosedJaxpr, batched: Iterable[bool]) -> list[bool]:
-    """Which results have a batch, by which arguments do."""
+    """Return which results have a batch, given which arguments have one."""
     jaxpr: Jaxpr = closed.jaxpr
     known = dict(zip(jaxpr.invars, batched, strict=True))
 
@@ -314,8 +322,10 @@ def depends_on_batch(closed: ClosedJaxpr, batched: Iterable[bool]) -> list[bool]
 
 
 def _while_depends(equation: JaxprEqn, inputs: Sequence[bool]) -> tuple[list[bool], bool]:
-    """What of the loop's values has a batch, for it starts with one or is given one on the way; and whether each of the
-    batch ends in its own time."""
+    """Return which of the loop's values have a batch, and whether the number of iterations differs over the batch.
+
+    A value has a batch if it has one at the start or receives one during the loop.
+    """
     of_cond, of_body, batched = _parts(inputs, equation.params["cond_nconsts"], equation.params["body_nconsts"])
     while True:
         each = depends_on_batch(equation.params["cond_jaxpr"], [*of_cond, *batched])[0]
@@ -327,7 +337,7 @@ def _while_depends(equation: JaxprEqn, inputs: Sequence[bool]) -> tuple[list[boo
 
 
 def _scan_depends(equation: JaxprEqn, inputs: Sequence[bool]) -> list[bool]:
-    """Which of the last carry and of the results of all steps have a batch."""
+    """Return which values of the final carry, and which results of all steps, have a batch."""
     carried = equation.params["num_carry"]
     fixed, batched, rows = _parts(inputs, equation.params["num_consts"], carried)
     while True:
@@ -339,7 +349,7 @@ def _scan_depends(equation: JaxprEqn, inputs: Sequence[bool]) -> list[bool]:
 
 
 def _parts(values: Sequence[Any], first: int, second: int) -> tuple[list[Any], list[Any], list[Any]]:
-    """The first so many, the next so many, and the rest."""
+    """Return the first `first` values, the next `second` values, and the rest."""
     return list(values[:first]), list(values[first : first + second]), list(values[first + second :])
 
 
@@ -348,7 +358,7 @@ def _wrapped(values: Iterable[Any], batched: Iterable[bool]) -> list[Any]:
 
 
 def unwrap(values: Iterable[Any], batched: Iterable[bool], size: int) -> list[Any]:
-    """Return bare arrays; those that are `batched` have a batch, whether they had one before or not."""
+    """Return bare arrays. Those that are `batched` have a batch, even if the value had none."""
     return [_full(x, size) if b else x for x, b in zip(values, batched, strict=True)]
 
 

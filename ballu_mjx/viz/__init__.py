@@ -1,1 +1,1 @@
-"""Figures, pages, videos and live views of runs."""
+"""Figures, reports, videos and live views of runs."""

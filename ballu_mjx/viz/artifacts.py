@@ -1,4 +1,4 @@
-"""The files that an evaluation leaves in a run's folder."""
+"""Files that an evaluation writes to a run's folder."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def write_evaluation(evaluator: OpenLoopEvaluator, params: Any, folder: Path) -> Evaluation:
-    """Evaluate, and write `evaluation.txt`, `evaluation.json`, `tracking.png` and `replay.npz` into `folder`."""
+    """Evaluate a residual; write `evaluation.txt`, `evaluation.json`, `tracking.png` and `replay.npz` to `folder`."""
     names = evaluator.base, evaluator.name
     replays = dict(zip(names, (evaluator.replay(params, scale=0.0), evaluator.replay(params)), strict=True))
     vanilla, residual = (evaluator.errors(replays[name]) for name in names)
@@ -32,7 +32,7 @@ def write_evaluation(evaluator: OpenLoopEvaluator, params: Any, folder: Path) ->
 
 
 def draw_tracking(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay], path: Path) -> None:
-    """Draw whole-recording replays, by simulator: of the first recording of each group."""
+    """Draw the replays of whole recordings by simulator, for the first recording of each group."""
     from ballu_mjx.recordings.groups import group_of
     from ballu_mjx.viz import plots
 
@@ -56,7 +56,7 @@ def draw_tracking(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay], p
 
 
 def stored_rollouts(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay]) -> list[StoredRollout]:
-    """Whole-recording replays of every recording, by simulator, to be looked at; the force is the last simulator's."""
+    """Return the replays of whole recordings by simulator, for views in 3D. The force is that of the last simulator."""
     found = []
     for index, motion in enumerate(evaluator.motions):
         run = evaluator.first_runs[index]
@@ -79,7 +79,7 @@ def stored_rollouts(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay])
 
 
 def draw_learning_curve(folder: Path, best_step: int) -> None:
-    """Draw `learning_curve.png` from the run's `metrics.jsonl`."""
+    """Draw `learning_curve.png` from the `metrics.jsonl` in a run's folder."""
     from ballu_mjx.runs.metrics import read_column
     from ballu_mjx.viz import plots
 

@@ -1,4 +1,4 @@
-"""Figures of a fit of declared parameters, drawn from arrays into PNG files."""
+"""Figures of a fit of declared parameters, drawn from arrays and written as PNG files."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from matplotlib.figure import Figure
 from ballu_mjx.viz.style import colour_of, save_figure
 
 _NAMES = {"measured": "recording", "nominal": "vanilla", "identified": "vanilla+sysid"}
-"""Whose colours measured and simulated motions have."""
+"""Simulator whose colour a measured or simulated motion has."""
 
 
 @dataclasses.dataclass(frozen=True)
 class HeldOutPanel:
-    """A held-out window.
+    """Curves of a held-out window.
 
     **Fields**
 
-    - `title`: which one.
-    - `time`: s, from the window's start.
-    - `curves`: what was measured and simulated, by name (measured, nominal, identified).
+    - `title`: name of the window.
+    - `time`: time from the window's start (s).
+    - `curves`: measured and simulated motions, by name (measured, nominal, identified).
     """
 
     title: str
@@ -34,7 +34,7 @@ class HeldOutPanel:
 
 
 def held_out_windows(path: Path, panels: Sequence[HeldOutPanel], channels: Sequence[str]) -> None:
-    """Draw channels over time, a row for each of `channels`, whose names hold units, and a column for each panel."""
+    """Draw channels over time, with a row for each of `channels` (names with units) and a column for each panel."""
     figure = Figure(figsize=(1.5 + 3.5 * len(panels), 1.5 + 1.8 * len(channels)), layout="constrained")
     axes = figure.subplots(len(channels), len(panels), sharex="col", squeeze=False)
     for column, panel in zip(axes.T, panels, strict=True):
@@ -60,7 +60,10 @@ def residual_autocorrelation(
     correlations: Mapping[str, Float[np.ndarray, "lags channels"]],
     channels: Sequence[str],
 ) -> None:
-    """Draw the autocorrelation of what nominal and identified values leave, a panel for each channel; lags in s."""
+    """Draw the autocorrelation of the errors with nominal and identified values, with a panel for each channel.
+
+    Lags are in s.
+    """
     figure = Figure(figsize=(7.0, 1.0 + 1.8 * len(channels)), layout="constrained")
     axes = figure.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
     for channel, axis in enumerate(axes):
@@ -70,7 +73,7 @@ def residual_autocorrelation(
         axis.set_ylabel(channels[channel])
         axis.set_ylim(-1.05, 1.05)
         axis.grid(alpha=0.3)
-    axes[-1].set_xlabel("lag (s); white noise has none beyond 0")
+    axes[-1].set_xlabel("lag (s); white noise has no correlation beyond 0")
     axes[0].legend(fontsize="small")
     save_figure(figure, path)
 
@@ -82,8 +85,11 @@ def parameter_intervals(
     robust: Float[np.ndarray, " parameters"],
     white: Float[np.ndarray, " parameters"],
 ) -> None:
-    """Draw identified less nominal values and their 95 % intervals, all in prior standard deviations: by robust
-    standard errors, and thicker by those of white noise."""
+    """Draw the differences of identified and nominal values with 95 % intervals, in units of the prior's standard
+    deviation.
+
+    Thin intervals are from robust standard errors (`robust`), thick ones from those for white noise (`white`).
+    """
     figure = Figure(figsize=(7.0, 1.2 + 0.35 * len(names)), layout="constrained")
     axis, place, colour = figure.subplots(), np.arange(len(names))[::-1], colour_of("vanilla+sysid")
     axis.errorbar(values, place, xerr=1.96 * robust, fmt="o", color=colour, capsize=3, label="robust")
@@ -92,7 +98,7 @@ def parameter_intervals(
     axis.axvline(0.0, color=colour_of("vanilla"), linestyle="--", label="nominal")
     axis.set_yticks(place, names)
     axis.set_ylim(-0.6, len(names) - 0.4)
-    axis.set_xlabel("identified less nominal, in standard deviations among robots")
+    axis.set_xlabel("identified minus nominal, in standard deviations among robots")
     axis.grid(alpha=0.3)
     axis.legend(fontsize="small")
     save_figure(figure, path)

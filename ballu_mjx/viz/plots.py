@@ -1,4 +1,4 @@
-"""Figures of a training run, drawn from arrays into PNG files; no display and no global state."""
+"""Figures of a training run, drawn from arrays and written as PNG files, without display and global state."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ _QUANTITIES = ("x (m)", "y (m)", "yaw (deg)")
 
 @dataclasses.dataclass(frozen=True)
 class TrackingPanel:
-    """One recording, with what simulators make of its commands from its first state on.
+    """A recording, and simulations of its commands from its first state.
 
     **Fields**
 
-    - `title`: the recording's name, say.
-    - `time`: s.
-    - `recording`: the tracked body's x (m), y (m) and yaw (rad).
-    - `simulations`: the same by simulator (any name), one run, or several of which mean and range are drawn.
+    - `title`: title of the panel, for example the name of the recording.
+    - `time`: time (s).
+    - `recording`: recorded x (m), y (m) and yaw (rad) of the tracked body.
+    - `simulations`: simulated x, y and yaw, by the name of the simulator. An array has one run or several runs. For
+      several runs, mean and range are drawn.
     """
 
     title: str
@@ -35,13 +36,13 @@ class TrackingPanel:
 
 
 def tracking(path: Path, panels: Sequence[TrackingPanel]) -> None:
-    """x, y and yaw over time, a column for each panel."""
+    """Draw x, y and yaw over time, with a column for each panel."""
     figure = Figure(figsize=(1.0 + 5.0 * len(panels), 7.0), layout="constrained")
     axes = figure.subplots(len(_QUANTITIES), len(panels), sharex="col", squeeze=False)
     for column, panel in zip(axes.T, panels, strict=True):
         column[0].set_title(panel.title)
         column[-1].set_xlabel("time (s)")
-        curves = {**panel.simulations, "recording": panel.recording}  # the recording last, on top
+        curves = {**panel.simulations, "recording": panel.recording}  # the recording is drawn last, on top
         for name, values in curves.items():
             runs = unwrapped(values if values.ndim == 3 else values[None], float(panel.recording[0, 2]))
             for index, axis in enumerate(column):
@@ -67,7 +68,7 @@ def learning_curve(
     validation_error: Float[np.ndarray, " m"],
     best_step: int | None = None,
 ) -> None:
-    """Mean reward per control step, and the validation error as a ratio to vanilla's, against control steps."""
+    """Draw the mean reward per control step, and the ratio of the validation error to vanilla's, over control steps."""
     best = None if best_step is None else best_step / 1e6
     figure, upper, lower = _over_validation((validation_steps / 1e6, validation_error), "envmimic", "vanilla", best)
     upper.plot(steps / 1e6, reward, color=colour_of("envmimic"))
@@ -85,7 +86,10 @@ def fit_curve(
     simulator: str,
     best_step: int,
 ) -> None:
-    """Losses by name and the validation error, called `label`, against gradient steps, in the simulator's colour."""
+    """Draw losses by name, and the validation error with the axis label `label`, over gradient steps.
+
+    The curves have the simulator's colour.
+    """
     figure, upper, lower = _over_validation(validation, simulator, "no force", float(best_step))
     for (name, curve), style in zip(losses.items(), ("-", "--"), strict=False):
         upper.plot(*curve, color=colour_of(simulator), linestyle=style, label=name)
@@ -99,8 +103,11 @@ def fit_curve(
 def _over_validation(
     validation: tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]], simulator: str, base: str, best: float | None
 ) -> tuple[Figure, Axes, Axes]:
-    """Return a figure of two panels. The lower one has the validation error as a ratio to that of what is called
-    `base`, and where the best checkpoint is; the upper one is empty."""
+    """Return a figure with two panels.
+
+    The lower panel has the validation error as a ratio to that of `base` (a label), and a line at the best checkpoint.
+    The upper panel is empty.
+    """
     figure = Figure(figsize=(7.0, 6.0), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
     lower.plot(*validation, color=colour_of(simulator), marker="o", markersize=4)
@@ -114,8 +121,10 @@ def _over_validation(
 
 
 def compared(path: Path, panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]]]) -> None:
-    """Learning curves side by side: by axis label, by row, control steps, mean, and half the interval's width (not a
-    number: none is drawn)."""
+    """Draw learning curves of several rows, with a panel for each metric.
+
+    `panels[label][row]` holds control steps, mean, and half the width of the interval. An interval of NaN is not drawn.
+    """
     figure = Figure(figsize=(8.0, 3.5 * len(panels)), layout="constrained")
     rows = list(dict.fromkeys(label for lines in panels.values() for label in lines))
     for axis, (title, lines) in zip(
@@ -140,8 +149,10 @@ def reward_curve(
     validation_reward: Float[np.ndarray, " m"],
     simulator: str,
 ) -> None:
-    """Mean reward per control step (m/s) against control steps, in the simulator's colour: of training, and of the
-    policy without exploration."""
+    """Draw the mean reward per control step (m/s) over control steps, in training and without exploration.
+
+    The curves have the simulator's colour.
+    """
     figure = Figure(figsize=(7.0, 3.5), layout="constrained")
     axis = figure.subplots()
     axis.plot(steps / 1e6, reward, color=colour_of(simulator), label=f"{label_of(simulator)}, training")

@@ -1,4 +1,4 @@
-"""A recording over time."""
+"""Figure of a recording over time."""
 
 from __future__ import annotations
 
@@ -16,14 +16,16 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.viz.style import save_figure
 
 _Lines = Sequence[tuple[str, Float[np.ndarray, " T"], Sequence[str]]]
-"""Label, values and columns of each line."""
+"""Label, values and recording columns of each line."""
 
 
 def draw_recording(
     path: Path, seen: Recording, robot: RobotDescription, gaps: Mapping[str, Sequence[tuple[float, float]]]
 ) -> None:
-    """Write a figure of a recording: the tracked body's way and orientation, the points' heights, joints and commands.
-    Drop-outs (first and last time, s, by column) are shaded."""
+    """Draw a recording: position and orientation of the tracked body, heights of the points, joints and commands.
+
+    Drop-outs are shaded. `gaps` has their first and last times (s), by column of the recording.
+    """
     panels = _panels(seen, robot)
     figure = Figure(figsize=(9.0, 1.0 + 1.7 * len(panels)), layout="constrained")
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]

@@ -1,7 +1,7 @@
-"""A run as one page for the browser: `python -m ballu_mjx report RUN`.
+"""Report of a run as one page for the browser: `python -m ballu_mjx report RUN`.
 
-The page holds all it shows and loads nothing: options, learning curves, errors, plots over time, and the replay in 3D.
-JAX, MuJoCo, and all that needs them, are imported inside functions: `runtime.prepare` has to come first.
+The page has options, learning curves, errors, plots over time, and the replay in 3D. It contains all its data and loads
+nothing. JAX, MuJoCo and modules that need them are imported inside functions: `runtime.prepare` has to come first.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _ROW_HEIGHT = 170
 
 
 def render(content: Content) -> str:
-    """The page. Strings of the run are escaped wherever they stand; nothing in them is markup.
+    """Return the page as HTML. All strings of the run are escaped, so that none is read as markup.
 
-    **Raises** `InputError` where the packages of the extra `report` are missing.
+    **Raises** `InputError` if packages of the extra `report` are missing.
     """
     try:
         import jinja2
@@ -97,7 +97,7 @@ def _curve_rows(curves: Sequence[Curve]) -> _Rows:
 
 
 def _take_rows(take: StoredRollout) -> _Rows:
-    """x, y and yaw of each robot's tracked body, the residual force, the commands."""
+    """Return plot rows over time: x, y and yaw of each robot's tracked body, the residual force, and the commands."""
     from ballu_mjx.viz import robot_meshes
     from ballu_mjx.viz.style import COMMAND_COLOURS, label_of, unwrapped
 
@@ -124,7 +124,7 @@ def _take_rows(take: StoredRollout) -> _Rows:
 
 
 def _plot(rows: _Rows, x_title: str) -> dict[str, Any]:
-    """A plotly figure as plain data, a panel for each row, over one x."""
+    """Return a Plotly figure as plain data, with a panel for each row and a shared x axis."""
     from plotly.subplots import make_subplots
 
     figure = make_subplots(rows=len(rows), cols=1, shared_xaxes=True, vertical_spacing=0.03)

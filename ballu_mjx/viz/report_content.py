@@ -1,6 +1,6 @@
-"""What the report of a run shows, read from the run's folder.
+"""Content of a run's report, read from the run's folder.
 
-JAX, MuJoCo, and all that needs them, are imported inside functions: `runtime.prepare` has to come first.
+JAX, MuJoCo and modules that need them are imported inside functions: `runtime.prepare` has to come first.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 
 IDENTIFICATION_FILE = "identification.json"
-"""What `train sysid` leaves of declared parameters: `identification.fit_report.fit_details`."""
+"""File that `train sysid` writes for declared parameters. Its content is `identification.fit_report.fit_details`."""
 _INTERACTIVE = ("tracking.png", "learning_curve.png")
-"""Figures of a run's folder that the page has an interactive twin of."""
+"""Figures of a run's folder that the page leaves out, because it has interactive versions of them."""
 _CURVES = {
     "reward": "reward per control step",
     "validation_error": "validation error (ratio to vanilla)",
@@ -41,15 +41,17 @@ _WHOLE = (("mean_com_error", "mean CoM error (m)", 3), ("final_orientation_error
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """A number as it is shown, and as it was stored."""
+    """Cell of a table."""
 
     text: str
+    """Text that is shown."""
     exact: str | None = None
+    """Number in full precision, as it was stored. None if the cell has no number."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """A titled table."""
+    """Table with a title."""
 
     title: str
     header: Sequence[str]
@@ -58,35 +60,38 @@ class Table:
 
 @dataclasses.dataclass(frozen=True)
 class Curve:
-    """What was measured in training: `values` by name of a run, each (control steps, values)."""
+    """Learning curves of one metric."""
 
     title: str
     values: Mapping[str, tuple[np.ndarray, np.ndarray]]
+    """Control steps and values of the metric, by the name of a run."""
 
 
 @dataclasses.dataclass
 class Content:
-    """All that a page shows."""
+    """Content of a report."""
 
     title: str
     facts: list[tuple[str, str]] = dataclasses.field(default_factory=list)
+    """Names and values of the run's properties, such as its folder and its command."""
     tables: list[Table] = dataclasses.field(default_factory=list)
     markdown: list[tuple[str, str]] = dataclasses.field(default_factory=list)
-    """Titled tables in Markdown."""
+    """Titles and tables in Markdown."""
     texts: list[tuple[str, str]] = dataclasses.field(default_factory=list)
-    """Titled plain text."""
+    """Titles and plain texts."""
     curves: list[Curve] = dataclasses.field(default_factory=list)
     images: list[tuple[str, bytes]] = dataclasses.field(default_factory=list)
-    """Titled PNGs."""
+    """Titles and PNG images."""
     takes: list[StoredRollout] = dataclasses.field(default_factory=list)
+    """Replays for the view in 3D."""
     options: list[tuple[str, list[tuple[str, str]]]] = dataclasses.field(default_factory=list)
-    """Options by section."""
+    """Names and values of the options, by section."""
 
 
 def collect(folder: Path) -> Content:
-    """What there is to show of a run, or of a folder of `train all`.
+    """Return the report's content for a run, or for a folder of `train all`.
 
-    **Raises** `InputError` where `folder` is neither, or a file in it is damaged.
+    **Raises** `InputError` if `folder` is neither, or if a file in it is damaged.
     """
     from ballu_mjx.policies import pipeline_layout
 
@@ -125,7 +130,7 @@ def _run(folder: Path) -> Content:
 
 
 def _story(folder: Path, tables: Mapping[str, str]) -> Content:
-    """A folder of `train all`: its tables, and of each seed and task the policies over each other."""
+    """Return the content for a folder of `train all`: its tables, and for each seed and task the policies overlaid."""
     from ballu_mjx.policies import pipeline_layout
     from ballu_mjx.viz.style import label_of
 
@@ -145,7 +150,7 @@ def _story(folder: Path, tables: Mapping[str, str]) -> Content:
                 image = seed / f"trials-{task}-{setting}" / "trials.png"
                 if image.is_file():
                     content.images.append((f"Trials on the robot: {where}, {setting}", image.read_bytes()))
-            residuals: dict[Path, str] = {}  # two settings may have one
+            residuals: dict[Path, str] = {}  # two settings may share a residual
             for setting in (pipeline_layout.ROUNDS, *pipeline_layout.settings_beyond(seed, task)):
                 residuals.setdefault(pipeline_layout.residual_folder(seed, task, setting), setting)
             for learned, setting in residuals.items():
@@ -161,7 +166,7 @@ def _story(folder: Path, tables: Mapping[str, str]) -> Content:
 
 
 def _over_each_other(name: str, own: Mapping[str, StoredRollout]) -> StoredRollout:
-    """Policies' episodes as one take, each in its own simulator, as long as the shortest."""
+    """Return the episodes of several policies, each in its own simulator, as one replay of the shortest length."""
     states = min(len(take.time) for take in own.values())
     first = next(iter(own.values()))
     qpos = {setting: next(iter(take.qpos.values()))[:states] for setting, take in own.items()}
@@ -169,7 +174,7 @@ def _over_each_other(name: str, own: Mapping[str, StoredRollout]) -> StoredRollo
 
 
 def _add_evaluation(content: Content, folder: Path, prefix: str = "") -> None:
-    """Tables from `evaluation.json`, and `evaluation.txt` as it is."""
+    """Add the tables of `evaluation.json`, and the text of `evaluation.txt`, if the folder has them."""
     path = folder / "evaluation.json"
     if not path.is_file():
         return
@@ -195,11 +200,11 @@ def _add_evaluation(content: Content, folder: Path, prefix: str = "") -> None:
 
 
 def _add_identification(content: Content, folder: Path) -> None:
-    """Tables from `identification.json`: parameters with intervals, and errors on held-out windows."""
+    """Add the tables of `identification.json`, if any: parameters with intervals, and errors on held-out windows."""
     path = folder / IDENTIFICATION_FILE
     if not path.is_file():
         return
-    found = files.read_json(path, "identify again")
+    found = files.read_json(path, "run the identification again")
     try:
         rows = []
         for each in found["parameters"]:
@@ -218,11 +223,11 @@ def _add_identification(content: Content, folder: Path) -> None:
         title = f"errors on {pair[0]['windows']} held-out windows"
         content.tables.append(Table(title, ["", "nominal", "identified"], rows))
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: is damaged ({error!r}); identify again.") from None
+        raise InputError(f"{path}: is damaged ({error!r}); run the identification again.") from None
 
 
 def _horizons(title: str, names: tuple[str, str], without: Errors, mimic: Errors, angle: str) -> Table:
-    """One recording's errors by horizon: mean over the starts, without and with the residual, and their ratio."""
+    """Return the table of a recording's errors by horizon: means over starts without and with residual, and ratios."""
     from ballu_mjx.evaluation.errors import quotient
 
     header = ["horizon (s)"]
@@ -260,7 +265,7 @@ def _curves(folders: Mapping[str, Path]) -> list[Curve]:
 
 
 def _options(config: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """The sections of a `config.json`, each as names and values."""
+    """Return the sections of a `config.json`, each with names and values."""
     sections, loose = [], []
     for name, value in config.items():
         if isinstance(value, dict):

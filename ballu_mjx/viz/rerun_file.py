@@ -1,6 +1,6 @@
-"""A rollout as a file for Rerun's viewer (https://rerun.io), `NAME.rrd`: robots, ways, residual force, commands.
+"""File of a rollout for Rerun's viewer (https://rerun.io), `NAME.rrd`: robots, paths, residual force and commands.
 
-Needs the extra `rerun`.
+It needs the extra `rerun`.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from ballu_mjx.viz import robot_meshes
 from ballu_mjx.viz.style import colour_of, label_of
 
 TIMELINE = "time"
-"""Seconds of the recording."""
+"""Name of the timeline, which is the time (s) from the rollout's start."""
 
 
 def write_rerun(path: Path, rollout: StoredRollout) -> None:
-    """Write a rollout to `path`: each robot's bodies under `world/NAME`, commands and force as plots.
+    """Write a rollout to `path`, with each robot's bodies under `world/NAME`, and commands and force as plots.
 
-    **Raises** `InputError` where the package rerun-sdk is missing.
+    **Raises** `InputError` if the package rerun-sdk is missing.
     """
     try:
         import rerun as rr  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise InputError(
-            f"{path}: Rerun's files need the package rerun-sdk, which comes with the extra rerun: "
+            f"{path}: Rerun's files need the package rerun-sdk, which is in the extra rerun: "
             'pip install -c constraints.txt -e ".[rerun]".'
         ) from None
     shapes = robot_meshes.RobotShapes(rollout.description)
@@ -45,7 +45,7 @@ def write_rerun(path: Path, rollout: StoredRollout) -> None:
             paths.append(f"{paths[model.body_parentid[body]]}/{_entity(model.body(body).name or f'body-{body}')}")
             moved = rr.Transform3D.columns(
                 translation=found.position[:, body],
-                quaternion=np.roll(found.quaternion[:, body], -1, axis=1),  # w last
+                quaternion=np.roll(found.quaternion[:, body], -1, axis=1),  # Rerun has w last
             )
             stream.send_columns(paths[body], [states], moved)
         for index, part in enumerate(shapes.parts):
@@ -74,5 +74,5 @@ def write_rerun(path: Path, rollout: StoredRollout) -> None:
 
 
 def _entity(name: str) -> str:
-    """Return a name as a part of an entity's path: a slash would start another level."""
+    """Return a name as part of an entity's path, without slashes, which would start another level."""
     return name.replace("/", "_")

@@ -1,6 +1,6 @@
-"""The robot as something to look at: see-through copies over each other, in MuJoCo's scenes and as meshes.
+"""Drawing of robots: translucent copies of a robot over each other, in MuJoCo's scenes and as meshes.
 
-Shapes are the geoms of the model, poses those of C MuJoCo's kinematics; nothing is simulated here.
+Shapes are the model's geoms, and poses are from C MuJoCo's kinematics. This module does not simulate.
 """
 
 from __future__ import annotations
@@ -18,23 +18,24 @@ from ballu_mjx.runs.rollout_file import StoredRollout
 from ballu_mjx.viz.style import colour_of
 
 OPACITY, TRANSLUCENT_OPACITY = 0.8, 0.12
-"""Of geoms that are opaque in the model, and of those that are not (alpha below 1), such as big hulls."""
+"""Opacity of geoms that are opaque in the model, and of translucent ones (alpha below 1), such as big hulls."""
 ARROW_COLOUR = (0.8, 0.0, 0.0)
 _SMALLEST_SHARE = 3.5e-4
-"""Of the robot's weight: the force below which no arrow is drawn."""
+"""Force below which no arrow is drawn, as a fraction of the robot's weight."""
 _WEIGHT_SHARE = 0.065
-"""The arrow of a force of this share of the robot's weight is as long as the robot."""
+"""Force whose arrow is as long as the robot, as a fraction of the robot's weight."""
 _SKY = (0.93, 0.94, 0.96)
 _GRAVITY = 9.81
 _SHOWN_GROUPS = 3
-"""Geoms of groups 0 to 2 are drawn, as in MuJoCo's viewer; models keep shapes for collisions in others."""
+"""Number of geom groups that are drawn, from group 0, as in MuJoCo's viewer. Others often have collision shapes."""
 _HIDDEN_GROUP = mujoco.mjNGROUP - 1
 _MOST_FACES = 5_000
-"""Of a mesh; what has more is drawn as its convex hull, for pages hold a copy for each robot."""
+"""Largest number of faces of a mesh. A larger mesh is drawn as its convex hull, because a page has a copy for each
+robot."""
 
 
 class Part(NamedTuple):
-    """Geoms of a body that look alike, as one triangle mesh in the body's frame (m)."""
+    """Geoms of a body with the same opacity, as one triangle mesh in the body frame (m)."""
 
     body: int
     vertices: Float[np.ndarray, "vertices 3"]
@@ -43,30 +44,30 @@ class Part(NamedTuple):
 
 
 class Poses(NamedTuple):
-    """Each body over time in its parent's frame, and the tracked one in the world."""
+    """Poses of all bodies over time in the frames of their parents, and of the tracked body in the world frame."""
 
     position: Float[np.ndarray, "states bodies 3"]
-    """m."""
+    """Positions of the bodies (m, parent's frame)."""
     quaternion: Float[np.ndarray, "states bodies 4"]
-    """w, x, y, z."""
+    """Orientations of the bodies (w, x, y, z; parent's frame)."""
     tracked: Float[np.ndarray, "states 3"]
-    """The tracked site (m)."""
+    """Position of the tracked site (m, world frame)."""
     pushed: Float[np.ndarray, "states 3"]
-    """Centre of mass (m) of the tracked site's body, at which the residual force acts."""
+    """Centre of mass of the tracked body, at which the residual force acts (m, world frame)."""
     yaw: Float[np.ndarray, " states"]
-    """Of the tracked body (rad), not unwrapped."""
+    """Yaw of the tracked body (rad, world frame), not unwrapped."""
 
 
 class RobotShapes:
-    """What a robot looks like, and how large it is.
+    """Shapes and size of a robot.
 
     **Fields**
 
-    - `robot`, `model`: the nominal robot.
-    - `parts`: see `parts`.
-    - `extent`: the longest side (m) of the box around it in its initial pose.
-    - `above`: height (m) of that box's middle above the tracked site; below 0 where it is lower.
-    - `arrow_scale`: length (m) of the arrow of a force of 1 N.
+    - `robot`, `model`: description and nominal model of the robot.
+    - `parts`: meshes of its bodies; see `parts`.
+    - `extent`: longest side (m) of its bounding box in the initial pose.
+    - `above`: height (m) of the centre of this box above the tracked site. It is negative if the centre is lower.
+    - `arrow_scale`: length of an arrow for a force of 1 N (m/N).
     """
 
     def __init__(self, robot: RobotDescription) -> None:
@@ -76,7 +77,7 @@ class RobotShapes:
         data.qpos[:] = robot.adapter.initial_qpos(robot, self.model)
         mujoco.mj_kinematics(self.model, data)
         corners = [data.xpos[p.body] + p.vertices @ data.xmat[p.body].reshape(3, 3).T for p in self.parts]
-        # A robot without shapes is as large as its bodies are apart.
+        # The size of a robot without shapes is the extent of its bodies' positions.
         points = np.concatenate(corners) if corners else data.xpos[1:]
         low, high = points.min(axis=0), points.max(axis=0)
         site = self.model.site(robot.tracked).id
@@ -84,15 +85,18 @@ class RobotShapes:
         self.above = float(low[2] + high[2]) / 2 - float(data.site_xpos[site, 2])
         root = self.model.body_rootid[self.model.site_bodyid[site]]
         self._weight = float(self.model.body_subtreemass[root]) * _GRAVITY
-        # To one digit: it stands in the report.
+        # One digit, because the report shows this number.
         self.arrow_scale = float(f"{self.extent / (_WEIGHT_SHARE * self._weight):.1g}")
 
     def poses(self, qpos: Float[np.ndarray, "states nq"]) -> Poses:
-        """Return `poses` of this robot."""
+        """Return the poses of this robot's bodies for generalized positions; see `poses`."""
         return poses(self.model, self.robot, qpos)
 
     def arrow(self, rollout: StoredRollout, state: int) -> Float[np.ndarray, " 3"] | None:
-        """Return the arrow (m, world) of the residual force in a state; None: there is none, or hardly one."""
+        """Return the arrow (m, world frame) of the residual force in a state.
+
+        None if there is no force, or if it is less than a small fraction of the robot's weight.
+        """
         force = force_at(rollout, state)
         if force is None or np.linalg.norm(force) <= _SMALLEST_SHARE * self._weight:
             return None
@@ -100,7 +104,7 @@ class RobotShapes:
 
 
 def parts(model: mujoco.MjModel) -> list[Part]:
-    """Return the geoms of all bodies that move, without the world's."""
+    """Return the meshes of all moving bodies. Geoms that are fixed to the world are left out."""
     found: dict[tuple[int, float], list[trimesh.Trimesh]] = {}
     for geom in _shown_geoms(model):
         mesh = _mesh(model, geom)
@@ -122,7 +126,7 @@ def parts(model: mujoco.MjModel) -> list[Part]:
 
 
 def poses(model: mujoco.MjModel, robot: RobotDescription, qpos: Float[np.ndarray, "states nq"]) -> Poses:
-    """Return where a robot's bodies are."""
+    """Return the poses of a robot's bodies for generalized positions."""
     data = mujoco.MjData(model)
     site = model.site(robot.tracked).id
     tracked = int(model.site_bodyid[site])
@@ -153,9 +157,10 @@ def draw(
     states: Mapping[str, Float[np.ndarray, " nq"]],
     arrow: Float[np.ndarray, " 3"] | None,
 ) -> None:
-    """Add robots to a MuJoCo scene, each in its colour, and an arrow (m, world) at the last one's tracked body.
+    """Add robots to a MuJoCo scene, each in its colour, and an arrow at the tracked body of the last robot.
 
-    `data` is left at the last one's state.
+    `states` holds the generalized positions by the name of a robot, `arrow` is in m in the world frame. Afterwards,
+    `data` has the state of the last robot.
     """
     option, perturbation = mujoco.MjvOption(), mujoco.MjvPerturb()
     option.sitegroup[:] = 0
@@ -179,7 +184,7 @@ def draw(
 
 
 def load_scenery(robot: RobotDescription) -> mujoco.MjModel:
-    """Return the robot's model, lit and with a sky, of which a view with `option_for_scenery` sees the world alone."""
+    """Return the robot's model with light and sky. With `option_for_scenery`, a view shows the world without robot."""
     spec = mujoco.MjSpec.from_file(str(robot.model))
     if all(texture.type != mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
         spec.add_texture(
@@ -199,24 +204,27 @@ def load_scenery(robot: RobotDescription) -> mujoco.MjModel:
 
 
 def option_for_scenery(option: mujoco.MjvOption) -> None:
-    """Let a view of `load_scenery` leave out what belongs to the robot."""
+    """Set the options of a view of `load_scenery`, so that it does not show the robot."""
     option.geomgroup[_HIDDEN_GROUP] = 0
     option.sitegroup[:] = 0
     option.flags[mujoco.mjtVisFlag.mjVIS_TENDON] = 0
 
 
 def force_at(rollout: StoredRollout, state: int) -> Float[np.ndarray, " 3"] | None:
-    """Return the residual force (N, world) that acts from a state on; in the last state, the one that led there."""
+    """Return the residual force (N, world frame) in the control step after a state.
+
+    For the last state, it is the force in the control step before it. None if the rollout has no force.
+    """
     return None if rollout.force is None else rollout.force[min(state, len(rollout.force) - 1)]
 
 
 def pushed_robot(rollout: StoredRollout) -> str | None:
-    """Return the robot of a rollout on which the residual force acts; None where no force is known."""
+    """Return the name of the robot in a rollout on which the residual force acts. None if the rollout has no force."""
     return None if rollout.force is None else list(rollout.qpos)[-1]
 
 
 def _moving(model: mujoco.MjModel) -> np.ndarray:
-    """Return which geoms are of bodies that move."""
+    """Return a mask of the geoms whose bodies move."""
     return model.body_weldid[model.geom_bodyid] != 0
 
 
@@ -228,7 +236,7 @@ def _shown_geoms(model: mujoco.MjModel) -> list[int]:
 
 
 def _mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh | None:
-    """Return a geom's surface in its own frame; None for kinds that have none, such as height fields."""
+    """Return a geom's surface in the geom's frame. None for types that are not drawn, such as height fields."""
     kind, size, types = int(model.geom_type[geom]), model.geom_size[geom], mujoco.mjtGeom
     match kind:
         case types.mjGEOM_BOX:

@@ -1,4 +1,4 @@
-"""One colour and one label for each simulator, in all figures."""
+"""Style of figures: one colour and one label for each simulator."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ COLOURS: Mapping[str, str] = {
     "envmimic-near": "#88ccee",
     "envmimic-wrench": "#44aa99",
 }
-"""Colours of simulators in all figures (Okabe and Ito's, six of Tol's: the colour-blind tell them apart). Read them by
-`colour_of`, which knows every name."""
+"""Colours of simulators in all figures. They are from the palettes of Okabe and Ito and (six of them) of Tol, for
+colour-blind readers. Read them by `colour_of`, which has a colour for every name."""
 
 LABELS: Mapping[str, str] = {
     "recording": "recording",
@@ -54,10 +54,11 @@ LABELS: Mapping[str, str] = {
 
 
 def colour_of(simulator: str) -> tuple[float, float, float]:
-    """Return the colour of a simulator, always the same one, whatever its name (red, green, blue; 0 to 1).
+    """Return the colour of a simulator (red, green, blue; 0 to 1). The same name always has the same colour.
 
-    A sum of residuals (`aerodynamic+supervised`) without an entry in `COLOURS` is a dark mixture of its parts, mostly
-    of the last. A later round (`envmimic-2`) is paler than the one before. Other names get one of `_OTHERS`.
+    A sum of residuals (`aerodynamic+supervised`) without an entry in `COLOURS` has a dark mixture of its parts'
+    colours, mostly of the last. A later round (`envmimic-2`) is paler than the previous one. Other names have one of
+    `_OTHERS`.
     """
     variant = SimulatorVariant.parse(simulator)
     red, green, blue = 1 - (1 - _first_round(variant.residual or variant.name)) * _PALER ** (variant.round - 1)
@@ -65,7 +66,10 @@ def colour_of(simulator: str) -> tuple[float, float, float]:
 
 
 def label_of(simulator: str) -> str:
-    """Return what a simulator is called in figures; one that `LABELS` lacks by its own name, a sum by its parts'."""
+    """Return the label of a simulator in figures.
+
+    For a sum of residuals that is not in `LABELS`, join the labels of its parts. For another name, return the name.
+    """
     variant = SimulatorVariant.parse(simulator)
     name = variant.residual or variant.name
     label = LABELS.get(name) or "+".join(LABELS.get(part, part) for part in name.split("+"))
@@ -86,19 +90,23 @@ _PALER = 0.55
 _DARKER = 0.75
 _SHARE_OF_LAST = 0.65
 _OTHERS = ("#8c564b", "#7f7f7f", "#bcbd22", "#17becf", "#e377c2", "#6b6ecf", "#b5cf6b", "#ad494a")
-"""Colours of names that are none of `COLOURS`."""
+"""Colours of names that are not in `COLOURS`."""
 _DOTS_PER_INCH = 120
 COMMAND_COLOURS = ("#1f77b4", "#d64d1f", "#2ca02c", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
-"""Colours of a robot's commands, in order; after the last, the first one comes again."""
+"""Colours of a robot's commands, in order. They repeat if there are more commands."""
 
 
 def unwrapped(runs: Float[np.ndarray, "runs T 3"], start: float) -> Float[np.ndarray, "runs T 3"]:
-    """Yaw in degrees without jumps, starting on the same turn as the recording's."""
+    """Return runs (x, y, yaw) with unwrapped yaw in degrees instead of yaw in radians.
+
+    The first yaw of each run is within 180 deg of `start` (rad), the recording's first yaw.
+    """
     yaw = np.unwrap(runs[..., 2], axis=-1)
     yaw = yaw - 2 * np.pi * np.round((yaw[:, :1] - start) / (2 * np.pi))
     return np.concatenate([runs[..., :2], np.rad2deg(yaw)[..., None]], axis=-1)
 
 
 def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, without a display."""
     FigureCanvasAgg(figure)
     figure.savefig(path, dpi=_DOTS_PER_INCH)

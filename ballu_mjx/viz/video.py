@@ -1,4 +1,4 @@
-"""A rollout as MP4, drawn by MuJoCo's renderer. Needs OpenGL, and the extra `video` for the encoder."""
+"""Video (MP4) of a rollout by MuJoCo's renderer. It needs OpenGL, and the extra `video` for the encoder."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from ballu_mjx.runs.rollout_file import StoredRollout
 WIDTH, HEIGHT = 960, 544
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 _NO_OPENGL = (
-    "No video: there is no OpenGL to draw with ({}). `apt-get install libegl1 libgl1-mesa-dri` with MUJOCO_GL=egl, or "
-    "`apt-get install libosmesa6` with MUJOCO_GL=osmesa, brings one."
+    "No video: there is no OpenGL to draw with ({}). Install one by `apt-get install libegl1 libgl1-mesa-dri` and use "
+    "MUJOCO_GL=egl, or by `apt-get install libosmesa6` and use MUJOCO_GL=osmesa."
 )
 
 
 def choose_renderer() -> None:
-    """Settle by which library MuJoCo draws, where there is no screen and the user has not said; before its import."""
+    """Choose MuJoCo's OpenGL library if there is no screen and MUJOCO_GL is not set. MuJoCo must be imported later."""
     if sys.platform != "linux" or "MUJOCO_GL" in os.environ:
         return
     if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
@@ -31,15 +31,15 @@ def choose_renderer() -> None:
 
 
 def write(path: Path, take: StoredRollout) -> None:
-    """Draw a rollout at the control rate, the camera beside the robots.
+    """Write a video of a rollout at the control rate, with the camera beside the robots.
 
-    **Raises** `InputError` where there is no OpenGL or no encoder.
+    **Raises** `InputError` if there is no OpenGL or no encoder.
     """
     try:
         import imageio_ffmpeg
     except ImportError:
         raise InputError(
-            'No video: the encoder comes with the extra video: pip install -c constraints.txt -e ".[video]".'
+            'No video: the encoder is missing; install the extra video: pip install -c constraints.txt -e ".[video]".'
         ) from None
     import mujoco
 
@@ -51,7 +51,7 @@ def write(path: Path, take: StoredRollout) -> None:
     try:
         most = (200 + 2 * model.ngeom) * (1 + len(take.qpos))
         renderer = mujoco.Renderer(model, HEIGHT, WIDTH, max_geom=most)
-    except Exception as error:  # each OpenGL library has errors of its own
+    except Exception as error:  # each OpenGL library raises other errors
         raise InputError(_NO_OPENGL.format(str(error).strip().split("\n")[0] or type(error).__name__)) from None
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -75,7 +75,7 @@ def write(path: Path, take: StoredRollout) -> None:
             robots = {name: qpos[state] for name, qpos in take.qpos.items()}
             arrow = shapes.arrow(take, state)
             robot_meshes.draw(renderer.scene, shapes.model, data, shapes.robot, robots, arrow)
-            # Where there is no GPU, shadows and mirrors would take two thirds of the time.
+            # Without a GPU, shadows and reflections would take two thirds of the time.
             renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
             renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
             frames.send(renderer.render())

@@ -1,6 +1,6 @@
-"""Robots of a rollout in a viser scene: live, or recorded into a page that plays without a server.
+"""Robots of a rollout in a viser scene, live or recorded as a page that plays without a server.
 
-Needs the extra `report`.
+It needs the extra `report`.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from ballu_mjx.viz import robot_meshes
 from ballu_mjx.viz.style import colour_of, label_of
 
 HOST = "127.0.0.1"
-"""Servers listen here alone: nothing is served to other machines."""
+"""Address of the servers. They serve nothing to other machines."""
 _GRAIN = 2.0**-14
-"""Positions (m) and quaternions are rounded to multiples of this, so that recordings pack well."""
+"""Resolution of positions (m) and quaternions. Rounding makes recorded pages smaller."""
 _OWN_PAGES = re.compile(r"http://(127\.0\.0\.1|localhost)(:[0-9]+)?")
 _PATCHING = threading.Lock()
 _FIELD_OF_VIEW = np.deg2rad(40.0)
 
 
 class RobotScene:
-    """The robots of one rollout, their ways over the floor, and the residual force."""
+    """Scene with the robots of one rollout, their paths on the floor, and the residual force."""
 
     def __init__(self, server: viser.ViserServer, take: StoredRollout) -> None:
         scene = server.scene
@@ -89,7 +89,7 @@ class RobotScene:
         self.show(0)
 
     def show(self, state: int) -> None:
-        """Put all robots into a state of the rollout."""
+        """Show all robots in a state of the rollout, given its index."""
         for name, poses in self.poses.items():
             for body, handle in enumerate(self._handles[name], start=1):
                 handle.position = _rounded(poses.position[state, body])
@@ -102,11 +102,11 @@ class RobotScene:
                 self._arrow.points = _rounded(np.stack([start, start + arrow])[None])
 
     def centre(self, state: int) -> Float[np.ndarray, " 3"]:
-        """Return the middle (m, world) of all robots."""
+        """Return the centre of all robots in a state (m, world frame)."""
         return np.mean([p.tracked[state] for p in self.poses.values()], axis=0) + [0.0, 0.0, self.shapes.above]
 
     def _camera(self) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-        """Place of a camera that sees the whole way, across it, and what it looks at."""
+        """Return position and target (m) of a camera that looks across the whole path."""
         ways = np.concatenate([poses.tracked for poses in self.poses.values()])
         low, high = ways.min(axis=0), ways.max(axis=0)
         target = np.array([*((low + high)[:2] / 2), self.centre(0)[2]])
@@ -117,33 +117,32 @@ class RobotScene:
 
 
 class LocalServer(viser.ViserServer):
-    """A server that no client can ask for a tunnel to the outside, and that pages of other origins cannot talk to."""
+    """Server for this machine alone: clients cannot request a public tunnel, and pages of other origins are refused."""
 
     def __init__(self, *, port: int) -> None:
-        """Listen at `port` or the next that is free; at any free one for 0.
+        """Listen on `port` or the next free one, or on any free port if `port` is 0.
 
-        **Raises** `OSError` where there is none.
+        **Raises** `OSError` if there is no free port.
         """
         with _own_origin_only():
             super().__init__(host=HOST, port=port, verbose=False)
 
     def request_share_url(self, verbose: bool = True) -> None:
-        """None: nothing is shared."""
+        """Return None: the server is never shared."""
 
     def stop(self) -> None:
-        """Stop without a word."""
+        """Stop without printing."""
         with contextlib.redirect_stdout(io.StringIO()):
             super().stop()
 
 
 @contextlib.contextmanager
 def _own_origin_only() -> Iterator[None]:
-    """Let websockets that are opened meanwhile accept this machine's own pages alone, and clients that are no browser.
+    """Let websocket servers opened in this context accept only pages of this machine, and clients that are no browsers.
 
-    Any port will do: a tunnel to another machine may change it.
-
-    A web page elsewhere may open a websocket to this machine; browsers then say which page it was (RFC 6455, 10.2).
-    viser has no option for it, and calls this function of websockets'.
+    A web page of another origin may open a websocket to this machine, but browsers then send the page's origin (RFC
+    6455, 10.2). Origins of this machine are accepted with any port, because a tunnel from another machine may change
+    it. viser has no option for origins, so that this context replaces the function of websockets that viser calls.
     """
 
     def serve_own(handler: Any, host: str, port: int, **options: Any) -> Any:
@@ -159,15 +158,15 @@ def _own_origin_only() -> Iterator[None]:
 
 
 def serve(port: int) -> LocalServer:
-    """A server for this machine alone, on `port` or the next that is free; on any free one for 0.
+    """Return a server for this machine alone, on `port` or the next free one, or on any free port if `port` is 0.
 
-    **Raises** `InputError` where there is none.
+    **Raises** `InputError` if there is no free port.
     """
     try:
         with contextlib.redirect_stdout(io.StringIO()):
             server = LocalServer(port=port)
     except OSError as error:
-        raise InputError(f"--port {port}: cannot be listened on ({error}); give another one.") from error
+        raise InputError(f"--port {port}: cannot be used ({error}); give another one.") from error
     server.scene.set_up_direction("+z")
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()
@@ -175,7 +174,7 @@ def serve(port: int) -> LocalServer:
 
 
 def page(take: StoredRollout) -> str:
-    """Return a page (HTML) that plays a rollout in the browser by itself, from its own text alone."""
+    """Return a self-contained page (HTML) that plays a rollout in the browser."""
     server = serve(0)
     try:
         stage = RobotScene(server, take)
@@ -190,7 +189,7 @@ def page(take: StoredRollout) -> str:
 
 
 def shared(pages: Sequence[str]) -> tuple[str, list[str], str]:
-    """Pages as what they all begin with, what is each one's own, and what they all end with."""
+    """Split pages into their common beginning, the middle part of each, and their common end."""
     shortest = min(map(len, pages))
     head = _common(pages, shortest)
     tail = _common([page[::-1] for page in pages], shortest - head)
@@ -198,7 +197,7 @@ def shared(pages: Sequence[str]) -> tuple[str, list[str], str]:
 
 
 def _common(texts: Sequence[str], longest: int) -> int:
-    """Length of what all texts begin with, `longest` at most."""
+    """Return the length of the common beginning of all texts, at most `longest`."""
     low, high = 0, longest
     while low < high:
         middle = (low + high + 1) // 2

@@ -1,15 +1,15 @@
 # %% [markdown]
 # # Another robot: a tethered balloon in wind
 #
-# Not a biped: a balloon on a tether of two rods, with two propellers. Its model (`balloon.xml`) knows no air. The
-# "real" one flies in wind, with the drag of MuJoCo's ellipsoid fluid model and gusts that come and go. From recordings
-# of it, in the project's format, the project's own command learns the forces that its simulator lacks; all that it is
-# told of the robot stands in `balloon.robot.json`. The table gives errors on recordings that training never saw: in the
-# wind of the training recordings, and in another wind. A rival is the best constant wrench: a steady wind pushes much
-# the same all the time.
+# The robot is a balloon with two propellers on a tether of two rods. Its model (`balloon.xml`) has no air. The "real"
+# balloon flies in wind with gusts, with the drag of MuJoCo's ellipsoid fluid model. It is recorded in the project's
+# format. From these recordings, the project's own command learns the forces that the model lacks. The command gets no
+# information on the robot other than `balloon.robot.json`. The table has errors on test recordings, in the wind of the
+# training recordings and in another wind. The baseline is the best constant wrench, because a steady wind exerts nearly
+# constant forces.
 #
-# `python experiments/tethered_balloon/tethered_balloon.py` takes some minutes a method and seed on two cores. `--quick`
-# shows that it works. `--methods` names residual methods.
+# `python experiments/tethered_balloon/tethered_balloon.py` takes some minutes for each method and seed on two cores.
+# `--methods` selects residual methods. `--quick` is a short trial run.
 
 # %%
 from __future__ import annotations
@@ -51,23 +51,23 @@ from ballu_mjx.viz.style import colour_of, label_of
 DESCRIPTION = FOLDER / "balloon.robot.json"
 
 # %% [markdown]
-# ## The real balloon, and what motion capture sees of it
+# ## The real balloon and its motion capture
 
 # %%
 WIND = np.array([0.6, 0.3, 0.0])
-"""Mean wind, m/s."""
+"""Mean wind (m/s)."""
 OTHER_WIND = np.array([-0.2, 0.5, 0.0])
-"""Mean wind (m/s) of test flights that training has no example of."""
+"""Mean wind (m/s) of a part of the test recordings. Training has no recording in this wind."""
 GUSTS = 0.1
-"""Standard deviation of the wind's strength, as a part of it; gusts last some 4 s."""
+"""Standard deviation of the wind's speed, relative to its mean. The correlation time of gusts is 4 s."""
 RATE = 100
-"""Hz, of capture and gusts."""
+"""Rate of motion capture and gusts (Hz)."""
 POSITION_NOISE, ROTATION_NOISE = 5e-4, np.deg2rad(0.3)
-"""m and rad: standard deviations, each axis."""
+"""Standard deviations of the noise of positions (m) and rotations (rad), for each axis."""
 
 
 def real(description: RobotDescription) -> mujoco.MjModel:
-    """The same balloon in air, at a small time step."""
+    """Return the model of the balloon in air, with a time step of 1 ms."""
     spec = mujoco.MjSpec.from_file(str(description.model))
     spec.option.timestep, spec.option.density, spec.option.viscosity = 1e-3, 1.2, 1.8e-5
     spec.geom("balloon").fluid_ellipsoid = 1
@@ -75,14 +75,14 @@ def real(description: RobotDescription) -> mujoco.MjModel:
 
 
 def commands(rng: np.random.Generator, steps: int) -> np.ndarray:
-    """Levels between 0 and 1 for each propeller, of 0.5 to 2 s; (steps, 2)."""
+    """Return random piecewise constant commands between 0 and 1, of 0.5 to 2 s, for each propeller (steps, 2)."""
     lengths = rng.integers(10, 41, (steps, 2))
     levels = rng.uniform(0, 1, (steps, 2)) * (rng.random((steps, 2)) < 0.7)
     return np.stack([np.repeat(levels[:, side], lengths[:, side])[:steps] for side in range(2)], axis=1)
 
 
 def record(description: RobotDescription, name: str, seconds: float, seed: int, wind: np.ndarray) -> Recording:
-    """A flight in a wind, after half a minute in which it has found its place there."""
+    """Record a flight in wind, after 30 s in which the balloon settles."""
     rng = np.random.default_rng(seed)
     model = real(description)
     data = mujoco.MjData(model)
@@ -123,11 +123,11 @@ QUICK_FLIGHTS = {use: (1, 6.0) for use in FLIGHTS}
 
 
 GROUPS = {"flight": "the same wind", "turned": "another wind"}
-"""What the first words of recordings' names mean."""
+"""Titles of the groups of recordings."""
 
 
 def record_all(description: RobotDescription, folder: Path, quick: bool) -> None:
-    """Recordings for training, validation and test; those for test in both winds."""
+    """Record flights for training, validation and test into subfolders of `folder`. Test flights are in both winds."""
     for number_of_use, (use, (count, seconds)) in enumerate((QUICK_FLIGHTS if quick else FLIGHTS).items()):
         (folder / use).mkdir(parents=True, exist_ok=True)
         winds = {"flight": WIND, **({"turned": OTHER_WIND} if use == "test" else {})}
@@ -139,7 +139,7 @@ def record_all(description: RobotDescription, folder: Path, quick: bool) -> None
 
 
 # %% [markdown]
-# ## A residual, by the command
+# ## Training of residuals by the project's command
 
 # %%
 METHODS = {
@@ -151,16 +151,16 @@ METHODS = {
     "aerodynamic": ["aerodynamic"],
     "fluid": ["fluid"],
 }
-"""Beginnings of the commands, by method."""
+"""First arguments of the command, by method."""
 _FEW = ["--num-timesteps", "4000", "--num-envs", "16", "--batch-size", "16", "--num-minibatches", "4"]
 LABELS = {"envmimic-force": "EnvMimic, a force alone", "envmimic-multi": "EnvMimic, forces at balloon and knot"}
 SEEDED = ("envmimic", "supervised", "analytic")
-"""Subcommands that draw random numbers."""
+"""Subcommands that use a seed."""
 COLOURS = {
     label_of(name): colour_of(name)
     for name in ("vanilla", "envmimic", "supervised", "analytic", "aerodynamic", "fluid")
 }
-"""The project's colours, by label."""
+"""The project's colours, by label of the simulator."""
 QUICK = {
     "envmimic": _FEW,
     "supervised": ["--updates", "50"],
@@ -168,11 +168,11 @@ QUICK = {
     "aerodynamic": ["--window-seconds", "0.5", "--evaluations", "2"],
     "fluid": ["--terms", "linear", "--window-seconds", "0.5", "--steps", "1"],
 }
-"""Options of a training of seconds, by subcommand."""
+"""Options of a training that takes seconds, by subcommand."""
 
 
 def arguments_of(recordings: Path, run: Path, method: str, seed: int, quick: bool) -> list[str]:
-    """The arguments of `ballu_mjx.train`: of a new run, or of one that goes on."""
+    """Return the arguments of `ballu_mjx.train`, for a new run or for one that is resumed."""
     command = METHODS[method]
     if list_checkpoints(run) and command[0] == "envmimic":
         return [command[0], "--resume", str(run)]
@@ -186,7 +186,7 @@ def arguments_of(recordings: Path, run: Path, method: str, seed: int, quick: boo
 
 
 def learn(recordings: Path, run: Path, method: str, seed: int, quick: bool) -> Evaluation:
-    """Train, unless the run is there already, or go on with it; its evaluation on the test recordings."""
+    """Train a residual unless the run is finished, and return its evaluation on the test recordings."""
     if not (run / "evaluation.json").exists():
         status = train.main(arguments_of(recordings, run, method, seed, quick))
         if status:
@@ -195,7 +195,7 @@ def learn(recordings: Path, run: Path, method: str, seed: int, quick: bool) -> E
 
 
 def constant_wrench(description: RobotDescription, recordings: Path) -> Evaluation:
-    """The evaluation of the rival that has no more than six numbers."""
+    """Fit the constant wrench, which has only six parameters, and return its evaluation on the test recordings."""
     simulator = Simulator(description)
     motions = {
         use: [
@@ -213,11 +213,14 @@ def constant_wrench(description: RobotDescription, recordings: Path) -> Evaluati
 
 # %%
 HORIZONS = (1.0, 5.0, 20.0)
-"""s, of the table."""
+"""Horizons of the tables (s)."""
 
 
 def comparison(found: Mapping[str, Sequence[Evaluation]], horizon: float) -> Table:
-    """Return vanilla's errors after a horizon (s), and what each simulator leaves of them; a value a seed."""
+    """Return the table of vanilla's errors over a horizon (s), and of the ratios of other simulators to it.
+
+    Cells have one value for each seed.
+    """
     first = next(iter(found.values()))[0]
     columns = [(group, quantity) for group in GROUPS for quantity in ("position", "orientation")]
     simulators = {label: [run.residual for run in runs] for label, runs in found.items()}
@@ -227,7 +230,7 @@ def comparison(found: Mapping[str, Sequence[Evaluation]], horizon: float) -> Tab
 
 
 def figure(found: Mapping[str, Sequence[Evaluation]], path: Path) -> None:
-    """Draw position errors over the horizon, mean and range over seeds, a panel a wind."""
+    """Draw position errors over the horizon, with mean and range over seeds, and a panel for each wind."""
     drawing = Figure(figsize=(9.0, 3.8), layout="constrained")
     first = next(iter(found.values()))[0]
     for axis, group in zip(drawing.subplots(1, len(GROUPS), sharey=True), GROUPS, strict=True):
@@ -253,11 +256,11 @@ def figure(found: Mapping[str, Sequence[Evaluation]], path: Path) -> None:
 
 # %%
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description="A residual for a tethered balloon in wind.")
-    parser.add_argument("--methods", nargs="*", choices=METHODS, default=["envmimic"], help="how residuals are learned")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="seeds of the trainings")
-    parser.add_argument("--output", type=Path, default=Path("runs/tethered-balloon"), help="folder of all that is made")
-    parser.add_argument("--quick", action="store_true", help="one seed, for seconds; the numbers mean little")
+    parser = argparse.ArgumentParser(description="Learn residuals for a tethered balloon in wind.")
+    parser.add_argument("--methods", nargs="*", choices=METHODS, default=["envmimic"], help="methods (envmimic)")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds (0 1 2)")
+    parser.add_argument("--output", type=Path, default=Path("runs/tethered-balloon"), help="folder of all results")
+    parser.add_argument("--quick", action="store_true", help="train one seed for seconds; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     options = parser.parse_args(arguments)
 

@@ -165,7 +165,7 @@ def test_import_overwrites_nothing(room: Path, capsys: pytest.CaptureFixture[str
     (room / "out").mkdir()
     (room / "out" / "walk.json").write_text("mine")
     assert record.main([*LINE, "--offset", "-512.25"]) == 2
-    assert "walk.json: stands there already" in capsys.readouterr().err
+    assert "walk.json: exists already" in capsys.readouterr().err
     assert (room / "out" / "walk.json").read_text() == "mine"
 
 

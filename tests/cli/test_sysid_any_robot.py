@@ -129,7 +129,7 @@ def test_what_does_not_fit_is_refused(
 def test_options_of_declared_parameters_do_not_go_with_a_method_of_its_own(capsys: pytest.CaptureFixture):
     assert train.main(["sysid", "--window-seconds", "2"]) == 2
     assert (
-        "--window-seconds is for declared parameters; ballu has a method of its own" in capsys.readouterr().err.lower()
+        "--window-seconds is for declared parameters, but ballu has its own method" in capsys.readouterr().err.lower()
     )
 
 

@@ -256,7 +256,7 @@ def test_wrong_path_is_refused_in_one_sentence(folder: Path):
     [
         (["--recordings", "data", "--num-envs", "7"], "--num-envs is 7"),
         (["--recordings", "data", "--test", "data/near-1.csv"], "is among the training and the test recordings"),
-        (["--recordings", "{suspended}"], "EnvMimic takes free ones only"),
+        (["--recordings", "{suspended}"], "residuals need free recordings"),
         (["--recordings", "data", "--output", "data"], "data: the folder is not empty"),
         (["--resume", "data"], "data: there is no run"),
         (["--resume", "run"], " already"),

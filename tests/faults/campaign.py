@@ -281,7 +281,7 @@ def full_disk(at: Trainer, reference: Path, disk: Path, steps: int, free: int) -
     said = at.told.read_text()[before:].strip()
     one_sentence = process.exitcode == 2 and "\n" not in said and f"{folder}: its disk is full; make room" in said
     last = last_checkpoint(folder, training=True)
-    if not one_sentence or (f"step {last.step:,} is whole" not in said):
+    if not one_sentence or (f"step {last.step:,} is intact" not in said):
         raise RuntimeError(f"Exit status {process.exitcode}, checkpoint {last.step}: {said!r}")
     ballast.unlink()
     at.finish(folder)

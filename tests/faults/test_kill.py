@@ -128,7 +128,7 @@ def test_a_full_disk_ends_training_in_a_sentence_and_loses_nothing(at: Trainer, 
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
-@pytest.mark.parametrize(("saved", "then"), [(True, "the checkpoint of step 80 is whole"), (False, "start again")])
+@pytest.mark.parametrize(("saved", "then"), [(True, "the checkpoint of step 80 is intact"), (False, "start again")])
 def test_measurements_that_cannot_be_written_end_a_run_in_a_sentence(tmp_path: Path, saved: bool, then: str):
     folder = tmp_path / "run"
     folder.mkdir()

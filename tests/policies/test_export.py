@@ -496,9 +496,9 @@ def test_check_runs_an_exported_policy_in_c_mujoco(
     np.savez(damaged / "weights.npz", **stored | {"check_commands": stored["check_commands"] + 1})
     for arguments, words in (
         ([rover_policy, "--simulator", arm], "is a simulator of arm, not of rover"),
-        ([rover_policy, "--simulator", tmp_path], "is no exported simulator"),
+        ([rover_policy, "--simulator", tmp_path], "is not an exported simulator"),
         ([rover_policy, "--run", tmp_path / "gone"], "there is no run"),
-        ([damaged], "is another policy than that of its run"),
+        ([damaged], "differs from the policy of its run"),
         ([rover_policy, "--seconds", "-1"], "--seconds"),
     ):
         assert export_command.main(["check", *map(str, arguments)]) == 2
@@ -539,11 +539,11 @@ def test_wrong_exports_differ(rover_policy: Path, tmp_path: Path):
 
 
 def test_trials_that_rounding_parts_do_not_make_an_export_differ():
-    """Contacts magnify rounding: what decides is commands and states while they can be foretold."""
+    """Contacts magnify rounding: what decides is commands and states while they can be predicted."""
     own, other = Trial("own", 0.01, (0.1, 0.2), 10.0), Trial("c", 0.02, (0.4, -0.2), -80.0)
     found = PolicyCheck(Agreement(1e-6, 1.5, 2e-5, 9e-4), own, other, other, 24.0)
     assert found.agrees
-    assert found.verdict().startswith("AGREES") and "only the first 1.50 s can be foretold" in found.verdict()
+    assert found.verdict().startswith("AGREES") and "only the first 1.50 s can be predicted" in found.verdict()
     for worse in (Agreement(0.01, 1.5, 2e-5, 9e-4), Agreement(1e-6, 1.5, 0.02, 9e-4), Agreement(math.nan, 1, 0, 0)):
         assert not dataclasses.replace(found, agreement=worse).agrees
     assert Agreement(0.0, 1.0, 9e-6, 1e-9).problem() is None

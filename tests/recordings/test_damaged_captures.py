@@ -87,7 +87,7 @@ def saved(name: str, array: np.ndarray) -> Damage:
     return damage
 
 
-CUT_OFF, NO_NUMBER = "the file was cut off; copy", "is not a number that can be meant;"
+CUT_OFF, NO_NUMBER = "the file was cut off; copy", "is not a number, or is too large;"
 REFUSALS: list[tuple[str, Damage, list[str]]] = [
     # a row that ends early
     ("motive", shortened(80, 5), ["line 80: the row ends before 'hull Rotation W'", CUT_OFF]),
@@ -101,28 +101,36 @@ REFUSALS: list[tuple[str, Damage, list[str]]] = [
     ("table", shortened(80, 5), ["line 80: the row has 5 cells, the header 13", "was cut off, copy it again"]),
     # a header that is missing, or a line of it
     ("motive", without_line(1), ["line 1: the line that begins with Format Version", "is missing; export again"]),
-    ("motive", without_line(3), ["the rows Type, Name and Rotation or Position do not all stand; export again"]),
+    (
+        "motive",
+        without_line(3),
+        ["the rows Type, Name and Rotation or Position above it are not complete; export again"],
+    ),
     ("motive", without_line(7), ["no line begins with Frame, Time (Seconds); export again, with header"]),
     ("qualisys-6d", without_line(1), ["line 1: NO_OF_FRAMES is ''", "export again with the TSV header"]),
     ("qualisys-6d", without_line(9), ["DATA_INCLUDED is ''; export 3D or 6D data with the TSV header"]),
     ("qualisys-3d", without_line(10), ["DATA_INCLUDED is '3D', without names; export"]),
     ("nexus", replaced(",,rover:hull,,,,,\n", ""), ["line 17: the row of components begins with ','; export again"]),
-    ("nexus", replaced(",,deg,deg,deg,mm,mm,mm\n", ""), ["line 18: it holds numbers where the units should stand;"]),
-    ("tracker", without_line(1), ["line 1: here a section's title is missing; export again"]),
+    ("nexus", replaced(",,deg,deg,deg,mm,mm,mm\n", ""), ["line 18: it holds numbers instead of units;"]),
+    ("tracker", without_line(1), ["line 1: the section's title is missing; export again"]),
     ("tracker", without_line(2), ["line 2: ',,Global Angle hull:hull", "is not a rate in Hz; export again"]),
     ("tracker", without_line(3), ["line 4: the row of components begins with ','; export again"]),
     ("tracker", without_line(4), ["no line begins with Frame, Sub Frame; export as CSV"]),
-    ("tracker", without_line(5), ["line 5: it holds numbers where the units should stand; export again"]),
-    ("euroc", without_line(1), ["line 1: it holds numbers where the names of the columns should stand; write"]),
-    ("table", without_line(2), ["line 2: it holds numbers where the names of the columns should stand; write"]),
+    ("tracker", without_line(5), ["line 5: it holds numbers instead of units; export again"]),
+    ("euroc", without_line(1), ["line 1: it holds numbers instead of column names; write"]),
+    ("table", without_line(2), ["line 2: it holds numbers instead of column names; write"]),
     # a column of another name
     ("motive", in_line(7, 7, "V"), ["line 7: 'hull' has no column Position Y; export again"]),
     ("motive", in_line(7, 2, "V"), ["line 7, hull: its rotation has the columns V, Y, Z, W", "again"]),
     ("qualisys-6d", replaced("hull X\tY", "hull V\tY"), ["line 11: the column 'hull X' is missing; export again"]),
     ("qualisys-6d", replaced("Rot[4]", "Rot[44]"), ["'hull' has a rotation matrix with 8 of 9 columns; export the"]),
     ("qualisys-3d", replaced("hull1 X", "hull1 V"), ["line 11: the column 'hull1 X' is missing; export again"]),
-    ("nexus", replaced("RZ,TX,", "RZ,UX,"), ["line 17: 'hull' has the components RX, RY, RZ, UX, TY, TZ, and no"]),
-    ("nexus", replaced("Frame,RX,", "Frame,QX,"), ["section Segments, rover:hull: of RX, RY, RZ it has RY and RZ"]),
+    ("nexus", replaced("RZ,TX,", "RZ,UX,"), ["line 17: 'hull' has the components RX, RY, RZ, UX, TY, TZ, but no"]),
+    (
+        "nexus",
+        replaced("Frame,RX,", "Frame,QX,"),
+        ["section Segments, rover:hull: it has only RY and RZ of RX, RY, RZ"],
+    ),
     (
         "tracker",
         replaced("Frame,RX,RY,RZ,TX", "Frame,RX,RY,RZ,X"),
@@ -140,18 +148,34 @@ REFUSALS: list[tuple[str, Damage, list[str]]] = [
     ("tracker", in_line(80, 3, "ten"), ["line 80, hull:hull RY: 'ten'", NO_NUMBER]),
     ("tum", in_line(80, 3, "ten", " "), ["line 80, tz: 'ten'", NO_NUMBER, "write nan if the sample is missing"]),
     ("tum", in_line(2, 3, "ten", " "), ["line 2, tz: 'ten'", NO_NUMBER]),
-    ("tum", in_line(80, 7, "1 2", " "), ["line 80: the row has more than 8 numbers; delete what is not meant"]),
+    ("tum", in_line(80, 7, "1 2", " "), ["line 80: the row has more than 8 numbers; delete the others"]),
     ("euroc", in_line(80, 3, "ten"), ["line 80, z: 'ten'", NO_NUMBER]),
     ("table", in_line(80, 3, "ten"), ["line 80, column hull_z: 'ten' is not a number; write a number"]),
     ("npz", saved("hull_pos", np.full((300, 3), "ten")), ["there is no column 'hull_pos[0]'; fix ", "room.toml"]),
     ("npz", saved("hull_pos", np.full((300, 3), np.inf)), ["hull_pos[0], sample 1: it is infinite; write NaN"]),
     # a unit that is none, or another than the format's
-    ("motive", replaced("Length Units,Meters", "Length Units,"), ["line 1, Length Units: '' is no length", "[units]"]),
-    ("nexus", replaced("mm,mm,mm", "km,km,km"), ["line 18, rover:hull TX to TZ: the unit 'km' is no length"]),
-    ("nexus", replaced("deg", "mm"), ["line 18, rover:hull RX to RZ: the unit 'mm' is no angle", "[units]"]),
-    ("tracker", replaced("rad", "turns"), ["line 5, hull:hull RX to RZ: the unit 'turns' is no angle", "[units]"]),
-    ("euroc", replaced("[m]", "[mm]"), ["line 1: EuRoC's positions are in m, and the header has 'p_RS_R_x [mm]'"]),
-    ("euroc", replaced("0000000,", ","), ["column timestamp: the timestamps are 1 apart, and EuRoC's are in ns;"]),
+    (
+        "motive",
+        replaced("Length Units,Meters", "Length Units,"),
+        ["line 1, Length Units: '' is not a known unit of length", "[units]"],
+    ),
+    (
+        "nexus",
+        replaced("mm,mm,mm", "km,km,km"),
+        ["line 18, rover:hull TX to TZ: the unit 'km' is not a known unit of length"],
+    ),
+    (
+        "nexus",
+        replaced("deg", "mm"),
+        ["line 18, rover:hull RX to RZ: the unit 'mm' is not a known unit of angle", "[units]"],
+    ),
+    (
+        "tracker",
+        replaced("rad", "turns"),
+        ["line 5, hull:hull RX to RZ: the unit 'turns' is not a known unit of angle", "[units]"],
+    ),
+    ("euroc", replaced("[m]", "[mm]"), ["line 1: EuRoC's positions are in m, but the header has 'p_RS_R_x [mm]'"]),
+    ("euroc", replaced("0000000,", ","), ["column timestamp: the timestamps are 1 apart, but EuRoC's are in ns;"]),
     ("qualisys-6d", replaced("FRAMES\t300", "FRAMES\tmany"), ["line 1: NO_OF_FRAMES is 'many'", "export again"]),
     # quaternions of another length
     ("motive", in_line(100, 5, "3"), ["line 7, hull: the quaternion of sample 93 has length 3", "export unit"]),

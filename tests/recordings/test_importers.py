@@ -239,7 +239,7 @@ def line(number: int, change: Callable[[list[str]], list[str]]) -> Callable[[str
     "damage, said",
     [
         (line(80, lambda cells: cells[:9]), ["line 80", "ends before 'ballu:base'", "cut off"]),
-        (line(80, lambda cells: [*cells, "7"]), ["line 80", "more cells than the header", "points in numbers"]),
+        (line(80, lambda cells: [*cells, "7"]), ["line 80", "more cells than the header", "decimal points"]),
         (line(80, lambda cells: [*cells[:8], "12.x", *cells[9:]]), ["line 80", "ballu:base RX", "'12.x'", "empty"]),
         (line(80, lambda cells: [*cells[:8], "1e300", *cells[9:]]), ["line 80", "ballu:base RX", "number"]),
         (line(80, lambda cells: ["12", *cells[1:]]), ["line 80", "run back, from 74 to 12", "one trial"]),
@@ -252,8 +252,11 @@ def line(number: int, change: Callable[[list[str]], list[str]]) -> Callable[[str
             line(5, lambda cells: [*cells[:5], "in", *cells[6:]]),
             ["line 5", "ballu:balloon TX to TZ", "'in'", "[units]"],
         ),
-        (line(5, lambda cells: [c.replace("deg", "rad") for c in cells]), ["turned by", "unit of angles"]),
-        (line(5, lambda cells: [c.replace("deg", "mm") for c in cells]), ["line 5", "RX to RZ", "no angle"]),
+        (
+            line(5, lambda cells: [c.replace("deg", "rad") for c in cells]),
+            ["the rotation of", "which is too large", "unit of angles"],
+        ),
+        (line(5, lambda cells: [c.replace("deg", "mm") for c in cells]), ["line 5", "RX to RZ", "unit of angle"]),
         (line(3, lambda cells: [c.replace("ballu:base", "ballu:beam") for c in cells]), ["'ballu:base'", "ballu:"]),
         (line(3, lambda cells: [c.replace("ballu:base", "ballu:balloon") for c in cells]), ["line 4", "RX twice"]),
         (line(1, lambda cells: ["Segments", "two"]), ["line 1", "title is missing"]),
@@ -281,7 +284,7 @@ def vicon_text() -> str:
 
 def test_a_marker_cannot_be_the_balloon(tmp_path: Path):
     text = section("Trajectories", captured(np.eye(3)), rotation=None)
-    with pytest.raises(InputError, match=r"room.toml, \[balloon\]: what it names has no orientation; name an object"):
+    with pytest.raises(InputError, match=r"room.toml, \[balloon\]: its source has no orientation; name an object"):
         read(tmp_path, text, 'robot = "r"\n' + BODIES)
 
 
@@ -359,7 +362,7 @@ def test_messages_count_frames_as_the_file_does(tmp_path: Path):
     others = np.stack([found[role][0] for role in ROLES[1:]], axis=1)
     labels = [*(f"B{i}" for i in range(5)), *(f"ballu:{role}" for role in ROLES[1:])]
     (tmp_path / "walk.c3d").write_bytes(c3d_bytes(1e3 * np.concatenate([markers, others], axis=1), labels, first=213))
-    with pytest.raises(InputError, match="in frame 263 the markers of balloon are off their places"):
+    with pytest.raises(InputError, match="the markers of balloon deviate from a rigid body in frame 263"):
         read_c3d(tmp_path / "walk.c3d", c3d_room(tmp_path))
     text = section("Objects", captured(np.eye(3)), rotation="quaternion", first=213)
     row = text.splitlines()[5 + 80].split(",")
@@ -399,7 +402,7 @@ def test_markers_on_a_line_or_mixed_up_are_refused():
     with pytest.raises(InputError, match="lie on a line"):
         rigid_body(Path("x"), "balloon", markers[:3], on_a_line, 0.01)
     markers[:2, 150] = markers[1::-1, 150]
-    with pytest.raises(InputError, match="in sample 151 the markers of balloon are off their places"):
+    with pytest.raises(InputError, match="the markers of balloon deviate from a rigid body in sample 151"):
         rigid_body(Path("x"), "balloon", markers, cluster(), 0.01)
 
 
@@ -448,13 +451,13 @@ def test_a_c3d_cut_anywhere_is_refused(c3d_file: Path, share: float):
 def test_c3d_without_what_is_asked_for_is_refused(c3d_file: Path):
     room = c3d_room(c3d_file.parent)
     (c3d_file.parent / "room.toml").write_text((c3d_file.parent / "room.toml").read_text().replace("B4", "B9"))
-    with pytest.raises(InputError, match=r"walk.c3d: there is no marker 'B9'; mend .*room\.toml"):
+    with pytest.raises(InputError, match=r"walk.c3d: there is no marker 'B9'; fix .*room\.toml"):
         read_c3d(c3d_file, read_mapping(c3d_file.parent / "room.toml", ROBOT))
     content = bytearray(c3d_file.read_bytes())
     units = content.index(b"UNITS")
     content[content.index(b"mm", units) : content.index(b"mm", units) + 2] = b"xy"
     c3d_file.write_bytes(content)
-    with pytest.raises(InputError, match=r"POINT:UNITS: the unit 'xy' is no length"):
+    with pytest.raises(InputError, match=r"POINT:UNITS: the unit 'xy' is not a known unit of length"):
         read_c3d(c3d_file, room)
     same(place(read_c3d(c3d_file, c3d_room(c3d_file.parent, '[units]\nlength = "mm"\n')), room, ROBOT, "walk"))
 
@@ -725,7 +728,7 @@ def test_json_is_read_alike(tmp_path: Path):
         ('robot = "r"', "", ["key robot", "missing"]),
         ('robot = "r"', 'robot = "r', ["not TOML", "example-mapping"]),
         ("[base]", "[bass]", ["[base]", "missing"]),
-        ('body = "ballu:base"', 'bdy = "ballu:base"', ["[base]", "nothing says"]),
+        ('body = "ballu:base"', 'bdy = "ballu:base"', ["[base]", "source is missing"]),
         ('body = "ballu:base"', 'body = "b"\nofset = [0, 0, 0]', ["[base] ofset", "no such key", "offset"]),
         ('body = "ballu:base"', 'body = "b"\noffset = [0, 0]', ["[base] offset", "3 numbers"]),
         ('body = "ballu:base"', 'body = "b"\noffset = [0, 0, 30]', ["[base] offset", "metres"]),

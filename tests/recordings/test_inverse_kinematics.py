@@ -121,7 +121,7 @@ def test_a_closed_loop_shows_the_joint_behind_it(tmp_path: Path):
     motion = reconstruct(capture(robot, qpos), robot)
     np.testing.assert_allclose(motion.qpos[3:-3], qpos[::5][: len(motion.qpos)][3:-3], atol=0.02)
     read_description(describe(tmp_path, FOURBAR.replace("LOOP", LOOP), tracked="mid", points=["far"]).file)
-    with pytest.raises(InputError, match="of another robot than mid"):
+    with pytest.raises(InputError, match="to another robot than mid"):
         describe(tmp_path, FOURBAR.replace("LOOP", ""), tracked="mid", points=["far"])
     open_chain = describe(tmp_path, FOURBAR.replace("LOOP", ""), tracked="mid")
     with pytest.raises(InputError, match="nothing that is measured shows the joint jc"):

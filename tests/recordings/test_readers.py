@@ -44,6 +44,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.recordings.importers.mapping import RoomMapping, read_mapping
 from ballu_mjx.recordings.importers.readers import READERS, find_reader, read_capture
+from ballu_mjx.recordings.importers.table import Table
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
 
@@ -246,7 +247,7 @@ def test_motive_saved_again_by_a_spreadsheet(tmp_path: Path, robot: RobotDescrip
 def test_motive_tells_measured_markers_from_expected_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run("map", write_motive(tmp_path))
     said = capsys.readouterr().out
-    assert "Expected places of markers are not measured, and are not read: hull:Marker 001." in said
+    assert "Expected positions of markers are not measurements and are not read: hull:Marker 001." in said
     assert "96.3 % seen" in said and 'up = "y"' in said
 
 
@@ -337,7 +338,7 @@ def test_lerobot_datasets(tmp_path: Path, robot: RobotDescription, version: str)
     np.testing.assert_allclose(found.commands.command, COMMAND, atol=1e-6)
     later = read_capture(path, room(tmp_path, robot, text.replace("episode = 0", "episode = 1")))
     np.testing.assert_allclose(later.bodies["hull"].position, HULL.place + 0.01, atol=1e-6)
-    with pytest.raises(InputError, match=r"holds 2 episodes, 0 to 1; say which by episode = ... under \[clock\]"):
+    with pytest.raises(InputError, match=r"holds 2 episodes, 0 to 1; select one by episode = ... under \[clock\]"):
         read_capture(path, room(tmp_path, robot, LEROBOT))
     with pytest.raises(InputError, match="there is no episode 7; its episodes are 0 to 1, 2 in all"):
         read_capture(path, room(tmp_path, robot, text.replace("episode = 0", "episode = 7")))
@@ -430,11 +431,16 @@ def cut_bytes(path: Path) -> None:
     "write, damage, text, said",
     [
         (write_motive, cut_text, NAMED, ["the row ends before", "cut off"]),
-        (write_motive, replaced("Meters", "Cubits"), NAMED, ["line 1, Length Units: 'Cubits' is no length"]),
+        (
+            write_motive,
+            replaced("Meters", "Cubits"),
+            NAMED,
+            ["line 1, Length Units: 'Cubits' is not a known unit of length"],
+        ),
         (write_motive, replaced("Frame,Time (Seconds)", "Frames,Times"), NAMED, ["no line begins with Frame, Time"]),
         (write_motive, replaced(",Name,", ",Named,"), NAMED, ["the rows Type, Name and Rotation or Position"]),
         (write_motive, in_line(80, 1, "0.1"), NAMED, ["line 80", "time runs back or stands still"]),
-        (write_motive, in_line(80, 0, "3"), NAMED, ["line 80", "runs back", "one take a file"]),
+        (write_motive, in_line(80, 0, "3"), NAMED, ["line 80", "runs back", "one take per file"]),
         (write_motive, in_line(80, 3, "0,5"), NAMED, ["line 80", "more cells than the header"]),
         (write_motive, in_line(80, 3, "ten"), NAMED, ["line 80, hull Rotation Y: 'ten' is not a number"]),
         (write_motive, in_line(100, 2, "0.9"), NAMED, ["hull: the quaternion of sample 93 has length"]),
@@ -451,7 +457,12 @@ def cut_bytes(path: Path) -> None:
             NAMED + '[clock]\ntime = "t"\n',
             ["room.toml, [clock]", "OptiTrack Motive CSV", "leave it"],
         ),
-        (write_motive, None, NAMED.replace('"hull"', '"hull"\nrotation = "XYZ"'), ["[hull] rotation", "says itself"]),
+        (
+            write_motive,
+            None,
+            NAMED.replace('"hull"', '"hull"\nrotation = "XYZ"'),
+            ["[hull] rotation", "states its convention"],
+        ),
         (
             write_qualisys_bodies,
             lambda path: path.write_text("\n".join(path.read_text().split("\n")[:200])),
@@ -466,7 +477,7 @@ def cut_bytes(path: Path) -> None:
             write_qualisys_bodies,
             in_line(50, 10, "0.2", "\t"),
             NAMED,
-            ["hull: Rot[0] to Rot[8] of sample", "no rotation"],
+            ["hull: Rot[0] to Rot[8] of sample", "not a rotation matrix"],
         ),
         (write_qualisys_bodies, in_line(50, 1, "0.01", "\t"), NAMED, ["line 50", "time runs back"]),
         (
@@ -475,14 +486,19 @@ def cut_bytes(path: Path) -> None:
             NAMED,
             ["'hull'", "twice"],
         ),
-        (write_npz, cut_bytes, ARCHIVE, ["not a whole .npz archive"]),
+        (write_npz, cut_bytes, ARCHIVE, ["not a complete .npz file"]),
         (
             write_npz,
             None,
             ARCHIVE.replace("tip_pos[0]", "tip_pos[3]"),
             ["there is no column 'tip_pos[3]'", "room.toml"],
         ),
-        (write_npz, None, ARCHIVE.replace('length = "m"', ""), ["[units]", "the length of trial.npz's columns"]),
+        (
+            write_npz,
+            None,
+            ARCHIVE.replace('length = "m"', ""),
+            ["[units]", "the unit of length of trial.npz's columns"],
+        ),
         (
             write_npz,
             lambda path: np.savez(path, time=-TIME, hull_pos=HULL.place),
@@ -493,15 +509,20 @@ def cut_bytes(path: Path) -> None:
             write_npz,
             lambda path: np.savez(path, x=np.array([{}], object)),
             ARCHIVE,
-            ["no array with a number a sample"],
+            ["no array with one number per sample"],
         ),
         (write_bag, None, BAG.replace("/mocap/tip", "/mocap/top"), ["no body or marker '/mocap/top'"]),
         (write_bag, None, BAG + '[clock]\ntime = "t"\n', ["[clock] time", "a bag has no column 't'", '"received"']),
         (write_bag, lambda path: cut_bytes(next(path.glob("*.db3"))), BAG, ["trial"]),
-        (write_json_mcap, cut_bytes, NAMED, ["not a whole MCAP file", "mcap recover"]),
+        (write_json_mcap, cut_bytes, NAMED, ["not a complete MCAP file", "mcap recover"]),
         (lambda folder: write_json_mcap(folder, "protobuf"), None, NAMED, ["encoded as 'protobuf'", "JSON"]),
-        (lambda folder: write_bag(folder, "ros1"), cut_bytes, BAG, ["trial.bag: not a whole bag"]),
-        (write_lerobot, lambda path: cut_bytes(next(path.rglob("*.parquet"))), LEROBOT, ["not a whole parquet file"]),
+        (lambda folder: write_bag(folder, "ros1"), cut_bytes, BAG, ["trial.bag: not a complete bag"]),
+        (
+            write_lerobot,
+            lambda path: cut_bytes(next(path.rglob("*.parquet"))),
+            LEROBOT,
+            ["not a complete parquet file"],
+        ),
         (write_lerobot, lambda path: next(path.rglob("*.parquet")).unlink(), LEROBOT, ["no parquet file under data/"]),
         (
             write_lerobot,
@@ -514,13 +535,13 @@ def cut_bytes(path: Path) -> None:
             write_table,
             lambda path: path.write_text("1,2,3\n4,5,6\n"),
             NAMED,
-            ["line 1: it holds numbers where the names"],
+            ["line 1: it holds numbers instead of column names"],
         ),
         (
             write_table,  # `ros2 topic echo --csv`: seconds and nanoseconds apart, a frame's name, no header
             lambda path: path.write_text("".join(f"17,{i}0000000,map,0.1,0.2,1.5,0,0,0,1\n" for i in range(50))),
             ARCHIVE,
-            ["line 1: it holds numbers where the names", "above the numbers"],
+            ["line 1: it holds numbers instead of column names", "above the numbers"],
         ),
     ],
 )
@@ -579,7 +600,7 @@ def test_every_format_has_its_name_in_the_options():
 
 
 def test_a_folder_of_no_format_is_refused(tmp_path: Path):
-    with pytest.raises(InputError, match="a folder of no format that is known; give a file in it"):
+    with pytest.raises(InputError, match="a folder of unknown format; give a file in it"):
         find_reader(tmp_path)
 
 
@@ -672,7 +693,7 @@ def test_what_the_wizard_cannot_tell_is_left_empty_and_refused(
     with pytest.raises(InputError, match=r'\[tip\] body: it is ""; write text there'):
         read_mapping(tmp_path / "room.toml", robot)
     assert record.main(["map", str(path), "--output", str(tmp_path / "room.toml")]) == 2
-    assert "stands there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
 
 
 def test_names_that_break_lines_do_not_break_the_mapping(tmp_path: Path, robot: RobotDescription):
@@ -683,6 +704,14 @@ def test_names_that_break_lines_do_not_break_the_mapping(tmp_path: Path, robot: 
     (tmp_path / "room.toml").write_text(draft_mapping(contents, robot))
     with pytest.raises(InputError, match=r"\[hull\] position"):
         read_mapping(tmp_path / "room.toml", robot)
+
+
+@pytest.mark.parametrize("first", ["0", "0.0", "-0.0", "0.25"])
+def test_a_header_may_be_the_last_comment_whatever_the_first_time_is(tmp_path: Path, first: str):
+    path = tmp_path / "table.csv"
+    path.write_text(f"# made by hand\n#time,x\n{first},1\n1.5,2\n")
+    table = Table(path)
+    assert table.column("time").tolist() == [float(first), 1.5] and table.column("x").tolist() == [1.0, 2.0]
 
 
 def test_a_table_without_telling_names_asks_for_places_alone(tmp_path: Path, robot: RobotDescription):

@@ -372,7 +372,7 @@ DAMAGE = {
         lambda t: t.update({c: [repr(0.5 + float(v)) for v in t[c]] for c in POSITIONS if c[-1] == "z"}),
         "foot_left_z",
         152,
-        "not to the floor at 0",
+        "not that of the floor, 0",
     ),
     "feet exchanged": (
         exchanged(**{c: c.replace("left", "r").replace("right", "left").replace("_r_", "_right_") for c in POSITIONS}),
@@ -411,7 +411,7 @@ TEXT_DAMAGE = {
     "header and blank": (lambda b: b[: b.index(b"\n") + 1] + b"\n\n", "row 2: there is no sample"),
     "column twice": (
         lambda b: b.replace(b"base_y", b"base_x", 1),
-        "column base_x, row 1: the column stands there twice",
+        "column base_x, row 1: the column appears twice",
     ),
     "semicolons": (
         lambda b: b.replace(b".", b"\0").replace(b",", b";").replace(b"\0", b","),
@@ -507,7 +507,7 @@ def test_a_gzip_bomb_is_refused_before_it_fills_the_memory(path: Path) -> None:
     with gzip.open(path.with_name("walk.csv.gz"), "wb", compresslevel=1) as stream:
         for _ in range(130):
             stream.write(bytes(2**20))
-    refused(path.with_name("walk.csv.gz"), "more than 128 MiB", "cut it", file="walk.csv.gz")
+    refused(path.with_name("walk.csv.gz"), "more than 128 MiB", "split it", file="walk.csv.gz")
 
 
 # ---- paths ----

@@ -103,7 +103,7 @@ def test_limits_are_the_description_s_and_rates_the_control_step_s(tmp_path: Pat
         read_recording(path, describe(tmp_path, limits={"speed": 3.0}))
     elbow[100:, 0] += 0.5
     write_recording(dataclasses.replace(swing(), points={"elbow": elbow}), path, robot)
-    with pytest.raises(InputError, match="column elbow_x, row 102: jumps by 0.5.* m within 10 ms, as no robot does"):
+    with pytest.raises(InputError, match="column elbow_x, row 102: jumps by 0.5.* m within 10 ms, which no robot does"):
         read_recording(path, robot)
 
 

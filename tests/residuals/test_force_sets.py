@@ -179,5 +179,5 @@ def test_a_robot_without_joints_to_act_along_is_refused(robot: RobotDescription,
     assert num_loads(ForceNetworkConfig(forces="joints"), one) == 1
     content["force_joints"] = ["wrist"]
     (tmp_path / "stiff.robot.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match="\"force_joints\" names 'wrist', no joint of the model"):
+    with pytest.raises(InputError, match="\"force_joints\" names 'wrist', which is no joint of the model"):
         read_description(tmp_path / "stiff.robot.json")

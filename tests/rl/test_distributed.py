@@ -137,7 +137,7 @@ def test_a_process_that_fails_does_not_wait_for_those_that_wait_for_it(tmp_path:
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({"process_id": 1}, "--process-id goes with --coordinator"),
+        ({"process_id": 1}, "--process-id needs --coordinator"),
         ({"coordinator": "here:1"}, "needs --num-processes and --process-id"),
         ({"coordinator": "here:1", "num_processes": 2, "process_id": 2}, "must be 0 to 1"),
         ({"coordinator": "here", "num_processes": 2, "process_id": 1}, "give host:port"),

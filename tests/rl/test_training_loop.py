@@ -110,7 +110,7 @@ def test_a_loss_that_is_no_number_ends_training_with_the_last_good_checkpoint(tm
         session = session_in(run)
         session._step_done(100, state(1.0), GOOD)
         with pytest.raises(
-            InputError, match="total_loss is not a number any more. The last good checkpoint is that of step 100"
+            InputError, match="total_loss is no longer finite. The last good checkpoint is that of step 100"
         ):
             session._step_done(200, state(np.nan), GOOD | {"total_loss": float("nan")})
     step, tree = restore_checkpoint(tmp_path / "run", "last")
@@ -179,7 +179,7 @@ def test_changed_options_start_the_environments_anew(tmp_path, small, ppo_change
         start.state(small, changed, training_facts(content(changed, **sections)), told.append)
     )
     (said,) = told
-    assert "the environments start anew, for the options changed; the optimizer goes on" in said
+    assert "options have changed; the environments are reset, the optimizer continues" in said
     stored = training_state.stored(before)
     assert np.array_equal(again["optimizer.1.count"], stored["optimizer.1.count"])
     assert again["optimizer.1.hyperparams.learning_rate"] == 0.5
@@ -201,7 +201,7 @@ def test_a_run_of_an_older_version_goes_on_from_its_parameters(tmp_path, small):
     start = resumed(folder, CONFIG)
     told: list[str] = []
     again = training_state.params(start.state(small, CONFIG, training_facts(content()), told.append))
-    assert "an older version kept parameters alone" in told[0]
+    assert "an older version saved only the parameters" in told[0]
     assert start.step == 160
     for name, value in training_state.stored(before).items():
         if name.startswith("networks"):
@@ -307,7 +307,7 @@ def test_a_folder_that_takes_no_results_is_found_before_the_work(tmp_path):
         (tmp_path / "locked").mkdir(mode=0o555)
         places.append(tmp_path / "locked" / "run")
     for place in places:
-        with pytest.raises(InputError, match="cannot be written to .*; mend its permissions, or give another folder"):
+        with pytest.raises(InputError, match="cannot be written to .*; fix its permissions, or give another folder"):
             files.check_folder(place)
         with pytest.raises(InputError, match="cannot be written to"):
             new_folder(place, "walk")

@@ -121,9 +121,9 @@ SWIVEL = '<joint name="swivel" axis="0 0 1" stiffness="0.008"/>'
         (in_json(name=" "), '"name" is'),
         (in_json(model="nothing.xml"), "there is no file"),
         (in_json(model="balloon.robot.json"), "MuJoCo cannot read"),
-        (in_json(tracked="ballon"), "'ballon', no site of the model; there are knot, balloon"),
+        (in_json(tracked="ballon"), "'ballon', which is no site of the model; there are knot, balloon"),
         (in_json(points="knot"), "a list of names"),
-        (in_json(points=["knot", "knot"]), "one twice"),
+        (in_json(points=["knot", "knot"]), "a name twice"),
         (in_json(points=["balloon"]), "two columns balloon_x"),
         (in_json(points=["kn,ot"]), "letters, digits"),
         (in_json(commands={"left": "propeller_left"}), "all in its order: propeller_left, propeller_right"),
@@ -136,12 +136,12 @@ SWIVEL = '<joint name="swivel" axis="0 0 1" stiffness="0.008"/>'
         (in_json(control_timestep=0.0), '"control_timestep" is 0.0'),
         (in_json(control_timestep=0.015), "divide the control step of 0.015 s"),
         (in_json(keyframe="hover"), "no keyframe of the model; there are none"),
-        (in_json(oriented_points=["balloon"]), 'none of "points"'),
+        (in_json(oriented_points=["balloon"]), 'not among "points"'),
         (in_json(limits={"height": [3, 1]}), '"limits: height" is'),
         (in_json(limits={"speed": -1}), "above 0"),
         (in_json(limits={"depth": 1}), "some of height, distance, speed, angle"),
         (in_json(mirror={"left": "rihgt"}), '"mirror" names'),
-        (in_json(mirror={"left": "right", "right": "left"}), "one twice"),
+        (in_json(mirror={"left": "right", "right": "left"}), "a name twice"),
         (in_json(commands={"left": {"actuator": "propeller_left"}, "right": "propeller_right"}), "for left"),
         (in_model(SWIVEL, '<joint name="swivel" type="ball"/>'), "a ball joint"),
         (in_model("</worldbody>", BUOY + "</worldbody>"), "a free joint that is not the first joint, 'afloat'"),
@@ -314,7 +314,7 @@ def test_a_joint_that_nothing_shows_is_named(flight: tuple[Recording, np.ndarray
 
 def test_places_that_are_not_the_model_s_are_refused(flight: tuple[Recording, np.ndarray, np.ndarray]):
     moved = {"knot": flight[0].points["knot"] + [0.0, 0.0, 0.4]}
-    with pytest.raises(InputError, match="from where the model can have it"):
+    with pytest.raises(InputError, match="from the model's best fit"):
         reconstruct(dataclasses.replace(flight[0], points=moved), DESCRIPTION)
 
 

@@ -205,14 +205,14 @@ class Bomb:
     [
         (
             lambda arrays, path: arrays | {"0/qpos/vanilla": np.array([Bomb(path)], object)},
-            "no archive of plain arrays",
+            "not an archive of plain arrays",
         ),
-        (lambda arrays, path: arrays | {"names": np.array([Bomb(path)], object)}, "no archive of plain arrays"),
+        (lambda arrays, path: arrays | {"names": np.array([Bomb(path)], object)}, "not an archive of plain arrays"),
         (lambda arrays, path: arrays | {"0/force": arrays["0/force"][:-1]}, "0/force is not an array of (20, 3)"),
         (lambda arrays, path: arrays | {"0/qpos/vanilla": np.full((21, 14), np.nan)}, "0/qpos/vanilla is not"),
         (lambda arrays, path: arrays | {"0/time": np.array(["x"] * 21)}, "0/time is not an array"),
         (lambda arrays, path: {k: v for k, v in arrays.items() if "qpos" not in k}, "has no robot"),
-        (lambda arrays, path: arrays | {"format": np.array("other/1")}, "is not of the format ballu-replay/2"),
+        (lambda arrays, path: arrays | {"format": np.array("other/1")}, "the format is not ballu-replay/2"),
     ],
 )
 def test_damaged_replay_is_refused(short: Path, tmp_path: Path, capsys, damage: Callable, says: str):
@@ -233,7 +233,7 @@ def test_file_that_is_no_archive_is_refused(tmp_path: Path):
     np.save(single, np.zeros(3))
     for content in (b"", b"PK\x03\x04 cut off", b"\x80\x04\x95 pickle", single.getvalue()):
         (tmp_path / ROLLOUT_FILE).write_bytes(content)
-        with pytest.raises(report.InputError, match="no archive of plain arrays"):
+        with pytest.raises(report.InputError, match="not an archive of plain arrays"):
             read_rollouts(tmp_path / ROLLOUT_FILE)
 
 
@@ -255,7 +255,7 @@ def test_replay_comes_back_in_single_precision(tmp_path: Path):
     [
         (["{}/nowhere"], "there is no run"),
         (["{}", "--output", "{}"], "is a folder; give a file"),
-        (["{}", "--show", "far-9"], "there is no such replay; one of near-1"),
+        (["{}", "--show", "far-9"], "there is no such replay; give one of near-1"),
     ],
 )
 def test_what_cannot_be_reported_is_refused(short: Path, capsys, arguments: list[str], says: str):

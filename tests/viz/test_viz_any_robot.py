@@ -74,13 +74,13 @@ def test_replay_of_a_robot_that_has_changed_is_refused(tmp_path: Path):
     with pytest.raises(view.InputError, match=r"rover\.robot\.json: the robot description, or its model, has changed"):
         read_rollouts(tmp_path / "replay.npz")
     robot.file.unlink()
-    with pytest.raises(view.InputError, match="the robot description is gone"):
+    with pytest.raises(view.InputError, match="the robot description is missing"):
         read_rollouts(tmp_path / "replay.npz")
     with np.load(tmp_path / "replay.npz") as archive:
         arrays = dict(archive)
     arrays["robot/path"] = np.zeros((11, 3))
     np.savez(tmp_path / "replay.npz", **arrays)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(view.InputError, match=r"replay\.npz: does not say of which robot it is"):
+    with pytest.raises(view.InputError, match=r"replay\.npz: does not name its robot"):
         read_rollouts(tmp_path / "replay.npz")
 
 

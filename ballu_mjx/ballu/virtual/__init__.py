@@ -1,1 +1,1 @@
-"""A virtual BALLU that stands in for the hardware."""
+"""A virtual BALLU that replaces the hardware."""

@@ -1,8 +1,9 @@
-"""The bundled data set, recorded on the virtual robot; and larger test sets of the same family, drawn at random.
+"""The bundled data set, recorded on the virtual robot, and larger random test sets of the same family.
 
-Training: ten gaits of 20 s by hand (bang-bang commands of differing period, phase, duty and asymmetry), two of them
-three times, in different draughts. Validation and test: two near recordings (the same family of gaits, parameters
-between those trained on) and two far ones (commands unlike any gait) each. And one suspended actuator sweep.
+The training set has ten hand-designed gaits of 20 s: bang-bang commands with different period, phase, duty and
+asymmetry. Two of them are recorded three times, in different draughts. The validation and the test set have two near
+and two far recordings each. Near recordings are gaits of the same family, with parameters between those of training.
+Far recordings have commands unlike any gait. There is also one suspended sweep.
 """
 
 from __future__ import annotations
@@ -22,10 +23,12 @@ from ballu_mjx.recordings.csv_format import write_recording
 from ballu_mjx.robots.registry import load_robot
 
 ROBOT_SEED = 0
+"""Seed of the virtual robot of the bundled recordings."""
 DECIMALS = 4
-"""Of positions (quaternions get one fewer): rounding by a tenth of the noise at most keeps the set at 2 MB."""
+"""Decimals of positions. Quaternions have one fewer. Rounding by at most a tenth of the noise keeps the set at 2 MB."""
 SECONDS = {"training": 20.0, "validation": 25.0, "test": 25.0}
-"""Five seconds more for validation and test: five starts for a horizon of 20 s, where one alone is a matter of luck."""
+"""Length (s) of recordings. Validation and test recordings are 5 s longer, which gives five starts for a horizon of
+20 s. A single start would depend too much on chance."""
 
 TRAINING = (
     Gait(0.70, 0.50, (0.40, 0.40), (1.00, 1.00)),
@@ -39,8 +42,9 @@ TRAINING = (
     Gait(1.50, 0.45, (0.35, 0.45), (0.90, 0.80)),
     Gait(0.80, 0.80, (0.45, 0.35), (0.80, 1.00)),
 )
+"""Gaits of the training recordings."""
 REPEATED = (1, 3)
-"""Gaits that are recorded three times."""
+"""Indices of the training gaits that are recorded three times."""
 NEAR = {
     "validation": (
         Gait(1.00, 0.50, (0.40, 0.40), (0.90, 0.90)),
@@ -56,17 +60,20 @@ FAR = {"validation": (hopping, one_legged), "test": (telegraph, waves)}
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """One recording to make."""
+    """A recording to make."""
 
     split: str
+    """Folder of the recording, such as "training"."""
     name: str
     commands: Float[np.ndarray, "steps 2"]
+    """Commands (left, right) at the control rate."""
     trial: int
+    """Seed of the trial's conditions."""
     notes: str
 
 
 def jobs() -> list[Job]:
-    """List all free recordings of the data set, each in a draught of its own."""
+    """Return the jobs for all free recordings of the data set. Each recording has a different draught."""
     found: list[tuple[str, str, Float[np.ndarray, "steps 2"], str]] = []
     for index, gait in enumerate(TRAINING):
         for take in range(3 if index in REPEATED else 1):
@@ -81,10 +88,11 @@ def jobs() -> list[Job]:
 
 
 def fresh_jobs(seed: int, each: int = 6) -> list[Job]:
-    """Draw a larger test set than the bundled one at random: `each` near and `each` far recordings.
+    """Draw a larger test set than the bundled one, with `each` near and `each` far recordings.
 
-    Near: gaits with period, phase, duty and height drawn from the range of the training gaits. Far: random jumps, both
-    legs together, smooth waves (a phase apart, or of two periods) and one leg at a time, in turn.
+    Near recordings are gaits whose period, phase, duty and high commands are drawn from within the range of the
+    training gaits. Far recordings cycle through five kinds: random jumps, both legs together, smooth waves with a phase
+    shift, smooth waves with two periods, and one leg at a time.
     """
     rng = np.random.default_rng([seed, 4])
     seconds = SECONDS["test"]
@@ -120,7 +128,7 @@ def fresh_jobs(seed: int, each: int = 6) -> list[Job]:
 
 
 def record_job(job: Job, robot: virtual_robot.VirtualRobot, output: Path) -> Path:
-    """Record one job on a virtual robot, and write it below the folder of its split."""
+    """Record one job on a virtual robot, and write it to the folder of its split in `output`. Return the file."""
     recording = virtual_robot.record(
         robot,
         virtual_robot.draw_trial(job.trial),
@@ -136,7 +144,7 @@ def record_job(job: Job, robot: virtual_robot.VirtualRobot, output: Path) -> Pat
 
 
 def record_fresh(seed: int, folder: Path, each: int = 6, robot_seed: int = ROBOT_SEED) -> list[Path]:
-    """Record `fresh_jobs` into a folder, on all cores; files that are there stay as they are."""
+    """Record `fresh_jobs` into a folder, on all cores, and return the files. Existing files are kept."""
     wanted = fresh_jobs(seed, each)
     paths = [folder / job.split / f"{job.name}.csv.gz" for job in wanted]
     record_jobs([job for job, path in zip(wanted, paths, strict=True) if not path.exists()], robot_seed, folder)
@@ -144,7 +152,7 @@ def record_fresh(seed: int, folder: Path, each: int = 6, robot_seed: int = ROBOT
 
 
 def record_dataset(robot_seed: int, folder: Path) -> list[Path]:
-    """Record the whole data set on a virtual robot into a folder; the sweep comes last."""
+    """Record the whole data set on a virtual robot into a folder, and return the files, the sweep last."""
     paths = record_jobs(jobs(), robot_seed, folder)
     sweep = folder / "suspended" / "sweep.csv.gz"
     sweep.parent.mkdir(parents=True, exist_ok=True)

@@ -1,12 +1,18 @@
-"""A stand-in for the hardware: a family of virtual robots in C MuJoCo that the training simulator does not contain.
+"""Virtual robots that replace the hardware: a family in C MuJoCo that the training simulator does not contain.
 
-What differs from `assets/ballu.xml`: a time step of 0.5 ms and explicit (semi-implicit Euler) integration in double
-precision; air on the balloon cluster, by MuJoCo's ellipsoid model (drag, lift, Magnus force) and an added mass and
-inertia in its body, and a slow draught that is another one in every trial; servos and cables that differ left to right
-(gain, zero, torque limit, friction, backlash, slack); knee springs and stops likewise; a balloon cluster a little off
-centre; command latency. The robot is seen through motion capture alone: 100 Hz, 0.5 mm, 0.3 deg, hidden markers.
+They differ from `assets/ballu.xml` in these points:
 
-Nothing that trains may import this module's robots: they are known by their recordings only.
+- The time step is 0.5 ms. Integration is explicit (semi-implicit Euler) and in double precision.
+- Air acts on the balloon cluster by MuJoCo's ellipsoid model (drag, lift, Magnus force). The balloon's body has an
+  added mass and inertia. A slow draught differs between trials.
+- Servos and cables differ between left and right: gain, zero, torque limit, friction, backlash and slack. Knee springs
+  and stops differ too.
+- The balloon cluster is slightly off centre.
+- Commands have a latency.
+
+Only motion capture observes the robot: 100 Hz, noise of 0.5 mm and 0.3 deg, hidden markers.
+
+Code that trains must not import this module's robots. It may know them only by their recordings.
 """
 
 from __future__ import annotations
@@ -28,59 +34,64 @@ from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.model import assets, set_fields
 
 CaptureController = Callable[[Capture], Float[np.ndarray, " 2"]]
-"""Sees all frames so far, returns the next commands (left, right)."""
+"""Function from all captured frames so far to the next commands (left, right)."""
 NAMES = ("balloon", "base", "foot_left", "foot_right")
-"""What motion capture sees; each is hidden independently of the others."""
+"""Points that motion capture sees. Each is hidden independently of the others."""
 PHYSICS_TIMESTEP = 5e-4
+"""Physics step (s)."""
 CAPTURE_TIMESTEP = 0.01
+"""Time (s) between two frames of motion capture."""
 _TICK = 1e-3
-"""Seconds between two looks at the command queue; latency is resolved to it."""
+"""Time (s) between two readings of the command queue, and thus the resolution of the latency."""
 AIR_DENSITY = 1.2
+"""Density of the air (kg/m^3)."""
 POSITION_NOISE = 5e-4
+"""Standard deviation (m) of captured positions, along each axis."""
 ORIENTATION_NOISE = float(np.deg2rad(0.3))
+"""Standard deviation (rad) of captured orientations, about each axis."""
 
 
 @dataclasses.dataclass(frozen=True)
 class VirtualRobot:
-    """One robot of the family. Pairs are (left, right); SI units, radians."""
+    """A robot of the family. Pairs are (left, right). Units are SI units and radians."""
 
     name: str
     knee_spring_stiffness: tuple[float, float]
-    """N m/rad."""
+    """Stiffness of the knee springs (N m/rad)."""
     default_knee_angle: tuple[float, float]
-    """Knee stops (rad)."""
+    """Angles of the knee stops (rad)."""
     knee_friction: tuple[float, float]
-    """Dry friction (N m)."""
+    """Dry friction of the knees (N m)."""
     motor_gain: tuple[float, float]
-    """N m/rad."""
+    """Position gain of the servos (N m/rad)."""
     default_motor_angle: tuple[float, float]
     """Motor angle (rad) at command 0."""
     torque_limit: tuple[float, float]
-    """N m."""
+    """Torque at which the servos saturate (N m)."""
     motor_friction: tuple[float, float]
-    """Dry friction (N m)."""
+    """Dry friction of the motors (N m)."""
     backlash: tuple[float, float]
-    """Width of the play between command and arm (rad)."""
+    """Width of the backlash between command and motor target (rad)."""
     cable_slack: tuple[float, float]
-    """Slack (m) with the motor at 0 and the knee at its stop."""
+    """Slack of the cables (m) with the motor at 0 and the knee at its stop."""
     foot_friction: tuple[float, float]
     """Coefficient of sliding friction between foot and floor."""
     balloon_offset: tuple[float, float, float]
-    """Centre of lift and mass of the balloon cluster, off the nominal one (m, balloon frame)."""
+    """Offset of the balloon cluster's centre of lift and mass from the nominal one (m, balloon frame)."""
     balloon_semi_axes: tuple[float, float, float]
-    """The ellipsoid of air that the cluster displaces (m)."""
+    """Semi-axes of the ellipsoid of air that the cluster displaces (m)."""
     added_mass: float
-    """Mass of air that the cluster drags along (kg), alike in all directions; its weight is carried by lift."""
+    """Mass of the air that moves with the cluster (kg), equal in all directions. Lift carries its weight."""
     added_inertia: float
-    """Rotational counterpart of `added_mass` (kg m^2)."""
+    """Moment of inertia of the air that turns with the cluster (kg m^2), equal about all axes."""
     buoyancy: float
-    """Lift over the nominal robot's weight."""
+    """Ratio of the lift to the nominal robot's weight."""
     latency: float
-    """Seconds from a command to the servo's target."""
+    """Time (s) from a command to the servo's target."""
 
     @property
     def actuators(self) -> ActuatorParameters:
-        """What identification of its actuators can hope to find."""
+        """Return the true values of the actuator parameters that `ActuatorParameters` requires."""
         names = {field.name for field in dataclasses.fields(self)}
         own = [f.name for f in dataclasses.fields(ActuatorParameters) if f.default is dataclasses.MISSING]
         return ActuatorParameters(**{name: jnp.array(getattr(self, name)) for name in own if name in names})
@@ -88,20 +99,20 @@ class VirtualRobot:
 
 @dataclasses.dataclass(frozen=True)
 class TrialConditions:
-    """What differs from one trial of the same robot to the next."""
+    """Conditions that differ between trials of the same robot."""
 
     draught: tuple[float, float, float]
-    """Mean air velocity (m/s, world)."""
+    """Mean air velocity (m/s, world frame)."""
     draught_swing: tuple[float, float]
-    """Amplitude (m/s) and period (s) of the slow change of the draught."""
+    """Amplitude (m/s) and period (s) of the slow variation of the draught."""
     start: tuple[float, float, float]
-    """Offset of the start: x, y (m) and yaw (rad)."""
+    """Offset of the start from the origin: x, y (m) and yaw (rad)."""
     capture_seed: int
     """Seed of the motion capture's noise and drop-outs."""
 
 
 def still(trial: TrialConditions) -> TrialConditions:
-    """The same without a draught."""
+    """Return the conditions of a trial without its draught."""
     return dataclasses.replace(trial, draught=(0.0, 0.0, 0.0), draught_swing=(0.0, trial.draught_swing[1]))
 
 
@@ -137,7 +148,7 @@ def draw_robot(seed: int) -> VirtualRobot:
 
 
 def draw_trial(seed: int) -> TrialConditions:
-    """Draw the circumstances of one trial."""
+    """Draw the conditions of one trial."""
     rng = np.random.default_rng([seed, 2])
     direction, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, 0.06)
     return TrialConditions(
@@ -149,7 +160,10 @@ def draw_trial(seed: int) -> TrialConditions:
 
 
 def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
-    """The robot's C model. `suspended` welds the base to the world a metre up, for actuator sweeps."""
+    """Return the robot's C MuJoCo model.
+
+    `suspended`: whether to weld the base to the world with the feet off the ground, for sweeps.
+    """
     spec = mujoco.MjSpec.from_file(str(assets() / "ballu.xml"))
     spec.option.timestep = PHYSICS_TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -180,7 +194,7 @@ def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
     nominal = load_model()
     parameters = dataclasses.replace(virtual.actuators, cable_slack=jnp.full(2, CABLE_SLACK))
     set_fields(model, actuator_fields(model, parameters))
-    model.actuator_forcerange[:] = np.outer(virtual.torque_limit, [-1.0, 1.0])  # in full precision
+    model.actuator_forcerange[:] = np.outer(virtual.torque_limit, [-1.0, 1.0])  # again, in double precision
     model.tendon_lengthspring[:, 1] += np.array(virtual.cable_slack) - CABLE_SLACK
 
     index = model.body("balloon").id
@@ -196,13 +210,14 @@ def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
 
 
 def _leave_drag_lift_and_magnus_force(model: mujoco.MjModel) -> None:
-    """Take from MuJoCo's fluid model, in place, what does not belong to this robot's air.
+    """Remove from MuJoCo's fluid model the parts that this robot's air does not have, in place.
 
-    - The virtual mass and inertia of the ellipsoid. MuJoCo has their velocity-dependent forces alone. The body has the
-      whole of an added mass already: mass `added_mass` at the centre has momentum m v, whose rate is m (dv/dt + w x v)
-      in the body's frame, Kirchhoff's force for equal added masses along all axes, without a Munk moment (m v x v = 0).
-    - Drag of the other bodies. A body without an ellipsoid would get that of its inertia box; one whose coefficients
-      are all 0 gets none.
+    - The virtual mass and inertia of the ellipsoid. MuJoCo has only their velocity-dependent forces, and the body
+      already has the complete added mass. The mass `added_mass` at the centre has the momentum m v, whose rate of
+      change in the body frame is m (dv/dt + w x v). This is Kirchhoff's force for added masses that are equal along all
+      axes. There is no Munk moment (m v x v = 0).
+    - The drag of the other bodies. A body without an ellipsoid would have the drag of its inertia box. A body whose
+      coefficients are all 0 has none.
     """
     air = model.geom("air").id
     model.geom_fluid[air, _VIRTUAL_MASS] = 0.0
@@ -212,23 +227,29 @@ def _leave_drag_lift_and_magnus_force(model: mujoco.MjModel) -> None:
 
 
 _VIRTUAL_MASS = slice(6, 12)
-"""In a row of `geom_fluid`: interaction, five coefficients of drag, lift and Magnus force, virtual mass and inertia."""
+"""Columns of virtual mass and inertia in a row of `geom_fluid`. The columns before them are the interaction and five
+coefficients of drag, lift and Magnus force."""
 
 
 @dataclasses.dataclass
 class _Servos:
-    """Latency and backlash between the commands as sent and the servos' targets."""
+    """Latency and backlash between the sent commands and the servos' targets."""
 
     latency: float
+    """Latency (s)."""
     backlash: Float[np.ndarray, " 2"]
+    """Width of the backlash (rad)."""
     queue: list[tuple[float, np.ndarray]]
+    """Commands that have not arrived yet, with the times (s) at which they arrive."""
     target: Float[np.ndarray, " 2"]
+    """Targets (command units)."""
 
     def send(self, time: float, command: np.ndarray) -> None:
+        """Send a command at `time` (s)."""
         self.queue.append((time + self.latency, command))
 
     def at(self, time: float) -> np.ndarray:
-        """Targets in command units: the play operator lets a target follow only when pushed by half its width."""
+        """Return the targets (command units) at `time` (s). They stay within half the backlash of the last command."""
         while self.queue and self.queue[0][0] <= time + 1e-9:
             _, command = self.queue.pop(0)
             half = self.backlash / SERVO_RANGE / 2
@@ -237,7 +258,7 @@ class _Servos:
 
 
 def open_loop(commands: Float[np.ndarray, "steps 2"]) -> CaptureController:
-    """A controller that plays `commands`, one a control step, and looks at nothing."""
+    """Return a controller that replays `commands`, one for each control step, without feedback."""
     frames = round(CONTROL_TIMESTEP / CAPTURE_TIMESTEP)
     return lambda capture: commands[(len(capture.time) - 1) // frames]
 
@@ -250,10 +271,10 @@ def record(
     name: str,
     notes: str = "",
 ) -> Recording:
-    """Run one trial of `duration` seconds and return what motion capture saw.
+    """Run one trial of `duration` seconds and return its recording by motion capture.
 
-    The robot stands still for two seconds before time 0. Commands change at the control rate (20 Hz); the last
-    command is repeated in the last frame.
+    The robot stands still for two seconds before time 0. Commands change at the control rate (20 Hz). The last command
+    is repeated in the last frame.
     """
     capture, base_quaternion, _, _ = _simulate(virtual, trial, controller, duration)
     return _finish(capture, base_quaternion, virtual, name, notes)
@@ -262,7 +283,10 @@ def record(
 def record_truth(
     virtual: VirtualRobot, trial: TrialConditions, controller: CaptureController, duration: float
 ) -> tuple[Float[np.ndarray, "frames nq"], Float[np.ndarray, "frames nv"]]:
-    """The same trial's true generalized positions and velocities, for checking what is made from the recording."""
+    """Return the true generalized positions and velocities in a trial of `record`, at the frames of its recording.
+
+    They serve to check quantities that are computed from the recording.
+    """
     _, _, qpos, qvel = _simulate(virtual, trial, controller, duration)
     return qpos, qvel
 
@@ -270,7 +294,7 @@ def record_truth(
 def _simulate(
     virtual: VirtualRobot, trial: TrialConditions, controller: CaptureController, duration: float
 ) -> tuple[Capture, np.ndarray, np.ndarray, np.ndarray]:
-    """Return what motion capture saw, the base's orientation that it saw beside, and the true states."""
+    """Return the captured frames, the captured orientations of the base, and the true qpos and qvel."""
     model = build(virtual)
     data = mujoco.MjData(model)
     data.qpos[:] = standing_qpos(model)
@@ -301,8 +325,10 @@ def _simulate(
 
 
 def _advance(model: mujoco.MjModel, data: mujoco.MjData, servos: _Servos, trial: TrialConditions, time: float) -> None:
-    """On from one frame of the capture, at `time` (s), to the next. Commands arrive with a tick, or with the nearest
-    physics step where these are longer."""
+    """Advance the simulation from a frame of the capture, at `time` (s), to the next one.
+
+    Commands arrive at ticks, or at the nearest physics step if physics steps are longer than ticks.
+    """
     model.opt.wind[:] = _wind(trial, time)
     tick = max(_TICK, model.opt.timestep)
     for start in time + tick * np.arange(round(CAPTURE_TIMESTEP / tick)):
@@ -319,10 +345,13 @@ def carry_on(
     count: int,
     model: mujoco.MjModel | None = None,
 ) -> Float[np.ndarray, "count nq"]:
-    """Take a trial up at its control step `first`, in a given state (qpos, qvel) and with the servos as the commands
-    before have left them: generalized positions after each of `count` control steps.
+    """Continue a trial from its control step `first` and return generalized positions after each of `count` steps.
 
-    `model`: another than the robot's own, of a time step up to the capture's.
+    **Arguments**
+
+    - `commands`: all commands of the trial. Those before `first` determine the state of the servos.
+    - `state`: qpos and qvel at the control step `first`.
+    - `model`: model that replaces the robot's own. Its time step is at most that of the capture.
     """
     model = build(virtual) if model is None else model
     data = mujoco.MjData(model)
@@ -343,7 +372,7 @@ def carry_on(
 
 
 def record_sweep(virtual: VirtualRobot, seed: int, name: str, *, commands: int = 20, hold: float = 2.0) -> Recording:
-    """A suspended actuator sweep: `commands` levels spread uniformly over [0, 1], each held for `hold` seconds."""
+    """Record a suspended sweep: `commands` levels spread uniformly over [0, 1], each held for `hold` seconds."""
     model = build(virtual, suspended=True)
     data = mujoco.MjData(model)
     knees = [model.joint(f"knee_{side}").qposadr[0] for side in SIDES]
@@ -379,7 +408,7 @@ def record_sweep(virtual: VirtualRobot, seed: int, name: str, *, commands: int =
 
 
 def _place(model: mujoco.MjModel, data: mujoco.MjData, trial: TrialConditions) -> None:
-    """Turn and shift the standing robot about its base, so that a trial starts near the origin, facing x."""
+    """Turn and shift the standing robot about its base, so that a trial starts near the origin and faces x."""
     start = Rotation.from_quat(data.qpos[3:7], scalar_first=True)
     heading = start.as_euler("ZYX")[0]
     turn = Rotation.from_euler("z", trial.start[2] - heading)
@@ -389,13 +418,14 @@ def _place(model: mujoco.MjModel, data: mujoco.MjData, trial: TrialConditions) -
 
 
 def _wind(trial: TrialConditions, time: float) -> np.ndarray:
+    """Return the air velocity (m/s, world frame) at `time` (s)."""
     amplitude, period = trial.draught_swing
     phase = 2 * np.pi * time / period
     return np.array(trial.draught) + amplitude * np.array([np.sin(phase), np.cos(phase), 0.0])
 
 
 def _hidden(rng: np.random.Generator, frames: int) -> np.ndarray:
-    """Which of the marker groups is hidden in which frame: about once in 10 s, for up to 0.15 s."""
+    """Return which points are hidden in which frame: each about once in 10 s, for up to 0.15 s."""
     hidden = np.zeros((frames, len(NAMES)), bool)
     for marker in range(len(NAMES)):
         for _ in range(rng.poisson(frames * CAPTURE_TIMESTEP / 10.0)):
@@ -407,7 +437,7 @@ def _hidden(rng: np.random.Generator, frames: int) -> np.ndarray:
 def _capture_frame(
     data: mujoco.MjData, rng: np.random.Generator, hidden: np.ndarray, time: float, capture: Capture
 ) -> Float[np.ndarray, " 4"]:
-    """Add what motion capture sees now; return the base's orientation (w, x, y, z), which no policy sees."""
+    """Append the current frame to `capture`. Return the base's orientation (w, x, y, z), which policies do not see."""
 
     def position(site: str, is_hidden: np.bool) -> np.ndarray:
         noisy = data.site(site).xpos + rng.normal(0, POSITION_NOISE, 3)
@@ -430,6 +460,7 @@ def _capture_frame(
 def _finish(
     capture: Capture, base_quaternion: Float[np.ndarray, "T 4"], virtual: VirtualRobot, name: str, notes: str
 ) -> Recording:
+    """Return the recording of all captured frames."""
     position = np.array(capture.position)
     return make_recording(
         name=name,

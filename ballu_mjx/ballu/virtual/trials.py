@@ -1,4 +1,4 @@
-"""Trials of a policy on the virtual robot, beside the same policy in its own simulator."""
+"""Trials of a policy on the virtual robot, compared with the same policy in its own simulator."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from ballu_mjx.sim.simulator import Simulator
 
 
 class ExportedPolicy:
-    """A policy as `python -m ballu_mjx export` ships it, rate limit and time-out included, fed from captures."""
+    """A policy as exported by `python -m ballu_mjx export`, with rate limit and time-out, for captured frames."""
 
     def __init__(self, stored: Mapping[str, np.ndarray]) -> None:
-        """`stored` is what `export.weights` returns."""
+        """`stored` is the result of `export.weights`."""
         self.controller = Controller(stored)
         self._fed = 0
 
     def __call__(self, capture: Capture) -> Float[np.ndarray, " 2"]:
-        """Return the commands after the frames that came since the last call; a trial needs a new controller."""
+        """Return the commands after the frames that are new since the last call. Every trial needs a new controller."""
         commands = self.controller.command
         for frame in range(self._fed, len(capture.time)):
             seen = {
@@ -58,11 +58,17 @@ def run_trials(
     loop: ClosedLoop | None = None,
     tell: Callable[[str], None] = lambda text: None,
 ) -> list[Transfer]:
-    """Run each trial in closed loop from motion capture alone, under the controller that `export` ships, and compare it
-    with the policy's own simulator (`loop`, where that is at hand already) from the same state.
+    """Run trials in closed loop, and compare each with the policy in its own simulator from the same state.
 
-    `tell` takes a sentence after each trial. Leaves in `folder` a recording a trial, and `trials.png`: the ways from
-    above, on the robot and in simulation.
+    On the robot, the exported controller sees motion capture alone. The function writes to `folder` a recording of each
+    trial, `trials.png` with the trajectories from above on the robot and in simulation, and `gait.png` with the first
+    trial's gait.
+
+    **Arguments**
+
+    - `draws`: conditions of each trial.
+    - `loop`: the policy in its own simulator. None to make it.
+    - `tell`: function that is called with a sentence after each trial.
     """
     stored = weights(policy)
     seconds, setting = policy.task.trial_seconds, policy.variant.name
@@ -73,7 +79,7 @@ def run_trials(
         recording = virtual_robot.record(hardware, draw, ExportedPolicy(stored), seconds, name, notes)
         path = folder / f"{name}.csv.gz"
         write_recording(recording, path, load_robot(), decimals=4)
-        recordings.append(read_recording(path, load_robot()))  # reading fills the gaps
+        recordings.append(read_recording(path, load_robot()))  # reading fills the gaps of hidden points
         tell(f"{policy.task.name}, {setting}: {name} of {len(draws)} done")
 
     simulator = Simulator(load_robot(), policy.actuators)
@@ -83,16 +89,16 @@ def run_trials(
     starts = [np.stack([getattr(motion, name)[0] for motion in motions]) for name in ("qpos", "qvel")]
     rollout = (loop or policy.closed_loop())(policy.params, starts[0], starts[1], len(motions[0].command))
     recorded = np.asarray(com), np.asarray(reference.features)
-    hardware_ways = [_way(*(x[i, : len(motion.qpos)] for x in recorded)) for i, motion in enumerate(motions)]
-    simulated = [_way(*states) for states in zip(rollout.com, rollout.features, strict=True)]
+    on_robot = [_trajectory(*(x[i, : len(motion.qpos)] for x in recorded)) for i, motion in enumerate(motions)]
+    simulated = [_trajectory(*states) for states in zip(rollout.com, rollout.features, strict=True)]
     ballu_plots.draw_trajectories(
-        folder / "trials.png", [way.com for way in hardware_ways], [way.com for way in simulated], setting
+        folder / "trials.png", [run.com for run in on_robot], [run.com for run in simulated], setting
     )
     ballu_plots.gait(folder / "gait.png", motions[0].qpos, motions[0].command)
-    return [compare_trajectories(sim, real) for sim, real in zip(simulated, hardware_ways, strict=True)]
+    return [compare_trajectories(sim, real) for sim, real in zip(simulated, on_robot, strict=True)]
 
 
-def _way(com: Float[np.ndarray, "T 3"], features: Float[np.ndarray, "T 27"]) -> Trajectory:
-    """Of states as `observation.observe_features` sees them."""
+def _trajectory(com: Float[np.ndarray, "T 3"], features: Float[np.ndarray, "T 27"]) -> Trajectory:
+    """Return the trajectory of states with the features of `observation.observe_features`."""
     yaw, steps = features[:, ObservationLayout.yaw], count_steps(foot_positions(features))
     return Trajectory(com, yaw, steps, CONTROL_TIMESTEP)

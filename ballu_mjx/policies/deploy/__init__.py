@@ -1,1 +1,1 @@
-"""A policy on the robot's own computer."""
+"""Export of policies to the robot's own computer."""

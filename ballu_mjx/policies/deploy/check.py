@@ -1,4 +1,4 @@
-"""An exported policy in C MuJoCo, beside the simulator that it was trained in: does it do there what it did here?"""
+"""Check of an exported policy in C MuJoCo against the policy and the simulator of its training."""
 
 from __future__ import annotations
 
@@ -27,38 +27,39 @@ from ballu_mjx.sim.c_model import improved_model, site_poses
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 TOLERANCE = 0.1
-"""Of the distance or reward of a trial, by which another that does the same may differ."""
+"""Largest relative difference of distance or reward between two trials that count as equal."""
 COMMAND_TOLERANCE = 1e-3
-"""Of a command's range, by which the exported network may differ from the policy."""
+"""Largest difference between exported network and policy, as a fraction of a command's range."""
 PREDICTABLE = 1e-3
-"""m. States are compared as long as single precision alone changes the place of the tracked site by less."""
+"""Position error (m) of the tracked site, due to single precision alone, at which the comparison of states ends."""
 _ROUNDINGS, _LEAST_APART = 10.0, 1e-5
-"""C MuJoCo may be so many times as far from our simulator as single precision is, or so many m."""
+"""Tolerance for the distance between C MuJoCo and our simulator: this multiple of the distance due to single precision,
+but at least this distance (m)."""
 _LEAST_DISTANCE, _LEAST_SPEED = 0.1, 0.01
-"""m and m/s that count as no difference."""
+"""Distance (m) and speed (m/s) below which differences are ignored."""
 _FRAME_INTERVAL = 0.005
-"""Shortest time between two frames (s) that the controller is given."""
+"""Shortest time between two frames for the controller (s)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Trial:
-    """A trial of a policy in one simulator."""
+    """Result of a policy's trial in one simulator."""
 
     simulator: str
-    """What it is called in the table."""
+    """Name of the simulator in the table."""
     reward: float
-    """Mean over the trial; of the tasks here a velocity (m/s)."""
+    """Mean reward over the trial. It is a velocity (m/s) for the tasks of this package."""
     displacement: tuple[float, float]
-    """Of the centre of mass along x and y (m)."""
+    """Displacement of the centre of mass along x and y (m)."""
     yaw: float
-    """Of the tracked body at the end (deg)."""
+    """Yaw of the tracked body at the end (deg)."""
 
     def differs_from(self, other: Trial) -> str | None:
-        """Return in which respect this trial is another than `other`; None: in none."""
+        """Return a description of the difference from `other`. None if the trials count as equal."""
         far = float(np.hypot(*other.displacement))
         apart = float(np.hypot(*np.subtract(self.displacement, other.displacement)))
         if not apart <= max(TOLERANCE * far, _LEAST_DISTANCE):
-            return f"it ends {apart:.2f} m from where it ends in {other.simulator}"
+            return f"its final position is {apart:.2f} m from that in {other.simulator}"
         if not abs(self.reward - other.reward) <= max(TOLERANCE * abs(other.reward), _LEAST_SPEED):
             return f"its mean reward is {self.reward:.3f}, not {other.reward:.3f}"
         return None
@@ -66,61 +67,63 @@ class Trial:
 
 @dataclasses.dataclass(frozen=True)
 class Agreement:
-    """How near the exported network and its simulator are to ours, along the trial in C MuJoCo."""
+    """Differences of exported network and simulator from the originals, along the trial in C MuJoCo."""
 
     commands: float
-    """Largest difference of commands between network and policy on the same observations, over the commands' ranges."""
+    """Largest difference between commands of network and policy for equal observations, as a fraction of their
+    ranges."""
     compared: float
-    """Seconds for which states are compared: until single precision alone moves the tracked site by `PREDICTABLE`."""
+    """Duration (s) of the comparison of states. It ends when single precision alone moves the tracked site by at least
+    `PREDICTABLE`."""
     apart: float
-    """Distance (m) of the tracked site from where our simulator has it in double precision, under the same commands:
-    the largest within that time."""
+    """Largest distance (m), in this time, of the tracked site from its position in our simulator in double precision,
+    under the same commands."""
     rounding: float
-    """The same of our simulator in single precision."""
+    """The same distance for our simulator in single precision."""
 
     def problem(self) -> str | None:
-        """Return what differs; None: nothing."""
+        """Return a description of what differs. None if nothing differs."""
         if not self.commands <= COMMAND_TOLERANCE:
             return (
                 f"on the same observations its commands are up to {self.commands:.2%} of their range from the policy's"
             )
         if not self.apart <= max(_ROUNDINGS * self.rounding, _LEAST_APART):
             return (
-                f"under the same commands the tracked site is {1000 * self.apart:.3g} mm from where its own simulator "
-                f"has it within {self.compared:.2f} s; rounding explains {1000 * self.rounding:.3g} mm"
+                f"under the same commands the tracked site is up to {1000 * self.apart:.3g} mm from its position in "
+                f"its own simulator within {self.compared:.2f} s; rounding explains {1000 * self.rounding:.3g} mm"
             )
         return None
 
     def __str__(self) -> str:
         return (
-            f"Commands on the same observations: {self.commands:.2g} of their range apart at most.\n"
-            f"Tracked site under the same commands, over {self.compared:.2f} s: {1000 * self.apart:.2g} mm apart at "
-            f"most, in double precision; single precision alone: {1000 * self.rounding:.2g} mm."
+            f"Commands on the same observations differ by at most {self.commands:.2g} of their range.\n"
+            f"Positions of the tracked site under the same commands, over {self.compared:.2f} s, differ by at most "
+            f"{1000 * self.apart:.2g} mm in double precision; single precision alone: {1000 * self.rounding:.2g} mm."
         )
 
 
 @dataclasses.dataclass(frozen=True)
 class PolicyCheck:
-    """Trials of an exported policy; `own` is that in the simulator of its training."""
+    """Result of a check: trials of an exported policy. `own` is the trial in the simulator of its training."""
 
     agreement: Agreement
     own: Trial
     network: Trial
-    """In C MuJoCo, its network on exact features."""
+    """Trial in C MuJoCo of its network alone, on exact features."""
     controller: Trial
-    """In C MuJoCo, the whole controller on frames of the true poses: estimator and rate limit act."""
+    """Trial in C MuJoCo of the whole controller, with estimator and rate limit, on frames of the true poses."""
     seconds: float
-    """Length of a trial."""
+    """Duration of a trial (s)."""
     notes: tuple[str, ...] = ()
-    """What of the policy's own simulator C MuJoCo leaves out."""
+    """Properties of the policy's own simulator that C MuJoCo leaves out, one sentence each."""
 
     @property
     def agrees(self) -> bool:
-        """Whether network and simulator are those of the run."""
+        """Whether network and simulator agree with those of the run."""
         return self.agreement.problem() is None
 
     def table(self) -> str:
-        """Return the trials side by side, and what follows."""
+        """Return a table of the trials, and the verdict."""
         trials = (self.own, self.network, self.controller)
         rows = [
             ("", *(trial.simulator for trial in trials)),
@@ -136,16 +139,15 @@ class PolicyCheck:
         return "\n".join([*lines, *self.notes, str(self.agreement), self.verdict()])
 
     def verdict(self) -> str:
-        """Return whether network and simulator are those of the run, how far the trials are apart, and what the
-        controller changes, a sentence each."""
+        """Return the verdict: agreement with the run, difference of the trials, and effect of the controller."""
         problem, apart = self.agreement.problem(), self.network.differs_from(self.own)
-        said = "AGREES: in C MuJoCo the policy is that of its run, and so is the simulator."
+        said = "AGREES: in C MuJoCo, policy and simulator are those of the run."
         if problem is not None:
             said = f"DIFFERS: {problem}."
         elif apart is not None:
             said += (
-                f" The trials part all the same: {apart}. The motion magnifies rounding, so only the first "
-                f"{self.agreement.compared:.2f} s can be foretold."
+                f" The trials differ nevertheless: {apart}. The motion magnifies rounding, so only the first "
+                f"{self.agreement.compared:.2f} s can be predicted."
             )
         changed = self.controller.differs_from(self.network)
         if changed is None:
@@ -160,24 +162,26 @@ def check_policy(
     run: Path | str | None = None,
     seconds: float | None = None,
 ) -> PolicyCheck:
-    """Run an exported policy in C MuJoCo and in the simulator that it was trained in.
+    """Run an exported policy in C MuJoCo and in the simulator of its training.
 
-    What decides whether they agree is commands on the same observations, and states under the same commands
-    (`Agreement`). How far trials get is told beside it: contacts make it depend on rounding.
+    Two comparisons decide whether they agree: commands on the same observations, and states under the same commands
+    (`Agreement`). The distances of the trials are reported but do not decide, because contacts make them depend on
+    rounding.
 
     **Arguments**
 
-    - `folder`: what `export.export_policy` wrote.
-    - `simulator`: an exported simulator to run in; None: the policy's own one, exported for this.
-    - `run`: where the policy's run is; None: where it was.
-    - `seconds`: length of a trial; None: the task's.
+    - `folder`: folder that `export.export_policy` wrote.
+    - `simulator`: folder of an exported simulator to run in. None for the policy's own simulator, which is then
+      exported temporarily.
+    - `run`: folder of the policy's run. None for the folder that was stored at export.
+    - `seconds`: duration of a trial (s), above 0 and at most 3600. None for that of the task.
 
-    **Raises** `InputError` where a folder is damaged, the run is gone, or the simulator is of another robot.
+    **Raises** `InputError` if a folder is damaged, the run is missing, or the simulator is of another robot.
     """
     folder = Path(folder)
     path, fix = folder / POLICY_FILE, "export the policy again"
     if not path.is_file():
-        raise InputError(f"{folder}: is no exported policy ({POLICY_FILE} is missing); {fix}.")
+        raise InputError(f"{folder}: is not an exported policy ({POLICY_FILE} is missing); {fix}.")
     described = files.read_json(path, fix)
     if described.get("format") != POLICY_FORMAT or not isinstance(described.get("run"), str):
         raise InputError(f'{path}: is not of the format "{POLICY_FORMAT}"; {fix}.')
@@ -219,9 +223,9 @@ def check_policy(
     from_frames = _run_trial("C MuJoCo, from frames", there, _from_frames(folder), *rest)
     notes = []
     if policy.config.sampled_residual:
-        notes.append("Training drew the residual's forces; C MuJoCo takes the most likely ones.")
+        notes.append("Training sampled the residual's forces; C MuJoCo uses the mode of their distribution.")
     if policy.config.residual_decay > 0:
-        notes.append("Training let the residual fade outside of its data; C MuJoCo does not.")
+        notes.append("Training reduced the residual's forces outside its training range; C MuJoCo does not.")
     return PolicyCheck(agreement, trial, network, from_frames, steps * policy.robot.control_timestep, tuple(notes))
 
 
@@ -233,7 +237,7 @@ def _compare(
     qvel: Float[np.ndarray, "steps nv"],
     commands: Float[np.ndarray, "steps commands"],
 ) -> Agreement:
-    """Compare along a trial in C MuJoCo: the states before its control steps, and their commands."""
+    """Compare network and simulator along a trial in C MuJoCo. `qpos` and `qvel` are the states before `commands`."""
     low, high = np.array(policy.robot.command_ranges).T
     features, _ = own.simulator.observe_all(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
     act = policy.act()
@@ -246,8 +250,8 @@ def _compare(
     found = np.array([there.step(command).qpos.copy() for command in commands])
     places, _ = site_poses(model, policy.robot.tracked, np.stack([exact, found, rounded]))
     apart, rounding = np.linalg.norm(places[1:] - places[0], axis=-1)
-    unforetold = ~(rounding < PREDICTABLE)
-    count = max(int(unforetold.argmax()), 1) if unforetold.any() else len(rounding)
+    unpredictable = ~(rounding < PREDICTABLE)
+    count = max(int(unpredictable.argmax()), 1) if unpredictable.any() else len(rounding)
     return Agreement(
         float(np.max(np.abs(expected - commands) / (high - low))),
         count * policy.robot.control_timestep,
@@ -258,7 +262,7 @@ def _compare(
 
 Frames = list[tuple[float, dict[str, np.ndarray]]]
 Act = Callable[[Frames], Any]
-"""From the frames of the last control step to commands."""
+"""Function that maps the frames of the last control step to commands."""
 
 
 def _from_frames(folder: Path) -> Act:
@@ -315,7 +319,7 @@ def _check_same(controller: Controller, policy: Policy, folder: Path) -> None:
         ranges = stored["command_high"] - stored["command_low"]
         if np.max(np.abs(now - given) / ranges) < 1e-3:
             return
-    raise InputError(f"{folder}: is another policy than that of its run; export it again, or give --run.")
+    raise InputError(f"{folder}: differs from the policy of its run; export it again, or give its run with --run.")
 
 
 def _read_simulator(folder: Path, policy: Policy) -> ImprovedSimulator:
@@ -323,7 +327,9 @@ def _read_simulator(folder: Path, policy: Policy) -> ImprovedSimulator:
         there = ImprovedSimulator(folder)
     except (OSError, ValueError, KeyError) as error:
         problem = " ".join(str(error).split())
-        raise InputError(f"{folder}: is no exported simulator ({problem}); `export simulator` writes one.") from error
+        raise InputError(
+            f"{folder}: is not an exported simulator ({problem}); `export simulator` writes one."
+        ) from error
     robot = policy.robot
     if (there.names, there.commands) != ((robot.tracked, *robot.points), robot.commands) or (
         there.model.nq != robot.load_model().nq

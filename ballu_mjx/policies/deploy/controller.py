@@ -1,7 +1,8 @@
-"""A locomotion policy on the robot: frames of motion capture in, commands out.
+"""A controller that runs a locomotion policy on the robot: motion capture frames in, commands out.
 
-Python 3.9 and NumPy are all it needs. `python -m ballu_mjx export` copies this file, with the policy's `weights.npz`
-and the estimator `estimator.py`, into one folder; `python controller.py` there tests itself and tells its time.
+It needs only Python 3.9 and NumPy. `python -m ballu_mjx export policy` copies this file, the policy's `weights.npz` and
+the estimator `estimator.py` into one folder. `python controller.py` in that folder runs a self-test and measures the
+time of a control step.
 """
 
 from __future__ import annotations
@@ -18,21 +19,22 @@ import numpy as np
 from ballu_mjx.policies.deploy.estimator import Capture, estimate, orientation_of
 
 TIMEOUT = 0.3
-"""Seconds after which a marker that was not seen, or whose pose did not change, is taken for lost."""
+"""Time (s) after which a marker counts as lost if it was not seen or if its pose did not change."""
 ROOM = 100.0
-"""Largest coordinate, m, that is taken for a measurement."""
+"""Largest absolute coordinate (m) that counts as a measurement."""
 MEMORY = 1.0
-"""Seconds of frames that are kept; also the longest gap between two that the clock counts."""
+"""Time (s) for which frames are kept. It is also the longest gap between two frames that the clock counts."""
 LOST_CALL = 0.01
-"""Seconds that a call whose time cannot be used is taken to have lasted."""
+"""Time (s) by which the clock advances in a call whose time cannot be used."""
 _JITTER = 0.005
-"""Seconds by which a control step may be early or late without moving those after it."""
+"""Time (s) by which a control step may be early or late without moving the steps after it."""
 
 
 def observation(features: np.ndarray, anchored: bool = False) -> np.ndarray:
-    """Return what the policy sees of the features that `estimator.estimate` returns.
+    """Return the policy's observation for the features that `estimator.estimate` returns.
 
-    The same as `locomotion_env.locomotion_observation`, in NumPy; `observation_names` says what is what."""
+    It equals `locomotion_env.locomotion_observation`, in NumPy. `observation_names` names its entries.
+    """
     yaw = features[8]
     cosine, sine = np.cos(yaw), np.sin(yaw)
     vectors = np.concatenate([features[:6], features[9:]]).reshape(-1, 3)
@@ -43,11 +45,13 @@ def observation(features: np.ndarray, anchored: bool = False) -> np.ndarray:
 
 
 def observation_names(names: Sequence[str]) -> list[str]:
-    """Return the names, with units, of what the policy sees, in order: `names` are the tracked body and the points.
+    """Return the names, with units, of the entries of the policy's observation, in order.
 
-    Of a free robot, x and y axes are turned about z into the tracked body's heading (its yaw), and x and y of positions
-    are relative to it, so that the first two entries are 0; z is above the floor. Of an anchored robot all is in the
-    world frame."""
+    `names` are the names of the tracked body and of the points. For a free robot, the x and y axes are rotated about z
+    into the tracked body's heading (its yaw). The x and y positions are relative to the tracked body, so that the first
+    two entries are 0. The z positions are heights above the floor. For an anchored robot, everything is in the world
+    frame.
+    """
     kinematics = [
         f"{name} {quantity} {axis}, {unit}"
         for name in names
@@ -65,22 +69,21 @@ def observation_names(names: Sequence[str]) -> list[str]:
 
 
 class Controller:
-    """The policy of a folder, step by step.
+    """A controller that runs an exported policy, one control step at a time.
 
-    Whatever it is given, commands are within their ranges, change at the control rate and no faster than the rate
-    limit. With a marker out of sight its last motion goes on for a while (`estimator.estimate`). A marker that was not
-    seen for `timeout` seconds, or whose pose has not changed for as long, as of a stream that stands still, is lost:
-    the commands go to those of a robot at rest at the limit's rate, and the policy takes over again when all markers
-    move again.
+    For any input, commands stay within their ranges, and change at the control rate and no faster than the rate limit.
+    A hidden marker is assumed to continue its motion for a while (`estimator.estimate`). A marker is lost if it was not
+    seen, or if its pose did not change, for `timeout` seconds. The latter happens if a stream repeats its last frame.
+    Commands then move, at the rate limit, to those of a robot at rest. The policy resumes when all markers move again.
 
     **Arguments**
 
     - `source`: the folder that holds `weights.npz`, or its arrays by name.
-    - `full_travel`: s in which a command may go through the whole of its range; 0: no limit. None: what the policy was
-      exported with.
-    - `timeout`: s, see `TIMEOUT`; below `MEMORY`.
+    - `full_travel`: shortest time (s) in which a command may move through its whole range. 0 for no limit, None for the
+      value stored at export.
+    - `timeout`: time-out (s) of markers, above 0 and below `MEMORY`; see `TIMEOUT`.
 
-    **Raises** `ValueError` for numbers out of range, and where the arrays are no network for this controller.
+    **Raises** `ValueError` if a number is out of range, or if the arrays are not a network for this controller.
     """
 
     def __init__(
@@ -90,7 +93,10 @@ class Controller:
         timeout: float = TIMEOUT,
     ) -> None:
         if not ((full_travel is None or full_travel >= 0) and 0 < timeout < MEMORY):
-            raise ValueError(f"full_travel must be 0 or more, timeout between 0 and {MEMORY:g} s")
+            raise ValueError(
+                f"full_travel is {full_travel} and timeout is {timeout}: full_travel must be 0 or more, "
+                f"and timeout above 0 and below {MEMORY:g} s."
+            )
         self.weights = _checked(source, "weights") if isinstance(source, Mapping) else _read(Path(source))
         count = sum(name.startswith("kernel_") for name in self.weights)
         self._layers = [
@@ -99,22 +105,22 @@ class Controller:
         self._mean, self._std, self._clip = (self.weights[n].astype(float) for n in ("mean", "std", "observation_clip"))
         self._activation = _ACTIVATIONS[str(self.weights["activation"])]
         self.names = tuple(str(name) for name in self.weights["names"])
-        """What motion capture must see, the tracked body first."""
+        """Names of the sites that motion capture must see, the tracked body first."""
         self.commands = tuple(str(name) for name in self.weights["commands"])
         """Names of the commands."""
         self.period = float(self.weights["control_timestep"])
-        """Seconds between two commands."""
+        """Duration of a control step (s)."""
         self.full_travel = float(self.weights["full_travel"]) if full_travel is None else full_travel
         self.timeout = timeout
         self._low, self._high, self._rest = (self.weights[f"command_{n}"].astype(float) for n in _LEVELS)
         self._anchored = bool(self.weights["anchored"])
         self.command = self._rest.copy()
-        """The present commands; the robot is taken to start at rest."""
+        """Current commands. The robot is assumed to start at rest."""
         self.status = "waiting for the first frame"
-        """`running`, or what is missing."""
+        """`running`, or a description of what is missing."""
         self.steps = 0
-        """Control steps so far."""
-        # The clock here starts at 0 and never runs back, whatever that of the frames does.
+        """Number of control steps so far."""
+        # The controller's clock starts at 0 and never runs backwards, even if the frames' clock does.
         self._now = self._newest = self._offset = 0.0
         self._due = self._controlled = -math.inf
         self._capture = Capture(self.names)
@@ -123,7 +129,7 @@ class Controller:
         self._last = [np.full(3, np.nan)] * len(self._markers)
 
     def act(self, features: np.ndarray) -> np.ndarray:
-        """Return the policy's commands, in the actuators' units, for `estimator.estimate`'s features."""
+        """Return the policy's commands, in the actuators' units, for the features of `estimator.estimate`."""
         x = np.clip((observation(features, self._anchored) - self._mean) / self._std, -self._clip, self._clip)
         for number, (kernel, bias) in enumerate(self._layers):
             x = x @ kernel + bias
@@ -132,15 +138,15 @@ class Controller:
         return self._low + np.clip((x + 1) / 2, 0.0, 1.0) * (self._high - self._low)
 
     def step(self, time: Any, frame: Any = None) -> tuple[float, ...]:
-        """Return the commands from now on, in the order of `commands`; to be called with every frame, or at the control
-        rate.
+        """Return the current commands, in the order of `commands`. Call this with every frame, or at the control rate.
 
         **Arguments**
 
-        - `time`: s, when the frame was taken, or now; a steady clock's (`time.monotonic()`), from any origin. Frames
-          that come out of order are passed over.
-        - `frame`: mapping, or object with attributes, of arrays: `NAME_position` (3) for each of `names`, and
-          `NAME_quaternion` (4: w, x, y, z) for the first of them; m, world frame. NaN: hidden. None: nothing came.
+        - `time`: time (s) at which the frame was taken, or the present time. It must come from a steady clock
+          (`time.monotonic()`) with any origin. Frames that arrive out of order are ignored.
+        - `frame`: mapping, or object with attributes, of arrays in the world frame. `NAME_position` (3 numbers, m) is
+          needed for each of `names`, and `NAME_quaternion` (4 numbers: w, x, y, z) for the first of them. NaN means
+          hidden. None if no frame arrived.
         """
         self._take(time, frame)
         now = self._now
@@ -154,7 +160,7 @@ class Controller:
             self.status = "running"
             target = self.act(estimate(self._until(now)))
             if not np.all(np.isfinite(target)):
-                self.status, target = "relaxed: the policy's output is no number", self._rest
+                self.status, target = "relaxed: the policy's output is not finite", self._rest
         change = target - self.command
         if self.full_travel > 0:
             limit = min(now - self._controlled, self.period) / self.full_travel * (self._high - self._low)
@@ -169,7 +175,7 @@ class Controller:
         return tuple(float(value) for value in self.command)
 
     def _take(self, time: Any, frame: Any) -> None:
-        """Advance the clock and keep the frame, if its time can be used."""
+        """Advance the clock, and keep the frame if its time can be used."""
         try:
             time = float(time)
         except (TypeError, ValueError, OverflowError):
@@ -178,11 +184,11 @@ class Controller:
             self._offset = -time
         elif not time + self._offset > self._newest:  # NaN, too
             self._now += LOST_CALL
-            if time + self._offset < self._newest - self.timeout:  # The frames' clock was set back.
+            if time + self._offset < self._newest - self.timeout:  # the frames' clock was set back
                 self._newest, self._offset = self._now, self._now - time
             return
         moment = time + self._offset
-        if not self._now - self.period <= moment <= self._now + MEMORY:  # It stood still, or jumped.
+        if not self._now - self.period <= moment <= self._now + MEMORY:  # the frames' clock stood still or jumped
             moment = self._now if moment < self._now else self._now + MEMORY
             self._offset = moment - time
         self._newest = moment
@@ -198,7 +204,7 @@ class Controller:
         capture.position.append(places)
         capture.quaternion.append(quaternion)
         for marker, value in enumerate((places[0], quaternion, *places[1:])):
-            # Noise changes every measurement: one that is as before was not made anew.
+            # Noise changes every measurement, so that an unchanged value is not a new measurement.
             if not np.isnan(value).any() and not np.array_equal(value, self._last[marker]):
                 self._seen[marker], self._last[marker] = moment, value
         while capture.time[0] < moment - MEMORY:
@@ -206,7 +212,7 @@ class Controller:
                 del values[0]
 
     def _until(self, now: float) -> Capture:
-        """Return the frames, with an empty one at `now` where the newest is older."""
+        """Return the frames, followed by an empty frame at `now` if the newest one is older."""
         kept = self._capture
         if kept.time[-1] >= now:
             return kept
@@ -226,19 +232,20 @@ def _swish(x: np.ndarray) -> np.ndarray:
 _LEVELS = ("low", "high", "rest")
 _ACTIVATIONS = {"swish": _swish, "tanh": np.tanh}
 _LARGEST = 1e6
-"""No weight of a network that was trained comes near."""
+"""Upper bound of the absolute values in `weights.npz`. Trained networks stay far below it."""
 
 
 def _read(folder: Path) -> Mapping[str, np.ndarray]:
     """Return the arrays of a folder's `weights.npz`.
 
-    **Raises** `ValueError` where they are no network for this controller."""
+    **Raises** `ValueError` if they are not a network for this controller.
+    """
     path = folder / "weights.npz"
     with path.open("rb") as file:
         try:
             with np.load(file, allow_pickle=False) as archive:
                 weights = {name: archive[name] for name in archive.files}
-        except Exception as error:  # what unpacking and NumPy make of damage is of many kinds
+        except Exception as error:  # a damaged archive raises many kinds of errors
             raise ValueError(f"{path}: is damaged ({type(error).__name__}); copy it from the export again.") from error
     return _checked(weights, str(path))
 
@@ -246,15 +253,15 @@ def _read(folder: Path) -> Mapping[str, np.ndarray]:
 def _checked(weights: Mapping[str, np.ndarray], name: str) -> Mapping[str, np.ndarray]:
     try:
         good = _fit(weights)
-    except Exception as error:  # what is missing or of another kind fails in many ways
+    except Exception as error:  # missing or wrong arrays raise many kinds of errors
         raise ValueError(f"{name}: is damaged ({type(error).__name__}); copy it from the export again.") from error
     if not good:
-        raise ValueError(f"{name}: is no network of this controller; copy it from the export again.")
+        raise ValueError(f"{name}: is not a network for this controller; copy it from the export again.")
     return weights
 
 
 def _fit(weights: Mapping[str, np.ndarray]) -> bool:
-    """Return whether the arrays are a network for this controller, all of them in shape and finite."""
+    """Return whether the arrays are a network for this controller, with the right shapes and finite values."""
     names = [str(name) for name in weights["names"]]
     commands, width = len(weights["commands"]), len(observation_names(names))
     shapes = {"mean": (width,), "std": (width,), "observation_clip": (), "control_timestep": (), "full_travel": ()}
@@ -278,7 +285,7 @@ def _fit(weights: Mapping[str, np.ndarray]) -> bool:
 
 
 def _values(frame: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """An array of a frame; NaN where it is missing or has another shape."""
+    """Return an array of a frame. NaN if it is missing or has another shape."""
     value = frame.get(name) if isinstance(frame, Mapping) else getattr(frame, name, None)
     try:
         array = np.array(value, dtype=float)
@@ -288,13 +295,13 @@ def _values(frame: Any, name: str, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _position(frame: Any, name: str) -> np.ndarray:
-    """Return a position of a frame; NaN where it is not in the room."""
+    """Return a position in a frame. NaN if it is missing or a coordinate is larger than `ROOM`."""
     array = _values(frame, name, (3,))
     return array if np.all(np.abs(array) <= ROOM) else np.full(3, np.nan)
 
 
 def _quaternion(frame: Any, name: str) -> np.ndarray:
-    """A unit quaternion of a frame; NaN where it is none."""
+    """Return a unit quaternion in a frame. NaN if it is missing or its norm is not close to 1."""
     array = _values(frame, name, (4,))
     if not np.all(np.abs(array) <= 2.0):
         return np.full(4, np.nan)
@@ -303,7 +310,10 @@ def _quaternion(frame: Any, name: str) -> np.ndarray:
 
 
 def self_test(folder: Path, frames: int = 5000) -> int:
-    """Compare the policy with what it gave where it was exported, run on random frames at 100 Hz, print times."""
+    """Compare the policy with its commands at export, run it on random frames at 100 Hz, and print times.
+
+    Return 0 if the test passed, else 1.
+    """
     controller = Controller(folder)
     pairs = range(len(controller.weights["check_features"]))
     given = np.array([controller.act(controller.weights["check_features"][i]) for i in pairs])
@@ -325,9 +335,9 @@ def self_test(folder: Path, frames: int = 5000) -> int:
         low, high = (controller.weights[f"command_{which}"] for which in ("low", "high"))
         good = good and bool(np.all((low <= command) & (command <= high)))
     median, worst = 1000 * float(np.median(durations)), 1000 * max(durations)
-    print(f"Difference from the policy where it was exported, of a command's range: {difference:.1e} (at most 1e-4).")
-    print(f"Control step: {median:.2f} ms, the slowest of {len(durations)} {worst:.2f} ms.")
-    print(f"There are {1000 * controller.period:g} ms for each.")
+    print(f"Difference from the policy at export: {difference:.1e} of a command's range (at most 1e-4).")
+    print(f"Time of a control step: {median:.2f} ms (median); {worst:.2f} ms (slowest of {len(durations)}).")
+    print(f"Available time: {1000 * controller.period:g} ms.")
     good = good and difference <= 1e-4
     print("Passed." if good else "FAILED: do not run this on the robot.")
     return 0 if good else 1

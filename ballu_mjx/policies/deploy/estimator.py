@@ -1,6 +1,6 @@
-"""What runs on the robot between motion capture and a policy: from frames as they come to features, now.
+"""Estimator of features on the robot, from the motion capture frames so far.
 
-Without JAX and MuJoCo, so that it can go where the policy goes.
+It needs neither JAX nor MuJoCo, so that it can be exported with the policy.
 """
 
 from __future__ import annotations
@@ -12,28 +12,29 @@ import numpy as np
 from jaxtyping import Float
 
 POSITION_WINDOW = 0.04
-"""Seconds of frames behind a position and velocity. Longer ones lag at footfalls, shorter ones pass on more noise."""
+"""Time window (s) of frames for positions and velocities. Longer ones lag at footfalls, shorter ones pass more
+noise."""
 ORIENTATION_WINDOW = 0.1
-"""Seconds of frames behind the tracked body's orientation, which is noisier and turns slowly."""
+"""Time window (s) of frames for the tracked body's orientation, which is noisier and changes slowly."""
 FEWEST_FRAMES = 3
-"""Where fewer are visible in a window, as at the end of a drop-out, older ones are taken."""
+"""Smallest number of frames for an estimate. If a window has fewer, as after a drop-out, older frames are added."""
 EXTRAPOLATION_LIMIT = 0.2
-"""Seconds for which a hidden marker is taken to move on as it last did; drop-outs usually last up to 0.15."""
+"""Time (s) for which a hidden marker is assumed to continue its last motion. Drop-outs usually last up to 0.15 s."""
 
 
 @dataclasses.dataclass
 class Capture:
-    """Motion capture frames as they come, in the world frame; NaN where something is hidden.
+    """Motion capture frames so far, in the world frame. NaN where a marker is hidden.
 
-    The newest frame has no command yet.
+    The newest frame may have no command yet.
 
     **Fields**
 
-    - `names`: of what is seen, the tracked body first, then the robot's points.
-    - `time`: s, one entry a frame.
-    - `command`: in the actuators' units, one entry a frame.
-    - `position`: places (m) of what `names` names, one entry a frame.
-    - `quaternion`: orientation of the tracked body (w, x, y, z), one entry a frame.
+    - `names`: names of the tracked body and then of the robot's points.
+    - `time`: times (s), one for each frame.
+    - `command`: commands in the actuators' units, one row for each frame.
+    - `position`: positions (m) of all `names`, one array for each frame.
+    - `quaternion`: orientation of the tracked body (w, x, y, z), one for each frame.
     """
 
     names: tuple[str, ...]
@@ -48,21 +49,22 @@ def estimate(
 ) -> Float[np.ndarray, " features"]:
     """Return the features of `observation.observe_features` at the newest frame, from this and earlier frames only.
 
-    Each position, and the tracked body's Euler angles, are a least-squares line over the visible frames of a window
-    that ends with the last visible frame, read off now; the line's slope is the velocity. Of a marker seen once, the
-    velocity is 0. One hidden for longer than `EXTRAPOLATION_LIMIT` is taken to have come to rest there.
+    A least-squares line is fitted to each position and to the tracked body's Euler angles. It uses the visible frames
+    of a window that ends with the last visible frame. Its value at the newest frame is the estimate, and its slope is
+    the velocity. A marker that was seen once has velocity 0. A marker that has been hidden for longer than
+    `EXTRAPOLATION_LIMIT` is assumed to rest where the line was at that time.
 
     **Arguments**
 
-    - `capture`: all frames so far. The cost does not grow with their number, only with how long a marker is hidden.
-    - `window`, `orientation_window`: s.
+    - `capture`: all frames so far. The cost depends not on their number, but on the time for which a marker is hidden.
+    - `window`, `orientation_window`: windows (s).
 
     **Returns**
 
-    World frame; m, m/s, rad: position, velocity and Euler angles (roll, pitch, yaw; intrinsic z-y-x; yaw and roll in
-    [-pi, pi]) of the tracked body, then position and velocity of each point.
+    Features in the world frame (m, m/s, rad). Position, velocity and Euler angles (roll, pitch, yaw; intrinsic z-y-x;
+    yaw and roll in [-pi, pi]) of the tracked body come first, then position and velocity of each point.
 
-    **Raises** `ValueError` if a marker has been hidden from the first frame on.
+    **Raises** `ValueError` if a marker has been hidden since the first frame.
     """
     kinematics = []
     for place, name in enumerate(capture.names):
@@ -79,12 +81,15 @@ def estimate(
 
 
 def orientation_of(tracked: str) -> str:
-    """Return what the orientation of the tracked body is called."""
+    """Return the name of the tracked body's orientation."""
     return f"{tracked}'s orientation"
 
 
 def euler_angles(quaternion: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " 3"]:
-    """Roll, pitch and yaw (rad; intrinsic z-y-x) of a unit quaternion (w, x, y, z), as `observation.euler_angles`."""
+    """Return roll, pitch and yaw (rad; intrinsic z-y-x) of a unit quaternion (w, x, y, z).
+
+    It is the same function as `observation.euler_angles`.
+    """
     w, x, y, z = quaternion
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
@@ -95,7 +100,7 @@ def euler_angles(quaternion: Float[np.ndarray, " 4"]) -> Float[np.ndarray, " 3"]
 def _visible(
     time: list[float], sample: Callable[[int], np.ndarray], name: str, window: float
 ) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, "frames 3"]]:
-    """Times (s) and values of the visible frames within `window` of the last visible one, the oldest first."""
+    """Return times (s) and values of the frames that are visible within `window` (s) of the last visible one."""
     times: list[float] = []
     samples: list[np.ndarray] = []
     for frame in reversed(range(len(time))):
@@ -113,7 +118,10 @@ def _visible(
 def _line(
     time: Float[np.ndarray, " frames"], values: Float[np.ndarray, "frames 3"], now: float
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-    """Value and slope, at `now` (s), of the least-squares line; of rest after `EXTRAPOLATION_LIMIT`."""
+    """Return value and slope of the least-squares line at `now` (s).
+
+    Later than `EXTRAPOLATION_LIMIT` after the last frame, the value stays constant and the slope is 0.
+    """
     centre = time.mean()
     spread = np.sum((time - centre) ** 2)
     slope = (time - centre) @ values / spread if spread > 0 else np.zeros(3)

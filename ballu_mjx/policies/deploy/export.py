@@ -1,8 +1,8 @@
-"""A policy for the robot's own computer: `python -m ballu_mjx export policy RUN`.
+"""Export of a policy to the robot's own computer: `python -m ballu_mjx export policy RUN`.
 
-What is written runs on Python and NumPy alone: `controller.py` and `estimator.py` of this package as they are, but for
-their imports, and the policy's parameters as `weights.npz`. JAX, and all that needs it, is imported inside functions:
-`runtime.prepare` has to come first.
+The exported files need only Python and NumPy. They are `controller.py` and `estimator.py` of this package, with other
+imports, and the policy's parameters as `weights.npz`. JAX, and all modules that need it, are imported inside functions,
+because `runtime.prepare` must run first.
 """
 
 from __future__ import annotations
@@ -29,34 +29,34 @@ if TYPE_CHECKING:
 POLICY_FORMAT = "ballu-policy/1"
 POLICY_FILE = "policy.json"
 _CHECKS = 20
-"""Features and commands that go with the weights, for the robot to check its own arithmetic."""
+"""Number of features and commands stored with the weights. The robot's computer checks its arithmetic on them."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ExportOptions:
-    """What is exported, and where to."""
+    """Options of the export of a policy."""
 
     run: Path
-    """Folder of the run."""
+    """Folder of the policy's run."""
     output: Path | None = None
     """Folder to write into, new or empty. Without this option: export/ in the run's folder."""
     seconds: float | None = None
-    """Length of commands.csv, s. Without this option: that of a trial of the task."""
+    """Duration of commands.csv, s, at most 3600. Without this option: the duration of a trial of the task."""
     open_loop: bool = True
-    """Write commands.csv, the commands that the policy gives in its own simulator."""
+    """Write commands.csv: the commands that the policy gives in its own simulator."""
     onnx: bool = False
-    """Write policy.onnx too, for other runtimes: from observation to commands, without estimator, rate limit and
-    time-out. Its properties name inputs and outputs, with units. Needs the extra onnx."""
+    """Also write policy.onnx, for other runtimes. It computes commands from observations, without estimator, rate limit
+    and time-out. Its properties name inputs and outputs, with units. Needs the extra onnx."""
     pulse_low: float = 1000.0
-    """Pulse width, microseconds, that stands for the smallest value of a command."""
+    """Pulse width, microseconds, for the smallest value of a command; above 0 and below 20000."""
     pulse_high: float = 2000.0
-    """Pulse width, microseconds, that stands for the largest value of a command."""
+    """Pulse width, microseconds, for the largest value of a command; above 0 and below 20000."""
 
 
 def export_policy(options: ExportOptions) -> Path:
-    """Write the folder; returns it.
+    """Write the exported policy and return its folder.
 
-    **Raises** `InputError` where the run is none of a locomotion policy, or the folder holds something.
+    **Raises** `InputError` if the run is not one of a locomotion policy, or if the folder is not empty.
     """
     from ballu_mjx.policies.policy import Policy
     from ballu_mjx.policies.tasks import TASKS
@@ -97,8 +97,11 @@ def export_policy(options: ExportOptions) -> Path:
 
 
 def weights(policy: Policy) -> dict[str, np.ndarray]:
-    """Return what `controller.Controller` reads: normalizer, layers of the mean's network, what the robot is seen and
-    driven by, and a few features and commands."""
+    """Return the arrays that `controller.Controller` reads.
+
+    They are the normalizer, the layers of the network that computes the mean, names and units of observation and
+    commands, and a few features with their commands.
+    """
     from ballu_mjx.rl.network_export import network_arrays
 
     robot = policy.robot
@@ -123,7 +126,7 @@ def weights(policy: Policy) -> dict[str, np.ndarray]:
 
 
 def describe_policy(policy: Policy, stored: Mapping[str, np.ndarray], run: Path) -> dict[str, Any]:
-    """Return the content of `policy.json`: where the policy comes from, and what it sees and commands."""
+    """Return the content of `policy.json`: the policy's origin, and names and units of its observation and commands."""
     robot = policy.robot
     ranges = zip(robot.commands, robot.command_ranges, stored["command_rest"].tolist(), strict=True)
     return {
@@ -162,7 +165,10 @@ def policy_onnx(stored: Mapping[str, np.ndarray]) -> bytes:
 
 
 def sources() -> dict[str, str]:
-    """The robot's files by name: the package's own text, free of the package and of jaxtyping."""
+    """Return the source files for the robot by name.
+
+    They are modules of this package, without imports of the package and of jaxtyping.
+    """
     return {name: standalone_source(__package__ or "", name) for name in _FILES}
 
 
@@ -188,11 +194,11 @@ def _check(options: ExportOptions) -> None:
 
         check_onnx()
     if options.pulse_low == options.pulse_high:
-        raise InputError(f"--pulse-low and --pulse-high are both {options.pulse_low:g}: nothing would move.")
+        raise InputError(f"--pulse-low and --pulse-high are both {options.pulse_low:g}: nothing would move; give two.")
 
 
 def _plausible(rng: np.random.Generator, count: int, size: int) -> Float[np.ndarray, "count size"]:
-    """Return features of the order of a moving robot's."""
+    """Return random features with the magnitude of those of a moving robot."""
     from ballu_mjx.sim.observation import ObservationLayout
 
     features = rng.normal(0.0, 0.2, (count, size))
@@ -215,12 +221,12 @@ def _write_commands(
 
 
 def _decimals(step: float) -> int:
-    """Return how many decimals multiples of a step need, two at least."""
+    """Return the number of decimals that multiples of a step need, at least two."""
     return max(2, len(f"{step:.6f}".rstrip("0").partition(".")[2]))
 
 
 def _rate(commands: Float[np.ndarray, "steps commands"], stored: Mapping[str, np.ndarray]) -> str | None:
-    """Return how much of the policy's commands the controller's rate limit would change; None: there is no limit."""
+    """Return a sentence on how often the controller's rate limit would act in `commands`. None if there is no limit."""
     if not stored["full_travel"] > 0:
         return None
     largest = stored["control_timestep"] / stored["full_travel"]
@@ -248,8 +254,8 @@ def _readme(
 
     observed = "; ".join(f"{i}: {name}" for i, name in enumerate(stored["observation"].tolist()))
     frame = "World frame: floor at z = 0, z up; x forward and y left as the robot stands at the start."
-    seen = "x and y axes are turned about z into the heading (the yaw) of {0}; x and y of positions are relative to {0}"
-    seen = seen.format(robot.tracked) + " (so entries 0 and 1 are 0); z is above the floor; m, m/s, rad."
+    seen = "x and y axes are rotated about z into the heading (yaw) of {0}; x and y of positions are relative to {0}"
+    seen = seen.format(robot.tracked) + " (so entries 0 and 1 are 0); z is the height above the floor; m, m/s, rad."
     if robot.anchored:
         frame = "World frame of the robot's model, z up."
         seen = "Everything is in the world frame; m, m/s, rad."
@@ -267,15 +273,15 @@ def _readme(
         for name, bounds, rest in zip(robot.commands, robot.command_ranges, stored["command_rest"], strict=True)
     )
     commanded = [f"In the actuators' own units: {ranges}.", notes.commands]
-    commanded += [f"Pulses: {low:g} us at the smallest value, {high:g} us at the largest.", _limit(step, travel)]
+    commanded += [f"Pulses: {low:g} us for the smallest value, {high:g} us for the largest.", _limit(step, travel)]
     commanded.append(
         f"If a marker has not been seen for {controller.TIMEOUT:g} s, or its pose has not changed for as long, "
         "commands go to those at rest until all have been seen again."
     )
     estimation = (
-        f"Each position is a straight line through the frames of the last {estimator.POSITION_WINDOW:g} s "
-        f"(orientation: {estimator.ORIENTATION_WINDOW:g} s), read off now; its slope is the velocity. A hidden marker "
-        f"moves on as it last did for {estimator.EXTRAPOLATION_LIMIT:g} s, then rests."
+        f"A straight line is fitted to each position in the frames of the last {estimator.POSITION_WINDOW:g} s "
+        f"(orientation: {estimator.ORIENTATION_WINDOW:g} s). Its present value is the position, its slope the velocity."
+        f" A hidden marker is assumed to continue its motion for {estimator.EXTRAPOLATION_LIMIT:g} s, and then to rest."
     )
     open_loop = "Not written (--no-open-loop)."
     if commands is not None:
@@ -285,10 +291,11 @@ def _readme(
         )
     measure = [
         *notes.measure,
-        "Motion capture: sign and zero of the yaw (turn the robot left: it must grow), heights, which marker is which.",
+        "Motion capture: sign and zero of the yaw (it must grow when the robot turns left), heights, and which marker "
+        "is which.",
         f"Time from the camera to the actuator. {_latency(policy.latency)}",
-        "Control step's time on the robot (python3 controller.py).",
-        "First runs with the robot held, at a fraction of the speed (Controller(folder, full_travel=1.0)).",
+        "Time of a control step on the robot (python3 controller.py).",
+        "First runs: hold the robot, and limit the speed (Controller(folder, full_travel=1.0)).",
     ]
     return f"""\
 A policy for {robot.name}: task '{policy.task.name}', trained in the simulator '{simulator}', step {policy.step}.
@@ -296,30 +303,30 @@ A policy for {robot.name}: task '{policy.task.name}', trained in the simulator '
 Files
     controller.py    the controller: Controller(folder).step(time, frame) -> {", ".join(robot.commands)}
     estimator.py     its estimator: positions and velocities from motion capture frames so far
-    weights.npz      the policy's network, the normalization of its observation, and names and units of what it
-                     sees and commands
-    policy.json      the run that it comes from, and the same names and units, for other programs
+    weights.npz      the policy's network, the normalization of its observation, and names and units of its
+                     observation and commands
+    policy.json      the policy's run, and the same names and units, for other programs
     commands.csv     see 'Open loop' below
     policy.onnx      with --onnx: the network alone, from 'observation' (as below) to 'command', for other runtimes
 
 Running it
     Needs Python 3.9 or newer and NumPy, nothing else. Copy this folder to the robot and there:
 
-        python3 controller.py        # must print 'Passed.'; tells the time of a control step
+        python3 controller.py        # must print 'Passed.'; measures the time of a control step
 
-    In the robot's loop, with every frame of motion capture (best at 100 Hz, 50 Hz or more; or once every
-    {step:g} s, where velocities lag more):
+    In the robot's loop, call step with every frame of motion capture (50 Hz or more, best 100 Hz). Calls once every
+    {step:g} s work too, but then velocities lag more.
 
         import time
         from controller import Controller
         controller = Controller(folder)
         while True:
-            frame = newest_frame()                     # or None where nothing came
+            frame = newest_frame()                     # or None if no frame came
             commands = controller.step(time.monotonic(), frame)
             send(commands)                             # {", ".join(robot.commands)}
 
-    Call it with None when no frame came for {step:g} s: the time-out is counted inside step. If the program
-    itself stops, the actuators' driver must stop them; nothing here can. controller.status says what is missing.
+    Call it with None when no frame came for {step:g} s, because step itself measures the time-out. If the program
+    stops, the actuators' driver must stop them; the controller cannot. controller.status says what is missing.
 
 A frame
     A dict, or an object with attributes, of arrays (m); NaN where a marker is hidden.
@@ -332,7 +339,7 @@ Commands
 Estimator
 {indented(estimation)}
 
-What the policy sees
+The policy's observation
 {indented(seen)}
 {indented(observed)}
 
@@ -345,18 +352,18 @@ Measure first
 
 
 def _limit(step: float, travel: float) -> str:
-    """Return what the README says of the rate limit."""
+    """Return the README's text on the rate limit."""
     changing = f"Commands change every {step:g} s"
     if travel == 0:
-        return f"{changing}, without a limit of their rate; Controller's full_travel sets one."
+        return f"{changing}, without a rate limit; Controller's full_travel sets one."
     return (
-        f"{changing}, by {step / travel:g} of their range at most: full travel in {travel:g} s; Controller's "
-        "full_travel sets it."
+        f"{changing}, by at most {step / travel:g} of their range: full travel in {travel:g} s; Controller's "
+        "full_travel sets this limit."
     )
 
 
 def _latency(seconds: float) -> str:
-    """Return what the README says of the latency in training."""
+    """Return the README's text on the latency in training."""
     if seconds == 0:
         return "The policy was trained without delay."
     return f"The policy was trained with a delay of {1000 * seconds:.0f} ms from its command to the actuator."

@@ -1,1 +1,1 @@
-"""Improved simulators as environments of other libraries."""
+"""Improved simulators as environments for other libraries."""

@@ -1,4 +1,7 @@
-"""A batch of environments for libraries that step from Python: one compiled program a step, finished ones renewed."""
+"""A batch of environments for libraries that step from Python.
+
+One compiled program performs a step of the whole batch and resets finished environments.
+"""
 
 from __future__ import annotations
 
@@ -22,33 +25,36 @@ from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 
 class BatchStep(NamedTuple):
-    """What a step of all environments gives."""
+    """Result of a step of all environments."""
 
     observation: Float[np.ndarray, "envs observations"]
-    """Of finished ones that of the fresh state."""
+    """Observation. For finished environments, it is that of the state after the reset."""
     last_observation: Float[np.ndarray, "envs observations"]
-    """Before finished ones were renewed."""
+    """Observation before finished environments were reset."""
     reward: Float[np.ndarray, " envs"]
     terminated: Bool[np.ndarray, " envs"]
-    """Where the simulation diverged."""
+    """Whether the simulation diverged."""
     truncated: Bool[np.ndarray, " envs"]
-    """Where the time was over."""
+    """Whether the episode's time was over."""
     metrics: dict[str, Float[np.ndarray, " envs"]]
 
 
 class LocomotionBatch:
-    """A task in a simulator, `num_envs` times side by side; the first of the devices shares them with the others."""
+    """`num_envs` parallel environments of a task in a simulator.
+
+    All devices share the batch if their number divides `num_envs`. Otherwise the first device computes all of it.
+    """
 
     def __init__(self, env: LocomotionEnv, num_envs: int) -> None:
-        """Prepare; nothing is compiled before the first `reset`.
+        """Prepare the batch. Nothing is compiled before the first `reset`.
 
-        **Raises** `ValueError` for no environments.
+        **Raises** `ValueError` if `num_envs` is less than 1.
         """
         if num_envs < 1:
             raise ValueError(f"num_envs is {num_envs}: it must be 1 or more.")
         self.env, self.num_envs = env, num_envs
         devices = jax.local_devices()
-        # A batch that does not divide stays on one device.
+        # A batch that the devices cannot share equally stays on one device.
         devices = devices if num_envs % len(devices) == 0 else devices[:1]
         _, self._split = device_shardings(devices)
         self._reset, self._step = (
@@ -58,7 +64,7 @@ class LocomotionBatch:
         self._state: State | None = None
 
     def reset(self, seed: int | None = None) -> Float[np.ndarray, "envs observations"]:
-        """Start all anew; a `seed` settles all randomness from here on."""
+        """Start new episodes in all environments. `seed` determines all randomness from here on."""
         if seed is not None:
             self._key = jax.random.key(seed)
         self._key, own = jax.random.split(self._key)
@@ -66,7 +72,7 @@ class LocomotionBatch:
         return np.array(state.obs)
 
     def step(self, action: Float[np.ndarray, "envs commands"]) -> BatchStep:
-        """Advance all by a control step; actions from -1 to 1 are the commands' ranges.
+        """Advance all environments by a control step. Actions from -1 to 1 cover the commands' ranges.
 
         **Raises** `ValueError` before the first `reset`.
         """
@@ -75,7 +81,7 @@ class LocomotionBatch:
         self._key, own = jax.random.split(self._key)
         action = jax.device_put(np.asarray(action, np.float32).reshape(self.num_envs, -1), self._split)
         self._state, seen = self._step(self._state, action, self._keys(own))
-        return BatchStep(*jax.tree.map(np.array, jax.device_get(seen)))  # libraries write into what they get
+        return BatchStep(*jax.tree.map(np.array, jax.device_get(seen)))  # libraries write into these arrays
 
     def _keys(self, key: Array) -> Array:
         return jax.device_put(jax.random.split(key, self.num_envs), self._split)
@@ -96,9 +102,9 @@ def make_environment(
     run: Any = None,
     robot: Any = None,
 ) -> LocomotionEnv:
-    """Return a task in a simulator, or in that of a run or robot (`simulators.load_simulator`).
+    """Return the environment of a task in a simulator, or in that of a run or robot (`load_simulator.load_simulator`).
 
-    **Raises** `InputError` for an unknown task, options out of range, and a robot that cannot do the task.
+    **Raises** `InputError` if the task is unknown, an option is out of range, or the robot cannot perform the task.
     """
     augmented = load_simulator(run, robot) if simulator is None else simulator.with_residual(None)
     config = config or LocomotionConfig()

@@ -1,4 +1,4 @@
-"""Tasks in improved simulators as Brax environments, for Brax's own training."""
+"""Tasks in improved simulators as Brax environments, for training with Brax's own trainers."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _ENDLESS = 2**30
 
 
 class BraxEnv(Env):
-    """A task in a simulator whose episodes the caller ends: Brax's trainers do, by `episode_length`.
+    """A task in a simulator, as an environment whose episodes the caller ends.
 
-    `done` is 1 where the simulation diverged. Brax's own wrapper starts every episode of an environment in the state
-    that it drew first.
+    Brax's trainers do so by `episode_length`. `done` is 1 if the simulation diverged. Brax's own wrapper starts every
+    episode of an environment in the state that was drawn first.
     """
 
     def __init__(
@@ -36,21 +36,21 @@ class BraxEnv(Env):
         config: LocomotionConfig | None = None,
         **settings: Any,
     ) -> None:
-        """Make the environment, of a simulator or of that of a run or robot; `settings` are fields of `config`.
+        """Make the environment of a simulator, or of that of a run or robot. `settings` are fields of `config`.
 
-        **Raises** `InputError` as `batch.make_environment`.
+        **Raises** `InputError` like `batch.make_environment`.
         """
         config = dataclasses.replace(config or LocomotionConfig(), **settings)
         self.locomotion: LocomotionEnv = make_environment(task, simulator, config, run=run, robot=robot)
 
     @property
     def episode_length(self) -> int:
-        """Control steps in a trial of the task; what Brax's trainers take under this name."""
+        """Number of control steps in a trial of the task. Brax's trainers take it under this name."""
         return max(round(self.locomotion.task.trial_seconds / self.dt), 1)
 
     @property
     def dt(self) -> float:
-        """Seconds in a control step."""
+        """Duration of a control step (s)."""
         return self.locomotion.robot.control_timestep
 
     def reset(self, rng: Array) -> State:
@@ -60,7 +60,7 @@ class BraxEnv(Env):
         return dataclasses.replace(state, pipeline_state=cast(Any, endless))
 
     def step(self, state: State, action: Array) -> State:
-        """Advance by a control step; actions from -1 to 1 are the commands' ranges."""
+        """Advance by a control step. Actions from -1 to 1 cover the commands' ranges."""
         return self.locomotion.step(state, action)
 
     @property
@@ -79,5 +79,5 @@ class BraxEnv(Env):
 def brax_env(
     simulator: Simulator | AugmentedSimulator | None = None, task: str | Task = "walk", **options: Any
 ) -> BraxEnv:
-    """Return a task in a simulator as a Brax environment; `options` are those of `BraxEnv`."""
+    """Return a task in a simulator as a Brax environment. `options` are those of `BraxEnv`."""
     return BraxEnv(task, simulator, **options)

@@ -1,8 +1,8 @@
 """Tasks in improved simulators as Gymnasium environments, single and vector.
 
-Actions are from -1 to 1, the range of each command. Observations are those of this package's own policies
-(`deploy.controller.observation_names` says what is what). An episode ends by `truncated`, its length drawn about
-`LocomotionConfig.episode_seconds`, or by `terminated` where the simulation diverged.
+Actions from -1 to 1 cover the range of each command. Observations are those of this package's own policies
+(`deploy.controller.observation_names` names their entries). An episode ends with `truncated` after a drawn time with
+mean `LocomotionConfig.episode_seconds`, or with `terminated` if the simulation diverged.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ except ImportError as error:
 
 
 class GymEnv(gymnasium.Env):
-    """A task in a simulator, one robot: for what wants a single environment. `GymVectorEnv` is many times faster."""
+    """A task in a simulator, with one robot, for programs that need a single environment.
+
+    `GymVectorEnv` is many times faster.
+    """
 
     metadata: dict[str, Any] = {"render_modes": []}
 
@@ -41,11 +44,11 @@ class GymEnv(gymnasium.Env):
 
     @property
     def observation_names(self) -> list[str]:
-        """Names of the observation's numbers, with their units."""
+        """Names of the entries of the observation, with units."""
         return observation_names((self.locomotion.robot.tracked, *self.locomotion.robot.points))
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
-        """Start an episode; a `seed` settles all randomness from here on."""
+        """Start an episode. `seed` determines all randomness from here on."""
         super().reset(seed=seed)
         return self._batch.reset(seed)[0], {}
 
@@ -63,9 +66,10 @@ class GymEnv(gymnasium.Env):
 
 
 class GymVectorEnv(VectorEnv):
-    """A task in a simulator, many robots in one compiled program; finished ones are reset in the same step.
+    """A task in a simulator, with many robots in one compiled program.
 
-    `info` then has `final_obs` with its mask `_final_obs`, and the environment's measurements.
+    Finished environments are reset in the same step. `info` then has `final_obs` and its mask `_final_obs`. In every
+    step it has the environments' metrics.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
@@ -80,7 +84,7 @@ class GymVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Float[np.ndarray, "envs observations"], dict[str, Any]]:
-        """Start all episodes; a `seed` settles all randomness from here on."""
+        """Start all episodes. `seed` determines all randomness from here on; of a list, only the first entry counts."""
         first = seed[0] if isinstance(seed, list) else seed
         super().reset(seed=first)
         return self._batch.reset(first), {}
@@ -88,7 +92,7 @@ class GymVectorEnv(VectorEnv):
     def step(
         self, actions: Float[np.ndarray, "envs commands"]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advance all by a control step."""
+        """Advance all environments by a control step."""
         found = self._batch.step(actions)
         info: dict[str, Any] = dict(found.metrics)
         done = found.terminated | found.truncated
@@ -113,7 +117,7 @@ def gym_env(
 ) -> GymEnv:
     """Return a task in a simulator, or in that of a run or robot, as a Gymnasium environment.
 
-    `settings` are fields of `config`. **Raises** `InputError` as `batch.make_environment`.
+    `settings` are fields of `config`. **Raises** `InputError` like `batch.make_environment`.
     """
     return GymEnv(make_environment(task, simulator, _config(config, settings), run=run, robot=robot))
 
@@ -128,7 +132,7 @@ def gym_vector_env(
     config: LocomotionConfig | None = None,
     **settings: Any,
 ) -> GymVectorEnv:
-    """Return the same many times side by side, as a Gymnasium vector environment."""
+    """Return `num_envs` parallel environments as a Gymnasium vector environment; see `gym_env`."""
     return GymVectorEnv(make_environment(task, simulator, _config(config, settings), run=run, robot=robot), num_envs)
 
 

@@ -1,4 +1,4 @@
-"""Tasks in improved simulators as Stable-Baselines3's vector environments, which are not Gymnasium's."""
+"""Tasks in improved simulators as vector environments of Stable-Baselines3, which differ from those of Gymnasium."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ except ImportError as error:
 
 
 class StableBaselinesEnv(VecEnv):
-    """A `GymVectorEnv` for Stable-Baselines3; `info` has `episode` as its `VecMonitor` would."""
+    """A `GymVectorEnv` for Stable-Baselines3. `info` has the entry `episode` of Stable-Baselines3's `VecMonitor`."""
 
     def __init__(self, env: GymVectorEnv) -> None:
         self._env, self._seed, self.render_mode = env, None, None
@@ -35,11 +35,11 @@ class StableBaselinesEnv(VecEnv):
         return self._env.reset(seed=seed)[0]
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions of the coming step."""
+        """Store the actions for the next step."""
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Advance all by a control step."""
+        """Advance all environments by a control step."""
         observation, reward, terminated, truncated, more = self._env.step(self._actions)
         done = terminated | truncated
         self._return += reward
@@ -55,22 +55,28 @@ class StableBaselinesEnv(VecEnv):
         return observation, reward, done, infos
 
     def close(self) -> None:
-        """Release nothing: the environments are arrays."""
+        """Do nothing: there are no resources to release."""
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of the vector environment, once for each index."""
         return [getattr(self._env, attr_name, None)] * len(self._get_indices_of(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """**Raises** `NotImplementedError`: all environments are one."""
-        raise NotImplementedError(f"{attr_name} cannot be set: all environments are one.")
+        """Refuse: all environments are one object.
+
+        **Raises** `NotImplementedError` always.
+        """
+        raise NotImplementedError(f"{attr_name} cannot be set: all environments are one object.")
 
     def env_method(self, method_name: str, *arguments: Any, indices: Any = None, **named: Any) -> list[Any]:
-        """**Raises** `NotImplementedError`: all environments are one."""
-        raise NotImplementedError(f"{method_name} cannot be called: all environments are one.")
+        """Refuse: all environments are one object.
+
+        **Raises** `NotImplementedError` always.
+        """
+        raise NotImplementedError(f"{method_name} cannot be called: all environments are one object.")
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Return that no environment is wrapped."""
+        """Return False for each index: no environment is wrapped."""
         return [False] * len(self._get_indices_of(indices))
 
     def _get_indices_of(self, indices: Any) -> Sequence[int]:

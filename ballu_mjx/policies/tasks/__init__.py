@@ -1,4 +1,4 @@
-"""Locomotion tasks, by name: a file each."""
+"""Locomotion tasks by name, one file for each."""
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.tasks import turn, turn_right, walk, walk_backward
@@ -10,10 +10,10 @@ __all__ = ["TASKS", "Step", "Task", "find_task"]
 
 
 def find_task(name: str) -> Task:
-    """Return the task of a name.
+    """Return the task with a name.
 
-    **Raises** `InputError` where there is none.
+    **Raises** `InputError` if there is none.
     """
     if name not in TASKS:
-        raise InputError(f"There is no task {name!r}; there are {', '.join(TASKS)}.")
+        raise InputError(f"There is no task {name!r}; give one of {', '.join(TASKS)}.")
     return TASKS[name]

@@ -1,4 +1,4 @@
-"""What a locomotion task is: a name, a reward, and how long a trial of it lasts."""
+"""Definition of a locomotion task: its name, its reward, and the duration of a trial."""
 
 from __future__ import annotations
 
@@ -10,24 +10,27 @@ from jaxtyping import Array, Float
 
 
 class Step(NamedTuple):
-    """One control step, as rewards see it (world frame: x forward, y left, z up)."""
+    """One control step, the input of a reward (world frame: x forward, y left, z up)."""
 
     velocity: Float[Array, " 3"]
-    """Of the centre of mass, mean over the control step (m/s)."""
+    """Mean velocity of the centre of mass over the control step (m/s)."""
     features: Float[Array, " features"]
-    """`observation.observe_features` at the step's end."""
+    """Features (`observation.observe_features`) at the end of the step."""
     command: Float[Array, " commands"]
     """Commands, in the actuators' units."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """What a policy is trained for. `reward` is pure, per control step, and of the order of 0.1 m/s."""
+    """A task for which a policy is trained.
+
+    `reward` is a pure function of one control step. Its values are of the order of 0.1 m/s.
+    """
 
     name: str
-    """The subcommand of `python -m ballu_mjx.train`."""
+    """Name of the task, and of its subcommand of `python -m ballu_mjx.train`."""
     summary: str
-    """One line for its help."""
+    """One-line description in the subcommand's help."""
     reward: Callable[[Step], Float[Array, ""]]
     trial_seconds: float
-    """Length of a trial on the robot (s)."""
+    """Duration of a trial on the robot (s)."""

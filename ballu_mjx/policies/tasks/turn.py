@@ -1,4 +1,4 @@
-"""Turning left (paper, section "Improved Sim-to-real Transfer"): velocity along y, trials of 22 s."""
+"""Turning left (paper, section "Improved Sim-to-real Transfer"): reward is the velocity along y; trials of 22 s."""
 
 from ballu_mjx.policies.tasks.base import Task
 

@@ -1,4 +1,4 @@
-"""Turning right: velocity along -y."""
+"""Turning right. The reward is the velocity along -y."""
 
 from ballu_mjx.policies.tasks.base import Task
 

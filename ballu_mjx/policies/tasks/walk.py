@@ -1,4 +1,4 @@
-"""Forward walking (paper, section "Improved Sim-to-real Transfer"): velocity along x, trials of 24 s."""
+"""Walking forward (paper, section "Improved Sim-to-real Transfer"): reward is the velocity along x; trials of 24 s."""
 
 from ballu_mjx.policies.tasks.base import Task
 

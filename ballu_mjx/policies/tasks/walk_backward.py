@@ -1,4 +1,4 @@
-"""Walking backward: velocity along -x."""
+"""Walking backward. The reward is the velocity along -x."""
 
 from ballu_mjx.policies.tasks.base import Task
 

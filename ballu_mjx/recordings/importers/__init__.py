@@ -1,6 +1,6 @@
-"""Importers: from what a laboratory has to `ballu-recording/1`.
+"""Importers of motion capture files, which convert them to the format `ballu-recording/1`.
 
-`readers` lists the formats. Each gives what a `mapping` asks for as `Trajectories`, in SI units and the capture's own
-frame; most do so by a `capture`, the file's bodies and columns by name. `placement` turns trajectories into the model's
-sites in the format's frame. `draft` writes a first mapping for a file.
+`readers` lists the file formats. A reader returns the parts that a `mapping` selects as `Trajectories`, in SI units and
+the frame of the capture. Most readers first make a `capture`: the bodies and columns of the file by name. `placement`
+converts trajectories to the model's sites in the frame of recordings. `draft` writes a first mapping for a file.
 """

@@ -1,10 +1,10 @@
-"""Arrays with a sample a row: NumPy's `.npz`, and LeRobot datasets on disk (https://github.com/huggingface/lerobot).
+"""Reader of arrays with one sample per row: NumPy's `.npz`, and LeRobot datasets on disk.
 
-A column of a one-dimensional array has the array's name, column i of a two-dimensional one `name[i]`.
+A one-dimensional array is a column with the array's name. Column i of a two-dimensional array is named `name[i]`.
 
-A LeRobot dataset is a folder with `meta/info.json` and parquet files under `data/`, of versions 2 (a file an episode)
-and 3 (several episodes a file). Its times are the feature `timestamp`, in s. Parquet is read by pyarrow: the extra
-`lerobot`.
+A LeRobot dataset (https://github.com/huggingface/lerobot) is a folder with `meta/info.json` and parquet files under
+`data/`. Versions 2 (one episode per file) and 3 (several episodes per file) are read. The times are the feature
+`timestamp` (s). Parquet files are read with pyarrow, which the extra `lerobot` installs.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from ballu_mjx.recordings.importers.mapping import RoomMapping
 from ballu_mjx.recordings.importers.trajectories import TIMES, refuse, shorten
 
 _LARGEST = 2**31
-"""Bytes of arrays that are read."""
+"""Largest total size of the arrays in an archive (bytes)."""
 _WIDEST = 4096
-"""Columns of an array."""
+"""Largest number of columns of an array."""
 _INFO = Path("meta", "info.json")
 _TIME = "timestamp"
 
 
 def recognise_npz(path: Path, start: str) -> bool:
-    """Whether the file's name ends in .npz."""
+    """Return whether the file's name ends in .npz."""
     del start
     return path.suffix.lower() == ".npz"
 
 
 def open_npz(path: Path, mapping: RoomMapping | None) -> Capture:
-    """Return the arrays of the archive at `path`; nothing in it is executed.
+    """Return the arrays of the archive at `path`. Pickled objects in it are not loaded, so no code is executed.
 
-    **Raises** `InputError` for what is no whole archive of numbers.
+    **Raises** `InputError` if the file is damaged or holds no arrays of numbers.
     """
     del mapping
     arrays: dict[str, np.ndarray] = {}
@@ -49,7 +49,7 @@ def open_npz(path: Path, mapping: RoomMapping | None) -> Capture:
     try:
         with zipfile.ZipFile(path) as archive:
             if sum(each.file_size for each in archive.infolist()) > _LARGEST:
-                refuse(path, "", f"holds more than {_LARGEST >> 20} MiB", "save what is needed alone")
+                refuse(path, "", f"holds more than {_LARGEST >> 20} MiB", "save only the needed arrays")
         with np.load(path, allow_pickle=False) as archive:
             for name in archive.files:
                 try:
@@ -57,7 +57,7 @@ def open_npz(path: Path, mapping: RoomMapping | None) -> Capture:
                 except ValueError as error:
                     if "pickle" not in str(error).lower():
                         raise
-                    notes.append(f"{shorten(name)!r} holds Python objects, and is not read.")
+                    notes.append(f"{shorten(name)!r} holds Python objects and is not read.")
                     continue
                 if (
                     array.dtype.kind in "fiub"
@@ -72,8 +72,8 @@ def open_npz(path: Path, mapping: RoomMapping | None) -> Capture:
         raise
     except FileNotFoundError:
         refuse(path, "", "there is no such file", "check the path")
-    except Exception as error:  # zip, zlib and NumPy have many names for damage
-        refuse(path, "", f"not a whole .npz archive ({shorten(str(error) or type(error).__name__)})", "save it again")
+    except Exception as error:  # zipfile, zlib and NumPy raise many types for damaged files.
+        refuse(path, "", f"not a complete .npz file ({shorten(str(error) or type(error).__name__)})", "save it again")
     return _capture(path, "an .npz archive", arrays, None, notes)
 
 
@@ -88,10 +88,10 @@ def _capture(
     lengths = {name: len(array) for name, array in arrays.items()}
     rows = max(lengths.values(), key=lambda n: (list(lengths.values()).count(n), n), default=0)
     if rows == 0:
-        refuse(path, "", "holds no array with a number a sample", "save arrays of shape (samples,) or (samples, n)")
+        refuse(path, "", "holds no array with one number per sample", "save arrays of shape (samples,) or (samples, n)")
     for name, length in lengths.items():
         if length != rows:
-            notes.append(f"{shorten(name)!r} has {length} rows where others have {rows}, and is not read.")
+            notes.append(f"{shorten(name)!r} has {length} rows instead of {rows} and is not read.")
 
     def column(name: str, array: np.ndarray, index: int | None) -> Series:
         values = np.asarray(array if index is None else array[:, index], float)
@@ -113,13 +113,13 @@ def _capture(
         time = columns[name].values * TIMES[unit]
         if np.isnan(time).any():
             refuse(
-                path, f"{shorten(name)}, sample {int(np.isnan(time).argmax()) + 1}", "the time is missing", "fill it"
+                path, f"{shorten(name)}, sample {int(np.isnan(time).argmax()) + 1}", "the time is missing", "fill it in"
             )
         back = np.diff(time) <= 0
         if back.any():
             row = int(back.argmax())
             problem = f"time runs back or stands still, from {time[row]:.6f} to {time[row + 1]:.6f} s"
-            refuse(path, f"{shorten(name)}, sample {row + 2}", problem, "sort the samples, one trial a file")
+            refuse(path, f"{shorten(name)}, sample {row + 2}", problem, "sort the samples, and save one trial per file")
         return time
 
     return Capture(path, program, columns=columns, clock=clock, rows=rows, time_column=time_column, notes=notes)
@@ -129,23 +129,23 @@ def _capture(
 
 
 def recognise_lerobot(path: Path, start: str) -> bool:
-    """Whether the folder holds meta/info.json."""
+    """Return whether the folder holds meta/info.json."""
     del start
     return path.is_dir() and (path / _INFO).is_file()
 
 
 def open_lerobot(path: Path, mapping: RoomMapping | None) -> Capture:
-    """Return one episode of the dataset in the folder `path`: the mapping's, or the only one.
+    """Return one episode of the dataset in the folder `path`: the one that the mapping selects, or the only one.
 
-    **Raises** `InputError` where pyarrow is not installed, for a dataset that is not whole, and where it holds several
-    episodes and the mapping does not say which.
+    **Raises** `InputError` if pyarrow is not installed, if the dataset is damaged or incomplete, or if it holds several
+    episodes and the mapping selects none.
     """
     try:
         import pyarrow  # pyright: ignore[reportMissingImports]
         from pyarrow import parquet  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         mend = 'install it by `pip install "ballu-mjx[lerobot]"`'
-        raise InputError(f"{path}: LeRobot datasets are read by pyarrow, which is not installed; {mend}.") from error
+        raise InputError(f"{path}: LeRobot datasets are read with pyarrow, which is not installed; {mend}.") from error
     again = "copy the dataset again"
     info = read_json(path / _INFO, again)
     features = info.get("features")
@@ -165,7 +165,7 @@ def open_lerobot(path: Path, mapping: RoomMapping | None) -> Capture:
         except KeyError:
             refuse(file, "", "there is no column 'episode_index'", again)
         except (pyarrow.ArrowException, OSError, ValueError) as error:
-            refuse(file, "", f"not a whole parquet file ({shorten(str(error))})", again)
+            refuse(file, "", f"not a complete parquet file ({shorten(str(error))})", again)
         present |= {int(number) for number in np.unique(numbers)}
         chosen = numbers == (min(present) if episode is None else episode)
         if not chosen.any():
@@ -177,8 +177,8 @@ def open_lerobot(path: Path, mapping: RoomMapping | None) -> Capture:
     if episode is None and len(present) > 1:
         problem = f"holds {len(present)} episodes, {min(present)} to {max(present)}"
         if mapping is not None:
-            refuse(path, "", problem, f"say which by episode = ... under [clock] in {mapping.path}")
-        notes.append(f"It {problem}; here is episode {min(present)}.")
+            refuse(path, "", problem, f"select one by episode = ... under [clock] in {mapping.path}")
+        notes.append(f"It {problem}; this list is of episode {min(present)}.")
     elif episode is not None and episode not in present:
         problem = f"there is no episode {episode}"
         refuse(path, "", problem, f"its episodes are {min(present)} to {max(present)}, {len(present)} in all")
@@ -187,14 +187,14 @@ def open_lerobot(path: Path, mapping: RoomMapping | None) -> Capture:
         if len({part.shape[1:] for part in parts}) == 1:
             joined[name] = np.concatenate(parts)
     labels = {f"{name}[{i}]": label for name, feature in features.items() for i, label in enumerate(_labels(feature))}
-    notes.append("LeRobot states no units of angles: they may be degrees, radians or shares of a range.")
+    notes.append("LeRobot states no units of angles. They may be degrees, radians or fractions of a range.")
     capture = _capture(path, "a LeRobot dataset", joined, _TIME if _TIME in joined else None, notes, labels)
     several = len(present) > 1 and episode is None
     return dataclasses.replace(capture, episodes=sorted(present)) if several else capture
 
 
 def _numbers(column: Any, chosen: np.ndarray) -> np.ndarray | None:
-    """A column as (T,) or (T, n) numbers; None for images, text and lists of different lengths."""
+    """Return a column as numbers (T,) or (T, n). None for images, text and lists of different lengths."""
     values = column.filter(chosen.tolist()) if not chosen.all() else column
     plain = values.to_pylist()
     try:

@@ -1,13 +1,14 @@
-"""ROS 1 and ROS 2 bags, and MCAP (https://mcap.dev): poses, joints and commands by topic. The extra `bags`.
+"""Reader of ROS 1 and ROS 2 bags and of MCAP files (https://mcap.dev): poses, joints and commands by topic.
 
-Bags are read by rosbags, MCAP files by mcap, with messages in ROS's encodings or JSON. A topic's name is that of
+Bags are read with rosbags and MCAP files with mcap, which the extra `bags` installs. Messages are in ROS's encodings or
+JSON.
 
-- a body, where it holds poses: PoseStamped, PoseWithCovarianceStamped, Odometry, TransformStamped, and PointStamped (a
-  marker). A transform of a TFMessage is the body `topic:child_frame`.
-- columns else: `topic:field.field` or `topic:field[i]` for each number in its messages, and, for a JointState,
-  `topic:position[joint]`, `velocity` and `effort` alike.
+- A topic with poses is a body with the topic's name. Pose types are PoseStamped, PoseWithCovarianceStamped, Odometry,
+  TransformStamped, and PointStamped (a marker). Each transform of a TFMessage is a body `topic:child_frame`.
+- Every other topic has one column for each number in its messages: `topic:field.field` or `topic:field[i]`. The columns
+  of a JointState are `topic:position[joint]`, `topic:velocity[joint]` and `topic:effort[joint]`.
 
-Units are ROS's own (REP 103): m and rad.
+Units are those of ROS (REP 103): m and rad.
 """
 
 from __future__ import annotations
@@ -27,55 +28,58 @@ from ballu_mjx.recordings.importers.mapping import RoomMapping
 from ballu_mjx.recordings.importers.trajectories import LENGTHS, refuse, shorten, to_quaternion
 
 HEADER, RECEIVED = "header", "received"
-"""The two clocks of a bag: the stamps in the messages' headers, and when each was recorded."""
+"""The two clocks of a bag: the stamps in the messages' headers, and the times at which they were recorded."""
 _EITHER = "either"
-"""To list a bag's topics: the header's stamps where there are any."""
+"""Clock for listing a bag's topics: the stamps of the headers if there are any, else the recorded times."""
 _POSES = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped", "PointStamped")
 _TREE, _JOINTS = "TFMessage", "JointState"
 _LONGEST_ARRAY = 256
-"""Numbers; longer arrays (images, scans) are no columns."""
+"""Largest length of an array whose numbers become columns. Longer arrays (images, scans) are left out."""
 _DEEPEST = 5
+"""Largest depth of nested fields whose numbers become columns."""
 _ENDINGS = (".bag", ".mcap", ".db3")
 
 
 @dataclasses.dataclass(frozen=True)
 class _Topic:
+    """A topic of a bag, with its messages."""
+
     name: str
     kind: str
-    """The message's type, without its package."""
+    """Type of the messages, without package."""
     messages: Callable[[], Iterator[tuple[int, Any]]]
-    """When each was recorded (ns), and the message, as objects or dictionaries."""
+    """Iterator over the recorded time (ns) and the message, an object or a dictionary."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Decoded:
-    """A topic's numbers."""
+    """Times and numbers of a topic or body."""
 
     received: np.ndarray
-    """ns."""
+    """Recorded times (ns)."""
     stamped: np.ndarray | None
-    """ns; None without headers."""
+    """Stamps of the headers (ns). None if any message has none."""
     values: Mapping[str, np.ndarray]
-    """By column."""
+    """Numbers by column."""
 
 
 def recognise_bag(path: Path, start: str) -> bool:
-    """Whether the file's name ends in .bag, .db3 or .mcap, or the folder holds a ROS 2 bag's metadata.yaml."""
+    """Return whether the file's name ends in .bag, .db3 or .mcap, or the folder holds a ROS 2 bag (metadata.yaml)."""
     del start
     return path.suffix.lower() in _ENDINGS or (path.is_dir() and (path / "metadata.yaml").is_file())
 
 
 def open_bag(path: Path, mapping: RoomMapping | None) -> Capture:
-    """Return the bodies and columns of the bag or MCAP at `path`; topics are decoded when they are asked for.
+    """Return the bodies and columns of the bag or MCAP file at `path`. A topic is decoded at first use.
 
-    **Raises** `InputError` where a package is missing, for a file that is not whole, and for a clock that a topic does
-    not have.
+    **Raises** `InputError` if a package is not installed, if the file is damaged, or if a topic lacks the selected
+    clock.
     """
     if not path.exists():
         refuse(path, "", "there is no such file or folder", "check the path")
     clock = _EITHER if mapping is None else mapping.clock.time
     if clock not in (None, HEADER, RECEIVED, _EITHER) or (mapping is not None and clock == _EITHER):
-        fix = f'write "{HEADER}" (the messages\' stamps) or "{RECEIVED}" (when they were recorded)'
+        fix = f'write "{HEADER}" (stamps of the messages) or "{RECEIVED}" (times of recording)'
         refuse(mapping.path if mapping else path, "[clock] time", f"a bag has no column {shorten(clock)!r}", fix)
     length = 1.0 if mapping is None or mapping.length is None else LENGTHS[mapping.length]
     topics = _mcap_topics(path) if path.suffix.lower() == ".mcap" else _bag_topics(path)
@@ -94,13 +98,13 @@ def open_bag(path: Path, mapping: RoomMapping | None) -> Capture:
         first = _first(path, topic)
         names = [] if first is None else list(_columns_of(topic, first))
         if not names:
-            notes.append(f"{shorten(topic.name)} ({shorten(topic.kind)}) holds no numbers that are read.")
+            notes.append(f"{shorten(topic.name)} ({shorten(topic.kind)}) holds no readable numbers.")
             continue
         numbers = functools.cache(functools.partial(_decode, path, topic, _columns_of))
         for name in names:
             columns[name] = functools.partial(_series, path, topic, numbers, name, clock)
     if not bodies and not columns:
-        refuse(path, "", "holds no topic with poses or numbers", "record the robot's topics, and give that bag")
+        refuse(path, "", "holds no topic with poses or numbers", "give a bag with the robot's topics")
     return Capture(path, "a ROS bag or MCAP", Lazy(bodies), Lazy(columns), notes=notes)
 
 
@@ -114,7 +118,7 @@ def _get(message: Any, *names: str) -> Any:
 
 
 def _stamp(message: Any) -> int | None:
-    """ns of the header; None without one, or where it was never set."""
+    """Return the stamp of a message's header (ns). None without header, or if the stamp is 0."""
     stamp = _get(message, "header", "stamp")
     if stamp is None:
         return None
@@ -126,7 +130,7 @@ def _stamp(message: Any) -> int | None:
 
 
 def _poses_of(topic: _Topic, message: Any) -> Iterator[tuple[str, Any, Sequence[float]]]:
-    """Name, the message with the header, and x, y, z, qw, qx, qy, qz of each pose; of a point the first three."""
+    """Yield name, message with the header, and numbers of each pose: x, y, z, qw, qx, qy, qz, or x, y, z of a point."""
     if topic.kind == _TREE:
         for transform in _get(message, "transforms") or ():
             yield f"{topic.name}:{_get(transform, 'child_frame_id')}", transform, _transform(transform)
@@ -147,6 +151,7 @@ def _transform(message: Any) -> list[float]:
 
 
 def _columns_of(topic: _Topic, message: Any) -> dict[str, float]:
+    """Return the numbers of a message by column."""
     if topic.kind == _JOINTS:
         names = list(_get(message, "name") or ())
         found = {}
@@ -159,6 +164,7 @@ def _columns_of(topic: _Topic, message: Any) -> dict[str, float]:
 
 
 def _flatten(prefix: str, value: Any, depth: int) -> Iterator[tuple[str, float]]:
+    """Yield column name and number for each number in the nested fields of a message, without its header."""
     if isinstance(value, bool | int | float | np.bool_ | np.number):
         yield prefix.rstrip(":"), float(value)
     elif isinstance(value, list | tuple | np.ndarray):
@@ -188,7 +194,7 @@ def _damaged(path: Path, topic: _Topic, error: Exception) -> NoReturn:
 
 
 def _decode(path: Path, topic: _Topic, of: Callable[..., Any]) -> dict[str, _Decoded]:
-    """All messages of a topic: by body, or all columns under the topic's name."""
+    """Return all messages of a topic, decoded by `of`: by body, or with all columns under the topic's name."""
     rows: dict[str, list[tuple[int, int | None, Any]]] = {}
     try:
         for received, message in topic.messages():
@@ -199,7 +205,7 @@ def _decode(path: Path, topic: _Topic, of: Callable[..., Any]) -> dict[str, _Dec
                     rows.setdefault(name, []).append((received, _stamp(holder), numbers))
     except InputError:
         raise
-    except Exception as error:  # what the decoders make of damage
+    except Exception as error:  # Decoders raise many types for damaged messages.
         _damaged(path, topic, error)
     found = {}
     for name, each in rows.items():
@@ -217,12 +223,12 @@ def _decode(path: Path, topic: _Topic, of: Callable[..., Any]) -> dict[str, _Dec
 
 
 def _times(path: Path, name: str, decoded: _Decoded, clock: str | None) -> tuple[np.ndarray, str]:
-    """Times (s), and which clock they are."""
+    """Return the times (s) of a topic, and the name of their clock."""
     if clock == _EITHER:
         clock = RECEIVED if decoded.stamped is None else HEADER
     if clock != RECEIVED and decoded.stamped is None:
-        fix = f'write time = "{RECEIVED}" under [clock] in the mapping: when each message was recorded'
-        refuse(path, shorten(name), "its messages have no stamp in a header", fix)
+        fix = f'write time = "{RECEIVED}" under [clock] in the mapping, the times of recording'
+        refuse(path, shorten(name), "not all of its messages have a stamp in a header", fix)
     ns = decoded.received if clock == RECEIVED or decoded.stamped is None else decoded.stamped
     back = np.diff(ns) <= 0
     if back.any():
@@ -243,7 +249,7 @@ def _stream(
 ) -> Stream:
     decoded = decode().get(name)
     if decoded is None:
-        refuse(path, shorten(name), "the topic holds no message", "record it again")
+        refuse(path, shorten(name), "the topic has no messages", "record it again")
     table = np.stack(list(decoded.values.values()), axis=1)
     bad = ~np.isfinite(table).all(axis=1)
     table[bad] = np.nan
@@ -270,7 +276,7 @@ def _series(
 
 def _missing(path: Path, package: str, error: ImportError) -> NoReturn:
     mend = 'install it by `pip install "ballu-mjx[bags]"`'
-    raise InputError(f"{path}: bags and MCAP are read by {package}, which is not installed; {mend}.") from error
+    raise InputError(f"{path}: bags and MCAP files are read with {package}, which is not installed; {mend}.") from error
 
 
 def _bag_topics(path: Path) -> list[_Topic]:
@@ -279,7 +285,7 @@ def _bag_topics(path: Path) -> list[_Topic]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         _missing(path, "rosbags", error)
-    # Bags of ROS 2 before Iron hold no definitions of their messages.
+    # Bags of ROS 2 before Iron do not hold the definitions of their messages.
     store = get_typestore(Stores.ROS2_HUMBLE)
 
     def messages(name: str) -> Iterator[tuple[int, Any]]:
@@ -293,7 +299,7 @@ def _bag_topics(path: Path) -> list[_Topic]:
             kinds = {each.topic: each.msgtype for each in reader.connections}
     except Exception as error:
         reason = shorten(" ".join(str(error).split()) or type(error).__name__)
-        refuse(path, "", f"not a whole bag ({reason})", "stop the recording cleanly, or reindex or copy the bag again")
+        refuse(path, "", f"not a complete bag ({reason})", "stop recordings cleanly, or reindex or copy the bag again")
     return [_Topic(n, kind.rpartition("/")[2], functools.partial(messages, n)) for n, kind in sorted(kinds.items())]
 
 
@@ -311,7 +317,7 @@ def _mcap_topics(path: Path) -> list[_Topic]:
             channels = {c.topic: (c, summary.schemas.get(c.schema_id)) for c in summary.channels.values()}
     except Exception as error:
         reason = shorten(" ".join(str(error).split()) or type(error).__name__)
-        refuse(path, "", f"not a whole MCAP file ({reason})", "mend it by `mcap recover`, or record again")
+        refuse(path, "", f"not a complete MCAP file ({reason})", "repair it with `mcap recover`, or record again")
     decoders = {name: _decoder(path, channel, schema) for name, (channel, schema) in channels.items()}
 
     def messages(name: str) -> Iterator[tuple[int, Any]]:
@@ -334,7 +340,7 @@ def _decoder(path: Path, channel: Any, schema: Any) -> Callable[[bytes], Any]:
 
         def unknown(data: bytes) -> NoReturn:
             problem = f"its messages are encoded as {shorten(encoding)!r}"
-            refuse(path, shorten(channel.topic), problem, "record in ROS's encodings (cdr, ros1) or JSON")
+            refuse(path, shorten(channel.topic), problem, "record in an encoding of ROS (cdr, ros1) or in JSON")
 
         return unknown
     try:

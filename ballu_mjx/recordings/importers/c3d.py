@@ -1,4 +1,4 @@
-"""C3D files (https://www.c3d.org)."""
+"""Reader of C3D files (https://www.c3d.org), which hold markers."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from ballu_mjx.recordings.importers.trajectories import LENGTHS, Body, Trajector
 _METRES = ("mete", "meter", "meters", "metre", "metres")
 _SPELLINGS = {name: "m" for name in _METRES}
 _SPELLINGS |= {f"centi{name}": "cm" for name in _METRES} | {f"milli{name}": "mm" for name in _METRES}
-"""Units as programs write them; Visual3D keeps four letters."""
+"""Spellings of length units by various programs. Visual3D keeps only four letters."""
 
 
 def recognise_c3d(path: Path, start: str) -> bool:
-    """Whether the file's name ends in .c3d."""
+    """Return whether the file's name ends in .c3d."""
     del start
     return path.suffix.lower() == ".c3d"
 
 
 def list_c3d(path: Path) -> Contents:
-    """Return what the C3D at `path` holds.
+    """Return the list of the markers in the C3D file at `path`.
 
-    **Raises** `InputError` as `read_c3d`.
+    **Raises** `InputError` if the file is missing, damaged or cut off.
     """
     found = _read_points(path)
     seen = np.all(np.isfinite(found.position), axis=0)
@@ -35,7 +35,7 @@ def list_c3d(path: Path) -> Contents:
         for label, each in zip(found.labels, seen, strict=False)
         if label
     ]
-    return Contents(path, "a C3D file", items, notes=["C3D holds markers alone: a body is given by three or more."])
+    return Contents(path, "a C3D file", items, notes=["C3D holds only markers. Give a body by three or more of them."])
 
 
 def _read_points(path: Path) -> C3DPoints:
@@ -50,11 +50,11 @@ def _read_points(path: Path) -> C3DPoints:
 
 
 def read_c3d(path: Path, mapping: RoomMapping) -> Trajectories:
-    """The markers that `mapping` names, from the C3D at `path`; a negative residual is a sample not seen.
+    """Return the markers that `mapping` names from the C3D file at `path`. A negative residual means: not seen.
 
-    Time counts from the trial's first frame, also in a file that begins later.
+    Time counts from the trial's first frame, also if the file begins at a later one.
 
-    **Raises** `InputError` for files that are damaged, cut off, without unit or rate, or without such markers.
+    **Raises** `InputError` if the file is damaged or cut off, or lacks a unit, a rate or one of the markers.
     """
     found = _read_points(path)
     points, count = found.position, found.position.shape[2]
@@ -64,21 +64,21 @@ def read_c3d(path: Path, mapping: RoomMapping) -> Trajectories:
     unit = mapping.length or _SPELLINGS.get(found.unit.lower(), found.unit.lower())
     if unit not in LENGTHS:
         fix = 'write length = "..." under [units] in the mapping'
-        refuse(path, "POINT:UNITS", f"the unit {shorten(unit)!r} is no length that is known", fix)
+        refuse(path, "POINT:UNITS", f"the unit {shorten(unit)!r} is not a known unit of length", fix)
     labels = found.labels[: points.shape[1]]
     points = points * LENGTHS[unit]
 
     def marker(name: str) -> np.ndarray:
         full = find(path, name, [label for label in labels if label], "marker", mapping.path)
         if labels.count(full) > 1:
-            refuse(path, "POINT:LABELS", f"{shorten(full)!r} stands there twice", "give markers different names")
+            refuse(path, "POINT:LABELS", f"{shorten(full)!r} appears twice", "give markers different names")
         position = points[:, labels.index(full)].T
         if np.isinf(position).any():
             refuse(path, "", f"{shorten(full)!r} has infinite positions", "export it again")
         return position
 
     if not mapping.sources:
-        refuse(mapping.path, "", "it asks for no marker of a C3D file", "say what its sites are, or give a table")
+        refuse(mapping.path, "", "it selects no marker of a C3D file", "name the markers of its sites")
     frames, bodies = found.first_frame + np.arange(count), {}
     for role, source in mapping.sources.items():
         if source.position:

@@ -1,4 +1,4 @@
-"""What a laboratory's file holds, by name: bodies, markers and columns; and the part of it that a mapping asks for."""
+"""Content of a motion capture file (bodies, markers and columns by name), and selection from it by a mapping."""
 
 from __future__ import annotations
 
@@ -29,48 +29,48 @@ from ballu_mjx.recordings.importers.trajectories import (
 )
 
 _COMMAND_TOLERANCE = 0.005
-"""Of a command's range: values that exceed it by at most this share are measurement noise and are clipped."""
+"""Tolerance as a share of a command's range. Values outside by at most this much count as noise and are clipped."""
 _COMMENT_SIGNS = "#% "
-"""Before the first name of a header, as `rostopic echo -p` writes it: "%time"."""
+"""Characters that may precede the first name of a header. `rostopic echo -p` writes "%time"."""
 _LONGEST_BRIDGE = 2.5
-"""Sample spacings: streams at other times are interpolated over shorter steps only, the rest was not seen."""
+"""Longest gap over which a stream is interpolated, in sample spacings. In longer gaps the values are NaN (not seen)."""
 
 _Value = TypeVar("_Value")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Stream:
-    """A marker or a rigid body with times of its own; NaN where it was not seen."""
+    """Trajectory of a marker or a rigid body with its own times. NaN where it was not seen."""
 
     time: Float[np.ndarray, " T"]
-    """s, strictly increasing."""
+    """Times (s), strictly increasing."""
     position: Float[np.ndarray, "T 3"]
-    """m, capture frame."""
+    """Position (m, capture frame)."""
     quaternion: Float[np.ndarray, "T 4"] | None = None
-    """w, x, y, z: the body's frame in the capture's."""
+    """Orientation of the body's frame in the capture frame (w, x, y, z). None for a marker."""
     angles: Float[np.ndarray, "T 3"] | None = None
-    """rad; three angles of which the file does not say what they are, in place of a quaternion."""
+    """Three rotation angles (rad) instead of a quaternion, if the file does not state their convention."""
     clock: str | None = None
-    """Which of the file's clocks `time` is, where it has several."""
+    """Clock of `time`, if the file has several."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Series:
-    """A column of numbers; NaN where a sample is missing."""
+    """Column of numbers. NaN where a sample is missing."""
 
     values: Float[np.ndarray, " T"]
     time: Float[np.ndarray, " T"] | None = None
-    """s. None: a sample a row, and a column of the file holds the times."""
+    """Times (s). None if the file has one sample per row and a column with the times."""
     si: bool = False
-    """Whether the format fixes the unit: rad and m."""
+    """Whether the format specifies SI units (rad and m)."""
     clock: str | None = None
-    """As of a `Stream`."""
+    """Clock of `time`, as in `Stream`."""
     label: str | None = None
-    """What the file calls it beside its name."""
+    """Label of the column in the file, in addition to its name. None if there is none."""
 
 
 class Lazy(Mapping[str, _Value]):
-    """Values by name, each made when it is first asked for."""
+    """Mapping whose values are computed at first access."""
 
     def __init__(self, makers: Mapping[str, Callable[[], _Value]]) -> None:
         self._makers = makers
@@ -90,27 +90,29 @@ class Lazy(Mapping[str, _Value]):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Capture:
-    """What one file holds."""
+    """Content of one file."""
 
     path: Path
     program: str
-    """What wrote it, for messages: "a table", "an OptiTrack Motive CSV"."""
+    """Kind of the file for messages, such as "a table" or "an OptiTrack Motive CSV"."""
     bodies: Mapping[str, Stream] = dataclasses.field(default_factory=dict)
+    """Bodies and markers by name."""
     columns: Mapping[str, Series] = dataclasses.field(default_factory=dict)
+    """Columns by name."""
     clock: Callable[[str, str], Float[np.ndarray, " T"]] | None = None
-    """Of the columns that hold a sample a row: times (s) by the name and the unit of the column that holds them."""
+    """Function that returns the times (s) of the rows, given name and unit of the time column. None without rows."""
     rows: int = 0
-    """Samples of these columns."""
+    """Number of rows, if the columns have one sample per row."""
     time_column: str | None = None
-    """Which column that is, where the format fixes it."""
+    """Name of the time column, if the format specifies it."""
     notes: Sequence[str] = ()
-    """Sentences about what is in the file and not read, and what is not certain."""
+    """Sentences about parts of the file that are not read, and about uncertain properties."""
     episodes: Sequence[int] = ()
-    """Which episodes there are, where the mapping has to name one; this capture is of the first."""
+    """Numbers of the episodes, if a mapping must select one. This capture holds the first."""
 
 
 def list_capture(capture: Capture) -> Contents:
-    """Return what `capture` holds. What cannot be read is told in the notes."""
+    """Return the list of the items in `capture`. The notes name items that cannot be read."""
     items: list[Item] = []
     notes = list(capture.notes)
     for name, stream in _readable(capture.bodies, notes):
@@ -152,7 +154,7 @@ def list_capture(capture: Capture) -> Contents:
 
 
 def _readable(values: Mapping[str, _Value], notes: list[str]) -> Iterator[tuple[str, _Value]]:
-    """Yield what can be read, by name; what is wrong with the rest is added to `notes`."""
+    """Yield name and value of each readable item. The errors of the others are added to `notes`."""
     for name in values:
         try:
             value = values[name]
@@ -167,28 +169,27 @@ def _rate(time: np.ndarray) -> float | None:
 
 
 def _step(values: np.ndarray) -> float | None:
-    """The median step of a column that could be a clock."""
+    """Return the median step of a column that always increases, as times do. None for other columns."""
     steps = np.diff(values)
     return float(np.median(steps)) if len(steps) and np.isfinite(steps).all() and (steps > 0).all() else None
 
 
-# ---- what a mapping asks for ----
+# ---- selection by a mapping ----
 
 
 def select(capture: Capture, mapping: RoomMapping) -> Trajectories:
-    """Return what `mapping` asks for of `capture`, all on the times of the tracked site (in a suspended recording: of
-    the first joint).
+    """Return the parts of `capture` that `mapping` selects, at the times of the first site, or else of the first joint.
 
-    Streams with times of their own are interpolated, orientations along the shortest rotation.
+    Streams with other times are interpolated, and orientations along the shortest rotation.
 
-    **Raises** `InputError` naming file and fix for what is not there, has no unit, or lacks times.
+    **Raises** `InputError` if a selected part is not in the file, has no unit, or lacks times.
     """
     picked = {role: _pick(capture, mapping, source) for role, source in mapping.sources.items()}
     joints = {name: _joint(capture, mapping, joint) for name, joint in mapping.joints.items()}
     clocks = [stream.time for stream in picked.values()] + [time for time, _ in joints.values()]
     if not clocks:
-        fix = "say what its sites are, or what its joints are"
-        refuse(mapping.path, "", f"it asks for nothing of {capture.program}", fix)
+        fix = "give a source for its sites or its joints"
+        refuse(mapping.path, "", f"it selects nothing from {capture.program}", fix)
     time = clocks[0]
     bodies = {role: _on_clock(stream, time) for role, stream in picked.items()}
     angles = {name: _values_on_clock(each, values, time) for name, (each, values) in joints.items()}
@@ -201,10 +202,11 @@ def select(capture: Capture, mapping: RoomMapping) -> Trajectories:
 def read_commands(
     capture: Capture, columns: Commands, mapping: RoomMapping | None = None
 ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N commands"]]:
-    """Return times (s, the log's own clock) and commands of a log, in the actuators' units; an empty cell goes on with
-    the command before.
+    """Return times (s, the log's clock) and commands (in the actuators' units) of a command log.
 
-    **Raises** `InputError` naming file, line, column and fix.
+    In an empty cell the previous command continues.
+
+    **Raises** `InputError` naming file, line and column if a command or time is missing or invalid.
     """
     return _commands(capture, columns, mapping, log=True)
 
@@ -217,7 +219,7 @@ def _pick(capture: Capture, mapping: RoomMapping, source: Source) -> Stream:
         return _from_columns(capture, mapping, source)
     if not capture.bodies:
         fix = 'it has columns, write position = ["x", "y", "z"] there'
-        refuse(mapping.path, place, f"it is given by name, and {capture.path.name} is {capture.program}", fix)
+        refuse(mapping.path, place, f"it is given by name, but {capture.path.name} is {capture.program}", fix)
 
     def named(name: str) -> Stream:
         return capture.bodies[find(capture.path, name, capture.bodies, "body or marker", mapping.path)]
@@ -233,14 +235,14 @@ def _pick(capture: Capture, mapping: RoomMapping, source: Source) -> Stream:
     if stream.angles is None:
         if source.rotation not in (None, "quaternion"):
             fix = "leave rotation out"
-            refuse(mapping.path, f"{place} rotation", f"{capture.program} says itself what its rotations are", fix)
+            refuse(mapping.path, f"{place} rotation", f"{capture.program} states its convention of rotations", fix)
         return stream
     if source.rotation in (None, "quaternion"):
         fix = (
             'export quaternions, or write rotation = "XYZ" (about the body\'s own axes in turn) or "xyz" (about the '
             "capture's)"
         )
-        refuse(mapping.path, place, f"{capture.program} does not say about which axes its angles turn", fix)
+        refuse(mapping.path, place, f"{capture.program} does not state the axes of its angles", fix)
     where = f"the angles of {shorten(source.body or '')}"
     quaternion = to_quaternion(capture.path, where, stream.angles, source.rotation, 1.0)
     return Stream(stream.time, stream.position, quaternion)
@@ -256,7 +258,7 @@ def _from_columns(capture: Capture, mapping: RoomMapping, source: Source) -> Str
     assert source.rotation is not None
     unit = 1.0 if source.rotation == "quaternion" else _unit(capture, mapping, parts[3][1], ANGLES, "angle")
     place = f"columns {source.orientation[0]} to {source.orientation[-1]}"
-    mend = f"export unit quaternions, or mend the order of the columns in {mapping.path}"
+    mend = f"export unit quaternions, or fix the order of the columns in {mapping.path}"
     quaternion = to_quaternion(capture.path, place, values[:, 3:], source.rotation, unit, mend=mend)
     return Stream(time, position, quaternion)
 
@@ -274,12 +276,12 @@ def _unit(capture: Capture, mapping: RoomMapping, series: Series, known: Mapping
     if unit is None:
         fix = f'write {name} = "{next(iter(known))}" or another there'
         whose = "a table's" if capture.program == "a table" else f"{capture.path.name}'s"
-        refuse(mapping.path, "[units]", f"the {name} of {whose} columns is not said", fix)
+        refuse(mapping.path, "[units]", f"the unit of {name} of {whose} columns is missing", fix)
     return known[unit]
 
 
 def _find_column(capture: Capture, name: str) -> str | None:
-    """The column that `name` means: itself, or the one that differs by a sign of a comment; None: there is none."""
+    """Return the column called `name`, or the one whose name differs only by a comment character. None if missing."""
     if name in capture.columns:
         return name
     bare = name.lstrip(_COMMENT_SIGNS)
@@ -292,7 +294,7 @@ def _look_up(capture: Capture, name: str, mapping: RoomMapping | None) -> Series
         return capture.columns[column]
     if not capture.columns:
         bodies = suggest("", capture.bodies)
-        problem = f"it is {capture.program}, which has bodies and markers in place of columns such as {shorten(name)!r}"
+        problem = f"it is {capture.program}, which has bodies and markers instead of columns such as {shorten(name)!r}"
         refuse(capture.path, "", problem, f'write body = "..." in the mapping, {bodies}')
     where = "the mapping" if mapping is None else mapping.path
     hint = suggest(name, capture.columns).rstrip("?")
@@ -300,12 +302,13 @@ def _look_up(capture: Capture, name: str, mapping: RoomMapping | None) -> Series
 
 
 def _column(capture: Capture, mapping: RoomMapping, name: str) -> tuple[np.ndarray, Series]:
-    """Times and values of a column."""
+    """Return times and values of a column."""
     series = _look_up(capture, name, mapping)
     return (_rows_clock(capture, mapping) if series.time is None else series.time), series
 
 
 def _rows_clock(capture: Capture, mapping: RoomMapping) -> np.ndarray:
+    """Return the times (s) of a file's rows: from its time column, or else from the mapping's rate."""
     name = mapping.clock.time or capture.time_column or mapping.commands.time
     column = _find_column(capture, name)
     if capture.clock is not None and column is not None:
@@ -317,13 +320,13 @@ def _rows_clock(capture: Capture, mapping: RoomMapping) -> np.ndarray:
 
 
 def _log_clock(capture: Capture, columns: Commands, mapping: RoomMapping | None) -> np.ndarray:
-    """Times of a log whose columns hold a sample a row."""
+    """Return the times (s) of a log with one sample per row."""
     column = _find_column(capture, columns.time)
     if column is None:
         where = "the mapping" if mapping is None else mapping.path
         fix = f'write time = "..." under [commands] in {where}, {suggest(columns.time, capture.columns)}'.rstrip("?")
         if mapping is not None and mapping.clock.time is None:
-            fix += "; a captured file's own column of times stands under [clock]"
+            fix += "; the time column of the captured file belongs under [clock]"
         refuse(capture.path, "", f"there is no column {shorten(columns.time)!r} of times", fix)
     assert capture.clock is not None
     return capture.clock(column, columns.time_unit)
@@ -348,7 +351,7 @@ def _commands(
         clocks.append(rows if each.time is None else each.time)  # pyright: ignore[reportArgumentType]
     time = clocks[0]
     if any(len(clock) != len(time) or (clock != time).any() for clock in clocks):
-        # Held until the next: all instants at which any of them changes, from where all of them are known.
+        # A command is held until the next, so take all instants at which any changes, once all are known.
         time = np.unique(np.concatenate(clocks))
         time = time[time >= max(clock[0] for clock in clocks)]
     values = []
@@ -364,10 +367,10 @@ def _commands(
 def _share(
     capture: Capture, name: str, command: str, raw: Float[np.ndarray, " N"], shown: tuple[float, float]
 ) -> Float[np.ndarray, " N"]:
-    """How far a command is from its smallest (0) to its largest (1) value."""
+    """Return a command's position in its range, from 0 (smallest value) to 1 (largest value)."""
     held = np.maximum.accumulate(np.where(np.isnan(raw), -1, np.arange(len(raw))))
     if held[0] < 0:
-        fix = "write what was being sent, or delete the samples before the first command"
+        fix = "write the command, or delete the samples before the first one"
         refuse(capture.path, f"column {shorten(name)}", "the first command is missing", fix)
     with np.errstate(over="ignore"):
         share = (raw[held] - shown[0]) / (shown[1] - shown[0])
@@ -376,17 +379,18 @@ def _share(
         row = int(outside.argmax())
         problem = f"{raw[held][row]:g} is outside of {shown[0]:g} to {shown[1]:g}"
         fix = (
-            "write under [commands] in the mapping what the column shows at the smallest and the largest command, as "
+            "write the column's values at the smallest and the largest command under [commands] in the mapping, as "
             f"range_{command}"
         )
         refuse(capture.path, f"sample {row + 1}, column {shorten(name)}", problem, fix)
     return np.clip(share, 0.0, 1.0)
 
 
-# ---- one clock ----
+# ---- interpolation to one clock ----
 
 
 def _on_clock(stream: Stream, time: Float[np.ndarray, " T"]) -> Body:
+    """Return a stream interpolated to `time`."""
     if stream.time is time or np.array_equal(stream.time, time):
         return Body(stream.position, stream.quaternion)
     position = np.stack([_values_on_clock(stream.time, axis, time) for axis in stream.position.T], axis=1)
@@ -402,6 +406,7 @@ def _on_clock(stream: Stream, time: Float[np.ndarray, " T"]) -> Body:
 
 
 def _values_on_clock(own: np.ndarray, values: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Return values at the times `own` interpolated to `time`."""
     if own is time or np.array_equal(own, time):
         return values
     found = np.full(len(time), np.nan)
@@ -413,7 +418,7 @@ def _values_on_clock(own: np.ndarray, values: np.ndarray, time: np.ndarray) -> n
 
 
 def _bridged(own: np.ndarray, seen: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Which of `time` lie between two samples that are seen, one after the other but for `_LONGEST_BRIDGE`."""
+    """Return which of `time` lie between two seen samples with a gap of at most `_LONGEST_BRIDGE` spacings."""
     if len(seen) < 2:
         return np.zeros(len(time), bool)
     known = own[seen]

@@ -1,4 +1,4 @@
-"""What is in a laboratory's file, for people: names, rates, lengths and units."""
+"""Listing of a motion capture file's content for the user: names, rates, lengths and units."""
 
 from __future__ import annotations
 
@@ -12,56 +12,61 @@ from ballu_mjx.recordings.importers.trajectories import shorten
 
 @dataclasses.dataclass(frozen=True)
 class Item:
-    """One body, marker or column."""
+    """Body, marker or column of a file."""
 
     name: str
     kind: Literal["body", "marker", "column"]
-    """A body has an orientation, a marker a place alone."""
+    """A body has position and orientation, a marker only a position."""
     samples: int
     rate: float | None
-    """Hz; None where the file does not say."""
+    """Sampling rate (Hz). None if the file does not state it."""
     share: float = 1.0
-    """Of the samples that are seen."""
+    """Share of samples that were seen, from 0 to 1."""
     unit: str | None = None
-    """None: the file does not say."""
+    """Unit. None if the file does not state it."""
     section: str | None = None
-    """Of a Vicon CSV, where the name stands in several."""
+    """Section of a Vicon CSV, if the name occurs in several sections."""
     rotation: str | None = None
-    """A guess of what its three angles are, where the file does not say."""
+    """Guessed convention of the three rotation angles, if the file does not state it."""
     clock: str | None = None
+    """Clock of its times, if the file has several."""
     label: str | None = None
-    """What the file calls the column beside its name."""
+    """Label of the column in the file, in addition to its name."""
     low: float | None = None
+    """Smallest value, in `unit`."""
     high: float | None = None
+    """Largest value, in `unit`."""
     step: float | None = None
-    """Median step of a column that increases throughout, as a clock does; in the column's unit."""
+    """Median step of a column that always increases, as times do, in the column's unit. None for other columns."""
 
     @property
     def called(self) -> str:
+        """Label of the column if there is one, else the name."""
         return self.label or self.name
 
 
 @dataclasses.dataclass(frozen=True)
 class Contents:
-    """What one file holds."""
+    """Content of one file."""
 
     path: Path
     program: str
     items: Sequence[Item]
     rows: bool = False
-    """Whether columns hold a sample a row, and the times are a column."""
+    """Whether the columns have one sample per row, with the times in one column."""
     notes: Sequence[str] = ()
+    """Sentences about parts of the file that are not read, and about uncertain properties."""
     episodes: Sequence[int] = ()
-    """Where a mapping has to name one; what is told here is of the first."""
+    """Numbers of the episodes, if a mapping must select one. The items are of the first."""
 
 
 def printable(text: str) -> str:
-    """Return `text` without what would break a line."""
+    """Return `text` with a question mark for each character that cannot be printed in a line."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def describe_contents(contents: Contents, *, most: int = 60) -> list[str]:
-    """Return lines for people: a line an item, at most `most`, and the notes."""
+    """Return lines for the user: one for each of the first `most` items, and one for each note."""
     lines = [f"{contents.path} is {contents.program}."]
     for item in contents.items[:most]:
         told = [item.kind, shorten(item.name) + (f" ({aside})" if (aside := item.section or item.label) else "")]

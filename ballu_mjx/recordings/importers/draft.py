@@ -1,4 +1,4 @@
-"""A first mapping for a file: what can be told by names, and what is guessed, said to be a guess."""
+"""Draft of a mapping for a file, from the names in it. Guessed entries are marked as guesses."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ _CLOCKS = ("time", "timestamp", "t", "stamp", "times", "timesec", "seconds", "se
 _TIME_UNITS = ("s", "ms", "us", "ns", "sec", "secs", "seconds", "msec", "usec", "nsec")
 _COMMANDS = ("command", "cmd", "action", "ctrl", "control", "target")
 _UP = "OptiTrack Motive"
-"""Programs whose own axes have y up."""
+"""Program whose files have y up by default."""
 _LONGEST_M = 20.0
-"""Positions beyond are taken for mm."""
+"""Positions with larger values are assumed to be in mm."""
 _LISTED = 16
-"""Names in a comment."""
+"""Largest number of names in a comment."""
 _LONGEST_RAD = 7.0
-"""Angles beyond are taken for deg."""
+"""Angles with larger values are assumed to be in deg."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Part:
-    """Lines of a mapping's table, and what of the file they name."""
+    """Lines of a table of the mapping, with the columns and items of the file that they name."""
 
     lines: Sequence[str]
     columns: Sequence[str] = ()
     items: Sequence[Item] = ()
     empty: bool = False
-    """The user has to name columns of places."""
+    """Whether the user must name the columns of positions."""
 
 
 def draft_mapping(contents: Contents, robot: RobotDescription) -> str:
-    """Return a mapping file for `robot` that `record import` takes where the file's names leave no doubt.
+    """Return a mapping file for `robot`. If the file's names are unambiguous, `record import` accepts it unchanged.
 
-    What is guessed has a comment that says so. What is not found stands there empty, with what there is to choose from.
+    Each guess has a comment. Entries that were not found are empty, with the possible names in a comment.
     """
     roles = (robot.tracked, *robot.points)
     parts = {role: _role(contents, role, roles, robot) for role in roles}
@@ -48,7 +48,7 @@ def draft_mapping(contents: Contents, robot: RobotDescription) -> str:
     commands = _find_commands(contents, robot, taken)
     used = [item for part in parts.values() for item in part.items] + [*joints.values(), *commands.values()]
     lines = [
-        "# A first mapping, by `ballu_mjx record map`. Check what is marked as a guess; complete what is empty.",
+        "# Draft of a mapping, by `ballu_mjx record map`. Check the entries marked as a guess, and fill in empty ones.",
         *(f"# {line}" for line in describe_contents(contents, most=24)),
         "",
         f"robot = {json.dumps(robot.name.lower().replace(' ', '_') + '-1')}  # the name of this specimen",
@@ -69,17 +69,18 @@ def draft_mapping(contents: Contents, robot: RobotDescription) -> str:
 
 
 def _plain(name: str) -> str:
+    """Return the letters and digits of a name, in lower case."""
     return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
 def _last(name: str) -> str:
-    """What a name ends in: behind a subject, a topic, a frame; within brackets that hold a name."""
+    """Return the last part of a name: after a subject, a topic or a frame, or a name in brackets at its end."""
     inside = re.fullmatch(r".*\[([^\]]*[^\]\d][^\]]*)\]", name)
     return _plain(inside[1] if inside else re.split(r"[:/]", name.rstrip("/"))[-1])
 
 
 def _match(role: str, items: Sequence[Item]) -> Item | None:
-    """The one item that is called like `role`: wholly, by its last part, or, where that is one alone, in part."""
+    """Return the only item whose name is `role`, or else ends in it, or else contains it. None if there is none."""
     wanted = _plain(role)
     for fits in (
         lambda item: _plain(item.called) == wanted,
@@ -102,6 +103,7 @@ def _columns(contents: Contents) -> list[Item]:
 
 
 def _role(contents: Contents, role: str, roles: Sequence[str], robot: RobotDescription) -> _Part:
+    """Return the table of a site: from a body, a marker, several markers, or columns."""
     tracked = robot.tracked
     bodies = [item for item in contents.items if item.kind == "body"]
     markers = [item for item in contents.items if item.kind == "marker"]
@@ -114,14 +116,14 @@ def _role(contents: Contents, role: str, roles: Sequence[str], robot: RobotDescr
         if found.section is not None:
             lines.append(f"section = {json.dumps(found.section)}")
         if found.rotation is not None:
-            comment = '# a guess: the file does not say. "helical": a rotation vector, "XYZ": Euler angles'
+            comment = '# a guess: the file does not state it. "helical": a rotation vector, "XYZ": Euler angles'
             lines.append(f'rotation = "{found.rotation}"  {comment}')
         return _Part(lines, items=[found])
     cluster = [
         item for item in markers if _plain(item.name).startswith(_plain(role)) or _plain(role) in _last(item.name)
     ]
     if role == tracked and len(cluster) >= 3:
-        return _markers(cluster, "its axes are the capture's in the first whole sample")
+        return _markers(cluster, "its axes are parallel to the capture's in the first sample that shows all markers")
     if (part := _from_columns(contents, role, robot, alone=len(roles) == 1)) is not None:
         return part
     if role == tracked and not bodies:
@@ -142,7 +144,7 @@ def _markers(items: Sequence[Item], comment: str) -> _Part:
 
 
 def _names(items: Sequence[Item]) -> str:
-    """Names for a comment, the likely ones first: what moves has more than one sample."""
+    """Return names for a comment. Items with a single sample come last, because they do not move."""
     names = [
         printable(item.name + (f" ({item.label})" if item.label else ""))
         for item in sorted(items, key=lambda item: item.samples < 2)
@@ -151,7 +153,10 @@ def _names(items: Sequence[Item]) -> str:
 
 
 def _stems(names: Sequence[str]) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
-    """Names that differ in a last letter x, y, z, and w, x, y, z, and arrays of three, four or seven columns."""
+    """Return the columns of positions and of quaternions, by stem of their names.
+
+    The names end in x, y, z or in w, x, y, z. Arrays of three, four or seven columns count too.
+    """
     known = set(names)
     places: dict[str, list[str]] = {}
     turns: dict[str, list[str]] = {}
@@ -180,6 +185,7 @@ def _stems(names: Sequence[str]) -> tuple[dict[str, list[str]], dict[str, list[s
 
 
 def _from_columns(contents: Contents, role: str, robot: RobotDescription, *, alone: bool) -> _Part | None:
+    """Return the table of a site from columns of a position, and of a quaternion if needed. None if not found."""
     items = {item.called: item for item in _columns(contents)}
     places, turns = _stems(list(items))
 
@@ -203,7 +209,7 @@ def _from_columns(contents: Contents, role: str, robot: RobotDescription, *, alo
 
 
 def _turn_lines(contents: Contents, stem: str | None) -> list[str]:
-    """Lines for the tracked site's orientation: the quaternion called `stem`, or else the only one that there is."""
+    """Return the lines of a site's orientation: the quaternion named `stem`, or else the only quaternion."""
     items = {item.called: item for item in _columns(contents)}
     turns, guess = _stems(list(items))[1], ""
     if stem is None and len(turns) == 1:
@@ -214,7 +220,7 @@ def _turn_lines(contents: Contents, stem: str | None) -> list[str]:
     return [f"orientation = {json.dumps([items[name].name for name in turns[stem]])}{guess}", 'rotation = "quaternion"']
 
 
-# ---- the rest ----
+# ---- axes, units, clock and commands ----
 
 
 def _axes(contents: Contents) -> list[str]:
@@ -231,10 +237,10 @@ def _units(parts: Mapping[str, _Part], joints: Mapping[str, Item], contents: Con
     angles = [item for item in joints.values() if item.unit is None]
     lines = []
     if not places and any(part.empty for part in parts.values()):
-        lines.append('length = "m"  # a guess: of the places that you name below')
+        lines.append('length = "m"  # a guess: the unit of the positions that you name below')
     if places:
         unit = "mm" if _largest(places) > _LONGEST_M else "m"
-        lines.append(f'length = "{unit}"  # a guess: places reach {_largest(places):.4g}')
+        lines.append(f'length = "{unit}"  # a guess: positions reach {_largest(places):.4g}')
     if angles:
         unit = "deg" if _largest(angles) > _LONGEST_RAD else "rad"
         lines.append(f'angle = "{unit}"  # a guess: angles reach {_largest(angles):.4g}')
@@ -253,7 +259,7 @@ def _time_item(contents: Contents) -> Item | None:
 
 
 def _is_clock(name: str) -> bool:
-    """Whether a column is called like a clock: `time`, `timestamp_ns`, `t_ms`, `Stamp [us]`."""
+    """Return whether a column has the name of a clock, such as `time`, `timestamp_ns`, `t_ms` or `Stamp [us]`."""
     words = [word for word in re.split(r"[^a-z0-9]+", name.lower()) if word]
     if len(words) > 1 and words[-1] in _TIME_UNITS:
         words = words[:-1]
@@ -267,7 +273,7 @@ def _rate_line(contents: Contents) -> list[str]:
     rising = [item for item in _columns(contents) if item.step is not None]
     if rising:
         return [f"rate = 100.0  # Hz; a guess. If one of these is the time, name it under [clock]: {_names(rising)}"]
-    return ["rate = 100.0  # Hz; a guess: no column rises as a clock does"]
+    return ["rate = 100.0  # Hz; a guess: no column increases as times do"]
 
 
 def _clock(contents: Contents, used: Sequence[Item]) -> list[str]:
@@ -275,12 +281,12 @@ def _clock(contents: Contents, used: Sequence[Item]) -> list[str]:
     if clocks:
         if len(clocks) == 1:
             return ["[clock]", f'time = "{clocks.pop()}"', ""]
-        return ["[clock]", 'time = "received"  # not all messages have stamps in a header', ""]
+        return ["[clock]", 'time = "received"  # not all messages have a stamp in a header', ""]
     item = _time_item(contents)
     if not contents.rows or item is None:
         return []
     step = item.step or 0.0
-    # A capture has 5 Hz to 5 kHz.
+    # Assume a rate of 5 Hz to 5 kHz.
     unit = next((unit for unit, scale in TIMES.items() if 2e-4 <= step * scale <= 0.2), "s")
     return [
         "[clock]",
@@ -320,6 +326,6 @@ def _command_lines(contents: Contents, robot: RobotDescription, commands: Mappin
     for (name, found), (low, high) in zip(commands.items(), robot.command_ranges, strict=True):
         guess = "" if _plain(name) in _plain(found.called) else "  # a guess: by their order"
         lines.append(f"{name} = {json.dumps(found.name)}{guess}")
-        shown = f"the column reaches from {found.low:.4g} to {found.high:.4g}" if found.low is not None else ""
-        lines.append(f"range_{name} = [{low:g}, {high:g}]  # what the column shows at the command's ends; {shown}")
+        shown = f"the column ranges from {found.low:.4g} to {found.high:.4g}" if found.low is not None else ""
+        lines.append(f"range_{name} = [{low:g}, {high:g}]  # the column's values at the command's limits; {shown}")
     return lines

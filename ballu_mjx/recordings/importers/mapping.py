@@ -1,4 +1,4 @@
-"""Mapping files: what in a laboratory's file is which part of the robot, in which units and axes. TOML or JSON."""
+"""Reader of mapping files (TOML or JSON), which assign parts of a capture file to the robot, with units and axes."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ from ballu_mjx.recordings.recording import Kind
 from ballu_mjx.robots.description import RobotDescription
 
 MARKER_TOLERANCE = 0.01
-"""m, see `trajectories.rigid_body`."""
+"""Tolerance (m) of rigid bodies from markers, see `trajectories.rigid_body`."""
 _TABLES = ("axes", "origin", "units", "clock", "commands")
 _RESERVED = ("robot", "kind", "notes", "rate", *_TABLES)
-"""Names that no site or joint of a mapping file can have."""
+"""Keys of a mapping file, which cannot be names of sites or joints."""
 _RESERVED_COMMANDS = ("time", "time_unit")
+"""Keys of the table `[commands]`, which cannot be names of commands."""
 
 _AXIS = re.compile(r"([+-]?)([xyz])")
 _EULER = re.compile(r"[XYZ]{3}|[xyz]{3}")
@@ -34,94 +35,102 @@ _EULER = re.compile(r"[XYZ]{3}|[xyz]{3}")
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """Where one part of the robot comes from; see `example_mapping`."""
+    """Source of one site of the robot. The fields are the keys of its table, see `example_mapping`."""
 
     role: str
+    """Name of the site."""
     body: str | None = None
     section: str | None = None
     rotation: str | None = None
     markers: tuple[str, ...] = ()
     geometry: tuple[tuple[float, ...], ...] | None = None
-    """m."""
+    """Positions (m) of the markers in the body's frame. None to take them from the file."""
     position: tuple[str, ...] = ()
     orientation: tuple[str, ...] = ()
     offset: tuple[float, ...] = (0.0, 0.0, 0.0)
-    """m, tracked body's frame."""
+    """Position (m) of the site in the tracked body's frame."""
     turn: tuple[float, ...] | Literal["start"] = (0.0, 0.0, 0.0)
-    """rad, rotation vector."""
+    """Rotation vector (rad) of the model's body frame in the tracked body's frame."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A joint angle of a table: (column - zero) x sign."""
+    """Joint angle from a column: (column - zero) x sign."""
 
     column: str
     sign: float
     zero: float
     slides: bool = False
-    """Whether it is a length."""
+    """Whether the joint is a slide, so that the column is a length."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Commands:
-    """Columns of a command log."""
+    """Columns of a command log, with their ranges."""
 
     columns: Mapping[str, str]
-    """By the robot's commands, in their order."""
+    """Column by name of the robot's command, in the robot's order."""
     limits: tuple[tuple[float, float], ...]
-    """Smallest and largest value of each command, in its actuator's units."""
+    """Smallest and largest value of each command, in its actuator's unit."""
     ranges: tuple[tuple[float, float], ...]
-    """What the columns show at these."""
+    """Values of the columns at these limits, in the columns' units."""
     time: str = "time"
+    """Time column."""
     time_unit: str = "s"
+    """Unit of the time column."""
 
     @staticmethod
     def of(robot: RobotDescription) -> Commands:
-        """Return the columns that a log without a mapping has."""
+        """Return the columns of a log that needs no mapping: `command_NAME`, in the actuators' units."""
         columns = {name: f"command_{name}" for name in robot.commands}
         return Commands(columns, robot.command_ranges, robot.command_ranges)
 
 
 @dataclasses.dataclass(frozen=True)
 class Clock:
-    """Where the captured file has its times."""
+    """Source of the captured file's times."""
 
     time: str | None = None
-    """The column of times, or of a bag "header" or "received". None: the format's own."""
+    """Time column, or "header" or "received" for a bag. None for the default of the format."""
     time_unit: str = "s"
-    """Of a column whose unit the format does not fix."""
+    """Unit of the time column, if the format does not specify it."""
     episode: int | None = None
-    """Of a LeRobot dataset with several."""
+    """Number of the episode in a LeRobot dataset. None if it has only one."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RoomMapping:
-    """A mapping file, checked."""
+    """Content of a mapping file, checked."""
 
     path: Path
     robot: str
-    """Which specimen was captured."""
+    """Name of the captured specimen."""
     kind: Kind
     notes: str
     rate: float | None
-    """Hz."""
+    """Sampling rate (Hz) that replaces the file's. None if not given."""
     axes: Float[np.ndarray, "3 3"]
-    """Turns the capture's coordinates into (forward, left, up)."""
+    """Rotation matrix from coordinates of the capture to (forward, left, up)."""
     start: bool
+    """Whether the robot's start becomes the origin, with the tracked body facing forward."""
     floor: float | str
-    """m, or a name among the robot's `RecordingHooks.floors`."""
+    """Height (m) of the floor in the capture, or a name among the robot's `RecordingHooks.floors`."""
     length: str | None
+    """Unit of lengths. None if not given."""
     angle: str | None
+    """Unit of angles. None if not given."""
     clock: Clock
     sources: Mapping[str, Source]
+    """Sources by site."""
     joints: Mapping[str, Joint]
+    """Columns of joint angles by joint."""
     commands: Commands
 
 
 def read_mapping(path: Path, robot: RobotDescription) -> RoomMapping:
-    """Read and check the mapping at `path` for captures of `robot`: JSON where it ends in .json, TOML else.
+    """Read and check the mapping file at `path` for captures of `robot`: JSON if its name ends in .json, else TOML.
 
-    **Raises** `InputError` naming file, key and fix.
+    **Raises** `InputError` naming file and key if the file is invalid.
     """
     fix = "correct it there; `python -m ballu_mjx record example-mapping` prints one that works"
     if path.suffix == ".json":
@@ -148,13 +157,13 @@ def read_mapping(path: Path, robot: RobotDescription) -> RoomMapping:
     units = top.keys("units")
     length = units.choice("length", LENGTHS, None)
     angle = units.choice("angle", ANGLES, None)
-    time = units.choice("time", TIMES, None)  # where mappings before `[clock]` have it
+    time = units.choice("time", TIMES, None)  # Earlier mappings, without `[clock]`, have the unit here.
     units.finish()
     clock = _clock(top.keys("clock"), time)
     sources = {role: _source(top.keys(role), role) for role in roles if role in content}
     for role in roles:
         if role not in sources and kind == "free":
-            refuse(path, f"[{role}]", "the table is missing", f'say what the {role} is, such as body = "name:{role}"')
+            refuse(path, f"[{role}]", "the table is missing", f'give its source, such as body = "name:{role}"')
     tracked = sources.get(robot.tracked)
     if kind == "free" and tracked is not None and not (tracked.body or tracked.markers or tracked.orientation):
         fix = 'give it by body = "...", by markers = [...] or by orientation = [...]'
@@ -172,16 +181,17 @@ def read_mapping(path: Path, robot: RobotDescription) -> RoomMapping:
 
 
 def _check_names(path: Path, roles: Sequence[str], robot: RobotDescription) -> None:
+    """Check that no site, joint or command has the name of a key of mapping files."""
     for name, reserved in [
         *((name, _RESERVED) for name in (*roles, *robot.joints)),
         *((name, _RESERVED_COMMANDS) for name in robot.commands),
     ]:
         if name in reserved:
-            refuse(robot.file, shorten(name), f"the mapping {path} has another meaning for this name", "rename it")
+            refuse(robot.file, shorten(name), f"this name is reserved in mapping files such as {path}", "rename it")
 
 
 class _Keys:
-    """A table of the file: each key is asked for once, with its type; what nobody asked for is refused."""
+    """Table of the file. Each method reads a key of one type. `finish` refuses keys that were not read."""
 
     def __init__(self, path: Path, name: str, values: Mapping[str, Any]) -> None:
         self.path, self.name, self.values = path, name, values
@@ -265,8 +275,8 @@ class _Keys:
 def _json(value: Any) -> str:
     try:
         return json.dumps(value, default=str)
-    except ValueError:  # TOML's hexadecimal numbers may have more digits than Python prints
-        return "a number of very many digits"
+    except ValueError:  # Hexadecimal numbers in TOML may have more digits than Python prints.
+        return "a number with too many digits"
 
 
 def _axes(keys: _Keys) -> Float[np.ndarray, "3 3"]:
@@ -289,25 +299,25 @@ def _axes(keys: _Keys) -> Float[np.ndarray, "3 3"]:
 
 def _source(keys: _Keys, role: str) -> Source:
     body, section = keys.optional_text("body"), keys.optional_text("section")
-    markers = keys.names("markers", None, "write the names of three different markers or more")
+    markers = keys.names("markers", None, "write the names of three or more different markers")
     position = keys.names("position", (3,), 'write the names of three columns, ["x", "y", "z"]')
     ways = [name for name, given in (("body", body), ("markers", markers), ("position", position)) if given]
     if len(ways) != 1:
-        problem = "nothing says where it comes from" if not ways else f"{' and '.join(ways)} both stand there"
+        problem = "its source is missing" if not ways else f"{' and '.join(ways)} are both given"
         refuse(keys.path, f"[{role}]", problem, 'write one of body = "...", markers = [...] and position = [...]')
     if markers and len(markers) < 3:
         keys.bad("markers", 'write three or more, or body = "..." for a single one')
     orientation = keys.names("orientation", (3, 4), "write the names of three or four columns")
     if orientation and not position:
-        keys.bad("orientation", "it belongs beside position = [...], leave it out")
+        keys.bad("orientation", "it needs position = [...]; add that, or leave orientation out")
     rotation = keys.optional_text("rotation")
     if rotation is not None and rotation not in ("helical", "quaternion"):
         if not _EULER.fullmatch(rotation) or any(a == b for a, b in zip(rotation, rotation[1:], strict=False)):
             keys.bad("rotation", 'write "helical", "quaternion", or a sequence of Euler angles such as "XYZ"')
     if orientation and rotation is None:
-        keys.bad("rotation", 'say what the columns are, such as rotation = "quaternion" for w, x, y, z')
+        keys.bad("rotation", 'state the meaning of the columns, such as rotation = "quaternion" for w, x, y, z')
     if orientation and (rotation == "quaternion") != (len(orientation) == 4):
-        keys.bad("orientation", "write four columns for a quaternion (w, x, y, z), three for all else")
+        keys.bad("orientation", "write four columns for a quaternion (w, x, y, z), or three for angles")
     geometry = keys.get("geometry")
     if geometry is not None:
         if not isinstance(geometry, list) or len(geometry) != len(markers):
@@ -318,7 +328,7 @@ def _source(keys: _Keys, role: str) -> Source:
         geometry = tuple(tuple(map(float, place)) for place in geometry)
     offset = keys.numbers("offset", 3, (0.0, 0.0, 0.0))
     if max(map(abs, offset)) > 2.0:
-        keys.bad("offset", "write metres")
+        keys.bad("offset", "write it in metres, at most 2")
     turn: tuple[float, ...] | Literal["start"] = "start"
     if keys.get("turn") != "start":
         turn = tuple(np.deg2rad(keys.numbers("turn", 3, (0.0, 0.0, 0.0))).tolist())
@@ -342,9 +352,9 @@ def _joint(keys: _Keys, *, slides: bool) -> Joint:
 
 
 def _clock(keys: _Keys, unit: str | None) -> Clock:
-    """Return the table `[clock]`; `unit` is that of `[units]`, None where it says none."""
+    """Return the table `[clock]`. `unit` is the unit of times in `[units]`, None if there is none."""
     if unit is not None and "time_unit" in keys.values:
-        keys.bad("time_unit", "time under [units] says the same; leave that one out")
+        keys.bad("time_unit", "time under [units] has the same meaning; leave that one out")
     episode = keys.get("episode")
     if episode is not None and (isinstance(episode, bool) or not isinstance(episode, int) or not 0 <= episode < 2**31):
         keys.bad("episode", "write its number, such as 0")
@@ -363,7 +373,7 @@ def _commands(keys: _Keys, robot: RobotDescription) -> Commands:
         key = f"range_{command}"
         low, high = keys.numbers(key, 2, limits)
         if low == high:
-            keys.bad(key, f"write what the column shows at command {limits[0]:g} and at command {limits[1]:g}")
+            keys.bad(key, f"write the column's values at command {limits[0]:g} and at command {limits[1]:g}")
         ranges.append((low, high))
     keys.finish()
     return Commands(columns, default.limits, tuple(ranges), time, unit or "s")

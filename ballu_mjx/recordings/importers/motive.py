@@ -1,4 +1,4 @@
-"""OptiTrack Motive's CSV exports, format versions 1.2x (https://docs.optitrack.com, "Data Export: CSV").
+"""Reader of OptiTrack Motive's CSV exports, format versions 1.2x (https://docs.optitrack.com, "Data Export: CSV").
 
     Format Version,1.23,Take Name,...,Rotation Type,Quaternion,Length Units,Meters,Coordinate Space,Global
     (empty)
@@ -7,9 +7,9 @@
     ,ID,506381AA,...                            some versions have a row Parent here
     ,,Rotation,Rotation,Rotation,Rotation,Position,...,Mean Marker Error
     Frame,Time (Seconds),X,Y,Z,W,X,Y,Z,,...
-    0,0.000000,...                              an empty cell is a sample not seen
+    0,0.000000,...                              an empty cell: the sample was not seen
 
-Motive's own axes have y up. Quaternions are x, y, z, w: the body's frame in the room's.
+Motive's default axes have y up. Quaternions (x, y, z, w) are the orientation of the body's frame in the room's.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ _PROGRAM = "an OptiTrack Motive CSV"
 _UNITS = {"meters": "m", "metres": "m", "centimeters": "cm", "millimeters": "mm"}
 _BODIES, _MARKERS = ("rigid body", "bone"), ("marker",)
 _EXPECTED = ("rigid body marker", "bone marker")
-"""Where the body's definition has its markers: nothing that was measured."""
+"""Positions of markers according to the body's definition, not measurements."""
 _AXES, _LETTERS = ("X", "Y", "Z"), ("X", "Y", "Z", "W")
 _FIRST_ROWS = 20
-"""Among which the row that begins with Frame stands."""
+"""Number of rows among which the row that begins with Frame is searched."""
 _MEND = "export again, with header"
 
 
 def recognise_motive(path: Path, start: str) -> bool:
-    """Whether the file that begins with `start` is one, or the rest of one whose first lines were lost."""
+    """Return whether a file that begins with `start` is a Motive CSV, possibly without its first lines."""
     del path
     if start.lstrip("\ufeff\n\r").startswith(("Format Version", '"Format Version"')):
         return True
@@ -47,8 +47,8 @@ def recognise_motive(path: Path, start: str) -> bool:
 def open_motive(path: Path, mapping: RoomMapping | None) -> Capture:
     """Return the bodies and markers of the Motive CSV at `path`.
 
-    **Raises** `InputError` naming file, line and mend: for what is missing, cut off, counted backwards or no number,
-    and for units that are not known.
+    **Raises** `InputError` naming file and line if a part is missing or cut off, if a cell is not a number, if times do
+    not increase, or if a unit is unknown.
     """
     lines = read_text(path).splitlines()
     delimiter = max(",;\t", key=next((line for line in lines if line.strip()), "").count)
@@ -73,11 +73,11 @@ def open_motive(path: Path, mapping: RoomMapping | None) -> Capture:
     columns = [f"{names[i]} {components[i]} {axes[i]}".strip() if i > 1 else axes[i] for i in range(len(axes))]
     table = read_numbers(path, lines, header + 1, columns, delimiter)
     frame = table[:, 0]
-    check_times(path, frame, header + 1, "export again, one take a file")
+    check_times(path, frame, header + 1, "export again, one take per file")
     rate = None if mapping is None else mapping.rate
     if rate is None:
         time = table[:, 1]
-        check_times(path, time, header + 1, "export again, one take a file")
+        check_times(path, time, header + 1, "export again, one take per file")
     else:
         time = (frame - frame[0]) / rate
     unit = _length(path, _value(top, "Length Units"), mapping)
@@ -95,7 +95,7 @@ def open_motive(path: Path, mapping: RoomMapping | None) -> Capture:
     bodies: dict[str, Stream] = {}
     notes = ["Motive's axes have y up unless the export settings say otherwise."]
     hidden = []
-    # Bodies before markers: in a skeleton's export, labels of markers may be names of bones too.
+    # Bodies before markers, because in a skeleton's export a marker and a bone may have the same name.
     for (kind, name), group in sorted(groups.items(), key=lambda item: item[0][0] in _MARKERS):
         if kind not in (*_BODIES, *_MARKERS):
             continue
@@ -104,7 +104,7 @@ def open_motive(path: Path, mapping: RoomMapping | None) -> Capture:
             problem = f"{shorten(name)!r} has no column Position {', '.join(lacking)}"
             refuse(path, f"line {header + 1}", problem, _MEND)
         if kind == "bone" and local:
-            notes.append(f"{shorten(name)!r} is in its parent's frame (Coordinate Space Local), and is not read.")
+            notes.append(f"{shorten(name)!r} is in its parent's frame (Coordinate Space Local) and is not read.")
             continue
         if name in bodies and kind in _MARKERS:
             hidden.append(name)
@@ -120,7 +120,7 @@ def open_motive(path: Path, mapping: RoomMapping | None) -> Capture:
         place = f"line {header + 1}, {shorten(name)}"
         if any(turn is None for turn in turns[:3]) or (rotation == "Quaternion") != (turns[3] is not None):
             problem = f"its rotation has the columns {', '.join(a for (c, a) in group if c == 'Rotation')}"
-            refuse(path, place, f"{problem}, and Rotation Type is {shorten(rotation)!r}", "export quaternions again")
+            refuse(path, place, f"{problem}, but Rotation Type is {shorten(rotation)!r}", "export quaternions again")
         values = table[:, [turn for turn in turns if turn is not None]]
         if turns[3] is not None:
             quaternion = to_quaternion(path, place, values[:, [3, 0, 1, 2]], "quaternion", 1.0)
@@ -131,7 +131,7 @@ def open_motive(path: Path, mapping: RoomMapping | None) -> Capture:
         notes.append(f"Markers that share their names with bodies are not read: {_first_of(hidden)}.")
     expected = [name for (kind, name), _ in groups.items() if kind in _EXPECTED and name not in bodies]
     if expected:
-        notes.append(f"Expected places of markers are not measured, and are not read: {_first_of(expected)}.")
+        notes.append(f"Expected positions of markers are not measurements and are not read: {_first_of(expected)}.")
     return Capture(path, _PROGRAM, bodies, notes=notes)
 
 
@@ -142,8 +142,10 @@ def _first_of(names: Sequence[str]) -> str:
 def _header_rows(
     path: Path, lines: Sequence[str], header: int, delimiter: str, width: int
 ) -> tuple[list[str], list[str], list[str]]:
-    """Types, names and components over each column: rows that say what they are in their second cell, or, without
-    that, by their order."""
+    """Return type, name and component of each column.
+
+    Their rows are found by the second cell (Type, Name), or else by their order.
+    """
     rows = [split_cells(line, delimiter) for line in lines[1:header]]
     rows = [row for row in rows if any(row)]
     found = {row[1].lower(): row for row in rows if len(row) > 1 and row[1]}
@@ -153,13 +155,14 @@ def _header_rows(
     elif not found and len(bare) >= 3:
         chosen = bare[0], bare[1], bare[-1]
     else:
-        problem = "above it the rows Type, Name and Rotation or Position do not all stand"
+        problem = "the rows Type, Name and Rotation or Position above it are not complete"
         refuse(path, f"line {header + 1}", problem, _MEND)
     types, names, components = ([*row, *[""] * width] if len(row) < width else list(row) for row in chosen)
     return types, names, components
 
 
 def _value(top: Sequence[str], key: str) -> str:
+    """Return the cell after `key` in the first line. Empty if there is none."""
     place = next((i for i, cell in enumerate(top) if cell == key), len(top))
     return top[place + 1] if place + 1 < len(top) else ""
 
@@ -170,5 +173,5 @@ def _length(path: Path, stated: str, mapping: RoomMapping | None) -> float:
         unit = mapping.length
     if unit is None:
         mend = 'export in Meters, or write length = "..." under [units] in the mapping'
-        refuse(path, "line 1, Length Units", f"{shorten(stated)!r} is no length that is known", mend)
+        refuse(path, "line 1, Length Units", f"{shorten(stated)!r} is not a known unit of length", mend)
     return LENGTHS[unit]

@@ -1,4 +1,4 @@
-"""From trajectories in a capture's frame to a recording: sites, axes, origin, commands on the capture's clock."""
+"""Conversion of trajectories in a capture's frame to a recording: sites, axes, origin, and commands."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from ballu_mjx.recordings.recording import Recording, cut
 from ballu_mjx.robots.description import RobotDescription
 
 _START_SAMPLES = 20
-"""Samples at the start over which `turn = "start"` takes the mean."""
+"""Number of samples at the start over which `turn = "start"` averages the orientation."""
 _LOWEST_PERCENTILE = 1.0
-"""Of the heights of what stands on the floor: the lowest without outliers."""
+"""Percentile of the heights of the sites on the floor. It is the lowest height without outliers."""
 
 
 def place(trajectories: Trajectories, mapping: RoomMapping, robot: RobotDescription, name: str) -> Recording:
-    """The recording of `robot` that `trajectories` hold, without commands yet (NaN): sites of the model, x forward, y
-    left, z up.
+    """Return the recording of `robot` in `trajectories`, with x forward, y left, z up. Its commands are NaN.
 
-    A body's orientation is renamed with the axes: one that stands like the capture's axes stands like the new ones.
+    Positions and orientations are of the model's sites. Orientations change with the axes: a body that is aligned with
+    the capture's axes is aligned with the new axes.
 
-    **Raises** `InputError` where an orientation is needed and not there, or nothing was seen at all.
+    **Raises** `InputError` if a required orientation is missing, or if a site was never seen.
     """
     mapped = {
         site: _site(trajectories, mapping, site, body, needs_orientation=site == robot.tracked)
@@ -61,18 +61,18 @@ def place(trajectories: Trajectories, mapping: RoomMapping, robot: RobotDescript
 
 
 def _site(trajectories: Trajectories, mapping: RoomMapping, role: str, body: Body, *, needs_orientation: bool) -> Body:
-    """The model's site on a tracked body, with the axes renamed."""
+    """Return the trajectory of the model's site on a tracked body, in the new axes."""
     source = mapping.sources[role]
     axes = mapping.axes
     if np.isnan(body.position).all():
         refuse(trajectories.path, "", f"[{role}] was never seen", "fix the mapping or the labels")
     if body.quaternion is None:
         if needs_orientation:
-            fix = "name an object or a segment, or three markers or more, or columns, for it"
-            refuse(mapping.path, f"[{role}]", "what it names has no orientation", fix)
+            fix = "name an object or a segment, three or more markers, or columns"
+            refuse(mapping.path, f"[{role}]", "its source has no orientation", fix)
         if source.turn == "start" or any(source.turn) or any(source.offset):
-            fix = "leave turn and offset out, or name what has one"
-            refuse(mapping.path, f"[{role}]", "what it names has no orientation to turn or shift along", fix)
+            fix = "leave turn and offset out, or name a source with an orientation"
+            refuse(mapping.path, f"[{role}]", "its source has no orientation, which turn and offset need", fix)
         return Body(body.position @ axes.T)
     seen = ~np.isnan(body.quaternion).any(axis=1)
     if not seen.any():
@@ -90,7 +90,7 @@ def _site(trajectories: Trajectories, mapping: RoomMapping, role: str, body: Bod
 
 
 def _standing(body: Body) -> Body:
-    """The body turned in its own frame so that at the start it stands like the format's axes."""
+    """Return the body rotated in its own frame so that it is aligned with the recording's axes at the start."""
     assert body.quaternion is not None
     seen = np.flatnonzero(~np.isnan(body.quaternion).any(axis=1))
     turned = Rotation.from_quat(body.quaternion[seen], scalar_first=True)
@@ -100,7 +100,7 @@ def _standing(body: Body) -> Body:
 
 
 def _to_floor(mapping: RoomMapping, mapped: dict[str, Body], robot: RobotDescription) -> None:
-    """Shift everything up or down, in place, until the floor is at 0."""
+    """Shift all sites vertically, in place, so that the floor is at height 0."""
     if isinstance(mapping.floor, str):
         standing = hooks_of(robot).floors[mapping.floor]
         heights = np.concatenate([mapped[site].position[:, 2] - above for site, above in standing.items()])
@@ -112,8 +112,11 @@ def _to_floor(mapping: RoomMapping, mapped: dict[str, Body], robot: RobotDescrip
 
 
 def _to_start(mapped: dict[str, Body], robot: RobotDescription) -> None:
-    """Turn about the vertical and shift along the floor, in place: the robot starts at the origin, and its tracked body
-    looks along x. Both are taken from the first sample that shows them."""
+    """Rotate all sites about the vertical and shift them horizontally, in place, to the start.
+
+    Then the robot starts at the origin, and its tracked body faces x. Both are taken from the first sample that shows
+    them.
+    """
     tracked, over = mapped[robot.tracked], mapped[hooks_of(robot).origin or robot.tracked]
     assert tracked.quaternion is not None
     seen = ~np.isnan(tracked.quaternion).any(axis=1)
@@ -121,7 +124,7 @@ def _to_start(mapped: dict[str, Body], robot: RobotDescription) -> None:
     turn = Rotation.from_euler("z", -np.arctan2(forward[1], forward[0]))
     origin = over.position[int((~np.isnan(over.position).any(axis=1)).argmax())] * [1.0, 1.0, 0.0]
     for role, body in mapped.items():
-        position = turn.apply(body.position - origin)  # NaN stays NaN
+        position = turn.apply(body.position - origin)  # Keeps NaN.
         quaternion = body.quaternion
         if quaternion is not None:
             known = ~np.isnan(quaternion).any(axis=1)
@@ -138,19 +141,20 @@ def with_commands(
     time: Float[np.ndarray, " N"],
     command: Float[np.ndarray, "N commands"],
 ) -> tuple[Recording, tuple[float, float]]:
-    """`recording` with `command` sent at `time` (s, the recording's clock), each held until the next.
+    """Return `recording` with commands, each held until the next one.
 
-    The last one is held as long as the longest before it. What lies outside is cut off.
+    The last command is held as long as the longest one before it. Samples without a command are cut off.
 
     **Arguments**
 
-    - `path`: the log that messages name.
+    - `path`: the command log, for messages.
+    - `recording`: a recording without commands.
+    - `time`: times of the commands (s, the recording's clock).
+    - `command`: the commands, in the actuators' units.
 
-    **Returns**
+    **Returns** the recording, from time 0 on, and the durations (s) cut off at its start and at its end.
 
-    The recording, from time 0 on, and the seconds cut off its start and end.
-
-    **Raises** `InputError` where less than a second is left.
+    **Raises** `InputError` if less than a second is left.
     """
     clock = recording.time
     last = time[-1] + (np.diff(time).max() if len(time) > 1 else 0.0)

@@ -1,9 +1,10 @@
-"""Files of one body's poses: TUM trajectories and EuRoC's CSV.
+"""Readers of files with the poses of one body: TUM trajectories and EuRoC's CSV.
 
-TUM (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats): lines of `timestamp tx ty tz qx qy qz qw`, in s
-and m, with # before comments. EuRoC (https://projects.asl.ethz.ch/datasets, state_groundtruth_estimate0): a CSV whose
-first line begins with `#timestamp`, in ns, then the position (m), then the quaternion w, x, y, z; what follows is not
-read. Both give the body's frame in the world's.
+A TUM trajectory (https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats) has lines of `timestamp tx ty tz qx qy
+qz qw`, in s and m. Comments begin with #. EuRoC's ground truth (https://projects.asl.ethz.ch/datasets,
+state_groundtruth_estimate0) is a CSV whose first line begins with `#timestamp`. Its columns are the time (ns), the
+position (m) and the quaternion w, x, y, z. Further columns are not read. Poses are those of the body's frame in the
+world frame.
 """
 
 from __future__ import annotations
@@ -19,18 +20,18 @@ from ballu_mjx.recordings.importers.text import check_times, parse_number, read_
 from ballu_mjx.recordings.importers.trajectories import LENGTHS, TIMES, refuse, shorten, to_quaternion
 
 BODY = "pose"
-"""What mappings call the one body of these files."""
+"""Name of the body of these files, for mappings."""
 _TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 _EUROC = ("timestamp", "x", "y", "z", "qw", "qx", "qy", "qz")
 _MEND = "sort the lines by time, and delete repeated ones"
 _FIRST_POSES = 5
-"""By which the format is known, though one of them may be damaged."""
+"""Number of poses by which the format is recognized, although one of them may be damaged."""
 _SHORTEST_STEP = 1e-5
-"""s between samples; where they are closer, the times are in another unit than ns."""
+"""Shortest sample spacing (s). With a shorter one, the times are not in ns."""
 
 
 def recognise_tum(path: Path, start: str) -> bool:
-    """Whether the first lines that are no comments begin with numbers, and one has eight of them between blanks."""
+    """Return whether the first line without comment begins with a number, and one of the first has eight numbers."""
     del path
     lines = [line.split() for line in start.splitlines() if line.strip() and not line.startswith("#")][:_FIRST_POSES]
     if not lines or parse_number(lines[0][0]) is None:
@@ -41,7 +42,7 @@ def recognise_tum(path: Path, start: str) -> bool:
 def open_tum(path: Path, mapping: RoomMapping | None) -> Capture:
     """Return the trajectory at `path`, a body named `pose`.
 
-    **Raises** `InputError` naming file, line and fix.
+    **Raises** `InputError` naming file and line if the file is damaged.
     """
     lines = read_text(path).splitlines()
     poses = [i for i, line in enumerate(lines) if line.strip() and not line.startswith("#")]
@@ -50,13 +51,13 @@ def open_tum(path: Path, mapping: RoomMapping | None) -> Capture:
     first, last = poses[0], poses[-1]
     if last - first >= len(poses):
         between = next(a for a, b in zip(poses, poses[1:], strict=False) if b > a + 1) + 1
-        refuse(path, f"line {between + 1}", "a line without a pose stands among the poses", "delete it")
+        refuse(path, f"line {between + 1}", "a line without a pose is between the poses", "delete it")
     table = read_numbers(path, lines[: last + 1], first, _TUM, None, unlimited=[0])
     return _pose(path, "a TUM trajectory", table, table[:, 0], first, [7, 4, 5, 6], mapping)
 
 
 def recognise_euroc(path: Path, start: str) -> bool:
-    """Whether the first line begins with #timestamp."""
+    """Return whether the first line begins with #timestamp."""
     del path
     return start.lstrip("\ufeff").lower().startswith("#timestamp") and "," in start.partition("\n")[0]
 
@@ -64,7 +65,7 @@ def recognise_euroc(path: Path, start: str) -> bool:
 def open_euroc(path: Path, mapping: RoomMapping | None) -> Capture:
     """Return the trajectory at `path`, a body named `pose`.
 
-    **Raises** `InputError` naming file, line and fix.
+    **Raises** `InputError` naming file and line if the file is damaged.
     """
     lines = read_text(path).splitlines()
     header = split_cells(lines[0], ",") if lines else []
@@ -76,14 +77,14 @@ def open_euroc(path: Path, mapping: RoomMapping | None) -> Capture:
     for cell in header[1:4]:
         unit = cell.partition("[")[2].rstrip("] ")
         if unit not in ("", "m") and (mapping is None or mapping.length is None):
-            problem = f"EuRoC's positions are in m, and the header has {shorten(cell)!r}"
+            problem = f"EuRoC's positions are in m, but the header has {shorten(cell)!r}"
             refuse(path, "line 1", problem, 'give m, or write length = "..." under [units] in the mapping')
     columns = [*_EUROC, *header[len(_EUROC) :]]
     table = read_numbers(path, lines, 1, columns, ",", unlimited=[0, *range(len(_EUROC), len(columns))])
     time = table[:, 0] * TIMES["ns"]
     capture = _pose(path, "an EuRoC CSV", table, time, 1, [4, 5, 6, 7], mapping)
     if len(time) > 1 and (step := float(np.median(np.diff(time)))) < _SHORTEST_STEP:
-        problem = f"the timestamps are {step / TIMES['ns']:.3g} apart, and EuRoC's are in ns"
+        problem = f"the timestamps are {step / TIMES['ns']:.3g} apart, but EuRoC's are in ns"
         refuse(path, "column timestamp", problem, "write them in ns")
     return capture
 

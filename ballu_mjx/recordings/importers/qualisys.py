@@ -1,4 +1,4 @@
-"""Qualisys Track Manager's TSV exports (https://docs.qualisys.com, "Motion data (.tsv)" and "6DOF data").
+"""Reader of Qualisys Track Manager's TSV exports (https://docs.qualisys.com, "Motion data (.tsv)" and "6DOF data").
 
     NO_OF_FRAMES<tab>22245
     FREQUENCY<tab>100
@@ -7,9 +7,9 @@
     Frame<tab>Time<tab>hull X<tab>Y<tab>Z<tab>Roll<tab>Pitch<tab>Yaw<tab>Residual<tab>Rot[0]<tab>...<tab>Rot[8]<tab>
     1<tab>0.00000<tab>...
 
-Lengths are mm. Rot[0] to Rot[8] is the rotation matrix, column after column: the body's frame in the room's. Roll,
-pitch and yaw depend on the settings and are not used. A body or marker whose numbers are all 0, empty or NULL was not
-seen.
+Lengths are in mm. Rot[0] to Rot[8] are the rotation matrix of the body's frame in the room's, column by column. Roll,
+pitch and yaw depend on the export settings and are not used. A body or marker whose numbers are all 0, empty or NULL
+was not seen.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ _PROGRAM = "a Qualisys TSV"
 _KEYS = ("FILE_VERSION", "NO_OF_FRAMES")
 """A file begins with one of these."""
 _FIRST_ROWS = 20
-"""Among which the header's keys stand."""
+"""Number of rows among which the keys of the header are searched."""
 _NAMES = {"3D": "MARKER_NAMES", "6D": "BODY_NAMES"}
 _ROTATION = tuple(f"Rot[{i}]" for i in range(9))
 _BODY_COLUMNS = ("X", "Y", "Z", "Roll", "Pitch", "Yaw", "Residual", *_ROTATION)
 _TOLERANCE = 0.02
-"""How far a rotation matrix may be from one; it is written with five decimals."""
+"""Tolerance of the orthonormality of a rotation matrix, which the file has with five decimals."""
 
 
 def recognise_qualisys(path: Path, start: str) -> bool:
-    """Whether the file that begins with `start` is one, or the rest of one whose first lines were lost."""
+    """Return whether a file that begins with `start` is a Qualisys TSV, possibly without its first lines."""
     del path
     keys = {line.partition("\t")[0] for line in start.lstrip("\ufeff").splitlines()[:_FIRST_ROWS]}
     return start.lstrip("\ufeff").startswith(_KEYS) or "DATA_INCLUDED" in keys
@@ -49,7 +49,8 @@ def recognise_qualisys(path: Path, start: str) -> bool:
 def open_qualisys(path: Path, mapping: RoomMapping | None) -> Capture:
     """Return the markers (3D) or bodies (6D) of the TSV at `path`.
 
-    **Raises** `InputError` naming file, line and mend: for what is missing, cut off, counted backwards or no number.
+    **Raises** `InputError` naming file and line if a part is missing or cut off, if a cell is not a number, or if times
+    do not increase.
     """
     lines = read_text(path).splitlines()
     keys: dict[str, list[str]] = {}
@@ -70,19 +71,19 @@ def open_qualisys(path: Path, mapping: RoomMapping | None) -> Capture:
     doubled = next((name for i, name in enumerate(names) if name in names[:i]), None)
     if doubled is not None:
         place = f"line {places[_NAMES[included]]}"
-        refuse(path, place, f"{shorten(doubled)!r} stands there twice", "give them different names and export again")
+        refuse(path, place, f"{shorten(doubled)!r} appears twice", "give them different names and export again")
     columns, samples, leading = _columns(path, lines, first, included, names)
     table = read_numbers(path, lines, samples, columns, "\t")
     frames = keys.get("NO_OF_FRAMES", [""])[0]
     stated = parse_number(frames)
     if stated is None:
-        problem = f"NO_OF_FRAMES is {shorten(frames)!r}, so that it is not known whether all frames are there"
+        problem = f"NO_OF_FRAMES is {shorten(frames)!r}, so the number of frames cannot be checked"
         refuse(path, f"line {places.get('NO_OF_FRAMES', 1)}", problem, "export again with the TSV header")
     if len(table) < stated:
         problem = f"holds {len(table)} of the {stated:g} frames that its header states"
         refuse(path, "", problem, "the file was cut off; copy or export it again")
     if "Frame" in leading:
-        check_times(path, table[:, leading.index("Frame")], samples, "export again, one capture a file")
+        check_times(path, table[:, leading.index("Frame")], samples, "export again, one capture per file")
     if "Time" in leading and (mapping is None or mapping.rate is None):
         time = table[:, leading.index("Time")]
         check_times(path, time, samples, "export again, or write rate = ... in the mapping")
@@ -98,16 +99,16 @@ def open_qualisys(path: Path, mapping: RoomMapping | None) -> Capture:
         else _body(path, table, index, name, time, unit)
         for name in names
     }
-    notes = [] if "Time" in leading else ["Times follow from FREQUENCY: there is no column of them."]
+    notes = [] if "Time" in leading else ["Times are computed from FREQUENCY, because there is no time column."]
     return Capture(path, _PROGRAM, bodies, notes=notes)
 
 
 def _columns(
     path: Path, lines: Sequence[str], first: int, included: str, names: Sequence[str]
 ) -> tuple[list[str], int, list[str]]:
-    """The columns' full names, the line of the first sample, and which of Frame and Time lead.
+    """Return the full names of the columns, the line of the first sample, and the leading ones of Frame and Time.
 
-    Without a row of names the columns are the documented ones.
+    Without a row of names, the columns are those of the documentation.
     """
     cells = split_cells(lines[first], "\t") if first < len(lines) else []
     while cells and not cells[-1]:
@@ -116,13 +117,13 @@ def _columns(
     if not cells or parse_number(cells[0]) is not None:
         leading = {0: [], 2: ["Frame", "Time"]}.get(len(cells) - len(of_each) * len(names))
         if leading is None:
-            problem = f"the row has {len(cells)} cells, and {len(names)} names need {len(of_each) * len(names)}"
-            mend = "export with column headers, and with frame and time or without both"
+            problem = f"the row has {len(cells)} cells, but {len(names)} names need {len(of_each) * len(names)}"
+            mend = "export with column headers, and either with both frame and time or with neither"
             refuse(path, f"line {first + 1}", problem, mend)
         return [*leading, *(f"{name} {part}" for name in names for part in of_each)], first, leading
     leading = [cell for cell in cells[:2] if cell in ("Frame", "Time")]
     columns, current = list(leading), ""
-    # A name that begins another is told from it by what follows.
+    # A name can be the beginning of another one, so the longest match counts.
     by_length = sorted(names, key=len, reverse=True)
     for cell in cells[len(leading) :]:
         owner = next((name for name in by_length if cell.startswith(f"{name} ")), None)
@@ -171,7 +172,7 @@ def _quaternions(
     bad = (error > _TOLERANCE) | (np.linalg.det(whole) < 0)
     if bad.any():
         row = int(np.flatnonzero(seen)[int(bad.argmax())])
-        problem = f"Rot[0] to Rot[8] of sample {row + 1} is no rotation matrix"
+        problem = f"Rot[0] to Rot[8] of sample {row + 1} are not a rotation matrix"
         refuse(path, shorten(name), problem, "export again")
     quaternion = np.full((len(matrices), 4), np.nan)
     if seen.any():

@@ -1,4 +1,4 @@
-"""The formats that are read: how each is recognised, listed, and read by a mapping."""
+"""Registry of the file formats, with functions that recognise, list and read each of them."""
 
 from __future__ import annotations
 
@@ -21,27 +21,30 @@ from ballu_mjx.recordings.importers.trajectories import Trajectories, refuse
 from ballu_mjx.recordings.importers.vicon import list_vicon, read_vicon, recognise_vicon
 
 _START = 1 << 16
-"""Bytes that a format is recognised by."""
+"""Number of bytes at the start of a file by which its format is recognised."""
 
 Opener = Callable[[Path, RoomMapping | None], Capture]
+"""Function that reads a whole file. The mapping is None to list the file."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Reader:
-    """One format."""
+    """Functions of one file format."""
 
     name: str
-    """As `record import --format` takes it."""
+    """Name of the format, as in `record import --format`."""
     program: str
-    """What wrote the file, for messages."""
+    """Kind of file, for messages."""
     recognise: Callable[[Path, str], bool]
-    """Whether a file is one, by its path and how its text begins."""
+    """Function that returns whether a file has this format, from its path and the start of its text."""
     read: Callable[[Path, RoomMapping], Trajectories]
+    """Function that reads the parts that a mapping selects."""
     list: Callable[[Path], Contents]
+    """Function that lists the content of a file."""
     open: Opener | None = None
-    """The whole file; None for formats that hold no columns."""
+    """Function that reads the whole file. None if the format has no such function."""
     clock: bool = False
-    """Whether [clock] of a mapping has a meaning for it."""
+    """Whether the table [clock] of a mapping applies to this format."""
 
 
 def _reader(
@@ -68,13 +71,13 @@ READERS: Mapping[str, Reader] = {
         _reader("table", "table", lambda path, start: True, lambda path, mapping: open_table(path), clock=True),
     )
 }
-"""By name, in the order in which they are tried; a table is what no other format is."""
+"""Readers by name, in the order in which they are tried. A file of no other format is a table."""
 
 
 def find_reader(path: Path, name: str | None = None) -> Reader:
     """Return the reader named `name`, or the one that recognises the file or folder at `path`.
 
-    **Raises** `InputError` where there is no such file, or a folder that no reader knows.
+    **Raises** `InputError` if there is no such file, or if no reader recognises a folder.
     """
     if not path.exists():
         refuse(path, "", "there is no such file", "check the path")
@@ -90,33 +93,33 @@ def find_reader(path: Path, name: str | None = None) -> Reader:
     found = next(reader for reader in READERS.values() if reader.recognise(path, start))
     if path.is_dir() and found.name == "table":
         fix = "give a file in it; a ROS 2 bag holds metadata.yaml, a LeRobot dataset meta/info.json"
-        refuse(path, "", "a folder of no format that is known", fix)
+        refuse(path, "", "a folder of unknown format", fix)
     return found
 
 
 def read_capture(path: Path, mapping: RoomMapping, name: str | None = None) -> Trajectories:
-    """Return what `mapping` asks for of the file at `path`, of the format `name` or the one that it is.
+    """Return the parts of the file at `path` that `mapping` selects. `name` is the format; None to recognise it.
 
-    **Raises** `InputError` naming file and fix.
+    **Raises** `InputError` if the file cannot be read, or lacks a selected part.
     """
     reader = find_reader(path, name)
     clock = mapping.clock
     if not reader.clock and (clock.time is not None or clock.episode is not None):
-        problem = f"{path.name} is read as a {reader.program}, which has one clock, its own"
+        problem = f"{path.name} is read as a {reader.program}, which has only one clock"
         refuse(mapping.path, "[clock]", problem, "leave it out")
     if clock.episode is not None and reader.name != "lerobot":
-        refuse(mapping.path, "[clock] episode", f"{path.name} is no LeRobot dataset", "leave it out")
+        refuse(mapping.path, "[clock] episode", f"{path.name} is not a LeRobot dataset", "leave it out")
     return reader.read(path, mapping)
 
 
 def open_log(path: Path, mapping: RoomMapping) -> Capture:
-    """Return a log of commands: any format that holds columns.
+    """Return the command log at `path`, in any format with columns.
 
-    **Raises** `InputError` naming file and fix.
+    **Raises** `InputError` if the file cannot be read, or if its format holds no commands.
     """
     reader = find_reader(path)
     if reader.open is None or reader.name in ("motive", "qualisys", "euroc", "tum"):
-        raise InputError(f"{path}: a {reader.program} holds no commands; give a table, an archive or a bag of them.")
-    # The log has a clock of its own: [clock] is the capture's.
+        raise InputError(f"{path}: a {reader.program} holds no commands; give them as a table, an archive or a bag.")
+    # [clock] is for the capture. The clock of the log is under [commands].
     own = mapping.commands.time if reader.name == "bag" and mapping.commands.time in ("header", "received") else None
     return reader.open(path, dataclasses.replace(mapping, clock=dataclasses.replace(mapping.clock, time=own)))

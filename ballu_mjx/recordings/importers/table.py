@@ -1,4 +1,4 @@
-"""Tables: CSV with a row of names above the samples. Any program's, by a mapping; and command logs."""
+"""Reader of tables: CSV with column names above the samples, from any program. Command logs are tables too."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _COMMENT = "#"
 
 
 class Table:
-    """A CSV's columns by name, converted to numbers when asked for."""
+    """Columns of a CSV by name, converted to numbers at first use."""
 
     def __init__(self, path: Path) -> None:
-        """Read the CSV at `path`. Lines that begin with # are comments, unless the last of them is the header.
+        """Read the CSV at `path`. Lines that begin with # are comments, but the last of them may be the header.
 
-        Raises `InputError` for one without header or samples, or with rows cut off.
+        **Raises** `InputError` if the header or the samples are missing, or if a row is cut off.
         """
         self.path = path
         lines = read_text(path).splitlines(keepends=True)
@@ -50,7 +50,7 @@ class Table:
                 if len(cells) != len(header):
                     few = len(cells) < len(header)
                     problem = f"the row has {len(cells)} cells, the header {len(header)}"
-                    fix = "the file was cut off, copy it again" if few else "write points in numbers, not commas"
+                    fix = "the file was cut off, copy it again" if few else "use decimal points, not commas"
                     refuse(path, f"line {line}", problem, fix)
                 self.rows.append(cells)
                 self.lines.append(line)
@@ -62,12 +62,15 @@ class Table:
         self.header = header
 
     def column(self, name: str) -> Float[np.ndarray, " T"]:
-        """The numbers of a column, NaN where a cell is empty. Raises `InputError` naming line, column and fix."""
+        """Return the numbers of a column, NaN for empty cells.
+
+        **Raises** `InputError` naming line and column if a cell is not a number, or if there is no such column.
+        """
         if name not in self.header:
             hint = suggest(name, self.header).rstrip("?")
             refuse(self.path, "", f"there is no column {shorten(name)!r}", f"add it, {hint}")
         if self.header.count(name) > 1:
-            refuse(self.path, "", f"the column {shorten(name)!r} stands there twice", "rename one")
+            refuse(self.path, "", f"the column {shorten(name)!r} appears twice", "rename one")
         place = self.header.index(name)
         values = np.empty(len(self.rows))
         for i, row in enumerate(self.rows):
@@ -81,7 +84,10 @@ class Table:
         return values
 
     def clock(self, name: str, unit: str) -> Float[np.ndarray, " T"]:
-        """A column of times in s, strictly increasing."""
+        """Return the times (s) of a time column with the unit `unit`.
+
+        **Raises** `InputError` naming line and column if a time is missing, or if times do not increase.
+        """
         time = self.column(name) * TIMES[unit]
         missing = np.isnan(time)
         if missing.any():
@@ -97,9 +103,9 @@ class Table:
 
 
 def open_table(path: Path) -> Capture:
-    """Return the table at `path`; its columns are converted when they are asked for.
+    """Return the table at `path`. Its columns are converted at first use.
 
-    **Raises** `InputError` as `Table`.
+    **Raises** `InputError` if the header or the samples are missing, or if a row is cut off.
     """
     table = Table(path)
 
@@ -111,25 +117,29 @@ def open_table(path: Path) -> Capture:
 
 
 def _header_line(lines: list[str]) -> int:
-    """The line (from 0) with the names: behind comments, or the last comment where numbers follow it and it has as
-    many cells."""
+    """Return the line (from 0) with the column names.
+
+    It is the first line after the comments, or the last comment if that has as many cells as the numbers below it.
+    """
     first = next((i for i, line in enumerate(lines) if line.strip() and not line.startswith(_COMMENT)), len(lines))
     if first == len(lines) or first == 0:
         return first
     delimiter = max(",;\t", key=lines[first].count)
     cells = lines[first].split(delimiter)
     above = lines[first - 1]
-    if above.startswith(_COMMENT) and above.count(delimiter) == len(cells) - 1 and parse_number(cells[0].strip()):
+    as_many = above.startswith(_COMMENT) and above.count(delimiter) == len(cells) - 1
+    if as_many and parse_number(cells[0].strip()) is not None:
         return first - 1
     return first
 
 
 def _check_header(path: Path, line: int, header: list[str]) -> list[str]:
+    """Return the column names without comment character and empty cells at the end. Refuse a row of numbers."""
     while header and not header[-1]:
         header.pop()
     header[:1] = [name.removeprefix(_COMMENT).strip() for name in header[:1]]
     numbers = sum(parse_number(name) is not None for name in header)
     if 2 * numbers > len(header):
         fix = "write the columns' names above the numbers, or export with a header"
-        refuse(path, f"line {line}", "it holds numbers where the names of the columns should stand", fix)
+        refuse(path, f"line {line}", "it holds numbers instead of column names", fix)
     return header

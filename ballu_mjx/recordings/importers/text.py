@@ -1,4 +1,4 @@
-"""Rows of numbers in text files, with the line and the column in every message."""
+"""Reader of rows of numbers in text files. Every error message names line and column."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from jaxtyping import Float
 from ballu_mjx.recordings.importers.trajectories import refuse, shorten
 
 LARGEST = 1e6
-"""No unit makes sense of a larger position or angle."""
+"""Largest plausible position or angle, in any unit."""
 _MISSING = ("", "nan", "null", "none")
 
 
 def split_cells(line: str, delimiter: str | None) -> list[str]:
-    """Return the cells of a line, without blanks and quotes around them; `delimiter` None: blanks part them."""
+    """Return the cells of a line without surrounding blanks and quotes. A `delimiter` of None means blanks."""
     return [cell.strip(' "\r') for cell in line.split(delimiter)]
 
 
 def parse_number(text: str) -> float | None:
-    """Return the finite number that `text` is, or None."""
+    """Return `text` as a finite number. None if it is not one."""
     try:
         value = float(text)
     except ValueError:
@@ -40,14 +40,19 @@ def read_numbers(
     largest: float = LARGEST,
     unlimited: Sequence[int] = (0, 1),
 ) -> Float[np.ndarray, "T n"]:
-    """Return the rows from line `first` (from 0) on, NaN for empty cells; blank lines at the end are no rows.
+    """Return the rows of numbers from line `first` (from 0) on, NaN for empty cells. Ignore blank lines at the end.
 
     **Arguments**
 
-    - `names`: of the columns, for messages; as many numbers stand in each row.
-    - `largest`: no number may be larger, but in the columns `unlimited`.
+    - `path`: the file, for messages.
+    - `lines`: all lines of the file.
+    - `names`: names of the columns, for messages. Each row has as many numbers.
+    - `delimiter`: the separator of cells. None for blanks.
+    - `largest`: largest magnitude of a number outside of the columns `unlimited`.
+    - `unlimited`: indices of columns without limit.
 
-    **Raises** `InputError` naming line, column and fix.
+    **Raises** `InputError` naming line and column if a row has too few or too many cells, or if a cell is not a number
+    or is too large.
     """
     last = len(lines)
     while last > first and not lines[last - 1].strip(f' "\r{delimiter or ""}'):
@@ -63,21 +68,24 @@ def read_numbers(
             refuse(path, place, problem, "the file was cut off; copy or export it again")
         if any(cells[len(names) :]):
             if delimiter is None:
-                refuse(path, place, f"the row has more than {len(names)} numbers", "delete what is not meant")
-            refuse(path, place, "the row has more cells than the header", "export with points in numbers, not commas")
+                refuse(path, place, f"the row has more than {len(names)} numbers", "delete the others")
+            refuse(path, place, "the row has more cells than the header", "export with decimal points, not commas")
         for column, cell in enumerate(cells[: len(names)]):
             value = math.nan if cell.lower() in _MISSING else parse_number(cell)
             if value is None or (abs(value) > largest and column not in unlimited):
                 missing = "write nan" if delimiter is None else "leave the cell empty"
-                mend = f"{missing} if the sample is missing, and write points in numbers"
-                problem = f"{shorten(cell)!r} is not a number that can be meant"
+                mend = f"{missing} if the sample is missing, and use decimal points"
+                problem = f"{shorten(cell)!r} is not a number, or is too large"
                 refuse(path, f"{place}, {shorten(names[column])}", problem, mend)
             table[number - first, column] = value
     return table
 
 
 def check_times(path: Path, time: Float[np.ndarray, " T"], first: int, mend: str) -> None:
-    """Refuse times that are missing, or do not increase; row 0 stands in line `first` (from 0)."""
+    """Check that times are given and increase. Row 0 is in line `first` (from 0), and `mend` is the fix in messages.
+
+    **Raises** `InputError` naming the line.
+    """
     missing = np.isnan(time)
     if missing.any():
         refuse(path, f"line {first + int(missing.argmax()) + 1}", "the time is missing", "delete the line")

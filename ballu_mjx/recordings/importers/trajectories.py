@@ -1,4 +1,4 @@
-"""What all importers give: named markers and bodies over time, in SI units and the capture's own frame."""
+"""Result of all importers: named markers and bodies over time, in SI units and the frame of the capture."""
 
 from __future__ import annotations
 
@@ -15,66 +15,68 @@ from scipy.spatial.transform import Rotation
 from ballu_mjx.common.errors import InputError
 
 LENGTHS: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-"""Metres in a unit."""
+"""Length of each unit in metres."""
 ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": float(np.pi / 180)}
-"""Radians in a unit."""
+"""Size of each unit in radians."""
 TIMES: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-"""Seconds in a unit."""
+"""Length of each unit in seconds."""
 QUATERNION_TOLERANCE = 0.02
+"""Tolerance of a quaternion's length, which must be 1."""
 _LARGEST_TURN = 4 * np.pi * 1.001
-"""rad; angles that were counted on over a full turn or two are read, degrees called radians are not."""
+"""Largest magnitude of an angle (rad): two turns, for unwrapped angles. It detects degrees labelled as radians."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Body:
-    """A marker or a rigid body over T samples; NaN where it was not seen."""
+    """Trajectory of a marker or a rigid body over T samples. NaN where it was not seen."""
 
     position: Float[np.ndarray, "T 3"]
-    """m, capture frame."""
+    """Position (m, capture frame)."""
     quaternion: Float[np.ndarray, "T 4"] | None = None
-    """w, x, y, z: the body's frame in the capture's. None for a marker."""
+    """Orientation of the body's frame in the capture frame (w, x, y, z). None for a marker."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CommandLog:
-    """Commands that a file holds beside its motion."""
+    """Commands in a file that also holds the motion."""
 
     time: Float[np.ndarray, " N"]
-    """s, the clock of the file's motion."""
+    """Times of the commands (s, the clock of the motion)."""
     command: Float[np.ndarray, "N commands"]
-    """In the actuators' units, each held until the next."""
+    """Commands in the actuators' units, each held until the next one."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trajectories:
-    """T samples of what a file holds, as far as a mapping asks for it."""
+    """T samples of the parts of a file that a mapping selects."""
 
     path: Path
+    """The file, for messages."""
     time: Float[np.ndarray, " T"]
-    """s, strictly increasing."""
+    """Times (s), strictly increasing."""
     bodies: Mapping[str, Body]
-    """By the robot's site."""
+    """Trajectories by site of the robot."""
     columns: Mapping[str, Float[np.ndarray, " T"]] = dataclasses.field(default_factory=dict)
-    """Joint angles (rad; of slides, m) by joint."""
+    """Joint angles (rad) or positions of slides (m) by joint."""
     commands: CommandLog | None = None
-    """None where the file holds none."""
+    """Commands in the file. None if it holds none."""
     first_frame: int = 1
-    """Of the trial: a file that was cropped at its start begins later, and so does `time`."""
+    """Number of the first frame in its trial. In a file cropped at its start it is above 1, and `time` begins later."""
 
 
 def refuse(path: Path, place: str, problem: str, mend: str) -> NoReturn:
-    """Raise the sentence."""
+    """Raise an `InputError` that names file, place, problem and fix (`mend`)."""
     where = f"{path}, {place}" if place else str(path)
     raise InputError(f"{where}: {problem}; {mend}.")
 
 
 def shorten(text: str) -> str:
-    """At most 40 characters of `text`."""
+    """Return the first 40 characters of `text`, with an ellipsis if it is longer."""
     return text if len(text) <= 40 else text[:40] + "..."
 
 
 def suggest(name: str, known: Iterable[str], *, most: int = 12) -> str:
-    """What the file holds instead of `name`, for the end of a sentence."""
+    """Return a hint for the end of a message: the known name closest to `name`, or the first `most` known names."""
     names = list(dict.fromkeys(known))
     close = difflib.get_close_matches(name, names, 1)
     if close:
@@ -84,9 +86,16 @@ def suggest(name: str, known: Iterable[str], *, most: int = 12) -> str:
 
 
 def find(path: Path, name: str, known: Iterable[str], what: str, mapping: Path) -> str:
-    """The full name in `known` that `name` means, in `mapping`: itself, or the only one that is it behind a subject's.
+    """Return the full name in `known` for a `name` in a mapping file.
 
-    **Raises** `InputError` where there is none or several.
+    It is `name` itself, or the only full name "subject:name".
+
+    **Arguments**
+
+    - `path`, `mapping`: the capture file and the mapping file, for messages.
+    - `what`: kind of item, for messages.
+
+    **Raises** `InputError` if there is none or more than one.
     """
     names = list(known)
     if name in names:
@@ -97,7 +106,7 @@ def find(path: Path, name: str, known: Iterable[str], what: str, mapping: Path) 
         refuse(path, "", f"{what} {shorten(name)!r} belongs to several subjects", mend)
     if not behind:
         hint = suggest(name, names).rstrip("?")
-        refuse(path, "", f"there is no {what} {shorten(name)!r}", f"mend {mapping}, {hint}")
+        refuse(path, "", f"there is no {what} {shorten(name)!r}", f"fix {mapping}, {hint}")
     return behind[0]
 
 
@@ -111,18 +120,20 @@ def to_quaternion(
     *,
     mend: str = "export unit quaternions again",
 ) -> Float[np.ndarray, "T 4"]:
-    """Unit quaternions (w, x, y, z) from a file's columns; NaN where any of the columns is.
+    """Return unit quaternions (w, x, y, z) from a file's columns. A NaN in a row, or a zero quaternion, gives NaN.
 
     **Arguments**
 
-    - `place`: names the columns in messages.
-    - `rotation`: "quaternion" (columns w, x, y, z), "helical" (rotation vector, of the angle's length) or Euler angles
-      in SciPy's notation: "XYZ" about the body's own axes in turn, "xyz" about the capture's, and so on.
-    - `unit`: radians in a unit of the columns; not for quaternions.
-    - `frames`: the file's own numbers of the samples, for messages; None: it has none.
-    - `mend`: what to do about quaternions that are none.
+    - `path`: the file, for messages.
+    - `place`: name of the columns, for messages.
+    - `values`: the columns.
+    - `rotation`: "quaternion" (columns w, x, y, z), "helical" (rotation vector, whose length is the angle) or Euler
+      angles in SciPy's notation, for example "XYZ" about the body's axes in turn, or "xyz" about the capture's axes.
+    - `unit`: size of the columns' unit (rad). Ignored for quaternions.
+    - `frames`: frame numbers of the samples, for messages. None if the file has none.
+    - `mend`: fix in the message about invalid quaternions.
 
-    **Raises** `InputError` for quaternions that are none, and angles that are too large to be meant.
+    **Raises** `InputError` if a quaternion is not of length 1, or if an angle is too large.
     """
     quaternion = np.full((len(values), 4), np.nan)
     seen = ~np.isnan(values).any(axis=1)
@@ -145,8 +156,8 @@ def to_quaternion(
     bad = seen & (np.abs(angles) > _LARGEST_TURN).any(axis=1)
     if bad.any():
         row = int(bad.argmax())
-        problem = f"{called(row)} is turned by {np.abs(angles[row]).max():.3g} rad"
-        refuse(path, place, problem, "mend the unit of angles, in the file or under [units] in the mapping")
+        problem = f"the rotation of {called(row)} is {np.abs(angles[row]).max():.3g} rad, which is too large"
+        refuse(path, place, problem, "correct the unit of angles, in the file or under [units] in the mapping")
     if rotation == "helical":
         turned = Rotation.from_rotvec(angles[seen])
     else:
@@ -163,18 +174,19 @@ def rigid_body(
     tolerance: float,
     frames: Int[np.ndarray, " T"] | None = None,
 ) -> Body:
-    """The rigid body that carries `markers`, by least squares from all that are seen, three at least.
+    """Return the pose of a rigid body from its markers, by least squares. A sample with fewer than three gives NaN.
 
     **Arguments**
 
-    - `name`: of the body, for messages.
-    - `markers`: m, capture frame, NaN where hidden.
-    - `geometry`: where they sit in the body's frame (m). None: the frame has its origin in their middle and stands
-      like the capture's in the first sample that shows all of them.
-    - `tolerance`: m; a sample that fits no better (root mean square) is refused, for a marker was then mixed up.
-    - `frames`: the file's own numbers of the samples, for messages; None: it has none.
+    - `path`: the file, for messages.
+    - `name`: name of the body, for messages.
+    - `markers`: positions (m, capture frame), NaN where a marker was not seen.
+    - `geometry`: positions of the markers in the body's frame (m). If None, the body's frame has its origin at their
+      mean, and its axes are parallel to the capture's in the first sample that shows all markers.
+    - `tolerance`: largest error of a sample (m, root mean square). A larger one means that markers were mixed up.
+    - `frames`: frame numbers of the samples, for messages. None if the file has none.
 
-    **Raises** `InputError` for markers on a line, never seen together, or not rigid.
+    **Raises** `InputError` if the markers lie on a line, are never seen together, or are not rigid.
     """
     seen = ~np.isnan(markers).any(axis=2)
     if geometry is not None:
@@ -182,12 +194,12 @@ def rigid_body(
     else:
         together = seen.all(axis=0)
         if not together.any():
-            refuse(path, "", f"the markers of {name} are never all seen at once", "leave the worst one out")
+            refuse(path, "", f"the markers of {name} are never all seen at once", "leave out the one seen least")
         first = markers[:, int(together.argmax())]
         places = first - first.mean(axis=0)
     spread = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
     if spread[1] < 0.05 * spread[0] or spread[0] == 0:
-        refuse(path, "", f"the markers of {name} lie on a line", "add one beside it, or orientation is not known")
+        refuse(path, "", f"the markers of {name} lie on a line", "add one beside it, to determine the orientation")
     samples = markers.shape[1]
     position, quaternion = np.full((samples, 3), np.nan), np.full((samples, 4), np.nan)
     patterns, which = np.unique(seen, axis=1, return_inverse=True)
@@ -197,9 +209,9 @@ def rigid_body(
         rows = np.flatnonzero(which.reshape(-1) == number)
         points, model = markers[pattern][:, rows].transpose(1, 0, 2), places[pattern]
         if np.linalg.svd(model - model.mean(axis=0), compute_uv=False)[1] < 0.05 * spread[0]:
-            continue  # what is left lies on a line
+            continue  # The markers that are seen lie on a line.
         middle, centre = points.mean(axis=1), model.mean(axis=0)
-        # Kabsch's algorithm, all samples with the same markers at once.
+        # Kabsch's algorithm, for all samples with the same markers at once.
         u, _, vt = np.linalg.svd(np.einsum("mi,tmj->tij", model - centre, points - middle[:, None]))
         flip = np.sign(np.linalg.det(u @ vt))
         u[:, :, 2] *= flip[:, None]
@@ -209,8 +221,8 @@ def rigid_body(
         if error.max() > tolerance:
             worst = int(rows[int(error.argmax())])
             where = f"sample {worst + 1}" if frames is None else f"frame {frames[worst]}"
-            problem = f"in {where} the markers of {name} are off their places by {1e3 * error.max():.0f} mm"
-            refuse(path, "", problem, "mend their labels there, or leave the marker out")
+            problem = f"the markers of {name} deviate from a rigid body in {where}, by {1e3 * error.max():.0f} mm"
+            refuse(path, "", problem, "correct their labels there, or leave the wrong marker out")
         position[rows] = middle - np.einsum("tij,j->ti", turn, centre)
         quaternion[rows] = Rotation.from_matrix(turn).as_quat(scalar_first=True)
     return Body(position, quaternion)

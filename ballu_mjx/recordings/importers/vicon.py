@@ -1,17 +1,17 @@
-"""Vicon's CSV exports, of Nexus and Tracker.
+"""Reader of Vicon's CSV exports, from Nexus and Tracker.
 
-A file holds one or more sections, each after blank lines or none:
+A file holds one or more sections, separated by blank lines:
 
     Segments                                    title: Objects, Segments, Trajectories, Joints, Model Outputs, ...
     100                                         rate (Hz)
     ,,robot:base,,,,,,robot:body,,,,,           names, each above its first column; Tracker: "Global Angle robot"
     Frame,Sub Frame,RX,RY,RZ,TX,TY,TZ,RX,...    components; RX, RY, RZ, RW is a quaternion; markers have X, Y, Z
     ,,deg,deg,deg,mm,mm,mm,deg,...              units
-    1,0,0.1,...                                 an empty cell is a sample not seen
+    1,0,0.1,...                                 an empty cell: the sample was not seen
 
-Commas, semicolons or tabs between the cells. Frames count from any number; a body at exactly 0 in every component was
-not seen. The file does not say what three rotation components are: Nexus's segments are rotation vectors (helical
-angles), Tracker's objects as its settings say.
+Commas, semicolons or tabs separate the cells. Frame numbers may begin anywhere. A body with 0 in every component was
+not seen. The file does not state the convention of three rotation components. For Nexus's segments they are rotation
+vectors (helical angles). For Tracker's objects they depend on the export settings.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ _PREFIX = "Global Angle "
 _TRANSLATIONS = (("TX", "TY", "TZ"), ("X", "Y", "Z"))
 _ROTATION = ("RX", "RY", "RZ")
 _HELICAL = ("Segments",)
-"""Sections whose three rotation components are a rotation vector unless the mapping says otherwise."""
+"""Sections whose three rotation components are a rotation vector by default."""
 _USED = ("Objects", "Segments", "Trajectories")
-"""Sections that must be whole; others that are laid out alike are read, and those that are not (Events) left alone."""
+"""Sections that must be complete. Other sections are read if they have the same layout, else ignored (Events)."""
 _TITLES = (*_USED, "Joints", "Model Outputs", "Devices", "Events")
 _SEARCHED_ROWS = 12
 _HEADER_ROWS = 5
@@ -56,37 +56,42 @@ _SPELLINGS: Mapping[str, str] = {"degrees": "deg", "degree": "deg", "°": "deg",
 
 @dataclasses.dataclass(frozen=True)
 class _Group:
-    """The columns under one name of one section."""
+    """Columns of one name in one section."""
 
     section: _Section
     columns: Mapping[str, int]
-    """By component."""
+    """Column by component."""
     units: Mapping[str, str]
+    """Unit by component."""
     repeated: str | None
-    """A component that stands there twice: names that are not used may be untidy."""
+    """A component that appears twice, or None. It is an error only if the mapping selects the name."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Section:
-    """A section's header, and the lines of its samples; lines count from 0."""
+    """Header of a section, and the lines of its samples. Lines count from 0."""
 
     title: str
     rate: float
+    """Frame rate (Hz)."""
     first: int
+    """First line of the samples."""
     last: int
+    """Line after the last sample."""
     width: int
+    """Number of columns."""
     names: Sequence[str]
-    """The name over each column, without Tracker's prefix."""
+    """Name above each column, without Tracker's prefix."""
     components: Sequence[str]
     units: Sequence[str]
 
 
 _Values = Callable[[_Group, Sequence[str]], Float[np.ndarray, "T n"]]
-"""The columns of a group by component, over all frames."""
+"""Function that returns columns of a group, given their components, over all frames."""
 
 
 def recognise_vicon(path: Path, start: str) -> bool:
-    """Whether a section begins among the first rows: by a title alone in its line, or by its components."""
+    """Return whether a section begins in the first rows, with a title alone in its line or with a row of components."""
     del path
     rows = [_cells(line, ",") for line in start.replace(";", ",").replace("\t", ",").splitlines()]
     rows = [row for row in rows if any(row)]
@@ -102,9 +107,9 @@ def _begins_components(cells: Sequence[str]) -> bool:
 
 
 def list_vicon(path: Path) -> Contents:
-    """Return what the Vicon CSV at `path` holds.
+    """Return the list of the bodies and markers in the Vicon CSV at `path`.
 
-    **Raises** `InputError` as `read_vicon`, for its headers.
+    **Raises** `InputError` naming file and line if a header is invalid.
     """
     lines = read_text(path).splitlines()
     items = []
@@ -127,15 +132,15 @@ def list_vicon(path: Path) -> Contents:
             )
     notes = []
     if any(item.rotation for item in items):
-        notes.append("RX, RY, RZ may be a rotation vector (helical) or Euler angles, as was chosen at export.")
+        notes.append("RX, RY, RZ may be a rotation vector (helical) or Euler angles, depending on the export settings.")
     return Contents(path, "a Vicon CSV", items, notes=notes)
 
 
 def read_vicon(path: Path, mapping: RoomMapping) -> Trajectories:
-    """The bodies and markers that `mapping` names, from the Vicon CSV at `path`.
+    """Return the bodies and markers that `mapping` names from the Vicon CSV at `path`.
 
-    **Raises** `InputError` naming file, line and mend: for what is missing, cut off, counted backwards or no number,
-    and for units or rotations that are not clear.
+    **Raises** `InputError` naming file and line if a part is missing or cut off, if a cell is not a number, if frame
+    numbers do not increase, or if a unit or a rotation convention is unknown.
     """
     lines = read_text(path).splitlines()
     delimiter = _delimiter(path, lines)
@@ -143,11 +148,11 @@ def read_vicon(path: Path, mapping: RoomMapping) -> Trajectories:
     groups = _groups(sections)
     wanted = {role: _wanted(path, mapping.path, source, groups, sections) for role, source in mapping.sources.items()}
     if not wanted:
-        refuse(mapping.path, "", "it asks for no body of a Vicon file", "say what its sites are, or give a table")
+        refuse(mapping.path, "", "it selects no body of a Vicon file", "name the bodies of its sites")
     used = list({id(g.section): g.section for gs in wanted.values() for g in gs}.values())
     rates = {section.rate for section in used}
     if len(rates) > 1:
-        refuse(path, "", f"sections run at {' and '.join(f'{r:g}' for r in sorted(rates))} Hz", "export one rate")
+        refuse(path, "", f"sections run at {' and '.join(f'{r:g}' for r in sorted(rates))} Hz", "export at one rate")
     tables = {id(section): _read(path, lines, delimiter, section, wanted) for section in used}
     frames = np.unique(np.concatenate([frame for frame, _ in tables.values()]))
 
@@ -200,6 +205,7 @@ def _sections(path: Path, lines: Sequence[str], delimiter: str) -> list[_Section
 
 
 def _section(path: Path, lines: Sequence[str], delimiter: str, start: int, end: int) -> _Section | None:
+    """Return the section in lines `start` to `end`. None if it has another layout and is not needed."""
     title = _cells(lines[start], delimiter)
     components = _cells(lines[start + 3], delimiter) if end - start >= _HEADER_ROWS else []
     laid_out = _begins_components(components)
@@ -207,23 +213,23 @@ def _section(path: Path, lines: Sequence[str], delimiter: str, start: int, end: 
         return None
     place = f"line {start + 1}"
     if any(title[1:]) or parse_number(title[0]) is not None:
-        mend = "export again; sections begin with a title such as Segments in a line of its own, after a blank line"
-        refuse(path, place, "here a section's title is missing", mend)
+        mend = "export again; a section begins with a blank line, then a title such as Segments alone in its line"
+        refuse(path, place, "the section's title is missing", mend)
     if end - start < _HEADER_ROWS:
         problem = f"the section {shorten(title[0])!r} ends within its header"
-        refuse(path, place, problem, "export again: title, rate, names, components and units stand above the samples")
+        refuse(path, place, problem, "export again; title, rate, names, components and units must precede the samples")
     rate_row, names, units = (_cells(lines[start + i], delimiter) for i in (1, 2, 4))
     rate = parse_number(rate_row[0])
     if rate is None or not 1 <= rate <= 1e5 or any(rate_row[1:]):
         problem = f"{shorten(delimiter.join(rate_row))!r} is not a rate in Hz"
-        refuse(path, f"line {start + 2}", problem, "export again; the rate stands alone below the title")
+        refuse(path, f"line {start + 2}", problem, "export again; the rate must be alone in the line below the title")
     if not laid_out:
         problem = f"the row of components begins with {shorten(delimiter.join(components[:2]))!r}"
-        mend = "export again; it begins with Frame, Sub Frame, and title, rate and names stand above it"
+        mend = "export again; it must begin with Frame, Sub Frame, below title, rate and names"
         refuse(path, f"line {start + 4}", problem, mend)
     if parse_number(units[0]) is not None:
-        mend = "export again; the units stand between components and samples"
-        refuse(path, f"line {start + 5}", "it holds numbers where the units should stand", mend)
+        mend = "export again; the units must be between components and samples"
+        refuse(path, f"line {start + 5}", "it holds numbers instead of units", mend)
     while components and not components[-1]:
         components.pop()
     width = len(components)
@@ -238,7 +244,7 @@ def _section(path: Path, lines: Sequence[str], delimiter: str, start: int, end: 
 
 
 def _groups(sections: Sequence[_Section]) -> dict[str, list[_Group]]:
-    """All positions in the file by name."""
+    """Return all columns with a position, by name."""
     groups: dict[str, list[_Group]] = {}
     for section in sections:
         for name in dict.fromkeys(section.names[2:]):
@@ -257,7 +263,7 @@ def _wanted(
     path: Path, mapping: Path, source: Source, groups: Mapping[str, list[_Group]], sections: Sequence[_Section]
 ) -> list[_Group]:
     if source.position:
-        mend = 'a Vicon file has bodies and markers by name, write body = "..." there'
+        mend = 'a Vicon file has bodies and markers by name; write body = "..." there'
         refuse(path, "", f"{mapping} gives [{source.role}] by columns", mend)
     found = []
     for name in source.markers or (source.body or "",):
@@ -266,12 +272,12 @@ def _wanted(
         candidates = [g for g in groups[full] if source.section in (None, g.section.title)]
         if not candidates:
             titles = [g.section.title for g in groups[full]]
-            problem = f"{shorten(full)!r} does not stand in a section {shorten(str(source.section))!r}"
-            refuse(path, "", problem, f"mend {mapping}, {suggest(str(source.section), titles).rstrip('?')}")
+            problem = f"{shorten(full)!r} is not in a section {shorten(str(source.section))!r}"
+            refuse(path, "", problem, f"fix {mapping}, {suggest(str(source.section), titles).rstrip('?')}")
         if len(candidates) > 1:
             titles = ", ".join(dict.fromkeys(g.section.title for g in candidates))
             mend = f'add section = "..." to [{source.role}] in {mapping}'
-            refuse(path, "", f"{shorten(full)!r} stands in several sections ({titles})", mend)
+            refuse(path, "", f"{shorten(full)!r} is in several sections ({titles})", mend)
         chosen = candidates[0]
         if chosen.repeated is not None:
             problem = f"{shorten(full)!r} has {chosen.repeated} twice"
@@ -281,7 +287,7 @@ def _wanted(
 
 
 def _check_position(path: Path, name: str, groups: Mapping[str, list[_Group]], sections: Sequence[_Section]) -> None:
-    """Refuse a name that stands over some of a position's components: it is there, and yet no body or marker."""
+    """Refuse a name whose columns lack components of a position: it exists, but is neither a body nor a marker."""
     for section in sections:
         if section.title not in _USED or name in {part for full in groups for part in (full, full.rpartition(":")[2])}:
             continue
@@ -292,13 +298,13 @@ def _check_position(path: Path, name: str, groups: Mapping[str, list[_Group]], s
         ]
         if here:
             problem = f"{shorten(name)!r} has the components {', '.join(shorten(c) for c in here[:8])}"
-            refuse(path, f"line {section.first - 1}", f"{problem}, and no whole position", "export TX, TY, TZ again")
+            refuse(path, f"line {section.first - 1}", f"{problem}, but no complete position", "export TX, TY, TZ too")
 
 
 def _read(
     path: Path, lines: Sequence[str], delimiter: str, section: _Section, wanted: Mapping[str, Sequence[_Group]]
 ) -> tuple[np.ndarray, dict[int, np.ndarray]]:
-    """Frame numbers, and the columns wanted by their place."""
+    """Return the frame numbers, and the wanted columns by their index."""
     columns = sorted(
         {i for groups in wanted.values() for g in groups if g.section is section for i in g.columns.values()}
     )
@@ -311,16 +317,16 @@ def _read(
         frame, sub = (parse_number(cells[i].strip(' "')) if i < len(cells) else None for i in (0, 1))
         if frame is None or sub is None or frame != round(frame) or not 0 <= frame < 2**40:
             problem = f"{shorten(delimiter.join(cells[:2]))!r} is not a frame and a sub-frame"
-            refuse(path, place, problem, "export again, or delete the line if it is no sample")
+            refuse(path, place, problem, "export again, or delete the line if it is not a sample")
         if sub != 0:
             mend = "export at the cameras' rate"
             refuse(path, place, f"section {section.title} has sub-frames, samples between the cameras' frames", mend)
         if frames and frame <= frames[-1]:
             problem = f"frame numbers run back, from {frames[-1]:g} to {frame:g}"
-            refuse(path, place, problem, "export again, one trial a file")
+            refuse(path, place, problem, "export again, one trial per file")
         frames.append(frame)
         if any(cell.strip(' "') for cell in cells[section.width :]):
-            refuse(path, place, "the row has more cells than the header", "export with points in numbers, not commas")
+            refuse(path, place, "the row has more cells than the header", "export with decimal points, not commas")
         if len(cells) < section.width and any(cell.strip(' "') for cell in cells[2:]):
             name = shorten(section.names[len(cells)] or section.components[len(cells)])
             refuse(path, place, f"the row ends before {name!r}", "the file was cut off; copy or export it again")
@@ -330,8 +336,8 @@ def _read(
             value = parse_number(cell) if cell and cell.lower() != "nan" else math.nan
             if value is None or abs(value) > LARGEST:
                 name = f"{shorten(section.names[i])} {section.components[i]}"
-                mend = "leave the cell empty if the sample is missing, and write points in numbers"
-                refuse(path, f"{place}, {name}", f"{shorten(cell)!r} is not a number that can be meant", mend)
+                mend = "leave the cell empty if the sample is missing, and use decimal points"
+                refuse(path, f"{place}, {name}", f"{shorten(cell)!r} is not a number, or is too large", mend)
             row.append(value)
         table.append(row)
     values = np.array(table, float).reshape(len(table), len(columns))
@@ -349,7 +355,7 @@ def _unit(
         shown = ", ".join(sorted(repr(shorten(u)) for u in units))
         names = f"{shorten(group.section.names[group.columns[components[0]]])} {components[0]} to {components[-1]}"
         mend = f'export in {", ".join(known)}, or write {kind} = "..." under [units] in the mapping'
-        refuse(path, f"line {group.section.first}, {names}", f"the unit {shown} is no {kind} that is known", mend)
+        refuse(path, f"line {group.section.first}, {names}", f"the unit {shown} is not a known unit of {kind}", mend)
     return known[unit]
 
 
@@ -376,11 +382,11 @@ def _body(
     name = shorten(group.section.names[next(iter(group.columns.values()))])
     place = f"section {group.section.title}, {name}"
     if len(turns) < len(_ROTATION):
-        refuse(path, place, f"of RX, RY, RZ it has {' and '.join(turns)} alone", "export again")
+        refuse(path, place, f"it has only {' and '.join(turns)} of RX, RY, RZ", "export again")
     rotation, unit = source.rotation, 1.0
     if "RW" in group.columns:
         if rotation not in (None, "quaternion"):
-            refuse(path, place, f"has RW, so it is no {rotation} rotation", 'write rotation = "quaternion"')
+            refuse(path, place, f"it has RW, so its rotation is not {rotation}", 'write rotation = "quaternion"')
         rotation = "quaternion"
         columns = values(group, ("RW", *_ROTATION))
     else:

@@ -1,1 +1,1 @@
-"""An improved simulator for C MuJoCo."""
+"""Export of an improved simulator to C MuJoCo."""

@@ -1,6 +1,6 @@
-"""An improved simulator for C MuJoCo, as a folder: the model, the drivetrain and the residual, with what applies them.
+"""Export of an improved simulator to C MuJoCo, as a folder with the model, the drivetrain and the residual.
 
-The folder runs on NumPy and MuJoCo alone; `residual.py` in it is this package's own, as it is.
+The folder needs only NumPy and MuJoCo. Its `residual.py` is a copy of `residuals/deploy/residual.py`.
 """
 
 from __future__ import annotations
@@ -40,23 +40,23 @@ from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
 CHECK_SECONDS = 5.0
-"""Length of the rollout that goes with a folder."""
+"""Default length of the rollout in the folder, which its self-test repeats (s)."""
 _SOURCE = "residual.py"
 _EXAMPLE = "example.py"
 _HOLD = 0.25
-"""Seconds for which the check's rollout holds a command."""
+"""Time for which this rollout holds each command (s)."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ExportedSimulator:
-    """What `export_simulator` has written.
+    """Result of `export_simulator`.
 
     **Fields**
 
-    - `folder`: where it is.
-    - `deviation`: largest difference from the exported simulator over the rollout that goes with it: of the tracked
-      site (m) and of its body (deg). None: no rollout was made.
-    - `left_out`: fields of the model that MJCF cannot hold to six digits; `parameters.npz` has them.
+    - `folder`: the folder that was written.
+    - `deviation`: largest difference between the simulator in the folder and the exported simulator over the rollout:
+      in position of the tracked site (m) and in orientation of its body (deg). None if no rollout was made.
+    - `left_out`: names of model fields whose values MJCF text cannot hold. `parameters.npz` has them.
     """
 
     folder: Path
@@ -65,7 +65,7 @@ class ExportedSimulator:
 
 
 class ExportedPart(NamedTuple):
-    """A part of a residual: its entry in `simulator.json`, and its arrays by name."""
+    """A part of a residual: its entry in `simulator.json`, and its arrays in `parameters.npz` by name."""
 
     settings: dict[str, Any]
     arrays: dict[str, np.ndarray]
@@ -78,25 +78,27 @@ def export_simulator(
     onnx: bool = False,
     check_seconds: float = CHECK_SECONDS,
 ) -> ExportedSimulator:
-    """Write a simulator, with its actuators, drivetrain and residual, for C MuJoCo into a folder, new or empty.
+    """Export a simulator, with its actuators, drivetrain and residual, to C MuJoCo.
 
     **Arguments**
 
-    - `onnx`: also write each network as `NAME.onnx`, from what it sees to the loads that it pushes with.
-    - `check_seconds`: length of a rollout in double precision that goes with the folder, for its self-test; 0: none.
+    - `folder`: a new or empty folder.
+    - `onnx`: also write each network of the residual as `NAME.onnx`. Its outputs are the loads.
+    - `check_seconds`: length of a rollout in double precision that the folder's self-test repeats (s). If 0, the folder
+      has no rollout.
 
-    **Raises** `InputError` where the folder holds something, the model cannot be written, or a part of the residual is
-    of a kind that cannot be exported.
+    **Raises** `InputError` if the folder is not empty, if the model cannot be written, if the residual is scaled or has
+    a part of a kind that cannot be exported, or if `onnx` is set and the residual has no network.
     """
     augmented = simulator.with_residual(None)
     if augmented.scale is not None:
-        raise InputError("A simulator with a scaled residual cannot be exported; leave the scale out.")
+        raise InputError("A simulator with a scaled residual cannot be exported; make it without the scale.")
     if onnx:
         check_onnx()
     robot, parts = augmented.robot, _parts(augmented)
     networks = [part for part in parts if part.settings["kind"] == "network"]
     if onnx and not networks:
-        raise InputError("--onnx: the simulator has no network; its residual stands as formulas in residual.py.")
+        raise InputError("--onnx: the simulator has no network, only formulas in residual.py; leave the option out.")
     place = new_folder(Path(folder), "export")
     place.mkdir(parents=True, exist_ok=True)
     wanted = improved_model(augmented)
@@ -130,7 +132,7 @@ def export_simulator(
     return ExportedSimulator(place, deviation, left_out)
 
 
-# ---- the residual's parts ----
+# ---- parts of the residual ----
 
 
 def _parts(simulator: AugmentedSimulator) -> list[ExportedPart]:
@@ -139,6 +141,7 @@ def _parts(simulator: AugmentedSimulator) -> list[ExportedPart]:
 
 
 def _flat(model: Residual, params: Any) -> list[tuple[Residual, Any]]:
+    """Return the parts of a residual that may be a sum, with their parameters."""
     if isinstance(model, SumOfResiduals):
         return [each for part, own in zip(model.parts, params, strict=True) for each in _flat(part, own)]
     return [(model, params)]
@@ -149,7 +152,9 @@ def _export_part(simulator: AugmentedSimulator, model: Residual, params: Any) ->
         if isinstance(model, kind):
             return export(simulator, model, jax.device_get(params))
     known = ", ".join(kind.__name__ for kind in _KINDS)
-    raise InputError(f"The residual {model.name} is of a kind that cannot be exported; there are {known}.")
+    raise InputError(
+        f"The residual {model.name} is of a kind that cannot be exported; kinds that can be exported: {known}."
+    )
 
 
 def _network_part(simulator: AugmentedSimulator, model: NetworkResidual, params: Any) -> ExportedPart:
@@ -226,6 +231,7 @@ def _network_onnx(part: ExportedPart) -> bytes:
 
 
 def _settings(simulator: AugmentedSimulator, model: mujoco.MjModel, parts: list[ExportedPart]) -> dict[str, Any]:
+    """Return the content of `simulator.json`."""
     robot, plain = simulator.robot, simulator.simulator
     rest = robot.adapter.rest_command(robot, model)
     commands = [
@@ -266,6 +272,8 @@ def _write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 class _Check(NamedTuple):
+    """Content of `check.npz`: commands, first state, and poses of the tracked site after each control step."""
+
     commands: Float[np.ndarray, "steps commands"]
     qpos: Float[np.ndarray, " nq"]
     qvel: Float[np.ndarray, " nv"]
@@ -274,7 +282,7 @@ class _Check(NamedTuple):
 
 
 def check_commands(robot: RobotDescription, seconds: float) -> Float[np.ndarray, "steps commands"]:
-    """Return random commands over their ranges, each held for a while."""
+    """Return random commands for `seconds` (s), uniform over their ranges. Each command is held for 0.25 s."""
     rng = np.random.default_rng(0)
     steps, hold = (max(round(time / robot.control_timestep), 1) for time in (seconds, _HOLD))
     low, high = np.array(robot.command_ranges).T
@@ -298,10 +306,10 @@ def rollout_in_double(
     qvel: Float[np.ndarray, " nv"],
     commands: Float[np.ndarray, "steps commands"],
 ) -> Float[np.ndarray, "steps nq"]:
-    """Return the generalized positions after each control step, simulated in double precision.
+    """Simulate in double precision, and return the generalized positions after each control step.
 
-    `model` is the simulator's own for C MuJoCo (`improved_model`). The robot has been in the state for a while, under
-    the first command.
+    `model` is the simulator's model for C MuJoCo (`improved_model`). History and drivetrain start as if the robot had
+    been in the first state, under the first command, for a long time.
     """
     with jax.enable_x64(True):
         run = jax.jit(functools.partial(rollout_positions, in_double(simulator, model)))
@@ -314,9 +322,10 @@ def rollout_positions(
     qvel: Float[Array, " nv"],
     commands: Float[Array, "steps commands"],
 ) -> Float[Array, "steps nq"]:
-    """Return the generalized positions after each control step, in the precision of the simulator and its arguments.
+    """Simulate, and return the generalized positions after each control step.
 
-    The robot has been in the state for a while, under the first command. To be jitted, and vmapped over starts.
+    The precision is that of the simulator and its arguments. History and drivetrain start as if the robot had been in
+    the first state, under the first command, for a long time. The function may be jitted, and vmapped over states.
     """
 
     def step(state: RolloutState, command: Array) -> tuple[RolloutState, Array]:
@@ -327,7 +336,7 @@ def rollout_positions(
 
 
 def in_double(simulator: AugmentedSimulator, model: mujoco.MjModel) -> AugmentedSimulator:
-    """Return the simulator in double precision; to be called, and used, in `jax.enable_x64`."""
+    """Return the simulator in double precision. Call it, and use the result, within `jax.enable_x64`."""
 
     def double(tree: Any) -> Any:
         return jax.tree.map(lambda x: jnp.asarray(x, jnp.float64) if np.asarray(x).dtype.kind == "f" else x, tree)
@@ -344,7 +353,7 @@ def _begin_rollout(
     qvel: Float[Array, " nv"],
     command: Float[Array, " commands"],
 ) -> RolloutState:
-    """Return the state of a robot that has been at a place under a command for a while."""
+    """Return the rollout state of a robot that has been in a state, under a command, for a long time."""
     plain = simulator.simulator
     physics = state_at(qpos, qvel)
     features, _ = plain.observe(physics)

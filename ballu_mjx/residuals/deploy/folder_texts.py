@@ -33,7 +33,7 @@ for step in range(round(5 / simulator.control_timestep)):
 
 
 def example_program(name: str) -> str:
-    """Return a program that steps the simulator of the robot called `name`."""
+    """Return an example program that steps the simulator of the robot `name`."""
     return _EXAMPLE_TEXT.format(name=name)
 
 
@@ -45,32 +45,33 @@ def folder_readme(
     onnx: bool,
     checked: bool,
 ) -> str:
-    """Return what the folder holds and how it is used.
+    """Return the README of the folder, which describes its files and their use.
 
     **Arguments**
 
-    - `parts`: settings of the residual's parts, as `simulator.json` has them.
-    - `left_out`: fields of the model that MJCF cannot hold.
-    - `onnx`, `checked`: whether the folder has networks as ONNX, and a rollout to compare with.
+    - `parts`: entries of the residual's parts in `simulator.json`.
+    - `left_out`: names of model fields whose values MJCF text cannot hold.
+    - `onnx`: whether the folder has the networks as ONNX.
+    - `checked`: whether the folder has a rollout for the self-test.
     """
     robot, plain = simulator.robot, simulator.simulator
     names = " + ".join(part["name"] for part in parts) or "none"
     option = plain.mj_model.opt
     lines = [
-        f"# {robot.name}, an improved simulator for C MuJoCo",
+        f"# Improved simulator of {robot.name} for C MuJoCo",
         f"Residual: {names}. Identified actuators: {'no' if simulator.actuators is None else 'yes'}. Drivetrain: "
         f"{'no' if plain.drivetrain is None else 'yes'}.",
-        "The folder needs Python 3.10, NumPy and MuJoCo. It was written for MuJoCo "
-        f"{mujoco.__version__}; the solver of another version may differ in the last digits.",
+        "The folder needs Python 3.10 or newer, NumPy and MuJoCo. It was written with MuJoCo "
+        f"{mujoco.__version__}. The solver of another version may differ in the last digits.",
         "| file | content |\n| --- | --- |\n"
         "| `identified.xml` | the model, with the values of identified actuators and of the residual; numbers have six "
         "digits |\n"
         "| `simulator.json` | names, ranges, time steps, the drivetrain, and the residual's settings |\n"
-        "| `parameters.npz` | the residual's arrays, and the model's fields in all digits |\n"
-        "| `residual.py` | `ImprovedSimulator`, which applies drivetrain and residual |\n"
-        "| `example.py` | a control loop |\n"
-        + ("| `check.npz` | a rollout of the simulator that was exported |\n" if checked else "")
-        + ("| `*.onnx` | the networks, from what they see to the loads that they push with |\n" if onnx else ""),
+        "| `parameters.npz` | the residual's arrays, and the model's fields in full precision |\n"
+        "| `residual.py` | `ImprovedSimulator`, which applies the drivetrain and the residual |\n"
+        "| `example.py` | a control loop with random commands |\n"
+        + ("| `check.npz` | a rollout of the exported simulator, for the self-test |\n" if checked else "")
+        + ("| `*.onnx` | the residual's networks; their outputs are loads |\n" if onnx else ""),
         "```python\n"
         "from residual import ImprovedSimulator\n\n"
         "simulator = ImprovedSimulator(folder)\n"
@@ -79,37 +80,38 @@ def folder_readme(
         "```",
     ]
     if checked:
-        lines.append(
-            "`python residual.py` compares a rollout with the simulator that was exported, in double precision."
-        )
+        lines.append("`python residual.py` compares a rollout with one of the exported simulator, in double precision.")
     ranges = "; ".join(
         f"`{name}` from {low:g} to {high:g}"
         for name, (low, high) in zip(robot.commands, robot.command_ranges, strict=True)
     )
     lines += [
-        f"A control step is {robot.control_timestep:g} s: {plain.substeps} physics steps of {option.timestep:g} s. The "
-        f"solver makes at most {option.iterations} iterations, as in training.",
+        f"A control step lasts {robot.control_timestep:g} s: {plain.substeps} physics steps of {option.timestep:g} s. "
+        f"The solver makes at most {option.iterations} iterations, as in training.",
         f"Commands are in the actuators' own units: {ranges}.",
-        "`ImprovedSimulator(folder, model)` takes a scene of your own that holds the robot, with the same names of "
-        "sites and actuators. It sets `ctrl` of the robot's actuators, and `xfrc_applied` of the bodies and "
-        "`qfrc_applied` of the joints that the residual pushes.",
+        "`ImprovedSimulator(folder, model)` simulates a scene of your own that contains the robot, with the same names "
+        "of sites, joints and actuators. It sets `ctrl` of the robot's actuators. It also sets `xfrc_applied` of the "
+        "bodies and `qfrc_applied` of the joints on which the residual acts.",
     ]
     if left_out:
-        lines.append(f"MJCF cannot hold these fields; `parameters.npz` does: {', '.join(left_out)}.")
+        lines.append(
+            f"MJCF text cannot hold the values of these model fields. `parameters.npz` has them: {', '.join(left_out)}."
+        )
     for part in parts:
         if part["kind"] == "network":
-            seen = "\n".join(f"{i}. {name}" for i, name in enumerate(part["inputs"]))
-            pushed = ", ".join(part["outputs"])
-            frame = f"the heading frame of {robot.tracked}" if part["heading_frame"] else "the world's axes"
-            lines.append(f"## What the network {part['name']} sees")
+            inputs = "\n".join(f"{i}. {name}" for i, name in enumerate(part["inputs"]))
+            outputs = ", ".join(part["outputs"])
+            frame = f"the heading frame of {robot.tracked}" if part["heading_frame"] else "the world frame"
+            lines.append(f"## Input and output of the network {part['name']}")
             lines.append(
                 f"Vectors are in {frame}."
                 + (
-                    f" x and y of positions are from {robot.tracked} now; z is above the floor."
+                    f" x and y of positions are relative to the current position of {robot.tracked}; z is the height "
+                    "above the floor."
                     if part["relative_observation"]
                     else ""
                 )
-                + f" It pushes with: {pushed}."
+                + f" Outputs: {outputs}. Inputs:"
             )
-            lines.append(seen)
+            lines.append(inputs)
     return "\n\n".join(textwrap.dedent(line) for line in lines) + "\n"

@@ -1,11 +1,16 @@
-"""An improved simulator in C MuJoCo: a robot with its identified actuators, its drivetrain and its residual.
+"""Improved simulator in C MuJoCo: a robot with identified actuators, a drivetrain and a residual.
 
-Python 3.10, NumPy and MuJoCo are all it needs. `python -m ballu_mjx export simulator` copies this file into a folder,
-beside the model `identified.xml` and the parameters `simulator.json` and `parameters.npz`. `python residual.py` there
-compares a rollout with that of the simulator that was exported.
+This file needs only Python 3.10 or newer, NumPy and MuJoCo. `python -m ballu_mjx export simulator` copies it into a
+folder, beside the model `identified.xml` and the parameters `simulator.json` and `parameters.npz`. `python residual.py`
+in that folder compares a rollout of this simulator with a rollout of the exported simulator.
 
-One control step, as there: features of the current state; the residual's commands and wrenches by the features and
-commands of the last control steps; the drivetrain, once a physics step; physics steps with the wrenches held.
+A control step has the same order as in the exported simulator:
+
+1. The residual computes its loads from the features and commands of the last control steps. It may also delay or change
+   the command.
+2. In each physics step, the drivetrain turns the command into the actuators' `ctrl`, and MuJoCo advances the state. The
+   loads are constant over the control step.
+3. The features of the new state are added to the history.
 """
 
 from __future__ import annotations
@@ -28,24 +33,32 @@ MODEL_FILE, SETTINGS_FILE, PARAMETERS_FILE, CHECK_FILE = (
     "check.npz",
 )
 HISTORY = 3
-"""Control steps whose features and commands the residual sees."""
+"""Number of control steps in the history of features and commands that the residual takes as input."""
 POSITION, VELOCITY, EULER, FIRST_POINT = slice(0, 3), slice(3, 6), slice(6, 9), 9
-"""Where `features` has what of the tracked body, and where the points begin."""
+"""Layout of `features`: position, velocity and Euler angles of the tracked body, and the index of the first point."""
 YAW = 8
-_SLOW = 1e-3
-"""m/s; keeps the speed differentiable at rest."""
-_JUST = 1e-3
-"""Of a control step: a delay of just so many physics steps is over when they are."""
+"""Index of the tracked body's yaw in `features`."""
+_SPEED_AT_REST = 1e-3
+"""Smoothed speed of a body at rest (m/s). Training needs a speed that is differentiable at rest."""
+_ROUNDING = 1e-3
+"""Tolerance for rounding errors of a delay (control steps). Without it, a command whose delay is a whole number of
+physics steps could arrive one physics step late."""
 
 
-# ---- what the residual sees ----
+# ---- inputs of the residual ----
 
 
 def features(model: mujoco.MjModel, data: mujoco.MjData, sites: np.ndarray) -> np.ndarray:
-    """Return what motion capture sees of a state, in the world frame: m, m/s, rad.
+    """Return the features of a state: the quantities that motion capture measures, in the world frame.
 
-    Position, velocity, roll, pitch and yaw (intrinsic z-y-x) of the first of `sites`, then position and velocity of
-    each other one. Kinematics in `data` are computed anew.
+    The function recomputes the kinematics in `data` from `qpos` and `qvel`.
+
+    **Arguments**
+
+    - `sites`: ids of the tracked site and then of the points.
+
+    **Returns** position (m) and velocity (m/s) of the tracked site, roll, pitch and yaw (rad; intrinsic z-y-x) of its
+    body, then position and velocity of each point. The array has 9 + 6 * points numbers.
     """
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
@@ -60,7 +73,7 @@ def features(model: mujoco.MjModel, data: mujoco.MjData, sites: np.ndarray) -> n
 
 
 def euler_angles(quaternion: np.ndarray) -> np.ndarray:
-    """Return roll, pitch and yaw (rad; intrinsic z-y-x) of a unit quaternion (w, x, y, z)."""
+    """Return roll, pitch and yaw (rad; intrinsic z-y-x) of a unit quaternion (w, x, y, z; body to world)."""
     w, x, y, z = quaternion
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
@@ -69,13 +82,20 @@ def euler_angles(quaternion: np.ndarray) -> np.ndarray:
 
 
 def heading_rotation(yaw: float) -> np.ndarray:
-    """Return the rotation about z that takes vectors in the tracked body's heading frame to the world."""
+    """Return the rotation matrix, heading frame of the tracked body to world frame, for a yaw angle (rad)."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def network_input(history: np.ndarray, commands: np.ndarray, part: Mapping[str, Any]) -> np.ndarray:
-    """Return what a network sees, in the order of its `inputs` in `simulator.json`."""
+    """Return the input of a network; the list `inputs` of its entry in `simulator.json` names each number.
+
+    **Arguments**
+
+    - `history`: features of the last `HISTORY` control steps, the current one last.
+    - `commands`: commands of the last control steps and the coming one, `HISTORY` in all.
+    - `part`: the network's entry in `simulator.json`.
+    """
     now = history[-1]
     origin = now[POSITION] * (np.array([1.0, 1.0, 0.0]) if part["relative_observation"] else 0.0)
     heading = now[YAW] if part["heading_frame"] else 0.0
@@ -93,8 +113,11 @@ def network_input(history: np.ndarray, commands: np.ndarray, part: Mapping[str, 
 
 
 def body_motion(history: np.ndarray, control_timestep: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the tracked body's rotation (body to world), and velocity (m/s) and angular velocity (rad/s) along its
-    axes in the middle of the coming control step, extrapolated from the last ones."""
+    """Return the tracked body's rotation matrix (body to world), velocity (m/s) and angular velocity (rad/s).
+
+    The rotation is the current one. Both velocities are in the body frame. They are extrapolated from the last features
+    to the middle of the coming control step, over which forces are held.
+    """
     earlier, before, now = (_rotation(seen[EULER]) for seen in history[-3:])
     velocity = now.T @ (1.5 * history[-1, VELOCITY] - 0.5 * history[-2, VELOCITY])
     turned = 2 * _turn(before.T @ now) - _turn(earlier.T @ before)
@@ -102,50 +125,67 @@ def body_motion(history: np.ndarray, control_timestep: float) -> tuple[np.ndarra
 
 
 def _rotation(euler: np.ndarray) -> np.ndarray:
+    """Return the rotation matrix (body to world) of roll, pitch and yaw (rad; intrinsic z-y-x)."""
     roll, pitch, yaw = euler
     cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
     return heading_rotation(yaw) @ np.array([[cp, sp * sr, sp * cr], [0.0, cr, -sr], [-sp, cp * sr, cp * cr]])
 
 
 def _turn(matrix: np.ndarray) -> np.ndarray:
-    """Return the rotation vector (rad) of a small rotation, to second order."""
+    """Return the rotation vector (rad) of a small rotation, accurate to second order."""
     return np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2
 
 
-# ---- the residual's parts ----
+# ---- parts of the residual ----
 
 
 class Action(NamedTuple):
-    """What a part does over a control step."""
+    """Loads of a part of the residual, constant over a control step."""
 
     wrench: np.ndarray
-    """Forces and torques (N, N m; world), a row each: on the tracked body, then at the points where there are more."""
+    """Wrenches, (1 or 1 + points, 6): force (N) and torque (N m) in the world frame. The first row acts at the tracked
+    body's centre of mass. Further rows act at the points, in order."""
     joint_force: np.ndarray | float = 0.0
-    """Forces and torques (N, N m) along the part's `joints`."""
+    """Generalized forces along the part's `joints` (N for slides, N m for hinges)."""
     command_change: np.ndarray | float = 0.0
-    """What is added to the command, in the actuators' own units."""
+    """Change that is added to the command (the actuators' own units)."""
 
 
 class Part:
-    """A part of the residual. This one does nothing."""
+    """Base class of the residual's parts. It has no effect."""
 
     joints: Sequence[str] = ()
-    """Joints that it acts along."""
+    """Names of the joints along which the part's generalized forces act."""
 
     def command(self, commands: np.ndarray) -> np.ndarray:
-        """Return the command, as it is or late, for equal parts of the control step."""
+        """Return the command for each of equal parts of the coming control step, (parts, commands).
+
+        A part of the residual with a delay returns older commands. The base class returns the coming command for the
+        whole control step.
+
+        **Arguments**
+
+        - `commands`: commands of the last control steps and the coming one, `HISTORY` in all.
+        """
         return commands[-1:]
 
     def act(self, history: np.ndarray, commands: np.ndarray) -> Action:
-        """Return what it does over the coming control step."""
+        """Return the loads over the coming control step.
+
+        **Arguments**
+
+        - `history`: features of the last `HISTORY` control steps, the current one last.
+        - `commands`: commands of the last control steps and the coming one, `HISTORY` in all.
+        """
         del history, commands
         return Action(np.zeros((1, 6)))
 
 
 class NetworkPart(Part):
-    """Forces, torques or changes of the command by a neural network; `part` is its entry in `simulator.json`."""
+    """Neural network that computes forces, torques or changes of the command."""
 
     def __init__(self, part: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+        """Build the network from its entry `part` in `simulator.json` and its `arrays` in `parameters.npz`."""
         self._part = part
         self._mean, self._std, self._clip = (arrays[name] for name in ("mean", "std", "observation_clip"))
         count = sum(name.startswith("kernel_") for name in arrays)
@@ -154,7 +194,7 @@ class NetworkPart(Part):
         self.joints = part["joints"]
 
     def act(self, history: np.ndarray, commands: np.ndarray) -> Action:
-        """Return the network's loads, where they act."""
+        """Return the network's loads; forces and torques on bodies are in the world frame."""
         forces, loads = self._part["forces"], self.loads(network_input(history, commands, self._part))
         if forces == "joints":
             return Action(np.zeros((1, 6)), joint_force=loads)
@@ -166,7 +206,11 @@ class NetworkPart(Part):
         return Action(vectors.reshape(1, 6) if forces == "wrench" else np.pad(vectors, [(0, 0), (0, 3)]))
 
     def loads(self, seen: np.ndarray) -> np.ndarray:
-        """Return the loads (N, N m, commands' units), in the frame of what the network sees."""
+        """Return the loads (N, N m, commands' units) for an input of the network.
+
+        Forces and torques on bodies are in the frame of the input: the heading frame, or the world frame if the entry
+        in `simulator.json` has `heading_frame` false.
+        """
         x = np.clip((seen - self._mean) / self._std, -self._clip, self._clip)
         for number, (kernel, bias) in enumerate(self._layers):
             x = x @ kernel + bias
@@ -177,13 +221,17 @@ class NetworkPart(Part):
 
 
 def _swish(x: np.ndarray) -> np.ndarray:
-    return x * (1 + np.tanh(x / 2)) / 2  # without overflow
+    return x * (1 + np.tanh(x / 2)) / 2  # This form does not overflow.
 
 
 class AerodynamicPart(Part):
-    """Drag of the tracked body, and late commands; its mass, inertia, centre and lift stand in the model."""
+    """Drag on the tracked body, and a delay of the commands.
+
+    The body's identified mass, inertia, centre of mass and lift are part of the model `identified.xml`.
+    """
 
     def __init__(self, part: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+        """Read drag coefficients and delay from the entry `part` in `simulator.json`."""
         del arrays
         self._control_timestep = part["control_timestep"]
         self._linear, self._quadratic, self._turning = (
@@ -191,104 +239,124 @@ class AerodynamicPart(Part):
         )
         longest = (HISTORY - 1) * self._control_timestep
         late = min(max(part["parameters"]["delay"], 0.0), longest) - part["timestep"] * np.arange(part["substeps"])
-        self._age = np.maximum(np.ceil(late / self._control_timestep - _JUST), 0).astype(int)
+        self._age = np.maximum(np.ceil(late / self._control_timestep - _ROUNDING), 0).astype(int)
 
     def command(self, commands: np.ndarray) -> np.ndarray:
-        """Return what has arrived by the start of each physics step."""
+        """Return the command that has arrived at the start of each physics step, (physics steps, commands)."""
         return commands[HISTORY - 1 - self._age]
 
     def act(self, history: np.ndarray, commands: np.ndarray) -> Action:
-        """Return the drag (N, N m; world) in still air."""
+        """Return the wrench of the drag (N, N m; world frame) in still air."""
         del commands
         now, velocity, rate = body_motion(history, self._control_timestep)
-        speed = np.sqrt(np.sum(velocity**2) + _SLOW**2)
+        speed = np.sqrt(np.sum(velocity**2) + _SPEED_AT_REST**2)
         force = -(self._linear + self._quadratic * speed) * velocity
         return Action(np.concatenate([now @ force, now @ (-self._turning * rate)])[None])
 
 
 class FluidPart(Part):
-    """Force and torque on the tracked body as polynomials of its motion, in its own axes."""
+    """Force and torque on the tracked body as a linear combination of terms.
+
+    A term is a product of velocities and components of the direction of gravity, in the body frame, times a power of
+    the speed. Coefficients have SI units.
+    """
 
     _NAMES = ("vx", "vy", "vz", "wx", "wy", "wz", "gx", "gy", "gz")
 
     def __init__(self, part: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+        """Read terms from the entry `part` in `simulator.json`, and coefficients (terms, 6) from `arrays`."""
         self._control_timestep, self._down = part["control_timestep"], np.array(part["down"])
         self._factors = [[self._NAMES.index(name) for name in term["factors"]] for term in part["terms"]]
         self._power = np.array([term["power_of_speed"] for term in part["terms"]])
         self._coefficients = arrays["coefficients"]
 
     def act(self, history: np.ndarray, commands: np.ndarray) -> Action:
-        """Return the wrench (N, N m; world)."""
+        """Return the wrench (N, N m; world frame)."""
         del commands
         frame, velocity, rate = body_motion(history, self._control_timestep)
-        speed = np.sqrt(np.sum(velocity**2) + _SLOW**2)
+        speed = np.sqrt(np.sum(velocity**2) + _SPEED_AT_REST**2)
         components = np.concatenate([velocity, rate, frame.T @ self._down])
         terms = np.array([np.prod(components[factors]) for factors in self._factors]) * speed**self._power
-        own = terms @ self._coefficients
-        return Action(np.concatenate([frame @ own[:3], frame @ own[3:]])[None])
+        wrench = terms @ self._coefficients
+        return Action(np.concatenate([frame @ wrench[:3], frame @ wrench[3:]])[None])
 
 
 _PARTS = {"network": NetworkPart, "aerodynamic": AerodynamicPart, "fluid": FluidPart}
 
 
-# ---- the drivetrain ----
+# ---- drivetrain ----
 
 
 class Drivetrain:
-    """What a command meets on its way to its actuator: delay, scale and offset, rate limit, lag, and backlash."""
+    """Drivetrain between commands and actuators: delay, scale and offset, rate limit, lag, and backlash, in this order.
+
+    Commands and `ctrl` are in the actuators' own units.
+    """
 
     def __init__(self, settings: Mapping[str, Any], timestep: float) -> None:
+        """Build the drivetrain from `drivetrain` in `simulator.json`, for physics steps of `timestep` (s)."""
         self._scale, self._offset, self._delay, self._backlash, self._lag = (
             np.array(settings[name], float) for name in ("scale", "offset", "delay", "backlash", "lag")
         )
-        # JSON has no infinity: null is no limit.
-        self._most = timestep * np.array([np.inf if each is None else each for each in settings["rate_limit"]])
+        # JSON has no infinity. null means no rate limit.
+        self._max_change = timestep * np.array([np.inf if each is None else each for each in settings["rate_limit"]])
         self._timestep, self._slots = timestep, int(settings["slots"])
         self.reset(np.zeros(len(self._scale)))
 
     def reset(self, command: np.ndarray) -> None:
-        """Start at rest under a command, the backlash in its middle."""
+        """Set the state after a long time under the same command, with the backlash centred."""
         self._sent = np.tile(command, (self._slots, 1))
-        self._limited = self._lagged = self._played = self._scale * command + self._offset
+        self._limited = self._lagged = self._ctrl = self._scale * command + self._offset
 
     def step(self, command: np.ndarray) -> np.ndarray:
-        """Advance by one physics step; return the actuators' `ctrl`."""
+        """Advance by one physics step under a command, and return the actuators' `ctrl`."""
         self._sent = np.concatenate([command[None], self._sent[:-1]])
         arrived = self._scale * self._delayed() + self._offset
-        self._limited = np.clip(arrived, self._limited - self._most, self._limited + self._most)
+        self._limited = np.clip(arrived, self._limited - self._max_change, self._limited + self._max_change)
         lag = self._lag / (self._lag + self._timestep)
         self._lagged = self._limited + (self._lagged - self._limited) * lag
         half = self._backlash / 2
-        self._played = np.clip(self._played, self._lagged - half, self._lagged + half)
-        return self._played
+        self._ctrl = np.clip(self._ctrl, self._lagged - half, self._lagged + half)
+        return self._ctrl
 
     def _delayed(self) -> np.ndarray:
+        """Return the delayed commands, linearly interpolated between physics steps."""
         last = self._slots - 1
-        late = np.clip(self._delay / self._timestep, 0.0, last)
-        whole = np.minimum(np.floor(late), last - 1).astype(int)
-        share, columns = late - whole, np.arange(len(late))
-        return (1 - share) * self._sent[whole, columns] + share * self._sent[whole + 1, columns]
+        steps = np.clip(self._delay / self._timestep, 0.0, last)
+        whole = np.minimum(np.floor(steps), last - 1).astype(int)
+        fraction, columns = steps - whole, np.arange(len(steps))
+        return (1 - fraction) * self._sent[whole, columns] + fraction * self._sent[whole + 1, columns]
 
 
-# ---- the simulator ----
+# ---- simulator ----
 
 
 class ImprovedSimulator:
-    """The improved simulator of a folder, control step by control step.
+    """Improved simulator of an exported folder, which advances by control steps.
 
-    `model` and `data` are MuJoCo's; `command` is the command of the last control step. Commands are in the actuators'
-    own units, in the order of `commands`; the residual and the drivetrain act on them and on the robot's bodies.
+    `model` and `data` are the `mujoco.MjModel` and `mujoco.MjData` of the simulation. `settings` is the content of
+    `simulator.json`. `command` is the command of the last control step. Commands are in the actuators' own units, in
+    the order of `commands`.
 
-    **Arguments**
-
-    - `folder`: with `identified.xml`, `simulator.json` and `parameters.npz`.
-    - `model`: a model of your own that holds the robot, with sites and actuators of the same names; None: the folder's.
-      A model of your own must have the identified values: build it from `identified.xml`.
-
-    **Raises** `ValueError` where the folder is of another format, or the model does not have the robot.
+    ```python
+    simulator = ImprovedSimulator(folder)
+    simulator.reset(qpos, qvel)
+    data = simulator.step(command)
+    ```
     """
 
     def __init__(self, folder: Path | str, model: mujoco.MjModel | None = None) -> None:
+        """Load the simulator and reset it to its initial state.
+
+        **Arguments**
+
+        - `folder`: folder with `identified.xml`, `simulator.json` and `parameters.npz`.
+        - `model`: a scene of your own that contains the robot, with the same names of sites, joints and actuators.
+          Build it from `identified.xml`, so that it has the identified values. If None, the folder's model.
+
+        **Raises** `ValueError` if the folder has another format, if the model lacks a site, joint or actuator of the
+        robot, or if it has another time step.
+        """
         folder = Path(folder)
         self.settings: dict[str, Any] = json.loads((folder / SETTINGS_FILE).read_text(encoding="utf-8"))
         if self.settings.get("format") != FORMAT:
@@ -299,50 +367,59 @@ class ImprovedSimulator:
         self.data = mujoco.MjData(self.model)
         settings = self.settings
         self.commands = tuple(command["name"] for command in settings["commands"])
-        """Names of the commands."""
+        """Names of the commands, in order."""
         self.names = (settings["tracked"], *settings["points"])
-        """Sites that are observed, the tracked one first."""
+        """Names of the observed sites: the tracked site, then the points."""
         self.control_timestep: float = settings["control_timestep"]
-        """Seconds between two commands."""
+        """Duration of a control step (s)."""
         self.substeps: int = settings["substeps"]
-        """Physics steps in a control step."""
+        """Number of physics steps in a control step."""
         if not np.isclose(self.model.opt.timestep * self.substeps, self.control_timestep):
-            raise ValueError(f"The model's time step must be {self.control_timestep / self.substeps:g} s.")
+            raise ValueError(
+                f"The model's time step is {self.model.opt.timestep:g} s, but the robot needs "
+                f"{self.control_timestep / self.substeps:g} s; set `timestep` in the model's `option`."
+            )
         self._sites = self._find(mujoco.mjtObj.mjOBJ_SITE, self.names)
         self._bodies = self.model.site_bodyid[self._sites]
         actuators = [command["actuator"] for command in settings["commands"]]
         self._actuators = self._find(mujoco.mjtObj.mjOBJ_ACTUATOR, actuators)
         self.rest = np.array([command["rest"] for command in settings["commands"]], float)
-        """Commands of a robot at rest."""
-        own = [
+        """Commands of the robot at rest."""
+        part_arrays = [
             {name.partition("/")[2]: value for name, value in arrays.items() if name.startswith(f"part_{number}/")}
             for number in range(len(settings["residual"]))
         ]
-        self.residual = [_PARTS[p["kind"]](p, a) for p, a in zip(settings["residual"], own, strict=True)]
-        """The residual's parts, which act together."""
+        self.residual = [_PARTS[p["kind"]](p, a) for p, a in zip(settings["residual"], part_arrays, strict=True)]
+        """Parts of the residual. Their loads add up."""
         drivetrain, timestep = settings["drivetrain"], float(self.model.opt.timestep)
         self.drivetrain = None if drivetrain is None else Drivetrain(drivetrain, timestep)
-        """None where commands arrive unchanged."""
-        self._places = [
+        """Drivetrain between commands and actuators. None if commands arrive unchanged."""
+        self._dofs = [
             self.model.jnt_dofadr[self._find(mujoco.mjtObj.mjOBJ_JOINT, part.joints)] if len(part.joints) else []
             for part in self.residual
         ]
         self._ranges = np.array([[command["low"], command["high"]] for command in settings["commands"]]).T
         self.wrench = np.zeros((1, 6))
-        """Force (N) and torque (N m, world) of the last control step: on the tracked body, then at the points."""
+        """Residual wrenches of the last control step, (1 or 1 + points, 6): force (N) and torque (N m) in the world
+        frame. The first row acts at the tracked body's centre of mass. Further rows act at the points."""
         self.joint_force = np.zeros(self.model.nv)
-        """Generalized forces (N, N m) of the last control step."""
+        """Residual generalized forces of the last control step, (nv,) (N, N m)."""
         self.reset()
 
     def reset(
         self, qpos: np.ndarray | None = None, qvel: np.ndarray | None = None, command: np.ndarray | None = None
     ) -> None:
-        """Start at a state that the robot has been in for a while.
+        """Reset the simulation to a state.
+
+        The history and the drivetrain are reset as if the robot had been in this state, under this command, for a long
+        time.
 
         **Arguments**
 
-        - `qpos`, `qvel`: generalized positions and velocities; None: where the exported simulator starts, at rest.
-        - `command`: what has been commanded; None: the commands of a robot at rest.
+        - `qpos`: generalized positions, (nq,). If None, the initial pose of the exported simulator. A model of your own
+          with another `nq` then starts in its `qpos0`.
+        - `qvel`: generalized velocities, (nv,). If None, 0.
+        - `command`: constant command before the reset (the actuators' own units). If None, that of the robot at rest.
         """
         mujoco.mj_resetData(self.model, self.data)
         start = self.settings["initial_qpos"]
@@ -358,17 +435,20 @@ class ImprovedSimulator:
             self.drivetrain.reset(self.command)
 
     def features(self) -> np.ndarray:
-        """Return what motion capture sees of the current state; see the function of the same name."""
+        """Return the features of the current state; see the function `features` of this module."""
         return features(self.model, self.data, self._sites)
 
     def step(self, command: np.ndarray) -> mujoco.MjData:
-        """Advance by a control step under a command; returns `data`."""
+        """Advance by one control step under a command, (commands,), and return `data`."""
         for _ in self.substep(command):
             pass
         return self.data
 
     def substep(self, command: np.ndarray):  # noqa: ANN201
-        """Advance by a control step under a command; yields `data` after each of its physics steps."""
+        """Advance by one control step under a command, and yield `data` after each physics step.
+
+        Exhaust the generator before the next command, because the history is updated after the last physics step.
+        """
         self.command = np.array(command, float)
         commands = np.concatenate([self._earlier, self.command[None]])
         sent = self.command[None]
@@ -378,9 +458,9 @@ class ImprovedSimulator:
             actions = [part.act(self._history, commands) for part in self.residual]
             self.wrench = np.zeros((max(len(action.wrench) for action in actions), 6))
             self.joint_force[:] = 0.0
-            for places, action in zip(self._places, actions, strict=True):
+            for dofs, action in zip(self._dofs, actions, strict=True):
                 self.wrench[: len(action.wrench)] += action.wrench
-                self.joint_force[places] += action.joint_force
+                self.joint_force[dofs] += action.joint_force
             change = sum(action.command_change for action in actions)
             if np.any(change):
                 sent = np.clip(sent + change, *self._ranges)
@@ -391,12 +471,13 @@ class ImprovedSimulator:
         self._history = np.concatenate([self._history[1:], self.features()[None]])
 
     def _physics_step(self, ctrl: np.ndarray) -> None:
+        """Advance by one physics step under the actuators' `ctrl` and the residual's loads."""
         model, data = self.model, self.data
         data.ctrl[self._actuators] = ctrl
         data.xfrc_applied[self._bodies] = 0.0
-        for places in self._places:
-            data.qfrc_applied[places] = self.joint_force[places]
-        if len(self.wrench) > 1:  # where the points are now decides on the torques
+        for dofs in self._dofs:
+            data.qfrc_applied[dofs] = self.joint_force[dofs]
+        if len(self.wrench) > 1:  # The torques of forces at points depend on the current positions of the points.
             mujoco.mj_kinematics(model, data)
         for number, (wrench, site, body) in enumerate(zip(self.wrench, self._sites, self._bodies, strict=False)):
             data.xfrc_applied[body] += wrench
@@ -405,14 +486,21 @@ class ImprovedSimulator:
         mujoco.mj_step(model, data)
 
     def _find(self, kind: mujoco.mjtObj, names: Any) -> np.ndarray:
+        """Return the ids of objects of the model. **Raises** `ValueError` if one is missing."""
         found = np.array([mujoco.mj_name2id(self.model, kind, name) for name in names])
         if (found < 0).any():
-            raise ValueError(f"The model has no {list(names)[int(np.argmin(found))]!r}, which the robot needs.")
+            raise ValueError(
+                f"The model has no site, joint or actuator {list(names)[int(np.argmin(found))]!r}, which the robot "
+                "needs; build your model from identified.xml."
+            )
         return found
 
 
 def _load_model(folder: Path, arrays: Mapping[str, np.ndarray]) -> mujoco.MjModel:
-    """Return the model; fields of which MJCF's text holds fewer digits come from the arrays."""
+    """Return the folder's model in full precision.
+
+    Numbers in `identified.xml` have six digits. `arrays` hold the exact values of fields that need more.
+    """
     model = mujoco.MjModel.from_xml_path(str(folder / MODEL_FILE))
     for name, value in arrays.items():
         owner, _, field = name.partition("/")
@@ -425,12 +513,15 @@ def _load_model(folder: Path, arrays: Mapping[str, np.ndarray]) -> mujoco.MjMode
     return model
 
 
-# ---- the check ----
+# ---- self-test ----
 
 
 def deviations(folder: Path | str) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return how far this simulator is from the exported one after each control step of a rollout that came with the
-    folder: of the tracked site (m) and of its body (deg); and the seconds that a control step takes here."""
+    """Compare this simulator with the exported simulator over the rollout in the folder's `check.npz`.
+
+    **Returns** the difference in position of the tracked site (m) and in orientation of its body (deg) after each
+    control step, and the mean time that the computation of a control step takes on this computer (s).
+    """
     simulator = ImprovedSimulator(folder)
     with np.load(Path(folder) / CHECK_FILE, allow_pickle=False) as archive:
         commands, qpos, qvel, position, quaternion = (
@@ -442,7 +533,7 @@ def deviations(folder: Path | str) -> tuple[np.ndarray, np.ndarray, float]:
     for command, place, turn in zip(commands, position, quaternion, strict=True):
         data = simulator.step(command)
         distances.append(np.linalg.norm(data.site(site).xpos - place))
-        # By the sine of half the angle: the cosine has no digits left for small ones.
+        # The sine of half the angle is accurate for small angles. The cosine is not.
         product = np.zeros(4)
         mujoco.mju_mulQuat(product, turn * [1, -1, -1, -1], data.xquat[simulator._bodies[0]])
         angles.append(2 * np.rad2deg(np.arcsin(min(np.linalg.norm(product[1:]), 1.0))))
@@ -450,17 +541,20 @@ def deviations(folder: Path | str) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def self_test(folder: Path | str) -> int:
-    """Compare a rollout with the exported simulator's, and print the differences; returns 0 where they are small."""
+    """Compare a rollout with one of the exported simulator and print the differences.
+
+    **Returns** 0 if all differences are below 1 mm and 0.1 deg, and otherwise 1: the exit status of the program.
+    """
     distances, angles, seconds = deviations(folder)
     step = json.loads((Path(folder) / SETTINGS_FILE).read_text(encoding="utf-8"))["control_timestep"]
-    print("Difference from the simulator that was exported, largest so far:")
+    print("Largest difference from the exported simulator:")
     for number in sorted({max(round(after / step), 1) for after in (0.5, 1, 2, 5)} | {len(distances)}):
         if number <= len(distances):
             largest = 1000 * distances[:number].max(), angles[:number].max()
-            print(f"  after {number * step:5.2f} s  {largest[0]:9.4f} mm  {largest[1]:9.5f} deg")
+            print(f"  up to {number * step:5.2f} s  {largest[0]:9.4f} mm  {largest[1]:9.5f} deg")
     print(f"A control step of {1000 * step:g} ms takes {1000 * seconds:.2f} ms here.")
     good = distances.max() < 1e-3 and angles.max() < 0.1
-    print("Passed." if good else "FAILED: the differences are above 1 mm or 0.1 deg.")
+    print("Passed." if good else "FAILED: a difference is 1 mm or 0.1 deg or more.")
     return 0 if good else 1
 
 

@@ -1,18 +1,19 @@
 # %% [markdown]
-# # A real double pendulum: friction, motors and delay from recordings
+# # Identification of a real double pendulum: friction, motors and delay
 #
 # The data are public: `dfki-ric-underactuated-lab/double_pendulum` on GitHub, commit `1e8544e`, BSD-3-Clause; Wiebe et
 # al., open-source dual-purpose acrobot and pendubot platform, IEEE RAM 2023. We use the ten recordings of design C.1 in
-# `data/experiment_records/design_C.1/sys_id/20230629`. `--data` is a folder with these as recordings of the project's
-# format (`docs/data.md`), named `sysid-20230629-HHMMSS.csv.gz`. Columns `shoulder`, `elbow` are `pos_meas1`,
-# `pos_meas2` (rad); `command_shoulder`, `command_elbow` are `tau_con / 20 + 0.5`. Places of `middle` and `tip` follow
-# by forward kinematics.
+# `data/experiment_records/design_C.1/sys_id/20230629`. `--data` is a folder with these as recordings in the project's
+# format (`docs/data.md`), named `sysid-20230629-HHMMSS.csv.gz`. The columns `shoulder` and `elbow` are `pos_meas1` and
+# `pos_meas2` (rad). The columns `command_shoulder` and `command_elbow` are `tau_con / 20 + 0.5`. The positions of
+# `middle` and `tip` are computed by forward kinematics.
 #
-# Masses, lengths and inertias of the model are the published ones. Motors may be stronger or weaker than they say. Six
-# recordings train, two chose what is declared and show whether identification helps (validation), two are the test. The
-# published friction is replayed beside.
+# The model has the published masses, lengths and inertias. The strength of the motors is identified, because it may
+# differ from the nominal one. Six recordings are for training. Two are for validation: they chose the declared
+# parameters, and they show whether identification helps. Two are for the test. For comparison, the published friction
+# is replayed, too.
 #
-# `python experiments/real/double_pendulum/double_pendulum.py --data FOLDER`; `--quick` shows that it works.
+# Run `python experiments/real/double_pendulum/double_pendulum.py --data FOLDER`. `--quick` is a short trial run.
 
 # %%
 from __future__ import annotations
@@ -41,27 +42,28 @@ TRAINING = ("143339", "143524", "143601", "143704", "144115", "154220")
 VALIDATION = ("143747", "143906")
 TEST = ("144003", "154548")
 SAMPLING = SamplingConfig(sample_timestep=0.02, angle_noise=np.deg2rad(0.1), position_window=0.03, rate_window=0.05)
-"""Encoders see far less than 0.1 deg of noise; what the gears hide is more."""
+"""The assumed angle noise of 0.1 deg is far above the encoders' noise, because the gears hide larger errors."""
 PUBLISHED = {
     "shoulder_frictionloss": 0.16 * np.pi / 2,
     "elbow_frictionloss": 0.12 * np.pi / 2,
     "shoulder_damping": 0.001,
     "elbow_damping": 0.001,
 }
-"""Of the data's authors, whose Coulomb friction is cf atan(100 v)."""
+"""Friction of the data's authors. Their model of Coulomb friction is cf atan(100 v)."""
 
 
 def load(data: Path, names: tuple[str, ...]) -> list[MeasuredMotion]:
-    """Read recordings by the time in their names."""
+    """Read and measure recordings, given the times in their names."""
     return read([data / f"sysid-20230629-{name}.csv.gz" for name in names])
 
 
 def load_swing_ups(data: Path) -> list[MeasuredMotion]:
-    """Read the swing-ups of the acrobot under the controller `ilqr_tvlqr_lqr`, if they are there."""
+    """Read and measure the swing-ups of the acrobot under the controller `ilqr_tvlqr_lqr`, if there are any."""
     return read(sorted(data.glob("acrobot-ilqr_tvlqr_lqr-experiment*.csv.gz")))
 
 
 def read(paths: list[Path]) -> list[MeasuredMotion]:
+    """Read recordings, and compute their measured motions."""
     robot = read_description(FOLDER / "double_pendulum.robot.json")
     return [measure(read_recording(path, robot), robot, robot.load_model(), SAMPLING) for path in paths]
 
@@ -81,14 +83,17 @@ def identify(data: Path, *, quick: bool) -> RobotFit:
 
 
 def row(name: str, found: HeldOut, motions: int) -> str:
-    """Median absolute errors of both joints at the windows' end, and of each recording."""
+    """Return a table row with the median absolute errors (deg) of both joints at the end of the windows.
+
+    The first cell is over all recordings, the others are for each one.
+    """
     each = [np.median(np.abs(found.errors[found.motion == number, -1, :2]), axis=0) for number in range(motions)]
     cells = [np.rad2deg(found.final_median[:2]), *map(np.rad2deg, each)]
     return f"| {name} | " + " | ".join(f"{q1:.2f} / {q2:.2f}" for q1, q2 in cells) + " |"
 
 
 def tip_errors(found: HeldOut, motions: list[MeasuredMotion], seconds: float, interval: float) -> np.ndarray:
-    """Distances (m) between simulated and recorded tip at the windows' end; inf where a simulation diverged."""
+    """Return the distance (m) between simulated and recorded tip at the end of each window; infinite if it diverged."""
     windows = cut_windows(motions, seconds, interval)
     ends = zip(windows.motion, windows.first + windows.samples - 1, strict=True)
     recorded = np.array([motions[motion].qpos[sample] for motion, sample in ends])
@@ -97,7 +102,7 @@ def tip_errors(found: HeldOut, motions: list[MeasuredMotion], seconds: float, in
 
 
 def tip(angles: np.ndarray) -> np.ndarray:
-    """Place of the tip (m) in the plane of motion; angles (..., 2) in rad."""
+    """Return the position of the tip (m) in the plane of motion, from the joint angles (rad, shape (..., 2))."""
     upper, lower = angles[..., 0], angles.sum(axis=-1)
     return np.stack([0.2 * np.sin(upper) + 0.3 * np.sin(lower), -0.2 * np.cos(upper) - 0.3 * np.cos(lower)], axis=-1)
 

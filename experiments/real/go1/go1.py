@@ -1,16 +1,18 @@
 # %% [markdown]
-# # A real motor: identified with three loads, tested with a fourth
+# # Identification of a real motor with three payloads, and test with a fourth
 #
 # A Unitree Go1 motor swings a pendulum with 0, 1, 2 or 3 kg at 0.15 m. The data are public: `rimim/bam` on GitHub,
-# commit `38071b1`, `example_data/data_raw_go1`, a fork of `Rhoban/bam` (Apache-2.0); method and friction models:
-# Duclusaud et al., ICRA 2025 (arXiv 2410.08650). `--data` is a folder with `go1_0/recordings` to `go1_3/recordings`,
-# three recordings each in the project's format (`docs/data.md`), `sin_sin`, `sin_time_square` and `up_and_down`: column
-# `motor` is `position` (rad), `command_goal` is `goal_position / (2 pi) + 0.5`. `lift_and_drop` switches the motor off,
-# which no command says, and is left out.
+# commit `38071b1`, `example_data/data_raw_go1`, a fork of `Rhoban/bam` (Apache-2.0). Method and friction models are by
+# Duclusaud et al., ICRA 2025 (arXiv 2410.08650).
 #
-# The fit sees 0, 1 and 2 kg. Each load is a model of its own; the parameters are common.
+# `--data` is a folder with `go1_0/recordings` to `go1_3/recordings`. Each has three recordings in the project's format
+# (`docs/data.md`): `sin_sin`, `sin_time_square` and `up_and_down`. The column `motor` is `position` (rad), and
+# `command_goal` is `goal_position / (2 pi) + 0.5`. `lift_and_drop` is left out, because it switches the motor off, and
+# commands do not show this.
 #
-# `python experiments/real/go1/go1.py --data FOLDER`; `--quick` shows that it works.
+# The fit uses 0, 1 and 2 kg. Each payload has its own model, and all models share the parameters.
+#
+# Run `python experiments/real/go1/go1.py --data FOLDER`. `--quick` is a short trial run.
 
 # %%
 from __future__ import annotations
@@ -36,17 +38,18 @@ from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.robots.description import read_description
 
 LOADS = (0, 1, 2, 3)
-"""kg; the last is the test."""
+"""Payloads (kg). The last one is for the test."""
 SAMPLING = SamplingConfig(sample_timestep=0.016, angle_noise=np.deg2rad(0.1), position_window=0.08, rate_window=0.1)
 LIGHTEST = 0.001
-"""kg: a body needs some mass."""
+"""Mass (kg) of the payload's body without payload, because MuJoCo needs a positive mass."""
 PUBLISHED = {"motor_frictionloss": 0.0914, "motor_damping": 0.047}
-"""Of the data's authors (Coulomb and viscous)."""
+"""Coulomb and viscous friction of the data's authors."""
 SECONDS = 5.9
+"""Length of the replays (s)."""
 
 
 def load(data: Path, kilograms: int) -> list[MeasuredMotion]:
-    """Read the recordings of a load, each with the model of that load."""
+    """Read and measure the recordings of a payload (kg), each with the model of this payload."""
     robot = read_description(FOLDER / "go1.robot.json")
     spec = mujoco.MjSpec.from_file(str(robot.model))
     spec.body("load").mass = max(kilograms, LIGHTEST)
@@ -56,7 +59,7 @@ def load(data: Path, kilograms: int) -> list[MeasuredMotion]:
 
 
 def identify(data: Path, *, quick: bool) -> RobotFit:
-    """Fit the declared parameters to all loads but the last."""
+    """Fit the declared parameters to the recordings of all payloads but the last."""
     robot = read_description(FOLDER / "go1.robot.json")
     parameters = declared_parameters(robot, robot.load_model())
     training = [motion for kilograms in LOADS[:-1] for motion in load(data, kilograms)]
@@ -65,7 +68,7 @@ def identify(data: Path, *, quick: bool) -> RobotFit:
 
 
 def mean_errors(fit: RobotFit, motions: list[MeasuredMotion], points: list[np.ndarray]) -> np.ndarray:
-    """Mean absolute angle errors (deg) of whole recordings, (points, recordings)."""
+    """Return mean absolute angle errors (deg) over `SECONDS`, by parameter vector and recording."""
     found = replay(fit.parameters, motions, points, SECONDS, 2 * SECONDS)
     return np.array([np.rad2deg(np.abs(errors.errors[..., 0]).mean(axis=1)) for errors in found])
 

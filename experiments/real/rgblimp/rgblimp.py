@@ -1,5 +1,5 @@
 # %% [markdown]
-# # A real helium blimp: forces of the air from recorded flights
+# # A real helium blimp: air forces from recorded flights
 #
 # RGBlimp (Peking University) has an envelope with wings, a gondola that moves fore and aft, and two propellers. The
 # data are public: `zhu-yj/ABNODE` on GitHub, commit `138a1de`, `data/data_1.csv` to `data_140.csv`, MIT. Papers: Zhu,
@@ -7,7 +7,7 @@
 #
 # `--data` is a folder with these files (`data_N.csv`, also `.csv.xz`), or with the recordings that an earlier run made
 # of them (`flight-NNN.csv.gz`). File N is flight (N - 1) mod 4 + 1 of input (N - 1) div 4. Commands are constant in a
-# flight. Spirals are files 1 to 120, straight flights 121 to 140.
+# flight. Files 1 to 120 are spirals, and files 121 to 140 are straight flights.
 #
 # | use | files |
 # | --- | --- |
@@ -17,14 +17,14 @@
 # | test, between | inputs 20 to 24: pairs of thrusts that training lacks |
 # | test, far | files 121 to 130: straight flights |
 #
-# These test flights have been reported before: they are development data. Other flights of the data set are left for a
-# final check, and this script does not read them.
+# Results on these test flights have been reported before, so that they are development data. Other flights of the data
+# set are kept for a final check; this script does not read them.
 #
-# Rivals are the nominal model without air, the constant wrench that explains the training flights best, the published
-# aerodynamic model, and the mean motion of the nearest recorded moments. Errors are those at the end of a horizon, root
-# mean square over starts in every second.
+# The baselines are the nominal model without air, the constant wrench that explains the training flights best, the
+# published aerodynamic model, and the mean motion of the nearest recorded moments. Errors are root mean squares of the
+# errors at the end of a horizon, over starts in every second.
 #
-# `python experiments/real/rgblimp/rgblimp.py --data FOLDER`; `--quick` shows that it works.
+# Run `python experiments/real/rgblimp/rgblimp.py --data FOLDER`. `--quick` is a short trial run.
 
 # %%
 from __future__ import annotations
@@ -69,7 +69,7 @@ from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.viz import plots
 
 HORIZONS = (1.0, 2.0, 5.0)
-"""s."""
+"""Horizons of the errors (s)."""
 TRAINING = tuple(4 * i + flight for i in range(20) for flight in (1, 2))
 VALIDATION = tuple(4 * i + 3 for i in range(20))
 TEST: Mapping[str, tuple[int, ...]] = {
@@ -78,13 +78,13 @@ TEST: Mapping[str, tuple[int, ...]] = {
     "far": tuple(range(121, 131)),
 }
 FLIP = np.array([1.0, -1.0, -1.0])
-"""North, east, down to forward, left, up; its own inverse."""
+"""Signs that convert between (north, east, down) and (forward, left, up) axes, in both directions."""
 SHORT = ("no air", "published model", "fluid", "nearest moments")
 """Rows of the short table."""
 SHOWN = 20.0
-"""Seconds of the figure."""
+"""Length of the flights in the figure (s)."""
 FULL_THRUST, FIRST_PLACE, TRAVEL = 0.07, 0.0647, 0.05
-"""Of the commands: N, m, m."""
+"""Thrust at a command of 1 (N), gondola position at a command of 0 (m), and its travel up to a command of 1 (m)."""
 
 # %% [markdown]
 # ## Conversion
@@ -92,9 +92,9 @@ FULL_THRUST, FIRST_PLACE, TRAVEL = 0.07, 0.0647, 0.05
 
 # %%
 def convert(path: Path, name: str) -> Recording:
-    """Return a flight of the public data as a recording: 60 rows a second, world z up.
+    """Return a flight of the public data as a recording at 60 Hz, with the world's z axis up.
 
-    **Raises** `InputError` where the file lacks a column.
+    **Raises** `InputError` if the file lacks a column.
     """
     text = lzma.open(path, "rt").read() if path.suffix == ".xz" else path.read_text()
     header, *rows = text.split("\n")
@@ -122,7 +122,10 @@ def convert(path: Path, name: str) -> Recording:
 
 
 def load(data: Path, numbers: Sequence[int], robot: RobotDescription, made: Path) -> list[Motion]:
-    """Return reconstructed flights by the numbers of their files; conversions are kept in the folder `made`."""
+    """Return reconstructed flights, given the numbers of their files. Converted recordings are kept in `made`.
+
+    **Raises** `InputError` if `data` has neither a file nor its recording.
+    """
     motions = []
     for number in numbers:
         name = f"flight-{number:03d}.csv.gz"
@@ -130,7 +133,7 @@ def load(data: Path, numbers: Sequence[int], robot: RobotDescription, made: Path
         if path is None:
             raw = next((p for e in ("csv", "csv.xz") if (p := data / f"data_{number}.{e}").exists()), None)
             if raw is None:
-                raise InputError(f"{data}: there is neither data_{number}.csv nor {name}; fetch the public data set.")
+                raise InputError(f"{data}: has neither data_{number}.csv nor {name}; download the public data set.")
             made.mkdir(parents=True, exist_ok=True)
             path = made / name
             write_recording(convert(raw, name.removesuffix(".csv.gz")), path, robot)
@@ -141,18 +144,21 @@ def load(data: Path, numbers: Sequence[int], robot: RobotDescription, made: Path
 # %% [markdown]
 # ## The published aerodynamic model
 #
-# Lift, drag, side force and moments over angle of attack and sideslip, and rotary damping: `models/RGBlimp_dynamics.py`
-# and `utils/parameters.py` of the data's authors. Whether they were fitted to these same flights is not said there.
+# The model has lift, drag, side force and moments as functions of angle of attack and sideslip, and rotary damping. It
+# is from `models/RGBlimp_dynamics.py` and `utils/parameters.py` of the data's authors. They do not say whether it was
+# fitted to these same flights.
 
 
 # %%
 class PublishedAerodynamics(Residual):
-    """The published model as a residual; it has no parameters."""
+    """Residual with the published model. It has no parameters."""
 
     pressure_area = 0.5 * 1.2187 * 0.25
+    """Half the air density (kg/m^3) times the reference area (m^2)."""
     damping = np.array([-0.0503, -0.0264, -0.0137])
+    """Rotary damping about forward, right and down (N m s)."""
     centre = np.array([-0.0436, 0.0003, -0.008])
-    """Centre of mass of the hull (m), where wrenches act."""
+    """Centre of mass of the hull (m), where the residual's wrench acts."""
 
     def __init__(self, control_timestep: float) -> None:
         self._control_timestep = control_timestep
@@ -196,11 +202,11 @@ class PublishedAerodynamics(Residual):
 
 # %%
 Found = Mapping[float, tuple[float, float, int, int]]
-"""By horizon (s): position (m), yaw (deg), starts, diverged ones."""
+"""Position error (m), yaw error (deg), number of starts and number of diverged starts, by horizon (s)."""
 
 
 def end_errors(evaluator: OpenLoopEvaluator, replay: Replay) -> Found:
-    """Return position (m) and yaw error (deg) at each horizon's end, root mean square, starts, and diverged ones."""
+    """Return root mean square errors of position (m) and yaw (deg) at each horizon's end, and numbers of starts."""
     found = {}
     for horizon in HORIZONS:
         steps = round(horizon / evaluator.robot.control_timestep)
@@ -221,9 +227,10 @@ def end_errors(evaluator: OpenLoopEvaluator, replay: Replay) -> Found:
 def neighbour_errors(
     training: Sequence[Motion], test: Sequence[Motion], control_timestep: float, neighbours: int = 20
 ) -> Found:
-    """Return the errors of the mean displacement of the most similar recorded moments, in the heading frame.
+    """Return the errors of a prediction by the mean displacement of the most similar training moments.
 
-    Moments are compared by roll, pitch, velocity and angular velocity in the body, and commands.
+    Displacements are in the heading frame. Moments are compared by roll, pitch, velocity and angular velocity (both in
+    the body frame), and commands.
     """
     found = {}
     for horizon in HORIZONS:
@@ -242,11 +249,11 @@ def neighbour_errors(
 
 
 _LIKE = np.array([0.01] * 2 + [0.01] * 3 + [0.02] * 3 + [0.001] * 3)
-"""Differences that count alike: rad, m/s, rad/s, commands."""
+"""Differences of equal weight, of roll and pitch (rad), velocity (m/s), angular velocity (rad/s) and commands."""
 
 
 def _moments(motion: Motion, steps: int, every: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return what moments of a motion are compared by, and the displacement and turn that follow."""
+    """Return moments of a motion: features for comparison, and the displacement (m) and turn (rad) after `steps`."""
     count = max(len(motion.qpos) - steps, 0)
     here = np.arange(2, count, every)
     if not len(here):
@@ -262,13 +269,13 @@ def _moments(motion: Motion, steps: int, every: int) -> tuple[np.ndarray, np.nda
 
 
 def tables(rows: Mapping[str, Mapping[str, Found]]) -> dict[str, Table]:
-    """Return a table of position and one of yaw errors; `rows` by method and group."""
+    """Return tables of position and yaw errors, and a short one of both; `rows[method][group]` holds the errors."""
     heads = [f"{group}: {', '.join(f'{horizon:g}' for horizon in HORIZONS)} s" for group in TEST]
 
     def cell(found: Found, place: int, form: str) -> str:
-        lost, starts = found[HORIZONS[-1]][3], found[HORIZONS[-1]][2]
+        diverged, starts = found[HORIZONS[-1]][3], found[HORIZONS[-1]][2]
         numbers = ", ".join("-" if f[3] == f[2] else format(f[place], form) for f in found.values())
-        return numbers + (f" ({lost} of {starts} diverged)" if lost else "")
+        return numbers + (f" ({diverged} of {starts} diverged)" if diverged else "")
 
     units = [("position", "m", ".3f"), ("yaw", "deg", ".1f")]
     short = Table(
@@ -301,7 +308,7 @@ def draw(
     residuals: Mapping[str, tuple[Residual, Any]],
     test: Mapping[str, Sequence[Motion]],
 ) -> None:
-    """Draw the first flight of each group, and what simulators make of it from its first state on."""
+    """Draw the first flight of each group, and simulations from its first state."""
     steps = round(SHOWN / simulator.control_timestep)
     panels = []
     for group, motions in test.items():
@@ -319,17 +326,17 @@ def draw(
 
 
 # %% [markdown]
-# ## All of it
+# ## Run
 
 
 # %%
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Fit the air around a real blimp, and predict flights never seen.")
+    parser = argparse.ArgumentParser(description="Fit the air forces on a real blimp, and predict test flights.")
     parser.add_argument("--data", type=Path, required=True, help="folder with the public files or recordings of them")
     parser.add_argument("--output", type=Path, default=Path("runs/rgblimp"), help="folder for results (runs/rgblimp)")
     parser.add_argument("--quick", action="store_true", help="few flights and steps; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
-    parser.add_argument("--figure", type=Path, help="PNG file to draw three test flights to")
+    parser.add_argument("--figure", type=Path, help="PNG file for a figure of three test flights")
     options = parser.parse_args()
     robot = read_description(FOLDER / "rgblimp.robot.json")
     few = slice(0, 2) if options.quick else slice(None)
