@@ -30,6 +30,7 @@ from ballu_mjx.ballu.suspended_leg import SuspendedLeg
 from ballu_mjx.ballu.sweep import SAMPLE_TIMESTEP, Sweep
 from ballu_mjx.identification.batched_solver import along_directions
 from ballu_mjx.identification.effective_samples import integrated_autocorrelation_time
+from ballu_mjx.sim.sharding import chunks, compile_for_devices
 
 
 class LegData(NamedTuple):
@@ -85,15 +86,17 @@ class CompiledLeg:
     """
 
     def __init__(self, space: ParameterTransform, batch: int, data: LegData, *, motion: bool) -> None:
-        self.leg, self.batch = SuspendedLeg(), batch
+        self.leg = SuspendedLeg()
+        devices = len(jax.local_devices())
+        self._batch = -(-batch // devices) * devices
         size, (legs, holds) = int(space.free.sum()), data.command.shape
         every = size + len(FIRST_DYNAMICS)
 
         def settled(coordinates: Array, command: Array) -> tuple[Array, Array]:
             vectors, by_coordinates = jax.vmap(lambda y: (space.vector(y), jax.jacfwd(space.vector)(y)))(coordinates)
             qpos, jacobians = self.leg.settled(jnp.repeat(vectors, holds, axis=0), command.ravel())
-            jacobians = jacobians.reshape(batch, holds, *jacobians.shape[1:])
-            return qpos.reshape(batch, holds, -1), jacobians @ by_coordinates[:, None]
+            jacobians = jacobians.reshape(-1, holds, *jacobians.shape[1:])
+            return qpos.reshape(-1, holds, qpos.shape[-1]), jacobians @ by_coordinates[:, None]
 
         def moving(coordinates: Array, command: Array) -> tuple[Array, Array]:
             def path(y: Array, command: Array) -> Array:
@@ -102,7 +105,8 @@ class CompiledLeg:
             directions = jnp.tile(jnp.eye(every), (legs, 1, 1))
             return along_directions(path, (coordinates,), (directions,), (command,))
 
-        programs = [jax.jit(settled).lower(jnp.zeros((batch, size)), jnp.zeros((batch, holds)))]
+        spread = compile_for_devices(settled, shared=0, over=lambda batched: batched)
+        programs = [spread.lower(jnp.zeros((self._batch, size)), jnp.zeros((self._batch, holds)))]
         if motion:
             programs.append(jax.jit(moving).lower(jnp.zeros((legs, every)), jnp.zeros(data.commanded.shape)))
         with ThreadPoolExecutor() as pool:
@@ -113,9 +117,7 @@ class CompiledLeg:
     ) -> tuple[Float[np.ndarray, "n holds nq"], Float[np.ndarray, "n holds nq size"]]:
         """Return generalized positions at rest and their derivatives, for any number of coordinate vectors."""
         values, jacobians = [], []
-        for first in range(0, len(coordinates), self.batch):
-            count = min(self.batch, len(coordinates) - first)
-            rows = np.minimum(first + np.arange(self.batch), first + count - 1)
+        for rows, count in chunks(len(coordinates), self._batch):
             value, jacobian = self._compiled[0](jnp.asarray(coordinates[rows]), jnp.asarray(command[rows]))
             values.append(np.asarray(value)[:count])
             jacobians.append(np.asarray(jacobian)[:count])

@@ -162,10 +162,10 @@ class SuspendedLeg:
         """
         nq = self.model.nq
         every = jnp.eye(nq + vectors.shape[1])
-        directions = tuple(jnp.tile(x, (len(close), 1, 1)) for x in (every[:, :nq], every[:, nq:]))
+        by_qpos, by_vector = (jnp.tile(x, (len(close), 1, 1)) for x in (every[:, :nq], every[:, nq:]))
 
         def evaluate(qpos: Array) -> tuple[Array, Array]:
-            return along_directions(self.residual_torque, (qpos, vectors), directions, (commands,))
+            return along_directions(self.residual_torque, (qpos,), (by_qpos[:, :nq],), (vectors, commands))
 
         def body(state: tuple[Array, ...]) -> tuple[Array, ...]:
             x, value, jacobian, damping, trial, count = state
@@ -174,10 +174,9 @@ class SuspendedLeg:
             x, value = (jnp.where(better[:, None], *pair) for pair in ((trial, x), (new_value, value)))
             jacobian = jnp.where(better[:, None, None], new_jacobian, jacobian)
             damping = jnp.where(better, damping / 100, damping * 10)
-            by_position = jacobian[..., :nq]
-            normal = jnp.swapaxes(by_position, 1, 2) @ by_position
+            normal = jnp.swapaxes(jacobian, 1, 2) @ jacobian
             damped = normal * (1 + damping[:, None, None] * jnp.eye(nq))
-            step = jnp.linalg.solve(damped, jnp.swapaxes(by_position, 1, 2) @ value[..., None])[..., 0]
+            step = jnp.linalg.solve(damped, jnp.swapaxes(jacobian, 1, 2) @ value[..., None])[..., 0]
             return x, value, jacobian, damping, x - step, count + 1
 
         def unfinished(state: tuple[Array, ...]) -> Array:
@@ -185,9 +184,9 @@ class SuspendedLeg:
             return (count < _ROOT_STEPS) & ((count == 0) | (jnp.max(jnp.abs(trial - x)) > _ROOT_TOLERANCE))
 
         legs, nv = len(close), self.model.nv
-        start = (close, jnp.full((legs, nv), jnp.inf), jnp.zeros((legs, nv, len(every))), jnp.full(legs, 1e-4), close)
-        x, _, jacobian, *_ = jax.lax.while_loop(unfinished, body, (*start, jnp.zeros((), int)))
-        return x, jacobian
+        start = (close, jnp.full((legs, nv), jnp.inf), jnp.zeros((legs, nv, nq)), jnp.full(legs, 1e-4), close)
+        x, *_ = jax.lax.while_loop(unfinished, body, (*start, jnp.zeros((), int)))
+        return x, along_directions(self.residual_torque, (x, vectors), (by_qpos, by_vector), (commands,))[1]
 
 
 _RELAXATION_TIMESTEP = 0.05
