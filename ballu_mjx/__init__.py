@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from ballu_mjx.common.errors import InputError
     from ballu_mjx.evaluation.errors import Evaluation
     from ballu_mjx.evaluation.open_loop import evaluate
+    from ballu_mjx.identification.actuator_choice import choose_actuators
     from ballu_mjx.identification.actuators import identify_actuators
-    from ballu_mjx.identification.guard import choose_actuators
     from ballu_mjx.policies.deploy.check import check_policy
     from ballu_mjx.policies.environments.brax_env import brax_env
     from ballu_mjx.policies.environments.gym_env import gym_env, gym_vector_env
@@ -32,15 +32,15 @@ if TYPE_CHECKING:
     from ballu_mjx.recordings.recording import Recording
     from ballu_mjx.residuals.aerodynamics_fit import AirConfig
     from ballu_mjx.residuals.aerodynamics_training import fit_aerodynamics
-    from ballu_mjx.residuals.analytic import AnalyticConfig
     from ballu_mjx.residuals.deploy.export import export_simulator
     from ballu_mjx.residuals.envmimic import EnvMimicConfig
     from ballu_mjx.residuals.envmimic_training import train_envmimic
     from ballu_mjx.residuals.fluid_fit import FluidConfig
     from ballu_mjx.residuals.fluid_training import fit_fluid
-    from ballu_mjx.residuals.force_fitting import fit_analytic, fit_supervised
-    from ballu_mjx.residuals.supervised import SupervisedConfig
-    from ballu_mjx.residuals.trained import TrainedResidual
+    from ballu_mjx.residuals.force_gradients import AnalyticConfig
+    from ballu_mjx.residuals.force_regression import SupervisedConfig
+    from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised
+    from ballu_mjx.residuals.trained_residual import TrainedResidual
     from ballu_mjx.rl.ppo import PPOConfig
     from ballu_mjx.robots.adapter import IdentifiedActuators
     from ballu_mjx.robots.description import RobotDescription
@@ -53,13 +53,13 @@ __version__ = "0.1.0"
 
 _MODULES = {
     "AirConfig": "residuals.aerodynamics_fit",
-    "AnalyticConfig": "residuals.analytic",
+    "AnalyticConfig": "residuals.force_gradients",
     "AugmentedSimulator": "sim.simulator",
     "EnvMimicConfig": "residuals.envmimic",
     "Evaluation": "evaluation.errors",
     "IdentifiedActuators": "robots.adapter",
     "InputError": "common.errors",
-    "LocomotionConfig": "policies.locomotion_env",
+    "LocomotionConfig": "policies.locomotion_config",
     "Motion": "recordings.motion",
     "PPOConfig": "rl.ppo",
     "PhaseProgress": "runs.progress",
@@ -69,18 +69,18 @@ _MODULES = {
     "RobotDescription": "robots.description",
     "Run": "runs.folder",
     "Simulator": "sim.simulator",
-    "SupervisedConfig": "residuals.supervised",
-    "TrainedResidual": "residuals.trained",
+    "SupervisedConfig": "residuals.force_regression",
+    "TrainedResidual": "residuals.trained_residual",
     "brax_env": "policies.environments.brax_env",
     "check_policy": "policies.deploy.check",
-    "choose_actuators": "identification.guard",
+    "choose_actuators": "identification.actuator_choice",
     "evaluate": "evaluation.open_loop",
     "export_simulator": "residuals.deploy.export",
     "fit_aerodynamics": "residuals.aerodynamics_training",
     "FluidConfig": "residuals.fluid_fit",
     "fit_fluid": "residuals.fluid_training",
-    "fit_analytic": "residuals.force_fitting",
-    "fit_supervised": "residuals.force_fitting",
+    "fit_analytic": "residuals.force_training",
+    "fit_supervised": "residuals.force_training",
     "gym_env": "policies.environments.gym_env",
     "gym_vector_env": "policies.environments.gym_env",
     "identify_actuators": "identification.actuators",

@@ -5,7 +5,7 @@ compared with the nominal ones:
 
 - settled angles: mean absolute error (deg) of simulated motors and knees, on commands that the fit did not use.
 - free walking: position RMSE (m) of open-loop replays from recorded states over 1 s and 5 s, with the drivetrain
-  (`identification.guard`). Near recordings are of gaits, far ones of other commands.
+  (`identification.actuator_choice`). Near recordings are of gaits, far ones of other commands.
 - the choice of `--actuators auto`, from the guard's replay of other recordings.
 
 Choices in the package were based on robots 0, 1 and 2. All five take about an hour on two cores.
@@ -69,7 +69,7 @@ from ballu_mjx.ballu.sysid_report import identification_details
 from ballu_mjx.common import provenance
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Table, write_results
-from ballu_mjx.identification.guard import HORIZONS, choose_actuators
+from ballu_mjx.identification.actuator_choice import HORIZONS, choose_actuators
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording

@@ -275,7 +275,7 @@ def main(quick: bool = False, duration: float = 20.0, seed: int = 0) -> None:
         positions, velocities = gather([p for p, _ in pairs]), gather([v for _, v in pairs])
         medians[case] = {name: float(np.median(value)) for name, value in positions.items()}
         said = np.rad2deg(np.mean([motion.uncertainty[BASE_PITCH] for motion in motions]))
-        residuals = {name: np.mean([m.residual_mm[name] for m in motions]) for name in motions[0].residual_mm}
+        residuals = {name: np.mean([m.fit_error_mm[name] for m in motions]) for name in motions[0].fit_error_mm}
         columns[case] = {
             **{name: spread(value) for name, value in positions.items()},
             "pitch, as reported deg": f"{said:.2f}",

@@ -74,7 +74,7 @@ WEIGHT = np.deg2rad(2.0)
 """Unit of position residuals (rad), about the error of the identified model."""
 SECONDS = 1.0
 """Length of a window (s). Windows are contiguous."""
-OUTLYING = FitConfig().outlying
+OUTLIER_THRESHOLD = FitConfig().outlying
 """Threshold of the pseudo-Huber loss."""
 
 
@@ -146,7 +146,7 @@ class WindowRollouts:
 
 def residuals(differences: Float[np.ndarray, "*batch channels"]) -> Float[np.ndarray, "*batch positions"]:
     """Return the residuals of positions, which are the first half of the channels."""
-    return soften(differences[..., : differences.shape[-1] // 2] / WEIGHT, OUTLYING)[0]
+    return soften(differences[..., : differences.shape[-1] // 2] / WEIGHT, OUTLIER_THRESHOLD)[0]
 
 
 class CompileClock:
@@ -188,7 +188,7 @@ def ours(
     tried: list[tuple[float, np.ndarray]] = []
     begins: list[float] = []
     config = FitConfig(
-        window_seconds=SECONDS, starts=1, steps=steps, outlying=OUTLYING, start_spread=0.0, reweigh=False
+        window_seconds=SECONDS, starts=1, steps=steps, outlying=OUTLIER_THRESHOLD, start_spread=0.0, reweigh=False
     )
     called = time.perf_counter()
     fit = fit_robot(

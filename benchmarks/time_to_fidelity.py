@@ -118,7 +118,7 @@ def vanilla_ratio(folder: str) -> float:
     from ballu_mjx.recordings.csv_format import read_recording
     from ballu_mjx.recordings.reconstruct import reconstruct
     from ballu_mjx.residuals.run_config import find_recordings
-    from ballu_mjx.residuals.trained import TrainedResidual
+    from ballu_mjx.residuals.trained_residual import TrainedResidual
     from ballu_mjx.robots.registry import load_robot
     from ballu_mjx.runs.folder import read_config
     from ballu_mjx.sim.simulator import Simulator

@@ -13,7 +13,7 @@ from scipy import optimize
 
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.motion_windows import cut_motion_windows, simulate_motion_window
-from ballu_mjx.recordings.window_errors import count_lost
+from ballu_mjx.recordings.window_errors import fill_diverged
 from ballu_mjx.sim.observation import ObservationLayout, world_rotation
 from ballu_mjx.sim.residual import Action, BoundResidual, Commands, History, Residual
 from ballu_mjx.sim.simulator import Simulator
@@ -66,7 +66,7 @@ def fit_constant_wrench(
 
     values, jacobian = jax.jit(errors), jax.jit(jax.jacfwd(errors))
     found = optimize.least_squares(
-        lambda x: count_lost(np.asarray(values(jnp.asarray(x, jnp.float32)), np.float64)).ravel(),
+        lambda x: fill_diverged(np.asarray(values(jnp.asarray(x, jnp.float32)), np.float64)).ravel(),
         np.zeros(6),
         lambda x: np.nan_to_num(np.asarray(jacobian(jnp.asarray(x, jnp.float32)), np.float64)).reshape(-1, 6),  # pyright: ignore[reportArgumentType]
         loss="soft_l1",

@@ -54,11 +54,11 @@ def identify(folder: Path, config: IdentificationConfig) -> None:
         train_sysid.train(train_sysid.SysidData(output=folder), config)
         return
     found = read_config(folder, "sysid")["fit"]
-    mend = "delete it, or give --output another folder"
+    fix = "delete it, or give --output another folder"
     if found != json.loads(json.dumps(dataclasses.asdict(config))):
-        raise InputError(f"{folder}: was made with other options (with or without --quick); {mend}.")
+        raise InputError(f"{folder}: was made with other options (with or without --quick); {fix}.")
     if not (folder / FIGURE).exists():
-        raise InputError(f"{folder}: its identification was interrupted; {mend}.")
+        raise InputError(f"{folder}: its identification was interrupted; {fix}.")
     print((folder / "identification.txt").read_text())
 
 

@@ -38,7 +38,7 @@ from ballu_mjx.recordings.motion_windows import MotionWindows
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.window_errors import pseudo_huber
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirWindows
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.sharding import shard_over_devices
 from ballu_mjx.sim.simulator import Simulator

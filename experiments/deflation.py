@@ -41,7 +41,7 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.simulator import Simulator
 

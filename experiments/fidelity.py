@@ -49,10 +49,10 @@ from ballu_mjx.evaluation.errors_file import read_evaluation
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
-from ballu_mjx.recordings.groups import OTHER
 from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.recordings.recording_groups import OTHER
 from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.model import assets
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.checkpoints import list_checkpoints

@@ -39,8 +39,8 @@ from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.open_loop import START_INTERVAL
-from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.recordings.recording_groups import group_of
 from ballu_mjx.robots.registry import load_robot
 
 HORIZON = 5.0
@@ -137,7 +137,7 @@ def errors(virtual: VirtualRobot, job: dataset.Job) -> tuple[str, Float[np.ndarr
         model, found = simulator(legs, variant), []
         for start in starts:
             state = motion.qpos[start], motion.qvel[start]
-            ran = seen(nominal, virtual_robot.carry_on(legs, air, job.commands, start, state, steps, model))
+            ran = seen(nominal, virtual_robot.continue_trial(legs, air, job.commands, start, state, steps, model))
             after = slice(start + 1, start + steps + 1)
             away = np.sum((ran[0] - place[after]) ** 2, axis=1)
             turned = np.angle(np.exp(1j * (ran[1] - turn[after])))

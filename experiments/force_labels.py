@@ -39,8 +39,8 @@ from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.residuals.supervised import ForceLabeller, SupervisedConfig
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.force_regression import ForceLabeller, SupervisedConfig
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.model import assets
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.folder import read_config, typed_config

@@ -157,7 +157,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="training seed of the policies (0)")
     parser.add_argument("--task", default="walk", choices=("walk", "turn"))
     parser.add_argument(
-        "--settings", nargs="+", default=list(pipeline_layout.SETTINGS), choices=pipeline_layout.SETTINGS
+        "--settings",
+        nargs="+",
+        default=list(pipeline_layout.PAPER_SIMULATORS),
+        choices=pipeline_layout.PAPER_SIMULATORS,
     )
     parser.add_argument("--trials", type=int, default=3, help="trials of each policy on each robot (3)")
     parser.add_argument("--quick", action="store_true", help="train for seconds, one trial; the numbers mean nothing")
@@ -166,12 +169,12 @@ def main() -> None:
     quick = arguments.quick
     output = arguments.output or (transfer_tables.QUICK_OUTPUT if quick else transfer_tables.OUTPUT)
     options = pipeline.Options(output=output, robot_seed=arguments.robot_seed, quick=quick)
-    story, trials = pipeline.Story(options, arguments.seed), 1 if quick else arguments.trials
+    stages, trials = pipeline.PipelineStages(options, arguments.seed), 1 if quick else arguments.trials
     robots = variants(virtual_robot.draw_robot(arguments.robot_seed))
     folder = output / f"effects-{arguments.task}-seed-{arguments.seed}"
     results = {}
     for setting in arguments.settings:
-        policy = Policy.load(story.policy(arguments.task, setting))
+        policy = Policy.load(stages.policy(arguments.task, setting))
         results[setting] = measure(policy, robots, trials, folder / setting)
     plain = {s: {n: [t.to_json() for t in found] for n, found in by.items()} for s, by in results.items()}
     (folder / "effects.json").write_text(json.dumps(plain, indent=2) + "\n")

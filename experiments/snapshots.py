@@ -47,7 +47,7 @@ from ballu_mjx.viz.style import colour_of, label_of
 
 TIMES = {"walk": (0.0, 5.0, 11.0, 16.0, 24.0), "turn": (0.0, 4.0, 10.0, 18.0, 22.0)}
 """Times of the paper's pictures (s), by task."""
-SETTINGS = ("vanilla+sysid+dr", "envmimic")
+PAPER_SIMULATORS = ("vanilla+sysid+dr", "envmimic")
 """Rows, from top to bottom."""
 COLOURS = {"left": "#1f77b4", "right": "#d64d1f", "frame": "#26262b", "balloon": "#b9bdc6"}
 """Colours by part. The legs have the colours of the model."""
@@ -264,8 +264,8 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--settings",
         nargs="+",
-        choices=pipeline_layout.SETTINGS,
-        default=list(SETTINGS),
+        choices=pipeline_layout.PAPER_SIMULATORS,
+        default=list(PAPER_SIMULATORS),
         help="training simulators, with a row for each (the paper's two)",
     )
     parser.add_argument("--seed", type=int, default=0, help="training seed (0)")

@@ -80,7 +80,10 @@ def finished_trials(folder: Path, task: str, seeds: Sequence[int]) -> dict[str, 
     **Raises** `InputError` if there is no such setting in `folder`.
     """
     found = {}
-    for setting in (*pipeline_layout.SETTINGS, *pipeline_layout.settings_beyond(folder / f"seed-{seeds[0]}", task)):
+    for setting in (
+        *pipeline_layout.PAPER_SIMULATORS,
+        *pipeline_layout.settings_beyond(folder / f"seed-{seeds[0]}", task),
+    ):
         trials = [folder / f"seed-{seed}" / f"trials-{task}-{setting}" for seed in seeds]
         if all(_finished(trial) for trial in trials):
             found[setting] = trials
@@ -198,7 +201,7 @@ def main() -> None:
     parser.add_argument(
         "--also",
         nargs="+",
-        choices=pipeline_layout.MORE_SETTINGS,
+        choices=pipeline_layout.OPTIONAL_SIMULATORS,
         default=[],
         help="further simulators; see `train all --help` (none)",
     )

@@ -149,18 +149,6 @@ def test_a_training_in_memory_is_that_in_a_folder(
     assert [row["step"] for row in memory.metrics if "validation_error" in row] == [0, 160, 320]
 
 
-def test_regression_returns_a_residual(simulator: bm.Simulator, motions: list[bm.Motion]):
-    learned = bm.fit_supervised(simulator, motions, bm.SupervisedConfig(updates=20, force_scales=(1.0,)))
-    assert np.isfinite(bm.evaluate(simulator.with_residual(learned), motions).score)
-    assert "Labels, training" in learned.report
-
-
-def test_gradients_return_a_residual(simulator: bm.Simulator, motions: list[bm.Motion]):
-    config = bm.AnalyticConfig(window_seconds=0.5, relinearizations=1, updates=2, validate_every=2)
-    learned = bm.fit_analytic(simulator, motions, config)
-    assert np.isfinite(bm.evaluate(simulator.with_residual(learned), motions).score)
-
-
 def test_recordings_of_another_robot_are_not_the_bundled_ones(robot: bm.RobotDescription, tmp_path: Path):
     folder = Path(__file__).parents[1] / "experiments" / "tethered_balloon"
     other = bm.load_robot(folder / "balloon.robot.json")

@@ -16,10 +16,10 @@ from ballu_mjx.ballu.features import foot_positions
 from ballu_mjx.ballu.gait import count_steps
 from ballu_mjx.ballu.model import JOINTS, SIDES, standing_qpos
 from ballu_mjx.ballu.sweep import LEVELS, read_sweep
-from ballu_mjx.recordings.hooks import RecordingHooks
 from ballu_mjx.recordings.inverse_kinematics import KinematicFit
 from ballu_mjx.recordings.motion import MeasurementGrid
 from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.recordings.recording_hooks import RecordingHooks
 from ballu_mjx.robots.adapter import (
     DeploymentNotes,
     IdentificationProgress,

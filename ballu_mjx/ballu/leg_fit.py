@@ -25,8 +25,8 @@ from ballu_mjx.ballu.curves import curve_distances
 from ballu_mjx.ballu.leg_model_selection import select_model
 from ballu_mjx.ballu.leg_parameters import (
     DEGREE,
-    FURTHER,
     LEG_PARAMETERS,
+    RICHER_PARAMETERS,
     SIMPLE_DYNAMICS,
     IdentificationConfig,
     LegDynamics,
@@ -67,7 +67,7 @@ def identify_legs(
     1. Settled angles alone are fitted from several starts in parallel, the best of many draws. From a single start, the
        search may end in a local minimum, for example with a servo that never saturates.
     2. The whole motion is fitted, starting from the solution whose motion is nearest to the measured one.
-       Steps 1 and 2 are done twice: with the `FURTHER` parameters held at their nominal values, and with all
+       Steps 1 and 2 are done twice: with the `RICHER_PARAMETERS` held at their nominal values, and with all
        parameters. The second search has the first one's solution among its starts. The richer model is kept if it
        explains enough of what the simpler one leaves (`Selection`).
     3. In the richer model, the springs are held at their nominal stiffness, which sets the scale of all forces
@@ -122,7 +122,7 @@ class Identifier:
         residuals = LegResiduals(self.space, self.physics, data, self._curve_gradients, motion=config.motion)
         legs = np.arange(len(SIDES))
         free = np.array(LEG_PARAMETERS)[self.space.free]
-        further = np.isin([*free, *(LegDynamics._fields if config.motion else ())], FURTHER)
+        further = np.isin([*free, *(LegDynamics._fields if config.motion else ())], RICHER_PARAMETERS)
         every = np.ones_like(further)
         kept, selection = every, None
         if further.any():

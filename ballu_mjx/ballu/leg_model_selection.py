@@ -14,7 +14,7 @@ from ballu_mjx.identification.undeclared import SMALL_EFFECT
 
 
 class Selection(NamedTuple):
-    """Result of the comparison of models without and with the `FURTHER` parameters, for both legs together."""
+    """Result of the comparison of models without and with the `RICHER_PARAMETERS`, for both legs together."""
 
     statistic: float
     """F statistic, with the effective number of independent samples."""

@@ -120,7 +120,7 @@ class LegDynamics(NamedTuple):
     """Viscous damping of the knee (N m s/rad)."""
 
 
-FIRST_DYNAMICS = LegDynamics(0.03, 2e-3, 5e-4, 1 * DEGREE, 0.01, 2e-3)
+INITIAL_DYNAMICS = LegDynamics(0.03, 2e-3, 5e-4, 1 * DEGREE, 0.01, 2e-3)
 """Values at which the search begins."""
 
 
@@ -128,24 +128,24 @@ DYNAMICS_PRIOR = np.array([3.0, 1.0, 1.0, 1.0, 2.0, 2.0])
 """Standard deviations among robots, in the coordinates of the dynamics. The mean is the start of the search."""
 NOMINAL_DYNAMICS = {"knee_damping": 1e-3}
 """Dynamics of the nominal robot. Those that are not listed are 0."""
-SIMPLE_DYNAMICS = FIRST_DYNAMICS._replace(lag=1e-4, **NOMINAL_DYNAMICS)
+SIMPLE_DYNAMICS = INITIAL_DYNAMICS._replace(lag=1e-4, **NOMINAL_DYNAMICS)
 """Start of the search with the simpler model: negligible lag, and the nominal damping."""
-FURTHER = ("motor_travel", "cable_stiffness", "knee_spring_reference", "lag", "knee_damping")
+RICHER_PARAMETERS = ("motor_travel", "cable_stiffness", "knee_spring_reference", "lag", "knee_damping")
 """Parameters that only the richer model fits. Each trades against others within a weak direction of the data."""
 
 
 def dynamics_coordinates(values: LegDynamics) -> Float[np.ndarray, " 6"]:
-    """Return unbounded coordinates: linear in the delay, logarithmic in the others, and 0 at `FIRST_DYNAMICS`."""
-    others = np.log(np.array(values[1:]) / np.array(FIRST_DYNAMICS[1:]))
-    return np.array([(values.delay - FIRST_DYNAMICS.delay) / DELAY_UNIT, *others])
+    """Return unbounded coordinates: linear in the delay, logarithmic in the others, and 0 at `INITIAL_DYNAMICS`."""
+    others = np.log(np.array(values[1:]) / np.array(INITIAL_DYNAMICS[1:]))
+    return np.array([(values.delay - INITIAL_DYNAMICS.delay) / DELAY_UNIT, *others])
 
 
 def leg_dynamics(coordinates: Float[Array, " 6"]) -> LegDynamics:
     """Return the inverse of `dynamics_coordinates`."""
     delay, *others = coordinates
     return LegDynamics(
-        FIRST_DYNAMICS.delay + DELAY_UNIT * delay,
-        *(f * jnp.exp(x) for f, x in zip(FIRST_DYNAMICS[1:], others, strict=True)),
+        INITIAL_DYNAMICS.delay + DELAY_UNIT * delay,
+        *(f * jnp.exp(x) for f, x in zip(INITIAL_DYNAMICS[1:], others, strict=True)),
     )
 
 

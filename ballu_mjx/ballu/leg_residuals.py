@@ -22,13 +22,13 @@ from jaxtyping import Array, Bool, Float, Int
 from ballu_mjx.ballu.leg_parameters import (
     DEGREE,
     DYNAMICS_PRIOR,
-    FIRST_DYNAMICS,
+    INITIAL_DYNAMICS,
     ParameterTransform,
     leg_dynamics,
 )
 from ballu_mjx.ballu.suspended_leg import SuspendedLeg
 from ballu_mjx.ballu.sweep import SAMPLE_TIMESTEP, Sweep
-from ballu_mjx.identification.batched_solver import along_directions
+from ballu_mjx.identification.batched_solver import directional_derivatives
 from ballu_mjx.identification.effective_samples import integrated_autocorrelation_time
 from ballu_mjx.sim.sharding import chunks, compile_for_devices
 
@@ -90,7 +90,7 @@ class CompiledLeg:
         devices = len(jax.local_devices())
         self._batch = -(-batch // devices) * devices
         size, (legs, holds) = int(space.free.sum()), data.command.shape
-        every = size + len(FIRST_DYNAMICS)
+        every = size + len(INITIAL_DYNAMICS)
 
         def settled(coordinates: Array, command: Array) -> tuple[Array, Array]:
             vectors, by_coordinates = jax.vmap(lambda y: (space.vector(y), jax.jacfwd(space.vector)(y)))(coordinates)
@@ -103,7 +103,7 @@ class CompiledLeg:
                 return self.leg.motion(space.vector(y[:size]), leg_dynamics(y[size:]), command, data.begins)
 
             directions = jnp.tile(jnp.eye(every), (legs, 1, 1))
-            return along_directions(path, (coordinates,), (directions,), (command,))
+            return directional_derivatives(path, (coordinates,), (directions,), (command,))
 
         spread = compile_for_devices(settled, shared=0, over=lambda batched: batched)
         programs = [spread.lower(jnp.zeros((self._batch, size)), jnp.zeros((self._batch, holds)))]

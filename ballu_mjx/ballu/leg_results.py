@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.ballu.leg_model_selection import Selection
-from ballu_mjx.ballu.leg_parameters import FURTHER, LEG_PARAMETERS, IdentificationConfig, LegDynamics
+from ballu_mjx.ballu.leg_parameters import LEG_PARAMETERS, RICHER_PARAMETERS, IdentificationConfig, LegDynamics
 from ballu_mjx.identification.parameters import Direction
 
 
@@ -58,22 +58,22 @@ class Identification:
     free: tuple[str, ...]
     """Names of the parameters that the configuration leaves free, in the order of `Fit.correlations`."""
     fitted: tuple[str, ...]
-    """Names of the fitted parameters. `FURTHER` parameters are not among them if the simpler model was kept."""
+    """Names of the fitted parameters. `RICHER_PARAMETERS` are not among them if the simpler model was kept."""
     selection: Selection | None
-    """Comparison of the simpler and the richer model. None if no `FURTHER` parameter was free."""
+    """Comparison of the simpler and the richer model. None if none of the `RICHER_PARAMETERS` was free."""
     config: IdentificationConfig
     """Options of the identification."""
 
     @property
     def keeps_simpler(self) -> bool:
-        """Return whether the `FURTHER` parameters were free, but the simpler model was kept."""
+        """Return whether the `RICHER_PARAMETERS` were free, but the simpler model was kept."""
         return self.selection is not None and not self.selection.richer
 
     @property
     def parameters(self) -> ActuatorParameters:
         """Return the parameters for simulators.
 
-        If the simpler model was kept, the `FURTHER` parameters have their nominal values.
+        If the simpler model was kept, the `RICHER_PARAMETERS` have their nominal values.
         """
         rows: dict[str, np.ndarray] = dict(
             zip(LEG_PARAMETERS, np.stack([fit.vector for fit in self.fits], axis=1), strict=True)
@@ -81,5 +81,5 @@ class Identification:
         dynamics = [fit.dynamics for fit in self.fits if fit.dynamics is not None]
         for name in LegDynamics._fields if dynamics else ():
             rows[name] = np.maximum([getattr(each, name) for each in dynamics], 0.0)
-        kept = {name: row for name, row in rows.items() if not (self.keeps_simpler and name in FURTHER)}
+        kept = {name: row for name, row in rows.items() if not (self.keeps_simpler and name in RICHER_PARAMETERS)}
         return ActuatorParameters(**{name: jnp.asarray(row, jnp.float32) for name, row in kept.items()})

@@ -13,10 +13,10 @@ from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
 from ballu_mjx.ballu.actuators import ActuatorParameters, actuator_fields
-from ballu_mjx.ballu.leg_parameters import FIRST_DYNAMICS, LEG_PARAMETERS, LegDynamics
+from ballu_mjx.ballu.leg_parameters import INITIAL_DYNAMICS, LEG_PARAMETERS, LegDynamics
 from ballu_mjx.ballu.model import SIDES, load_suspended_leg
 from ballu_mjx.ballu.sweep import SAMPLE_TIMESTEP
-from ballu_mjx.identification.batched_solver import along_directions
+from ballu_mjx.identification.batched_solver import directional_derivatives
 from ballu_mjx.robots.model import with_fields
 from ballu_mjx.sim.drivetrain import DrivetrainState, init_drivetrain, step_drivetrain
 from ballu_mjx.sim.step import PhysicsState, make_data, physics_step, put_model, state_at
@@ -44,8 +44,8 @@ class SuspendedLeg:
         self._data = make_data(self.model)
         with_friction = copy.copy(self.model)
         with_friction.dof_frictionloss[self._dofs] = (
-            FIRST_DYNAMICS.motor_friction,
-            FIRST_DYNAMICS.knee_friction,
+            INITIAL_DYNAMICS.motor_friction,
+            INITIAL_DYNAMICS.knee_friction,
         )  # not 0, because MJX leaves out joints without dry friction
         self._friction_model = put_model(with_friction)
         self._friction_data = make_data(with_friction)
@@ -158,14 +158,15 @@ class SuspendedLeg:
         The Jacobian is with respect to positions, then parameters.
 
         The solver is Newton's method with Levenberg's damping, starting from `close`. Optimistix has equivalent
-        solvers, but each of them contains MJX's program several times. This one contains it once.
+        solvers, but each of them contains MJX's program several times. This one contains it twice: for steps,
+        which need derivatives by positions alone, and for the Jacobian at the end.
         """
         nq = self.model.nq
         every = jnp.eye(nq + vectors.shape[1])
         by_qpos, by_vector = (jnp.tile(x, (len(close), 1, 1)) for x in (every[:, :nq], every[:, nq:]))
 
         def evaluate(qpos: Array) -> tuple[Array, Array]:
-            return along_directions(self.residual_torque, (qpos,), (by_qpos[:, :nq],), (vectors, commands))
+            return directional_derivatives(self.residual_torque, (qpos,), (by_qpos[:, :nq],), (vectors, commands))
 
         def body(state: tuple[Array, ...]) -> tuple[Array, ...]:
             x, value, jacobian, damping, trial, count = state
@@ -186,7 +187,7 @@ class SuspendedLeg:
         legs, nv = len(close), self.model.nv
         start = (close, jnp.full((legs, nv), jnp.inf), jnp.zeros((legs, nv, nq)), jnp.full(legs, 1e-4), close)
         x, *_ = jax.lax.while_loop(unfinished, body, (*start, jnp.zeros((), int)))
-        return x, along_directions(self.residual_torque, (x, vectors), (by_qpos, by_vector), (commands,))[1]
+        return x, directional_derivatives(self.residual_torque, (x, vectors), (by_qpos, by_vector), (commands,))[1]
 
 
 _RELAXATION_TIMESTEP = 0.05

@@ -12,9 +12,9 @@ from jaxtyping import Float
 from ballu_mjx.ballu.curves import curve_distances
 from ballu_mjx.ballu.leg_parameters import (
     DEGREE,
-    FURTHER,
     LEG_PARAMETERS,
     NOMINAL_DYNAMICS,
+    RICHER_PARAMETERS,
     LegDynamics,
     nominal_leg,
 )
@@ -75,7 +75,7 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
             unit, scale = _DYNAMICS_UNITS[name]
             label = f"{name.replace('_', ' ')}, {side}"
             before = NOMINAL_DYNAMICS.get(name, 0.0)
-            held = result.keeps_simpler and name in FURTHER
+            held = result.keeps_simpler and name in RICHER_PARAMETERS
             value = f"{(before if held else found) * scale:.4g}"
             error = "(held)" if held else f"{deviation * scale:.2g}"
             lines.append(f"{label:33}{before * scale:>10.4g}{value:>12}{error:>16} {unit}")
@@ -137,7 +137,7 @@ def identification_details(result: Identification) -> dict[str, Any]:
     errors = {name: [fit.standard_errors[i] for fit in result.fits] for i, name in enumerate(LEG_PARAMETERS)}
     dynamics = [fit.dynamics_errors for fit in result.fits if fit.dynamics_errors is not None]
     for name in LegDynamics._fields if dynamics else ():
-        if not (result.keeps_simpler and name in FURTHER):
+        if not (result.keeps_simpler and name in RICHER_PARAMETERS):
             errors[name] = [getattr(each, name) for each in dynamics]
     return {
         "standard_errors": {name: [float(f"{x:.3g}") for x in pair] for name, pair in errors.items()},

@@ -63,7 +63,7 @@ _DETAILS = {
     "fit": "method details",
     "windows": "details of windows",
     "sampling": "details of sampling",
-    "story": "more",
+    "pipeline": "more",
 }
 """Title of the group with a section's remaining options."""
 

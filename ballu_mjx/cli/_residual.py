@@ -12,14 +12,14 @@ import jax
 from ballu_mjx.cli._command import load_chosen_robot, open_run, written_to
 from ballu_mjx.common import files
 from ballu_mjx.evaluation.open_loop import Evaluators
-from ballu_mjx.identification.guard import choose_actuators
+from ballu_mjx.identification.actuator_choice import choose_actuators
 from ballu_mjx.identification.stable_time_step import check_stability
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.dataset import USES, RecordingsData, ResidualDataset
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.run_config import describe_run
-from ballu_mjx.residuals.scales import describe_scales, settle_scales
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.scales import describe_scales, resolve_scales
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl.resume_point import ResumePoint
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import new_folder
@@ -109,9 +109,9 @@ def train_residual(
 def settle(env: EnvMimicConfig, prepared: Prepared, *, first: bool = True) -> EnvMimicConfig:
     """Return the network's options with numbers for scales, limit and cost, and print these.
 
-    **Raises** `InputError` from `scales.settle_scales`.
+    **Raises** `InputError` from `scales.resolve_scales`.
     """
-    settled = settle_scales(env, prepared.improved, prepared.motions["training"])
+    settled = resolve_scales(env, prepared.improved, prepared.motions["training"])
     if first:
         print(describe_scales(settled, prepared.dataset.robot), flush=True)
     return settled

@@ -74,11 +74,11 @@ def read_mark(path: Path) -> dict[str, Any]:
 
     **Raises** `InputError` if the file is damaged.
     """
-    mend = "delete it, and its stage will be made again"
-    content = files.read_json(path, mend)
+    fix = "delete it, and its stage will be made again"
+    content = files.read_json(path, fix)
     key = content.get("key")
     if not (isinstance(key, str) and _KEY.fullmatch(key) and isinstance(content.get("done"), bool)):
-        raise InputError(f'{path}: the values of "key" and "done" are not valid; {mend}.')
+        raise InputError(f'{path}: the values of "key" and "done" are not valid; {fix}.')
     return content
 
 

@@ -62,7 +62,7 @@ def _evaluate(options: Options) -> None:
     from ballu_mjx.residuals.dataset import check_recording
     from ballu_mjx.residuals.registry import RESIDUAL_TASKS
     from ballu_mjx.residuals.run_config import find_recordings, run_robot
-    from ballu_mjx.residuals.trained import TrainedResidual
+    from ballu_mjx.residuals.trained_residual import TrainedResidual
     from ballu_mjx.robots.description import check_simulates
     from ballu_mjx.robots.registry import load_robot
     from ballu_mjx.runs.folder import read_config

@@ -43,8 +43,8 @@ from ballu_mjx.policies.deploy.export import weights
 from ballu_mjx.policies.locomotion_config import LocomotionConfig, check_locomotion_config
 from ballu_mjx.policies.pipeline_layout import (
     NEAR,
+    PAPER_SIMULATORS,
     ROUNDS,
-    SETTINGS,
     SHARED,
     TABLES,
     WRENCH,
@@ -52,19 +52,19 @@ from ballu_mjx.policies.pipeline_layout import (
     table_file,
 )
 from ballu_mjx.policies.policy import Policy
+from ballu_mjx.policies.simulator_variants import SimulatorVariant
 from ballu_mjx.policies.tasks import TASKS
 from ballu_mjx.policies.training import locomotion_ppo
-from ballu_mjx.policies.variants import SimulatorVariant
 from ballu_mjx.recordings.csv_format import write_recording
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig
-from ballu_mjx.residuals.analytic import AnalyticConfig
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.residuals.supervised import SupervisedConfig
+from ballu_mjx.residuals.force_gradients import AnalyticConfig
+from ballu_mjx.residuals.force_regression import SupervisedConfig
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.checkpoints import list_checkpoints
-from ballu_mjx.runs.layout import KEPT
+from ballu_mjx.runs.layout import CHECKPOINTS_KEPT
 from ballu_mjx.sim.force_sets import ForceSet
 
 _DECIMALS = 4
@@ -117,10 +117,10 @@ def run(options: Options) -> int:
     with written_to() as written:
         written.folder = options.output
         for seed in options.seeds:
-            story = Story(options, seed)
+            stages = PipelineStages(options, seed)
             for task in options.tasks:
                 for setting in settings:
-                    results[task][setting].append(story.transfers(task, setting))
+                    results[task][setting].append(stages.transfers(task, setting))
         for task in options.tasks:
             text = TABLES[task](results[task])
             table_file(options.output, task).write_text(text + "\n", encoding="utf-8")
@@ -132,7 +132,7 @@ def run(options: Options) -> int:
 
 def settings_of(options: Options) -> tuple[str, ...]:
     """Return the names of the simulators in which policies are trained, in the order of the tables."""
-    first = ("vanilla+dr", ROUNDS) if options.quick else SETTINGS
+    first = ("vanilla+dr", ROUNDS) if options.quick else PAPER_SIMULATORS
     return (*first, *(_again(number) for number in range(2, options.rounds + 1)), *options.also)
 
 
@@ -151,7 +151,7 @@ class _Job(NamedTuple):
     seconds: float
 
 
-class Story:
+class PipelineStages:
     """Stages of one seed. Each method makes its stage, and the stages that it needs, unless they exist already."""
 
     def __init__(self, options: Options, seed: int) -> None:
@@ -363,7 +363,7 @@ class Story:
 
 def _last_steps(run: Path) -> list[int]:
     """Return the steps of a run's last checkpoints, without the untrained one at step 0."""
-    return [step for step in list_checkpoints(run)[-KEPT:] if step > 0]
+    return [step for step in list_checkpoints(run)[-CHECKPOINTS_KEPT:] if step > 0]
 
 
 def _draw(seed: int, task: str, use: str, number: int) -> int:
@@ -389,6 +389,6 @@ def _check(options: Options) -> None:
 COMMAND = TrainCommand(
     "Run all experiments of the paper on a virtual robot: recordings, actuators, residuals, policies in five "
     "simulators, and trials.",
-    {"story": Options()},
-    lambda story: run(story),
+    {"pipeline": Options()},
+    lambda pipeline: run(pipeline),
 )

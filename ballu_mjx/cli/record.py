@@ -191,7 +191,7 @@ def _offset(
     **Raises** `InputError` if the offset is not clear.
     """
     from ballu_mjx.recordings.clock_alignment import align
-    from ballu_mjx.recordings.hooks import hooks_of
+    from ballu_mjx.recordings.recording_hooks import hooks_of
 
     log, by_hand = options.commands, "give the offset by --offset"
     for path, clock in ((log, time), (options.file, recording.time)):

@@ -14,7 +14,7 @@ from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS, Aerodynamics
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, check_air_config
 from ballu_mjx.residuals.aerodynamics_training import fit_aerodynamics
 from ballu_mjx.residuals.dataset import RecordingsData
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import TrainingRecord

@@ -15,7 +15,7 @@ from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.envmimic_training import VALIDATE_EVERY, check_envmimic_options, check_resumes, train_envmimic
 from ballu_mjx.residuals.presets import PresetName, describe_preset, preset_values
 from ballu_mjx.residuals.run_config import run_residual
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl import distributed, learner
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.runs.folder import read_config

@@ -10,7 +10,7 @@ from ballu_mjx.cli._residual import Prepared, show_report, train_residual
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.fluid_fit import FluidConfig, check_fluid_config
 from ballu_mjx.residuals.fluid_training import fit_fluid
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import TrainingRecord
 

@@ -9,11 +9,11 @@ from typing import Any
 
 from ballu_mjx.cli._command import TrainCommand, load_chosen_robot
 from ballu_mjx.cli._residual import Prepared, settle, train_residual
-from ballu_mjx.residuals.analytic import AnalyticConfig, check_analytic_config
 from ballu_mjx.residuals.dataset import RecordingsData
-from ballu_mjx.residuals.force_fitting import fit_analytic, fit_supervised, network_sections
-from ballu_mjx.residuals.supervised import SupervisedConfig, check_supervised_config
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.force_gradients import AnalyticConfig, check_analytic_config
+from ballu_mjx.residuals.force_regression import SupervisedConfig, check_supervised_config
+from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised, network_sections
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.metrics import read_column
 from ballu_mjx.runs.progress import PhaseProgress

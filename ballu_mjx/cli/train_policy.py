@@ -29,7 +29,7 @@ from ballu_mjx.policies.training import (
     validation_trials,
 )
 from ballu_mjx.residuals.run_config import describe_run, run_actuators, run_residual
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl import distributed, learner
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription

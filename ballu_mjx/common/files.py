@@ -44,27 +44,27 @@ def read_text(path: Path) -> str:
         _refuse(path, f"line {line} is not UTF-8 text", "save the file as UTF-8 text")
 
 
-def read_json(path: Path, mend: str) -> dict[str, Any]:
-    """Return the JSON object in a file. Messages about its content end with `mend`, which says how to fix it.
+def read_json(path: Path, fix: str) -> dict[str, Any]:
+    """Return the JSON object in a file. Messages about its content end with `fix`, which says how to fix it.
 
     **Raises** `InputError` in the cases of `read_text` and `parse_object`.
     """
-    return parse_object(read_text(path), str(path), mend)
+    return parse_object(read_text(path), str(path), fix)
 
 
-def parse_object(text: str, where: str, mend: str) -> dict[str, Any]:
+def parse_object(text: str, where: str, fix: str) -> dict[str, Any]:
     """Return the JSON object in a text. The arguments are those of `parse_json`.
 
     **Raises** `InputError` in the cases of `parse_json`, and if the value is not an object.
     """
-    content = parse_json(text, where, mend)
+    content = parse_json(text, where, fix)
     if not isinstance(content, dict):
-        raise InputError(f"{where}: not a JSON object; {mend}.")
+        raise InputError(f"{where}: not a JSON object; {fix}.")
     return content
 
 
-def parse_json(text: str, where: str, mend: str) -> Any:
-    """Return the JSON value in a text. Messages begin with `where` (file and place) and end with `mend` (the fix).
+def parse_json(text: str, where: str, fix: str) -> Any:
+    """Return the JSON value in a text. Messages begin with `where` (file and place) and end with `fix` (the fix).
 
     **Raises** `InputError` if the text is not JSON, or has a string that UTF-8 cannot encode.
     """
@@ -73,8 +73,8 @@ def parse_json(text: str, where: str, mend: str) -> Any:
         json.dumps(content, ensure_ascii=False).encode()  # half a surrogate pair cannot be printed or written
     except (ValueError, RecursionError) as error:
         if isinstance(error, json.JSONDecodeError):
-            raise InputError(f"{where}: not JSON (line {error.lineno}: {error.msg}); {mend}.") from error
-        raise InputError(f"{where}: not JSON that this program can read ({type(error).__name__}); {mend}.") from error
+            raise InputError(f"{where}: not JSON (line {error.lineno}: {error.msg}); {fix}.") from error
+        raise InputError(f"{where}: not JSON that this program can read ({type(error).__name__}); {fix}.") from error
     return content
 
 
@@ -154,6 +154,6 @@ def is_full(error: BaseException) -> bool:
     return any(os.strerror(number) in str(error) for number in _FULL)
 
 
-def _refuse(path: Path, problem: str, mend: str) -> NoReturn:
+def _refuse(path: Path, problem: str, fix: str) -> NoReturn:
     """Raise `InputError` with a file, its problem and the fix."""
-    raise InputError(f"{path}: {problem}; {mend}.")
+    raise InputError(f"{path}: {problem}; {fix}.")

@@ -37,7 +37,7 @@ class Errors:
 
     recording: str
     group: str
-    """Group of the recording; see `groups.group_of`."""
+    """Group of the recording; see `recording_groups.group_of`."""
     position: dict[float, tuple[float, float]]
     """Mean and spread of the RMSE of the tracked body's position (m), by horizon (s)."""
     orientation: dict[float, tuple[float, float]]

@@ -13,7 +13,7 @@ import numpy as np
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.evaluation.errors import LARGEST, WHOLE, Angle, Errors, Evaluation
-from ballu_mjx.recordings.groups import group_of
+from ballu_mjx.recordings.recording_groups import group_of
 from ballu_mjx.robots.description_fields import HORIZON_RANGE
 
 
@@ -150,11 +150,11 @@ def read_evaluation(path: Path) -> Evaluation:
 
     **Raises** `InputError` if the file holds no valid evaluation.
     """
-    mend = f"`python -m ballu_mjx evaluate {path.parent} --output {path.parent}` writes it again"
-    content = files.read_json(path, mend)
+    fix = f"`python -m ballu_mjx evaluate {path.parent} --output {path.parent}` writes it again"
+    content = files.read_json(path, fix)
     try:
         return evaluation_from_json(content)
     except KeyError as error:
-        raise InputError(f"{path}: is no evaluation ({error} is missing); {mend}.") from error
+        raise InputError(f"{path}: is no evaluation ({error} is missing); {fix}.") from error
     except (ValueError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: is no evaluation ({error}); {mend}.") from error
+        raise InputError(f"{path}: is no evaluation ({error}); {fix}.") from error

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
 from ballu_mjx.evaluation.errors import (
+    LARGEST,
     Errors,
     Evaluation,
     base_name,
@@ -30,8 +31,8 @@ from ballu_mjx.evaluation.errors import (
     summarize_starts,
 )
 from ballu_mjx.identification.parameters import LEAST_FRICTION
-from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.recording_groups import group_of
 from ballu_mjx.recordings.reference import ReferenceMotions, pad_to_bucket, stack_motions
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.drivetrain import DrivetrainParameters, identity_drivetrain
@@ -342,9 +343,7 @@ class OpenLoopEvaluator:
                 states = len(motion.qpos) - start
                 series = self._differences(replay, run, against)
                 forces.append(float(np.linalg.norm(replay.force[run, : states - 1], axis=-1).mean()))
-                broken = np.flatnonzero(
-                    ~(np.abs(series["position"]) < _DIVERGED_DISTANCE) | ~np.isfinite(series["orientation"])
-                )
+                broken = np.flatnonzero(~(np.abs(series["position"]) < LARGEST) | ~np.isfinite(series["orientation"]))
                 if len(broken) and (soonest is None or broken[0] < soonest[1]):
                     soonest = start, int(broken[0])
                 for horizon in self.horizons:
@@ -418,8 +417,6 @@ class OpenLoopEvaluator:
 
 
 _QUANTITIES = ("position", "orientation", "points", "joints")
-_DIVERGED_DISTANCE = 1e6
-"""Position error of the tracked body (m) from which a run counts as diverged."""
 
 
 def _rms(values: np.ndarray) -> float:

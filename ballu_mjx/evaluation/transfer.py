@@ -111,15 +111,15 @@ def read_transfer(path: pathlib.Path) -> list[Transfer]:
 
     **Raises** `InputError` if the file holds no valid trials.
     """
-    mend = "delete its folder, and the trials will be made again"
-    found = files.parse_json(files.read_text(path), str(path), mend)
+    fix = "delete its folder, and the trials will be made again"
+    found = files.parse_json(files.read_text(path), str(path), fix)
     try:
         if isinstance(found, list) and found:
             return [Transfer.from_json(each) for each in found]
         problem = "holds no trials"
     except (ValueError, AttributeError) as error:
         problem = f"holds an invalid trial ({error})"
-    raise InputError(f"{path}: {problem}; {mend}.")
+    raise InputError(f"{path}: {problem}; {fix}.")
 
 
 def compare_trajectories(simulation: Trajectory, robot: Trajectory) -> Transfer:

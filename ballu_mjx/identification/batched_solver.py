@@ -13,7 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 
-def along_directions(
+def directional_derivatives(
     function: Callable[..., Array],
     points: tuple[Float[Array, "n _"] | Float[Array, " n"], ...],
     directions: tuple[Float[Array, "n k _"] | Float[Array, "n k"], ...],

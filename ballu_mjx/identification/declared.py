@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import mujoco
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.identification.actuator_choice import HORIZONS, Choice, choose_actuators
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_report import fit_details, fit_table
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, Visibility, check_fit_config, fit_robot
-from ballu_mjx.identification.guard import HORIZONS, Choice, choose_actuators
 from ballu_mjx.identification.measured_motion import (
     MeasuredMotion,
     SamplingConfig,

@@ -138,7 +138,7 @@ def held_motion(
         command=mean_command(recording, edges),
         qpos=measured.start_qpos,
         qvel=measured.qvel,
-        residual_mm={},
+        fit_error_mm={},
         interpolated=dict(recording.interpolated),
         robot=recording.robot,
         joints=robot.joints,

@@ -155,7 +155,7 @@ class ParameterSet:
         """Return the values at shares."""
         return self._span.values(shares)
 
-    def by_shares(self, values: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " parameters"]:
+    def with_respect_to_shares(self, values: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " parameters"]:
         """Return the derivatives of values with respect to their shares."""
         return self._span.slopes(values)
 
@@ -241,12 +241,12 @@ class ParameterSet:
         return np.array([all(isinstance(t, CommandTarget) for t in p.targets) for p in self.parameters], bool)
 
     @property
-    def rubbing_dofs(self) -> np.ndarray:
+    def friction_dofs(self) -> np.ndarray:
         """Return the indices of the degrees of freedom whose dry friction is a parameter."""
         return self._indices("dof_frictionloss")
 
     @property
-    def rubbing_tendons(self) -> np.ndarray:
+    def friction_tendons(self) -> np.ndarray:
         """Return the indices of the tendons whose dry friction is a parameter."""
         return self._indices("tendon_frictionloss")
 

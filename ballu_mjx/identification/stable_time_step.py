@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.identification.guard import physics_commands, simulate_motion
+from ballu_mjx.identification.actuator_choice import physics_commands, simulate_motion
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, bare_parameters

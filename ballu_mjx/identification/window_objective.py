@@ -39,7 +39,7 @@ class ReducedResiduals(NamedTuple):
     """Jacobian in the parameters' units, orthogonal to all changes by starting states."""
     start: Float[np.ndarray, "windows start"]
     """Optimal shifts of the starting states, to first order, in units of the measurements' noise."""
-    start_slopes: Float[np.ndarray, "windows start parameters"]
+    start_jacobian: Float[np.ndarray, "windows start parameters"]
     """Derivatives of these shifts with respect to the parameters."""
 
     @property
@@ -81,7 +81,7 @@ class WindowObjective:
         slopes, residuals = flat(weight * simulated.by_parameters[:, :, positions]), flat(soft)
         if not moving:
             none = np.zeros((windows, 0, slopes.shape[-1]))
-            return ReducedResiduals(values=residuals, slopes=slopes, start=start, start_slopes=none), simulated
+            return ReducedResiduals(values=residuals, slopes=slopes, start=start, start_jacobian=none), simulated
         own = np.tile(np.eye(moving) / self.config.start_spread, (windows, 1, 1))
         by_start = np.concatenate([flat(weight * simulated.by_start[:, :, positions]), own], axis=1)
         slopes = np.concatenate([slopes, np.zeros((windows, moving, slopes.shape[-1]))], axis=1)
@@ -93,7 +93,7 @@ class WindowObjective:
             values=residuals,
             slopes=slopes - q @ along_slopes,
             start=start - np.linalg.solve(r, along)[..., 0],
-            start_slopes=-np.linalg.solve(r, along_slopes),
+            start_jacobian=-np.linalg.solve(r, along_slopes),
         )
         return reduced, simulated
 
@@ -138,7 +138,7 @@ class WindowSearch:
         values, start = parameters.at_shares(shares), self.start
         if self._best is not None:
             _, at, reduced = self._best
-            step = reduced.start + reduced.start_slopes @ (values - at) - start
+            step = reduced.start + reduced.start_jacobian @ (values - at) - start
             start = start + np.clip(step / 2.0**self._refused, -_FAR, _FAR)
         reduced, simulated = self.objective(values, start)
         if self.on_evaluation is not None:
@@ -155,7 +155,7 @@ class WindowSearch:
         windows = np.asarray(np.linalg.qr(table, mode="r")).reshape(-1, len(values) + 1)
         own = np.concatenate([np.diag(1 / parameters.prior), prior[:, None]], axis=1)
         triangle = np.asarray(np.linalg.qr(np.concatenate([windows, own]), mode="r"))
-        triangle[:, :-1] *= parameters.by_shares(values)
+        triangle[:, :-1] *= parameters.with_respect_to_shares(values)
         return triangle[:, -1], triangle[:, :-1]
 
 

@@ -277,8 +277,8 @@ def _with_friction_rows(model: mujoco.MjModel, parameters: ParameterSet) -> mujo
     """Return a copy with dry friction above 0 where it is a parameter. MJX omits friction rows that are 0 at first."""
     model = copy.copy(model)
     for field, places in (
-        (model.dof_frictionloss, parameters.rubbing_dofs),
-        (model.tendon_frictionloss, parameters.rubbing_tendons),
+        (model.dof_frictionloss, parameters.friction_dofs),
+        (model.tendon_frictionloss, parameters.friction_tendons),
     ):
         field[places] = np.maximum(field[places], LEAST_FRICTION)
     return model

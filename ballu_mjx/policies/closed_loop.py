@@ -10,7 +10,7 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
-from ballu_mjx.policies.locomotion_env import Contents, LocomotionEnv, locomotion_state
+from ballu_mjx.policies.locomotion_env import EnvironmentParameters, LocomotionEnv, locomotion_state
 from ballu_mjx.rl.ppo import Inference, Params
 from ballu_mjx.sim.observation import ObservationLayout
 from ballu_mjx.sim.sharding import chunks
@@ -47,18 +47,18 @@ class ClosedLoop:
     """Closed-loop simulation of policies.
 
     One compiled program serves any number of runs and steps, and any parameters of the policy. It also serves all
-    simulators that differ only in their contents (`LocomotionEnv.contents`).
+    simulators that differ only in their parameters (`LocomotionEnv.parameters`).
     """
 
     def __init__(self, env: LocomotionEnv, infer: Inference) -> None:
-        self._contents = env.contents
+        self._parameters = env.parameters
 
         def look(state: State) -> tuple[Array, ...]:
             now = locomotion_state(state)
             return now.rollout.physics.qpos, now.rollout.features, now.com
 
-        def run(params: Params, contents: Contents, state: State) -> Any:
-            here = env.with_contents(contents)
+        def run(params: Params, parameters: EnvironmentParameters, state: State) -> Any:
+            here = env.with_parameters(parameters)
 
             def advance(state: State, _: None) -> tuple[State, Any]:
                 action = infer(params, state.obs)  # pyright: ignore[reportArgumentType]
@@ -67,11 +67,11 @@ class ClosedLoop:
 
             return jax.lax.scan(advance, state, None, _CHUNK)
 
-        def at(contents: Contents, qpos: Array, qvel: Array, key: Array) -> State:
-            return env.with_contents(contents).at(qpos, qvel, key)
+        def at(parameters: EnvironmentParameters, qpos: Array, qvel: Array, key: Array) -> State:
+            return env.with_parameters(parameters).at(qpos, qvel, key)
 
-        def reset(contents: Contents, key: Array) -> State:
-            return env.with_contents(contents).reset(key)
+        def reset(parameters: EnvironmentParameters, key: Array) -> State:
+            return env.with_parameters(parameters).reset(key)
 
         self._run = jax.jit(jax.vmap(run, in_axes=(None, None, 0)))
         self._at = jax.jit(jax.vmap(at, in_axes=(None, 0, 0, 0)))
@@ -93,11 +93,11 @@ class ClosedLoop:
     def _batch(self, params: Params, qpos: np.ndarray, qvel: np.ndarray, steps: int, runs: int) -> Rollout:
         keys = jax.random.split(jax.random.key(0), _BATCH)
         start = (jnp.asarray(x, jnp.float32) for x in (qpos, qvel))
-        state = self._at(self._contents, *start, keys)
+        state = self._at(self._parameters, *start, keys)
         pieces = [tuple(np.asarray(x)[:, None] for x in self._look(state))]
         outcomes = []
         for _ in range(-(-steps // _CHUNK)):
-            state, seen = self._run(params, self._contents, state)
+            state, seen = self._run(params, self._parameters, state)
             state_parts, step_parts = seen[: len(pieces[0])], seen[len(pieces[0]) :]
             pieces.append(tuple(np.asarray(x) for x in state_parts))
             outcomes.append(tuple(np.asarray(x) for x in step_parts))
@@ -107,6 +107,6 @@ class ClosedLoop:
 
     def standing(self, count: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Return `count` starting states (qpos, qvel), drawn as in training."""
-        state = self._reset(self._contents, jax.random.split(jax.random.key(seed), count))
+        state = self._reset(self._parameters, jax.random.split(jax.random.key(seed), count))
         physics = locomotion_state(state).rollout.physics
         return np.asarray(physics.qpos), np.asarray(physics.qvel)

@@ -28,8 +28,8 @@ class StartSpread(NamedTuple):
     """Standard deviation of each velocity (m/s, rad/s)."""
 
 
-class Setting(NamedTuple):
-    """Parameters that differ between simulators of the same task, as arrays; see `make_setting`."""
+class SimulatorSetting(NamedTuple):
+    """Parameters that differ between simulators of the same task, as arrays; see `make_simulator_setting`."""
 
     fields: dict[str, Array]
     """Fields of the MJX model that identified actuators change, by name."""
@@ -49,9 +49,9 @@ def colliding_geoms(model: mujoco.MjModel) -> Int[np.ndarray, " colliding"]:
     return np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0))
 
 
-def make_setting(
+def make_simulator_setting(
     robot: RobotDescription, model: mujoco.MjModel, config: LocomotionConfig, actuators: ModelParameters | None
-) -> Setting:
+) -> SimulatorSetting:
     """Return the parameters that differ between simulators of the same task.
 
     `model` is the nominal robot. `actuators` None: the nominal actuators.
@@ -71,7 +71,7 @@ def make_setting(
     turn = np.array([config.start_tilt, config.start_tilt, config.start_yaw])
     own = improved.geom_friction[colliding_geoms(model), 0]
     drawn = np.tile(config.friction, (len(own), 1))
-    return Setting(
+    return SimulatorSetting(
         fields=jax.tree.map(jnp.float32, fields),
         drivetrain=drivetrain_of(bare_parameters(actuators)),
         initial=jnp.asarray(robot.adapter.initial_qpos(robot, improved), jnp.float32),
@@ -96,7 +96,7 @@ class Start(NamedTuple):
     """Random key for the next draws."""
 
 
-def draw_start(setting: Setting, robot: RobotDescription, rng: Array) -> Start:
+def draw_start(setting: SimulatorSetting, robot: RobotDescription, rng: Array) -> Start:
     """Draw friction and starting state. Without domain randomization, both have the setting's own values."""
     key_friction, key_turn, key_joint, key_velocity, rng = jax.random.split(rng, 5)
     low, high = setting.friction.T

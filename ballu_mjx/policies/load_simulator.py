@@ -10,7 +10,7 @@ from ballu_mjx.policies.policy import check_belongs
 from ballu_mjx.policies.tasks import TASKS
 from ballu_mjx.residuals.registry import RESIDUAL_TASKS
 from ballu_mjx.residuals.run_config import run_actuators, run_residual, run_robot
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
 from ballu_mjx.runs.folder import read_config
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator

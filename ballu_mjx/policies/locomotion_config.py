@@ -39,10 +39,10 @@ class LocomotionConfig:
     residual_decay: float = 0.0
     """Decay rate of the residual force outside the range of its training data, 0 or more. The force is multiplied by
     exp(-decay x excess). The excess is the distance of the residual's observation from that range, in widths of the
-    range. 0 for no decay."""
+    range, less a margin of 0.1. 0 for no decay."""
     outside_cost: float = 0.0
     """Cost (reward, m/s) for each width of the training range by which the residual's observation lies outside this
-    range, 0 or more. It keeps the policy where the residual is reliable. A policy that is rewarded for speed otherwise
+    range by more than 0.1 widths, 0 or more. It keeps the policy where the residual is reliable. A policy that is rewarded for speed otherwise
     leaves this range. 0 for no cost."""
 
 

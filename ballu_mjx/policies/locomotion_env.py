@@ -17,11 +17,16 @@ import numpy as np
 from brax.envs.base import Env, State
 from jaxtyping import Array, Float, Int
 
-from ballu_mjx.policies.domain_randomization import Setting, colliding_geoms, draw_start, make_setting
+from ballu_mjx.policies.domain_randomization import (
+    SimulatorSetting,
+    colliding_geoms,
+    draw_start,
+    make_simulator_setting,
+)
 from ballu_mjx.policies.locomotion_config import LocomotionConfig, check_task
+from ballu_mjx.policies.simulator_variants import SimulatorVariant
 from ballu_mjx.policies.tasks import Step, Task
-from ballu_mjx.policies.variants import SimulatorVariant
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
@@ -30,12 +35,12 @@ from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
 
-class Contents(NamedTuple):
+class EnvironmentParameters(NamedTuple):
     """Parameters that differ between environments of the same task, configuration and kind of residual, as arrays."""
 
     model: Any
     """The MJX model."""
-    setting: Setting
+    setting: SimulatorSetting
     residual: Any
     """Parameters of the residual, and the range of its training data. None if there is no residual."""
 
@@ -43,7 +48,7 @@ class Contents(NamedTuple):
 class LocomotionState(NamedTuple):
     """State of one episode, with the parameters of its simulator."""
 
-    setting: Setting
+    setting: SimulatorSetting
     friction: Float[Array, " colliding"]
     """Sliding friction coefficients of the geoms that collide."""
     rollout: RolloutState
@@ -108,26 +113,26 @@ class LocomotionEnv(Env):
         simulator = Simulator(robot, actuators)
         self.simulator = simulator.with_residual(None if residual is None else residual.bound)
         model = simulator.mj_model
-        self.setting = make_setting(robot, robot.load_model(), config, actuators)
+        self.setting = make_simulator_setting(robot, robot.load_model(), config, actuators)
         self._colliding = colliding_geoms(model)
         self._friction = jnp.asarray(model.geom_friction)
         self._rest = jnp.asarray(robot.adapter.rest_command(robot, model), jnp.float32)
 
     @property
-    def contents(self) -> Contents:
+    def parameters(self) -> EnvironmentParameters:
         """The MJX model, the setting, and the parameters and training range of the residual.
 
         A program that takes them as an argument serves all environments that differ in nothing else. In a batch,
         settings may differ between robots.
         """
         residual = None if self.residual is None else (self.residual.params, self.residual.observed)
-        return Contents(self.simulator.simulator.model, self.setting, residual)
+        return EnvironmentParameters(self.simulator.simulator.model, self.setting, residual)
 
-    def with_contents(self, contents: Contents) -> LocomotionEnv:
-        """Return the same environment with other contents, which may be traced."""
+    def with_parameters(self, parameters: EnvironmentParameters) -> LocomotionEnv:
+        """Return the same environment with other parameters, which may be traced."""
         other = copy.copy(self)
-        params, observed = (None, None) if self.residual is None else contents.residual
-        other.simulator, other.setting = self.simulator.with_model(contents.model, params), contents.setting
+        params, observed = (None, None) if self.residual is None else parameters.residual
+        other.simulator, other.setting = self.simulator.with_model(parameters.model, params), parameters.setting
         if self.residual is not None:
             other.residual = dataclasses.replace(self.residual, params=params, observed=observed)
         return other
@@ -206,11 +211,11 @@ class LocomotionEnv(Env):
     def _observe(self, rollout: RolloutState) -> Float[Array, " observations"]:
         return locomotion_observation(rollout.features, self.robot.anchored)
 
-    def _start(self, setting: Setting, rng: Array) -> State:
+    def _start(self, setting: SimulatorSetting, rng: Array) -> State:
         qpos, qvel, friction, rng = draw_start(setting, self.robot, rng)
         return self._begin(setting, qpos, qvel, friction, rng)
 
-    def _begin(self, setting: Setting, qpos: Array, qvel: Array, friction: Array, rng: Array) -> State:
+    def _begin(self, setting: SimulatorSetting, qpos: Array, qvel: Array, friction: Array, rng: Array) -> State:
         key, key_length = jax.random.split(rng)
         mean = max(round(self.config.episode_seconds / self.robot.control_timestep), 2)
         physics = state_at(qpos, qvel)

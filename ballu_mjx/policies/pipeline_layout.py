@@ -11,14 +11,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from ballu_mjx.evaluation.transfer import Transfer, turning_table, walking_table
-from ballu_mjx.policies.variants import SimulatorVariant
+from ballu_mjx.policies.simulator_variants import SimulatorVariant
 
 TABLES: Mapping[str, Callable[[Mapping[str, Sequence[Sequence[Transfer]]]], str]] = {
     "walk": walking_table,
     "turn": turning_table,
 }
 """Functions that make the paper's tables, by task."""
-SETTINGS = ("vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic", "aerodynamic")
+PAPER_SIMULATORS = ("vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic", "aerodynamic")
 """The paper's four simulators, and one with identified aerodynamics instead of EnvMimic's forces."""
 SHARED = "envmimic-shared"
 """Simulator with one EnvMimic residual for all tasks."""
@@ -26,14 +26,14 @@ NEAR = "envmimic-near"
 """Simulator with EnvMimic's forces, whose policies pay a cost outside the residual's training range."""
 WRENCH = "envmimic-wrench"
 """Simulator with an EnvMimic residual that also applies a torque."""
-MORE_SETTINGS = (NEAR, SHARED, WRENCH, "supervised", "analytic")
+OPTIONAL_SIMULATORS = (NEAR, SHARED, WRENCH, "supervised", "analytic")
 """Optional simulators. The networks of the last two are learned by regression and by gradients."""
 ROUNDS = "envmimic"
 """Residual that is learned again in each round. From the second round on, its name ends with the round's number."""
 
 
 def settings_beyond(folder: Path, task: str) -> tuple[str, ...]:
-    """Return the simulators besides `SETTINGS` of which a seed's folder has policies.
+    """Return the simulators besides `PAPER_SIMULATORS` of which a seed's folder has policies.
 
     They are those of later rounds and the optional ones.
     """
@@ -42,7 +42,7 @@ def settings_beyond(folder: Path, task: str) -> tuple[str, ...]:
         return (folder / f"{task}-{name}").is_dir()
 
     later = (SimulatorVariant(ROUNDS, round=number).name for number in itertools.count(2))
-    return (*itertools.takewhile(there, later), *filter(there, MORE_SETTINGS))
+    return (*itertools.takewhile(there, later), *filter(there, OPTIONAL_SIMULATORS))
 
 
 def residual_folder(seed: Path, task: str, setting: str) -> Path:

@@ -22,10 +22,10 @@ from ballu_mjx.policies.locomotion_env import (
     num_observations,
     variant_of,
 )
+from ballu_mjx.policies.simulator_variants import SimulatorVariant
 from ballu_mjx.policies.tasks import TASKS, Task
-from ballu_mjx.policies.variants import SimulatorVariant
 from ballu_mjx.residuals.run_config import run_actuators, run_residual, run_robot
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Inference, Params, PPOConfig
 from ballu_mjx.robots.description import RobotDescription

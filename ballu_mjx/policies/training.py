@@ -13,7 +13,7 @@ from ballu_mjx.policies.closed_loop import ClosedLoop, Rollout
 from ballu_mjx.policies.locomotion_config import LocomotionConfig, check_locomotion_config
 from ballu_mjx.policies.policy import Policy, environment_of
 from ballu_mjx.policies.tasks import Task, find_task
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.rl.resume_point import ResumePoint

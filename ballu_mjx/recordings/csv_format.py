@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.recordings.hooks import hooks_of
 from ballu_mjx.recordings.recording import Column, ColumnGroup, Kind, Recording, Split, column_groups, values_of
+from ballu_mjx.recordings.recording_hooks import hooks_of
 from ballu_mjx.recordings.validation import (
     blank_held,
     check_cells,

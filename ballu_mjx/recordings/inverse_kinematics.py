@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.recordings.hooks import hooks_of
 from ballu_mjx.recordings.motion import MeasurementGrid, ReconstructionParameters
 from ballu_mjx.recordings.pose_solver import KinematicProblem, PoseSolver
 from ballu_mjx.recordings.posture_search import PostureSearch
+from ballu_mjx.recordings.recording_hooks import hooks_of
 from ballu_mjx.robots.description import RobotDescription
 
 _WORST_FIT = 0.05

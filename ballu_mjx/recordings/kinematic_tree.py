@@ -114,7 +114,7 @@ class KinematicTree:
         jacobian[:, :, dofs] = np.where(self.rotates[dofs], turned, axes.transpose(0, 2, 1))
         return jacobian
 
-    def turn_jacobian(self, poses: Poses, number: int) -> Float[np.ndarray, "N 3 nv"]:
+    def rotation_jacobian(self, poses: Poses, number: int) -> Float[np.ndarray, "N 3 nv"]:
         """Return the rotational Jacobian of body `number` of `bodies` (rotation vectors in the world frame)."""
         dofs = self.body_dofs[number]
         dofs = dofs[self.rotates[dofs]]

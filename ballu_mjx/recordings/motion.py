@@ -71,7 +71,7 @@ class Motion:
     qvel: Float[np.ndarray, "states nv"]
     """MuJoCo's generalized velocities. The free joint's linear velocity is in the world frame, its angular one in the
     body frame."""
-    residual_mm: Mapping[str, float]
+    fit_error_mm: Mapping[str, float]
     """RMS distance (mm) between measured and fitted positions before smoothing, by site."""
     interpolated: Mapping[str, int] = dataclasses.field(default_factory=dict)
     """Number of samples that were interpolated when the recording was read, by column."""

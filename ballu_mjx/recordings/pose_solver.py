@@ -108,7 +108,7 @@ class PoseSolver:
         for number, (turned, weight) in enumerate(zip(self._turned, self._turn_weights, strict=True)):
             back = turned[rows].transpose(0, 2, 1)
             errors.append(matrix_to_rotation_vector(back @ poses.rotations[number]) * weight)
-            jacobians.append(back @ self.tree.turn_jacobian(poses, number) * weight[:, None])
+            jacobians.append(back @ self.tree.rotation_jacobian(poses, number) * weight[:, None])
         noise, first = _LOOP_NOISE * parameters.position_noise, len(grid.positions)
         for number in range(len(self._loops)):
             one, other = first + 2 * number, first + 2 * number + 1

@@ -4,7 +4,7 @@
 2. Positions follow from least-squares inverse kinematics over all joints at once (`inverse_kinematics`). A joint that
    no measurement shows is an error.
 3. The robot's adapter refines positions that single samples determine badly
-   (`hooks.RecordingHooks.complete_positions`).
+   (`recording_hooks.RecordingHooks.complete_positions`).
 4. Velocities follow from a centred (hence lag-free) Savitzky-Golay differentiator. Its window is widest for the tracked
    body's rotation, whose rates matter most to a simulation that starts from the state.
 5. The adapter fills in joints that follow from the commands (`complete_joints`).
@@ -30,11 +30,11 @@ from ballu_mjx.recordings.filters import (
     sign_continuous,
     smooth_rotation,
 )
-from ballu_mjx.recordings.hooks import hooks_of
 from ballu_mjx.recordings.inverse_kinematics import solve_inverse_kinematics
 from ballu_mjx.recordings.kinematic_tree import KinematicTree
 from ballu_mjx.recordings.motion import MeasurementGrid, Motion, ReconstructionParameters
 from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.recordings.recording_hooks import hooks_of
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.drivetrain import DrivetrainParameters, count_slots, filter_commands
 
@@ -86,7 +86,7 @@ def reconstruct(
         command=mean_command(recording, edges),
         qpos=qpos[states],
         qvel=qvel[states],
-        residual_mm=distance,
+        fit_error_mm=distance,
         interpolated=dict(recording.interpolated),
         robot=recording.robot,
         joints=tuple(recording.joint_angles),
@@ -180,7 +180,7 @@ def _from_root(
     """Return the tracked body's orientation in the root's frame, and its rotational Jacobian there."""
     placed = np.concatenate([np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(qpos), 1)), qpos[:, 7:]], axis=1)
     poses = tree.pose(placed)
-    return poses.rotations[0], tree.turn_jacobian(poses, 0)
+    return poses.rotations[0], tree.rotation_jacobian(poses, 0)
 
 
 def _to_quaternions(matrices: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, "T 4"]:

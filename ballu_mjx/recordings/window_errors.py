@@ -13,13 +13,13 @@ from jaxtyping import Array, Float
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.observation import ObservationLayout, euler_to_matrix, wrap_angle
 
-POSITION = (0.002, 0.01)
+EXPECTED_POSITION_ERROR = (0.002, 0.01)
 """Expected error of the tracked body's position: value at a window's start (m), and growth rate (m/s)."""
-ANGLE = (np.deg2rad(0.3), np.deg2rad(0.6))
+EXPECTED_ANGLE_ERROR = (np.deg2rad(0.3), np.deg2rad(0.6))
 """Expected error of the tracked body's orientation: value at a window's start (rad), and growth rate (rad/s)."""
 _DIVERGED = 20.0
 """Norm of the errors assigned to a window that diverged in simulation, in units of the expected error."""
-OUTLYING = 3.0
+OUTLIER_THRESHOLD = 3.0
 """Norm of a window's errors above which the loss grows linearly, in units of the expected error. It limits the weight
 of windows in which, for example, a contact point slipped."""
 
@@ -47,19 +47,19 @@ def window_errors(
     else:
         one, other = (jax.vmap(euler_to_matrix)(jnp.asarray(x)[:, layout.euler_angles]) for x in (features, recorded))
         angles = ((one - other) / np.sqrt(2)).reshape(steps, 9)
-    start, each_second = np.array([POSITION] * 3 + [ANGLE] * angles.shape[1]).T
+    start, each_second = np.array([EXPECTED_POSITION_ERROR] * 3 + [EXPECTED_ANGLE_ERROR] * angles.shape[1]).T
     return jnp.concatenate([position, angles], axis=1) / ((start + each_second * time) * np.sqrt(steps))
 
 
 def pseudo_huber(squared: Any) -> Any:
     """Return the pseudo-Huber loss of windows from the squared norms of their errors.
 
-    For norms below `OUTLYING` the loss is about the squared norm. Above, it grows linearly with the norm.
+    For norms below `OUTLIER_THRESHOLD` the loss is about the squared norm. Above, it grows linearly with the norm.
     """
-    return 2 * OUTLYING**2 * ((1 + squared / OUTLYING**2) ** 0.5 - 1)
+    return 2 * OUTLIER_THRESHOLD**2 * ((1 + squared / OUTLIER_THRESHOLD**2) ** 0.5 - 1)
 
 
-def count_lost(errors: Float[np.ndarray, "windows entries"]) -> Float[np.ndarray, "windows entries"]:
+def fill_diverged(errors: Float[np.ndarray, "windows entries"]) -> Float[np.ndarray, "windows entries"]:
     """Return errors of windows in which each diverged (non-finite) window has errors of norm `_DIVERGED`."""
     finite = np.isfinite(errors).all(axis=1, keepdims=True)
     return np.where(finite, errors, _DIVERGED / math.sqrt(errors.shape[1]))

@@ -30,7 +30,7 @@ from ballu_mjx.recordings.motion_windows import (
     cut_motion_windows,
     simulate_motion_window,
 )
-from ballu_mjx.recordings.window_errors import OUTLYING, count_lost, pseudo_huber
+from ballu_mjx.recordings.window_errors import OUTLIER_THRESHOLD, fill_diverged, pseudo_huber
 from ballu_mjx.residuals.aerodynamics import (
     AIR_PARAMETERS,
     SIGNED_AIR_PARAMETERS,
@@ -266,7 +266,7 @@ def _soften(
     if slopes is None:
         return factor * errors, np.zeros((*errors.shape, 0))
     # The derivative of the factor with respect to the squared error, times the change of that along each direction.
-    steepness = 1 / np.sqrt(1 + squared / OUTLYING**2)
+    steepness = 1 / np.sqrt(1 + squared / OUTLIER_THRESHOLD**2)
     change = (steepness - loss / squared) / (2 * factor * squared)
     along = 2 * np.einsum("we,wed->wd", errors, slopes)[:, None, :]
     return factor * errors, factor[..., None] * slopes + change[..., None] * along * errors[..., None]
@@ -339,7 +339,7 @@ class AirWindows:
     def _whole(self, vector: np.ndarray) -> Float[np.ndarray, "windows entries"]:
         """Return `errors` for a vector with a whole delay."""
         self.control_steps += math.prod(np.shape(self.windows.features)[:2])
-        return count_lost(np.array(self._run(np.float32(vector), self.windows), np.float64))
+        return fill_diverged(np.array(self._run(np.float32(vector), self.windows), np.float64))
 
     def simulate(self, vector: Float[Array, " parameters"], window: MotionWindows) -> Float[Array, " entries"]:
         """Return `errors` of one window for a vector with a whole delay. JAX transformations apply."""

@@ -19,7 +19,7 @@ from ballu_mjx.residuals.aerodynamics import (
     air_parameters_to_json,
 )
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, check_air_config, identify_air
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.residuals.white_box_training import FitReport, fitted_residual
 from ballu_mjx.robots.model import same_parameters
 from ballu_mjx.runs.progress import PhaseProgress

@@ -11,11 +11,11 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.errors import shortest_recording
 from ballu_mjx.identification.actuators import AUTO, NOMINAL, find_actuators, read_actuators
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
-from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.load import bundled_recordings
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording, Split
+from ballu_mjx.recordings.recording_groups import group_of
 from ballu_mjx.residuals.run_config import find_recordings, run_actuators
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, same_parameters

@@ -27,7 +27,7 @@ from ballu_mjx.recordings.reference import pad_to_bucket, stack_motions
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import network_input, recorded_inputs
 from ballu_mjx.residuals.network_loads import force_frame, num_loads, square_newtons, world_loads
-from ballu_mjx.residuals.scales import settle_scales
+from ballu_mjx.residuals.scales import resolve_scales
 from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.coordinates import translations
@@ -176,7 +176,7 @@ class EnvMimicEnv(Env):
         If `simulator` has a residual, that residual also acts, and the policy learns the remaining forces.
         """
         self.simulator = simulator.with_residual(None)
-        self.config = settle_scales(config, self.simulator, motions)
+        self.config = resolve_scales(config, self.simulator, motions)
         plain = self.simulator.simulator
         model, self.robot = plain.mj_model, plain.robot
         self._held = np.array([model.joint(name).dofadr[0] for name in self.robot.held], int)
@@ -190,7 +190,7 @@ class EnvMimicEnv(Env):
         self._observation_size = {name: shape.shape for name, shape in shapes.items()}
 
     @property
-    def contents(self) -> dict[str, Any]:
+    def parameters(self) -> dict[str, Any]:
         """Return the parameters that differ between environments of the same configuration, as arrays.
 
         They are the model's numbers, the recordings, and the parameters of a base residual. A compiled program that
@@ -205,13 +205,13 @@ class EnvMimicEnv(Env):
             "base residual": None if self.simulator.residual is None else self.simulator.residual.params,
         }
 
-    def with_contents(self, contents: Mapping[str, Any]) -> EnvMimicEnv:
-        """Return the same environment with other contents, which may be traced."""
+    def with_parameters(self, parameters: Mapping[str, Any]) -> EnvMimicEnv:
+        """Return the same environment with other parameters, which may be traced."""
         other = copy.copy(self)
-        simulator = self.simulator.with_model(contents["model"], contents["base residual"])
-        other.simulator = simulator.with_drivetrain(contents["drivetrain"])
-        other.reference = contents["reference"]
-        other._spread, other._spread_of_starts = contents["spread"], contents["spread of starts"]
+        simulator = self.simulator.with_model(parameters["model"], parameters["base residual"])
+        other.simulator = simulator.with_drivetrain(parameters["drivetrain"])
+        other.reference = parameters["reference"]
+        other._spread, other._spread_of_starts = parameters["spread"], parameters["spread of starts"]
         return other
 
     def reset(self, rng: Array) -> State:

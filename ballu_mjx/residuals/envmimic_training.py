@@ -13,8 +13,8 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, check_envmimic_config
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_input import num_inputs
-from ballu_mjx.residuals.scales import settle_scales
-from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
+from ballu_mjx.residuals.scales import resolve_scales
+from ballu_mjx.residuals.trained_residual import TrainedResidual, observed_range, write_observed
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.rl.resume_point import ResumePoint
@@ -66,7 +66,7 @@ def train_envmimic(
     plain, robot = augmented.without_residual(), augmented.robot
     check_envmimic_options(config, ppo_config, validate_every, robot.control_timestep)
     check_resumes(start, config, robot)
-    config = settle_scales(config, augmented, motions)
+    config = resolve_scales(config, augmented, motions)
     sections = {"env": dataclasses.asdict(config), "ppo": dataclasses.asdict(ppo_config)}
     record = MemoryRecord(sections) if run is None else run
     env = EnvMimicEnv(augmented, motions, config)

@@ -90,7 +90,7 @@ _MIN_LINEAR = 2
 """Smallest number of linear velocities in a cubic term."""
 
 
-def mirrored(terms: Sequence[Term]) -> Bool[np.ndarray, "terms 6"]:
+def symmetric_mask(terms: Sequence[Term]) -> Bool[np.ndarray, "terms 6"]:
     """Return a mask of the coefficients that may differ from 0 for a body that is symmetric about the xz plane."""
     return np.array([term.odd for term in terms])[:, None] == _ODD_AXES
 

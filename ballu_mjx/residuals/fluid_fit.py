@@ -28,7 +28,7 @@ from ballu_mjx.recordings.motion_windows import (
     cut_motion_windows,
     simulate_motion_window,
 )
-from ballu_mjx.recordings.window_errors import OUTLYING, count_lost, pseudo_huber
+from ballu_mjx.recordings.window_errors import OUTLIER_THRESHOLD, fill_diverged, pseudo_huber
 from ballu_mjx.residuals.fluid import TERM_SETS, FluidCoefficients, FluidResidual, TermSet, terms_of
 from ballu_mjx.residuals.fluid_parametrization import (
     PASSIVE_SETS,
@@ -207,7 +207,7 @@ class _Windows:
         """Return the errors of all windows, in units of the expected error. Diverged windows have constant errors."""
         self.program.control_steps += self.count * self.steps
         found = [self.program.errors(np.float32(params), self._chosen(rows)) for rows, _ in chunks(self.count, _BATCH)]
-        return count_lost(np.concatenate(found).astype(np.float64)[: self.count])
+        return fill_diverged(np.concatenate(found).astype(np.float64)[: self.count])
 
     def derivatives(
         self, params: Float[np.ndarray, "terms 6"], directions: Float[np.ndarray, "size terms 6"]
@@ -276,7 +276,7 @@ class _Search:
         directions = self._coefficients.directions(vector)
         params = self._coefficients.table(vector)
         errors, jacobian = self._windows.errors(params), self._windows.derivatives(params, directions)
-        weight = 1 / np.sqrt(1 + np.sum(errors**2, axis=1) / OUTLYING**2)
+        weight = 1 / np.sqrt(1 + np.sum(errors**2, axis=1) / OUTLIER_THRESHOLD**2)
         scores = np.einsum("we,wes->ws", errors, jacobian) * weight[:, None]
         prior = np.eye(len(vector))
         bread = np.linalg.inv(np.einsum("w,wes,wet->st", weight, jacobian, jacobian, optimize=True) + prior)
@@ -291,7 +291,7 @@ class _Search:
         errors = windows.errors(params)
         jacobian = windows.derivatives(params, self._coefficients.directions(vector))
         # Iteratively reweighted least squares: the derivatives take the weight of a window as constant.
-        weight = (1 + np.sum(errors**2, axis=1)[:, None] / OUTLYING**2) ** -0.25
+        weight = (1 + np.sum(errors**2, axis=1)[:, None] / OUTLIER_THRESHOLD**2) ** -0.25
         values = np.concatenate([(weight * errors).ravel(), vector])
         return values, np.concatenate([(weight[..., None] * jacobian).reshape(-1, len(vector)), np.eye(len(vector))])
 

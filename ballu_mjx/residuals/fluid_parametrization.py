@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ballu_mjx.residuals.fluid import TERM_SETS, TermSet, mirrored, terms_of
+from ballu_mjx.residuals.fluid import TERM_SETS, TermSet, symmetric_mask, terms_of
 
 PASSIVE_SETS: tuple[TermSet, ...] = ("linear", "drag", "quadratic")
 """Sets of terms for which passive coefficients exist."""
@@ -65,7 +65,7 @@ class FreeCoefficients:
         - `symmetric`: whether the body is symmetric about the xz plane, so that some coefficients are 0.
         """
         terms = terms_of(TERM_SETS[-1])
-        free = mirrored(terms) if symmetric else np.ones(prior.shape, bool)
+        free = symmetric_mask(terms) if symmetric else np.ones(prior.shape, bool)
         free[len(terms_of(name)) :] = False
         self._directions = np.zeros((int(free.sum()), *prior.shape))
         self._directions[np.arange(len(self._directions)), *np.argwhere(free).T] = prior[free]
@@ -102,7 +102,7 @@ class PassiveCoefficients:
         - `symmetric`: whether the body is symmetric about the xz plane, so that some coefficients are 0.
         """
         terms = terms_of(TERM_SETS[-1])
-        allowed = mirrored(terms) if symmetric else np.ones(prior.shape, bool)
+        allowed = symmetric_mask(terms) if symmetric else np.ones(prior.shape, bool)
         linear, drag, quadratic = (len(terms_of(each)) for each in PASSIVE_SETS)
         parts = [_gravity_part(prior, allowed), _damping_part(prior, allowed, _GRAVITY)]
         if drag <= len(terms_of(name)):

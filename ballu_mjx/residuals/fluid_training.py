@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.fluid import FLUID_FILE, FluidResidual
 from ballu_mjx.residuals.fluid_fit import FluidConfig, FluidFit, fit_fluid_forces
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.residuals.white_box_training import FitReport, fitted_residual
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord

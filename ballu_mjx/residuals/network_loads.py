@@ -39,7 +39,7 @@ class LoadScales(NamedTuple):
 def load_scales(config: ForceNetworkConfig, robot: RobotDescription) -> LoadScales:
     """Return the scales of a network's outputs. Values that `config` lacks are the robot's own.
 
-    **Raises** `ValueError` if a value is in neither. `scales.settle_scales` estimates it from recordings.
+    **Raises** `ValueError` if a value is in neither. `scales.resolve_scales` estimates it from recordings.
     """
     own, size = robot.adapter.residual_scales(), num_loads(config, robot)
     names = ("force_scale", "torque_scale", "force_limit")
@@ -53,7 +53,7 @@ def load_scales(config: ForceNetworkConfig, robot: RobotDescription) -> LoadScal
     else:
         scales = list(config.scales) if len(config.scales) == size else None
     if force is None or limit is None or scales is None or None in scales:
-        raise ValueError("The scales of the forces are open; set them, or call settle_scales.")
+        raise ValueError("The scales of the forces are open; set them, or call resolve_scales.")
     return LoadScales(np.array(scales, float), float(force), float(limit / force))
 
 

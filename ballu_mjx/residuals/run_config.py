@@ -43,7 +43,7 @@ def run_robot(config: Mapping[str, Any], folder: Path) -> RobotDescription:
     return load_robot() if stored is None else find_robot(stored, folder / CONFIG_FILE)
 
 
-def check_stands_in(robot: RobotDescription, own: RobotDescription, folder: Path) -> None:
+def check_compatible_robot(robot: RobotDescription, own: RobotDescription, folder: Path) -> None:
     """Check that a residual that was learned for the robot `own` of a run can act on `robot`.
 
     **Raises** `InputError` if the robots differ in a quantity of a residual's input or loads. The message names it.

@@ -23,7 +23,7 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ballu_mjx.identification.guard import physics_commands
+from ballu_mjx.identification.actuator_choice import physics_commands
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, stack_motions
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
@@ -57,7 +57,7 @@ _PERTURBATION = 0.1
 Config = TypeVar("Config", bound=ForceNetworkConfig)
 
 
-def settle_scales(config: Config, simulator: Simulator | AugmentedSimulator, motions: Sequence[Motion]) -> Config:
+def resolve_scales(config: Config, simulator: Simulator | AugmentedSimulator, motions: Sequence[Motion]) -> Config:
     """Return the configuration with numbers for all scales, the limit and the cost.
 
     Values that are given stay. The others are the robot's own (`RobotAdapter.residual_scales`), or are derived from the

@@ -12,7 +12,7 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import recorded_inputs
-from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
+from ballu_mjx.residuals.trained_residual import TrainedResidual, observed_range, write_observed
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import TrainingRecord
 from ballu_mjx.sim.residual import Residual

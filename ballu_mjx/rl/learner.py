@@ -65,11 +65,11 @@ class Learner:
         each: Any = PartitionSpec()
         everywhere = NamedSharding(mesh, each)
         # From the host, because an array on one device cannot be placed on the devices of all processes.
-        self._contents = jax.device_put(jax.device_get(getattr(env, "contents", ())), everywhere)
+        self._parameters = jax.device_put(jax.device_get(getattr(env, "parameters", ())), everywhere)
         # A separate program, because its shapes are needed before another program uses it. So it is traced once.
-        self._reset = jax.jit(lambda keys, contents: self._with_contents(contents).reset(keys))
+        self._reset = jax.jit(lambda keys, parameters: self._with_parameters(parameters).reset(keys))
         keys = jax.ShapeDtypeStruct((config.num_envs, 2), jnp.uint32)
-        shapes = jax.eval_shape(self._reset, keys, self._contents).obs
+        shapes = jax.eval_shape(self._reset, keys, self._parameters).obs
         self._observation = {name: jax.ShapeDtypeStruct(x.shape[1:], jnp.float32) for name, x in shapes.items()}
         sizes = {name: x.shape for name, x in self._observation.items()}
         self._networks = ppo.make_networks(sizes, env.action_size, config)
@@ -106,7 +106,7 @@ class Learner:
 
     def init(self, seed: int) -> TrainingState:
         """Return the initial state for `seed`, the same as in Brax."""
-        arguments = np.array(jax.random.PRNGKey(seed)), self._contents
+        arguments = np.array(jax.random.PRNGKey(seed)), self._parameters
         first = self._first.lower(*arguments)
         state = jax.tree.map(
             lambda x, sharding: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding),
@@ -116,7 +116,7 @@ class Learner:
         # XLA compiles this program while Python traces the next.
         with ThreadPoolExecutor(1) as pool:
             compiled = pool.submit(first.compile)
-            self._step.lower(state, self._contents)
+            self._step.lower(state, self._parameters)
             compiled.result()
         return self._first(*arguments)
 
@@ -125,7 +125,7 @@ class Learner:
 
         The memory of `state` is reused, so do not read `state` afterwards.
         """
-        return self._step(state, self._contents)
+        return self._step(state, self._parameters)
 
     def resume(self, stored: Stored, *, environments: bool = True) -> tuple[TrainingState, bool]:
         """Return the state that `stored` holds, and whether all of it was used.
@@ -135,7 +135,7 @@ class Learner:
 
         **Raises** `ValueError` if any other array is missing or has another shape.
         """
-        shapes = jax.eval_shape(self._first, jax.random.PRNGKey(0), self._contents)
+        shapes = jax.eval_shape(self._first, jax.random.PRNGKey(0), self._parameters)
         leaves = jax.tree.leaves_with_path(shapes)
         stored = {
             array_name(path): np.zeros(leaf.shape, leaf.dtype) for path, leaf in leaves if 0 in leaf.shape
@@ -185,11 +185,11 @@ class Learner:
         """Move a state from the host to the devices, as `step` needs it."""
         return jax.device_put(state, self._shardings)
 
-    def _with_contents(self, contents: Any) -> Wrapper:
+    def _with_parameters(self, parameters: Any) -> Wrapper:
         env: Any = self._env
-        return wrap_for_training(env.with_contents(contents) if hasattr(env, "with_contents") else env)
+        return wrap_for_training(env.with_parameters(parameters) if hasattr(env, "with_parameters") else env)
 
-    def _make_first(self, key: UInt32[Array, 2], contents: Any) -> TrainingState:
+    def _make_first(self, key: UInt32[Array, 2], parameters: Any) -> TrainingState:
         key_networks, key = jax.random.split(key)
         key, key_environments, _ = jax.random.split(jax.random.fold_in(key, 0), 3)
         key_policy, key_value = jax.random.split(key_networks)
@@ -204,20 +204,20 @@ class Learner:
                 averaged_steps=jnp.zeros((), jnp.int32),
                 optimizer=self._optimizer.init(networks),  # pyright: ignore[reportArgumentType]
                 normalizer=running_statistics.init_state(self._observation),
-                environments=self._reset(jax.random.split(key_environments, self._config.num_envs), contents),
+                environments=self._reset(jax.random.split(key_environments, self._config.num_envs), parameters),
                 key=key,
                 steps=to_uint64(0),
             )
         )
 
-    def _make_step(self, state: TrainingState, contents: Any) -> tuple[TrainingState, dict[str, Array]]:
+    def _make_step(self, state: TrainingState, parameters: Any) -> tuple[TrainingState, dict[str, Array]]:
         """Take a training step on one device, with its share of the environments. Random keys are split as in Brax."""
         config = self._config
         key_step, key = jax.random.split(state.key)
         key_device = jax.random.split(key_step, self._devices)[jax.lax.axis_index(_AXIS)]
         key_learn, key_act, _ = jax.random.split(key_device, 3)
 
-        environments, data, measured = self._collect(self._with_contents(contents), state, key_act)
+        environments, data, measured = self._collect(self._with_parameters(parameters), state, key_act)
 
         # An adaptive learning rate compares with the policy that acted, so its normalizer is updated afterwards.
         adaptive = config.desired_kl > 0

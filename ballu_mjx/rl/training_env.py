@@ -38,9 +38,9 @@ def wrap_for_training(env: Env) -> Wrapper:
     **Reset.** Brax's auto-reset always returns to a cached first state. Here all environments are reset in every step,
     and only the finished ones use the result. This suits environments whose reset costs little compared with a step.
 
-    **Contents.** `env` may have an attribute `contents`, a tree of arrays, and a method `with_contents(contents)` that
-    returns the same environment with other contents. A `Learner` passes them to its program as arguments. So one
-    compiled program serves all environments that differ only in their contents.
+    **Parameters.** `env` may have an attribute `parameters`, a tree of arrays, and a method
+    `with_parameters(parameters)` that returns the same environment with other parameters. A `Learner` passes them to
+    its program as arguments. So one compiled program serves all environments that differ only in their parameters.
 
     **Variants.** If `env` has a method `renew(state, key)`, it is used for resets. The parameters of a variant of the
     environment can then be part of the state, instead of constants of the compiled program.

@@ -165,6 +165,6 @@ def said(error: Exception) -> str:
     return textwrap.shorten(re.sub(r"[^\x20-\x7e]+", " ", str(error)), 200) or type(error).__name__
 
 
-def refuse(path: Path, problem: str, mend: str) -> NoReturn:
+def refuse(path: Path, problem: str, fix: str) -> NoReturn:
     """Raise `InputError` with the file, the problem and the fix."""
-    raise InputError(f"{path}: {problem}; {mend}.")
+    raise InputError(f"{path}: {problem}; {fix}.")

@@ -18,17 +18,17 @@ def read_model(path: Path, place: Path) -> mujoco.MjModel:
 
     **Raises** `InputError` if there is no model that MuJoCo can read.
     """
-    mend = "give an MJCF file, relative to the description"
+    fix = "give an MJCF file, relative to the description"
     try:
         there = place.is_file()
     except (OSError, ValueError):  # the name is not a valid path
         there = False
     if not there:
-        refuse(path, f'"model" is {shown(place.name)}, but there is no file of this name', mend)
+        refuse(path, f'"model" is {shown(place.name)}, but there is no file of this name', fix)
     try:
         return mujoco.MjModel.from_xml_path(str(place))
     except (ValueError, mujoco.FatalError) as error:
-        refuse(path, f'"model" is {shown(place.name)}, which MuJoCo cannot read ({said(error)})', mend)
+        refuse(path, f'"model" is {shown(place.name)}, which MuJoCo cannot read ({said(error)})', fix)
 
 
 def checksum(path: Path, place: Path) -> str:
@@ -82,8 +82,8 @@ def check_joints(path: Path, model: mujoco.MjModel, control_timestep: float) -> 
             else:
                 later = model.jnt_type[0] != kinds.mjJNT_FREE
                 called = "a free joint that is not the first joint" if later else "a second free joint"
-            mend = "use hinges and slides; only the first joint may be free"
-            refuse(path, f'"model" has {called}, {shown(model.joint(index).name)}', mend)
+            fix = "use hinges and slides; only the first joint may be free"
+            refuse(path, f'"model" has {called}, {shown(model.joint(index).name)}', fix)
     count = control_timestep / model.opt.timestep
     if abs(count - round(count)) > 1e-6 or count < 1:
         problem = f'"model" has a time step of {model.opt.timestep:g} s'

@@ -22,7 +22,7 @@ from orbax.checkpoint import checkpoint_managers as policies
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.runs.layout import CHECKPOINTS_FOLDER, KEPT, PARAMS_FOLDER, RECORD_FILE, TRAINING_FOLDER
+from ballu_mjx.runs.layout import CHECKPOINTS_FOLDER, CHECKPOINTS_KEPT, PARAMS_FOLDER, RECORD_FILE, TRAINING_FOLDER
 
 _LOG = logging.getLogger(__name__)
 CHECKPOINT_OVERHEAD = 2**20
@@ -60,8 +60,8 @@ def restore_checkpoint(folder: Path, which: Which) -> tuple[int, dict[str, Any]]
             raise _no_checkpoint(folder, "validated checkpoint" if which == "best" else "checkpoint")
         return step, _read(folder, step, training=False).params
     except _DamagedError as error:
-        mend = "restore it from a copy, or delete its folder to use the next best"
-        raise InputError(f"{error}; {mend}.") from error
+        fix = "restore it from a copy, or delete its folder to use the next best"
+        raise InputError(f"{error}; {fix}.") from error
 
 
 def last_checkpoint(folder: Path, *, training: bool = False) -> Checkpoint:
@@ -175,12 +175,12 @@ def _no_checkpoint(folder: Path, kind: str) -> InputError:
 
 
 def checkpoint_manager(folder: Path) -> ocp.CheckpointManager:
-    """Return the orbax manager of a run's checkpoints, which keeps the last `KEPT` and the best."""
+    """Return the orbax manager of a run's checkpoints, which keeps the last `CHECKPOINTS_KEPT` and the best."""
     best = policies.BestN(get_metric_fn=_score, reverse=True, n=1, keep_checkpoints_without_metrics=False)
     options = ocp.CheckpointManagerOptions(
         best_fn=_score,
         best_mode="min",
-        preservation_policy=policies.AnyPreservationPolicy([policies.LatestN(KEPT), best]),
+        preservation_policy=policies.AnyPreservationPolicy([policies.LatestN(CHECKPOINTS_KEPT), best]),
         enable_async_checkpointing=False,
         create=False,
         multiprocessing_options=_alone(),
@@ -201,7 +201,7 @@ def _alone() -> ocp.options.MultiprocessingOptions:
 
 
 @contextlib.contextmanager
-def quiet_when_full(manager: ocp.CheckpointManager) -> Iterator[None]:
+def suppress_full_disk_output(manager: ocp.CheckpointManager) -> Iterator[None]:
     """Suppress orbax's output about a full disk: each of its threads fills pages. The exception still propagates."""
     stderr, before = sys.stderr, logging.root.manager.disable
     sys.stderr = said = io.StringIO()

@@ -41,9 +41,9 @@ from ballu_mjx.runs.checkpoints import (
     checkpoint_manager,
     drop_checkpoints,
     file_checksums,
-    quiet_when_full,
     record_checksum,
     restore_checkpoint,
+    suppress_full_disk_output,
 )
 from ballu_mjx.runs.layout import (
     CHECKPOINTS_FOLDER,
@@ -77,10 +77,10 @@ def new_folder(output: Path | None, task: str) -> Path:
     if output.exists() and not output.is_dir():
         raise InputError(f"{output}: this is a file; give --output a folder that is new or empty.")
     if output.exists() and any(output.iterdir()):
-        mend = "give --output a folder that is new or empty"
+        fix = "give --output a folder that is new or empty"
         if any((output / CHECKPOINTS_FOLDER).glob(f"*/{TRAINING_FOLDER}")):  # others cannot be resumed
-            mend = f"resume the run with --resume {output}, or give --output another folder"
-        raise InputError(f"{output}: the folder is not empty; {mend}.")
+            fix = f"resume the run with --resume {output}, or give --output another folder"
+        raise InputError(f"{output}: the folder is not empty; {fix}.")
     files.check_folder(output)
     return output
 
@@ -93,8 +93,8 @@ def read_config(folder: Path, *tasks: str) -> dict[str, Any]:
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise InputError(f"{folder}: there is no run ({CONFIG_FILE} is missing); check the path.")
-    mend = "restore it or start a new run"
-    content = files.read_json(path, mend)
+    fix = "restore it or start a new run"
+    content = files.read_json(path, fix)
     if content.get("format") not in READABLE_FORMATS:
         raise InputError(f"{path}: the format is not {RUN_FORMAT}; use the version of ballu_mjx that wrote it.")
     if content.get("task") not in tasks:
@@ -104,7 +104,7 @@ def read_config(folder: Path, *tasks: str) -> dict[str, Any]:
         )
     for name, fits in _SHAPES.items():
         if name in content and not fits(content[name]):
-            raise InputError(f'{path}: "{name}" has an invalid value, {shorten_value(content[name])}; {mend}.')
+            raise InputError(f'{path}: "{name}" has an invalid value, {shorten_value(content[name])}; {fix}.')
     return content
 
 
@@ -287,7 +287,7 @@ class Run:
         files.reserve(
             self.folder, CHECKPOINT_OVERHEAD + 2 * sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(trees))
         )
-        with quiet_when_full(self._manager):
+        with suppress_full_disk_output(self._manager):
             self._manager.save(step, args=ocp.args.Composite(**items), metrics=metrics)
             self._manager.wait_until_finished()
         # The record comes last: a checkpoint without a record is incomplete.

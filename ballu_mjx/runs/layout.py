@@ -7,7 +7,7 @@ from typing import Any
 
 RUN_FORMAT = "ballu-run/2"
 """Format of a run's folder. Checkpoints of version 1 held only parameters."""
-KEPT = 3
+CHECKPOINTS_KEPT = 3
 """Number of latest checkpoints that are kept."""
 
 READABLE_FORMATS = ("ballu-run/1", RUN_FORMAT)
@@ -15,7 +15,7 @@ CONFIG_FILE, METRICS_FILE, LOCK_FILE, CHECKPOINTS_FOLDER = "config.json", "metri
 PARAMS_FOLDER, TRAINING_FOLDER, RECORD_FILE = "params", "training", "record.json"
 NO_SCORE = 1e30
 """Score of a checkpoint whose validation score is not finite."""
-MOST_STEPS = 2**63
+MAX_STEPS = 2**63
 """Upper bound of a step number (exclusive)."""
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
-from ballu_mjx.runs.layout import METRICS_FILE, MOST_STEPS, shorten_value
+from ballu_mjx.runs.layout import MAX_STEPS, METRICS_FILE, shorten_value
 
 
 def read_metrics(folder: Path, last: int | None = None) -> list[dict[str, Any]]:
@@ -22,16 +22,16 @@ def read_metrics(folder: Path, last: int | None = None) -> list[dict[str, Any]]:
     path = folder / METRICS_FILE
     lines = files.read_text(path).split("\n")[:-1] if path.exists() else []
     rows: list[dict[str, Any]] = []
-    mend = "restore the file, or delete the line"
+    fix = "restore the file, or delete the line"
     for number, line in enumerate(lines, start=1):
-        row = files.parse_object(line, f"{path}, line {number}", mend)
+        row = files.parse_object(line, f"{path}, line {number}", fix)
         step, before = row.get("step"), rows[-1]["step"] if rows else 0
-        if type(step) is not int or not before <= step < MOST_STEPS:
-            raise InputError(f'{path}, line {number}: "step" must be an integer, and not below the one before; {mend}.')
+        if type(step) is not int or not before <= step < MAX_STEPS:
+            raise InputError(f'{path}, line {number}: "step" must be an integer, and not below the one before; {fix}.')
         for name, value in row.items():
             if value is not None and not is_number(value):
                 raise InputError(
-                    f"{path}, line {number}: {shorten_value(name)} is {shorten_value(value)}, not a number; {mend}."
+                    f"{path}, line {number}: {shorten_value(name)} is {shorten_value(value)}, not a number; {fix}."
                 )
         if last is not None and step > last:
             break

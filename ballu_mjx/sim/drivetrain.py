@@ -46,7 +46,7 @@ class DrivetrainState(NamedTuple):
     """Command after the rate limit."""
     lagged: Float[Array, " commands"]
     """Command after the lag."""
-    played: Float[Array, " commands"]
+    after_backlash: Float[Array, " commands"]
     """Command after the backlash: the actuators' `ctrl`."""
 
 
@@ -108,8 +108,8 @@ def step_drivetrain(
     # Backward Euler is exactly the identity at lag 0 and has a finite derivative there. It delays a ramp by the lag.
     lagged = limited + (state.lagged - limited) * (parameters.lag / (parameters.lag + timestep))
     half = parameters.backlash / 2
-    played = jnp.clip(state.played, lagged - half, lagged + half)
-    return DrivetrainState(sent, limited, lagged, played), played
+    after_backlash = jnp.clip(state.after_backlash, lagged - half, lagged + half)
+    return DrivetrainState(sent, limited, lagged, after_backlash), after_backlash
 
 
 def scan_drivetrain(

@@ -33,7 +33,7 @@ def write_evaluation(evaluator: OpenLoopEvaluator, params: Any, folder: Path) ->
 
 def draw_tracking(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay], path: Path) -> None:
     """Draw the replays of whole recordings by simulator, for the first recording of each group."""
-    from ballu_mjx.recordings.groups import group_of
+    from ballu_mjx.recordings.recording_groups import group_of
     from ballu_mjx.viz import plots
 
     shown: dict[str, plots.TrackingPanel] = {}

@@ -139,7 +139,7 @@ def _story(folder: Path, tables: Mapping[str, str]) -> Content:
     for seed in sorted(path for path in folder.glob("seed-*") if path.is_dir()):
         for task in tables:
             where = f"{task}, {seed.name}"
-            settings = ("vanilla", *pipeline_layout.SETTINGS, *pipeline_layout.settings_beyond(seed, task))
+            settings = ("vanilla", *pipeline_layout.PAPER_SIMULATORS, *pipeline_layout.settings_beyond(seed, task))
             policies = {setting: seed / f"{task}-{setting}" for setting in settings}
             policies = {setting: path for setting, path in policies.items() if (path / "config.json").is_file()}
             content.curves += [dataclasses.replace(c, title=f"{c.title} ({where})") for c in _curves(policies)]

@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from ballu_mjx.policies.variants import SimulatorVariant
+from ballu_mjx.policies.simulator_variants import SimulatorVariant
 
 COLOURS: Mapping[str, str] = {
     "recording": "black",

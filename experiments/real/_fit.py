@@ -12,7 +12,7 @@ import numpy as np
 from ballu_mjx.identification.fit_robot import RobotFit
 
 
-def parse(description: str | None) -> argparse.Namespace:
+def parse(description: str) -> argparse.Namespace:
     """Parse the command line, and return its options `data` and `quick`."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")

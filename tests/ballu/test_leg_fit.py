@@ -17,10 +17,10 @@ from ballu_mjx.ballu.curves import curve_distances, directed_hausdorff, polynomi
 from ballu_mjx.ballu.leg_fit import Identifier
 from ballu_mjx.ballu.leg_parameters import (
     ALL_PARAMETERS,
-    FURTHER,
     LEG_PARAMETERS,
     NOMINAL_DYNAMICS,
     PAPER_PARAMETERS,
+    RICHER_PARAMETERS,
     LegDynamics,
     ParameterTransform,
     dynamics_coordinates,
@@ -305,7 +305,7 @@ def test_the_richer_model_is_taken_where_a_robot_asks_for_it(physics: CompiledLe
 @pytest.mark.slow
 def test_the_simpler_model_stays_where_a_robot_has_no_more(physics: CompiledLeg, identifier: Identifier) -> None:
     """Springs are then as well known as if nothing else could differ; their errors say what that rests on."""
-    plain = [np.where(np.isin(LEG_PARAMETERS, FURTHER), SPACE.nominal, truth) for truth in TRUTH]
+    plain = [np.where(np.isin(LEG_PARAMETERS, RICHER_PARAMETERS), SPACE.nominal, truth) for truth in TRUTH]
     dynamics = dynamics_coordinates(TRAIN._replace(lag=1e-4, knee_damping=NOMINAL_DYNAMICS["knee_damping"]))
     y = np.concatenate([coordinates(*plain), np.tile(dynamics, (2, 1))], 1)
     motion = physics.motion(y, DATA.commanded)[0][:, DATA.counts]
@@ -316,10 +316,10 @@ def test_the_simpler_model_stays_where_a_robot_has_no_more(physics: CompiledLeg,
     assert found.selection is not None and not found.selection.richer
     assert found.selection.statistic > 0 and found.selection.effect > 0, "it has the simpler solution among its starts"
     parameters = found.parameters
-    assert all(getattr(parameters, name) is None for name in FURTHER) and parameters.backlash is not None
+    assert all(getattr(parameters, name) is None for name in RICHER_PARAMETERS) and parameters.backlash is not None
     spring, travel = (LEG_PARAMETERS.index(name) for name in ("knee_spring_stiffness", "motor_travel"))
     slopes = physics.motion(y, DATA.commanded)[1][:, DATA.counts].reshape(2, -1, y.shape[1])
-    simpler = ~np.isin([*LEG_PARAMETERS, *LegDynamics._fields], FURTHER)
+    simpler = ~np.isin([*LEG_PARAMETERS, *LegDynamics._fields], RICHER_PARAMETERS)
     for fit, truth, own, slope in zip(found.fits, plain, y, slopes[..., simpler] / np.deg2rad(0.5), strict=True):
         per_coordinate = jax.jacfwd(SPACE.vector)(jnp.asarray(own[: len(truth)]))[spring, spring]
         error = float(np.sqrt(np.linalg.inv(slope.T @ slope)[spring, spring]) * per_coordinate)

@@ -267,16 +267,16 @@ def test_turning_quickly(truth):
 
 def test_residuals_are_the_noise(seen_with_base, seen_without_base):
     for motion in (seen_with_base, seen_without_base):
-        assert set(motion.residual_mm) == {"balloon", "base", "foot_left", "foot_right"}
+        assert set(motion.fit_error_mm) == {"balloon", "base", "foot_left", "foot_right"}
         # Three axes of 0.5 mm are 0.87 mm; eleven unknowns take part of it.
-        assert all(0.1 < value < 0.87 for value in motion.residual_mm.values())
+        assert all(0.1 < value < 0.87 for value in motion.fit_error_mm.values())
 
 
 def test_residuals_show_a_wrong_skeleton(truth):
     longer = load_model()
     longer.body_pos[longer.body("balloon").id, 2] += 0.02
     motion = reconstruct(capture(truth, noise=0.0), load_robot(), longer)
-    assert motion.residual_mm["balloon"] > 3.0
+    assert motion.fit_error_mm["balloon"] > 3.0
 
 
 def test_states_start_a_simulator(truth, seen_with_base, seen_without_base):

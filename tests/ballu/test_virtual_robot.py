@@ -152,10 +152,10 @@ def test_a_trial_taken_up_in_its_true_state_goes_on_as_it_went(virtual: virtual_
     qpos, qvel = virtual_robot.record_truth(virtual, trial, virtual_robot.open_loop(commands), 3.0)
     start, ends = 27, slice(5 * 28, 5 * 58, 5)
     state = qpos[5 * start], qvel[5 * start]
-    again = virtual_robot.carry_on(virtual, trial, commands, start, state, 30)
+    again = virtual_robot.continue_trial(virtual, trial, commands, start, state, 30)
     np.testing.assert_allclose(again, qpos[ends], atol=1e-5)
     loose = dataclasses.replace(virtual, backlash=(0.0, 0.0), latency=0.0)
-    other = virtual_robot.carry_on(loose, trial, commands, start, state, 30)
+    other = virtual_robot.continue_trial(loose, trial, commands, start, state, 30)
     assert np.abs(other - qpos[ends]).max() > 0.05
 
 

@@ -34,7 +34,7 @@ from ballu_mjx.residuals.network_input import num_inputs
 from ballu_mjx.residuals.network_loads import num_loads
 from ballu_mjx.residuals.registry import RESIDUAL_TASKS
 from ballu_mjx.residuals.run_config import describe_run
-from ballu_mjx.residuals.trained import TrainedResidual, write_observed
+from ballu_mjx.residuals.trained_residual import TrainedResidual, write_observed
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.registry import load_robot

@@ -1,4 +1,4 @@
-"""Stages of the whole story: kept, found again, redone where something changed."""
+"""Stages of the pipeline: kept, found again, redone where something changed."""
 
 import json
 from pathlib import Path
@@ -15,7 +15,7 @@ class Interrupted(Exception):
     pass
 
 
-def story(root: Path, options: dict[str, int], stop_at: str | None = None) -> list[str]:
+def run_stages(root: Path, options: dict[str, int], stop_at: str | None = None) -> list[str]:
     """Three stages in a row, each needing the one before; returns which of them were made."""
     made: list[str] = []
 
@@ -35,31 +35,31 @@ def story(root: Path, options: dict[str, int], stop_at: str | None = None) -> li
 
 
 def test_finished_stages_are_found_again(tmp_path):
-    assert story(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["a", "b", "c"]
-    assert story(tmp_path, {"a": 1, "b": 2, "c": 3}) == []
+    assert run_stages(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["a", "b", "c"]
+    assert run_stages(tmp_path, {"a": 1, "b": 2, "c": 3}) == []
 
 
 def test_an_interrupted_story_goes_on_where_it_was(tmp_path):
     with pytest.raises(Interrupted):
-        story(tmp_path, {"a": 1, "b": 2, "c": 3}, stop_at="b")
+        run_stages(tmp_path, {"a": 1, "b": 2, "c": 3}, stop_at="b")
     assert (tmp_path / "b" / "begun").exists()
-    assert story(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["b", "c"]
+    assert run_stages(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["b", "c"]
 
 
 def test_a_changed_option_redoes_what_depends_on_it_and_loses_nothing(tmp_path):
-    story(tmp_path, {"a": 1, "b": 2, "c": 3})
-    assert story(tmp_path, {"a": 1, "b": 20, "c": 3}) == ["b", "c"]
+    run_stages(tmp_path, {"a": 1, "b": 2, "c": 3})
+    assert run_stages(tmp_path, {"a": 1, "b": 20, "c": 3}) == ["b", "c"]
     assert (tmp_path / "b" / "result").read_text() == "20"
     aside = [path for path in tmp_path.glob("b.*") if path.is_dir()]
     assert [(path / "result").read_text() for path in aside] == ["2"]
 
 
 def test_stages_without_a_key_are_never_taken_for_finished(tmp_path):
-    story(tmp_path, {"a": 1, "b": 2, "c": 3})
+    run_stages(tmp_path, {"a": 1, "b": 2, "c": 3})
     mark = tmp_path / "b.stage.json"
     content = json.loads(mark.read_text())
     mark.write_text(json.dumps(content | {"done": False}))
-    assert story(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["b"]
+    assert run_stages(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["b"]
 
 
 def test_trials_of_all_settings_meet_the_same_draughts_and_no_two_are_alike():
@@ -107,10 +107,10 @@ def test_each_round_learns_from_all_recordings_so_far_and_keeps_what_came_before
     monkeypatch.setattr(pipeline, "cached_stage", stage)
     also = "envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised"
     options = Options(output=tmp_path, rounds=3, also=also, outside_cost=2.0)
-    told = pipeline.Story(options, seed=0)
+    stages = pipeline.PipelineStages(options, seed=0)
     for setting in pipeline.settings_of(options):
-        told.policy("walk", setting)
-    assert pipeline.settings_of(options) == (*pipeline.SETTINGS, "envmimic-2", "envmimic-3", *options.also)
+        stages.policy("walk", setting)
+    assert pipeline.settings_of(options) == (*pipeline.PAPER_SIMULATORS, "envmimic-2", "envmimic-3", *options.also)
     recorded = ["recordings-walk", "recordings-walk-2", "recordings-walk-3"]
     for number, name in enumerate(("envmimic-walk", "envmimic-walk-2", "envmimic-walk-3"), 1):
         assert needs[name] == [*recorded[:number], "sysid"]

@@ -27,7 +27,7 @@ from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_
 from ballu_mjx.recordings.recording import Recording, cut
 from ballu_mjx.residuals.dataset import _choose, _read
 from ballu_mjx.residuals.run_config import describe_recording
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.model import assets
 from ballu_mjx.robots.registry import load_robot

@@ -24,7 +24,7 @@ from ballu_mjx.evaluation.errors import (
     summarize_starts,
 )
 from ballu_mjx.evaluation.errors_file import evaluation_from_json, evaluation_to_json, read_evaluation
-from ballu_mjx.recordings.groups import group_of
+from ballu_mjx.recordings.recording_groups import group_of
 
 
 def errors(name: str, starts: list[list[float]]) -> Errors:

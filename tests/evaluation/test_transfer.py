@@ -22,7 +22,7 @@ from ballu_mjx.evaluation.transfer import (
     walking_table,
 )
 
-SETTINGS = ("vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic")
+PAPER_SIMULATORS = ("vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic")
 
 
 def clock(seconds: float) -> Float[np.ndarray, " T"]:
@@ -129,7 +129,7 @@ def test_json_round_trip() -> None:
 def test_table_has_the_papers_rows_and_numbers(
     table: Callable[..., str], paper: Mapping[str, tuple[float, float, float]]
 ) -> None:
-    names = (*SETTINGS, "envmimic, other draughts")
+    names = (*PAPER_SIMULATORS, "envmimic, other draughts")
     results = {name: [[trial(0.1), trial(0.3)], [trial(0.2), trial(0.4)]] for name in names}
     text, caption = table(results).split("\n\n")
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()]

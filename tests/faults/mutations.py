@@ -415,7 +415,7 @@ def formats(work: Path) -> list[Format]:
     from ballu_mjx.recordings.importers.mapping import read_mapping
     from ballu_mjx.recordings.recording import cut
     from ballu_mjx.residuals.aerodynamics import AERODYNAMICS_FILE, AERODYNAMICS_FORMAT, read_air_parameters
-    from ballu_mjx.residuals.trained import _read_observed
+    from ballu_mjx.residuals.trained_residual import _read_observed
     from ballu_mjx.robots.description import read_description
     from ballu_mjx.robots.model import assets
     from ballu_mjx.robots.registry import load_robot

@@ -131,7 +131,7 @@ def test_no_file_of_a_run_s_folder_runs_code(run: Path, tmp_path: Path, found_cl
 
 
 def test_no_checkpoint_with_the_right_checksums_runs_code(run: Path, tmp_path: Path, found_classes: list[str]):
-    """Somebody who sends a folder can mend its checksums too: orbax itself must not unpickle."""
+    """Somebody who sends a folder can fix its checksums too: orbax itself must not unpickle."""
     mark = tmp_path / "exploded"
     place = run / "checkpoints" / "300"
     for file in sorted(path for path in place.rglob("*") if path.is_file() and path.name != "record.json"):

@@ -115,7 +115,7 @@ def test_shares_run_from_bound_to_bound(tmp_path: Path):
     shares = parameters.shares(values)
     np.testing.assert_allclose(parameters.at_shares(shares), values, rtol=1e-9)
     change = (parameters.at_shares(shares + 1e-6) - parameters.at_shares(shares - 1e-6)) / 2e-6
-    np.testing.assert_allclose([parameters.by_shares(each) for each in values], change, rtol=1e-6)
+    np.testing.assert_allclose([parameters.with_respect_to_shares(each) for each in values], change, rtol=1e-6)
     assert (values > parameters.lower).all() and (values < parameters.upper).all()
     # The first is nominal, but for what would begin on a bound.
     inside = (parameters.nominal > parameters.lower) & (parameters.nominal < parameters.upper)

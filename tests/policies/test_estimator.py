@@ -171,13 +171,13 @@ def walk() -> tuple[Capture, Float[np.ndarray, "steps 27"], Float[np.ndarray, "s
     """A virtual robot's 3 s of walking: the capture when it ended, what was estimated in time, and the truth."""
     steps = np.arange(60) * CONTROL_TIMESTEP / 0.9
     commands = np.where((steps[:, None] + [0.0, 0.5]) % 1.0 < 0.35, 0.9, 0.0)
-    played = iter(commands)
+    after_backlash = iter(commands)
     captures, seen = [], []
 
     def watched(capture: Capture) -> np.ndarray:
         captures.append(capture)
         seen.append(estimate(capture))
-        return next(played)
+        return next(after_backlash)
 
     virtual = virtual_robot.draw_robot(1)
     qpos, qvel = virtual_robot.record_truth(virtual, virtual_robot.draw_trial(40), watched, 3.0)

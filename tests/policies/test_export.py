@@ -40,7 +40,7 @@ from ballu_mjx.residuals.aerodynamics import (
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig
 from ballu_mjx.residuals.deploy.export import export_simulator
 from ballu_mjx.residuals.run_config import describe_run
-from ballu_mjx.residuals.trained import write_observed
+from ballu_mjx.residuals.trained_residual import write_observed
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Normalizer, Params, PPOConfig
 from ballu_mjx.robots.description import RobotDescription, read_description

@@ -12,14 +12,14 @@ from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.ballu.features import foot_positions
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, KNEES, MOTORS, standing_qpos
 from ballu_mjx.policies.closed_loop import ClosedLoop
-from ballu_mjx.policies.domain_randomization import make_setting
+from ballu_mjx.policies.domain_randomization import make_simulator_setting
 from ballu_mjx.policies.locomotion_config import LocomotionConfig
 from ballu_mjx.policies.locomotion_env import LocomotionEnv, LocomotionState, locomotion_observation, locomotion_state
 from ballu_mjx.policies.tasks import TASKS, Step
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_loads import load_units
-from ballu_mjx.residuals.trained import MARGIN, TrainedResidual
+from ballu_mjx.residuals.trained_residual import MARGIN, TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.learner import Learner
 from ballu_mjx.rl.ppo import PPOConfig
@@ -108,7 +108,7 @@ def test_randomization_draws_friction_and_start_and_is_off_by_default():
     assert np.ptp(plain.rollout.physics.qpos, axis=0).max() == 0 and np.abs(plain.rollout.physics.qvel).max() == 0
 
     config = LocomotionConfig(domain_randomization=True)
-    drawn = inner(draw(make_setting(BALLU, MODEL, config, None), keys))
+    drawn = inner(draw(make_simulator_setting(BALLU, MODEL, config, None), keys))
     low, high = config.friction
     assert low <= drawn.friction.min() < low + 0.05 and high - 0.05 < drawn.friction.max() <= high
     yaw = np.rad2deg(np.asarray(drawn.rollout.history)[:, -1, 8])
@@ -137,7 +137,7 @@ def test_identified_actuators_are_in_the_simulator_and_pass_from_episode_to_epis
     nominal = ActuatorParameters.nominal(MODEL)
     weak = dataclasses.replace(nominal, torque_limit=nominal.torque_limit * jnp.array([0.1, 1.0]))
     reached = []
-    for setting in (PLAIN.setting, make_setting(BALLU, MODEL, LocomotionConfig(), weak)):
+    for setting in (PLAIN.setting, make_simulator_setting(BALLU, MODEL, LocomotionConfig(), weak)):
         state = STEP(RESET(setting, jax.random.key(0)), jnp.ones(2))
         state = RESET(inner(state).setting, jax.random.key(1))
         for _ in range(20):
@@ -211,11 +211,11 @@ def test_one_program_serves_all_residuals_of_a_kind():
         )
         env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(), actuators=actuators, residual=learned)
         learner = Learner(env, sizes)
-        state = jax.eval_shape(learner._first, jax.random.PRNGKey(0), learner._contents)
-        training.append(learner._step.lower(state, learner._contents).as_text())
+        state = jax.eval_shape(learner._first, jax.random.PRNGKey(0), learner._parameters)
+        training.append(learner._step.lower(state, learner._parameters).as_text())
         loop = ClosedLoop(env, lambda params, seen: params.value * seen[:2])
-        state = jax.eval_shape(loop._reset, env.contents, jax.random.split(jax.random.key(0), 8))
-        closed_loop.append(loop._run.lower(GAIN, env.contents, state).as_text())
+        state = jax.eval_shape(loop._reset, env.parameters, jax.random.split(jax.random.key(0), 8))
+        closed_loop.append(loop._run.lower(GAIN, env.parameters, state).as_text())
     assert training[0] == training[1]
     assert closed_loop[0] == closed_loop[1]
 

@@ -12,7 +12,7 @@ import pytest
 from rover import write_rover
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.policies.domain_randomization import make_setting
+from ballu_mjx.policies.domain_randomization import make_simulator_setting
 from ballu_mjx.policies.locomotion_config import LocomotionConfig
 from ballu_mjx.policies.locomotion_env import LocomotionEnv, locomotion_state
 from ballu_mjx.policies.tasks import TASKS
@@ -50,7 +50,7 @@ def test_starts_are_drawn_about_the_keyframe_within_the_joints_ranges(rover: Rob
     assert np.asarray(now.rollout.physics.qvel).std(axis=0)[[0, 7]] == pytest.approx([0.03, 0.03], rel=0.2)
     np.testing.assert_allclose(now.rollout.commands[:, 0], np.tile(model.key("home").ctrl, (300, 1)))
 
-    plain = make_setting(rover, model, LocomotionConfig(), None)
+    plain = make_simulator_setting(rover, model, LocomotionConfig(), None)
     still = locomotion_state(jax.jit(lambda key: env._start(plain, key))(jax.random.key(1)))
     np.testing.assert_allclose(still.rollout.physics.qpos, home, atol=1e-6)
     np.testing.assert_allclose(still.friction, [0.7, 0.8, 0.6], atol=1e-6)  # floor, hull, arm: each its own

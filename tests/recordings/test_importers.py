@@ -1,4 +1,4 @@
-"""Importers: what each vendor's layout holds comes back, and damage is refused with place and mend."""
+"""Importers: what each vendor's layout holds comes back, and damage is refused with place and fix."""
 
 from __future__ import annotations
 

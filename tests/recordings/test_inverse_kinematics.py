@@ -83,7 +83,7 @@ def test_bent_arms_are_found_within_their_ranges(tmp_path: Path, links: int):
         qpos = rng.uniform(-2.2, 2.2, links) + 0.05 * np.sin(np.pi * np.arange(120) / RATE)[:, None]
         motion = reconstruct(capture(robot, qpos), robot)
         assert np.abs(motion.qpos).max() < 3.01
-        assert motion.residual_mm["tip"] < 1.0
+        assert motion.fit_error_mm["tip"] < 1.0
         assert np.abs(np.diff(motion.qpos, axis=0)).max() < 0.3, "one posture throughout"
         data.qpos[:] = motion.qpos[5]
         mujoco.mj_kinematics(model, data)
@@ -197,6 +197,6 @@ def test_kinematics_and_jacobians_are_mujocos():
         along, about = np.zeros((3, model.nv)), np.zeros((3, model.nv))
         mujoco.mj_jacSite(model, data, along, about, site.id)
         np.testing.assert_allclose(tree.point_jacobian(poses, 0)[i], along, atol=1e-12)
-        np.testing.assert_allclose(tree.turn_jacobian(poses, 0)[i], about, atol=1e-12)
+        np.testing.assert_allclose(tree.rotation_jacobian(poses, 0)[i], about, atol=1e-12)
         mujoco.mj_integratePos(model, row, step[i], 1.0)
         np.testing.assert_allclose(moved[i], row, atol=1e-12)

@@ -88,7 +88,7 @@ def blown(name: str, period: float, phase: float, steps: int = 160) -> Motion:
         states.append((data.qpos.copy(), data.qvel.copy()))
     qpos, qvel = (np.array(x) for x in zip(*states, strict=True))
     times = np.arange(steps + 1) * CONTROL_TIMESTEP
-    return Motion(name=name, time=times, command=command, qpos=qpos, qvel=qvel, residual_mm={})
+    return Motion(name=name, time=times, command=command, qpos=qpos, qvel=qvel, fit_error_mm={})
 
 
 def history(euler: np.ndarray, velocity: np.ndarray, turning: np.ndarray) -> jnp.ndarray:

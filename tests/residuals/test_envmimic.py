@@ -56,7 +56,7 @@ def make_motion(force: np.ndarray, name: str = "made", steps: int = STEPS) -> Mo
         command=command,
         qpos=np.array(qpos),
         qvel=np.array(qvel),
-        residual_mm={},
+        fit_error_mm={},
     )
 
 
@@ -326,8 +326,8 @@ def test_one_program_serves_all_recordings_and_actuators(still: Motion, pushed: 
     training, replaying = [], []
     for model, motions in cases:
         learner = Learner(EnvMimicEnv(Simulator(load_robot(), model=model), motions, EnvMimicConfig()), sizes)
-        state = jax.eval_shape(learner._first, jax.random.PRNGKey(0), learner._contents)
-        training.append(learner._step.lower(state, learner._contents).as_text())
+        state = jax.eval_shape(learner._first, jax.random.PRNGKey(0), learner._parameters)
+        training.append(learner._step.lower(state, learner._parameters).as_text())
         evaluator = OpenLoopEvaluator(
             Simulator(load_robot(), model=model),
             motions,

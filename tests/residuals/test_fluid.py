@@ -22,8 +22,8 @@ from ballu_mjx.residuals.fluid import (
     FluidCoefficients,
     FluidResidual,
     TermSet,
-    mirrored,
     read_fluid,
+    symmetric_mask,
     terms_of,
 )
 from ballu_mjx.residuals.fluid_fit import FluidConfig, FluidFit, check_fluid_config, fit_fluid_forces
@@ -121,7 +121,7 @@ def test_passive_coefficients_never_give_energy(name: TermSet, symmetric: bool):
     table = passive.table(vector)
     assert power(table, centre, 6).max() < 1e-9
     assert power(table, centre + 5.0, 6).max() > 1e-3, "about another point it would"
-    assert not symmetric or np.all(table[~mirrored(terms)] == 0)
+    assert not symmetric or np.all(table[~symmetric_mask(terms)] == 0)
     step = 1e-6 * np.eye(len(vector))
     differences = [(passive.table(vector + each) - passive.table(vector - each)) / 2e-6 for each in step]
     np.testing.assert_allclose(passive.directions(vector), differences, atol=1e-7)
@@ -156,7 +156,7 @@ def test_held_out_flights_are_predicted(fit: FluidFit):
 def test_the_mirror_image_of_a_motion_gets_the_mirror_image_of_the_wrench(glider: RobotDescription):
     forces = FluidResidual(glider, glider.load_model(), "cubic")
     rng = np.random.default_rng(2)
-    params = jnp.asarray(rng.normal(size=(len(forces.terms), 6)) * mirrored(forces.terms), jnp.float32)
+    params = jnp.asarray(rng.normal(size=(len(forces.terms), 6)) * symmetric_mask(forces.terms), jnp.float32)
     history = np.cumsum(rng.normal(size=(HISTORY, glider.features)) * 0.05, axis=0)
     flip = np.array([1, -1, 1, 1, -1, 1, -1, 1, -1])
     commands = jnp.zeros((HISTORY, 2))

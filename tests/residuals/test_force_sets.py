@@ -17,13 +17,13 @@ from servo_arm import wandering, write_arm
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.residuals import supervised
+from ballu_mjx.residuals import force_regression
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, tracking_state
+from ballu_mjx.residuals.force_regression import SupervisedConfig
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_loads import load_scales, num_loads
-from ballu_mjx.residuals.scales import describe_scales, missing_loads, settle_scales
-from ballu_mjx.residuals.supervised import SupervisedConfig
+from ballu_mjx.residuals.scales import describe_scales, missing_loads, resolve_scales
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.force_sets import ForceSet
@@ -124,10 +124,10 @@ def test_labels_and_scales_are_what_is_missing(
     # With half of it in a base residual, half is missing.
     base = simulator.with_residual(constant(robot, forces, loads / 2))
     np.testing.assert_allclose(missing_loads(base, [motion], forces), np.abs(loads) / 2, rtol=0.15)
-    config = settle_scales(ForceNetworkConfig(forces=forces), simulator, [motion])
-    labels = supervised.ForceLabeller(Linearizer(simulator, forces=forces), SupervisedConfig(), config)(motion)
+    config = resolve_scales(ForceNetworkConfig(forces=forces), simulator, [motion])
+    labels = force_regression.ForceLabeller(Linearizer(simulator, forces=forces), SupervisedConfig(), config)(motion)
     np.testing.assert_allclose(np.median(labels, axis=0), loads, rtol=0.1)
-    _, actions = supervised.examples(simulator, [motion], [labels], config)
+    _, actions = force_regression.examples(simulator, [motion], [labels], config)
     np.testing.assert_allclose(np.median(actions, axis=0), np.sign(loads), rtol=0.2)
 
 
@@ -151,9 +151,9 @@ def test_the_environment_rewards_the_missing_torque(robot: RobotDescription, sim
 
 def test_what_is_given_stays_and_ballus_are_its_own(robot: RobotDescription, simulator: Simulator):
     given = ForceNetworkConfig(forces="wrench", force_scale=0.3, torque_scale=0.2, force_limit=0.9)
-    assert settle_scales(given, simulator, []) == given
+    assert resolve_scales(given, simulator, []) == given
     ballu = load_robot()
-    settled = settle_scales(EnvMimicConfig(forces="wrench"), Simulator(ballu), [])
+    settled = resolve_scales(EnvMimicConfig(forces="wrench"), Simulator(ballu), [])
     assert (settled.force_scale, settled.torque_scale) == (0.05, 0.005)
     assert (settled.force_limit, settled.force_cost) == (1.0, 20.0)
     text = describe_scales(settled, ballu)
@@ -172,7 +172,7 @@ def test_a_robot_without_joints_to_act_along_is_refused(robot: RobotDescription,
     (tmp_path / "stiff.robot.json").write_text(json.dumps(content))
     stiff = read_description(tmp_path / "stiff.robot.json")
     with pytest.raises(InputError, match=r"--forces joints: arm has no hinge or slide.*force_joints"):
-        settle_scales(EnvMimicConfig(forces="joints"), Simulator(stiff), [])
+        resolve_scales(EnvMimicConfig(forces="joints"), Simulator(stiff), [])
     content["force_joints"] = ["elbow"]
     (tmp_path / "stiff.robot.json").write_text(json.dumps(content))
     one = read_description(tmp_path / "stiff.robot.json")

@@ -16,7 +16,7 @@ from ballu_mjx.residuals.fluid_fit import FluidConfig
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import num_inputs
 from ballu_mjx.residuals.run_config import describe_run
-from ballu_mjx.residuals.trained import TrainedResidual, write_observed
+from ballu_mjx.residuals.trained_residual import TrainedResidual, write_observed
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.runs.folder import Run
 

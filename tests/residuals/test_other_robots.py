@@ -17,15 +17,15 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.motion_windows import cut_motion_windows
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.residuals import analytic, supervised
+from ballu_mjx.residuals import force_gradients, force_regression
 from ballu_mjx.residuals.aerodynamics import Aerodynamics, AirParameters
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
-from ballu_mjx.residuals.analytic import AnalyticConfig
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.force_gradients import AnalyticConfig
+from ballu_mjx.residuals.force_regression import SupervisedConfig
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_input import num_inputs, recorded_inputs
 from ballu_mjx.residuals.network_loads import load_units, num_loads
-from ballu_mjx.residuals.supervised import SupervisedConfig
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription, read_description
@@ -77,9 +77,9 @@ def linearize() -> Linearizer:
 
 def test_labels_are_the_push(motions: list[Motion], linearize: Linearizer):
     """In the world's frame, whichever way the balloon faces."""
-    labels = supervised.ForceLabeller(linearize, PRIORS, CONFIG)(motions[0])
+    labels = force_regression.ForceLabeller(linearize, PRIORS, CONFIG)(motions[0])
     np.testing.assert_allclose(np.median(labels, axis=0), PUSH, atol=0.1 * float(np.linalg.norm(PUSH)))
-    _, actions = supervised.examples(SIMULATOR, motions[:1], [np.tile(PUSH, (STEPS, 1))], CONFIG)
+    _, actions = force_regression.examples(SIMULATOR, motions[:1], [np.tile(PUSH, (STEPS, 1))], CONFIG)
     np.testing.assert_allclose(load_units(CONFIG, ROBOT) * actions, np.tile(PUSH, (len(actions), 1)), atol=1e-6)
     yaw = stack_motions(SIMULATOR, motions)[0].features[0, :, ObservationLayout.yaw]
     assert np.ptp(np.asarray(yaw)) > 0.1  # in a heading frame these would be other actions
@@ -97,7 +97,7 @@ def test_gradients_through_the_simulation_find_the_push(motions: list[Motion], l
     )  # fmt: skip
     windows = cut_motion_windows(SIMULATOR, motions, settings.window_seconds, settings.interval_seconds)
     found = []
-    analytic.train(
+    force_gradients.train(
         forces,
         lambda policy: start._replace(policy=policy),
         start.policy,
@@ -157,13 +157,13 @@ def test_commands_in_other_units_are_the_same_robot(tmp_path: Path):
         infer, start = ppo.make_inference(*sizes), ppo.initial_policy(inputs, 3, NETWORK)
         forces = jax.jit(lambda policy, seen, infer=infer, start=start: infer(start._replace(policy=policy), seen))
         policies = []
-        supervised.regress(
+        force_regression.regress(
             forces, start.policy, (inputs, actions), SupervisedConfig(updates=20, validate_every=20),
             lambda step, policy, error, policies=policies: policies.append(policy),
         )  # fmt: skip
         windows = cut_motion_windows(simulator, [motion], 1.0, 1.0)
         network = NetworkResidual(CONFIG, robot, infer)
-        rollout = analytic.compile_rollout(simulator.with_residual(None), network)
+        rollout = force_gradients.compile_rollout(simulator.with_residual(None), network)
         _, features = rollout(start._replace(policy=policies[-1]), windows)
         learned.append((motion.qpos, inputs, np.asarray(features)))
     for one, other, tolerance in zip(*learned, (1e-9, 1e-4, 1e-3), strict=True):

@@ -18,14 +18,14 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.motion_windows import MotionWindows, cut_motion_windows
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.residuals import analytic, supervised
-from ballu_mjx.residuals.analytic import AnalyticConfig, check_analytic_config
+from ballu_mjx.residuals import force_gradients, force_regression
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.force_gradients import AnalyticConfig, check_analytic_config
+from ballu_mjx.residuals.force_regression import SupervisedConfig, check_supervised_config
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_input import num_inputs, recorded_inputs
 from ballu_mjx.residuals.network_loads import load_units, num_loads
-from ballu_mjx.residuals.supervised import SupervisedConfig, check_supervised_config
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.registry import load_robot
@@ -68,7 +68,7 @@ def pushed(name: str, height: float, model: mujoco.MjModel = MODEL, twist: float
         states.append((data.qpos.copy(), data.qvel.copy()))
     qpos, qvel = (np.array(x) for x in zip(*states, strict=True))
     times = np.arange(steps + 1) * CONTROL_TIMESTEP
-    return Motion(name=name, time=times, command=command, qpos=qpos, qvel=qvel, residual_mm={})
+    return Motion(name=name, time=times, command=command, qpos=qpos, qvel=qvel, fit_error_mm={})
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +103,7 @@ def start(inputs: np.ndarray) -> ppo.Params:
 @pytest.fixture(scope="module")
 def unforced(recorded: MotionWindows, start: ppo.Params) -> ControlSteps:
     still = start._replace(policy=jax.tree.map(np.zeros_like, jax.device_get(start.policy)))
-    return analytic.compile_rollout(SIMULATOR.with_residual(None), FORCES)(still, recorded)[0]
+    return force_gradients.compile_rollout(SIMULATOR.with_residual(None), FORCES)(still, recorded)[0]
 
 
 def test_derivatives_are_those_of_c_mujoco(unforced: ControlSteps, linearize: Linearizer):
@@ -151,7 +151,7 @@ def test_labels_are_the_push(linearize: Linearizer):
         joint_noise=1.0,
         torque_spread=1e-4,
     )
-    label = supervised.ForceLabeller(linearize, config, WRENCH)
+    label = force_regression.ForceLabeller(linearize, config, WRENCH)
     motions = [pushed("stepping", 0.0, twist=1.0), pushed("falling", 10.0, twist=1.0)]
     stepping, falling = (label(motion).mean(axis=0) for motion in motions)
     np.testing.assert_allclose(falling[:3], PUSH, atol=CLOSE)
@@ -168,7 +168,7 @@ def test_legs_that_differ_are_not_taken_for_forces(linearize: Linearizer):
     motion = pushed("stiff knees", 0.0, load_model(stiffer))
 
     def wrong(config: SupervisedConfig) -> float:
-        labels = supervised.ForceLabeller(linearize, config, WRENCH)(motion)
+        labels = force_regression.ForceLabeller(linearize, config, WRENCH)(motion)
         return float(np.median(np.linalg.norm(labels[:, :3] - PUSH, axis=1)))
 
     assert wrong(SupervisedConfig()) < 0.5 * wrong(SupervisedConfig(torque_spread=1e-5))
@@ -178,7 +178,7 @@ def test_examples_are_in_the_balloon_s_heading(motions: list[Motion]):
     """Seen by a robot that has turned, a force keeps its side."""
     simulator = SIMULATOR
     loads = [np.tile(np.r_[PUSH, TWIST], (len(motion.command), 1)) for motion in motions]
-    seen, actions = supervised.examples(simulator, motions, loads, WRENCH)
+    seen, actions = force_regression.examples(simulator, motions, loads, WRENCH)
     features, _ = simulator.observe_all(jnp.asarray(motions[0].qpos[40:41]), jnp.asarray(motions[0].qvel[40:41]))
     yaw = float(features[0, 8])
     assert abs(yaw) > 1e-3
@@ -200,7 +200,7 @@ def test_gradients_find_the_push(recorded: MotionWindows, inputs: np.ndarray, st
         observation_noise=0.0,
     )
     found: list[tuple[object, dict[str, float]]] = []
-    analytic.train(
+    force_gradients.train(
         FORCES,
         lambda policy: start._replace(policy=policy),
         start.policy,
@@ -249,7 +249,7 @@ def test_a_share_of_a_policy_s_forces(start: ppo.Params, inputs: np.ndarray):
 def test_a_run_is_read_as_its_kind(tmp_path: Path, start: ppo.Params):
     """What `force_fit` leaves, `Residual.load` understands."""
     from ballu_mjx.residuals.run_config import describe_run
-    from ballu_mjx.residuals.trained import write_observed
+    from ballu_mjx.residuals.trained_residual import write_observed
     from ballu_mjx.runs.folder import Run
 
     sections = {"env": WRENCH, "ppo": NETWORK, "fit": SupervisedConfig()}

@@ -360,7 +360,7 @@ def test_truncation_bootstraps_in_brax():
 
 
 @pytest.mark.parametrize(
-    ("change", "option", "mend"),
+    ("change", "option", "fix"),
     [
         ({"num_envs": 100}, "--num-envs", "128 is the nearest"),
         ({"num_envs": 4096}, "--num-envs", "256 is the nearest"),
@@ -379,7 +379,7 @@ def test_truncation_bootstraps_in_brax():
         ({"initial_std": 0.0}, "--initial-std", "greater than 0"),
     ],
 )
-def test_sizes_that_do_not_fit_are_refused(change, option, mend):
-    with pytest.raises(InputError, match=mend) as error:
+def test_sizes_that_do_not_fit_are_refused(change, option, fix):
+    with pytest.raises(InputError, match=fix) as error:
         ppo.check(dataclasses.replace(SMALL, **change), devices=2)
     assert str(error.value).startswith(option)

@@ -264,7 +264,7 @@ def test_states_are_recovered(flight: tuple[Recording, np.ndarray, np.ndarray], 
     assert np.abs(motion.qpos - qpos)[inner].max() < 0.01
     error = np.abs(motion.qvel - qvel)[inner]
     assert np.sqrt(np.mean(error**2)) < 0.1 * np.sqrt(np.mean(qvel**2))
-    assert max(motion.residual_mm.values()) < 0.1
+    assert max(motion.fit_error_mm.values()) < 0.1
 
 
 def test_a_free_robot_is_recovered_wherever_it_is(tmp_path: Path):

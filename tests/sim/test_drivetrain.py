@@ -26,18 +26,18 @@ def wandering(seed: int = 0, steps: int = 400, commands: int = 2) -> np.ndarray:
 def reference(values: dict[str, float], commands: np.ndarray) -> np.ndarray:
     """One command, one step after the other, as the page says it."""
     found = []
-    limited = lagged = played = values["scale"] * commands[0] + values["offset"]
+    limited = lagged = after_backlash = values["scale"] * commands[0] + values["offset"]
     for step in range(len(commands)):
         late = step - values["delay"] / STEP
         arrived = values["scale"] * np.interp(late, np.arange(len(commands)), commands) + values["offset"]
         change = arrived - limited
         limited += np.sign(change) * min(abs(change), values["rate_limit"] * STEP)
         lagged += (limited - lagged) * STEP / (STEP + values["lag"])
-        if played < lagged - values["backlash"] / 2:
-            played = lagged - values["backlash"] / 2
-        if played > lagged + values["backlash"] / 2:
-            played = lagged + values["backlash"] / 2
-        found.append(played)
+        if after_backlash < lagged - values["backlash"] / 2:
+            after_backlash = lagged - values["backlash"] / 2
+        if after_backlash > lagged + values["backlash"] / 2:
+            after_backlash = lagged + values["backlash"] / 2
+        found.append(after_backlash)
     return np.array(found)
 
 

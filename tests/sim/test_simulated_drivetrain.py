@@ -134,7 +134,7 @@ def motion(robot: RobotDescription) -> Motion:
     commands = wandering(2, 80)
     qpos, qvel = true_path(robot, identified(robot, **TRUTH), commands)
     qpos, qvel = (np.concatenate([np.zeros((1, 2)), x[9::10]]) for x in (qpos, qvel))
-    return Motion(name="near", time=np.arange(81) * 0.05, command=commands, qpos=qpos, qvel=qvel, residual_mm={})
+    return Motion(name="near", time=np.arange(81) * 0.05, command=commands, qpos=qpos, qvel=qvel, fit_error_mm={})
 
 
 def test_recorded_motion_is_followed_from_any_start(simulator: Simulator, motion: Motion):
@@ -155,7 +155,7 @@ def test_windows_and_episodes_begin_in_the_drivetrains_recorded_state(simulator:
         np.testing.assert_allclose(after(state, commands), motion.qpos[first + 1 : first + 11], atol=1e-3)
 
     env = EnvMimicEnv(simulator, [motion], EnvMimicConfig(start_noise=0.0, observation_noise=0.0))
-    env = env.with_contents(env.contents)
+    env = env.with_parameters(env.parameters)
     state = jax.jit(env.reset)(jax.random.key(3))
     begun = tracking_state(state)
     reached = tracking_state(jax.jit(env.step)(state, jnp.zeros(env.action_size)))

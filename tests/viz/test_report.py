@@ -33,7 +33,7 @@ from ballu_mjx.policies import pipeline_layout
 from ballu_mjx.policies.locomotion_config import LocomotionConfig
 from ballu_mjx.policies.training import locomotion_ppo
 from ballu_mjx.recordings.csv_format import list_bundled
-from ballu_mjx.recordings.groups import group_of
+from ballu_mjx.recordings.recording_groups import group_of
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.rl.ppo import PPOConfig

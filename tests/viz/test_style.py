@@ -9,7 +9,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from ballu_mjx.ballu import plots as ballu_plots
-from ballu_mjx.policies.variants import SimulatorVariant
+from ballu_mjx.policies.simulator_variants import SimulatorVariant
 from ballu_mjx.viz import plots
 from ballu_mjx.viz.style import COLOURS, colour_of, label_of
 

@@ -336,7 +336,7 @@ def _advance(model: mujoco.MjModel, data: mujoco.MjData, servos: _Servos, trial:
         mujoco.mj_step(model, data, round(tick / model.opt.timestep))
 
 
-def carry_on(
+def continue_trial(
     virtual: VirtualRobot,
     trial: TrialConditions,
     commands: Float[np.ndarray, "steps 2"],

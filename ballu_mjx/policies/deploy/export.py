@@ -60,7 +60,7 @@ def export_policy(options: ExportOptions) -> Path:
     """
     from ballu_mjx.policies.policy import Policy
     from ballu_mjx.policies.tasks import TASKS
-    from ballu_mjx.residuals.trained import RESIDUAL_TASKS
+    from ballu_mjx.residuals.trained_residual import RESIDUAL_TASKS
     from ballu_mjx.runs.folder import new_folder, read_config
 
     _check(options)

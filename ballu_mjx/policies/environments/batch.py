@@ -19,7 +19,7 @@ from ballu_mjx.policies.locomotion_env import LocomotionEnv
 from ballu_mjx.policies.policy import environment_of
 from ballu_mjx.policies.tasks import find_task
 from ballu_mjx.policies.tasks.base import Task
-from ballu_mjx.residuals.trained import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.sim.sharding import compile_for_devices, device_shardings
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 

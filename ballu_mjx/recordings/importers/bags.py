@@ -275,8 +275,8 @@ def _series(
 
 
 def _missing(path: Path, package: str, error: ImportError) -> NoReturn:
-    mend = 'install it by `pip install "ballu-mjx[bags]"`'
-    raise InputError(f"{path}: bags and MCAP files are read with {package}, which is not installed; {mend}.") from error
+    fix = 'install it by `pip install "ballu-mjx[bags]"`'
+    raise InputError(f"{path}: bags and MCAP files are read with {package}, which is not installed; {fix}.") from error
 
 
 def _bag_topics(path: Path) -> list[_Topic]:

@@ -258,8 +258,8 @@ def _from_columns(capture: Capture, mapping: RoomMapping, source: Source) -> Str
     assert source.rotation is not None
     unit = 1.0 if source.rotation == "quaternion" else _unit(capture, mapping, parts[3][1], ANGLES, "angle")
     place = f"columns {source.orientation[0]} to {source.orientation[-1]}"
-    mend = f"export unit quaternions, or fix the order of the columns in {mapping.path}"
-    quaternion = to_quaternion(capture.path, place, values[:, 3:], source.rotation, unit, mend=mend)
+    fix = f"export unit quaternions, or fix the order of the columns in {mapping.path}"
+    quaternion = to_quaternion(capture.path, place, values[:, 3:], source.rotation, unit, fix=fix)
     return Stream(time, position, quaternion)
 
 

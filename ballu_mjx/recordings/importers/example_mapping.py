@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ballu_mjx.recordings.hooks import hooks_of
+from ballu_mjx.recordings.recording_hooks import hooks_of
 from ballu_mjx.robots.description import RobotDescription
 
 

@@ -16,9 +16,9 @@ from jaxtyping import Float
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import is_number
-from ballu_mjx.recordings.hooks import hooks_of
 from ballu_mjx.recordings.importers.trajectories import ANGLES, LENGTHS, TIMES, refuse, shorten, suggest
 from ballu_mjx.recordings.recording import Kind
+from ballu_mjx.recordings.recording_hooks import hooks_of
 from ballu_mjx.robots.description import RobotDescription
 
 MARKER_TOLERANCE = 0.01

@@ -172,6 +172,6 @@ def _length(path: Path, stated: str, mapping: RoomMapping | None) -> float:
     if mapping is not None and mapping.length is not None:
         unit = mapping.length
     if unit is None:
-        mend = 'export in Meters, or write length = "..." under [units] in the mapping'
-        refuse(path, "line 1, Length Units", f"{shorten(stated)!r} is not a known unit of length", mend)
+        fix = 'export in Meters, or write length = "..." under [units] in the mapping'
+        refuse(path, "line 1, Length Units", f"{shorten(stated)!r} is not a known unit of length", fix)
     return LENGTHS[unit]

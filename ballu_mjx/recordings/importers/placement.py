@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.recordings.hooks import hooks_of
 from ballu_mjx.recordings.importers.mapping import RoomMapping
 from ballu_mjx.recordings.importers.trajectories import Body, Trajectories, refuse
 from ballu_mjx.recordings.recording import Recording, cut
+from ballu_mjx.recordings.recording_hooks import hooks_of
 from ballu_mjx.robots.description import RobotDescription
 
 _START_SAMPLES = 20

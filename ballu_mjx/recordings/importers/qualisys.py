@@ -118,8 +118,8 @@ def _columns(
         leading = {0: [], 2: ["Frame", "Time"]}.get(len(cells) - len(of_each) * len(names))
         if leading is None:
             problem = f"the row has {len(cells)} cells, but {len(names)} names need {len(of_each) * len(names)}"
-            mend = "export with column headers, and either with both frame and time or with neither"
-            refuse(path, f"line {first + 1}", problem, mend)
+            fix = "export with column headers, and either with both frame and time or with neither"
+            refuse(path, f"line {first + 1}", problem, fix)
         return [*leading, *(f"{name} {part}" for name in names for part in of_each)], first, leading
     leading = [cell for cell in cells[:2] if cell in ("Frame", "Time")]
     columns, current = list(leading), ""
@@ -156,8 +156,8 @@ def _body(path: Path, table: np.ndarray, index: Mapping[str, int], name: str, ti
     present = [part for part in _ROTATION if f"{name} {part}" in index]
     if len(present) < len(_ROTATION):
         if present:
-            mend = "export the whole matrix, Rot[0] to Rot[8]"
-            refuse(path, "", f"{shorten(name)!r} has a rotation matrix with {len(present)} of 9 columns", mend)
+            fix = "export the whole matrix, Rot[0] to Rot[8]"
+            refuse(path, "", f"{shorten(name)!r} has a rotation matrix with {len(present)} of 9 columns", fix)
         return stream
     matrices = table[:, [index[f"{name} {part}"] for part in _ROTATION]].reshape(-1, 3, 3).transpose(0, 2, 1)
     return Stream(time, stream.position, _quaternions(path, name, matrices, stream.position))

@@ -74,15 +74,15 @@ def read_numbers(
             value = math.nan if cell.lower() in _MISSING else parse_number(cell)
             if value is None or (abs(value) > largest and column not in unlimited):
                 missing = "write nan" if delimiter is None else "leave the cell empty"
-                mend = f"{missing} if the sample is missing, and use decimal points"
+                fix = f"{missing} if the sample is missing, and use decimal points"
                 problem = f"{shorten(cell)!r} is not a number, or is too large"
-                refuse(path, f"{place}, {shorten(names[column])}", problem, mend)
+                refuse(path, f"{place}, {shorten(names[column])}", problem, fix)
             table[number - first, column] = value
     return table
 
 
-def check_times(path: Path, time: Float[np.ndarray, " T"], first: int, mend: str) -> None:
-    """Check that times are given and increase. Row 0 is in line `first` (from 0), and `mend` is the fix in messages.
+def check_times(path: Path, time: Float[np.ndarray, " T"], first: int, fix: str) -> None:
+    """Check that times are given and increase. Row 0 is in line `first` (from 0), and `fix` is the fix in messages.
 
     **Raises** `InputError` naming the line.
     """
@@ -93,4 +93,4 @@ def check_times(path: Path, time: Float[np.ndarray, " T"], first: int, mend: str
     if back.any():
         row = int(back.argmax()) + 1
         problem = f"time runs back or stands still, from {time[row - 1]:.6f} to {time[row]:.6f} s"
-        refuse(path, f"line {first + row + 1}", problem, mend)
+        refuse(path, f"line {first + row + 1}", problem, fix)

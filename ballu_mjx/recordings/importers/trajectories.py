@@ -64,10 +64,10 @@ class Trajectories:
     """Number of the first frame in its trial. In a file cropped at its start it is above 1, and `time` begins later."""
 
 
-def refuse(path: Path, place: str, problem: str, mend: str) -> NoReturn:
-    """Raise an `InputError` that names file, place, problem and fix (`mend`)."""
+def refuse(path: Path, place: str, problem: str, fix: str) -> NoReturn:
+    """Raise an `InputError` that names file, place, problem and fix (`fix`)."""
     where = f"{path}, {place}" if place else str(path)
-    raise InputError(f"{where}: {problem}; {mend}.")
+    raise InputError(f"{where}: {problem}; {fix}.")
 
 
 def shorten(text: str) -> str:
@@ -102,8 +102,8 @@ def find(path: Path, name: str, known: Iterable[str], what: str, mapping: Path) 
         return name
     behind = [full for full in names if full.rpartition(":")[2] == name]
     if len(behind) > 1:
-        mend = f"name one in {mapping}: {', '.join(behind[:4])}"
-        refuse(path, "", f"{what} {shorten(name)!r} belongs to several subjects", mend)
+        fix = f"name one in {mapping}: {', '.join(behind[:4])}"
+        refuse(path, "", f"{what} {shorten(name)!r} belongs to several subjects", fix)
     if not behind:
         hint = suggest(name, names).rstrip("?")
         refuse(path, "", f"there is no {what} {shorten(name)!r}", f"fix {mapping}, {hint}")
@@ -118,7 +118,7 @@ def to_quaternion(
     unit: float,
     frames: Int[np.ndarray, " T"] | None = None,
     *,
-    mend: str = "export unit quaternions again",
+    fix: str = "export unit quaternions again",
 ) -> Float[np.ndarray, "T 4"]:
     """Return unit quaternions (w, x, y, z) from a file's columns. A NaN in a row, or a zero quaternion, gives NaN.
 
@@ -131,7 +131,7 @@ def to_quaternion(
       angles in SciPy's notation, for example "XYZ" about the body's axes in turn, or "xyz" about the capture's axes.
     - `unit`: size of the columns' unit (rad). Ignored for quaternions.
     - `frames`: frame numbers of the samples, for messages. None if the file has none.
-    - `mend`: fix in the message about invalid quaternions.
+    - `fix`: fix in the message about invalid quaternions.
 
     **Raises** `InputError` if a quaternion is not of length 1, or if an angle is too large.
     """
@@ -149,7 +149,7 @@ def to_quaternion(
         if bad.any():
             row = int(bad.argmax())
             problem = f"the quaternion of {called(row)} has length {length[row]:.3g} instead of 1"
-            refuse(path, place, problem, mend)
+            refuse(path, place, problem, fix)
         quaternion[seen] = values[seen] / length[seen, None]
         return quaternion
     angles = values * unit

@@ -213,8 +213,8 @@ def _section(path: Path, lines: Sequence[str], delimiter: str, start: int, end: 
         return None
     place = f"line {start + 1}"
     if any(title[1:]) or parse_number(title[0]) is not None:
-        mend = "export again; a section begins with a blank line, then a title such as Segments alone in its line"
-        refuse(path, place, "the section's title is missing", mend)
+        fix = "export again; a section begins with a blank line, then a title such as Segments alone in its line"
+        refuse(path, place, "the section's title is missing", fix)
     if end - start < _HEADER_ROWS:
         problem = f"the section {shorten(title[0])!r} ends within its header"
         refuse(path, place, problem, "export again; title, rate, names, components and units must precede the samples")
@@ -225,11 +225,11 @@ def _section(path: Path, lines: Sequence[str], delimiter: str, start: int, end: 
         refuse(path, f"line {start + 2}", problem, "export again; the rate must be alone in the line below the title")
     if not laid_out:
         problem = f"the row of components begins with {shorten(delimiter.join(components[:2]))!r}"
-        mend = "export again; it must begin with Frame, Sub Frame, below title, rate and names"
-        refuse(path, f"line {start + 4}", problem, mend)
+        fix = "export again; it must begin with Frame, Sub Frame, below title, rate and names"
+        refuse(path, f"line {start + 4}", problem, fix)
     if parse_number(units[0]) is not None:
-        mend = "export again; the units must be between components and samples"
-        refuse(path, f"line {start + 5}", "it holds numbers instead of units", mend)
+        fix = "export again; the units must be between components and samples"
+        refuse(path, f"line {start + 5}", "it holds numbers instead of units", fix)
     while components and not components[-1]:
         components.pop()
     width = len(components)
@@ -263,8 +263,8 @@ def _wanted(
     path: Path, mapping: Path, source: Source, groups: Mapping[str, list[_Group]], sections: Sequence[_Section]
 ) -> list[_Group]:
     if source.position:
-        mend = 'a Vicon file has bodies and markers by name; write body = "..." there'
-        refuse(path, "", f"{mapping} gives [{source.role}] by columns", mend)
+        fix = 'a Vicon file has bodies and markers by name; write body = "..." there'
+        refuse(path, "", f"{mapping} gives [{source.role}] by columns", fix)
     found = []
     for name in source.markers or (source.body or "",):
         _check_position(path, name, groups, sections)
@@ -276,8 +276,8 @@ def _wanted(
             refuse(path, "", problem, f"fix {mapping}, {suggest(str(source.section), titles).rstrip('?')}")
         if len(candidates) > 1:
             titles = ", ".join(dict.fromkeys(g.section.title for g in candidates))
-            mend = f'add section = "..." to [{source.role}] in {mapping}'
-            refuse(path, "", f"{shorten(full)!r} is in several sections ({titles})", mend)
+            fix = f'add section = "..." to [{source.role}] in {mapping}'
+            refuse(path, "", f"{shorten(full)!r} is in several sections ({titles})", fix)
         chosen = candidates[0]
         if chosen.repeated is not None:
             problem = f"{shorten(full)!r} has {chosen.repeated} twice"
@@ -319,8 +319,8 @@ def _read(
             problem = f"{shorten(delimiter.join(cells[:2]))!r} is not a frame and a sub-frame"
             refuse(path, place, problem, "export again, or delete the line if it is not a sample")
         if sub != 0:
-            mend = "export at the cameras' rate"
-            refuse(path, place, f"section {section.title} has sub-frames, samples between the cameras' frames", mend)
+            fix = "export at the cameras' rate"
+            refuse(path, place, f"section {section.title} has sub-frames, samples between the cameras' frames", fix)
         if frames and frame <= frames[-1]:
             problem = f"frame numbers run back, from {frames[-1]:g} to {frame:g}"
             refuse(path, place, problem, "export again, one trial per file")
@@ -336,8 +336,8 @@ def _read(
             value = parse_number(cell) if cell and cell.lower() != "nan" else math.nan
             if value is None or abs(value) > LARGEST:
                 name = f"{shorten(section.names[i])} {section.components[i]}"
-                mend = "leave the cell empty if the sample is missing, and use decimal points"
-                refuse(path, f"{place}, {name}", f"{shorten(cell)!r} is not a number, or is too large", mend)
+                fix = "leave the cell empty if the sample is missing, and use decimal points"
+                refuse(path, f"{place}, {name}", f"{shorten(cell)!r} is not a number, or is too large", fix)
             row.append(value)
         table.append(row)
     values = np.array(table, float).reshape(len(table), len(columns))
@@ -354,8 +354,8 @@ def _unit(
     if unit not in known:
         shown = ", ".join(sorted(repr(shorten(u)) for u in units))
         names = f"{shorten(group.section.names[group.columns[components[0]]])} {components[0]} to {components[-1]}"
-        mend = f'export in {", ".join(known)}, or write {kind} = "..." under [units] in the mapping'
-        refuse(path, f"line {group.section.first}, {names}", f"the unit {shown} is not a known unit of {kind}", mend)
+        fix = f'export in {", ".join(known)}, or write {kind} = "..." under [units] in the mapping'
+        refuse(path, f"line {group.section.first}, {names}", f"the unit {shown} is not a known unit of {kind}", fix)
     return known[unit]
 
 
@@ -393,8 +393,8 @@ def _body(
         if rotation is None and group.section.title in _HELICAL:
             rotation = "helical"
         if rotation in (None, "quaternion"):
-            mend = f'write rotation = "helical" or "XYZ" in [{source.role}] of the mapping, as it was exported'
-            refuse(path, place, "RX, RY, RZ may be a rotation vector or Euler angles", mend)
+            fix = f'write rotation = "helical" or "XYZ" in [{source.role}] of the mapping, as it was exported'
+            refuse(path, place, "RX, RY, RZ may be a rotation vector or Euler angles", fix)
         columns = values(group, _ROTATION)
         unit = _unit(path, group, _ROTATION, ANGLES, mapping.angle, "angle")
     columns[np.isnan(position).any(axis=1)] = np.nan

@@ -109,7 +109,7 @@ def tip(angles: np.ndarray) -> np.ndarray:
 
 # %%
 def main() -> None:
-    options = _fit.parse(__doc__)
+    options = _fit.parse("Identify a geared double pendulum, and test on runs that the fit has not seen.")
     fit = identify(options.data, quick=options.quick)
     _fit.show(fit)
     print(f"validation, score: nominal {fit.nominal.score:.3g}, identified {fit.identified.score:.3g}")

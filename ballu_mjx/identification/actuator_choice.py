@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.recordings.groups import group_of
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.recording_groups import group_of
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, bare_parameters
 from ballu_mjx.sim.drivetrain import count_slots, drivetrain_of, filter_commands

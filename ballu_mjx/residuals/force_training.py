@@ -16,15 +16,15 @@ from ballu_mjx.evaluation.open_loop import Evaluators
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.motion_windows import cut_motion_windows
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.residuals import analytic, supervised
-from ballu_mjx.residuals.analytic import AnalyticConfig
+from ballu_mjx.residuals import force_gradients, force_regression
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.force_gradients import AnalyticConfig
+from ballu_mjx.residuals.force_regression import SupervisedConfig
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_input import recorded_inputs
 from ballu_mjx.residuals.network_loads import num_loads
-from ballu_mjx.residuals.scales import missing_loads, settle_scales
-from ballu_mjx.residuals.supervised import SupervisedConfig
-from ballu_mjx.residuals.trained import TrainedResidual, observed_range, write_observed
+from ballu_mjx.residuals.scales import missing_loads, resolve_scales
+from ballu_mjx.residuals.trained_residual import TrainedResidual, observed_range, write_observed
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.robots.description import RobotDescription
@@ -56,7 +56,7 @@ def fit_supervised(
     - `motions`: training motions.
     - `config`: options of labels and regression. None for the defaults.
     - `forces`: force set of the network, or options with the force set and its scales. Scales that are not given are
-      the robot's own, or are estimated from the motions (`scales.settle_scales`).
+      the robot's own, or are estimated from the motions (`scales.resolve_scales`).
     - `validation`: motions that choose the network. None for `motions`.
     - `run`: record of metrics and checkpoints, for example a run's folder. None to keep them in memory.
     - `progress`: display that is updated after every step.
@@ -65,7 +65,7 @@ def fit_supervised(
     **Raises** `InputError` for options out of range.
     """
     config = config or SupervisedConfig()
-    supervised.check_supervised_config(config)
+    force_regression.check_supervised_config(config)
     uses = _Uses(motions, motions if validation is None else validation)
     return _fit(_Supervised, "supervised", simulator, uses, config, forces, run, progress, evaluators)
 
@@ -86,7 +86,7 @@ def fit_analytic(
     `config` has the options of this method. The other arguments and the errors are those of `fit_supervised`.
     """
     config = config or AnalyticConfig()
-    analytic.check_analytic_config(config, simulator.robot.control_timestep)
+    force_gradients.check_analytic_config(config, simulator.robot.control_timestep)
     uses = _Uses(motions, motions if validation is None else validation)
     return _fit(_Analytic, "analytic", simulator, uses, config, forces, run, progress, evaluators)
 
@@ -178,7 +178,7 @@ class _Supervised(_Fit):
             size = missing_loads(setup.simulator, setup.motions.training, "joints")
             config = dataclasses.replace(config, torque_spread=float(size.max(initial=0.0)))
         linearize = Linearizer(setup.simulator, joints, env.forces)
-        label = supervised.ForceLabeller(linearize, config, env)
+        label = force_regression.ForceLabeller(linearize, config, env)
         uses = {"training": setup.motions.training}
         if setup.motions.validation is not setup.motions.training:
             uses["validation"] = setup.motions.validation
@@ -188,7 +188,7 @@ class _Supervised(_Fit):
             for motion in motions:
                 loads.append(label(motion))
                 self.show(f"labels, {use}", len(loads), len(motions), math.nan)
-            found[use] = supervised.examples(setup.simulator.simulator, motions, loads, env)
+            found[use] = force_regression.examples(setup.simulator.simulator, motions, loads, env)
             self.notes.append(f"Labels, {use}: {_sizes(np.concatenate(loads), env.forces, robot)}.")
         infer = jax.jit(lambda policy, seen: setup.forces.infer(setup.with_policy(policy), seen))
         seen, actions = found.get("validation", found["training"])
@@ -202,7 +202,7 @@ class _Supervised(_Fit):
             self.show("learning", step, config.updates, error)
 
         validate(0, self.zero_policy, float(np.mean(found["training"][1] ** 2)))
-        supervised.regress(infer, setup.start.policy, found["training"], config, validate)
+        force_regression.regress(infer, setup.start.policy, found["training"], config, validate)
         _, step, policy = best
         parts = {share: ppo.with_share(policy, share) for share in config.force_scales}
         errors = {share: self.validate(setup.with_policy(part)) for share, part in parts.items()}
@@ -234,7 +234,7 @@ class _Analytic(_Fit):
             self.show("learning", step, total, error)
 
         report(0, self.zero_policy, {})
-        analytic.train(
+        force_gradients.train(
             setup.forces,
             setup.with_policy,
             setup.start.policy,
@@ -276,7 +276,7 @@ def _fit(
     plain, robot = augmented.without_residual(), augmented.robot
     record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run
     env, network = network_sections(forces, config.seed)
-    env = settle_scales(env, augmented, motions.training)
+    env = resolve_scales(env, augmented, motions.training)
     reference, _ = stack_motions(plain, motions.training)
     inputs = np.asarray(recorded_inputs(reference, env, robot))
     sizes = {ppo.STATE: (inputs.shape[1],)}, num_loads(env, robot), network

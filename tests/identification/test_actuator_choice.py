@@ -7,7 +7,7 @@ import pytest
 from servo_arm import TRUTH, identified, true_path, wandering, write_arm
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.identification.guard import choose_actuators
+from ballu_mjx.identification.actuator_choice import choose_actuators
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.robots.description import RobotDescription
 
@@ -24,7 +24,7 @@ def motions(robot: RobotDescription) -> list[Motion]:
         commands = wandering(seed, steps)
         qpos, qvel = true_path(robot, identified(robot, **TRUTH), commands)
         states = (np.concatenate([np.zeros((1, 2)), x[9::10]]) for x in (qpos, qvel))
-        found.append(Motion(name, np.arange(steps + 1) * 0.05, commands, *states, residual_mm={}))
+        found.append(Motion(name, np.arange(steps + 1) * 0.05, commands, *states, fit_error_mm={}))
     return found
 
 

@@ -15,7 +15,7 @@ from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.residuals.aerodynamics import AirParameters
 from ballu_mjx.residuals.registry import KINDS, RESIDUAL_TASKS, StoredRun
-from ballu_mjx.residuals.run_config import check_stands_in, run_actuators, run_residual, run_robot
+from ballu_mjx.residuals.run_config import check_compatible_robot, run_actuators, run_residual, run_robot
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 from ballu_mjx.runs.folder import read_config
@@ -91,7 +91,7 @@ class TrainedResidual:
         stored = read_config(folder, *RESIDUAL_TASKS)
         own = run_robot(stored, folder)
         if other_model:
-            check_stands_in(robot, own, folder)
+            check_compatible_robot(robot, own, folder)
         elif own.sha256 != robot.sha256:
             raise InputError(f"{folder}: is of the robot {own.name}, not of {robot.name}; give one of the same robot.")
         identified = run_actuators(stored, folder, robot)
