@@ -42,8 +42,8 @@ class LocomotionConfig:
     range, less a margin of 0.1. 0 for no decay."""
     outside_cost: float = 0.0
     """Cost (reward, m/s) for each width of the training range by which the residual's observation lies outside this
-    range by more than 0.1 widths, 0 or more. It keeps the policy where the residual is reliable. A policy that is rewarded for speed otherwise
-    leaves this range. 0 for no cost."""
+    range by more than 0.1 widths, 0 or more. It keeps the policy where the residual is reliable. A policy that is
+    rewarded for speed otherwise leaves this range. 0 for no cost."""
 
 
 _STARTS = ("start_yaw", "start_tilt", "start_angle", "start_offset", "start_velocity")
