@@ -26,6 +26,7 @@ from ballu_mjx.policies.domain_randomization import (
 from ballu_mjx.policies.locomotion_config import LocomotionConfig, check_task
 from ballu_mjx.policies.simulator_variants import SimulatorVariant
 from ballu_mjx.policies.tasks import Step, Task
+from ballu_mjx.policies.tasks.base import mean_velocity
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
@@ -170,7 +171,7 @@ class LocomotionEnv(Env):
 
         rollout, finite = after.state.keep_finite(before.rollout, before.rollout.features)
         com = jnp.where(finite, after.com, before.com)
-        velocity = (com - before.com) / self.robot.control_timestep
+        velocity = mean_velocity(before.com, com, self.robot.control_timestep)
         earned = self.task.reward(Step(velocity, rollout.features, command)) - self.config.outside_cost * excess
         reward = jnp.where(finite, earned, 0.0)
         remaining = before.remaining - 1

@@ -20,6 +20,14 @@ class Step(NamedTuple):
     """Commands, in the actuators' units."""
 
 
+def mean_velocity(before: Float[Array, " 3"], after: Float[Array, " 3"], control_timestep: float) -> Float[Array, " 3"]:
+    """Return the mean velocity of the centre of mass over a control step (m/s), from its places (m) before and after.
+
+    Rewards are this velocity along a task's direction (paper, section "Policy Training with Improved Simulation").
+    """
+    return (after - before) / control_timestep
+
+
 @dataclasses.dataclass(frozen=True)
 class Task:
     """A task for which a policy is trained.
