@@ -104,6 +104,8 @@ class RobotFit:
     """Robust standard deviation of the remaining position errors, in units of the measurements' noise."""
     losses: Float[np.ndarray, " starts"]
     """Final losses of the searches, in ascending order."""
+    windows: Windows
+    """Windows of the training motions that were fitted; the held-out ones are not among them."""
     nominal: HeldOut
     identified: HeldOut
 
@@ -258,6 +260,7 @@ def fit_robot(
         at_bounds=parameters.at_bounds(values),
         scatter=objective.scale,
         losses=np.sort(losses),
+        windows=windows,
         nominal=pair[0],
         identified=pair[1],
     )

@@ -23,7 +23,7 @@ from ballu_mjx.identification.fit_robot import RobotFit
 from ballu_mjx.identification.measured_motion import MeasuredMotion
 from ballu_mjx.identification.parameters import Parameter, ParameterSet
 from ballu_mjx.identification.window_objective import ReducedResiduals, WindowConfig, WindowObjective
-from ballu_mjx.identification.window_simulator import WindowSimulator, cut_windows
+from ballu_mjx.identification.window_simulator import WindowSimulator
 from ballu_mjx.robots.description import RobotDescription
 
 
@@ -92,12 +92,13 @@ def suggest_parameters(
     """Return undeclared parameters that would explain the remaining error of `fit`.
 
     The candidate that explains most comes first. The next ones explain the remainder (forward selection). A candidate
-    is suggested if it differs significantly from nominal over all windows, whose errors are independent (Student's t).
-    Its step must also be allowed (friction is not negative), and its effect must be at least small (`SMALL_EFFECT`).
+    is suggested if it differs significantly from nominal over the fitted windows, whose errors are independent
+    (Student's t). Held-out windows have no influence. The candidate's step must also be allowed (friction is not
+    negative), and its effect must be at least small (`SMALL_EFFECT`).
 
     **Arguments**
 
-    - `motions`, `config`: motions and options of the fit.
+    - `motions`, `config`: training motions and options of the fit.
     """
     config, model = config or WindowConfig(), motions[0].model
     taken = {target[:2] for parameter in fit.parameters.parameters for target in parameter.targets}
@@ -113,8 +114,7 @@ def suggest_parameters(
     extended = ParameterSet([*fit.parameters.parameters, *candidates], fit.parameters.commands)
     values = np.concatenate([fit.values, [candidate.nominal for candidate in candidates]])
     with jax.enable_x64(True):
-        windows = cut_windows(motions, config.window_seconds, config.interval_seconds)
-        objective = WindowObjective(WindowSimulator(extended, motions, windows), config)
+        objective = WindowObjective(WindowSimulator(extended, motions, fit.windows), config)
         objective.scale = fit.scatter
         start = objective.measured_start()
         reduced, _ = objective(values, start)

@@ -1,4 +1,4 @@
-"""Does a fit say which parameter is missing, and is it silent where none is?"""
+"""Suggestions of parameters that the description does not declare but the recordings need."""
 
 import dataclasses
 from pathlib import Path
@@ -17,7 +17,7 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.registry import load_robot
 
 NOISE, FRICTION = 0.3, 1.0
-"""deg"""
+"""Noise of the measured angles, and largest offset from its target at which dry friction holds a joint (deg)."""
 CONFIG = FitConfig(window_seconds=0.6, starts=1)
 
 
@@ -36,38 +36,58 @@ def motions(arm: RobotDescription, folder: Path, friction: float) -> list[Measur
 
 
 @pytest.fixture(scope="module")
-def rubbing(arm: RobotDescription, tmp_path_factory: pytest.TempPathFactory) -> list[MeasuredMotion]:
-    return motions(arm, tmp_path_factory.mktemp("rubbing"), FRICTION)
+def recorded(arm: RobotDescription, tmp_path_factory: pytest.TempPathFactory) -> list[MeasuredMotion]:
+    return motions(arm, tmp_path_factory.mktemp("recorded"), FRICTION)
 
 
 @pytest.fixture(scope="module")
-def fit(arm: RobotDescription, rubbing: list[MeasuredMotion]) -> RobotFit:
-    return fit_robot(declared_parameters(arm, arm.load_model()), rubbing, rubbing, CONFIG)
+def fit(arm: RobotDescription, recorded: list[MeasuredMotion]) -> RobotFit:
+    return fit_robot(declared_parameters(arm, arm.load_model()), recorded, recorded, CONFIG)
 
 
-def test_friction_that_is_not_declared_is_named_with_its_size(
-    arm: RobotDescription, rubbing: list[MeasuredMotion], fit: RobotFit
+def test_dry_friction_that_is_not_declared_is_suggested_with_its_size(
+    arm: RobotDescription, recorded: list[MeasuredMotion], fit: RobotFit
 ):
-    found = suggest_parameters(arm, fit, rubbing, CONFIG)
+    found = suggest_parameters(arm, fit, recorded, CONFIG)
     assert {each.parameter.name for each in found} == {"shoulder_frictionloss", "elbow_frictionloss"}
     strength = {"shoulder_frictionloss": 6.0, "elbow_frictionloss": 4.0}
     for each in found:
-        # From the first order at no friction, where other parameters stand in for it.
+        # The estimate is of first order about zero friction, where other parameters explain part of the friction.
         assert each.value == pytest.approx(strength[each.parameter.name] * np.deg2rad(FRICTION), rel=0.4)
         assert f'"{each.parameter.name.split("_")[0]}", "field": "frictionloss"' in suggestions_table(found)
     assert 0.2 < sum(each.explained for each in found) < 1
-    # As the report says it, it can be declared.
+    # Suggested entries can be copied to the description.
     named = dataclasses.replace(arm, identify=tuple(each.entry for each in found))
     assert [p.nominal for p in declared_parameters(named, arm.load_model()).parameters] == [0.0, 0.0]
 
 
-def test_where_the_model_has_all_nothing_is_proposed(arm: RobotDescription, tmp_path: Path, fit: RobotFit):
+def test_a_complete_model_gets_no_suggestion(arm: RobotDescription, tmp_path: Path, fit: RobotFit):
     true = np.array([TRUTH[name] for name in fit.parameters.names])
     right = dataclasses.replace(fit, values=true, scatter=np.ones(2))
     assert suggest_parameters(arm, right, motions(arm, tmp_path, 0.0), CONFIG) == ()
 
 
-def test_candidates_are_of_the_elements_that_a_model_names():
+def test_held_out_windows_do_not_influence_suggestions(
+    arm: RobotDescription, recorded: list[MeasuredMotion], fit: RobotFit
+):
+    fitted = np.arange(len(fit.windows.first)) % 4 != 3
+    windows = fit.windows._replace(motion=fit.windows.motion[fitted], first=fit.windows.first[fitted])
+    fit = dataclasses.replace(fit, windows=windows)
+    other = []
+    for number, motion in enumerate(recorded):
+        used = np.zeros(len(motion.qpos), bool)
+        for first in windows.first[windows.motion == number]:
+            used[first : first + windows.samples] = True
+        assert not used.all()
+        other.append(dataclasses.replace(motion, qpos=np.where(used[:, None], motion.qpos, 1.0)))
+    one, two = (
+        [(each.parameter.name, each.value) for each in suggest_parameters(arm, fit, motions, CONFIG)]
+        for motions in (recorded, other)
+    )
+    assert one and one == two
+
+
+def test_candidates_are_parameters_of_named_model_elements():
     robot = load_robot("ballu")
     model = robot.load_model()
     entries = candidate_entries(robot, model)
