@@ -36,6 +36,7 @@ _FIELDS = tuple(field.name for field in dataclasses.fields(ActuatorParameters))
 _OPTIONAL = tuple(f.name for f in dataclasses.fields(ActuatorParameters) if f.default is None)
 _POSITIVE = ("knee_spring_stiffness", "motor_gain", "torque_limit", "motor_travel", "cable_stiffness")
 _NOT_NEGATIVE = ("knee_damping", "knee_friction", "motor_friction", "delay", "lag", "backlash")
+_ANGLES = ("default_motor_angle", "default_knee_angle", "knee_spring_reference", "backlash")
 _LARGEST_ANGLE = math.pi
 _LARGEST_SLACK = 0.05
 """Largest cable slack (m), more than a motor arm of 16 mm can take up."""
@@ -97,8 +98,10 @@ def actuators_from_json(values: Mapping[str, Any], path: Path) -> ActuatorParame
             raise InputError(f"{path}: {name} is {pair}; it must be 0 or more, in SI units.")
         if name in ("delay", "lag") and max(pair) > _LONGEST_DELAY:
             raise InputError(f"{path}: {name} is {pair}: give it in seconds.")
-        if name not in _POSITIVE and max(map(abs, pair)) > _LARGEST_ANGLE:
+        if name in _ANGLES and max(map(abs, pair)) > _LARGEST_ANGLE:
             raise InputError(f"{path}: {name} is {pair}: give it in radians, not degrees.")
+        if max(map(abs, pair)) > most:
+            raise InputError(f"{path}: {name} is {pair}; it must be {most:g} or less, in SI units.")
         pairs[name] = jnp.array(pair, jnp.float32)
     unknown = set(values) - set(_FIELDS)
     if unknown:

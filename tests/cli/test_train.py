@@ -210,6 +210,7 @@ def test_actuators_from_before_slack_was_identified_have_the_nominal_one(tmp_pat
         ({"motor_gain": [0.5, -0.5]}, "must be greater than 0"),
         ({"default_knee_angle": [27.0, 27.0]}, "give it in radians"),
         ({"cable_slack": [1.0, 1.0]}, "in metres"),
+        ({"knee_damping": [5e3, 5e3]}, "knee_damping is [5000.0, 5000.0]; it must be 1000 or less"),
         ({"gain": [1.0, 1.0]}, "there is no parameter 'gain'"),
     ],
 )
