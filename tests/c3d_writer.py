@@ -1,4 +1,4 @@
-"""Write C3D files of every processor type, tidy or not, by the format's definition (https://www.c3d.org)."""
+"""Write valid and inconsistent C3D files of every processor type, by the format's definition (https://www.c3d.org)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BLOCK = 512
 
 
 def floats(values: Float[np.ndarray, " n"], processor: int) -> bytes:
-    """Encode single-precision numbers for a processor."""
+    """Return single-precision numbers encoded for a processor."""
     if processor != DEC:
         return np.asarray(values, ">f4" if processor == MIPS else "<f4").tobytes()
     bits = (np.asarray(values, "f4") * 4).view(np.uint32)  # DEC's exponents are larger by two
@@ -22,7 +22,7 @@ def floats(values: Float[np.ndarray, " n"], processor: int) -> bytes:
 
 
 def integers(values: Sequence[int] | np.ndarray, processor: int) -> bytes:
-    """Encode 16-bit numbers for a processor; larger ones wrap."""
+    """Return 16-bit integers encoded for a processor. Larger ones wrap."""
     wrapped = np.asarray(values, np.int64) & 0xFFFF
     return wrapped.astype(">u2" if processor == MIPS else "<u2").tobytes()
 
@@ -40,13 +40,14 @@ def c3d_bytes(
     last: int | None = None,
     parameters: Mapping[tuple[str, str], tuple[int, Sequence[float] | Sequence[str]]] | None = None,
 ) -> bytes:
-    """Return a C3D file of points, in `unit`; NaN was not seen.
+    """Return the content of a C3D file of points.
 
     **Arguments**
 
-    - `scale`: negative for floating point, else the unit of 16-bit integers.
-    - `last`: what the header says of the last frame; None: the truth, in 16 bits.
-    - `parameters`: further ones by group and name, each with its type (1, 2 or 4 bytes) and values.
+    - `position`: positions (in `unit`). NaN marks samples without a measurement.
+    - `scale`: negative for floating-point data, else the unit of the 16-bit integers.
+    - `last`: number of the last frame in the header. None for the true number, in 16 bits.
+    - `parameters`: further parameters by group and name, each with its type (1, 2 or 4 bytes) and values.
     """
     frames, points = position.shape[:2]
     names = [name if isinstance(name, bytes) else name.encode() for name in labels]

@@ -1,4 +1,4 @@
-"""Files of laboratories, laid out as their vendors document it, of one motion of a hull and a tip."""
+"""Motion-capture files in the layouts that the vendors document. All hold the same motion of a hull and a tip."""
 
 from __future__ import annotations
 
@@ -12,19 +12,23 @@ from scipy.spatial.transform import Rotation
 SAMPLES, RATE = 300, 100.0
 TIME = np.arange(SAMPLES) / RATE
 HIDDEN = slice(60, 71)
-"""Samples in which the hull is not seen, where a format has a way to say so."""
+"""Samples without a measurement of the hull, in formats that can mark missing samples."""
 Y_UP = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""From Motive's axes (y up) to the format's, for a robot that looks along z."""
+"""Rotation matrix from Motive's axes (y up, robot facing along z) to those of the recording format."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Pose:
+    """Poses of a body over time."""
+
     place: np.ndarray
+    """Positions (m)."""
     turn: Rotation
+    """Rotations from the body frame to the world frame."""
 
 
 def motion() -> tuple[Pose, Pose, np.ndarray]:
-    """Hull, tip and commands: from the origin, looking along x, and about all axes."""
+    """Return poses of hull and tip, and commands. The hull begins at the origin, faces x and turns about all axes."""
     wave = np.stack([np.sin((1.3 + 0.4 * i) * TIME) for i in range(6)], axis=1)
     place = wave[:, :3] * [0.5, 0.3, 0.05] + [0.0, 0.0, 0.25]
     turn = Rotation.from_rotvec(0.6 * wave[:, 3:])
@@ -35,9 +39,9 @@ def motion() -> tuple[Pose, Pose, np.ndarray]:
 
 HULL, TIP, COMMAND = motion()
 START = 1_700_000_000 * 10**9
-"""ns: when it began, in formats whose times count from 1970."""
+"""Start time (ns since 1970) in formats with absolute times."""
 NAMED = '[hull]\nbody = "hull"\n[tip]\nbody = "tip"\n'
-"""A mapping of bodies by name."""
+"""Mapping of bodies by name."""
 TABLE = """[units]
 length = "m"
 [clock]
@@ -50,7 +54,7 @@ rotation = "quaternion"
 [tip]
 position = ["tip_x", "tip_y", "tip_z"]
 """
-"""Of the columns of `write_table`."""
+"""Mapping of the columns of `write_table`."""
 ARCHIVE = """[units]
 length = "m"
 [hull]
@@ -60,14 +64,14 @@ rotation = "quaternion"
 [tip]
 position = ["tip_pos[0]", "tip_pos[1]", "tip_pos[2]"]
 """
-"""Of the arrays of `write_npz`."""
+"""Mapping of the arrays of `write_npz`."""
 
 
 # ---- the formats ----
 
 
 def rows(columns: list[np.ndarray], delimiter: str, decimals: int, *, lost: list[int], first: str = "") -> str:
-    """Lines of numbers; `lost` columns are empty in the hidden samples."""
+    """Return rows of numbers as text. The cells of the columns `lost` are empty in the hidden samples."""
     lines = []
     for i, row in enumerate(np.column_stack(columns)):
         cells = [f"{x:.{decimals}f}" for x in row]
@@ -79,7 +83,8 @@ def rows(columns: list[np.ndarray], delimiter: str, decimals: int, *, lost: list
 
 
 def write_motive(folder: Path, version: str = "1.23", unit: str = "Meters") -> Path:
-    """https://docs.optitrack.com, "Data Export: CSV", and public takes of versions 1.21 to 1.25."""
+    """Write a Motive CSV, laid out as https://docs.optitrack.com ("Data Export: CSV") and public takes of versions 1.21
+    to 1.25."""
     scale = {"Meters": 1.0, "Centimeters": 1e2, "Millimeters": 1e3}[unit]
     hull = Rotation.from_matrix(Y_UP.T) * HULL.turn * Rotation.from_matrix(Y_UP)
     top = f"Format Version,{version},Take Name,trial 1,Take Notes,,Capture Frame Rate,{RATE:.6f},Export Frame Rate,"
@@ -94,7 +99,7 @@ def write_motive(folder: Path, version: str = "1.23", unit: str = "Meters") -> P
     if version == "1.25":
         heads.append(["", "Parent", *[""] * len(kinds)])
     heads += [["", "", *parts], ["Frame", "Time (Seconds)", *axes]]
-    if version == "1.21":  # does not say what a row is
+    if version == "1.21":  # its header rows have no labels
         heads = [["", "", *cells] for _, _, *cells in heads[:-1]] + [["Frame", "Time", *axes]]
     place, tip = scale * HULL.place @ Y_UP, scale * TIP.place @ Y_UP
     columns = [TIME, *hull.as_quat().T, *place.T, np.full(SAMPLES, 3e-4), *(place + 1).T, *tip.T]
@@ -117,7 +122,7 @@ def qualisys_header(included: str, names: list[str]) -> str:
 
 
 def write_qualisys_bodies(folder: Path) -> Path:
-    """6DOF data: as https://github.com/shiplab/dt_cv has it; the matrix stands column after column."""
+    """Write Qualisys 6DOF data, laid out as files of https://github.com/shiplab/dt_cv, with column-major matrices."""
     angles = ["X", "Y", "Z", "Roll", "Pitch", "Yaw", "Residual", *(f"Rot[{i}]" for i in range(9))]
     names = [
         "Frame",
@@ -132,7 +137,7 @@ def write_qualisys_bodies(folder: Path) -> Path:
     for i in range(HIDDEN.start, HIDDEN.stop):
         cells = body[i].split("\t")
         body[i] = "\t".join([*cells[:2], *["0.00000"] * 16, *cells[18:]])
-    # Frames are whole numbers, and every row ends in a tab.
+    # Frame numbers are integers, and every row ends with a tab.
     body = [f"{int(float(line.split(chr(9))[0]))}\t{line.partition(chr(9))[2]}\t" if line else line for line in body]
     text = qualisys_header("6D", ["hull", "tip"]) + "\t".join(names) + "\t\n" + "\n".join(body)
     path = folder / "trial.tsv"
@@ -165,7 +170,7 @@ def write_npz(folder: Path) -> Path:
 
 
 def write_table(folder: Path) -> Path:
-    """What others write by hand: milliseconds, comments, a comma at the end of each row."""
+    """Write a table as users write it by hand: with milliseconds, comments and a comma at the end of each row."""
     names = "time,hull_x,hull_y,hull_z,hull_qx,hull_qy,hull_qz,hull_qw,tip_x,tip_y,tip_z,arm_cmd,push_cmd,"
     columns = [1e3 * TIME, *HULL.place.T, *HULL.turn.as_quat().T, *TIP.place.T, *COMMAND.T]
     body = rows(columns, ",", 7, lost=[*range(1, 8)]).replace("\n", ",\n")
@@ -175,13 +180,13 @@ def write_table(folder: Path) -> Path:
 
 
 def tum_text() -> str:
-    """https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats."""
+    """Return a TUM trajectory, laid out as https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats."""
     columns = [TIME + 1.7e9, *HULL.place.T, *HULL.turn.as_quat().T]
     return "# timestamp tx ty tz qx qy qz qw\n" + rows(columns, " ", 7, lost=[])
 
 
 def euroc_text() -> str:
-    """https://projects.asl.ethz.ch/datasets, state_groundtruth_estimate0."""
+    """Return a EuRoC CSV, laid out as `state_groundtruth_estimate0` of https://projects.asl.ethz.ch/datasets."""
     header = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v [m]\n"
     numbers = np.hstack([HULL.place, HULL.turn.as_quat(scalar_first=True), 0 * HULL.place[:, :1]])
     lines = [f"{START + i * 10**7}," + ",".join(f"{x:.7f}" for x in row) for i, row in enumerate(numbers)]
@@ -222,8 +227,10 @@ def vicon_section(
     lost: Sequence[str] = (),
     hidden: slice = HIDDEN,
 ) -> str:
-    """One section in Vicon's layout; markers where `rotation` is None. The bodies `lost` have no numbers in the samples
-    `hidden`."""
+    """Return one section in Vicon's layout. It holds markers if `rotation` is None, else rigid bodies.
+
+    The cells of the bodies `lost` are empty in the samples `hidden`.
+    """
     components = [*{None: (), "quaternion": ("RX", "RY", "RZ", "RW")}.get(rotation, ("RX", "RY", "RZ"))]
     components += ["TX", "TY", "TZ"] if rotation else ["X", "Y", "Z"]
     turns = ["" if rotation == "quaternion" else angle] * (len(components) - 3)
@@ -251,7 +258,7 @@ def vicon_section(
 
 
 def write_nexus(folder: Path) -> Path:
-    """Segments and trajectories of one trial, beside sections that are none of the robot's."""
+    """Write segments and trajectories of one trial, with sections that do not concern the robot."""
     events = "Events\n100\nSubject,Context,Name,Time (s),Description\nrover,General,Start,0.5,It begins to move\n"
     devices = (
         "Devices\n1000\n,,Load cell - Force,,\nFrame,Sub Frame,Fx,Fy,Fz\n,,N,N,N\n1,0,0.1,0.2,0.3\n1,1,0.1,0.2,0.3\n"
@@ -264,7 +271,7 @@ def write_nexus(folder: Path) -> Path:
 
 
 def write_tracker(folder: Path, rotation: str = "helical") -> Path:
-    """Objects, whose rotations are what was chosen at export."""
+    """Write objects whose rotations have the representation chosen at export."""
     path = folder / "trial.csv"
     objects = {"hull": (HULL.place, HULL.turn), "tip": (TIP.place, TIP.turn)}
     named = {f"{name}:{name}": pose for name, pose in objects.items()}
@@ -278,11 +285,11 @@ def write_tracker(folder: Path, rotation: str = "helical") -> Path:
 # ---- damage ----
 
 Damage = Callable[[Path], object]
-"""Changes a file."""
+"""Function that changes a file."""
 
 
 def replaced(old: str, new: str, count: int = -1) -> Damage:
-    """Put `new` in place of `old`."""
+    """Replace `old` by `new`."""
 
     def damage(path: Path) -> None:
         text = path.read_bytes().decode()
@@ -293,7 +300,7 @@ def replaced(old: str, new: str, count: int = -1) -> Damage:
 
 
 def in_line(number: int, cell: int, text: str, delimiter: str = ",") -> Damage:
-    """Put `text` into a cell (from 0) of the line that messages call `number`."""
+    """Write `text` into a cell (counted from 0) of line `number` (counted from 1, as messages do)."""
 
     def damage(path: Path) -> None:
         lines = path.read_bytes().decode().split("\n")
@@ -306,7 +313,7 @@ def in_line(number: int, cell: int, text: str, delimiter: str = ",") -> Damage:
 
 
 def shortened(number: int, kept: int, delimiter: str = ",") -> Damage:
-    """Keep the first cells of a line alone."""
+    """Keep only the first `kept` cells of a line."""
 
     def damage(path: Path) -> None:
         lines = path.read_bytes().decode().split("\n")
@@ -317,7 +324,7 @@ def shortened(number: int, kept: int, delimiter: str = ",") -> Damage:
 
 
 def without_line(number: int) -> Damage:
-    """Take a line out."""
+    """Delete a line."""
 
     def damage(path: Path) -> None:
         lines = path.read_bytes().decode().split("\n")
@@ -328,7 +335,7 @@ def without_line(number: int) -> Damage:
 
 
 def zeroed(first: int, cells: Sequence[int], delimiter: str = ",", *, last: int = 10**6) -> Damage:
-    """Zeros in the cells of all lines from `first` to `last` that have them."""
+    """Write zeros into the given cells of all lines from `first` to `last`, except lines that are too short."""
 
     def damage(path: Path) -> None:
         lines = path.read_bytes().decode().split("\n")

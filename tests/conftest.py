@@ -1,4 +1,4 @@
-"""Tests run in the environment that the commands set up, with every annotated array shape checked."""
+"""Run the tests in the environment that the commands set up, and check every annotated array shape."""
 
 import os
 from collections.abc import Callable
@@ -15,25 +15,27 @@ Function = TypeVar("Function", bound=Callable)
 
 
 def typecheck(function: Function) -> Function:
-    """beartype, but not for constructors: JAX rebuilds pytrees by them with batches, or placeholders, for arrays."""
+    """Apply beartype, except to constructors. JAX rebuilds pytrees by constructors, with batches or placeholders
+    instead of arrays."""
     return function if function.__name__ == "__init__" else beartype(function)
 
 
-# JAX 0.10 has no such flag, and XLA refuses what it does not know.
+# JAX 0.10 does not have this flag, and XLA refuses unknown flags.
 _OLDER_FUSION = "--xla_cpu_use_fusion_emitters=false" if version("jax").startswith("0.9.") else ""
 
 
 def compile_fast() -> None:
-    """Settle how this process compiles: by XLA's older fusion, and without most optimizations (see below). A control
-    step then compiles in 4 s instead of 15, and most tests run what they compile for a moment.
+    """Make this process compile with XLA's older fusion, and without most optimizations (see below).
 
-    Commands that tests start compile as users' do, and leave in the cache what runs after the tests.
+    A control step then compiles in 4 s instead of 15 s. Most tests run their compiled programs only for a moment.
+    Commands that tests start as processes compile as they do for users. Their compiled programs stay in the cache for
+    runs after the tests.
     """
     os.environ["XLA_FLAGS"] = f"{_OLDER_FUSION} {os.environ.get('XLA_FLAGS', '')}".strip()
     runtime.prepare()
-    import jax  # not before `prepare`
+    import jax  # only after `prepare`
 
-    jax.jit(lambda: 0)()  # reads the flags, once and for all
+    jax.jit(lambda: 0)()  # the first compilation reads the flags; later changes have no effect
     os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(_OLDER_FUSION, "").strip()
 
 
@@ -43,7 +45,7 @@ install_import_hook("ballu_mjx", f"{__name__}.typecheck")
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Before the test's fixtures: programs of tests marked `optimized` run long enough to be worth it."""
-    import jax  # not before `prepare`
+    """Enable XLA's optimizations for tests marked `optimized`, whose programs run long. Fixtures are set up later."""
+    import jax  # only after `prepare`
 
     jax.config.update("jax_disable_most_optimizations", item.get_closest_marker("optimized") is None)

@@ -1,4 +1,4 @@
-"""An environment that is learned within seconds, without physics to compile."""
+"""A small environment without physics, in which a policy is trained within seconds."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from ballu_mjx.rl.ppo import Params
 
 
 class Follower(Env):
-    """A point mass pushed along a line, rewarded for staying at a place drawn at the start. Like a robot without
-    joints, it has an array without entries in its state."""
+    """A point mass that is pushed along a line. The reward is high near a goal, which is drawn at reset. The state
+    contains an empty array, as that of a robot without joints."""
 
     limit = 10
 
@@ -66,7 +66,7 @@ class Follower(Env):
 
 
 def weight(params: Params) -> float:
-    """Of the policy: enough for a validation to tell checkpoints apart."""
+    """Return one weight of the policy. It differs between checkpoints, so it can serve as their validation score."""
     return float(jax.tree.leaves(params.policy)[0].ravel()[0])
 
 

@@ -1,4 +1,4 @@
-"""A residual of a kind of its own: a push, and nothing else."""
+"""A residual that only applies a constant force."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ballu_mjx.sim.residual import Action, Residual
 
 
 class PlainPush(Residual):
-    """A force along x (N) on the tracked body, which is its parameter."""
+    """A residual whose parameter is a force along x (N) on the tracked body."""
 
     @property
     def name(self) -> str:

@@ -1,4 +1,4 @@
-"""Descriptions of robots that tests make, as files."""
+"""Write the descriptions of robots for tests to files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ballu_mjx.robots.description import RobotDescription, read_description
 
 
 def write_robot(folder: Path, name: str, mjcf: str, **keys: Any) -> RobotDescription:
-    """Write a model and its description, whose further keys are `keys`, to a folder."""
+    """Write a model and its description, with the further keys `keys`, to a folder. Return the description."""
     (folder / f"{name}.xml").write_text(mjcf)
     content = {"format": "ballu-robot/1", "name": name, "model": f"{name}.xml", "points": [], **keys}
     (folder / f"{name}.robot.json").write_text(json.dumps(content))

@@ -1,4 +1,4 @@
-"""A robot that is nothing like BALLU: a hull with a swinging arm and a sliding rod, commands in ranges of their own."""
+"""A robot that differs from BALLU: a hull with a hinged arm and a sliding rod, and commands with their own ranges."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _DESCRIPTION = {
 
 
 def write_rover(folder: Path) -> RobotDescription:
-    """Write the robot's two files into a folder; return it."""
+    """Write the robot's model and description to a folder. Return the description."""
     (folder / "rover.xml").write_text(_MODEL)
     (folder / "rover.robot.json").write_text(json.dumps(_DESCRIPTION))
     return read_description(folder / "rover.robot.json")

@@ -1,5 +1,5 @@
-"""A two-joint servo arm on a stand, and its true self in C MuJoCo: other numbers, and a drivetrain that a model of the
-arm does not have."""
+"""A two-joint servo arm on a stand, and the true arm in C MuJoCo. The true arm has other parameters, and a drivetrain
+that the arm's model lacks."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ TRUTH = {
 
 
 def write_arm(folder: Path, model: str = _MODEL) -> RobotDescription:
-    """Return the description, written to `folder` with its model."""
+    """Write the model and its description to `folder`. Return the description."""
     commands = {"shoulder": "one", "elbow": "two"}
     keys = {"tracked": "tip", "commands": commands, "joints": list(commands), "identify": IDENTIFY}
     return write_robot(folder, "arm", model, **keys)
 
 
 def identified(robot: RobotDescription, **values: float) -> IdentifiedParameters:
-    """Return the nominal parameters, but for `values`."""
+    """Return the nominal parameters with `values` in place of those that they name."""
     declared = declared_parameters(robot, robot.load_model())
     vector = declared.nominal.copy()
     for name, value in values.items():
@@ -82,9 +82,10 @@ def true_path(
     commands: Float[np.ndarray, "steps 2"],
     friction: float = 0.0,
 ) -> tuple[Float[np.ndarray, "physics 2"], Float[np.ndarray, "physics 2"]]:
-    """Return qpos and qvel after each physics step of C MuJoCo, from the rest pose, 10 physics steps to a command.
+    """Return qpos and qvel after each physics step of C MuJoCo, from the rest pose, with 10 physics steps per command.
 
-    `friction`: how far (rad) dry friction, which the arm's model lacks, can hold each joint off its target.
+    `friction`: largest offset (rad) from its target at which dry friction can hold each joint. The arm's model lacks
+    dry friction.
     """
     model = robot.load_model(parameters)
     model.dof_frictionloss[:] = friction * -model.actuator_biasprm[:, 1]
@@ -114,9 +115,12 @@ def record_arm(
     noise: float = 0.2,
     friction: float = 0.0,
 ) -> Path:
-    """Write a recording of 6 s of the true arm at 100 Hz, with noise (deg); suspended ones hold joints alone.
+    """Write a recording of 6 s of the true arm at 100 Hz. Suspended recordings contain only joint angles.
 
-    `friction` is that of `true_path`, in deg.
+    **Arguments**
+
+    - `noise`: standard deviation of the joint angles' noise (deg).
+    - `friction`: as in `true_path`, but in deg.
     """
     seconds, free = 6.0, kind == "free"
     commands = wandering(seed, round(seconds / 0.05), hold=8)

@@ -1,4 +1,4 @@
-"""The package's root: what a notebook imports, and that it does so lazily."""
+"""Tests of the package's root, which notebooks import. It imports its modules lazily."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_importing_the_package_imports_no_jax():
     assert done.stdout == done.stderr == ""
 
 
-def test_every_name_of_the_root_is_there():
+def test_root_defines_every_public_name():
     for name in bm.__all__:
         assert getattr(bm, name).__name__ == name
     assert set(bm.__all__) <= set(dir(bm))
@@ -48,7 +48,7 @@ def test_every_name_of_the_root_is_there():
 
 
 class Example(typing.NamedTuple):
-    """What the README's example leaves."""
+    """Variables and output of the README's example."""
 
     robot: bm.RobotDescription
     motions: list[bm.Motion]
@@ -56,12 +56,12 @@ class Example(typing.NamedTuple):
     sim: bm.Simulator
     air: bm.TrainedResidual
     policy: bm.Policy
-    said: str
+    printed: str
 
 
 @pytest.fixture(scope="module")
 def example() -> Example:
-    """The README's example as it stands there, on two short recordings and with quick sizes."""
+    """Run the README's example unchanged, on two short recordings and with small sizes."""
     readme = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(import ballu_mjx as bm\n.*?)```", readme, re.DOTALL)
     load = bm.load_recordings
@@ -79,12 +79,16 @@ def example() -> Example:
         "fit_aerodynamics": functools.partial(bm.fit_aerodynamics, config=air, free=("added_mass", "lift")),
         "train_policy": functools.partial(bm.train_policy, ppo_config=SIZES),
     }
-    said, left = io.StringIO(), {}
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+    printed, left = io.StringIO(), {}
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        contextlib.redirect_stdout(printed),
+        contextlib.redirect_stderr(printed),
+    ):
         for name, function in quick.items():
             patch.setattr(bm, name, function)
         exec(code, left)
-    return Example(said=said.getvalue(), **{name: left[name] for name in Example._fields if name != "said"})
+    return Example(printed=printed.getvalue(), **{name: left[name] for name in Example._fields if name != "printed"})
 
 
 @pytest.fixture(scope="module")
@@ -107,9 +111,9 @@ def air(example: Example) -> bm.TrainedResidual:
     return example.air
 
 
-def test_the_example_of_the_readme_prints_a_table_and_nothing_else(example: Example):
-    _, *table = example.said.splitlines()
-    assert "vanilla+sysid" in example.said and "aerodynamic" in example.said and table
+def test_readme_example_prints_a_table_and_returns_a_policy(example: Example):
+    _, *table = example.printed.splitlines()
+    assert "vanilla+sysid" in example.printed and "aerodynamic" in example.printed and table
     assert "motor gain, left" in example.actuators.report and "std. error" in example.air.report
     policy = example.policy
     assert policy.variant.name == "aerodynamic" and policy.step % 160 == 0
@@ -117,26 +121,26 @@ def test_the_example_of_the_readme_prints_a_table_and_nothing_else(example: Exam
     assert command.shape == (2,) and np.all((command >= 0) & (command <= 1))
 
 
-def test_evaluating_twice_gives_the_same(simulator: bm.Simulator, air: bm.TrainedResidual, motions: list[bm.Motion]):
+def test_evaluation_is_deterministic(simulator: bm.Simulator, air: bm.TrainedResidual, motions: list[bm.Motion]):
     one, other = (bm.evaluate(simulator.with_residual(air), motions) for _ in range(2))
     assert one == other
     assert one.residual != one.vanilla
 
 
-def test_forces_learned_beside_the_air_are_evaluated_with_it(
+def test_envmimic_on_top_of_aerodynamic_is_evaluated_with_both(
     simulator: bm.Simulator, air: bm.TrainedResidual, motions: list[bm.Motion]
 ):
-    """A residual learned in an improved simulator is the sum of both."""
+    """A residual learned in an improved simulator is evaluated together with that simulator's residual."""
     learned = bm.train_envmimic(simulator.with_residual(air), motions, ppo_config=SIZES)
     found = bm.evaluate(simulator.with_residual(learned), motions)
     assert found.name == "aerodynamic+envmimic"
     alone = bm.evaluate(simulator.with_residual(air), motions)
     assert found.vanilla == alone.vanilla
-    if not learned.step:  # no forces: what the air alone makes
+    if not learned.step:  # without learned forces only the aerodynamic residual acts
         np.testing.assert_allclose(found.score, alone.score, rtol=0.2)
 
 
-def test_a_training_in_memory_is_that_in_a_folder(
+def test_training_in_memory_and_in_a_folder_are_equal(
     simulator: bm.Simulator, motions: list[bm.Motion], tmp_path: Path, robot: bm.RobotDescription
 ):
     content = {"format": RUN_FORMAT, "task": "envmimic", "starts": [], "ppo": dataclasses.asdict(SIZES)}
@@ -149,7 +153,7 @@ def test_a_training_in_memory_is_that_in_a_folder(
     assert [row["step"] for row in memory.metrics if "validation_error" in row] == [0, 160, 320]
 
 
-def test_recordings_of_another_robot_are_not_the_bundled_ones(robot: bm.RobotDescription, tmp_path: Path):
+def test_bundled_recordings_and_sweeps_are_refused_for_other_robots(robot: bm.RobotDescription, tmp_path: Path):
     folder = Path(__file__).parents[1] / "experiments" / "tethered_balloon"
     other = bm.load_robot(folder / "balloon.robot.json")
     with pytest.raises(bm.InputError, match="bundled recordings are of BALLU"):

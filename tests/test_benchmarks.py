@@ -1,4 +1,4 @@
-"""Is the robot that the benchmarks run in PyBullet the same robot?"""
+"""Tests that the benchmarks' PyBullet robot matches BALLU's MuJoCo model."""
 
 from __future__ import annotations
 
@@ -24,54 +24,54 @@ def model() -> mujoco.MjModel:
 
 
 @pytest.fixture
-def rival(model: mujoco.MjModel) -> Iterator[bullet.Robot]:
-    with contextlib.closing(bullet.Robot(model, TIMESTEP)) as found:
-        yield found
+def bullet_robot(model: mujoco.MjModel) -> Iterator[bullet.Robot]:
+    with contextlib.closing(bullet.Robot(model, TIMESTEP)) as robot:
+        yield robot
 
 
-def test_it_weighs_the_same(model: mujoco.MjModel, rival: bullet.Robot) -> None:
-    np.testing.assert_allclose(rival.total_mass(), model.body_mass.sum(), rtol=1e-6)
+def test_bullet_robot_has_the_model_s_mass(model: mujoco.MjModel, bullet_robot: bullet.Robot) -> None:
+    np.testing.assert_allclose(bullet_robot.total_mass(), model.body_mass.sum(), rtol=1e-6)
 
 
-def test_its_joints_stop_at_the_same_angles(model: mujoco.MjModel, rival: bullet.Robot) -> None:
+def test_bullet_robot_has_the_model_s_joint_limits(model: mujoco.MjModel, bullet_robot: bullet.Robot) -> None:
     for name in JOINTS:
-        low, high = rival.joint_limits(name)
+        low, high = bullet_robot.joint_limits(name)
         if model.joint(name).limited[0]:
             np.testing.assert_allclose((low, high), model.joint(name).range, rtol=1e-6)
         else:
-            assert low > high  # Bullet's way to say none
+            assert low > high  # Bullet's convention for a joint without limits
 
 
-def test_it_sees_what_the_model_sees_of_a_bent_and_turned_pose(model: mujoco.MjModel, rival: bullet.Robot) -> None:
+def test_bullet_observation_of_a_pose_matches_the_model(model: mujoco.MjModel, bullet_robot: bullet.Robot) -> None:
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     data.qpos[:3] = 0.3, -0.2, 0.9
     data.qpos[3:7] = np.array([0.9, 0.1, -0.3, 0.2]) / np.linalg.norm([0.9, 0.1, -0.3, 0.2])
     data.qpos[7:] = 0.3, -0.4, 0.8, 0.2, 0.1, 0.6, 1.1
     mujoco.mj_forward(model, data)
-    rival.reset(data.qpos)
-    features, com = rival.observe()
+    bullet_robot.reset(data.qpos)
+    features, com = bullet_robot.observe()
     sites = {"balloon": 0, "base": 9, "foot_left": 15, "foot_right": 21}
     for name, start in sites.items():
         np.testing.assert_allclose(features[start : start + 3], data.site(name).xpos, atol=1e-6, err_msg=name)
     np.testing.assert_allclose(com, data.subtree_com[0], atol=1e-6)
-    np.testing.assert_allclose(rival.qpos(), data.qpos, atol=1e-6)
+    np.testing.assert_allclose(bullet_robot.qpos(), data.qpos, atol=1e-6)
 
 
-def test_it_stands_as_high(model: mujoco.MjModel, rival: bullet.Robot) -> None:
-    """For half a second: then the balloon, whose swaying nothing steadies, has begun to sway its own way in each."""
+def test_bullet_robot_stands_as_high_as_the_model(model: mujoco.MjModel, bullet_robot: bullet.Robot) -> None:
+    """The comparison ends after 0.5 s, because the balloon's undamped sway then differs between the simulators."""
     data = mujoco.MjData(model)
     data.qpos[:] = standing_qpos(model)
-    rival.reset(data.qpos)
+    bullet_robot.reset(data.qpos)
     for _ in range(10):
-        rival.step((0.0, 0.0))
+        bullet_robot.step((0.0, 0.0))
         for _ in range(round(CONTROL_TIMESTEP / model.opt.timestep)):
             mujoco.mj_step(model, data)
-        assert abs(rival.qpos()[2] - data.qpos[2]) < 1e-3
+        assert abs(bullet_robot.qpos()[2] - data.qpos[2]) < 1e-3
 
 
-def test_its_neck_swings_at_the_same_frequency(model: mujoco.MjModel) -> None:
-    """The base held still in the air, the balloon swings about the neck, its lift pulling it upright."""
+def test_bullet_neck_swings_at_the_model_s_frequency(model: mujoco.MjModel) -> None:
+    """With the base fixed in the air, the balloon swings about the neck. Its lift is the restoring force."""
     spec = mujoco.MjSpec.from_file(str(assets() / "ballu.xml"))
     spec.body("base").pos = [0, 0, 1.5]
     spec.delete(spec.joint("root"))
@@ -80,31 +80,31 @@ def test_its_neck_swings_at_the_same_frequency(model: mujoco.MjModel) -> None:
     data = mujoco.MjData(hanging)
     neck = hanging.joint("neck").qposadr[0]
     data.qpos[neck] = 0.3
-    with contextlib.closing(bullet.Robot(model, TIMESTEP, held=True)) as rival:
+    with contextlib.closing(bullet.Robot(model, TIMESTEP, held=True)) as bullet_robot:
         start = model.qpos0.copy()
         start[2], start[7] = 1.5, 0.3
-        rival.reset(start)
-        ours, theirs = [], []
+        bullet_robot.reset(start)
+        model_angles, bullet_angles = [], []
         for _ in range(round(6.0 / TIMESTEP)):
             mujoco.mj_step(hanging, data)
-            ours.append(data.qpos[neck])
-            rival.physics_step((0.0, 0.0))
-            theirs.append(rival.joint_angle("neck"))
-    np.testing.assert_allclose(_period(theirs), _period(ours), rtol=5e-3)
+            model_angles.append(data.qpos[neck])
+            bullet_robot.physics_step((0.0, 0.0))
+            bullet_angles.append(bullet_robot.joint_angle("neck"))
+    np.testing.assert_allclose(_period(bullet_angles), _period(model_angles), rtol=5e-3)
 
 
-def test_it_stays_whole_under_random_commands(model: mujoco.MjModel) -> None:
+def test_bullet_robot_stays_finite_under_random_commands(model: mujoco.MjModel) -> None:
     for timestep in bullet.TIMESTEPS:
-        with contextlib.closing(bullet.Robot(model, timestep)) as rival:
-            rival.reset(standing_qpos(model))
+        with contextlib.closing(bullet.Robot(model, timestep)) as bullet_robot:
+            bullet_robot.reset(standing_qpos(model))
             for command in np.random.default_rng(0).uniform(0.0, 1.0, (round(5.0 / CONTROL_TIMESTEP), 2)):
-                rival.step(command.tolist())
-                features, _ = rival.observe()
+                bullet_robot.step(command.tolist())
+                features, _ = bullet_robot.observe()
                 assert np.isfinite(features).all()
-                assert 0.3 < features[2] < 2.0  # the balloon is neither on the floor nor gone
+                assert 0.3 < features[2] < 2.0  # height of the balloon (m)
 
 
-def test_rewards_add_up_to_the_way_and_episodes_end_by_time() -> None:
+def test_gym_rewards_add_up_to_the_distance_and_episodes_end_by_time() -> None:
     pytest.importorskip("gymnasium", reason="needs the extra bench")
     import bullet_gym  # pyright: ignore[reportMissingImports]
 
@@ -112,20 +112,20 @@ def test_rewards_add_up_to_the_way_and_episodes_end_by_time() -> None:
         for seed in range(3):
             observation, _ = env.reset(seed=seed)
             assert env.observation_space.contains(observation)
-            start, way, ended = env.robot.observe()[1], 0.0, False
+            start, distance, ended = env.robot.observe()[1], 0.0, False
             rng, steps = np.random.default_rng(seed), 0
             while not ended:
                 observation, reward, terminated, ended, info = env.step(rng.uniform(-1.0, 1.0, 2))
                 assert reward == info["reward"] and not terminated
-                way, steps = way + reward * CONTROL_TIMESTEP, steps + 1
+                distance, steps = distance + reward * CONTROL_TIMESTEP, steps + 1
             assert env.observation_space.contains(observation)
-            np.testing.assert_allclose(way, env.robot.observe()[1][0] - start[0], atol=1e-9)
-            assert 20 <= steps <= 60  # half to one and a half times the mean
+            np.testing.assert_allclose(distance, env.robot.observe()[1][0] - start[0], atol=1e-9)
+            assert 20 <= steps <= 60  # 0.5 to 1.5 times the mean
 
 
 def _period(angles: list[float]) -> float:
-    """s; between the first and the last upward crossing of 0."""
+    """Return the mean period (s) between the first and the last upward crossing of 0."""
     swing = np.array(angles)
-    ups = np.flatnonzero((swing[:-1] < 0) & (swing[1:] >= 0))
-    assert len(ups) >= 2
-    return float((ups[-1] - ups[0]) / (len(ups) - 1) * TIMESTEP)
+    crossings = np.flatnonzero((swing[:-1] < 0) & (swing[1:] >= 0))
+    assert len(crossings) >= 2
+    return float((crossings[-1] - crossings[0]) / (len(crossings) - 1) * TIMESTEP)

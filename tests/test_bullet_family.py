@@ -1,4 +1,4 @@
-"""The second family of virtual robots: what it draws, and that a robot of it is one."""
+"""Tests of the second family of virtual robots, in PyBullet: draws, recordings, standing and walking."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ pytest.importorskip("pybullet")
 import bullet_family as family  # pyright: ignore[reportMissingImports]
 
 
-def test_robots_are_the_same_every_time_and_differ_from_each_other() -> None:
+def test_drawn_robots_are_reproducible_and_differ_from_each_other() -> None:
     robots = [family.draw(seed) for seed in family.ROBOTS]
     assert robots == [family.draw(seed) for seed in family.ROBOTS]
     assert len({dataclasses.astuple(robot)[1:] for robot in robots}) == len(robots)
 
 
-def test_recordings_are_the_same_every_time_and_can_be_read(tmp_path: Path) -> None:
+def test_recordings_are_reproducible_and_readable(tmp_path: Path) -> None:
     robot, commands = family.draw(0), family.walking_commands(1.0)["near-1"]
     for name in ("one", "other"):
         recording = family.record_walking(robot, commands, name)
@@ -35,7 +35,7 @@ def test_recordings_are_the_same_every_time_and_can_be_read(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("seed", family.ROBOTS)
-def test_a_robot_stands_on_its_weight_less_lift_and_moves(seed: int) -> None:
+def test_robot_loads_the_floor_with_weight_less_lift_and_walks(seed: int) -> None:
     robot = family.draw(seed)
     world = family.World(robot)
     world.run(np.zeros(2), 4.0)
@@ -56,15 +56,15 @@ def test_a_robot_stands_on_its_weight_less_lift_and_moves(seed: int) -> None:
     assert balloon.as_matrix()[2, 2] > 0.9
 
 
-def test_settled_angles_rise_with_the_command() -> None:
+def test_settled_angles_increase_with_the_command() -> None:
     recording = family.record_sweep(family.draw(1), family.sweep_commands(), "sweep")
     settled = read_sweep({Path("sweep.csv"): recording}).settled
     assert np.all(np.diff(settled[:, 0], axis=0) > 0), "arms"
-    assert np.all(np.diff(settled[:, 1], axis=0) > -np.deg2rad(0.3)), "knees, up to noise"
+    assert np.all(np.diff(settled[:, 1], axis=0) > -np.deg2rad(0.3)), "knees, within noise"
     assert np.rad2deg(settled[-1, 1] - settled[0, 1]).min() > 15
 
 
-def test_the_package_knows_nothing_of_it() -> None:
+def test_package_does_not_import_the_bullet_family() -> None:
     for file in Path(ballu_mjx.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []

@@ -1,4 +1,5 @@
-"""README and docs leave nothing out, name what there is, and are short. `mkdocs build --strict` checks their links."""
+"""Tests that README and docs are complete, correct in what they name, and short. `mkdocs build --strict` checks their
+links."""
 
 import ast
 import pkgutil
@@ -15,22 +16,22 @@ from ballu_mjx.cli import completion, record
 ROOT = Path(__file__).parents[1]
 API = ROOT / "docs" / "api"
 PROGRAMS = {"ballu_mjx.__main__", "ballu_mjx.train"}
-"""Run as processes, imported by nobody."""
+"""Modules that are run as processes and never imported."""
 FOLDERS = ("", "ballu_mjx", "ballu_mjx/recordings/importers", "ballu_mjx/policies", "benchmarks")
-"""Where the pages' paths begin."""
+"""Folders to which paths on the pages are relative."""
 TO_BE_WRITTEN = {"gp.py", "gp_training.py", "train_gp.py", "test_gp.py", "stroll.py", "trc.py"}
-"""Files of CONTRIBUTING's worked examples."""
+"""Files of CONTRIBUTING's worked examples, which do not exist."""
 PLACE = re.compile(r"((?:`[\w.]+`(?:,| and)?\s+)+)in\s+`([\w/]+\.py)`")
-"""Functions and classes, and the file that a page says they are in."""
+"""Pattern of functions and classes, and of the file in which a page says they are defined."""
 COMMAND = re.compile(r"(?:ballu_mjx[ .]|`)((?:train|record|export) [\w-]+|evaluate|report|view|compare)\b([^`\n#;]*)")
-"""A command, and what follows it, in a page's code."""
+"""Pattern of a command and the text after it, in a page's code."""
 WRITTEN = {"example.py"}
 """Files that `export simulator` writes."""
 IMAGINED = {"train gp", "train stroll"}
-"""Commands of the worked examples."""
+"""Commands of the worked examples, which do not exist."""
 
 
-def test_every_module_or_its_package_stands_in_the_reference():
+def test_reference_lists_every_module_or_its_package():
     pages = "\n".join(path.read_text() for path in API.glob("*.md"))
     named = re.findall(r"^::: (.*)$", pages, re.MULTILINE)
     assert len(named) == len(set(named))
@@ -38,7 +39,7 @@ def test_every_module_or_its_package_stands_in_the_reference():
     assert not {m for m in modules - PROGRAMS if m not in named and m.rpartition(".")[0] not in named}
 
 
-def test_files_that_the_pages_name_are_there():
+def test_files_named_in_the_pages_exist():
     names = {path.name for path in ROOT.glob("ballu_mjx/**/*.py")} | {
         path.name for path in ROOT.glob("benchmarks/*.py")
     }
@@ -53,7 +54,7 @@ def test_files_that_the_pages_name_are_there():
 
 
 def defined(path: Path) -> set[str]:
-    """Return what a file defines: functions, classes, constants, and members of classes as `Class.member`."""
+    """Return the names that a file defines: functions, classes, constants, and members of classes as `Class.member`."""
 
     def names(body: list[ast.stmt]) -> set[str]:
         found = set()
@@ -69,7 +70,7 @@ def defined(path: Path) -> set[str]:
     return names(ast.parse(path.read_text(encoding="utf-8")).body)
 
 
-def test_what_the_theory_says_is_in_a_file_is_defined_there():
+def test_theory_page_names_functions_that_are_defined_in_the_named_file():
     text = (ROOT / "docs" / "theory.md").read_text(encoding="utf-8")
     missing = set()
     for names, file in PLACE.findall(text):
@@ -78,10 +79,10 @@ def test_what_the_theory_says_is_in_a_file_is_defined_there():
     assert not missing
     sections = text.split("\n## ")[1:]
     without = [s.splitlines()[0] for s in sections if "$$" in s and not PLACE.search(s.partition("$$")[0])]
-    assert not without, "a shown equation, and before it no name of what computes it"
+    assert not without, "the page does not name the code that computes the equation"
 
 
-def test_commands_and_options_that_the_pages_name_are_there():
+def test_commands_and_options_named_in_the_pages_exist():
     script = completion.completion_script("bash", NAMES)
     spec = next(line for line in script.splitlines() if line.startswith("COMPLETION_SPEC = "))
     top = ast.literal_eval(spec.removeprefix("COMPLETION_SPEC = "))["subcommands"]
@@ -93,7 +94,7 @@ def test_commands_and_options_that_the_pages_name_are_there():
     }
     missing = set()
     for page in prose.pages():
-        if page.name == "CHANGELOG.md":  # it names what there was
+        if page.name == "CHANGELOG.md":  # it names former commands and options
             continue
         text = page.read_text(encoding="utf-8").replace("\\\n", " ")
         for command, rest in COMMAND.findall(text):
@@ -104,22 +105,22 @@ def test_commands_and_options_that_the_pages_name_are_there():
     assert not missing
 
 
-def test_the_page_on_recordings_shows_the_mapping_that_the_command_prints(capsys: pytest.CaptureFixture[str]):
+def test_page_on_recordings_shows_the_printed_example_mapping(capsys: pytest.CaptureFixture[str]):
     assert record.main(["example-mapping"]) == 0
     assert f"```toml\n{capsys.readouterr().out}```\n" in (ROOT / "docs" / "data.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("page", prose.pages(), ids=lambda page: str(page.relative_to(ROOT)))
-def test_no_sentence_is_too_long(page: Path):
+def test_no_sentence_in_a_page_is_too_long(page: Path):
     assert prose.long_sentences(page.read_text(encoding="utf-8")) == []
 
 
 @pytest.mark.parametrize("page", prose.pages(), ids=lambda page: str(page.relative_to(ROOT)))
-def test_results_are_of_current_commands(page: Path):
+def test_pages_state_no_results_of_earlier_versions(page: Path):
     assert "earlier version" not in " ".join(page.read_text(encoding="utf-8").split())
 
 
-def test_sentences_are_short_on_average():
+def test_sentences_of_the_pages_are_short_on_average():
     assert prose.mean_words() <= prose.MOST_WORDS_ON_AVERAGE
 
 
@@ -127,7 +128,7 @@ def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= prose.README_LINES
 
 
-def test_prose_is_counted_as_it_is_read():
+def test_word_counts_ignore_markup_code_and_abbreviations():
     text = """# A heading of several words
 
 One `python -m ballu_mjx.train envmimic` here, e.g. this. Two $a + b$ *here*.

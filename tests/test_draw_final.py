@@ -1,4 +1,4 @@
-"""The final tier's seeds: drawn once, from a commit that nobody can change any more."""
+"""Tests of the final evaluation's seeds. They are drawn once, from a tagged commit."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def repository(tmp_path: Path) -> Path:
     return folder
 
 
-def test_seeds_follow_from_the_tagged_commit_alone(repository: Path, tmp_path: Path) -> None:
+def test_seeds_depend_only_on_the_tagged_commit(repository: Path, tmp_path: Path) -> None:
     output = tmp_path / "results" / "final.json"
     found = draw_final.draw_final("final-1", output, repository)
     assert json.loads(output.read_text()) == found
@@ -46,11 +46,11 @@ def test_seeds_follow_from_the_tagged_commit_alone(repository: Path, tmp_path: P
     assert found["seeds"] == draw_final.draw_seeds(found["commit"]) != draw_final.draw_seeds("0" * 40)
     seeds = [seed for drawn in found["seeds"].values() for seed in drawn]
     assert len(set(seeds)) == len(seeds) == sum(draw_final.COUNTS.values())
-    assert all(10_000 <= seed < 2**31 for seed in seeds), "seeds of development"
+    assert all(10_000 <= seed < 2**31 for seed in seeds), "seeds below 10,000 are those of development"
     assert found["versions"]["jax"] and found["machine"]["cores"]
 
 
-def test_nothing_is_drawn_twice(repository: Path, tmp_path: Path) -> None:
+def test_second_draw_is_refused(repository: Path, tmp_path: Path) -> None:
     output = tmp_path / "final.json"
     draw_final.draw_final("final-1", output, repository)
     before = output.read_bytes()
@@ -60,7 +60,7 @@ def test_nothing_is_drawn_twice(repository: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("tag", "change", "said"),
+    ("tag", "change", "message"),
     [
         ("final-2", "", "there is no such tag"),
         ("final-1", "edit", "has changes .*code.py"),
@@ -68,8 +68,8 @@ def test_nothing_is_drawn_twice(repository: Path, tmp_path: Path) -> None:
         ("final-1", "commit", "is not the commit that is checked out"),
     ],
 )
-def test_what_is_not_the_tagged_commit_is_refused(
-    repository: Path, tmp_path: Path, tag: str, change: str, said: str
+def test_draw_is_refused_unless_the_tagged_commit_is_checked_out_unchanged(
+    repository: Path, tmp_path: Path, tag: str, change: str, message: str
 ) -> None:
     if change == "new file":
         (repository / "more.py").write_text("y = 2\n")
@@ -77,13 +77,13 @@ def test_what_is_not_the_tagged_commit_is_refused(
         (repository / "code.py").write_text("x = 2\n")
     if change == "commit":
         git(repository, "commit", "-q", "-a", "-m", "Second")
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         draw_final.draw_final(tag, tmp_path / "final.json", repository)
     assert not (tmp_path / "final.json").exists()
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "results").glob("final*.json")), ids=lambda path: path.name)
-def test_seeds_that_are_published_are_those_of_their_commit(path: Path) -> None:
+def test_published_seeds_are_those_of_their_commit(path: Path) -> None:
     stored = json.loads(path.read_text())
     assert stored["format"] == draw_final.FORMAT
     assert stored["seeds"] == draw_final.draw_seeds(stored["commit"])
@@ -91,5 +91,5 @@ def test_seeds_that_are_published_are_those_of_their_commit(path: Path) -> None:
         ["git", "-C", str(ROOT), "rev-parse", "--verify", "--quiet", f"refs/tags/{stored['tag']}^{{commit}}"],
         capture_output=True,
         text=True,
-    )  # a checkout without tags cannot tell
+    )  # empty in a checkout without tags
     assert tagged.stdout.strip() in ("", stored["commit"])

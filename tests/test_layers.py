@@ -1,4 +1,4 @@
-"""The arrangement of the package: imports run one way, and general code knows no robot."""
+"""Tests of the package's layers: folders import only folders below them, and general code depends on no robot."""
 
 import ast
 import re
@@ -25,15 +25,15 @@ LAYERS = (
     "robots",
     "common",
 )
-"""Each folder may import itself and those after it."""
+"""Folders of the package. Each may import itself and those after it."""
 ROBOT_WORDS = re.compile(
     r"\b(balloons?|knees?|servos?|foot|feet|legs?)\b|_(balloon|knee|servo|foot|feet|leg)s?\b", re.I
 )
-"""Parts that BALLU has, and that no general code may name."""
+"""Pattern of BALLU's parts, which general code must not name."""
 
 
 def modules() -> Iterator[tuple[str, Path]]:
-    """Yield folder and path of each module of a layer."""
+    """Yield folder and path of each module in a layer."""
     for path in sorted(PACKAGE.rglob("*.py")):
         folder, *rest = path.relative_to(PACKAGE).parts
         if rest:
@@ -41,7 +41,7 @@ def modules() -> Iterator[tuple[str, Path]]:
 
 
 def imported_folders(path: Path) -> Iterator[tuple[str, int]]:
-    """Yield the folder and the line of each import from this package."""
+    """Yield the imported folder and the line of each import from this package."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "ballu_mjx":
             parts = node.module.split(".")
@@ -58,7 +58,7 @@ def test_every_folder_is_a_layer():
     assert {folder for folder, _ in modules()} == set(LAYERS)
 
 
-def test_imports_run_one_way():
+def test_folders_import_only_folders_below_them():
     wrong = [
         f"{path.relative_to(PACKAGE)}:{line} imports {other}"
         for folder, path in modules()
@@ -69,7 +69,7 @@ def test_imports_run_one_way():
 
 
 @pytest.mark.parametrize("folder", [layer for layer in LAYERS if layer not in ("ballu", "cli")])
-def test_general_code_names_no_part_of_one_robot(folder: str):
+def test_general_code_names_no_parts_of_ballu(folder: str):
     found = []
     for path in sorted((PACKAGE / folder).rglob("*.py")):
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
@@ -78,7 +78,7 @@ def test_general_code_names_no_part_of_one_robot(folder: str):
     assert not found, "\n".join(found)
 
 
-def test_general_code_asks_no_robot_who_it_is():
+def test_general_code_does_not_check_which_robot_it_has():
     pattern = re.compile(r"is_ballu|== *[\"']ballu[\"']|== *[\"']BALLU[\"']|isinstance\([^)]*Ballu\b")
     for folder, path in modules():
         if folder != "ballu":

@@ -1,4 +1,4 @@
-"""Do the benchmarks of identification compare like with like?"""
+"""Tests that the identification benchmarks compare searches, times and simulators fairly."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ballu_mjx.identification.window_simulator import WindowSimulator, cut_windo
 SHARES = Shares(np.array([1e-3, -1.0]), np.array([1e1, 3.0]), np.array([True, False]))
 
 
-def test_a_search_over_shares_finds_values_of_any_size():
+def test_search_over_shares_finds_values_of_different_magnitudes():
     def function(place: np.ndarray) -> tuple[float, np.ndarray]:
         goal = SHARES.of(np.array([0.02, 2.5]))
         return float(np.sum((place - goal) ** 2)), 2 * (place - goal)
@@ -30,16 +30,16 @@ def test_a_search_over_shares_finds_values_of_any_size():
     assert trace[-1][0] <= seconds
 
 
-def test_the_time_to_an_error_is_that_of_the_first_point_as_good():
+def test_time_to_an_error_is_that_of_the_first_point_that_reaches_it():
     ours = Search("ours", 2, 3.0, 40.0, 1.0, [(1.0, 5.0), (2.0, 1.05), (3.0, 1.0)])
     other = Search("other", 2, 9.0, None, 1.1, [(1.0, 5.0), (8.0, 1.1), (9.0, 1.1)])
     assert ours.reached(1.1) == 2.0
     assert other.reached(1.0) == np.inf
-    said = compare([ours], other)
-    assert "the lower of the two" in said and "ours 4 times sooner" in said
+    text = compare([ours], other)
+    assert "the lower of the two" in text and "ours 4 times sooner" in text
 
 
-def test_compiling_is_counted_once_and_only_while_it_lasts():
+def test_compile_clock_counts_compilation_once():
     clock = sysid_pendulum.CompileClock()
     function = jax.jit(lambda x: jax.jit(jnp.sin)(x) ** 2)
     begin = time.perf_counter()
@@ -51,7 +51,7 @@ def test_compiling_is_counted_once_and_only_while_it_lasts():
     assert clock.between(compiled, end) == 0
 
 
-def test_windows_in_c_mujoco_are_those_of_the_fit():
+def test_windows_in_c_mujoco_match_those_of_the_fit():
     robot = sysid_pendulum.read_pendulum()
     model = robot.load_model()
     parameters = declared_parameters(robot, model)
@@ -72,8 +72,8 @@ def test_windows_in_c_mujoco_are_those_of_the_fit():
     vectors = np.stack([values, 1.1 * values])
     with jax.enable_x64(True):
         windows = cut_windows([motion], 0.2)
-        ours = WindowSimulator(parameters, [motion], windows)
-        theirs = sysid_pendulum.WindowRollouts(parameters, [motion], windows).differences(vectors)
-        for vector, found in zip(vectors, theirs, strict=True):
-            np.testing.assert_allclose(found, ours.differences(vector), atol=1e-5)
-    assert np.abs(theirs[0] - theirs[1]).max() > 1e-3
+        simulator = WindowSimulator(parameters, [motion], windows)
+        differences = sysid_pendulum.WindowRollouts(parameters, [motion], windows).differences(vectors)
+        for vector, found in zip(vectors, differences, strict=True):
+            np.testing.assert_allclose(found, simulator.differences(vector), atol=1e-5)
+    assert np.abs(differences[0] - differences[1]).max() > 1e-3

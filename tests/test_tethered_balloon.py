@@ -1,4 +1,4 @@
-"""The experiment with another robot: every residual method learns on it, and every command works on what it leaves."""
+"""Tests of the experiment with another robot: every residual method trains on it, and every command reads its runs."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def recordings(experiment: ModuleType, tmp_path_factory: pytest.TempPathFactory)
     return folder
 
 
-def test_all_methods_of_the_experiment_are_tried(experiment: ModuleType):
+def test_these_tests_cover_all_methods_of_the_experiment(experiment: ModuleType):
     assert tuple(experiment.METHODS) == METHODS
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_method_s_run_is_served_by_every_command(
+def test_every_command_reads_the_run_of_each_method(
     method: str, experiment: ModuleType, recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     run = tmp_path / method
@@ -70,7 +70,7 @@ def test_a_method_s_run_is_served_by_every_command(
         server.stop()
 
     capsys.readouterr()
-    checked = method == "fluid"  # a program of its own, in double precision
+    checked = method == "fluid"  # once, because the check compiles another program in double precision
     assert export.main(["simulator", str(run), "--check-seconds", "0.5" if checked else "0"]) == 0
     assert ("C MuJoCo differs from the simulator by" in capsys.readouterr().out) == checked
     assert (run / "simulator" / "identified.xml").exists()

@@ -1,4 +1,4 @@
-"""Identified actuators of BALLU: what their file holds is what simulators have."""
+"""Identified actuators of BALLU: their file, simulators with their values, and invalid values."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ FOUND = dataclasses.replace(
 )
 
 
-def test_nominal_actuators_are_the_nominal_model_and_no_drivetrain() -> None:
+def test_nominal_actuators_give_the_nominal_model_without_a_drivetrain() -> None:
     model = load_model()
     for name, values in NOMINAL.fields(model).items():
         np.testing.assert_allclose(values, getattr(model, name), rtol=1e-5, atol=1e-7, err_msg=name)
     assert drivetrain_of(NOMINAL) is None
 
 
-def test_the_file_gives_back_what_simulators_have(tmp_path: Path) -> None:
+def test_simulators_have_the_values_of_the_actuators_file(tmp_path: Path) -> None:
     write_actuators(tmp_path / "actuators.json", "robot", FOUND, {})
     name, read = read_actuators(tmp_path / "actuators.json")
     assert name == "robot" and actuators_to_json(read) == actuators_to_json(FOUND)
@@ -54,7 +54,7 @@ def test_the_file_gives_back_what_simulators_have(tmp_path: Path) -> None:
     model, drivetrain = simulator.mj_model, simulator.drivetrain
     assert drivetrain is not None
     assert drivetrain.delay == pytest.approx(DYNAMIC["delay"]) and drivetrain.lag == pytest.approx(DYNAMIC["lag"])
-    # The play is of the motor's target: in commands, it is wider where a command moves the motor less.
+    # The backlash is that of the motor's target. In command units, it is wider if a command moves the motor less.
     assert drivetrain.backlash * SERVO_RANGE * np.array([0.8, 0.95]) == pytest.approx(np.array(DYNAMIC["backlash"]))
     for kind in ("knee", "motor"):
         dofs = [model.joint(f"{kind}_{side}").dofadr[0] for side in ("left", "right")]
@@ -64,8 +64,8 @@ def test_the_file_gives_back_what_simulators_have(tmp_path: Path) -> None:
     assert model.tendon_stiffness == pytest.approx([1500.0, 2500.0])
 
 
-def test_sticking_joints_are_solved_for() -> None:
-    """Random commands for 2 s, against a solver that has converged."""
+def test_solver_iterations_suffice_for_dry_friction() -> None:
+    """Random commands of 2 s are simulated, and compared with a solver that has converged."""
     commands = np.random.default_rng(0).uniform(size=(8, 8, 2)).repeat(25, axis=1)
 
     def walk(iterations: int | None) -> np.ndarray:
@@ -83,11 +83,11 @@ def test_sticking_joints_are_solved_for() -> None:
         return np.array(ends)
 
     converged = walk(100)
-    off, nominal = (float(np.median(np.linalg.norm(walk(n) - converged, axis=1))) for n in (None, 3))
-    assert load_model().opt.iterations == 3 and off < 3e-4 < nominal
+    error, nominal_error = (float(np.median(np.linalg.norm(walk(n) - converged, axis=1))) for n in (None, 3))
+    assert load_model().opt.iterations == 3 and error < 3e-4 < nominal_error
 
 
-def test_files_of_the_first_format_have_the_nominal_rest(tmp_path: Path) -> None:
+def test_files_of_the_first_format_get_nominal_values_for_missing_parameters(tmp_path: Path) -> None:
     pairs = actuators_to_json(FOUND)
     first = ("knee_spring_stiffness", "motor_gain", "default_motor_angle", "default_knee_angle", "torque_limit")
     content = {"format": "ballu-actuators/1", "robot": "old", "parameters": {name: pairs[name] for name in first}}
@@ -97,24 +97,24 @@ def test_files_of_the_first_format_have_the_nominal_rest(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("name", "pair", "says"),
+    ("name", "pair", "message"),
     [("delay", [40.0, 40.0], "in seconds"), ("backlash", [-0.1, 0.0], "0 or more"), ("motor_travel", [0, 1], "than 0")],
 )
-def test_impossible_values_are_refused(tmp_path: Path, name: str, pair: list[float], says: str) -> None:
+def test_impossible_values_are_refused(tmp_path: Path, name: str, pair: list[float], message: str) -> None:
     content = {"format": "ballu-actuators/2", "robot": "r", "parameters": {**actuators_to_json(FOUND), name: pair}}
     (tmp_path / "actuators.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match=f"{name}.*{says}"):
+    with pytest.raises(InputError, match=f"{name}.*{message}"):
         read_actuators(tmp_path / "actuators.json")
 
 
-def test_the_nominal_robot_beside_an_identified_one_has_its_rows_of_constraints() -> None:
-    """Both are simulated by one program; MJX takes a row of friction 0 for one that never slips."""
+def test_nominal_model_has_the_constraint_rows_of_the_identified_model() -> None:
+    """One compiled program simulates both. MJX treats a row with dry friction 0 as a joint that never slips."""
     simulator = Simulator(load_robot(), FOUND)
-    beside = nominal_model(simulator)
-    assert make_data(beside)._impl.efc_J.shape == make_data(simulator.mj_model)._impl.efc_J.shape  # pyright: ignore
-    assert beside.dof_frictionloss.max() < 1e-8 < simulator.mj_model.dof_frictionloss.max()
+    nominal = nominal_model(simulator)
+    assert make_data(nominal)._impl.efc_J.shape == make_data(simulator.mj_model)._impl.efc_J.shape  # pyright: ignore
+    assert nominal.dof_frictionloss.max() < 1e-8 < simulator.mj_model.dof_frictionloss.max()
 
 
-def test_a_delay_that_the_actuators_have_is_not_identified_again() -> None:
+def test_aerodynamic_fit_refuses_to_fit_the_delay_of_identified_actuators() -> None:
     with pytest.raises(InputError, match="no parameter that is unknown"):
         fit_aerodynamics(Simulator(load_robot(), FOUND), [], free=("delay",))

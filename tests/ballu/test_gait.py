@@ -1,4 +1,4 @@
-"""Steps: of a gait, and of what is none."""
+"""Counting of steps in walks and in motions without steps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TIME = np.arange(200) * CONTROL_TIMESTEP
 
 
 def walk(height: float) -> Float[np.ndarray, "T 2 3"]:
-    """One foot swings for half a second, then the other."""
+    """Return positions (m) of feet that swing in turn, for half a second each, up to `height` (m)."""
     stride = np.stack([TIME, TIME - 0.5], axis=1)
     swing = np.clip(2 * (stride % 1.0), 0.0, 1.0)
     sideways = np.tile([0.05, -0.05], (len(TIME), 1))
@@ -21,12 +21,12 @@ def walk(height: float) -> Float[np.ndarray, "T 2 3"]:
 
 
 @pytest.mark.parametrize("height", [0.05, 0.001])
-def test_a_second_of_walking_is_two_steps(height: float) -> None:
-    """Also of feet that graze the floor."""
+def test_walking_counts_two_steps_per_second(height: float) -> None:
+    """This includes feet that graze the floor."""
     assert count_steps(walk(height))[-1] == pytest.approx(2 * TIME[-1], abs=1)
 
 
-def test_what_is_no_gait_takes_no_step() -> None:
+def test_motions_without_alternating_feet_count_no_steps() -> None:
     rest = np.tile(walk(0.0)[:1], (len(TIME), 1, 1))
     slide = np.stack([0.3 * TIME, 0 * TIME, 0 * TIME], axis=-1)[:, None]
     hop = np.stack([0 * TIME, 0 * TIME, 0.1 * np.abs(np.sin(3 * TIME))], axis=-1)[:, None]

@@ -1,4 +1,4 @@
-"""Identification: physics against C MuJoCo, derivatives against differences, known parameters recovered."""
+"""Identification of BALLU's legs: physics as in C MuJoCo, exact derivatives, and recovery of known parameters."""
 
 from __future__ import annotations
 
@@ -35,10 +35,13 @@ pytestmark = pytest.mark.optimized
 
 COMMANDS = np.linspace(0, 1, 20)
 HOLD = 60
-"""Times a command."""
+"""Number of samples for which each command is held."""
 HIGH, LOW = [1.3, 1.2, 0.05, 0.05, 0.9, 4e-4, -0.1, 0.8, 0.03], [0.8, 0.8, -0.06, -0.03, 0.55, 1e-3, 0.05, 1.3, -0.03]
-"""Times the nominal parameters (angles, slack and travel: added): a leg that never saturates, and one that does."""
-TRAIN = LegDynamics(
+"""Changes of the nominal parameters: offsets for angles, slack and travel, and factors for the others.
+
+The servo of HIGH never saturates. That of LOW does.
+"""
+DYNAMICS = LegDynamics(
     delay=0.043, motor_friction=3e-3, knee_friction=8e-4, backlash=np.deg2rad(2.0), lag=0.02, knee_damping=4e-3
 )
 
@@ -49,8 +52,8 @@ def double() -> Iterator[None]:
         yield
 
 
-BEYOND = ["torque_limit", "cable_slack", "motor_travel", "cable_stiffness", "knee_spring_reference"]
-"""What is not among the paper's eight."""
+NOT_IN_PAPER = ["torque_limit", "cable_slack", "motor_travel", "cable_stiffness", "knee_spring_reference"]
+"""Parameters of a leg that are not among the paper's four."""
 SPACE = ParameterTransform(nominal_leg(), ALL_PARAMETERS)
 
 
@@ -59,7 +62,7 @@ def vector(change: list[float]) -> np.ndarray:
 
 
 def blank() -> Sweep:
-    """A sweep of the sizes that all tests here share, and so two compiled programs."""
+    """Return a sweep of zeros. All tests use sweeps of its sizes, and so share two compiled programs."""
     times = len(COMMANDS) * HOLD
     return Sweep(
         robot="model",
@@ -91,22 +94,22 @@ def coordinates(*vectors: np.ndarray) -> np.ndarray:
 
 
 def rest(physics: CompiledLeg, *vectors: np.ndarray) -> np.ndarray:
-    """Positions at rest under COMMANDS."""
+    """Return the positions at which the leg rests under COMMANDS."""
     return physics.settled(coordinates(*vectors), np.tile(COMMANDS, (len(vectors), 1)))[0]
 
 
 def with_dynamics(*vectors: np.ndarray) -> np.ndarray:
-    """Coordinates of a left and a right leg and their dynamics, those of TRAIN."""
-    return np.concatenate([coordinates(*vectors), np.tile(dynamics_coordinates(TRAIN), (2, 1))], 1)
+    """Return coordinates of a left and a right leg, both with the dynamics DYNAMICS."""
+    return np.concatenate([coordinates(*vectors), np.tile(dynamics_coordinates(DYNAMICS), (2, 1))], 1)
 
 
 def moving(physics: CompiledLeg, *vectors: np.ndarray) -> np.ndarray:
-    """The motion of a left and a right leg."""
+    """Return the motion of a left and a right leg."""
     return physics.motion(with_dynamics(*vectors), DATA.commanded)[0][:, DATA.counts]
 
 
 def c_model(side: str, values: np.ndarray) -> mujoco.MjModel:
-    """The whole robot in C, base held, feet in the air, with one leg's parameters on both sides."""
+    """Return the suspended robot's model for C MuJoCo, with one leg's parameters on both sides."""
     spec = mujoco.MjSpec.from_file(str(assets() / "ballu.xml"))
     suspend(spec)
     model = spec.compile()
@@ -118,11 +121,11 @@ def c_model(side: str, values: np.ndarray) -> mujoco.MjModel:
 
 @pytest.mark.parametrize("change", [HIGH, LOW])
 @pytest.mark.parametrize("side", SIDES)
-def test_settled_angles_are_those_c_mujoco_comes_to_rest_at(
+def test_settled_angles_are_the_angles_at_rest_in_c_mujoco(
     physics: CompiledLeg, change: list[float], side: str
 ) -> None:
     model = c_model(side, vector(change))
-    model.dof_damping[:] = np.maximum(model.dof_damping, 0.05)  # rests sooner, at the same place
+    model.dof_damping[:] = np.maximum(model.dof_damping, 0.05)  # comes to rest earlier, at the same angles
     data = mujoco.MjData(model)
     expected = []
     for command in COMMANDS[::4]:
@@ -133,39 +136,41 @@ def test_settled_angles_are_those_c_mujoco_comes_to_rest_at(
     assert np.rad2deg(ours) == pytest.approx(np.rad2deg(expected), abs=0.02)
 
 
-def test_motion_is_that_of_c_mujoco_with_friction_play_and_delay(physics: CompiledLeg) -> None:
+def test_motion_matches_c_mujoco_with_friction_backlash_lag_and_delay(physics: CompiledLeg) -> None:
     values = vector(LOW)
     paths = moving(physics, vector(HIGH), values)[1]
     model = c_model("left", values)
-    for joint, friction in (("motor_left", TRAIN.motor_friction), ("knee_left", TRAIN.knee_friction)):
+    for joint, friction in (("motor_left", DYNAMICS.motor_friction), ("knee_left", DYNAMICS.knee_friction)):
         model.dof_frictionloss[model.joint(joint).dofadr] = friction
     data = mujoco.MjData(model)
     for name, angle in (("motor_left", values[2]), ("knee_left", values[3])):
         data.joint(name).qpos[:] = angle
-    model.dof_damping[model.joint("knee_left").dofadr] = TRAIN.knee_damping
-    half, lagged, target, expected = TRAIN.backlash / np.pi / values[6], 0.0, 0.0, []
-    share = model.opt.timestep / (TRAIN.lag + model.opt.timestep)
+    model.dof_damping[model.joint("knee_left").dofadr] = DYNAMICS.knee_damping
+    half, lagged, target, expected = DYNAMICS.backlash / np.pi / values[6], 0.0, 0.0, []
+    gain = model.opt.timestep / (DYNAMICS.lag + model.opt.timestep)
     mujoco.mj_step(model, data, 200)
     for command in np.repeat(COMMANDS, HOLD):
-        lagged += share * (command - lagged)
+        lagged += gain * (command - lagged)
         target = np.clip(target, lagged - half, lagged + half)
         expected.append([data.joint(f"{kind}_left").qpos[0] for kind in ("motor", "knee")])
         data.ctrl[:] = target
         mujoco.mj_step(model, data)
     times = model.opt.timestep * np.arange(len(paths))
-    late = np.stack([np.interp(times - TRAIN.delay, times, column) for column in np.array(expected).T], axis=1)
-    difference = np.rad2deg(np.abs(paths - late))
-    # MJX stops its solver sooner, and at a stick or slip that shows for a while.
+    delayed = np.stack([np.interp(times - DYNAMICS.delay, times, column) for column in np.array(expected).T], axis=1)
+    difference = np.rad2deg(np.abs(paths - delayed))
+    # MJX's solver stops earlier. This is visible for a short time after a joint sticks or slips.
     assert np.sqrt(np.mean(difference**2)) < 0.05 and difference.max() < 0.5
 
 
 @pytest.mark.parametrize("change", [HIGH, LOW])
-def test_derivatives_of_settled_angles_agree_with_differences(physics: CompiledLeg, change: list[float]) -> None:
-    """Cable slack and knee at its stop at low commands, cable taut at high ones, servo saturated in the weak leg."""
+def test_derivatives_of_settled_angles_match_finite_differences(physics: CompiledLeg, change: list[float]) -> None:
+    """At low commands, the cable is slack and the knee at its stop. At high ones, it is taut. LOW's servo saturates."""
     y, command, angles = coordinates(vector(change))[0], COMMANDS[None], physics.leg.angles
-    value, slope = (x[0][:, angles] for x in physics.settled(y[None], command))
-    assert value[0, 1] < vector(change)[3] and value[-1, 1] > vector(change)[3] + 0.2, "from the stop to far off it"
-    saturates = np.abs(slope[-1, :, LEG_PARAMETERS.index("torque_limit")]).max() > 0.1
+    value, derivative = (x[0][:, angles] for x in physics.settled(y[None], command))
+    assert value[0, 1] < vector(change)[3] and value[-1, 1] > vector(change)[3] + 0.2, (
+        "the knee must go from its stop to far away from it"
+    )
+    saturates = np.abs(derivative[-1, :, LEG_PARAMETERS.index("torque_limit")]).max() > 0.1
     assert saturates == (change is LOW)
     step = 1e-6
     steps = step * np.eye(len(y))
@@ -173,36 +178,36 @@ def test_derivatives_of_settled_angles_agree_with_differences(physics: CompiledL
     difference = np.moveaxis((up - down) / (2 * step), 0, -1)
     for index, name in enumerate(LEG_PARAMETERS):
         scale = np.abs(difference[..., index]).max()
-        assert slope[..., index] == pytest.approx(difference[..., index], abs=1e-4 * scale + 1e-6), name
+        assert derivative[..., index] == pytest.approx(difference[..., index], abs=1e-4 * scale + 1e-6), name
 
 
-def test_derivatives_of_the_motion_agree_with_differences(physics: CompiledLeg) -> None:
-    """Both legs at once: one that never saturates, and one that does."""
+def test_derivatives_of_the_motion_match_finite_differences(physics: CompiledLeg) -> None:
+    """The left leg's servo never saturates. The right leg's servo does."""
     y = with_dynamics(vector(HIGH), vector(LOW))
-    slopes = physics.motion(y, DATA.commanded)[1]
-    assert np.all(np.isfinite(slopes))
+    derivatives = physics.motion(y, DATA.commanded)[1]
+    assert np.all(np.isfinite(derivatives))
     step = 1e-6
     for index in range(y.shape[1]):
         change = step * (np.arange(y.shape[1]) == index)
         up, down = (physics.motion(y + sign * change, DATA.commanded)[0] for sign in (1, -1))
         difference = (up - down) / (2 * step)
-        # Where a cable tightens or a stop lets go within a step, the path has a kink: few samples may differ.
-        off = np.abs(slopes[..., index] - difference) > 0.01 * np.abs(difference).max() + 1e-9
-        assert off.mean() < 0.02, index
+        # The motion has a kink where a cable tightens or a knee leaves its stop. A few samples may therefore differ.
+        differs = np.abs(derivatives[..., index] - difference) > 0.01 * np.abs(difference).max() + 1e-9
+        assert differs.mean() < 0.02, index
 
 
-def test_every_leg_within_the_bounds_comes_to_rest(physics: CompiledLeg) -> None:
+def test_all_legs_within_the_bounds_come_to_rest(physics: CompiledLeg) -> None:
     draws = SPACE.draw(1, 40)
     qpos, _ = physics.settled(draws, np.tile(COMMANDS, (len(draws), 1)))
     torque = jax.jit(jax.vmap(lambda q, y, c: physics.leg.residual_torque(q, SPACE.vector(y), c), (0, None, 0)))
-    left = np.array([torque(q, jnp.asarray(y), COMMANDS) for q, y in zip(qpos, draws, strict=True)])
-    unbalanced = np.abs(left).max(axis=-1)
-    # Some jump to and fro over a kink in their last iterations.
-    assert np.mean(unbalanced > 1e-6) < 0.05
-    assert np.max(unbalanced) < 5e-3, "N m"
+    torques = np.array([torque(q, jnp.asarray(y), COMMANDS) for q, y in zip(qpos, draws, strict=True)])
+    residual = np.abs(torques).max(axis=-1)
+    # Some solutions jump back and forth across a kink in the last iterations.
+    assert np.mean(residual > 1e-6) < 0.05
+    assert np.max(residual) < 5e-3, "unbalanced torque (N m)"
 
 
-def test_hausdorff_distance_is_scipys_and_its_gradient_that_of_the_decisive_pair() -> None:
+def test_directed_hausdorff_distance_and_gradient_match_scipy() -> None:
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(30, 2)), rng.normal(size=(20, 2))
     distance, i, j = scipy_directed_hausdorff(a, b)
@@ -215,7 +220,7 @@ def test_hausdorff_distance_is_scipys_and_its_gradient_that_of_the_decisive_pair
     assert float(same[0]) == 0 and np.all(np.asarray(same[1]) == 0)
 
 
-def test_curves_are_numpys_polynomials() -> None:
+def test_curves_match_numpys_polynomial_fit() -> None:
     rng = np.random.default_rng(0)
     angles = rng.normal(size=20)
     expected = np.polynomial.Polynomial.fit(COMMANDS, angles, 5)(np.linspace(0, 1, 200)) / (np.pi / 2)
@@ -224,15 +229,17 @@ def test_curves_are_numpys_polynomials() -> None:
     assert curve[:, 0] == pytest.approx(np.linspace(0, 1, 200))
 
 
-def test_curve_distances_go_both_ways() -> None:
+def test_curve_distances_are_directed() -> None:
     measured = jnp.asarray(np.stack([COMMANDS, COMMANDS], 1))
     simulated = measured.at[-1, 0].add(0.5)
-    there, back = np.asarray(curve_distances(COMMANDS, simulated, measured, 7))
-    assert there[0] > back[0] > 0.01, "the point that juts out is far from the curve, not the curve from its neighbours"
-    assert there[1] == back[1] == 0
+    to_measured, to_simulated = np.asarray(curve_distances(COMMANDS, simulated, measured, 7))
+    assert to_measured[0] > to_simulated[0] > 0.01, (
+        "the outlier is far from the measured curve, which is near the outlier's neighbours"
+    )
+    assert to_measured[1] == to_simulated[1] == 0
 
 
-def test_coordinates_map_onto_the_bounds_and_back() -> None:
+def test_coordinates_map_to_values_within_the_bounds_and_back() -> None:
     for draw in SPACE.draw(3, 5):
         values = np.asarray(SPACE.vector(jnp.asarray(draw)))
         assert np.all((SPACE.lower < values) & (values < SPACE.upper))
@@ -240,7 +247,7 @@ def test_coordinates_map_onto_the_bounds_and_back() -> None:
     assert np.asarray(SPACE.vector(jnp.asarray(SPACE.draw(0, 1)[0]))) == pytest.approx(SPACE.nominal)
     paper = ParameterTransform(nominal_leg(), PAPER_PARAMETERS)
     held = np.asarray(paper.vector(jnp.asarray(paper.draw(0, 1)[1]))) == paper.nominal
-    assert [name for name, same in zip(LEG_PARAMETERS, held, strict=True) if same] == BEYOND
+    assert [name for name, same in zip(LEG_PARAMETERS, held, strict=True) if same] == NOT_IN_PAPER
 
 
 TRUTH = (
@@ -250,7 +257,7 @@ TRUTH = (
 
 
 def sweep_of(physics: CompiledLeg, *vectors: np.ndarray) -> Sweep:
-    """A sweep of the model itself, with these parameters. Its settled angles know no friction, its motion does."""
+    """Return a sweep simulated by the model itself. Its motion includes dry friction, its settled angles do not."""
     settled = np.moveaxis(rest(physics, *vectors)[:, :, physics.leg.angles], 0, -1)
     return dataclasses.replace(blank(), settled=settled, motion=np.moveaxis(moving(physics, *vectors), 0, -1))
 
@@ -261,7 +268,7 @@ def noiseless(physics: CompiledLeg) -> Sweep:
 
 
 def noisy(sweep: Sweep, seed: int, noise: float = np.deg2rad(0.5)) -> Sweep:
-    """White noise (rad) on every one of the samples."""
+    """Return the sweep with white noise (standard deviation in rad) on every sample."""
     rng = np.random.default_rng(seed)
     return dataclasses.replace(
         sweep,
@@ -272,25 +279,25 @@ def noisy(sweep: Sweep, seed: int, noise: float = np.deg2rad(0.5)) -> Sweep:
 
 @pytest.mark.slow
 def test_known_parameters_are_recovered(noiseless: Sweep, identifier: Identifier) -> None:
-    """Some draws end in a long curved valley, where the motion is right to a tenth of a capture's noise."""
-    every = []
+    """Some seeds end in a long curved valley of the loss. Their motion is still within a tenth of the capture noise."""
+    fits_by_seed = []
     for seed in range(2):
         identifier.config = dataclasses.replace(ALL_PARAMETERS, seed=seed, draws=32, steps=20)
-        every.append(identifier.run(noiseless, lambda *_: None).fits)
-        assert all(fit.residual < np.deg2rad(0.05) for fit in every[-1])
+        fits_by_seed.append(identifier.run(noiseless, lambda *_: None).fits)
+        assert all(fit.residual < np.deg2rad(0.05) for fit in fits_by_seed[-1])
     for leg, truth in enumerate(TRUTH):
-        fit = min((fits[leg] for fits in every), key=lambda fit: fit.residual)
+        fit = min((fits[leg] for fits in fits_by_seed), key=lambda fit: fit.residual)
         for index, name in enumerate(LEG_PARAMETERS):
             exact = 0.01 * truth[index] if SPACE.relative[index] else SPACE.prior[index] / 30
             assert fit.vector[index] == pytest.approx(truth[index], abs=exact), name
         assert fit.dynamics is not None
-        assert list(fit.dynamics) == pytest.approx(list(TRAIN), rel=0.02)
+        assert list(fit.dynamics) == pytest.approx(list(DYNAMICS), rel=0.02)
         assert not fit.open_directions
 
 
 @pytest.mark.slow
-def test_the_richer_model_is_taken_where_a_robot_asks_for_it(physics: CompiledLeg, identifier: Identifier) -> None:
-    """Springs then stay at their nominal stiffness, and all else is found about it."""
+def test_richer_model_is_selected_for_a_robot_that_requires_it(physics: CompiledLeg, identifier: Identifier) -> None:
+    """The springs then stay at their nominal stiffness. The other parameters are identified with this stiffness."""
     spring, travel = (LEG_PARAMETERS.index(name) for name in ("knee_spring_stiffness", "motor_travel"))
     truths = [np.where(np.arange(len(truth)) == spring, SPACE.nominal, truth) for truth in TRUTH]
     identifier.config = dataclasses.replace(ALL_PARAMETERS, nominal_springs=True, draws=32, steps=15)
@@ -303,10 +310,10 @@ def test_the_richer_model_is_taken_where_a_robot_asks_for_it(physics: CompiledLe
 
 
 @pytest.mark.slow
-def test_the_simpler_model_stays_where_a_robot_has_no_more(physics: CompiledLeg, identifier: Identifier) -> None:
-    """Springs are then as well known as if nothing else could differ; their errors say what that rests on."""
+def test_simpler_model_is_kept_for_a_robot_that_it_describes(physics: CompiledLeg, identifier: Identifier) -> None:
+    """The springs are then as accurate as in the simpler model alone. Standard errors are those of the richer model."""
     plain = [np.where(np.isin(LEG_PARAMETERS, RICHER_PARAMETERS), SPACE.nominal, truth) for truth in TRUTH]
-    dynamics = dynamics_coordinates(TRAIN._replace(lag=1e-4, knee_damping=NOMINAL_DYNAMICS["knee_damping"]))
+    dynamics = dynamics_coordinates(DYNAMICS._replace(lag=1e-4, knee_damping=NOMINAL_DYNAMICS["knee_damping"]))
     y = np.concatenate([coordinates(*plain), np.tile(dynamics, (2, 1))], 1)
     motion = physics.motion(y, DATA.commanded)[0][:, DATA.counts]
     settled = rest(physics, *plain)[:, :, physics.leg.angles]
@@ -314,24 +321,28 @@ def test_the_simpler_model_stays_where_a_robot_has_no_more(physics: CompiledLeg,
     identifier.config = dataclasses.replace(ALL_PARAMETERS, draws=32, steps=15)
     found = identifier.run(noisy(sweep, 0), lambda *_: None)
     assert found.selection is not None and not found.selection.richer
-    assert found.selection.statistic > 0 and found.selection.effect > 0, "it has the simpler solution among its starts"
+    assert found.selection.statistic > 0 and found.selection.effect > 0, (
+        "the richer search starts from the simpler solution, among others"
+    )
     parameters = found.parameters
     assert all(getattr(parameters, name) is None for name in RICHER_PARAMETERS) and parameters.backlash is not None
     spring, travel = (LEG_PARAMETERS.index(name) for name in ("knee_spring_stiffness", "motor_travel"))
-    slopes = physics.motion(y, DATA.commanded)[1][:, DATA.counts].reshape(2, -1, y.shape[1])
+    derivatives = physics.motion(y, DATA.commanded)[1][:, DATA.counts].reshape(2, -1, y.shape[1])
     simpler = ~np.isin([*LEG_PARAMETERS, *LegDynamics._fields], RICHER_PARAMETERS)
-    for fit, truth, own, slope in zip(found.fits, plain, y, slopes[..., simpler] / np.deg2rad(0.5), strict=True):
-        per_coordinate = jax.jacfwd(SPACE.vector)(jnp.asarray(own[: len(truth)]))[spring, spring]
-        error = float(np.sqrt(np.linalg.inv(slope.T @ slope)[spring, spring]) * per_coordinate)
+    for fit, truth, leg_coordinates, derivative in zip(
+        found.fits, plain, y, derivatives[..., simpler] / np.deg2rad(0.5), strict=True
+    ):
+        per_coordinate = jax.jacfwd(SPACE.vector)(jnp.asarray(leg_coordinates[: len(truth)]))[spring, spring]
+        error = float(np.sqrt(np.linalg.inv(derivative.T @ derivative)[spring, spring]) * per_coordinate)
         assert abs(fit.vector[spring] - truth[spring]) < 3 * error
-        assert error < fit.standard_errors[spring], "that of the richer model"
+        assert error < fit.standard_errors[spring], "the standard error must be that of the richer model"
         assert np.all(np.abs(fit.vector - truth) < 3 * fit.standard_errors + 1e-9)
-        assert fit.standard_errors[travel] > 0, "it may differ all the same"
+        assert fit.standard_errors[travel] > 0, "the travel is held, but it has a standard error"
 
 
 @pytest.mark.slow
-def test_standard_errors_are_honest(physics: CompiledLeg, identifier: Identifier) -> None:
-    """With 0.5 deg of noise, nine in ten estimates within two standard errors, where springs are what makers quote."""
+def test_standard_errors_cover_the_true_parameters(physics: CompiledLeg, identifier: Identifier) -> None:
+    """With noise of 0.5 deg and spring tolerances as makers quote, 90 % of estimates are within two standard errors."""
     spring = np.arange(len(SPACE.nominal)) == LEG_PARAMETERS.index("knee_spring_stiffness")
     truths = [np.where(spring, SPACE.nominal * factor, truth) for factor, truth in zip((1.1, 0.92), TRUTH, strict=True)]
     clean = sweep_of(physics, *truths)
@@ -345,24 +356,26 @@ def test_standard_errors_are_honest(physics: CompiledLeg, identifier: Identifier
 
 
 @pytest.mark.slow
-def test_friction_and_play_pass_for_actuators_only_where_settled_angles_are_all(
+def test_only_the_motion_separates_friction_and_backlash_from_motor_zero(
     noiseless: Sweep, identifier: Identifier
 ) -> None:
-    """At rest, a motor that play and friction stop short has another zero. Its motion tells them apart."""
+    """Backlash and friction stop a motor early, as another angle at command 0 would. Its motion shows the cause."""
     ends = noiseless.motion.reshape(len(COMMANDS), HOLD, 2, 2)[:, -20:].mean(axis=1)
     sweep = noisy(dataclasses.replace(noiseless, settled=ends), 0)
-    off = {}
+    zero_error = {}
     for motion in (True, False):
         identifier.config = dataclasses.replace(ALL_PARAMETERS, motion=motion, draws=32, steps=15)
         fits = identifier.run(sweep, lambda *_: None).fits
         zero = LEG_PARAMETERS.index("default_motor_angle")
-        off[motion] = [abs(fit.vector[zero] - truth[zero]) for fit, truth in zip(fits, TRUTH, strict=True)]
-    assert max(off[True]) < np.deg2rad(0.3) < min(off[False])
+        zero_error[motion] = [abs(fit.vector[zero] - truth[zero]) for fit, truth in zip(fits, TRUTH, strict=True)]
+    assert max(zero_error[True]) < np.deg2rad(0.3) < min(zero_error[False])
 
 
-def test_what_a_sweep_leaves_open_is_named_and_held_near_nominal(physics: CompiledLeg, identifier: Identifier) -> None:
-    """At rest, servos that never saturate say nothing about where they would (moving, they do), and the knee spring's
-    reference angle trades with its stiffness."""
+def test_open_directions_are_reported_and_held_near_nominal(physics: CompiledLeg, identifier: Identifier) -> None:
+    """Settled angles show no torque limit of servos that never saturate, although the motion does.
+
+    They do not separate the knee spring's reference angle from its stiffness either.
+    """
     strong = [vector(HIGH), vector(HIGH)]
     settled = np.moveaxis(rest(physics, *strong)[:, :, physics.leg.angles], 0, -1)
     sweep = dataclasses.replace(blank(), settled=settled)
@@ -377,14 +390,14 @@ def test_what_a_sweep_leaves_open_is_named_and_held_near_nominal(physics: Compil
         assert alone.weights[limit] > 0.95
         nominal = nominal_leg()[limit]
         assert fit.vector[limit] == pytest.approx(nominal, rel=0.2)
-        # What is known is found all the same.
+        # The other parameters are identified nevertheless.
         for index in set(range(len(LEG_PARAMETERS))) - {limit, spring, reference}:
             assert fit.vector[index] == pytest.approx(strong[0][index], rel=0.05, abs=np.deg2rad(0.5)), LEG_PARAMETERS[
                 index
             ]
 
 
-def test_the_papers_objective_is_lower_where_it_is_what_is_minimized(noiseless: Sweep, identifier: Identifier) -> None:
+def test_hausdorff_fit_has_a_lower_paper_objective_than_pointwise_fit(noiseless: Sweep, identifier: Identifier) -> None:
     sweep = dataclasses.replace(
         noiseless, settled=noiseless.settled + np.random.default_rng(0).normal(size=(20, 2, 2)) * np.deg2rad(1.0)
     )

@@ -1,4 +1,4 @@
-"""From recordings to states: are they where the robot was, as fast as it was, and fit to start a simulator from?"""
+"""Reconstruction of BALLU's motion: positions, velocities and commands, compared with the simulated robot."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ KNEES, HIPS, MOTORS = [9, 12], [8, 11], [10, 13]
 
 @dataclasses.dataclass(frozen=True)
 class Truth:
-    """The nominal robot on a bang-bang gait, every 10 ms."""
+    """States of the nominal robot during a bang-bang gait, every 10 ms."""
 
     time: np.ndarray
     command: np.ndarray
@@ -46,22 +46,22 @@ def truth() -> Truth:
     phase = time[:, None] / 1.2 + np.array([0.0, 0.5]) + 1e-9
     command = np.where(phase % 1.0 < 0.4, 1.0, 0.0)
     sites = [MODEL.site(name).id for name in ("balloon", "base", "foot_left", "foot_right")]
-    qpos, qvel, places, quaternion = [], [], [], []
+    qpos, qvel, positions, quaternion = [], [], [], []
     for row in command:
         mujoco.mj_kinematics(MODEL, data)
         qpos.append(data.qpos.copy())
         qvel.append(data.qvel.copy())
-        places.append(data.site_xpos[sites].copy())
+        positions.append(data.site_xpos[sites].copy())
         quaternion.append(data.body("balloon").xquat.copy())
         data.ctrl[:] = row
         mujoco.mj_step(MODEL, data)
-    return Truth(time, command, *(np.array(x) for x in (qpos, qvel, places, quaternion)))
+    return Truth(time, command, *(np.array(x) for x in (qpos, qvel, positions, quaternion)))
 
 
 def capture(
     truth: Truth, *, base: bool = True, noise: float = 1.0, time: np.ndarray | None = None, seed: int = 0
 ) -> Recording:
-    """What motion capture sees at `time`, with `noise` times 0.5 mm and 0.3 deg."""
+    """Return a motion capture recording at `time`, with noise of `noise` times 0.5 mm and 0.3 deg."""
     rng = np.random.default_rng(seed)
     time = truth.time if time is None else time
     sites = CubicSpline(truth.time, truth.sites)(time)
@@ -70,9 +70,9 @@ def capture(
     def orientation(values: np.ndarray) -> np.ndarray:
         exact = Rotation.from_quat(CubicSpline(truth.time, values)(time), scalar_first=True)
         error = Rotation.from_rotvec(noise * ROTATION_NOISE * rng.normal(size=(len(time), 3)))
-        seen = (exact * error).as_quat(scalar_first=True)
-        flips = np.sum(seen[1:] * seen[:-1], axis=1) < 0
-        return seen * np.concatenate([[1.0], np.cumprod(np.where(flips, -1.0, 1.0))])[:, None]
+        measured = (exact * error).as_quat(scalar_first=True)
+        flips = np.sum(measured[1:] * measured[:-1], axis=1) < 0
+        return measured * np.concatenate([[1.0], np.cumprod(np.where(flips, -1.0, 1.0))])[:, None]
 
     held = np.clip(np.searchsorted(truth.time, time + 1e-9, side="right") - 1, 0, len(truth.time) - 1)
     return make_recording(
@@ -90,42 +90,47 @@ def capture(
 
 
 @pytest.fixture(scope="module")
-def seen_with_base(truth: Truth) -> Motion:
+def motion_with_base(truth: Truth) -> Motion:
     return reconstruct(capture(truth), load_robot(), MODEL)
 
 
 @pytest.fixture(scope="module")
-def seen_without_base(truth: Truth) -> Motion:
+def motion_without_base(truth: Truth) -> Motion:
     return reconstruct(capture(truth, base=False), load_robot(), MODEL)
 
 
-def test_as_much_noise_again_errs_as_much_again(truth: Truth):
-    """States of a recording with noise added are off from the original's by as much as these from the truth: a
-    simulator's error by its starting states can be had without the truth."""
-    seen = capture(truth)
-    once = reconstruct(seen, load_robot(), MODEL).qpos
-    again = [reconstruct(add_capture_noise(seen, seed=seed), load_robot(), MODEL).qpos for seed in (1, 2)]
-    own = once[2:-2] - truth.qpos[::5][: len(once)][2:-2]
-    for twin in again:
-        places = [*range(3), *HIPS]  # what no stop clips
-        ratio = np.std((twin - once)[2:-2], axis=0)[places] / np.std(own, axis=0)[places]
+def test_added_noise_changes_states_as_much_as_measurement_noise(truth: Truth):
+    """Noise added to a recording changes its states by as much as its measurement noise did.
+
+    The error of a simulation due to its starting states can therefore be estimated without the true states.
+    """
+    recording = capture(truth)
+    once = reconstruct(recording, load_robot(), MODEL).qpos
+    again = [reconstruct(add_capture_noise(recording, seed=seed), load_robot(), MODEL).qpos for seed in (1, 2)]
+    error = once[2:-2] - truth.qpos[::5][: len(once)][2:-2]
+    for noisy in again:
+        columns = [*range(3), *HIPS]  # coordinates that joint stops do not clip
+        ratio = np.std((noisy - once)[2:-2], axis=0)[columns] / np.std(error, axis=0)[columns]
         assert np.all(ratio > 0.5) and np.all(ratio < 1.4), ratio
     assert np.abs(again[0] - again[1]).max() > 1e-4
 
 
 def at_control_rate(values: np.ndarray, motion: Motion, shift: int = 0) -> np.ndarray:
-    """Truth at the motion's times, `shift` samples later; both ends left out, so that shifts compare alike."""
+    """Return true values `shift` samples after the motion's times.
+
+    Both ends are left out, so that all shifts use the same number of samples.
+    """
     return values[5 * np.arange(2, len(motion.time) - 2) + shift]
 
 
 def position_errors(truth: Truth, motion: Motion) -> dict[str, np.ndarray]:
-    """Absolute errors: degrees, and millimetres for `base`."""
+    """Return absolute errors of positions: in mm for `base`, in deg for the others."""
     qpos = at_control_rate(truth.qpos, motion)
     found = motion.qpos[2:-2]
-    turn = Rotation.from_quat(qpos[:, 3:7], scalar_first=True).inv() * Rotation.from_quat(
+    rotation = Rotation.from_quat(qpos[:, 3:7], scalar_first=True).inv() * Rotation.from_quat(
         found[:, 3:7], scalar_first=True
     )
-    pitch = np.rad2deg(turn.as_rotvec()[:, 1])
+    pitch = np.rad2deg(rotation.as_rotvec()[:, 1])
     degrees = np.abs(np.rad2deg(found - qpos))
     return {
         "base": 1e3 * np.linalg.norm(found[:, :3] - qpos[:, :3], axis=1),
@@ -138,7 +143,7 @@ def position_errors(truth: Truth, motion: Motion) -> dict[str, np.ndarray]:
 
 
 def leg_angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angles (deg) between the world directions of femurs and tibias in two sets of positions."""
+    """Return the angles (deg) between the directions of femurs and tibias (world frame) in two sets of states."""
 
     def directions(qpos: np.ndarray) -> np.ndarray:
         data = mujoco.MjData(MODEL)
@@ -155,11 +160,11 @@ def leg_angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-@pytest.mark.parametrize("motion_name", ["seen_with_base", "seen_without_base"])
-def test_positions(truth, motion_name, request):
+@pytest.mark.parametrize("motion_name", ["motion_with_base", "motion_without_base"])
+def test_reconstructed_positions_match_the_simulated_robot(truth, motion_name, request):
     motion = request.getfixturevalue(motion_name)
     errors = position_errors(truth, motion)
-    assert np.median(errors["knees"]) < 0.3  # the issue's limit is 1 deg, for legs too, and 2 mm
+    assert np.median(errors["knees"]) < 0.3  # required: 1 deg for knees and legs, 2 mm for the base
     assert np.median(errors["legs"]) < 0.3
     assert np.median(errors["base"]) < 0.6
     assert np.percentile(errors["knees"], 95) < 1.5
@@ -169,20 +174,20 @@ def test_positions(truth, motion_name, request):
     np.testing.assert_allclose(np.linalg.norm(motion.qpos[:, 3:7], axis=1), 1.0, atol=1e-9)
 
 
-def test_hips_and_pitch(truth, seen_with_base, seen_without_base):
-    errors = position_errors(truth, seen_with_base)
+def test_hip_angles_and_base_pitch_match_with_and_without_a_measured_base(truth, motion_with_base, motion_without_base):
+    errors = position_errors(truth, motion_with_base)
     assert np.median(errors["hips"]) < 0.3
-    assert np.rad2deg(seen_with_base.uncertainty[BASE_PITCH]) < 0.3
-    # A sample's markers alone leave 7 deg; the torque balance, here exact, brings it down to the tenths.
-    errors = position_errors(truth, seen_without_base)
+    assert np.rad2deg(motion_with_base.uncertainty[BASE_PITCH]) < 0.3
+    # The markers of one sample determine the pitch to 7 deg. The torque balance is exact here and reduces the error.
+    errors = position_errors(truth, motion_without_base)
     assert np.median(errors["hips"]) < 1.0
     assert np.median(errors["pitch"]) < 1.0
-    assert 0.5 < np.rad2deg(seen_without_base.uncertainty[BASE_PITCH]) < 2.0
-    assert np.sqrt(np.mean(errors["pitch"] ** 2)) < 2 * np.rad2deg(seen_without_base.uncertainty[BASE_PITCH])
+    assert 0.5 < np.rad2deg(motion_without_base.uncertainty[BASE_PITCH]) < 2.0
+    assert np.sqrt(np.mean(errors["pitch"] ** 2)) < 2 * np.rad2deg(motion_without_base.uncertainty[BASE_PITCH])
 
 
-def test_pitch_follows_the_measured_base_against_the_torque_balance(truth):
-    """What is measured is believed: a base held 10 deg off its equilibrium is found there."""
+def test_measured_base_orientation_overrides_the_torque_balance(truth):
+    """A base that is measured 10 deg away from its equilibrium is reconstructed there."""
     recording = capture(truth, noise=0.0)
     tilt = Rotation.from_rotvec([0.0, np.deg2rad(10.0), 0.0])
     base = Rotation.from_quat(recording.orientations["base"], scalar_first=True) * tilt
@@ -200,50 +205,50 @@ def test_pitch_follows_the_measured_base_against_the_torque_balance(truth):
     assert np.median(np.abs(change[:, KNEES])) < 0.2
 
 
-def test_velocities_have_no_lag(truth, seen_with_base, seen_without_base):
-    """The error is least against the truth of the same instant, not of one 10 ms before or after.
+def test_reconstructed_velocities_have_no_time_lag(truth, motion_with_base, motion_without_base):
+    """The error is smallest relative to the true velocity at the same time, not 10 ms before or after.
 
-    In one sample in ten a foot lands or a knee meets its stop: these make most of the mean square, and say little of
-    the lag. The other nine tell it.
+    A foot lands or a knee meets its stop in one sample of ten. These samples dominate the mean square error, but hardly
+    depend on the lag. The lag is therefore measured on the other samples.
     """
     bounds = (([0, 1, 2], 0.02, 0.008), ([3, 5], 0.04, 0.02), ([4], 0.35, 0.12), ([7, 10], 0.4, 0.15))
-    for motion in (seen_with_base, seen_without_base):
+    for motion in (motion_with_base, motion_without_base):
         for columns, limit, usual_limit in (*bounds, ([8, 11], 1.3, 0.4)):
             error = {}
             for shift in range(-3, 4):
-                apart = np.abs(motion.qvel[2:-2] - at_control_rate(truth.qvel, motion, shift))[:, columns].ravel()
+                difference = np.abs(motion.qvel[2:-2] - at_control_rate(truth.qvel, motion, shift))[:, columns].ravel()
                 if shift == 0:
-                    assert np.sqrt(np.mean(apart**2)) < limit, columns
-                usual = np.sort(apart)[: len(apart) * 9 // 10]
+                    assert np.sqrt(np.mean(difference**2)) < limit, columns
+                usual = np.sort(difference)[: len(difference) * 9 // 10]
                 error[shift] = np.sqrt(np.mean(usual**2))
             assert error[0] < usual_limit, columns
-            if columns != [3, 5]:  # slower than the shifts can tell
+            if columns != [3, 5]:  # roll and yaw rates vary too slowly to show a shift
                 assert min(error, key=lambda shift: error[shift]) == 0, (columns, error)
 
 
-def test_velocities_are_mujocos(truth):
-    """In a world turned by 130 deg, only the linear velocity turns; integrating qvel leads to the next qpos."""
+def test_velocities_follow_mujocos_qvel_conventions(truth):
+    """Rotating the world by 130 deg rotates only the linear velocity. Integrating qvel gives the next qpos."""
     plain = capture(truth, noise=0.0)
     assert plain.tracked_position is not None and plain.tracked_quaternion is not None
-    turn = Rotation.from_euler("z", 130.0, degrees=True)
+    rotation = Rotation.from_euler("z", 130.0, degrees=True)
 
-    def turned(quaternion: np.ndarray) -> np.ndarray:
-        return (turn * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
+    def rotated(quaternion: np.ndarray) -> np.ndarray:
+        return (rotation * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
 
     recording = dataclasses.replace(
         plain,
-        tracked_position=turn.apply(plain.tracked_position),
-        tracked_quaternion=turned(plain.tracked_quaternion),
-        points={site: turn.apply(place) for site, place in plain.points.items()},
-        orientations={site: turned(quaternion) for site, quaternion in plain.orientations.items()},
+        tracked_position=rotation.apply(plain.tracked_position),
+        tracked_quaternion=rotated(plain.tracked_quaternion),
+        points={site: rotation.apply(place) for site, place in plain.points.items()},
+        orientations={site: rotated(quaternion) for site, quaternion in plain.orientations.items()},
     )
     motion, reference = reconstruct(recording, load_robot(), MODEL), reconstruct(plain, load_robot(), MODEL)
-    np.testing.assert_allclose(motion.qvel[:, :3], turn.apply(reference.qvel[:, :3]), atol=1e-6)
+    np.testing.assert_allclose(motion.qvel[:, :3], rotation.apply(reference.qvel[:, :3]), atol=1e-6)
     np.testing.assert_allclose(motion.qvel[:, 3:], reference.qvel[:, 3:], atol=1e-5)
 
     error, rate = [], np.zeros(MODEL.nv)
     for k in range(5, len(motion.time) - 5):
-        # The mean over the physics step that led to the state.
+        # Mean velocity over the physics step before the state.
         mujoco.mj_differentiatePos(MODEL, rate, STEP, truth.qpos[5 * k - 1], truth.qpos[5 * k])
         error.append(reference.qvel[k] - rate)
     typical = np.median(np.abs(error), axis=0)
@@ -251,8 +256,8 @@ def test_velocities_are_mujocos(truth):
     assert typical[6:].max() < 0.15
 
 
-def test_turning_quickly(truth):
-    """A body that turns at 3 rad/s about its own tilted axis, and through the sign change of its quaternion."""
+def test_fast_rotations_and_quaternion_sign_changes_are_handled(truth):
+    """A body rotates at 3 rad/s about a tilted body axis. Its quaternion changes sign on the way."""
     time = np.arange(0.0, 4.0, STEP)
     rate = np.array([0.3, 0.0, 3.0])
     tilt = Rotation.from_euler("y", 20.0, degrees=True)
@@ -265,23 +270,23 @@ def test_turning_quickly(truth):
     assert np.all(np.sum(found[1:, 3:7] * found[:-1, 3:7], axis=1) > 0.9)
 
 
-def test_residuals_are_the_noise(seen_with_base, seen_without_base):
-    for motion in (seen_with_base, seen_without_base):
+def test_fit_errors_are_of_the_size_of_the_measurement_noise(motion_with_base, motion_without_base):
+    for motion in (motion_with_base, motion_without_base):
         assert set(motion.fit_error_mm) == {"balloon", "base", "foot_left", "foot_right"}
-        # Three axes of 0.5 mm are 0.87 mm; eleven unknowns take part of it.
+        # Noise of 0.5 mm along three axes is 0.87 mm. Fitting eleven unknowns per sample removes a part of it.
         assert all(0.1 < value < 0.87 for value in motion.fit_error_mm.values())
 
 
-def test_residuals_show_a_wrong_skeleton(truth):
+def test_fit_errors_reveal_a_model_with_wrong_dimensions(truth):
     longer = load_model()
     longer.body_pos[longer.body("balloon").id, 2] += 0.02
     motion = reconstruct(capture(truth, noise=0.0), load_robot(), longer)
     assert motion.fit_error_mm["balloon"] > 3.0
 
 
-def test_states_start_a_simulator(truth, seen_with_base, seen_without_base):
-    """Started from the states found, the robot stays near the truth: the figures are in the benchmark's table."""
-    for motion in (seen_with_base, seen_without_base):
+def test_simulations_from_reconstructed_states_stay_near_the_truth(truth, motion_with_base, motion_without_base):
+    """Rollouts of 1 s from reconstructed states, with the recorded commands, stay near the true motion."""
+    for motion in (motion_with_base, motion_without_base):
         distance, heading = [], []
         for k in range(4, len(motion.time) - 24, 6):
             data = mujoco.MjData(MODEL)
@@ -292,22 +297,22 @@ def test_states_start_a_simulator(truth, seen_with_base, seen_without_base):
             mujoco.mj_kinematics(MODEL, data)
             end = 5 * (k + 20)
             distance.append(np.linalg.norm(data.site("balloon").xpos - truth.sites[end, 0]))
-            turn = Rotation.from_quat(truth.balloon_quaternion[end], scalar_first=True).inv() * Rotation.from_quat(
+            rotation = Rotation.from_quat(truth.balloon_quaternion[end], scalar_first=True).inv() * Rotation.from_quat(
                 data.body("balloon").xquat, scalar_first=True
             )
-            heading.append(abs(turn.as_rotvec(degrees=True)[2]))
+            heading.append(abs(rotation.as_rotvec(degrees=True)[2]))
         assert np.median(distance) < 0.02
         assert np.median(heading) < 1.5
 
 
-def test_knees_keep_their_stops(seen_with_base):
+def test_knees_exceed_their_soft_stops_by_half_a_degree_at_most(motion_with_base):
     stop = MODEL.joint("knee_left").range[0]
-    assert seen_with_base.qpos[:, KNEES].min() > stop - np.deg2rad(0.51)
-    assert seen_with_base.qpos[:, KNEES].min() < stop
+    assert motion_with_base.qpos[:, KNEES].min() > stop - np.deg2rad(0.51)
+    assert motion_with_base.qpos[:, KNEES].min() < stop
 
 
 @pytest.mark.parametrize("rate", [60.0, 100.0, 130.0])
-def test_jitter_and_rates(truth, rate):
+def test_capture_rates_of_60_to_130_hz_with_jitter_are_resampled(truth, rate):
     rng = np.random.default_rng(1)
     time = np.arange(0.0, DURATION - 0.02, 1.0 / rate)
     time = 7.0 + time + np.concatenate([[0.0], rng.uniform(-0.3, 0.3, len(time) - 1) / rate])
@@ -323,7 +328,7 @@ def test_jitter_and_rates(truth, rate):
     assert np.sqrt(np.mean(velocity[:, 5] ** 2)) < 0.04
 
 
-def test_hidden_markers(truth, tmp_path):
+def test_short_marker_dropouts_are_interpolated(truth, tmp_path):
     recording = capture(truth, base=False)
     balloon = np.array(recording.tracked_position)
     points = {site: place.copy() for site, place in recording.points.items()}
@@ -337,7 +342,7 @@ def test_hidden_markers(truth, tmp_path):
     assert max(errors["base"].max(), errors["knees"].max()) < 10.0
 
 
-def test_measured_joints_are_taken(truth):
+def test_measured_joint_angles_determine_the_joints(truth):
     recording = capture(truth)
     joints = {"motor_left": MOTORS[0], "motor_right": MOTORS[1], "knee_left": KNEES[0], "knee_right": KNEES[1]}
     angles = {joint: truth.qpos[:, place] + 0.1 * joint.startswith("motor") for joint, place in joints.items()}
@@ -349,7 +354,7 @@ def test_measured_joints_are_taken(truth):
     assert np.median(position_errors(truth, motion)["knees"]) < 0.03
 
 
-def test_commands_are_means_over_control_steps(truth):
+def test_commands_are_averaged_over_each_control_step(truth):
     recording = capture(truth, noise=0.0)
     command = np.zeros_like(recording.command)
     command[12:27, 0] = 1.0  # from 0.12 s to 0.27 s
@@ -359,31 +364,33 @@ def test_commands_are_means_over_control_steps(truth):
     assert len(motion.command) == len(motion.qpos) - 1 == len(motion.time) - 1
 
 
-def test_lengths_share_a_program(truth, seen_without_base):
+def test_recordings_of_different_lengths_share_one_compiled_program(truth, motion_without_base):
     before = _servo_chunk._cache_size()  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
     recording = capture(truth, base=False)
     motion = reconstruct(cut(recording, slice(333)), load_robot(), MODEL)
     assert len(motion.qpos) == 67
     assert _servo_chunk._cache_size() == before  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
-    np.testing.assert_allclose(motion.qpos[5:50, 7:], seen_without_base.qpos[5:50, 7:], atol=np.deg2rad(1.0))
+    np.testing.assert_allclose(motion.qpos[5:50, 7:], motion_without_base.qpos[5:50, 7:], atol=np.deg2rad(1.0))
 
 
-def test_a_slack_cable_leaves_the_servo_alone():
-    """Knees that swing, bent further than the cables reach: the motors go as without cables."""
+def test_slack_cables_do_not_load_the_servos():
+    """The swinging knees are bent so far that the cables stay slack. The motors move as in a model without cables."""
     time = np.arange(200) * STEP
     command = np.where(time[:, None] % 1.0 < 0.5, 0.3, 0.0) * np.ones(2)
     grid = MeasurementGrid(STEP, 5, command, {}, {}, {})
     qpos = np.tile(standing_qpos(MODEL), (len(time), 1))
     qpos[:, KNEES] = np.deg2rad(75 + 10 * np.sin(2 * np.pi * 2.0 * time))[:, None]
-    cut = load_model()
-    cut.tendon_stiffness[:] = cut.tendon_damping[:] = 0
-    found, alone = (complete_joints(model, grid, qpos, np.zeros((len(time), 14)))[0] for model in (MODEL, cut))
-    assert np.ptp(alone[:, MOTORS]) > 0.3
-    np.testing.assert_allclose(found[:, MOTORS], alone[:, MOTORS], atol=1e-12)
+    uncabled = load_model()
+    uncabled.tendon_stiffness[:] = uncabled.tendon_damping[:] = 0
+    found, without_cables = (
+        complete_joints(model, grid, qpos, np.zeros((len(time), 14)))[0] for model in (MODEL, uncabled)
+    )
+    assert np.ptp(without_cables[:, MOTORS]) > 0.3
+    np.testing.assert_allclose(found[:, MOTORS], without_cables[:, MOTORS], atol=1e-12)
 
 
-def test_a_model_with_damped_cables_is_refused():
-    """The reconstruction has none, and MuJoCo's would act on slack cables."""
+def test_models_with_damped_cables_are_refused():
+    """The reconstruction simulates cables without damping. In MuJoCo, damping would also act on slack cables."""
     damped = load_model()
     robot = load_robot()
     assert robot.adapter.check(robot, damped) is None

@@ -1,4 +1,4 @@
-"""Trials on the virtual robot: it is driven by what `export` ships, not by the bare policy."""
+"""Trials on the virtual robot: the exported controller drives it, with rate limit and time-out."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from ballu_mjx.policies.deploy.controller import observation_names
 from ballu_mjx.policies.deploy.estimator import Capture
 
 
-def stored(command: float) -> dict[str, np.ndarray]:
-    """The arrays of a policy that always asks for one command."""
+def constant_policy(command: float) -> dict[str, np.ndarray]:
+    """Return the exported arrays of a policy whose output is the same command for both legs at all times."""
     size = len(observation_names(virtual_robot.NAMES))
     return {
         "names": np.array(virtual_robot.NAMES),
@@ -32,22 +32,22 @@ def stored(command: float) -> dict[str, np.ndarray]:
     }
 
 
-def test_trials_are_limited_in_rate_as_the_exported_controller():
+def test_trials_apply_the_rate_limit_of_the_exported_controller():
     robot, trial = virtual_robot.draw_robot(0), virtual_robot.draw_trial(3)
-    controller = ExportedPolicy(stored(0.9))
-    seen = virtual_robot.record(robot, trial, controller, 1.0, "trial")
-    np.testing.assert_allclose(seen.command[:40:5, 0], [0.25, 0.5, 0.75, 0.9, 0.9, 0.9, 0.9, 0.9], atol=1e-9)
+    controller = ExportedPolicy(constant_policy(0.9))
+    recording = virtual_robot.record(robot, trial, controller, 1.0, "trial")
+    np.testing.assert_allclose(recording.command[:40:5, 0], [0.25, 0.5, 0.75, 0.9, 0.9, 0.9, 0.9, 0.9], atol=1e-9)
     assert controller.controller.steps == 20 and controller.controller.status == "running"
 
 
-@pytest.mark.parametrize("place", range(len(virtual_robot.NAMES)))
-def test_trials_relax_where_a_marker_is_lost(place: int):
-    """Every frame reaches the controller, also those between two commands."""
-    controller, rng = ExportedPolicy(stored(1.0)), np.random.default_rng(0)
+@pytest.mark.parametrize("marker", range(len(virtual_robot.NAMES)))
+def test_trials_command_rest_after_a_marker_is_lost(marker: int):
+    """The controller receives every frame, including the frames between two control steps."""
+    controller, rng = ExportedPolicy(constant_policy(1.0)), np.random.default_rng(0)
     capture, commands = Capture(virtual_robot.NAMES), []
     for frame in range(121):
         position = rng.normal(size=(4, 3))
-        position[place] = np.nan if frame > 50 else position[place]
+        position[marker] = np.nan if frame > 50 else position[marker]
         capture.time.append(frame * 0.01)
         capture.position.append(position)
         capture.quaternion.append(np.array([1.0, *rng.normal(0, 0.1, 3)]))

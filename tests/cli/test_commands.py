@@ -1,4 +1,4 @@
-"""The commands as a whole: `python -m ballu_mjx` lists them, and all tell of errors in the same way."""
+"""All commands: their list, help, options, presets, error messages and completion."""
 
 import dataclasses
 import importlib.util
@@ -48,7 +48,7 @@ def main(line: str) -> int:
     return importlib.import_module(f"ballu_mjx.cli.{command}").main(arguments)
 
 
-def test_every_command_is_listed_and_every_listed_one_is_there():
+def test_list_of_commands_is_complete_and_correct():
     listed = {command.split()[0] for _, command, _ in COMMANDS}
     found = set()
     for module in pkgutil.iter_modules(cli.__path__):
@@ -59,17 +59,17 @@ def test_every_command_is_listed_and_every_listed_one_is_there():
     assert found == listed
 
 
-def test_the_package_alone_lists_them():
+def test_package_without_a_command_lists_the_commands():
     done = subprocess.run([sys.executable, "-m", "ballu_mjx"], capture_output=True, text=True, check=True)
     assert done.stderr == ""
     assert all(command in done.stdout for _, command, _ in COMMANDS)
 
 
 @pytest.mark.parametrize("line", SUBCOMMANDS)
-def test_every_help_tells_of_debug(line: str, capsys: pytest.CaptureFixture[str]):
-    with pytest.raises(SystemExit) as left:
+def test_every_help_shows_the_debug_option(line: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as exit_info:
         main(f"{line} --help")
-    assert left.value.code == 0
+    assert exit_info.value.code == 0
     assert "--debug" in capsys.readouterr().out
 
 
@@ -87,7 +87,7 @@ def test_every_help_tells_of_debug(line: str, capsys: pytest.CaptureFixture[str]
         "train walk --resume=nowhere",
     ],
 )
-def test_the_traceback_of_bad_input_is_shown_on_demand(line: str, capsys: pytest.CaptureFixture[str]):
+def test_traceback_of_an_input_error_is_shown_with_debug(line: str, capsys: pytest.CaptureFixture[str]):
     assert main(line) == 2
     sentence = capsys.readouterr().err
     assert sentence.startswith("nowhere: ") and sentence.count("\n") == 1
@@ -106,11 +106,11 @@ def test_the_traceback_of_bad_input_is_shown_on_demand(line: str, capsys: pytest
         ("train sysid", ("--levels", "--robot", "--objective")),
     ],
 )
-def test_every_option_of_a_training_is_in_its_help(line: str, options: tuple, capsys: pytest.CaptureFixture[str]):
+def test_help_of_each_training_lists_its_options(line: str, options: tuple, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit):
         main(f"{line} --help")
-    told = capsys.readouterr().out
-    assert all(option in told for option in options)
+    output = capsys.readouterr().out
+    assert all(option in output for option in options)
 
 
 @pytest.mark.parametrize(
@@ -121,16 +121,16 @@ def test_every_option_of_a_training_is_in_its_help(line: str, options: tuple, ca
         ("train sysid", "--no-motion --starts 4"),
     ],
 )
-def test_help_tells_the_defaults_without_and_with_quick(line: str, sizes: str, capsys: pytest.CaptureFixture[str]):
+def test_help_shows_the_defaults_with_and_without_quick(line: str, sizes: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit):
         main(f"{line} --help")
-    told = " ".join(capsys.readouterr().out.split())
-    assert f"Defaults under --quick: {sizes}" in told
-    assert "(default: 3000000)" in told or "sysid" in line
+    output = " ".join(capsys.readouterr().out.split())
+    assert f"Defaults under --quick: {sizes}" in output
+    assert "(default: 3000000)" in output or "sysid" in line
 
 
 @pytest.mark.parametrize("line", [line for line in SUBCOMMANDS if line.startswith("train ")])
-def test_help_shows_every_option_once_in_a_newcomers_order(line: str, capsys: pytest.CaptureFixture[str]):
+def test_help_shows_every_option_once_and_common_options_first(line: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit):
         main(f"{line} --help")
     shown = re.findall(r"^\W{1,3}--([a-z][\w-]*)", capsys.readouterr().out, re.MULTILINE)
@@ -149,7 +149,7 @@ class Data(RecordingsData):
 
 
 def given(arguments: str) -> tuple[Data, PPOConfig]:
-    """What a training's options come to."""
+    """Return the options that a training receives from a command line."""
     found = []
 
     def keep(data: Data, ppo: PPOConfig) -> int:
@@ -162,15 +162,15 @@ def given(arguments: str) -> tuple[Data, PPOConfig]:
     return found[0]
 
 
-def test_quick_changes_defaults_wherever_it_stands_and_no_option_that_is_given():
+def test_quick_changes_defaults_but_not_given_options():
     assert given("learn") == (Data(), PPOConfig())
     small = PPOConfig(num_envs=256, normalize_observations=False)
     assert given("learn --quick") == (Data(quick=True), small)
     _, ppo = given("learn --num-envs 1024 --quick --normalize-observations --seed 3")
-    assert ppo == dataclasses.replace(PPOConfig(), seed=3)  # given, though equal to the defaults without --quick
+    assert ppo == dataclasses.replace(PPOConfig(), seed=3)  # two given options equal the defaults without --quick
 
 
-def test_a_preset_changes_defaults_and_no_option_that_is_given(tmp_path: Path):
+def test_preset_changes_defaults_but_not_given_options(tmp_path: Path):
     found = []
 
     def keep(data: train_envmimic.Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
@@ -187,14 +187,14 @@ def test_a_preset_changes_defaults_and_no_option_that_is_given(tmp_path: Path):
     assert env.force_scale == 1.0 and not env.relative_observation and ppo.activation == "tanh"
     assert other_env == dataclasses.replace(env, heading_frame=True)
     assert quick == dataclasses.replace(ppo, learning_rate=1e-3, num_timesteps=train_envmimic.QUICK["num_timesteps"])
-    told = describe_preset("paper", other_env, quick)
-    assert "False, but given as True" in told and "0.0003, but given as 0.001" in told
+    description = describe_preset("paper", other_env, quick)
+    assert "False, but given as True" in description and "0.0003, but given as 0.001" in description
     with pytest.raises(InputError, match="--preset does not go with --resume"):
         train_envmimic.train(train_envmimic.Data(preset="paper", resume=tmp_path), env, ppo)
 
 
-def test_the_paper_s_sizes_are_stable_baselines_():
-    """2048 control steps for an update, 64 in a minibatch; and they fit each other, on two devices too."""
+def test_paper_preset_has_the_batch_sizes_of_stable_baselines():
+    """An update has 2048 control steps, and a minibatch 64. The sizes are also valid on two devices."""
     _, config = preset_configs("paper")
     ppo_options.check(config, 2)
     assert config.batch_size * config.unroll_length == 64
@@ -202,7 +202,7 @@ def test_the_paper_s_sizes_are_stable_baselines_():
     assert config.num_envs * config.unroll_length == 2048
 
 
-def test_a_run_that_goes_on_keeps_its_options_but_for_those_given(tmp_path: Path):
+def test_resumed_run_keeps_its_options_except_given_ones(tmp_path: Path):
     stored = {"data": {"validate_every": 7, "output": "elsewhere"}, "ppo": {"num_envs": 64, "seed": 5}}
     content = {"format": RUN_FORMAT, "task": "learn", **stored}
     (tmp_path / "config.json").write_text(json.dumps(content))
@@ -214,41 +214,41 @@ def test_a_run_that_goes_on_keeps_its_options_but_for_those_given(tmp_path: Path
 
 
 @pytest.mark.parametrize("line", ["train residual", "train envmimic --method envmimic", "train sysid --num-envs 3"])
-def test_what_is_no_option_is_refused(line: str, capsys: pytest.CaptureFixture[str]):
-    with pytest.raises(SystemExit) as left:
+def test_unknown_options_and_subcommands_are_refused(line: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as exit_info:
         main(line)
-    assert left.value.code == 2
+    assert exit_info.value.code == 2
     capsys.readouterr()
 
 
-def test_an_unexpected_error_is_called_a_fault_of_the_package(capsys: pytest.CaptureFixture[str]):
+def test_unexpected_errors_are_reported_as_faults_of_the_package(capsys: pytest.CaptureFixture[str]):
     def fail() -> None:
         raise ValueError("shapes (3,)\nand (4,) do not match " + "x" * 5000)
 
     assert runtime.exit_status(fail, []) == 1
-    told = capsys.readouterr().err
-    assert "fault of ballu_mjx" in told and "ValueError: shapes (3,) and (4,)" in told and "--debug" in told
-    assert told.count("\n") == 1 and len(told) < 600
+    error = capsys.readouterr().err
+    assert "fault of ballu_mjx" in error and "ValueError: shapes (3,) and (4,)" in error and "--debug" in error
+    assert error.count("\n") == 1 and len(error) < 600
     assert runtime.exit_status(fail, ["--debug"]) == 1
     assert "Traceback" in (shown := capsys.readouterr().err) and "in fail" in shown
 
 
-def test_what_the_system_refuses_is_no_fault_of_the_package(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_system_errors_are_not_reported_as_faults_of_the_package(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     def open_nothing() -> None:
         (tmp_path / "nothing").open()
 
     assert runtime.exit_status(open_nothing, []) == 1
-    told = capsys.readouterr().err
-    assert f"{tmp_path}/nothing" in told and "fault" not in told and told.count("\n") == 1
+    error = capsys.readouterr().err
+    assert f"{tmp_path}/nothing" in error and "fault" not in error and error.count("\n") == 1
 
 
-def test_a_folder_that_is_none_is_refused_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_invalid_output_folder_is_refused_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "file").touch()
     assert main(f"record simulate --gait walking --seconds 1 --output {tmp_path}/file/walk.csv") == 2
     assert f"{tmp_path}/file: cannot be written to" in capsys.readouterr().err
 
 
-def test_a_reader_that_has_seen_enough_is_no_error():
+def test_closed_output_pipe_is_not_an_error():
     line = [sys.executable, "-m", "ballu_mjx", "record", "example-mapping"]
     with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None and process.stderr is not None
@@ -257,7 +257,7 @@ def test_a_reader_that_has_seen_enough_is_no_error():
     assert process.returncode == 141
 
 
-def test_the_script_runs_commands_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_entry_point_runs_commands_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert package.main(["record", "example-mapping"]) == 0
     assert "[commands]" in capsys.readouterr().out
     assert package.main(["record", "check", str(tmp_path / "nowhere")]) == 2
@@ -289,10 +289,12 @@ def bash_script(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("report rec", {"recordings"}),  # a path
     ],
 )
-def test_bash_completes(bash_script: Path, typed: str, offered: set[str], tmp_path: Path):
+def test_bash_completion_offers_commands_options_values_and_paths(
+    bash_script: Path, typed: str, offered: set[str], tmp_path: Path
+):
     (tmp_path / "recordings").mkdir()
     words = ["ballu_mjx", *typed.split(" ")]
-    # What readline does: the function first; where it offers nothing, files, if the script asks for these by default.
+    # As readline: call the function. If it offers nothing, offer files if the script has `-o default`.
     ask = """source "$1"; shift; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); set -- $(complete -p ballu_mjx)
         [[ " $* " =~ " -F "([^ ]+)" " ]]; "${BASH_REMATCH[1]}"
         if [[ -z "${COMPREPLY[*]}" && " $* " == *" -o default "* ]]; then
@@ -305,7 +307,7 @@ def test_bash_completes(bash_script: Path, typed: str, offered: set[str], tmp_pa
     assert set(done.stdout.split()) - {"-h", "--help"} == offered
 
 
-def test_the_script_for_zsh_names_the_subcommands():
+def test_zsh_completion_contains_all_subcommands():
     text = completion.completion_script("zsh", NAMES)
     assert text.startswith("#compdef ballu_mjx")
     assert all(line.split()[-1] in text for line in SUBCOMMANDS)

@@ -1,4 +1,4 @@
-"""Runs side by side: what counts as the same, and how sure a mean is."""
+"""Comparison of runs: grouping by options, confidence intervals over seeds, tables and refused input."""
 
 import json
 from pathlib import Path
@@ -52,7 +52,7 @@ def folders(tmp_path: Path) -> list[Path]:
     ]
 
 
-def test_seeds_are_one_row_and_its_interval_is_students(folders: list[Path]):
+def test_seeds_share_a_row_with_students_confidence_interval(folders: list[Path]):
     found = compare.rows(folders)
     assert [(row.label, len(row.folders)) for row in found] == [("force_scale 0.05", 3), ("force_scale 1.0", 2)]
     figures = [compare.figures(folder) for folder in found[0].folders]
@@ -65,7 +65,7 @@ def test_seeds_are_one_row_and_its_interval_is_students(folders: list[Path]):
     assert figures[0]["far yaw, 10 s (ratio)"] == pytest.approx(1.0)
 
 
-def test_the_command_writes_table_and_plot(folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_compare_writes_a_table_and_a_plot(folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert compare.main([*map(str, folders), "--output", str(tmp_path / "out")]) == 0
     text = (tmp_path / "out" / "compare.md").read_text()
     assert text.strip() in capsys.readouterr().out
@@ -80,7 +80,9 @@ def test_a_single_run_has_no_interval(folders: list[Path], capsys: pytest.Captur
     assert "| envmimic | 1 | 1.000 |" in out and "±" not in out and "nan" not in out
 
 
-def test_what_cannot_be_compared_is_refused(folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_runs_that_cannot_be_compared_are_refused(
+    folders: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     walk = write(tmp_path / "walk", 0, 0.05, 1.0, task="walk")
     (folders[1] / "evaluation.json").write_text('{"vanilla": [{"recording": 3}]}')
     (folders[2] / "metrics.jsonl").write_text("")
@@ -96,7 +98,7 @@ def test_what_cannot_be_compared_is_refused(folders: list[Path], tmp_path: Path,
         assert sentence in error and error.count("\n") == 1
 
 
-def test_a_ratio_of_errors_is_a_number_where_there_is_no_error() -> None:
+def test_ratio_of_errors_is_finite_if_an_error_is_zero() -> None:
     assert quotient(0.0, 0.0) == 1.0
     assert quotient(0.2, 0.1) == pytest.approx(2.0)
     assert 1.0 < quotient(0.1, 0.0) < np.inf
@@ -108,7 +110,7 @@ def altered(folder: Path, **changed: object) -> Path:
     return folder
 
 
-def test_methods_and_robots_are_told_apart(tmp_path: Path):
+def test_methods_and_robots_have_separate_rows(tmp_path: Path):
     one, other = write(tmp_path / "one", 0, 0.05, 1.0), write(tmp_path / "other", 0, 0.05, 1.0)
     altered(other, robot_description={"path": "somewhere/rover.robot.json", "sha256": "2"})
     assert [row.label for row in compare.rows([one, other])] == ["robot ballu", "robot rover"]
@@ -118,7 +120,7 @@ def test_methods_and_robots_are_told_apart(tmp_path: Path):
     assert "near position, 5 s (ratio)" in compare.table({"envmimic": [found[0]], "fluid": [found[1]]})
 
 
-def test_rows_that_were_measured_on_other_recordings_say_what_is_missing():
+def test_tables_show_values_that_some_rows_lack_as_missing():
     near, flight = "near position, 5 s (ratio)", "flight position, 2 s (ratio)"
     rows = {"ballu": [{"mean ratio": 0.4, near: 0.5}], "blimp": [{flight: 0.25, "mean ratio": 0.2}]}
     header, _, one, other, *notes = compare.table(rows).splitlines()

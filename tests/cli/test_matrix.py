@@ -1,4 +1,4 @@
-"""Every command on every other command's run, and every residual on every other: it works, or one sentence says why."""
+"""Every command on every kind of run, and all pairs of residuals: they work, or are refused in one sentence."""
 
 from __future__ import annotations
 
@@ -58,11 +58,11 @@ COMMANDS = (
     "train supervised --actuators RUN --recordings ONE",
     "train supervised --output RUN --recordings ONE",
 )
-"""Each ends before any long work: where the run suits it, a wrong option behind stops it."""
+"""Command lines that end before any long work. If the run suits the command, an invalid option stops it."""
 
 
 def write_run(folder: Path, task: str, base: Path | None = None) -> Path:
-    """A run as its command leaves it, of parameters that were never trained."""
+    """Write a run as its command does, with untrained parameters."""
     config: dict[str, Any] = {"residual": None if base is None else str(base)}
     if task == "all":
         folder.mkdir()
@@ -110,22 +110,22 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.mark.parametrize("line", COMMANDS)
 @pytest.mark.parametrize("task", RUNS)
-def test_every_command_ends_well_on_every_run(
+def test_every_command_succeeds_or_refuses_a_run_in_one_sentence(
     task: str, line: str, runs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     other = runs["envmimic" if task in RESIDUAL_TASKS else task]
-    places = {"RUN": str(runs[task]), "OTHER": str(other), "OUT": str(tmp_path), "ONE": str(ONE)}
+    substitutions = {"RUN": str(runs[task]), "OTHER": str(other), "OUT": str(tmp_path), "ONE": str(ONE)}
     command, *arguments = line.split()
-    for name, place in places.items():
-        arguments = [argument.replace(name, place) for argument in arguments]
+    for name, value in substitutions.items():
+        arguments = [argument.replace(name, value) for argument in arguments]
     status = importlib.import_module(f"ballu_mjx.cli.{command}").main(arguments)
-    said = capsys.readouterr().err
-    assert "fault of ballu_mjx" not in said
-    assert status == 0 or (status == 2 and said.count("\n") == 1 and said.endswith(".\n")), said
+    error = capsys.readouterr().err
+    assert "fault of ballu_mjx" not in error
+    assert status == 0 or (status == 2 and error.count("\n") == 1 and error.endswith(".\n")), error
 
 
 @pytest.mark.parametrize(
-    ("line", "suits"),
+    ("line", "suitable"),
     [
         ("report RUN --output OUT/page.html", RUNS),
         ("compare RUN", (*RESIDUAL_TASKS, "walk")),
@@ -133,24 +133,24 @@ def test_every_command_ends_well_on_every_run(
         ("export simulator RUN --output OUT/simulator --check-seconds 0", (*RESIDUAL_TASKS, "walk")),
     ],
 )
-def test_commands_work_on_the_runs_they_are_for(
-    line: str, suits: tuple[str, ...], runs: dict[str, Path], tmp_path: Path
+def test_commands_succeed_on_suitable_runs_only(
+    line: str, suitable: tuple[str, ...], runs: dict[str, Path], tmp_path: Path
 ):
     for task in RUNS:
         out = tmp_path / task
         out.mkdir()
         command, *arguments = line.replace("RUN", str(runs[task])).replace("OUT", str(out)).split()
         status = importlib.import_module(f"ballu_mjx.cli.{command}").main(arguments)
-        assert status == (0 if task in suits else 2), task
+        assert status == (0 if task in suitable else 2), task
 
 
 @pytest.mark.parametrize("task", RUNS)
-def test_a_run_without_a_replay_says_so_when_it_is_viewed(task: str, runs: dict[str, Path]):
+def test_viewing_a_run_without_a_replay_is_refused(task: str, runs: dict[str, Path]):
     with pytest.raises(InputError, match=r"\.$"):
         view.load(runs[task])
 
 
-def test_evaluate_refuses_what_is_no_residual(runs: dict[str, Path], capsys: pytest.CaptureFixture[str]):
+def test_evaluate_refuses_runs_that_are_not_residuals(runs: dict[str, Path], capsys: pytest.CaptureFixture[str]):
     evaluate = importlib.import_module("ballu_mjx.cli.evaluate")
     for task in ("walk", "sysid", "all"):
         assert evaluate.main([str(runs[task])]) == 2
@@ -158,8 +158,8 @@ def test_evaluate_refuses_what_is_no_residual(runs: dict[str, Path], capsys: pyt
 
 
 @pytest.mark.parametrize(("base", "task"), [*itertools.product(RESIDUAL_TASKS, ("envmimic", "supervised", "analytic"))])
-def test_every_residual_acts_beside_every_other(base: str, task: str, runs: dict[str, Path], tmp_path: Path):
-    """Its name is that of both; a third on top of them is read too."""
+def test_every_residual_can_act_on_top_of_every_other(base: str, task: str, runs: dict[str, Path], tmp_path: Path):
+    """The combined residual has both names. A third residual on top of it is loaded too."""
     both = write_run(tmp_path / "both", task, runs[base])
     assert TrainedResidual.load(both, BALLU).model.name == f"{base}+{task}"
     three = write_run(tmp_path / "three", "supervised", both)

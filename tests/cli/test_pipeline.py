@@ -1,4 +1,4 @@
-"""Stages of the pipeline: kept, found again, redone where something changed."""
+"""Stages of the pipeline: they are cached, and made again if an option or an earlier stage has changed."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ class Interrupted(Exception):
 
 
 def run_stages(root: Path, options: dict[str, int], stop_at: str | None = None) -> list[str]:
-    """Three stages in a row, each needing the one before; returns which of them were made."""
+    """Run three stages, each of which needs the previous one. Return the names of the stages that were made."""
     made: list[str] = []
 
     def make(name: str) -> Path:
@@ -34,27 +34,27 @@ def run_stages(root: Path, options: dict[str, int], stop_at: str | None = None) 
     return made
 
 
-def test_finished_stages_are_found_again(tmp_path):
+def test_finished_stages_are_not_made_again(tmp_path):
     assert run_stages(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["a", "b", "c"]
     assert run_stages(tmp_path, {"a": 1, "b": 2, "c": 3}) == []
 
 
-def test_an_interrupted_story_goes_on_where_it_was(tmp_path):
+def test_interrupted_pipeline_continues_with_the_unfinished_stage(tmp_path):
     with pytest.raises(Interrupted):
         run_stages(tmp_path, {"a": 1, "b": 2, "c": 3}, stop_at="b")
     assert (tmp_path / "b" / "begun").exists()
     assert run_stages(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["b", "c"]
 
 
-def test_a_changed_option_redoes_what_depends_on_it_and_loses_nothing(tmp_path):
+def test_changed_option_remakes_dependent_stages_and_keeps_the_old_ones(tmp_path):
     run_stages(tmp_path, {"a": 1, "b": 2, "c": 3})
     assert run_stages(tmp_path, {"a": 1, "b": 20, "c": 3}) == ["b", "c"]
     assert (tmp_path / "b" / "result").read_text() == "20"
-    aside = [path for path in tmp_path.glob("b.*") if path.is_dir()]
-    assert [(path / "result").read_text() for path in aside] == ["2"]
+    renamed = [path for path in tmp_path.glob("b.*") if path.is_dir()]
+    assert [(path / "result").read_text() for path in renamed] == ["2"]
 
 
-def test_stages_without_a_key_are_never_taken_for_finished(tmp_path):
+def test_unfinished_stages_are_made_again(tmp_path):
     run_stages(tmp_path, {"a": 1, "b": 2, "c": 3})
     mark = tmp_path / "b.stage.json"
     content = json.loads(mark.read_text())
@@ -62,7 +62,7 @@ def test_stages_without_a_key_are_never_taken_for_finished(tmp_path):
     assert run_stages(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["b"]
 
 
-def test_trials_of_all_settings_meet_the_same_draughts_and_no_two_are_alike():
+def test_trial_draws_are_unique_and_reproducible():
     draws = [
         pipeline._draw(seed, task, use, number)
         for seed in (0, 1)
@@ -75,7 +75,7 @@ def test_trials_of_all_settings_meet_the_same_draughts_and_no_two_are_alike():
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "message"),
     [
         ({"trials": 0}, "--trials is 0"),
         ({"policy_steps": -5}, "--policy-steps is -5"),
@@ -84,14 +84,14 @@ def test_trials_of_all_settings_meet_the_same_draughts_and_no_two_are_alike():
         ({"outside_cost": -1.0}, "--outside-cost is -1"),
     ],
 )
-def test_options_out_of_range_are_refused_before_anything_is_written(options, words, tmp_path):
-    with pytest.raises(InputError, match=words):
+def test_options_out_of_range_are_refused_before_anything_is_written(options, message, tmp_path):
+    with pytest.raises(InputError, match=message):
         pipeline.run(Options(output=tmp_path / "out", **options))
     assert not (tmp_path / "out").exists()
 
 
-def test_each_round_learns_from_all_recordings_so_far_and_keeps_what_came_before(tmp_path, monkeypatch):
-    """Which stage needs which, without making any: a stage is a folder whose needs stand beside it."""
+def test_each_round_learns_from_all_recordings_so_far(tmp_path, monkeypatch):
+    """The test records the needs of each stage, and makes none. A stage is identified by its folder."""
     needs: dict[str, list[str]] = {}
     costs: dict[str, float] = {}
     forces: dict[str, str] = {}
@@ -111,9 +111,9 @@ def test_each_round_learns_from_all_recordings_so_far_and_keeps_what_came_before
     for setting in pipeline.settings_of(options):
         stages.policy("walk", setting)
     assert pipeline.settings_of(options) == (*pipeline.PAPER_SIMULATORS, "envmimic-2", "envmimic-3", *options.also)
-    recorded = ["recordings-walk", "recordings-walk-2", "recordings-walk-3"]
+    recordings = ["recordings-walk", "recordings-walk-2", "recordings-walk-3"]
     for number, name in enumerate(("envmimic-walk", "envmimic-walk-2", "envmimic-walk-3"), 1):
-        assert needs[name] == [*recorded[:number], "sysid"]
+        assert needs[name] == [*recordings[:number], "sysid"]
     assert needs["recordings-walk-3"] == ["walk-envmimic-2"]
     assert needs["walk-envmimic-3"] == ["envmimic-walk-3"]
     assert needs["walk-envmimic"] == needs["walk-envmimic-near"] == ["envmimic-walk"]

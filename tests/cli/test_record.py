@@ -1,4 +1,4 @@
-"""`python -m ballu_mjx record`, from the outside."""
+"""The commands `record import`, `record check`, `record simulate` and `record example-mapping`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ROLES = ("balloon", "base", "foot_left", "foot_right")
 
 @pytest.fixture(scope="module")
 def recorded() -> Recording:
-    """Random jumps, told from each other everywhere."""
+    """Return 15 s of random jumps, which are different at all times."""
     (path,) = [path for path in list_bundled("test") if path.name.startswith("far-1")]
     return first(read_recording(path, load_robot()), 15.0)
 
@@ -37,13 +37,13 @@ def first(recording: Recording, seconds: float) -> Recording:
 
 
 def vicon_file(recording: Recording, path: Path) -> None:
-    """A Tracker file of objects, quaternions, in another corner of a room."""
-    there = Rotation.from_euler("z", -70, degrees=True)
+    """Write a Tracker file of objects with quaternions, in a rotated and shifted world frame."""
+    rotation = Rotation.from_euler("z", -70, degrees=True)
     assert recording.tracked_position is not None and recording.tracked_quaternion is not None
     balloon = Rotation.from_quat(recording.tracked_quaternion, scalar_first=True)
     columns = []
     for position in (recording.tracked_position, *(recording.points[role] for role in ROLES[1:])):
-        columns += [(there * balloon).as_quat(), 1e3 * (there.apply(position) + [2.0, 1.0, 0.0])]
+        columns += [(rotation * balloon).as_quat(), 1e3 * (rotation.apply(position) + [2.0, 1.0, 0.0])]
     names = [f"Global Angle ballu:{role}" + "," * 6 for role in ROLES]
     rows = [
         "Objects",
@@ -57,7 +57,7 @@ def vicon_file(recording: Recording, path: Path) -> None:
 
 
 def log_file(recording: Recording, path: Path, clock: float) -> None:
-    """Commands as a servo's degrees at 20 Hz."""
+    """Write a log of the commands as servo angles (deg) at 20 Hz."""
     rows = zip(recording.time[::5] + clock, *(90 * recording.command[::5].T), strict=True)
     path.write_text("t,l,r\n" + "".join(f"{t:.4f},{a:.3f},{b:.3f}\n" for t, a, b in rows))
 
@@ -78,21 +78,23 @@ def room(tmp_path: Path, recorded: Recording, monkeypatch: pytest.MonkeyPatch) -
 LINE = "import walk.csv --mapping room.toml --commands log.csv --output out/walk.csv.gz".split()
 
 
-def test_import_by_hand_gives_the_recording_back(room: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]):
+def test_import_with_a_given_offset_reproduces_the_recording(
+    room: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]
+):
     assert record.main([*LINE, "--offset", "-512.25"]) == 0
     read = read_recording(room / "out" / "walk.csv.gz", load_robot())
     assert (read.robot, read.kind, len(read.time)) == ("mine", "free", len(recorded.time))
     np.testing.assert_allclose(read.command, recorded.command, atol=1e-4)
-    # Turned and shifted to the start, it is the same walk: distances and heights are.
+    # The import rotates and shifts the walk to its start. Distances from the start stay the same.
     steps, expected = (np.linalg.norm(p - p[0], axis=1) for p in (read.points["base"], recorded.points["base"]))
     np.testing.assert_allclose(steps, expected, atol=3e-5)
     assert "15.00 s" in capsys.readouterr().out
 
 
-def test_a_trial_cropped_at_its_start_keeps_its_commands(
+def test_capture_cropped_at_its_start_keeps_its_commands(
     room: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]
 ):
-    """The frames before are gone, not the time: the same offset serves, and the import says where it begins."""
+    """Cropping removes frames but does not shift time. The offset stays valid, and the output names the first frame."""
     lines = (room / "walk.csv").read_text().splitlines()
     (room / "walk.csv").write_text("\n".join([*lines[:5], *lines[217:]]) + "\n")
     assert record.main([*LINE, "--offset", "-512.25"]) == 0
@@ -101,42 +103,42 @@ def test_a_trial_cropped_at_its_start_keeps_its_commands(
     assert "12.88 s, from frame 213, 2.12 s of the trial" in capsys.readouterr().out
 
 
-def test_a_log_in_milliseconds_that_is_read_as_seconds_is_told(room: Path, capsys: pytest.CaptureFixture[str]):
-    """Its first command then lasts longer than the whole capture."""
+def test_log_in_milliseconds_that_is_read_as_seconds_is_reported(room: Path, capsys: pytest.CaptureFixture[str]):
+    """The first command of this log then lasts longer than the whole capture."""
     lines = (room / "log.csv").read_text().splitlines()
     held = [(float(t) - 512.25, rest) for t, rest in (line.split(",", 1) for line in lines[1:])]
     (room / "log.csv").write_text("\n".join([lines[0], *(f"{1e3 * t:.1f},{rest}" for t, rest in held[::20])]) + "\n")
     assert record.main([*LINE, "--offset", "0"]) == 0
-    said = capsys.readouterr().out
-    assert "log.csv: the commands change 15 times, and never within the capture; check time_unit" in said
+    output = capsys.readouterr().out
+    assert "log.csv: the commands change 15 times, and never within the capture; check time_unit" in output
     (room / "room.toml").write_text(ROOM.replace('time = "t"', 'time = "t"\ntime_unit = "ms"'))
     assert record.main([*LINE[:-1], "out/again.csv", "--offset", "0"]) == 0
     assert "never within the capture" not in capsys.readouterr().out
 
 
-def test_import_finds_the_offset_and_says_how_sure_it_is(room: Path, capsys: pytest.CaptureFixture[str]):
+def test_import_finds_the_offset_and_prints_its_confidence(room: Path, capsys: pytest.CaptureFixture[str]):
     assert record.main(LINE) == 0
-    said = capsys.readouterr().out
-    offset = float(said.split("offset ")[1].split(" s:")[0])
+    output = capsys.readouterr().out
+    offset = float(output.split("offset ")[1].split(" s:")[0])
     assert offset == pytest.approx(-512.25, abs=0.08)
-    assert "confidence 0." in said and "good to about 0.05 s" in said
+    assert "confidence 0." in output and "good to about 0.05 s" in output
 
 
-def test_a_periodic_log_is_told(room: Path, capsys: pytest.CaptureFixture[str]):
+def test_periodic_log_requires_an_offset_or_its_range(room: Path, capsys: pytest.CaptureFixture[str]):
     (path,) = [path for path in list_bundled("test") if path.name.startswith("near-1")]
     walk = first(read_recording(path, load_robot()), 15.0)
     vicon_file(walk, room / "walk.csv")
     log_file(walk, room / "log.csv", 0.0)
     assert record.main(LINE) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("log.csv: the commands repeat themselves") and "--offset" in said
-    assert "Traceback" not in said and said.count("\n") == 1
+    error = capsys.readouterr().err
+    assert error.startswith("log.csv: the commands repeat themselves") and "--offset" in error
+    assert "Traceback" not in error and error.count("\n") == 1
     assert not (room / "out").exists()
     assert record.main([*LINE, "--offset-range", "-0.4", "0.4"]) == 0
 
 
 @pytest.mark.parametrize(
-    "change, line, said",
+    "change, line, message",
     [
         (lambda text: text.replace("[0, 90]", "[90, 0]"), [], "the robot moves against the commands"),
         (lambda text: text, ["--offset", "3"], "log.csv: its commands, from 515.25"),
@@ -151,17 +153,17 @@ def test_a_periodic_log_is_told(room: Path, capsys: pytest.CaptureFixture[str]):
         (lambda text: text + '[units]\nlength = "m"\n', ["--offset", "-512.25"], "nothing written"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_imported_is_refused_and_nothing_written(
-    room: Path, change: Callable[[str], str], line: list[str], said: str, capsys: pytest.CaptureFixture[str]
+def test_invalid_imports_are_refused_and_write_nothing(
+    room: Path, change: Callable[[str], str], line: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ):
     (room / "room.toml").write_text(change(ROOM))
     assert record.main([*LINE, *line]) == 2
     error = capsys.readouterr().err
-    assert said in error and "Traceback" not in error and error.count("\n") == 1
+    assert message in error and "Traceback" not in error and error.count("\n") == 1
     assert not list(room.glob("out/*"))
 
 
-def test_import_overwrites_nothing(room: Path, capsys: pytest.CaptureFixture[str]):
+def test_import_does_not_overwrite_files(room: Path, capsys: pytest.CaptureFixture[str]):
     (room / "out").mkdir()
     (room / "out" / "walk.json").write_text("mine")
     assert record.main([*LINE, "--offset", "-512.25"]) == 2
@@ -169,8 +171,8 @@ def test_import_overwrites_nothing(room: Path, capsys: pytest.CaptureFixture[str
     assert (room / "out" / "walk.json").read_text() == "mine"
 
 
-def test_a_sweep_comes_from_a_table_with_its_commands(tmp_path: Path):
-    """Degrees, a knee that counts the other way round, and milliseconds of an absolute clock."""
+def test_sweep_is_imported_from_a_table_with_commands(tmp_path: Path):
+    """Angles are in degrees, one knee has the opposite sign, and times are milliseconds of an absolute clock."""
     (path,) = list_bundled("suspended")
     sweep = read_recording(path, load_robot())
     angles = [np.rad2deg(sweep.joint_angles[j]) for j in ("motor_left", "motor_right", "knee_left", "knee_right")]
@@ -178,11 +180,11 @@ def test_a_sweep_comes_from_a_table_with_its_commands(tmp_path: Path):
     rows = [",".join(f"{x:.11g}" for x in row) for row in zip(*columns, strict=True)]
     (tmp_path / "bench.csv").write_text("\n".join(["ms,cl,cr,ml,mr,kl,kr", *rows]) + "\n")
     joints = {"motor_left": "ml", "motor_right": "mr", "knee_left": "kl", "knee_right": "kr"}
-    room = 'robot = "r"\nkind = "suspended"\n[units]\nangle = "deg"\n[clock]\ntime_unit = "ms"\n'
-    room += '[commands]\ntime = "ms"\nleft = "cl"\nright = "cr"\n'
-    room += "".join(f'[{name}]\ncolumn = "{column}"\n' for name, column in joints.items())
-    room = room.replace('column = "kl"', 'column = "kl"\nsign = -1\nzero = 90')
-    (tmp_path / "room.toml").write_text(room)
+    mapping = 'robot = "r"\nkind = "suspended"\n[units]\nangle = "deg"\n[clock]\ntime_unit = "ms"\n'
+    mapping += '[commands]\ntime = "ms"\nleft = "cl"\nright = "cr"\n'
+    mapping += "".join(f'[{name}]\ncolumn = "{column}"\n' for name, column in joints.items())
+    mapping = mapping.replace('column = "kl"', 'column = "kl"\nsign = -1\nzero = 90')
+    (tmp_path / "room.toml").write_text(mapping)
     line = ["import", tmp_path / "bench.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "sweep.csv"]
     assert record.main(list(map(str, line))) == 0
     read = read_recording(tmp_path / "sweep.csv", load_robot())
@@ -196,7 +198,9 @@ def test_a_sweep_comes_from_a_table_with_its_commands(tmp_path: Path):
 # ---- check ----
 
 
-def test_check_counts_what_is_missing(tmp_path: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]):
+def test_check_reports_dropouts_and_changes_of_commands(
+    tmp_path: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]
+):
     base = np.array(recorded.points["base"])
     base[100:112] = base[500:503] = np.nan
     hidden = dataclasses.replace(recorded, points={**recorded.points, "base": base})
@@ -204,28 +208,30 @@ def test_check_counts_what_is_missing(tmp_path: Path, recorded: Recording, capsy
     gaps = find_gaps(tmp_path / "walk.csv")
     assert gaps == {f"base_{axis}": [(1.0, 1.11), (5.0, 5.02)] for axis in "xyz"}
     assert record.main(["check", str(tmp_path), "--output", str(tmp_path / "figures")]) == 0
-    said = capsys.readouterr().out
-    assert "15.00 s, 1501 samples, 100 Hz, jitter 0.00 ms" in said
-    assert "base_x ... base_z: 2 drop-outs, 0.15 s in all, the longest 0.12 s" in said
+    output = capsys.readouterr().out
+    assert "15.00 s, 1501 samples, 100 Hz, jitter 0.00 ms" in output
+    assert "base_x ... base_z: 2 drop-outs, 0.15 s in all, the longest 0.12 s" in output
     changes = int((np.diff(recorded.command[:, 0]) != 0).sum())
-    assert f"{changes} changes" in said
+    assert f"{changes} changes" in output
     assert (tmp_path / "figures" / "walk.png").stat().st_size > 2e4
 
 
-def test_check_goes_on_after_a_broken_one(tmp_path: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]):
+def test_check_continues_after_a_damaged_recording(
+    tmp_path: Path, recorded: Recording, capsys: pytest.CaptureFixture[str]
+):
     for name in ("a", "b"):
         write_recording(recorded, tmp_path / f"{name}.csv", load_robot())
     text = (tmp_path / "a.csv").read_text().split("\n")
     (tmp_path / "a.csv").write_text("\n".join([*text[:10], "x" + text[10], *text[11:]]))
     assert record.main(["check", str(tmp_path)]) == 2
-    told = capsys.readouterr()
-    assert "a.csv, column time, row 11" in told.err and "b.csv: free" in told.out
+    output = capsys.readouterr()
+    assert "a.csv, column time, row 11" in output.err and "b.csv: free" in output.out
 
 
 # ---- simulate ----
 
 
-def test_simulate_plays_a_log_of_commands(tmp_path: Path):
+def test_simulate_replays_a_log_of_commands(tmp_path: Path):
     log = tmp_path / "log.csv"
     log.write_text("time,command_left,command_right\n7,0,0.5\n7.5,1,0.5\n9,0,0\n")
     path = tmp_path / "walk.csv"
@@ -238,7 +244,7 @@ def test_simulate_plays_a_log_of_commands(tmp_path: Path):
     assert at == [[0, 0.5], [0, 0.5], [1, 0.5], [1, 0.5], [0, 0]]
 
 
-def test_simulate_repeats_itself_by_its_seeds(tmp_path: Path):
+def test_simulate_is_reproducible_by_its_seeds(tmp_path: Path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         line = ["simulate", "--gait", "waves", "--seconds", 1.5, "--output", tmp_path / name / "walk.csv"]
         assert record.main([*map(str, line), "--trial-seed", str(seed)]) == 0
@@ -246,7 +252,7 @@ def test_simulate_repeats_itself_by_its_seeds(tmp_path: Path):
     assert first == again != other
 
 
-def test_simulate_sweeps(tmp_path: Path):
+def test_simulate_records_a_sweep(tmp_path: Path):
     line = ["simulate", "--suspended", "--levels", 5, "--hold", 0.5, "--output", tmp_path / "sweep.csv"]
     assert record.main(list(map(str, line))) == 0
     read = read_recording(tmp_path / "sweep.csv", load_robot())
@@ -254,12 +260,14 @@ def test_simulate_sweeps(tmp_path: Path):
 
 
 @pytest.mark.parametrize("line", [[], ["--gait", "waves", "--commands", "x"], ["--gait", "waves", "--seconds", "0.1"]])
-def test_simulate_needs_one_source_of_commands(tmp_path: Path, line: list[str], capsys: pytest.CaptureFixture[str]):
+def test_simulate_needs_one_source_of_commands_and_enough_seconds(
+    tmp_path: Path, line: list[str], capsys: pytest.CaptureFixture[str]
+):
     assert record.main(["simulate", "--output", str(tmp_path / "x.csv"), *line]) == 2
     assert "--" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
-def test_every_named_gait_can_be_asked_for():
+def test_simulate_offers_every_gait():
     named, _ = typing.get_args(typing.get_type_hints(record.Simulate)["gait"])
     assert typing.get_args(named) == tuple(GAITS)
 
@@ -267,7 +275,7 @@ def test_every_named_gait_can_be_asked_for():
 # ---- the command ----
 
 
-def test_the_example_mapping_is_printed_and_documented(tmp_path: Path):
+def test_example_mapping_is_printed_and_documented(tmp_path: Path):
     line = [sys.executable, "-m", "ballu_mjx", "record", "example-mapping"]
     done = subprocess.run(line, capture_output=True, text=True, timeout=120, cwd=tmp_path)
     assert done.returncode == 0 and done.stdout == example_mapping(load_robot())

@@ -1,4 +1,4 @@
-"""`train sysid` for a robot that declares what to identify, and what other commands make of the result."""
+"""`train sysid` for a robot that declares parameters, and the use of the result by other commands."""
 
 import contextlib
 import io
@@ -25,7 +25,7 @@ from ballu_mjx.robots.model import same_parameters
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
-    """The arm, with recordings beside it."""
+    """Return the description of the servo arm, with recordings beside it."""
     folder = tmp_path_factory.mktemp("arm")
     robot = write_arm(folder)
     for use, seed in (("training", 0), ("validation", 1)):
@@ -38,7 +38,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
 
 @pytest.fixture(scope="module")
 def run(robot: RobotDescription) -> tuple[Path, str]:
-    """A run of sysid, and what it printed."""
+    """Return a run of sysid and its output."""
     folder, printed = robot.file.parent, io.StringIO()
     arguments = ["sysid", "--robot", robot.file, "--recordings", folder / "sweep", "--output", folder / "run"]
     arguments += ["--validation", folder / "validation", "--starts", "2", "--steps", "12"]
@@ -47,7 +47,7 @@ def run(robot: RobotDescription) -> tuple[Path, str]:
     return folder / "run", printed.getvalue()
 
 
-def test_the_arm_is_identified_and_everything_is_written(robot: RobotDescription, run: tuple[Path, str]):
+def test_sysid_identifies_the_arm_and_writes_all_files(robot: RobotDescription, run: tuple[Path, str]):
     folder, printed = run
     name, found = read_actuators(robot, folder / ACTUATORS_FILE)
     assert name == "arm" and isinstance(found, IdentifiedParameters)
@@ -79,7 +79,7 @@ def dataset(robot: RobotDescription, **options: Path) -> RecordingsData:
     return RecordingsData(**parts, output=folder / "out", **options)  # pyright: ignore[reportArgumentType]
 
 
-def test_auto_takes_identified_actuators_where_they_replay_better(
+def test_identified_actuators_are_used_by_default_if_they_replay_better(
     robot: RobotDescription, run: tuple[Path, str], capsys: pytest.CaptureFixture
 ):
     beside = robot.file.parent / ACTUATORS_FILE
@@ -96,7 +96,7 @@ def test_auto_takes_identified_actuators_where_they_replay_better(
         printed = capsys.readouterr().out
         assert prepared.dataset.identified is None and prepared.simulator.drivetrain is None
         assert "WORSE than nominal" in printed and "Nominal actuators are taken" in printed
-        prepared = prepare("supervised", dataset(robot, actuators=beside))  # what is asked for is done
+        prepared = prepare("supervised", dataset(robot, actuators=beside))  # given explicitly
         assert prepared.dataset.identified is not None and "WORSE than nominal" in capsys.readouterr().out
         prepared = prepare("supervised", dataset(robot, actuators=Path("nominal")))
         assert prepared.dataset.identified is None and "than nominal" not in capsys.readouterr().out
@@ -105,7 +105,7 @@ def test_auto_takes_identified_actuators_where_they_replay_better(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (["--objective", "hausdorff"], "--objective is for BALLU's legs"),
         (["--levels", "5"], "--levels is for BALLU's legs"),
@@ -115,25 +115,25 @@ def test_auto_takes_identified_actuators_where_they_replay_better(
         (["--window-seconds", "60"], "no recording lasts 60 s"),
     ],
 )
-def test_what_does_not_fit_is_refused(
-    robot: RobotDescription, capsys: pytest.CaptureFixture, arguments: list[str], says: str
+def test_unsuitable_options_and_recordings_are_refused(
+    robot: RobotDescription, capsys: pytest.CaptureFixture, arguments: list[str], message: str
 ):
     folder = robot.file.parent
     line = ["sysid", "--robot", str(robot.file), "--recordings", str(folder / "training")]
     line += ["--output", str(folder / "refused")]
     assert train.main([*line, *(a.format(training=folder / "training") for a in arguments)]) == 2
-    assert says in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not (folder / "refused").exists()
 
 
-def test_options_of_declared_parameters_do_not_go_with_a_method_of_its_own(capsys: pytest.CaptureFixture):
+def test_options_of_declared_parameters_are_refused_for_ballu(capsys: pytest.CaptureFixture):
     assert train.main(["sysid", "--window-seconds", "2"]) == 2
     assert (
         "--window-seconds is for declared parameters, but ballu has its own method" in capsys.readouterr().err.lower()
     )
 
 
-def test_a_file_of_another_declaration_is_refused(robot: RobotDescription, tmp_path: Path):
+def test_actuators_file_of_another_declaration_is_refused(robot: RobotDescription, tmp_path: Path):
     path = tmp_path / "actuators.json"
     path.write_text(identified_to_json(robot, identified(robot, **TRUTH)))
     content = json.loads(robot.file.read_text()) | {"identify": IDENTIFY[:2], "model": str(robot.model)}

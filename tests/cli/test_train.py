@@ -1,4 +1,4 @@
-"""The commands, from the outside: what they write, what they refuse, and that they repeat themselves."""
+"""Training and evaluation from the command line: files, refused input, resumption and reproducibility."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ from ballu_mjx.runs.metrics import read_metrics
 from ballu_mjx.runs.progress import Progress
 
 SIZES = {name: value for name, value in train_envmimic.QUICK.items() if name != "num_timesteps"}
-"""Those of --quick, which then finds its programs compiled, wherever these tests ran before."""
+"""Sizes of --quick. After these tests, --quick finds its compiled programs in the cache."""
 OPTIONS = [text for name, value in SIZES.items() for text in (f"--{name.replace('_', '-')}", str(value))]
 _PPO = PPOConfig(**SIZES)
 STEPS = _PPO.batch_size * _PPO.unroll_length * _PPO.num_minibatches
-"""Control steps of a training step of that size."""
+"""Number of control steps in a training step with these sizes."""
 
 
 def command(module: str, *arguments: object, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -56,7 +56,7 @@ def first_seconds(recording: Recording, duration: float) -> Recording:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two short recordings and their robot's actuators, with room for runs beside them."""
+    """Return a folder with two short recordings and their robot's actuators, to which runs are written."""
     folder = tmp_path_factory.mktemp("cli")
     (folder / "data").mkdir()
     for path in list_bundled("validation")[1:3]:
@@ -68,7 +68,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @dataclasses.dataclass(frozen=True)
 class Stopped:
-    """A run that was interrupted, as it stood then."""
+    """State of a run when it was interrupted."""
 
     folder: Path
     step: int
@@ -78,12 +78,14 @@ class Stopped:
 
 @pytest.fixture(scope="module")
 def stopped(folder: Path) -> Stopped:
-    """A run interrupted after its first training step, validated at each."""
+    """Return a run that was interrupted after its first training step, with a validation at every training step."""
     line = [sys.executable, "-m", "ballu_mjx.train", "envmimic", "--recordings", "data", "--output", "run"]
     line += ["--num-timesteps", str(400 * STEPS), "--validate-every", str(STEPS), "--seed", "3", *OPTIONS]
-    # A shell's background jobs ignore SIGINT, and so would the tests' children there.
-    heed = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
-    line = [sys.executable, "-c", heed, *line]
+    # Background jobs of a shell ignore SIGINT. If the tests are one, their child processes would ignore it too.
+    launcher = (
+        "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
+    )
+    line = [sys.executable, "-c", launcher, *line]
     metrics = folder / "run" / "metrics.jsonl"
     with subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
         while process.poll() is None and not (metrics.exists() and '"reward"' in metrics.read_text()):
@@ -97,10 +99,10 @@ def stopped(folder: Path) -> Stopped:
 
 @pytest.fixture(scope="module")
 def trained(stopped: Stopped) -> Path:
-    """The same run, two training steps on."""
+    """Return the same run after two more training steps."""
     total = stopped.step + 2 * STEPS
     beside = stopped.folder.parent / "data" / ACTUATORS_FILE
-    hidden = beside.rename(beside.with_suffix(".hidden"))  # a run keeps the actuators it began with
+    hidden = beside.rename(beside.with_suffix(".hidden"))  # a resumed run keeps its actuators
     done = command("train", "envmimic", "--resume", "run", "--num-timesteps", total, folder=stopped.folder.parent)
     hidden.rename(beside)
     assert done.returncode == 0, done.stderr
@@ -110,19 +112,20 @@ def trained(stopped: Stopped) -> Path:
     return stopped.folder
 
 
-def test_interrupted_run_says_how_to_go_on(stopped: Stopped):
+def test_interrupted_run_prints_how_to_resume_it(stopped: Stopped):
     assert "--resume run" in stopped.error and "Traceback" not in stopped.error
     assert stopped.step == stopped.rows[-1]["step"] > 0
 
 
-def test_interrupted_run_goes_on_where_it_stopped(stopped: Stopped, trained: Path):
+def test_resumed_run_continues_at_the_interrupted_step(stopped: Stopped, trained: Path):
     rows, total = read_metrics(trained), stopped.step + 2 * STEPS
     assert rows[: len(stopped.rows)] == stopped.rows
     assert [row["step"] for row in rows if "reward" in row] == list(range(STEPS, total + STEPS, STEPS))
     config = json.loads((trained / "config.json").read_text())
-    assert config["ppo"]["seed"] == 3 and config["ppo"]["num_envs"] == SIZES["num_envs"]  # given once, kept
+    # Options and actuators of the first command are kept.
+    assert config["ppo"]["seed"] == 3 and config["ppo"]["num_envs"] == SIZES["num_envs"]
     beside = trained.parent / "data" / ACTUATORS_FILE
-    assert config["actuators"] == json.loads(beside.read_text())["parameters"]  # likewise
+    assert config["actuators"] == json.loads(beside.read_text())["parameters"]
     assert len(config["starts"]) == 2
     assert restore_checkpoint(trained, "last")[0] == total
 
@@ -141,20 +144,22 @@ def test_run_folder_is_complete(trained: Path):
     assert [Path(entry["path"]).name for entry in config["recordings"]["test"]] == ["far-2.csv", "near-1.csv"]
 
 
-def test_evaluate_repeats_the_same_numbers(trained: Path):
+def test_evaluate_reproduces_the_errors_of_the_training_run(trained: Path):
     done = command("evaluate", "run", "--noise-floor", "--output", "again", folder=trained.parent)
     assert done.returncode == 0, done.stderr
     assert (trained / "evaluation.txt").read_text() in done.stdout
     floors = re.findall(r"([\d.]+) m of ([\d.]+) m", done.stdout)
-    # Over 1 s; from one start over 5 s, as here, it is a matter of luck.
+    # Only the errors over 1 s are compared. Over 5 s, there is a single start here, and the order is random.
     assert len(floors) == 6 and all(0 < float(floor) < float(error) for floor, error in floors[::3])
-    first, second = (json.loads((f / "evaluation.json").read_text()) for f in (trained, trained.parent / "again"))
-    assert first == second
+    stored, repeated = (
+        json.loads((run / "evaluation.json").read_text()) for run in (trained, trained.parent / "again")
+    )
+    assert stored == repeated
 
 
 @pytest.fixture(scope="module")
 def identified(folder: Path) -> Path:
-    """A quick run of sysid on the bundled sweep."""
+    """Return a quick run of sysid on the bundled sweep."""
     done = command("train", "sysid", "--quick", "--output", "identified", folder=folder)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
@@ -162,11 +167,11 @@ def identified(folder: Path) -> Path:
     return folder / "identified"
 
 
-def test_sysid_explains_the_sweep_and_writes_what_it_found(identified: Path):
+def test_sysid_reduces_the_error_on_the_sweep_and_writes_actuators(identified: Path):
     assert (identified / "actuator_curves.png").stat().st_size > 10_000
     name, parameters = read_actuators(identified / ACTUATORS_FILE)
     assert name == "virtual-ballu-0"
-    # Plain to see in the sweep: the knees' stops, and the motors' angles at command 0.
+    # The sweep shows these values directly: the knee stops, and the motor angles at command 0.
     assert np.rad2deg(parameters.default_knee_angle) == pytest.approx([32.2, 26.0], abs=1.0)
     assert np.rad2deg(parameters.default_motor_angle) == pytest.approx([1.4, -5.9], abs=2.5)
     text = (identified / "identification.txt").read_text()
@@ -183,7 +188,7 @@ def test_bundled_actuators_come_from_the_bundled_sweep():
     assert sources == [describe_recording(p) for p in list_bundled("suspended")]
 
 
-def test_envmimic_takes_identified_actuators_from_beside_the_recordings(trained: Path):
+def test_envmimic_uses_identified_actuators_beside_the_recordings(trained: Path):
     stored = json.loads((trained / "config.json").read_text())["actuators"]
     assert stored == json.loads((trained.parent / "data" / ACTUATORS_FILE).read_text())["parameters"]
     loaded = TrainedResidual.load(trained, load_robot(), "last").actuators
@@ -193,7 +198,7 @@ def test_envmimic_takes_identified_actuators_from_beside_the_recordings(trained:
     assert "vanilla+sysid" in (trained / "evaluation.txt").read_text()
 
 
-def test_actuators_from_before_slack_was_identified_have_the_nominal_one(tmp_path: Path):
+def test_actuators_files_without_cable_slack_get_the_nominal_slack(tmp_path: Path):
     content = json.loads((assets() / "recordings" / ACTUATORS_FILE).read_text())
     del content["parameters"]["cable_slack"]
     (tmp_path / "old.json").write_text(json.dumps(content))
@@ -201,7 +206,7 @@ def test_actuators_from_before_slack_was_identified_have_the_nominal_one(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"format": "other"}, '"format" is not'),
         ({"robot": "virtual-ballu-9"}, "are the actuators of 'virtual-ballu-9'"),
@@ -214,7 +219,7 @@ def test_actuators_from_before_slack_was_identified_have_the_nominal_one(tmp_pat
         ({"gain": [1.0, 1.0]}, "there is no parameter 'gain'"),
     ],
 )
-def test_damaged_actuators_are_refused(tmp_path: Path, folder: Path, change: dict, says: str):
+def test_damaged_actuators_are_refused(tmp_path: Path, folder: Path, change: dict, message: str):
     content = json.loads((assets() / "recordings" / ACTUATORS_FILE).read_text())
     for key, value in change.items():
         (content if key in content else content["parameters"])[key] = value
@@ -223,11 +228,11 @@ def test_damaged_actuators_are_refused(tmp_path: Path, folder: Path, change: dic
     errors = io.StringIO()
     with contextlib.redirect_stderr(errors):
         assert train.main([*arguments, "--output", str(tmp_path / "run")]) == 2
-    assert says in errors.getvalue() and "bad.json" in errors.getvalue() and errors.getvalue().count("\n") == 1
+    assert message in errors.getvalue() and "bad.json" in errors.getvalue() and errors.getvalue().count("\n") == 1
     assert not (tmp_path / "run").exists()
 
 
-def test_quick_validates_on_own_recordings_where_there_are_no_others(folder: Path):
+def test_quick_validates_on_training_recordings_if_no_others_are_given(folder: Path):
     files = _choose(train_envmimic.Data(recordings=(folder / "data",), quick=True), load_robot(), None)
     assert len(files["training"]) == 2 and files["validation"] == files["training"] == files["test"]
     _read(files, load_robot())
@@ -235,7 +240,7 @@ def test_quick_validates_on_own_recordings_where_there_are_no_others(folder: Pat
     assert _choose(data, load_robot(), None)["test"] == files["training"][:1]
 
 
-def test_help_explains_every_option(folder: Path):
+def test_help_lists_the_options_of_envmimic(folder: Path):
     done = command("train", "envmimic", "--help", folder=folder)
     assert done.returncode == 0
     for option in ("--quick", "--recordings", "--validation", "--test", "--seed", "--output", "--num-timesteps"):
@@ -266,7 +271,7 @@ def test_wrong_path_is_refused_in_one_sentence(folder: Path):
         (["--recordings", "short.csv"], "lasts 3.0 s; validation and test need"),
     ],
 )
-def test_input_that_cannot_be_used_is_refused(trained, monkeypatch, capsys, arguments, sentence):
+def test_unsuitable_input_is_refused_in_one_sentence(trained, monkeypatch, capsys, arguments, sentence):
     monkeypatch.chdir(trained.parent)
     if "short.csv" in arguments:
         write_recording(
@@ -278,7 +283,7 @@ def test_input_that_cannot_be_used_is_refused(trained, monkeypatch, capsys, argu
     assert sentence in error and error.count("\n") == 1
 
 
-def test_changed_recording_is_noticed(trained, monkeypatch, capsys):
+def test_evaluate_refuses_a_changed_recording(trained, monkeypatch, capsys):
     monkeypatch.chdir(trained.parent)
     path = Path("data/near-1.csv")
     content = path.read_bytes()

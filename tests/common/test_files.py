@@ -1,4 +1,4 @@
-"""Files that are written to the end or not at all."""
+"""Files that are written completely or not at all."""
 
 import subprocess
 import sys
@@ -17,7 +17,7 @@ for _ in range(200):
 """
 
 
-def test_two_processes_that_write_one_file_leave_it_whole(tmp_path: Path) -> None:
+def test_concurrent_writers_leave_one_complete_file(tmp_path: Path) -> None:
     path = tmp_path / "result.json"
     writers = [subprocess.Popen([sys.executable, "-c", WRITER, str(path), letter]) for letter in "ab"]
     assert [writer.wait() for writer in writers] == [0, 0]
@@ -25,7 +25,7 @@ def test_two_processes_that_write_one_file_leave_it_whole(tmp_path: Path) -> Non
     assert [each.name for each in tmp_path.iterdir()] == ["result.json"]
 
 
-def test_what_cannot_be_written_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_write_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(self: Path, target: Path) -> None:
         raise OSError(28, "No space left on device")
 

@@ -1,4 +1,4 @@
-"""Tables as data: what is written is read again, and the pages show what the files hold."""
+"""Files of results: writing, reading, and rendering of their tables in the pages of the documentation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_cells_show_mean_and_range_and_what_diverged():
+def test_cells_show_mean_range_and_number_of_diverged_values():
     assert Cell((0.5, 0.25, 0.75), ".1f").to_text() == "0.5 [0.2, 0.8]"
     assert Cell((0.5, 0.25, 0.75), ".2f", "m", spread=False).to_text() == "0.50 m"
     assert Cell((5e-7,), ".0e", "mm").to_text() == "5e-07 mm"
@@ -36,7 +36,7 @@ def test_cells_show_mean_and_range_and_what_diverged():
         Table(("a", "b"), (("one",),))
 
 
-def test_results_are_read_as_written_and_say_where_they_come_from(folder: Path):
+def test_results_are_read_as_written_with_their_origin(folder: Path):
     found = read_results(folder / "measured.json")
     assert found.tables == {"errors": TABLE}
     assert found.machine["cores"] > 0 and found.versions["jax"]
@@ -48,7 +48,7 @@ def test_results_are_read_as_written_and_say_where_they_come_from(folder: Path):
     assert json.loads((folder / "infinite.json").read_text())["tables"]["a"]["rows"][0][0]["values"] == [1.0, None]
 
 
-def test_a_page_is_rendered_once_and_then_stays(folder: Path):
+def test_rendering_a_page_twice_changes_nothing(folder: Path):
     page = render.render_page(MARK, folder)
     assert "| one | 0.500 [0.250, 0.750] |" in page and "old" not in page
     assert page.startswith("before\n") and page.endswith("after\n")
@@ -57,7 +57,7 @@ def test_a_page_is_rendered_once_and_then_stays(folder: Path):
     assert "| one | 0.500" in captioned and "Training seeds: 3, 4." in " ".join(captioned.split())
 
 
-def test_what_cannot_be_rendered_is_refused(folder: Path):
+def test_invalid_marks_and_files_are_refused(folder: Path):
     with pytest.raises(InputError, match="no table 'other'; it has errors"):
         render.render_page(MARK.replace("errors", "other"), folder)
     with pytest.raises(InputError, match="missing.json"):
@@ -70,11 +70,11 @@ def test_what_cannot_be_rendered_is_refused(folder: Path):
 
 
 @pytest.mark.parametrize("page", prose.pages(), ids=lambda page: str(page.relative_to(prose.ROOT)))
-def test_the_pages_show_what_the_files_hold(page: Path):
+def test_pages_show_the_tables_of_the_results_files(page: Path):
     text = page.read_text(encoding="utf-8")
-    assert render.render_page(text) == text, "python docs/render.py renders it"
+    assert render.render_page(text) == text, "the page is out of date; run python docs/render.py"
 
 
-def test_every_file_of_results_is_shown_somewhere():
+def test_every_results_file_is_shown_in_a_page():
     shown = set().union(*(render.rendered_names(page.read_text(encoding="utf-8")) for page in prose.pages()))
     assert {path.stem for path in render.RESULTS.glob("*.json")} - {"final"} == shown

@@ -1,4 +1,4 @@
-"""Start-up: each question about the environment is put to a fresh process."""
+"""Start-up of the commands. Tests of the environment run in a new process."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from ballu_mjx.common import runtime
 from ballu_mjx.common.errors import InputError
 
-SETTLED_BY_PREPARE = (
+SET_BY_PREPARE = (
     "XLA_FLAGS",
     "TF_CPP_MIN_LOG_LEVEL",
     "JAX_COMPILATION_CACHE_DIR",
@@ -28,8 +28,8 @@ COMPILE = "import jax.numpy as jnp; jax.jit(lambda x: jnp.linalg.cholesky(x @ x.
 
 
 def python(code: str, cache: Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run `code` in a process that the user's settings, other than `environment`, do not reach."""
-    inherited = {name: value for name, value in os.environ.items() if name not in SETTLED_BY_PREPARE}
+    """Run `code` in a process that has the variables in `environment`, but no others that `prepare` sets."""
+    inherited = {name: value for name, value in os.environ.items() if name not in SET_BY_PREPARE}
     return subprocess.run(
         [sys.executable, "-c", code],
         env={**inherited, "JAX_PLATFORMS": "cpu", "XDG_CACHE_HOME": str(cache), **environment},
@@ -46,20 +46,22 @@ def python(code: str, cache: Path, **environment: str) -> subprocess.CompletedPr
         ("--xla_force_host_platform_device_count=3 --xla_cpu_enable_fast_math=false", 3),
     ],
 )
-def test_one_host_device_per_core_unless_the_user_says_otherwise(flags: str, expected: int, tmp_path: Path) -> None:
+def test_one_host_device_per_core_unless_the_user_sets_a_number(flags: str, expected: int, tmp_path: Path) -> None:
     out = python(PREPARE + "print(jax.device_count())", tmp_path, XLA_FLAGS=flags).stdout
     assert out == f"{expected}\n"
 
 
-def test_other_xla_flags_of_the_user_stay(tmp_path: Path) -> None:
+def test_other_xla_flags_of_the_user_are_kept(tmp_path: Path) -> None:
     flag = "--xla_cpu_enable_fast_math=false"
     out = python(PREPARE + "import os; print(os.environ['XLA_FLAGS'])", tmp_path, XLA_FLAGS=flag).stdout
     assert out.startswith(f"{flag} --xla_force_host_platform_device_count=")
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries have one heap")
-@pytest.mark.parametrize(("environment", "most"), [({}, CORES), ({"MALLOC_ARENA_MAX": "5"}, 5)])
-def test_threads_share_heaps(environment: dict[str, str], most: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("environment", "heaps"), [({}, CORES), ({"MALLOC_ARENA_MAX": "5"}, 5)])
+def test_threads_share_one_heap_per_core_unless_the_user_sets_a_number(
+    environment: dict[str, str], heaps: int, tmp_path: Path
+) -> None:
     report = tmp_path / "heaps.xml"
     code = PREPARE + (
         "import ctypes, threading\n"
@@ -77,10 +79,10 @@ def test_threads_share_heaps(environment: dict[str, str], most: int, tmp_path: P
         "libc.fclose(file)\n"
     )
     python(code, tmp_path, **environment)
-    assert report.read_text().count("<heap ") == most
+    assert report.read_text().count("<heap ") == heaps
 
 
-def test_nothing_appears_on_the_screen_with_a_cold_or_a_warm_cache(tmp_path: Path) -> None:
+def test_nothing_is_printed_with_a_cold_or_a_warm_cache(tmp_path: Path) -> None:
     code = PREPARE + "from ballu_mjx.sim import step\n" + COMPILE
     for _ in range(2):
         done = python(code, tmp_path, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="0")
@@ -91,32 +93,32 @@ def test_nothing_appears_on_the_screen_with_a_cold_or_a_warm_cache(tmp_path: Pat
     ("flags", "cpu", "width"),
     [("", "fma avx2 avx512f", "512"), ("", "fma avx2", None), ("--xla_cpu_prefer_vector_width=128", "avx512f", "128")],
 )
-def test_wide_vectors_are_used_where_there_are_some(flags: str, cpu: str, width: str | None) -> None:
+def test_vectors_of_512_bits_are_used_on_cpus_with_avx512(flags: str, cpu: str, width: str | None) -> None:
     found = re.findall(r"--xla_cpu_prefer_vector_width=(\d+)", runtime._with_flags(flags, 2, cpu))
     assert found == ([] if width is None else [width])
 
 
-def test_programs_are_kept_where_the_cache_is(tmp_path: Path) -> None:
+def test_compiled_programs_are_stored_in_the_cache_folder(tmp_path: Path) -> None:
     at_once = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     code = PREPARE + COMPILE + "; print(runtime.cache_dir())"
     folder = Path(python(code, tmp_path, **at_once).stdout.strip())
     assert folder.is_relative_to(tmp_path)
     assert any(path.stat().st_size > 0 for path in folder.iterdir())
 
-    own = tmp_path / "own"
-    python(code, tmp_path / "unused", JAX_COMPILATION_CACHE_DIR=str(own), **at_once)
-    assert any(own.iterdir())
+    chosen = tmp_path / "chosen"
+    python(code, tmp_path / "unused", JAX_COMPILATION_CACHE_DIR=str(chosen), **at_once)
+    assert any(chosen.iterdir())
     assert not (tmp_path / "unused").exists()
 
 
-def test_a_cache_that_cannot_be_written_stops_nobody(tmp_path: Path) -> None:
+def test_unwritable_cache_is_ignored(tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("no folder")
     done = python(PREPARE + COMPILE + "; print('done')", blocked)
     assert (done.stdout, done.stderr) == ("done\n", "")
 
 
-def test_importing_the_module_settles_nothing(tmp_path: Path) -> None:
+def test_importing_runtime_changes_no_setting(tmp_path: Path) -> None:
     code = (
         "import os, sys; from ballu_mjx.common import runtime; print('jax' in sys.modules, os.environ.get('XLA_FLAGS'))"
     )
@@ -124,7 +126,7 @@ def test_importing_the_module_settles_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("jax", "cpu"), [("0.9.3", "A"), ("0.9.2", "B")])
-def test_programs_of_another_jaxlib_or_cpu_are_not_loaded(jax: str, cpu: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_jaxlib_or_cpu_has_another_cache_folder(jax: str, cpu: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runtime.importlib.metadata, "version", lambda _: "0.9.2")
     monkeypatch.setattr(runtime, "_cpu_description", lambda: "A")
     before = runtime.cache_dir()
@@ -134,7 +136,7 @@ def test_programs_of_another_jaxlib_or_cpu_are_not_loaded(jax: str, cpu: str, mo
 
 
 @pytest.mark.parametrize("version", ["0.10.0", "0.10.1", "0.10.2"])
-def test_a_jax_that_deadlocks_is_refused_on_the_cpu_only(version: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jax_versions_that_deadlock_are_refused_on_the_cpu_only(version: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runtime.importlib.metadata, "version", lambda _: version)
     monkeypatch.setattr("jax.default_backend", lambda: "cpu")
     with pytest.raises(InputError, match="deadlocks.*pip install") as refused:
@@ -145,7 +147,7 @@ def test_a_jax_that_deadlocks_is_refused_on_the_cpu_only(version: str, monkeypat
 
 
 @pytest.mark.parametrize("version", ["0.9.2", "0.11.0", "1.0.0"])
-def test_other_versions_of_jax_start(version: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_jax_versions_are_accepted(version: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runtime.importlib.metadata, "version", lambda _: version)
     monkeypatch.setattr("jax.default_backend", lambda: "cpu")
     runtime.check_jax()

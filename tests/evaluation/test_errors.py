@@ -1,4 +1,4 @@
-"""Errors over horizons: what simulations that break down do to scores, bounds, table and file."""
+"""Errors over horizons, and the effect of diverged simulations on scores, bounds, tables and files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ from ballu_mjx.recordings.recording_groups import group_of
 
 
 def errors(name: str, starts: list[list[float]]) -> Errors:
-    """Of a recording, by horizon of `HORIZONS`: the error of each start, in m and in 10 deg."""
+    """Return the errors of a recording from `starts`: for each of `HORIZONS`, the error of each start.
+
+    A value x is a position error of x m and a yaw error of 10 x deg.
+    """
     given = dict(zip(HORIZONS, starts, strict=False))
     return Errors(
         name, group_of(name),
@@ -40,40 +43,40 @@ def errors(name: str, starts: list[list[float]]) -> Errors:
 
 
 SOUND = errors("near-1", [[0.1, 0.3], [0.2, 0.4], [0.5, 0.7]])
-PARTLY = errors("near-1", [[0.1, 0.1], [0.1, 0.1], [0.1, math.nan]])
-LOST = errors("near-1", [[0.1, 0.1], [0.1, math.nan], [math.nan, math.inf]])
+PARTLY_DIVERGED = errors("near-1", [[0.1, 0.1], [0.1, 0.1], [0.1, math.nan]])
+DIVERGED = errors("near-1", [[0.1, 0.1], [0.1, math.nan], [math.nan, math.inf]])
 
 
 def test_means_are_over_the_starts_that_did_not_diverge() -> None:
-    assert PARTLY.position[5.0] == (0.1, 0.0) and PARTLY.diverged[5.0] == (1, 2)
-    assert LOST.position[5.0] == (math.inf, 0.0)
-    assert summarize_starts([1e7, 1.0, 3.0]) == (2.0, 1.0), "a robot ten thousand kilometres off has diverged"
+    assert PARTLY_DIVERGED.position[5.0] == (0.1, 0.0) and PARTLY_DIVERGED.diverged[5.0] == (1, 2)
+    assert DIVERGED.position[5.0] == (math.inf, 0.0)
+    assert summarize_starts([1e7, 1.0, 3.0]) == (2.0, 1.0), "an error of 10,000 km must count as diverged"
 
 
-@pytest.mark.parametrize("residual", [PARTLY, LOST])
-def test_what_diverges_is_never_within_the_bound_nor_chosen(residual: Errors) -> None:
+@pytest.mark.parametrize("residual", [PARTLY_DIVERGED, DIVERGED])
+def test_diverged_residual_exceeds_the_bound_and_has_an_infinite_score(residual: Errors) -> None:
     result = Evaluation((SOUND,), (residual,))
-    worst, place = result.excess()
-    assert worst == math.inf and "near-1" in place and "diverged in " in place
+    worst, location = result.excess()
+    assert worst == math.inf and "near-1" in location and "diverged in " in location
     assert result.score == math.inf
     assert Evaluation((SOUND,), (SOUND,)).score == 1.0
 
 
-def test_an_error_that_is_no_number_counts_whatever_the_starts_say() -> None:
+def test_nan_error_exceeds_the_bound_for_any_number_of_diverged_starts() -> None:
     broken = dataclasses.replace(SOUND, position=SOUND.position | {5.0: (math.nan, 0.0)})
-    worst, place = Evaluation((SOUND,), (broken,)).excess()
-    assert worst == math.inf and "at 5 s" in place
+    worst, location = Evaluation((SOUND,), (broken,)).excess()
+    assert worst == math.inf and "at 5 s" in location
 
 
-def test_where_both_diverge_alike_the_rest_decides() -> None:
-    result = Evaluation((PARTLY,), (PARTLY,))
+def test_starts_that_diverge_in_both_simulators_do_not_affect_the_score() -> None:
+    result = Evaluation((PARTLY_DIVERGED,), (PARTLY_DIVERGED,))
     assert result.score == 1.0 and result.excess()[0] < 0
-    assert Evaluation((LOST,), (LOST,)).score == 1.0 and quotient(math.inf, math.inf) == 1.0
-    assert Evaluation((LOST,), (SOUND,)).excess()[0] < math.inf, "vanilla diverges, the residual does not"
+    assert Evaluation((DIVERGED,), (DIVERGED,)).score == 1.0 and quotient(math.inf, math.inf) == 1.0
+    assert Evaluation((DIVERGED,), (SOUND,)).excess()[0] < math.inf, "vanilla diverges, but the residual does not"
 
 
-def test_table_and_file_count_what_diverged_and_hold_no_nan(tmp_path: Path) -> None:
-    result = Evaluation((SOUND,), (LOST,), name="analytic")
+def test_table_and_file_count_diverged_starts_and_contain_no_nan(tmp_path: Path) -> None:
+    result = Evaluation((SOUND,), (DIVERGED,), name="analytic")
     table = result.table()
     assert "near-1, 5 s: analytic diverged in 2 of 2 starts" in table
     assert "near-1, 2 s: analytic diverged in 1 of 2 starts" in table
@@ -85,9 +88,9 @@ def test_table_and_file_count_what_diverged_and_hold_no_nan(tmp_path: Path) -> N
     assert read_evaluation(tmp_path / "evaluation.json") == result
 
 
-def test_a_group_s_means_keep_the_count() -> None:
+def test_group_means_keep_the_number_of_diverged_starts() -> None:
     other = errors("near-2", [[0.3], [0.3], [math.nan]])
-    (mean,) = mean_by_group([PARTLY, other])
+    (mean,) = mean_by_group([PARTLY_DIVERGED, other])
     assert mean.diverged[5.0] == (2, 3) and mean.position[5.0][0] == pytest.approx(0.1)
     assert Evaluation(mean_by_group([SOUND, SOUND]), (mean,)).excess()[0] == math.inf
 
@@ -102,7 +105,7 @@ def without(row: str) -> dict[str, Any]:
 @pytest.mark.parametrize(
     "content",
     [
-        without("diverged"),  # as before divergence was counted
+        without("diverged"),  # written before diverged starts were counted
         without("orientation"),
         evaluation_to_json(Evaluation((SOUND,), (SOUND,))) | {"vanilla": []},
         evaluation_to_json(Evaluation((SOUND,), (errors("near-2", [[0.1]]),))),
@@ -112,9 +115,7 @@ def without(row: str) -> dict[str, Any]:
         evaluation_to_json(Evaluation((SOUND,), (dataclasses.replace(SOUND, diverged={1.0: (3, 2)}),))),
     ],
 )
-def test_what_is_no_evaluation_is_refused_with_the_command_that_makes_it(
-    tmp_path: Path, content: dict[str, Any]
-) -> None:
+def test_invalid_evaluation_is_refused_with_the_command_that_writes_it(tmp_path: Path, content: dict[str, Any]) -> None:
     (tmp_path / "evaluation.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match="is no evaluation .* evaluate"):
         read_evaluation(tmp_path / "evaluation.json")
@@ -124,39 +125,39 @@ NAMES = (("near-3", "near"), ("far-1", "far"), ("stairs-up-2", "stairs"), ("poli
 
 
 @pytest.mark.parametrize(("name", "group"), NAMES)
-def test_groups_are_the_names_prefixes(name: str, group: str) -> None:
+def test_groups_are_prefixes_of_recording_names(name: str, group: str) -> None:
     assert group_of(name) == group
 
 
-def test_nominal_vanilla_stands_beside_vanilla_with_identified_actuators() -> None:
+def test_table_shows_vanilla_beside_vanilla_with_identified_actuators() -> None:
     nominal = errors("near-1", [[0.9], [0.9], [0.9]])
-    result = Evaluation((SOUND,), (PARTLY,), "vanilla+sysid", "analytic", (nominal,))
+    result = Evaluation((SOUND,), (PARTLY_DIVERGED,), "vanilla+sysid", "analytic", (nominal,))
     header = next(line for line in result.table().splitlines() if "(s)" in line)
     assert header.split("|")[1].split() == ["vanilla", "vanilla+sysid", "analytic", "ratio"]
     assert "0.900 ± 0.000" in result.table()
     assert evaluation_from_json(json.loads(json.dumps(evaluation_to_json(result)))) == result
-    assert result.ratio("near", "position", 1.0) == pytest.approx(0.1 / 0.2), "ratios are to the base"
+    assert result.ratio("near", "position", 1.0) == pytest.approx(0.1 / 0.2), "ratios must be relative to the base"
 
 
-def test_angles_between_orientations_pass_the_vertical() -> None:
-    """A pendulum swings about y: its yaw flips by 180 deg where it passes 90 deg of pitch, its angle does not."""
+def test_orientation_errors_are_continuous_through_the_vertical() -> None:
+    """A pendulum swings about y. Its yaw jumps by 180 deg at a pitch of 90 deg, but the orientation error does not."""
     angles = np.deg2rad([80.0, 89.0, 91.0, 179.0, -170.0])
-    turned = Rotation.from_euler("y", angles[:, None]).as_euler("ZYX")[:, ::-1]
+    simulated = Rotation.from_euler("y", angles[:, None]).as_euler("ZYX")[:, ::-1]
     recorded = Rotation.from_euler("y", angles[:, None] - np.deg2rad(4.0)).as_euler("ZYX")[:, ::-1]
-    np.testing.assert_allclose(orientation_errors(turned, recorded, upright=False), 4.0, atol=1e-6)
-    assert np.abs(orientation_errors(turned, recorded, upright=True)).max() > 179
-    way = np.zeros((2, 3)), np.array([[0.3, 0.0, 3.1], [0.0, 0.2, 0.1]])
-    np.testing.assert_allclose(orientation_errors(*way, upright=True), -np.rad2deg([3.1, 0.1]))
+    np.testing.assert_allclose(orientation_errors(simulated, recorded, upright=False), 4.0, atol=1e-6)
+    assert np.abs(orientation_errors(simulated, recorded, upright=True)).max() > 179
+    angles_of_both = np.zeros((2, 3)), np.array([[0.3, 0.0, 3.1], [0.0, 0.2, 0.1]])
+    np.testing.assert_allclose(orientation_errors(*angles_of_both, upright=True), -np.rad2deg([3.1, 0.1]))
 
 
-def test_horizons_are_the_robot_s_or_fit_the_recordings() -> None:
+def test_horizons_are_those_of_the_robot_or_fit_the_recordings() -> None:
     assert choose_horizons((), 30.0) == HORIZONS and max(choose_horizons((), 0.8)) < 0.8
     assert choose_horizons((0.2, 0.4), 30.0) == (0.2, 0.4)
     short = Errors("near-1", "near", {0.4: (0.1, 0.0)}, {0.4: (1.0, 0.0)}, 0.1, 1.0, 0.0)
     assert Evaluation((short,), (short,)).score == 1.0 and f"{0.4:>8g} |" in Evaluation((short,), (short,)).table()
 
 
-def test_medians_and_the_share_of_finite_starts_are_told() -> None:
+def test_table_shows_medians_and_the_percentage_of_finite_starts() -> None:
     medians = {"position": {1.0: 0.2}, "orientation": {1.0: 3.0}, "joints": {1.0: math.inf}}
     each = Errors(
         "near-1", "near", {1.0: (0.2, 0.0)}, {1.0: (3.0, 0.0)}, 0.1, 1.0, 0.0, {1.0: (1, 4)},

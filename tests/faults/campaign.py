@@ -1,10 +1,10 @@
-"""Kill trainings at random moments, damage what they saved, fill their disk, and count what survives.
+"""Kill trainings at random times, damage their checkpoints, fill their disk, and count how many trainings survive.
 
     python tests/faults/campaign.py --kills 20 --damages 20 --swaps 10 --full 10 --twice 5
 
-The training is a small one without physics, through the run folders and sessions that every training uses. After each
-fault the run is resumed; at the end its parameters and measurements are held against those of a training that nobody
-disturbed. Filling a disk takes the right to mount a small one in memory (root's); without it that fault is left out.
+The training is small and without physics, but uses the same run folders and training loop as every training. After each
+fault the run is resumed. At the end, its parameters and measurements are compared with those of an undisturbed
+training. The full disk is a small one in memory. Without the right to mount it (root's), this fault is left out.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from ballu_mjx.common import runtime
 _HERE = Path(__file__).resolve().parent
 TASK = "walk"
 STEP = 2 * 8 * 5
-"""Control steps of a training step."""
+"""Control steps per training step."""
 STEPS = 60
-"""Training steps of the whole training."""
+"""Number of training steps of the training."""
 EVERY = 5
-"""Training steps between two checkpoints."""
+"""Number of training steps between two checkpoints."""
 DISK = 32 * 2**20
-"""Bytes of a disk that is to be filled."""
+"""Size of the disk that is filled (bytes)."""
 TIMINGS = ("seconds", "steps_per_second", "validation_seconds")
-"""Measurements that no two trainings share."""
+"""Measurements that differ between identical trainings."""
 
 
 def train(folder: Path) -> None:
-    """Begin the training in `folder`, or go on with it, to its end."""
+    """Start or resume the training in `folder`, and finish it."""
     from follower import Follower, weight
 
     from ballu_mjx.residuals.run_config import describe_run
@@ -75,25 +75,25 @@ def train(folder: Path) -> None:
 
 
 def quietly(folder: Path, told: Path) -> None:
-    """`train` as a command does it, with what it says in the file `told`."""
-    # To the process's end: threads that the command has silenced would otherwise be heard again after it.
+    """Run `train` as a command does, write its output to the file `told`, and end the process with its exit status."""
+    # Never restored, because threads that the command has silenced would otherwise print at the end of the process.
     sys.stdout = sys.stderr = told.open("a")
     sys.exit(runtime.exit_status(lambda: train(folder), []))
 
 
 @dataclasses.dataclass
 class Trainer:
-    """Starts trainings, each in a process of its own."""
+    """Starter of trainings, each in its own process."""
 
     work: Path
 
     def __post_init__(self) -> None:
-        # Forked from a process that has imported everything, with what was compiled before, one starts in a second.
+        # A process starts in a second if it is forked after all imports, and finds compiled programs in the cache.
         self._processes = multiprocessing.get_context("forkserver")
         self._processes.set_forkserver_preload(["ready"])
-        places = [str(_HERE), str(_HERE.parent), os.environ.get("PYTHONPATH", "")]
+        paths = [str(_HERE), str(_HERE.parent), os.environ.get("PYTHONPATH", "")]
         settings = {
-            "PYTHONPATH": os.pathsep.join(filter(None, places)),
+            "PYTHONPATH": os.pathsep.join(filter(None, paths)),
             "JAX_COMPILATION_CACHE_DIR": str(self.work / "cache"),
             "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         }
@@ -114,18 +114,18 @@ class Trainer:
         return process
 
     def finish(self, folder: Path) -> None:
-        """Train to the end; raises `RuntimeError` where that fails."""
+        """Start or resume the training, and wait for its end. **Raises** `RuntimeError` if it fails."""
         process = self.start(folder)
         process.join()
         if process.exitcode:
             raise RuntimeError(f"The training ended with {process.exitcode}:\n{self.told.read_text()}")
 
     def started(self, folder: Path, steps: int) -> Any:
-        """Start training, and wait until it has measured `steps` training steps or is over; returns the process."""
+        """Start training, and return the process after it has logged `steps` training steps or has ended."""
         path = folder / "metrics.jsonl"
         old = path.stat().st_ino if path.exists() else None
         process = self.start(folder)
-        first: int | None = None  # lines that are kept: the file is a new one then
+        first: int | None = None  # number of lines kept at the start of a resumed training, which writes a new file
         while steps and process.is_alive():
             if path.exists() and path.stat().st_ino != old:
                 lines = path.read_bytes().count(b"\n")
@@ -136,8 +136,13 @@ class Trainer:
         return process
 
     def kill(self, folder: Path, steps: int, delay: float) -> bool:
-        """Start training, and kill it `delay` seconds after it has measured `steps` training steps, or after the
-        process began where these are 0; returns whether it was still at it."""
+        """Start training, and kill it. Return whether it was still running.
+
+        **Arguments**
+
+        - `steps`: number of training steps to wait for. 0 for none.
+        - `delay`: time (s) to wait after these steps, or after the start of the process.
+        """
         process = self.started(folder, steps)
         process.join(delay)
         alive = process.is_alive()
@@ -148,13 +153,13 @@ class Trainer:
 
 @contextlib.contextmanager
 def trainer() -> Iterator[Trainer]:
-    """A `Trainer` with a folder that is removed after it."""
+    """Yield a `Trainer` with a temporary folder."""
     with tempfile.TemporaryDirectory() as work:
         yield Trainer(Path(work))
 
 
 def outcome(folder: Path) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
-    """Measurements but for the timings, and all of the last state. Raises on a torn line."""
+    """Return the measurements without timings, and the whole last training state. An incomplete line is an error."""
     from ballu_mjx.runs.checkpoints import last_checkpoint
 
     text = (folder / "metrics.jsonl").read_text()
@@ -165,7 +170,7 @@ def outcome(folder: Path) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
 
 
 def same(first: Path, second: Path) -> bool:
-    """Whether two trainings measured and learned the same, to the last bit."""
+    """Return whether measurements and training states of two trainings are equal to the bit."""
     (rows, state), (other_rows, other_state) = outcome(first), outcome(second)
     return (
         rows == other_rows
@@ -175,7 +180,7 @@ def same(first: Path, second: Path) -> bool:
 
 
 def damage(path: Path, random: np.random.Generator) -> str:
-    """Cut a file off or turn one of its bits; returns what was done."""
+    """Truncate a file or flip one of its bits. Return a description of the damage."""
     content = bytearray(path.read_bytes())
     if not content or random.random() < 0.5:
         path.write_bytes(content[: random.integers(0, len(content) + 1)] if content else b"?")
@@ -186,7 +191,7 @@ def damage(path: Path, random: np.random.Generator) -> str:
 
 
 def checkpoint_files(folder: Path) -> list[Path]:
-    """The files of a run's last checkpoint."""
+    """Return the files of a run's last checkpoint."""
     from ballu_mjx.runs.checkpoints import list_checkpoints
 
     last = folder / "checkpoints" / str(list_checkpoints(folder)[-1])
@@ -194,8 +199,10 @@ def checkpoint_files(folder: Path) -> list[Path]:
 
 
 def kills(at: Trainer, reference: Path, folder: Path, count: int, random: np.random.Generator) -> tuple[int, bool]:
-    """Kill a training `count` times, then let it end; returns how many kills met it alive, and whether it ended as
-    `reference` did."""
+    """Kill a training `count` times, then finish it.
+
+    **Returns** the number of kills while it was running, and whether its result equals that of `reference`.
+    """
     met = 0
     for _ in range(count):
         if random.random() < 0.2:
@@ -207,7 +214,10 @@ def kills(at: Trainer, reference: Path, folder: Path, count: int, random: np.ran
 
 
 def damaged(at: Trainer, reference: Path, folder: Path, random: np.random.Generator) -> tuple[str, bool]:
-    """Copy a training that was killed to `folder`, damage its last checkpoint, let it end; returns what was done."""
+    """Copy a killed training to `folder`, damage its last checkpoint, and finish it.
+
+    **Returns** a description of the damage, and whether the result equals that of `reference`.
+    """
     shutil.copytree(reference.parent / "killed", folder)
     done = damage(random.choice(np.array(checkpoint_files(folder))), random)
     at.finish(folder)
@@ -215,8 +225,10 @@ def damaged(at: Trainer, reference: Path, folder: Path, random: np.random.Genera
 
 
 def swapped(at: Trainer, reference: Path, folder: Path, random: np.random.Generator) -> tuple[str, bool]:
-    """Copy a training that was killed to `folder`, exchange a file of its last two checkpoints, or all of them, let it
-    end; returns what was done."""
+    """Copy a killed training to `folder`, exchange its last two checkpoints or one file of them, and finish it.
+
+    **Returns** a description of the exchange, and whether the result equals that of `reference`.
+    """
     from ballu_mjx.runs.checkpoints import list_checkpoints
 
     shutil.copytree(reference.parent / "killed", folder)
@@ -225,7 +237,7 @@ def swapped(at: Trainer, reference: Path, folder: Path, random: np.random.Genera
     if random.random() < 0.7:
         what = "file swapped"
         files = [path.relative_to(other) for path in checkpoint_files(folder)]
-        # Names of data files differ from one checkpoint to the next.
+        # The names of data files differ between checkpoints.
         name = random.choice(np.array([str(path) for path in files if (one / path).exists()]))
         one, other = one / name, other / name
     aside = folder / "aside"
@@ -238,7 +250,7 @@ def swapped(at: Trainer, reference: Path, folder: Path, random: np.random.Genera
 
 @contextlib.contextmanager
 def small_disk(work: Path, size: int) -> Iterator[Path | None]:
-    """A disk in memory of `size` bytes; None where this process may not mount one."""
+    """Yield the path of a disk in memory of `size` bytes. None if this process may not mount one."""
     place = work / "disk"
     place.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(place)]
@@ -255,7 +267,7 @@ def small_disk(work: Path, size: int) -> Iterator[Path | None]:
 
 
 def fill(place: Path, free: int) -> Path:
-    """Fill a disk but for about `free` bytes; returns the file that does."""
+    """Fill a disk except for about `free` bytes. Return the file that fills it."""
     ballast = place / "ballast"
     with ballast.open("wb", buffering=0) as file:
         with contextlib.suppress(OSError):
@@ -266,8 +278,13 @@ def fill(place: Path, free: int) -> Path:
 
 
 def full_disk(at: Trainer, reference: Path, disk: Path, steps: int, free: int) -> bool:
-    """Fill the disk of a training after so many steps; returns whether one sentence said so, a whole checkpoint was
-    left, and with room again it ended as `reference` did. Raises `RuntimeError` where it did not stop."""
+    """Fill the disk of a training after `steps` training steps, except for `free` bytes. Then make room and finish it.
+
+    **Returns** whether the result equals that of `reference`.
+
+    **Raises** `RuntimeError` if the training does not stop, does not report the full disk in one sentence, or leaves no
+    intact checkpoint.
+    """
     from ballu_mjx.runs.checkpoints import last_checkpoint
 
     folder = disk / "run"
@@ -277,12 +294,12 @@ def full_disk(at: Trainer, reference: Path, disk: Path, steps: int, free: int) -
     process.join(60)
     if process.is_alive():
         process.kill()
-        raise RuntimeError("The training neither goes on nor ends on a full disk.")
-    said = at.told.read_text()[before:].strip()
-    one_sentence = process.exitcode == 2 and "\n" not in said and f"{folder}: its disk is full; make room" in said
+        raise RuntimeError("The training did not end within 60 s on a full disk.")
+    printed = at.told.read_text()[before:].strip()
+    one_sentence = process.exitcode == 2 and "\n" not in printed and f"{folder}: its disk is full; make room" in printed
     last = last_checkpoint(folder, training=True)
-    if not one_sentence or (f"step {last.step:,} is intact" not in said):
-        raise RuntimeError(f"Exit status {process.exitcode}, checkpoint {last.step}: {said!r}")
+    if not one_sentence or (f"step {last.step:,} is intact" not in printed):
+        raise RuntimeError(f"Exit status {process.exitcode}, checkpoint {last.step}: {printed!r}")
     ballast.unlink()
     at.finish(folder)
     ended = same(folder, reference)
@@ -291,27 +308,36 @@ def full_disk(at: Trainer, reference: Path, disk: Path, steps: int, free: int) -
 
 
 def twice(at: Trainer, reference: Path, folder: Path, steps: int) -> bool:
-    """Start a second training in the folder of one that runs; returns whether it was refused by one sentence, and the
-    first ended as `reference` did."""
+    """Start a second training in the folder of a running one.
+
+    **Returns** whether the second was refused with a message, and the result of the first equals that of `reference`.
+    """
     first = at.started(folder, steps)
     before = len(at.told.read_text())
     second = at.start(folder)
     second.join()
-    said = at.told.read_text()[before:]
+    printed = at.told.read_text()[before:]
     alive = first.is_alive()
     first.join()
-    refused = second.exitcode == 2 and "another process is writing to this run" in said
+    refused = second.exitcode == 2 and "another process is writing to this run" in printed
     return alive and refused and first.exitcode == 0 and same(folder, reference)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=20, help="trainings killed (SIGKILL)")
-    parser.add_argument("--damages", type=int, default=20, help="checkpoints cut off, or with one bit turned")
-    parser.add_argument("--swaps", type=int, default=10, help="checkpoints exchanged, or a file of them")
-    parser.add_argument("--full", type=int, default=10, help="disks filled up")
-    parser.add_argument("--twice", type=int, default=5, help="second processes in the folder of a run")
-    parser.add_argument("--seed", type=int, default=0, help="of the moments and places")
+    parser.add_argument("--kills", type=int, default=20, help="number of kills (SIGKILL)")
+    parser.add_argument(
+        "--damages", type=int, default=20, help="number of checkpoints damaged (truncated, or one bit flipped)"
+    )
+    parser.add_argument(
+        "--swaps",
+        type=int,
+        default=10,
+        help="number of trainings whose last two checkpoints, or one file of them, are exchanged",
+    )
+    parser.add_argument("--full", type=int, default=10, help="number of full disks")
+    parser.add_argument("--twice", type=int, default=5, help="number of second processes in the folder of a run")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the times and places of the faults")
     options = parser.parse_args()
     runtime.prepare()
     random = np.random.default_rng(options.seed)
@@ -357,7 +383,7 @@ def main() -> int:
         for _ in range(options.full):
             with small_disk(at.work, DISK) as disk:
                 if disk is None:
-                    print("disk full: left out, for this process may not mount a small one", file=sys.stderr)
+                    print("disk full: left out, because this process may not mount a small disk", file=sys.stderr)
                     break
                 moment = int(random.integers(EVERY + 1, 30)), int(2 ** random.uniform(0, 18))
                 _, survived = tried(lambda d=disk, m=moment: (None, full_disk(at, reference, d, *m)))

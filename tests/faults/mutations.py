@@ -1,10 +1,10 @@
-"""Hand every reader files that are damaged in every way, and count what it makes of them.
+"""Give every reader files with many kinds of damage, and count the outcomes.
 
     python tests/faults/mutations.py --files 10000
 
-A file must be refused, by one sentence that names it, or what is read from it must keep the promises of its format.
-Readers are called in this process, and stopped after a while; C3D files, whose library is called in a process of its
-own, and checkpoints, which are restored from the disk, get fewer files than the others.
+A reader must refuse a damaged file by one sentence that names it, or return content that is valid for its format.
+Readers are called in this process, and stopped after a time limit. Checkpoints, which
+are restored from the disk, get fewer files than other formats.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from ballu_mjx.common.errors import InputError
 
 OUTCOMES = ("refused", "accepted", "nonsense", "crashed", "hung")
 LONGEST = 10.0
-"""Seconds until a reader hangs; three times as many for processes of their own."""
+"""Time (s) after which a reader counts as hung. Formats with a share below 3 get three times as long."""
 LONGEST_SENTENCE = 900
-"""Characters, paths included."""
+"""Largest length of a message (characters), with paths."""
 ROBOT = "ballu-room-3"
 
 Random = np.random.Generator
@@ -137,7 +137,7 @@ def _cells(content: bytes, random: Random) -> bytes:
             del row[first]
         case 3:
             row.insert(first, row[second])
-        case 4:  # two columns exchange their samples, not their names
+        case 4:  # two columns exchange their samples, but keep their names
             for each in filled[1:]:
                 if max(first, second) < len(each):
                     each[first], each[second] = each[second], each[first]
@@ -150,7 +150,7 @@ def _cells(content: bytes, random: Random) -> bytes:
 
 
 def _stream(content: bytes, random: Random) -> bytes:
-    """What a streaming client does: hold samples, or stamp several at once."""
+    """Hold samples, or give several samples almost the same time, as streaming clients do."""
     rows = [line.split(",") for line in content.decode().split("\n")]
     samples = [row for row in rows if len(row) > 2 and re.fullmatch(r"-?\d+(\.\d+)?", row[0])]
     if len(samples) > 1 and random.integers(2):
@@ -168,7 +168,7 @@ CSV = (*TEXT, _cells, _cells, _cells, _cells, _stream, _stream)
 
 
 def _places(value: Any) -> Iterator[tuple[Any, Any]]:
-    """Every entry in a tree of dictionaries and lists, as its container and key."""
+    """Yield container and key of every entry in a tree of dictionaries and lists."""
     for key in value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
         yield value, key
         yield from _places(value[key])
@@ -246,24 +246,26 @@ def _arrays(content: bytes, random: Random) -> bytes:
 ARCHIVE = (*BYTES, _arrays, _arrays, _arrays, _arrays, _arrays)
 
 
-# ---- what each format promises ----
+# ---- what is valid for each format ----
 
 
 @dataclasses.dataclass(frozen=True)
 class Format:
-    """A format: how one file of it is damaged, read, and found to keep its promises."""
+    """A file format, with functions that damage, read and validate one file."""
 
     name: str
     file: Path
-    """The one that is damaged; it and all that is read with it are valid before."""
+    """The file that is damaged. It and all files read with it are valid before."""
     damages: Sequence[Callable[[bytes, Random], bytes]]
+    """Functions that damage the content of the file."""
     read: Callable[[], Any]
+    """Function that reads the file and returns its content."""
     fault: Callable[[Any], str | None]
-    """What of the promises is broken; None: nothing."""
+    """Function that returns which part of the content is invalid. None if all is valid."""
     share: int = 10
-    """Of the files."""
+    """Number of damaged files, relative to other formats."""
     partial: tuple[Path, ...] = ()
-    """What must not be left behind where the file is refused."""
+    """Files that must not exist after a refusal."""
 
 
 def finite(*values: Any) -> bool:
@@ -316,7 +318,7 @@ def actuators_fault(found: Any) -> str | None:
 
 
 def description_fault(found: Any) -> str | None:
-    """Everything that it names is in the model."""
+    """Return which names of a robot description are missing in its model."""
     model = found.load_model()
     sites = {model.site(index).name for index in range(model.nsite)}
     joints = {model.joint(index).name for index in range(model.njnt)}
@@ -342,7 +344,7 @@ def observed_fault(found: Any) -> str | None:
 
 
 def options_fault(found: Sequence[Any]) -> str | None:
-    """Every number finite, every count and size one."""
+    """Return which option is invalid. Numbers must be finite. Counts and sizes must be positive."""
     for config in found:
         for field in dataclasses.fields(config):
             value, default = getattr(config, field.name), getattr(type(config)(), field.name)
@@ -405,7 +407,7 @@ def transfers_fault(found: Any) -> str | None:
 
 
 def formats(work: Path) -> list[Format]:
-    """Every format that is read, with a valid example of it in a folder of its own below `work`."""
+    """Return all formats, each with a valid example in its own folder below `work`."""
     from ballu_mjx.ballu.actuators_file import read_actuators
     from ballu_mjx.cli.cached_stages import read_mark, write_mark
     from ballu_mjx.evaluation import transfer
@@ -423,7 +425,7 @@ def formats(work: Path) -> list[Format]:
     robot = load_robot()
     short = cut(read_recording(list_bundled("test")[0], robot), slice(130))
 
-    def place() -> Path:  # its name must not be that of the file, which messages are to name
+    def place() -> Path:  # its name must not contain the file's name, because messages must name the file
         return Path(tempfile.mkdtemp(dir=work))
 
     found: list[Format] = []
@@ -511,7 +513,7 @@ def formats(work: Path) -> list[Format]:
 
 
 def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
-    """The files of a run's folder."""
+    """Return the formats in a run's folder."""
     from ballu_mjx.cli import compare, train_envmimic
     from ballu_mjx.evaluation.errors import Errors, Evaluation
     from ballu_mjx.evaluation.errors_file import evaluation_to_json, read_evaluation
@@ -567,7 +569,7 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
         return shutil.copytree(example, place() / "run")
 
     def read_run(folder: Path) -> Any:
-        """As the commands that show, compare, evaluate or go on with a run do, but for its checkpoints."""
+        """Read a run, without checkpoints, as the commands that report, compare, evaluate or resume it do."""
         config = read_config(folder, "envmimic")
         found = [
             typed_config(EnvMimicConfig, config, "env", folder, lambda read: check_envmimic_config(read, 0.05)),
@@ -601,11 +603,11 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
         found.append(Format(name, folder / file, damages, lambda f=folder, r=read: r(f), fault, share))
 
     def read_checkpoint(folder: Path) -> Any:
-        said = io.StringIO()
-        with contextlib.redirect_stderr(said):
+        messages = io.StringIO()
+        with contextlib.redirect_stderr(messages):
             checkpoint = last_checkpoint(folder, training=True)
         if checkpoint.step < 300:
-            raise InputError(said.getvalue().rstrip("\n"))
+            raise InputError(messages.getvalue().rstrip("\n"))
         return checkpoint
 
     def checkpoint_fault(found: Any) -> str | None:
@@ -624,7 +626,7 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
 
 
 def _import_formats(place: Callable[[], Path], short: Any) -> list[Format]:
-    """What `record import` reads."""
+    """Return the formats that `record import` reads."""
     from scipy.spatial.transform import Rotation
 
     from ballu_mjx.cli import record
@@ -754,7 +756,7 @@ def _import_formats(place: Callable[[], Path], short: Any) -> list[Format]:
 
 
 def _one_body(name: str, path: Path, damages: Sequence[Any], text: str) -> Format:
-    """A format of one body, which is no recording of a robot with several."""
+    """Return a format that holds one body, from which no recording of BALLU can be made."""
     from ballu_mjx.recordings.importers.mapping import read_mapping
     from ballu_mjx.recordings.importers.readers import read_capture
     from ballu_mjx.robots.registry import load_robot
@@ -781,7 +783,7 @@ def _one_body(name: str, path: Path, damages: Sequence[Any], text: str) -> Forma
 
 
 def _write_bag(folder: Path, ending: str, short: Any, positions: Mapping[str, Any]) -> bytes | None:
-    """Poses by topic, and commands; None where rosbags or mcap is not installed."""
+    """Return a bag with poses by topic, and commands. None if rosbags or mcap is not installed."""
     try:
         import mcap  # noqa: F401
         from rosbags.rosbag1 import Writer as Writer1
@@ -789,7 +791,7 @@ def _write_bag(folder: Path, ending: str, short: Any, positions: Mapping[str, An
         from rosbags.rosbag2 import Writer as Writer2
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        print("Bags are left out: the extra bags is not installed.", file=sys.stderr)
+        print("Bags are left out, because the extra `bags` is not installed.", file=sys.stderr)
         return None
     store: Any = get_typestore(Stores.ROS1_NOETIC if ending == "bag" else Stores.ROS2_HUMBLE)
     types, version = store.types, {"seq": 0} if ending == "bag" else {}
@@ -818,7 +820,7 @@ def _write_bag(folder: Path, ending: str, short: Any, positions: Mapping[str, An
 
 
 def _write_weights(folder: Path) -> Path:
-    """A controller's network, as `ballu_mjx.export` writes it."""
+    """Write a controller's network, as `export policy` does. Return its path."""
     random = np.random.default_rng(0)
     sizes = [28, 8, 2]
     arrays: dict[str, np.ndarray] = {"mean": np.zeros(28), "std": np.ones(28), "observation_clip": np.array(10.0)}
@@ -837,7 +839,7 @@ def _write_weights(folder: Path) -> Path:
 
 
 class _Controlled:
-    """Reads a controller, which knows no `InputError`: it runs without this package."""
+    """Reader of a controller. It converts `ValueError`, because the controller does not use this package's errors."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -860,7 +862,7 @@ def controller_fault(controller: Any) -> str | None:
 
 
 class _Hang(BaseException):
-    """A reader's time is over. No `Exception`: readers catch these."""
+    """Time limit of a reader. Not an `Exception`, which readers may catch."""
 
 
 @contextlib.contextmanager
@@ -878,15 +880,15 @@ def limited(seconds: float) -> Iterator[None]:
 
 
 def judge(form: Format) -> tuple[str, str]:
-    """What a reader makes of the file as it stands: one of `OUTCOMES`, and why."""
-    said = io.StringIO()
+    """Return the outcome of reading the file as it is now, one of `OUTCOMES`, and its reason."""
+    printed = io.StringIO()
     try:
         with (
             warnings.catch_warnings(),
-            contextlib.redirect_stdout(said),
+            contextlib.redirect_stdout(printed),
             limited(LONGEST * (3 if form.share < 3 else 1)),
         ):
-            warnings.simplefilter("error")  # a user would see it instead of a sentence
+            warnings.simplefilter("error")  # users must get a sentence instead of a warning
             found = form.read()
         fault = form.fault(found)
     except InputError as error:
@@ -905,7 +907,13 @@ def judge(form: Format) -> tuple[str, str]:
 def campaign(
     files: int, seed: int, *, only: str = "", keep: Path | None = None
 ) -> tuple[dict[str, dict[str, int]], list[str]]:
-    """Damage about so many files; returns counts of outcomes by format, and what went wrong."""
+    """Damage about `files` files. Return counts of the outcomes by format, and descriptions of wrong outcomes.
+
+    **Arguments**
+
+    - `only`: only formats whose name contains this text.
+    - `keep`: folder for copies of the files with wrong outcomes.
+    """
     table: dict[str, dict[str, int]] = {}
     wrong: list[str] = []
     with tempfile.TemporaryDirectory() as work:
@@ -918,7 +926,7 @@ def campaign(
                 valid = form.file.read_bytes()
                 outcome, why = judge(form)
                 if outcome != "accepted":
-                    raise AssertionError(f"the valid {form.name} is {outcome}: {why}")
+                    raise AssertionError(f"the valid example of {form.name} is {outcome}: {why}")
                 for number in range(count):
                     random = np.random.default_rng([seed, sum(form.name.encode()), number])
                     damage = form.damages[int(random.integers(len(form.damages)))]
@@ -936,7 +944,7 @@ def campaign(
 
 
 def markdown(table: Mapping[str, Mapping[str, int]]) -> str:
-    """The counts, and their sums."""
+    """Return a Markdown table of the counts and their sums."""
     lines = ["| format | files | " + " | ".join(OUTCOMES) + " |", "| --- |" + " ---: |" * (1 + len(OUTCOMES))]
     total = {outcome: sum(row[outcome] for row in table.values()) for outcome in OUTCOMES}
     for name, row in [*table.items(), ("all", total)]:
@@ -946,10 +954,10 @@ def markdown(table: Mapping[str, Mapping[str, int]]) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--files", type=int, default=10_000, help="how many, all formats together")
-    parser.add_argument("--seed", type=int, default=0, help="of the damage")
-    parser.add_argument("--only", default="", help="formats whose name holds this")
-    parser.add_argument("--keep", type=Path, help="folder for the files that a reader is wrong about")
+    parser.add_argument("--files", type=int, default=10_000, help="number of damaged files, over all formats")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the damage")
+    parser.add_argument("--only", default="", help="test only formats whose name contains this text")
+    parser.add_argument("--keep", type=Path, help="folder for copies of the files with wrong outcomes")
     options = parser.parse_args()
     runtime.prepare()
     table, wrong = campaign(options.files, options.seed, only=options.only, keep=options.keep)

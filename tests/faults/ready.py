@@ -1,4 +1,4 @@
-"""What the trainings of a campaign need, imported once for all of them before they are forked off."""
+"""Imports of a campaign's trainings, made once before their processes are forked."""
 
 from ballu_mjx.common import runtime
 

@@ -1,8 +1,8 @@
-"""Whether two trainings with the same options ended in the same numbers, to the bit.
+"""Check that the results of two trainings with the same options are equal to the bit.
 
     python tests/faults/repeated.py RUN RUN
 
-Compared are all measurements but the timings, the whole last state of the learning, and the evaluation.
+The script compares all measurements except timings, the whole last training state, and the evaluation.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ballu_mjx.common import runtime
 
 
 def differences(first: Path, second: Path) -> list[str]:
-    """What two runs differ in, in words."""
+    """Return descriptions of the differences between two runs."""
     from campaign import outcome
 
     (rows, state), (other_rows, other_state) = outcome(first), outcome(second)
@@ -36,7 +36,7 @@ def main() -> int:
     first, second = map(Path, sys.argv[1:])
     runtime.prepare()
     found = differences(first, second)
-    print("They differ in " + ", ".join(found) if found else "The same, to the bit.")
+    print("The runs differ in " + ", ".join(found) if found else "The runs are equal to the bit.")
     return int(bool(found))
 
 

@@ -1,11 +1,10 @@
-"""Run the main job for long, and look whether it grows: memory, file handles, memory maps, compiled programs.
+"""Run the main job for a long time, and check for leaks of memory, file handles, memory maps and compiled programs.
 
     python tests/faults/soak.py --minutes 60
 
-The training is that of `python -m ballu_mjx.train envmimic` on the bundled recordings, as long as it takes, with a
-validation and a checkpoint about every minute. A line is fitted to the samples after the warm-up (Theil-Sen: half of
-them may lie anywhere); what it rises by, in percent of where it starts, must be 2 % at most, and half a one of what is
-counted.
+The training is that of `python -m ballu_mjx.train envmimic` on the bundled recordings, with a validation and a
+checkpoint about every minute. A line is fitted to the samples after the warm-up by the Theil-Sen estimator, which
+tolerates outliers. Its rise must be at most 2 % of its initial value. For counts, a rise of less than 0.5 also passes.
 """
 
 from __future__ import annotations
@@ -25,15 +24,15 @@ from scipy import stats
 from ballu_mjx.common import runtime
 
 MOST = 2.0
-"""Percent."""
+"""Largest accepted drift (percent)."""
 INTERVAL = 10.0
-"""Seconds between two samples."""
+"""Time between two samples (s)."""
 COUNTED = ("file handles", "compiled programs")
-"""Of these one more is a leak if it goes on; a slope of less than half a one is none."""
+"""Quantities that are counts. A fitted rise of less than 0.5 over all samples is not a leak."""
 
 
 def sample() -> dict[str, float]:
-    """What this process holds now."""
+    """Return the resources that this process holds now."""
     import jax
 
     status = Path("/proc/self/statm").read_text().split()
@@ -46,8 +45,10 @@ def sample() -> dict[str, float]:
 
 
 class Sampler(threading.Thread):
-    """Samples from when training has taken its first steps; after so many seconds more it ends the training, as Ctrl-C
-    does."""
+    """Thread that samples the process's resources, and then ends the training as Ctrl-C does.
+
+    Sampling begins `warm_up` seconds after the first training steps, and lasts `seconds`.
+    """
 
     def __init__(self, metrics: Path, warm_up: float, seconds: float) -> None:
         super().__init__(daemon=True)
@@ -68,14 +69,14 @@ class Sampler(threading.Thread):
 
 
 def drift(times: list[float], values: list[float]) -> tuple[float, float]:
-    """Slope (an hour) and drift over all samples (percent of the fitted line's start)."""
+    """Return the slope (per hour) and the drift over all samples (percent of the fitted line's initial value)."""
     fitted: Any = stats.theilslopes(values, times)
     slope, intercept = float(fitted[0]), float(fitted[1])
     return 3600.0 * slope, 100.0 * slope * (times[-1] - times[0]) / (intercept + slope * times[0])
 
 
 def table(times: list[float], samples: list[dict[str, float]]) -> tuple[str, bool]:
-    """Markdown, and whether nothing grows."""
+    """Return a Markdown table, and whether no quantity grows."""
     lines = ["| | first | last | slope an hour | drift (%) |", "| --- | ---: | ---: | ---: | ---: |"]
     flat = True
     for name in samples[0]:
@@ -89,12 +90,14 @@ def table(times: list[float], samples: list[dict[str, float]]) -> tuple[str, boo
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=60.0, help="of sampling, after the warm-up")
-    parser.add_argument("--warm-up", type=float, default=120.0, help="seconds of training before the first sample")
+    parser.add_argument("--minutes", type=float, default=60.0, help="duration of sampling after the warm-up (minutes)")
+    parser.add_argument("--warm-up", type=float, default=120.0, help="duration of training before the first sample (s)")
     parser.add_argument(
-        "--rate", type=float, default=1e5, help="control steps a second, more than this machine ever does"
+        "--rate", type=float, default=1e5, help="upper limit of this machine's control steps per second"
     )
-    parser.add_argument("--quick", action="store_true", help="the sizes of `train envmimic --quick`, for a trial")
+    parser.add_argument(
+        "--quick", action="store_true", help="use the small sizes of `train envmimic --quick`, to try the script"
+    )
     options = parser.parse_args()
     if not Path("/proc/self/statm").exists():
         print("Memory is read from /proc, which only Linux has.", file=sys.stderr)
@@ -115,19 +118,19 @@ def main() -> int:
         sampler = Sampler(output / "metrics.jsonl", options.warm_up, 60 * options.minutes)
         sampler.start()
         data = train_envmimic.Data(output=output, quick=options.quick)
-        # Shells start what runs in the background with this signal ignored.
+        # Shells start background processes with this signal ignored.
         signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
             status = train_envmimic.train(data, EnvMimicConfig(), config)
         except TrainingInterrupted as stopped:
             status = stopped.status
     if len(sampler.samples) < 3:
-        print(f"The training ended before there was anything to see, with {status}.", file=sys.stderr)
+        print(f"The training ended before three samples were taken, with exit status {status}.", file=sys.stderr)
         return 1
     text, flat = table(sampler.times, sampler.samples)
     print(f"\n{len(sampler.samples)} samples over {sampler.times[-1] / 60:.1f} minutes\n\n{text}")
     if status != 128 + signal.SIGINT:
-        print(f"The training ended before its time, with {status}.", file=sys.stderr)
+        print(f"The training ended before the last sample, with exit status {status}.", file=sys.stderr)
         return 1
     return 0 if flat else 1
 

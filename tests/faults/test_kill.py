@@ -1,4 +1,4 @@
-"""What happens to a training that is killed or started twice, whose checkpoint is damaged, whose disk is full?"""
+"""Tests of trainings that are killed or started twice, that have damaged checkpoints, or whose disk is full."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ def undisturbed(at: Trainer) -> Path:
     return at.work / "undisturbed"
 
 
-def test_a_killed_training_ends_as_if_nothing_had_happened(at: Trainer, undisturbed: Path):
+def test_killed_and_resumed_training_equals_an_undisturbed_one(at: Trainer, undisturbed: Path):
     random = np.random.default_rng(0)
     moments = [(int(random.integers(first, 20)), random.uniform(0.0, 0.2)) for first in (campaign.EVERY + 1, 1, 1)]
-    for attempt in range(10):  # a busy machine may let a training end before it is killed: then anew
+    for attempt in range(10):  # on a busy machine a training may end before it is killed
         folder = at.work / f"often-{attempt}"
         if all([at.kill(folder, *moment) for moment in moments]):
             break
     else:
-        pytest.fail("ten trainings were over before they were killed")
+        pytest.fail("ten trainings ended before they were killed")
     at.finish(folder)
     rows, _ = campaign.outcome(folder)
     steps = [row["step"] for row in rows if "total_loss" in row]
@@ -47,15 +47,15 @@ def test_a_killed_training_ends_as_if_nothing_had_happened(at: Trainer, undistur
     assert campaign.same(folder, undisturbed), moments
 
 
-def test_the_same_training_again_gives_the_same_numbers_to_the_bit(at: Trainer, undisturbed: Path):
+def test_repeated_training_is_equal_to_the_bit(at: Trainer, undisturbed: Path):
     at.finish(at.work / "again")
     assert campaign.same(at.work / "again", undisturbed)
     rows, _ = campaign.outcome(undisturbed)
     losses = [row["total_loss"] for row in rows if "total_loss" in row]
-    assert len(set(losses)) == len(losses) == campaign.STEPS, "nothing was learned that could differ"
+    assert len(set(losses)) == len(losses) == campaign.STEPS, "every training step must have another loss"
 
 
-def test_a_second_process_is_refused_until_the_first_is_killed(at: Trainer):
+def test_second_process_is_refused_until_the_first_has_ended(at: Trainer):
     folder = at.work / "twice"
     process = at.start(folder)
     while process.is_alive() and not read_metrics(folder):
@@ -71,10 +71,11 @@ def test_a_second_process_is_refused_until_the_first_is_killed(at: Trainer):
         pass
 
 
-def test_no_damage_to_the_last_checkpoint_passes_for_its_content(undisturbed: Path, tmp_path: Path, capsys):
-    """Every file of it, cut off or with a bit turned: what is read is what was written, or the checkpoint before."""
+def test_damaged_last_checkpoint_is_detected(undisturbed: Path, tmp_path: Path, capsys):
+    """Each file of it in turn is truncated, or one of its bits is flipped. The reader returns the checkpoint as it was
+    written, or the one before it."""
     last, before = (_read(undisturbed, step, training=True) for step in reversed(list_checkpoints(undisturbed)[-2:]))
-    random, fallen = np.random.default_rng(0), 0
+    random, detected = np.random.default_rng(0), 0
     for file in campaign.checkpoint_files(undisturbed):
         folder = tmp_path / "copy"
         shutil.copytree(undisturbed / "checkpoints", folder / "checkpoints")
@@ -84,23 +85,25 @@ def test_no_damage_to_the_last_checkpoint_passes_for_its_content(undisturbed: Pa
         message = f"{file.name} {what}"
         for name, value in dataclasses.asdict(expected).items():
             np.testing.assert_equal(getattr(found, name), value, err_msg=message)
-        said = capsys.readouterr().err
-        fallen += found.step == before.step
-        assert said.count("\n") == said.count("is damaged; taking the one before") == (found.step == before.step), (
-            message
-        )
+        message_text = capsys.readouterr().err
+        detected += found.step == before.step
+        assert (
+            message_text.count("\n")
+            == message_text.count("is damaged; taking the one before")
+            == (found.step == before.step)
+        ), message
         shutil.rmtree(folder)
-    assert fallen > 10
+    assert detected > 10
 
 
-def test_training_goes_on_from_the_checkpoint_before_a_damaged_one(at: Trainer, undisturbed: Path):
+def test_training_resumes_from_the_checkpoint_before_a_damaged_one(at: Trainer, undisturbed: Path):
     folder = at.work / "damaged"
     shutil.copytree(undisturbed, folder)
     last = list_checkpoints(folder)[-1]
     (score,) = (
         path for path in (folder / "checkpoints" / str(last) / "metrics").iterdir() if "score" in path.read_text()
     )
-    score.write_text("{")  # over which orbax alone would stumble
+    score.write_text("{")  # Orbax itself would fail to read this file
     at.finish(folder)
     assert campaign.same(folder, undisturbed)
     assert (
@@ -108,19 +111,19 @@ def test_training_goes_on_from_the_checkpoint_before_a_damaged_one(at: Trainer, 
     )
 
 
-def test_checkpoints_that_were_exchanged_are_not_taken(undisturbed: Path, tmp_path: Path, capsys):
-    """Whole ones: every file of them is as it was written."""
+def test_exchanged_checkpoints_are_not_restored(undisturbed: Path, tmp_path: Path, capsys):
+    """The folders of the checkpoints are exchanged, but none of their files is changed."""
     shutil.copytree(undisturbed / "checkpoints", tmp_path / "checkpoints")
     steps = list_checkpoints(tmp_path)
     one, other, aside = (tmp_path / "checkpoints" / name for name in (str(steps[-1]), str(steps[-2]), "aside"))
     for old, new in ((one, aside), (other, one), (aside, other)):
         old.rename(new)
     assert last_checkpoint(tmp_path).step == steps[-3]
-    said = capsys.readouterr().err
-    assert f"the checkpoint is that of step {steps[-2]}" in said and said.count("\n") == 2
+    message_text = capsys.readouterr().err
+    assert f"the checkpoint is that of step {steps[-2]}" in message_text and message_text.count("\n") == 2
 
 
-def test_a_full_disk_ends_training_in_a_sentence_and_loses_nothing(at: Trainer, undisturbed: Path):
+def test_full_disk_ends_training_with_a_message_and_loses_nothing(at: Trainer, undisturbed: Path):
     with campaign.small_disk(at.work, campaign.DISK) as disk:
         if disk is None:
             pytest.skip("this process may not mount a small disk")
@@ -129,7 +132,7 @@ def test_a_full_disk_ends_training_in_a_sentence_and_loses_nothing(at: Trainer, 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
 @pytest.mark.parametrize(("saved", "then"), [(True, "the checkpoint of step 80 is intact"), (False, "start again")])
-def test_measurements_that_cannot_be_written_end_a_run_in_a_sentence(tmp_path: Path, saved: bool, then: str):
+def test_run_ends_with_a_message_if_measurements_cannot_be_written(tmp_path: Path, saved: bool, then: str):
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "metrics.jsonl").symlink_to("/dev/full")
@@ -138,11 +141,11 @@ def test_measurements_that_cannot_be_written_end_a_run_in_a_sentence(tmp_path: P
         if saved:
             run.save(80, {"w": np.zeros(3)}, None)
         run.log(160, {"reward": 1.0})
-    said = str(error.value)
-    assert said.startswith(f"{folder}: its disk is full; make room there, then ") and then in said
+    message_text = str(error.value)
+    assert message_text.startswith(f"{folder}: its disk is full; make room there, then ") and then in message_text
 
 
-def test_when_every_checkpoint_is_damaged_one_sentence_says_so(undisturbed: Path, tmp_path: Path):
+def test_message_says_that_every_checkpoint_is_damaged(undisturbed: Path, tmp_path: Path):
     shutil.copytree(undisturbed / "checkpoints", tmp_path / "checkpoints")
     for record in (tmp_path / "checkpoints").glob("*/record.json"):
         record.write_text("{")

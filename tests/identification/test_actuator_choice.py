@@ -1,4 +1,4 @@
-"""Which of nominal and identified actuators is taken, and what the user is told."""
+"""The choice between nominal and identified actuators, and its report."""
 
 import dataclasses
 
@@ -28,7 +28,7 @@ def motions(robot: RobotDescription) -> list[Motion]:
     return found
 
 
-def test_what_replays_better_is_taken(robot: RobotDescription, motions: list[Motion]):
+def test_actuators_that_replay_better_are_chosen(robot: RobotDescription, motions: list[Motion]):
     truth = identified(robot, **TRUTH)
     choice = choose_actuators(robot, truth, motions)
     assert choice.improves and choice.actuators is truth and choice.ratio < 0.1
@@ -38,25 +38,25 @@ def test_what_replays_better_is_taken(robot: RobotDescription, motions: list[Mot
         ("far", 1.0, 5),
         ("far", 5.0, 1),
     ]
-    # From its own states, the true arm's motion comes back, but for the drivetrain's unknown state at later starts.
+    # With the true actuators only the drivetrain's unknown state at later starts leaves an error.
     assert choice.rows[2].identified.joints < 0.01 * choice.rows[2].nominal.joints
     assert "better than nominal" in choice.table() and "WORSE" not in choice.table()
 
 
-def test_identification_that_makes_it_worse_is_named_and_left(robot: RobotDescription, motions: list[Motion]):
+def test_actuators_that_replay_worse_are_reported_and_not_chosen(robot: RobotDescription, motions: list[Motion]):
     choice = choose_actuators(robot, identified(robot, shoulder_scale=1.4, mass=0.08), motions)
     assert not choice.improves and choice.actuators is None and choice.ratio > 1.2
     assert any(text.startswith("joint angles of near recordings over 1 s") for text in choice.worse)
     assert "WORSE than nominal" in choice.table()
 
 
-def test_more_divergence_is_never_better(robot: RobotDescription, motions: list[Motion]):
+def test_actuators_with_more_diverged_replays_are_not_chosen(robot: RobotDescription, motions: list[Motion]):
     choice = choose_actuators(robot, identified(robot, **TRUTH), motions)
-    lost = [row._replace(identified=row.identified._replace(diverged=1)) for row in choice.rows]
-    assert not dataclasses.replace(choice, rows=tuple(lost)).improves
+    diverged = [row._replace(identified=row.identified._replace(diverged=1)) for row in choice.rows]
+    assert not dataclasses.replace(choice, rows=tuple(diverged)).improves
 
 
-def test_recordings_that_are_too_short_are_refused(robot: RobotDescription, motions: list[Motion]):
+def test_choice_refuses_recordings_that_are_too_short(robot: RobotDescription, motions: list[Motion]):
     motion = motions[0]
     short = dataclasses.replace(motion, command=motion.command[:10], qpos=motion.qpos[:11], qvel=motion.qvel[:11])
     with pytest.raises(InputError, match=r"near-1: no validation recording lasts 1 s"):

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt within bounds."""
+"""The Levenberg-Marquardt solver with bounds."""
 
 import numpy as np
 
@@ -6,10 +6,10 @@ from ballu_mjx.identification.bounded_solver import bounded_least_squares
 
 
 def silent(step: int, steps: int, loss: float) -> None:
-    """No report."""
+    """Ignore the progress of a search."""
 
 
-def test_a_curved_valley_is_followed_to_its_end():
+def test_solver_finds_the_minimum_of_a_curved_valley():
     goal = np.array([0.7, 0.49])
 
     def valley(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -21,13 +21,14 @@ def test_a_curved_valley_is_followed_to_its_end():
     assert loss < 1e-9
 
 
-def test_a_value_leaves_the_bound_that_it_was_sent_to():
-    """A first step to a bound must not end there; logistic coordinates have no slope left at it."""
+def test_solver_leaves_a_bound_that_an_early_step_reached():
+    """A search whose first step ends on a bound still finds the minimum in the interior. In logistic coordinates, it
+    would stay at the bound, where their derivative is 0."""
     seen: list[np.ndarray] = []
 
     def bent(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         seen.append(x)
-        # The slope at the start is a tenth of that farther on: the first step goes ten times too far, to 0.
+        # The derivative at the start is a tenth of that farther on, so the first step is ten times too long.
         return np.array([np.tanh(8 * (x[0] - 0.4))]), np.array([[8 / np.cosh(8 * (x[0] - 0.4)) ** 2]])
 
     found, _ = bounded_least_squares(bent, np.array([0.65]), 40, silent, 10)
@@ -35,7 +36,7 @@ def test_a_value_leaves_the_bound_that_it_was_sent_to():
     np.testing.assert_allclose(found, 0.4, atol=1e-5)
 
 
-def test_where_the_least_lies_beyond_a_bound_the_rest_is_least_along_it():
+def test_solver_minimizes_along_a_bound_that_excludes_the_minimum():
     matrix, goal = np.array([[2.0, 1.0], [1.0, 3.0]]), np.array([1.5, 0.3])
     found, _ = bounded_least_squares(lambda x: (matrix @ (x - goal), matrix), np.array([0.5, 0.5]), 20, silent, 5)
     along = np.linspace(0, 1, 100_001)

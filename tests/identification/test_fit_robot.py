@@ -1,5 +1,5 @@
-"""Known parameters of a servo arm, simulated by C MuJoCo with noise, are found again; and what the data cannot show is
-said."""
+"""Fits of declared parameters to recordings of a servo arm from C MuJoCo, with noise and known parameters. The fit
+recovers the parameters and reports those that the data do not identify."""
 
 import dataclasses
 import json
@@ -58,7 +58,7 @@ def robot(folder: Path) -> tuple[RobotDescription, ParameterSet, mujoco.MjModel]
 
 
 def record(folder: Path, name: str, seed: int, seconds: float = 6.0) -> Path:
-    """A recording of the true arm at 100 Hz, by C MuJoCo at the model's time step."""
+    """Record the true arm at 100 Hz, simulated by C MuJoCo at the model's time step."""
     spec = mujoco.MjSpec.from_string(MODEL)
     spec.joint("elbow").damping[0] = TRUTH["elbow_damping"]
     spec.joint("elbow").frictionloss = TRUTH["elbow_frictionloss"]
@@ -120,15 +120,15 @@ def test_known_parameters_are_found_within_two_standard_errors(fit: RobotFit):
             assert error < 0.1 * TRUTH[name], (name, value, error)
 
 
-def test_held_out_windows_say_that_it_helps(fit: RobotFit):
+def test_identified_parameters_improve_held_out_windows(fit: RobotFit):
     assert fit.improves
     assert fit.identified.score < 0.2 * fit.nominal.score
     np.testing.assert_allclose(fit.best.values, fit.values)
-    # What is left is the noise of the angles.
+    # Only the noise of the angles remains.
     np.testing.assert_allclose(fit.scatter[0], 1.0, atol=0.15)
 
 
-def test_held_out_errors_far_above_the_noise_are_doubted(fit: RobotFit, tmp_path: Path):
+def test_report_warns_of_held_out_errors_far_above_the_noise(fit: RobotFit, tmp_path: Path):
     doubt, model = "the model may lack a force", robot(tmp_path)[2]
     assert doubt not in fit_table(fit, model, 1.0, "validation recordings")
     lacking = dataclasses.replace(fit, identified=fit.nominal)
@@ -136,22 +136,22 @@ def test_held_out_errors_far_above_the_noise_are_doubted(fit: RobotFit, tmp_path
     assert doubt in fit_table(lacking, model, 1.0, "validation recordings")
 
 
-def test_worse_than_nominal_is_said_and_not_taken(fit: RobotFit):
+def test_identified_parameters_worse_than_nominal_are_not_chosen(fit: RobotFit):
     swapped = dataclasses.replace(fit, nominal=fit.identified, identified=fit.nominal)
     assert not swapped.improves
     np.testing.assert_allclose(swapped.best.values, fit.parameters.nominal)
 
 
-def test_the_data_check_names_a_limit_that_no_recording_reaches(parameters: ParameterSet, fit: RobotFit):
+def test_fit_names_a_torque_limit_that_no_recording_reaches(parameters: ParameterSet, fit: RobotFit):
     assert fit.unseen == ("servo_forcerange",)
     assert len(fit.unidentified) == 1 and fit.unidentified[0] == "+1.00 servo_forcerange"
-    # It stays where it is believed to be, with the error of that belief.
+    # The parameter keeps the mean of its prior, with the prior's standard deviation.
     place = parameters.names.index("servo_forcerange")
     np.testing.assert_allclose(fit.values[place], 20.0, rtol=0.02)
     np.testing.assert_allclose(fit.standard_errors[place], 5.0, rtol=0.02)
 
 
-def test_derivatives_are_those_of_differences(motions: list[MeasuredMotion], parameters: ParameterSet):
+def test_derivatives_agree_with_finite_differences(motions: list[MeasuredMotion], parameters: ParameterSet):
     values = np.array([0.12, 0.08, 3.2, 0.36, 0.0333, 20.0])
     with jax.enable_x64(True):
         simulator = WindowSimulator(parameters, motions[:2], cut_windows(motions[:2], CONFIG.window_seconds))
@@ -161,22 +161,24 @@ def test_derivatives_are_those_of_differences(motions: list[MeasuredMotion], par
         for place in range(len(values) - 1):
             step = 1e-5 * values * np.eye(len(values))[place]
             change = simulator.differences(values + step, start) - simulator.differences(values - step, start)
-            slope, true = found.by_parameters[..., place], change / (2 * step[place])
-            # Where a joint sticks or slips at another step, neither says much; nearly nowhere.
-            off = np.abs(slope - true) > 0.01 * np.abs(true).max()
+            derivative, true = found.by_parameters[..., place], change / (2 * step[place])
+            # Finite differences are wrong where a joint begins to stick or slip at another step, which is rare.
+            off = np.abs(derivative - true) > 0.01 * np.abs(true).max()
             assert off.mean() < 0.02, (place, off.mean())
         step = np.array([1e-4, 0.0])
         change = simulator.differences(values, start + step) - simulator.differences(values, start - step)
         np.testing.assert_allclose(found.by_start[..., 0], change / 2e-4, atol=0.02)
 
 
-def test_with_states_as_measured_the_best_point_tried_is_found(motions: list[MeasuredMotion], parameters: ParameterSet):
+def test_fit_with_fixed_starting_states_returns_the_best_point_tried(
+    motions: list[MeasuredMotion], parameters: ParameterSet
+):
     tried: list[np.ndarray] = []
     config = FitConfig(window_seconds=1.0, starts=1, start_spread=0.0, reweigh=False)
     fit = fit_robot(parameters, motions[:2], motions[2:], config, on_evaluation=tried.append)
     with jax.enable_x64(True):
         simulator = WindowSimulator(parameters, motions[:2], cut_windows(motions[:2], 1.0))
-        # Positions count by the measurements' noise alone, and starting states do not move.
+        # Position errors are divided by the measurement noise alone, and starting states are fixed.
         losses = [
             np.sum(soften(simulator.differences(values)[..., : simulator.nv], config.outlying)[0] ** 2)
             + np.sum(((values - parameters.nominal) / parameters.prior) ** 2)
@@ -190,7 +192,9 @@ def test_with_states_as_measured_the_best_point_tried_is_found(motions: list[Mea
     np.testing.assert_allclose(held.by_parameters, free.by_parameters, atol=1e-9)
 
 
-def test_a_motion_of_another_load_is_simulated_with_its_own(motions: list[MeasuredMotion], parameters: ParameterSet):
+def test_a_motion_with_its_own_model_is_simulated_with_that_model(
+    motions: list[MeasuredMotion], parameters: ParameterSet
+):
     spec = mujoco.MjSpec.from_string(MODEL)
     spec.body("arm").mass = 0.9
     loaded = dataclasses.replace(motions[1], model=spec.compile())
@@ -202,13 +206,13 @@ def test_a_motion_of_another_load_is_simulated_with_its_own(motions: list[Measur
 
 def test_softening_keeps_small_differences_and_flattens_large_ones():
     values = np.array([-100.0, -0.1, 0.0, 0.1, 100.0])
-    soft, slopes = soften(values, 3.0)
+    soft, derivatives = soften(values, 3.0)
     np.testing.assert_allclose(soft**2, 2 * 9 * (np.sqrt(1 + values**2 / 9) - 1), atol=1e-12)
     change = (soften(values + 1e-6, 3.0)[0] - soften(values - 1e-6, 3.0)[0]) / 2e-6
-    np.testing.assert_allclose(slopes, change, atol=1e-6)
+    np.testing.assert_allclose(derivatives, change, atol=1e-6)
 
 
-def test_what_cannot_be_fitted_is_refused(motions: list[MeasuredMotion], parameters: ParameterSet, tmp_path: Path):
+def test_fit_refuses_unsuitable_input(motions: list[MeasuredMotion], parameters: ParameterSet, tmp_path: Path):
     with pytest.raises(InputError, match="No recording lasts 60 s"):
         fit_robot(parameters, motions, None, FitConfig(window_seconds=60.0))
     with pytest.raises(InputError, match="--starts is 0"):
@@ -221,15 +225,16 @@ def test_what_cannot_be_fitted_is_refused(motions: list[MeasuredMotion], paramet
         measure(read_recording(path, description), description, model)
 
 
-def test_standard_errors_are_what_leaving_out_windows_changes():
-    """Of a linear model without priors, whose windows each have an error of their own: refitted without each."""
+def test_robust_standard_errors_agree_with_the_jackknife_over_windows():
+    """The model is linear and has no priors, and each window has its own constant error. The expected standard errors come
+    from fits that leave out one window at a time (jackknife)."""
     rng = np.random.default_rng(0)
     windows, rows = 7, 5
-    slopes = rng.normal(size=(windows, rows, 2))
-    measured = slopes @ [1.0, -2.0] + rng.normal(size=(windows, 1)) + 0.1 * rng.normal(size=(windows, rows))
+    jacobian = rng.normal(size=(windows, rows, 2))
+    measured = jacobian @ [1.0, -2.0] + rng.normal(size=(windows, 1)) + 0.1 * rng.normal(size=(windows, rows))
 
     def solved(kept: np.ndarray) -> np.ndarray:
-        return np.linalg.lstsq(slopes[kept].reshape(-1, 2), measured[kept].ravel(), rcond=None)[0]
+        return np.linalg.lstsq(jacobian[kept].reshape(-1, 2), measured[kept].ravel(), rcond=None)[0]
 
     every = np.ones(windows, bool)
     best = solved(every)
@@ -237,7 +242,7 @@ def test_standard_errors_are_what_leaving_out_windows_changes():
     names, bounds = ("one", "other"), (-100.0, 100.0)
     parameters = ParameterSet([Parameter(name, "1", 0.0, bounds, np.inf, False, ()) for name in names], 0)
     none = np.zeros((windows, 0))
-    reduced = ReducedResiduals(slopes @ best - measured, slopes, none, np.zeros((windows, 0, 2)))
+    reduced = ReducedResiduals(jacobian @ best - measured, jacobian, none, np.zeros((windows, 0, 2)))
     found = analyse(reduced, parameters)
     expected = np.sqrt((windows - 1) / windows * np.sum(changes**2, axis=0))
     np.testing.assert_allclose(found.robust, expected, rtol=1e-3)

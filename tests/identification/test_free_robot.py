@@ -1,4 +1,4 @@
-"""Robots with a free joint, from reconstructed motions."""
+"""Simulation of windows of reconstructed motions, for robots with a free joint."""
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ MODEL = """
 
 
 def floating(seconds: float = 2.0) -> tuple[mujoco.MjModel, Motion]:
-    """A tumbling base with a driven arm, by C MuJoCo, at 20 Hz."""
+    """Simulate a tumbling base with a driven arm in C MuJoCo, and sample its states at 20 Hz."""
     model = mujoco.MjModel.from_xml_string(MODEL)
     data, rng, states = mujoco.MjData(model), np.random.default_rng(0), []
     data.qvel[:] = [0.1, 0.2, 0, 1.0, 2.0, -1.5, 0]
@@ -45,7 +45,7 @@ def floating(seconds: float = 2.0) -> tuple[mujoco.MjModel, Motion]:
     return model, Motion("floating", np.arange(len(qpos)) * 0.05, commands, qpos, qvel, {})
 
 
-def test_a_floating_robot_is_simulated_as_recorded_and_its_base_may_start_elsewhere():
+def test_windows_follow_the_recording_and_their_starting_states_may_be_moved():
     model, motion = floating()
     damping = Parameter("damping", "", 0.05, (0.0, 1.0), 0.1, False, (FieldTarget("dof_damping", (6,), 1.0),))
     measured = [measured_from_motion(motion, model)]
@@ -53,33 +53,33 @@ def test_a_floating_robot_is_simulated_as_recorded_and_its_base_may_start_elsewh
         simulator = WindowSimulator(ParameterSet([damping], 1), measured, cut_windows(measured, 0.5))
         assert simulator.count == 4
         true = np.array([0.05])
-        # In units of noise: half a millimetre, a third of a degree.
+        # Differences are in units of the noise: half a millimetre and a third of a degree.
         assert np.abs(simulator.differences(true)).max() < 1e-3
         assert np.abs(simulator.differences(2 * true)).max() > 1
         start = np.zeros((4, 14))
         start[:, [1, 4, 6, 9, 12]] = [1.0, 2.0, -1.0, 0.5, 0.3]
         moved = simulator.differences(true, start)
-        np.testing.assert_allclose(moved[:, 0], start, atol=1e-3)  # that much, in units of noise
+        np.testing.assert_allclose(moved[:, 0], start, atol=1e-3)  # in units of the noise
 
 
-def test_a_turn_there_and_back_is_none():
+def test_difference_of_positions_inverts_a_change_of_position():
     model, motion = floating(0.5)
     with jax.enable_x64(True):
         measured = [measured_from_motion(motion, model)]
         simulator = WindowSimulator(ParameterSet([], 1), measured, cut_windows(measured, 0.5))
         change = jnp.array([0.1, -0.2, 0.3, 0.01, -0.02, 0.03, 0.2])
-        there = simulator._moved(jnp.asarray(motion.qpos[3]), change)
-        np.testing.assert_allclose(simulator._difference(there, jnp.asarray(motion.qpos[3])), change, atol=1e-5)
-        np.testing.assert_allclose(np.linalg.norm(there[3:7]), 1)
-        opposite = there.at[3:7].multiply(-1)
+        moved = simulator._moved(jnp.asarray(motion.qpos[3]), change)
+        np.testing.assert_allclose(simulator._difference(moved, jnp.asarray(motion.qpos[3])), change, atol=1e-5)
+        np.testing.assert_allclose(np.linalg.norm(moved[3:7]), 1)
+        opposite = moved.at[3:7].multiply(-1)
         np.testing.assert_allclose(simulator._difference(opposite, jnp.asarray(motion.qpos[3])), change, atol=1e-5)
 
 
-def test_a_robot_whose_drivetrain_is_not_identified_gets_the_recorded_commands():
+def test_a_robot_without_an_identified_drivetrain_gets_the_recorded_commands():
     model, motion = floating(0.5)
     with jax.enable_x64(True):
         measured = [measured_from_motion(motion, model)]
         simulator = WindowSimulator(ParameterSet([], 1), measured, cut_windows(measured, 0.25))
-        ctrl, slopes = map(np.asarray, simulator._ctrl_slopes(jnp.zeros(0)))
+        ctrl, jacobian = map(np.asarray, simulator._ctrl_slopes(jnp.zeros(0)))
         np.testing.assert_allclose(simulator._of_windows(ctrl).ravel(), np.repeat(motion.command[:, 0], 5))
-        assert simulator._of_windows(slopes).shape == (2, 25, 0)
+        assert simulator._of_windows(jacobian).shape == (2, 25, 0)

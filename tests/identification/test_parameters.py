@@ -1,4 +1,4 @@
-"""Declared parameters: what they set, their coordinates, and what is refused."""
+"""Declared parameters: the model fields that they set, their coordinates, and errors in declarations."""
 
 import copy
 from pathlib import Path
@@ -76,14 +76,14 @@ def test_nominal_values_change_nothing(tmp_path: Path):
             np.testing.assert_allclose(getattr(same, name), getattr(model, name), rtol=1e-12, atol=1e-8)
     np.testing.assert_allclose(
         np.sort(fields["body_inertia"]), np.sort(model.body_inertia), rtol=1e-5
-    )  # axes may change their order, and orientation with them
+    )  # the order of the principal axes may change, and the orientation with it
     drivetrain = parameters.drivetrain(parameters.nominal)
     for own, same in zip(drivetrain, identity_drivetrain(2), strict=True):
-        ours = jnp.minimum(own, 2 / model.opt.timestep)  # so fast a rate limit holds nothing back
+        ours = jnp.minimum(own, 2 / model.opt.timestep)  # a rate limit this high has no effect
         np.testing.assert_allclose(ours, jnp.minimum(same, 2 / model.opt.timestep))
 
 
-def test_ties_set_all_their_targets(tmp_path: Path):
+def test_tied_parameters_set_all_their_targets(tmp_path: Path):
     parameters, model = arm(
         tmp_path,
         {"joint": ["left", "right"], "field": "damping"},
@@ -107,7 +107,7 @@ def test_ties_set_all_their_targets(tmp_path: Path):
     np.testing.assert_allclose(fields["jnt_stiffness"], [4.0, 6.0], rtol=1e-6)
 
 
-def test_shares_run_from_bound_to_bound(tmp_path: Path):
+def test_shares_0_and_1_are_the_bounds_of_a_parameter(tmp_path: Path):
     parameters, _ = arm(tmp_path, *EVERYTHING)
     for share, bound in ((0.0, parameters.lower), (1.0, parameters.upper)):
         np.testing.assert_allclose(parameters.at_shares(np.full(len(parameters), share)), bound, atol=1e-12)
@@ -117,7 +117,7 @@ def test_shares_run_from_bound_to_bound(tmp_path: Path):
     change = (parameters.at_shares(shares + 1e-6) - parameters.at_shares(shares - 1e-6)) / 2e-6
     np.testing.assert_allclose([parameters.with_respect_to_shares(each) for each in values], change, rtol=1e-6)
     assert (values > parameters.lower).all() and (values < parameters.upper).all()
-    # The first is nominal, but for what would begin on a bound.
+    # The first draw is nominal, except for parameters whose nominal value is a bound.
     inside = (parameters.nominal > parameters.lower) & (parameters.nominal < parameters.upper)
     np.testing.assert_allclose(values[0, inside], parameters.nominal[inside], rtol=1e-9)
     assert parameters.at_bounds(np.where(np.arange(len(parameters)) == 2, parameters.upper, values[1])) == (
@@ -125,7 +125,7 @@ def test_shares_run_from_bound_to_bound(tmp_path: Path):
     )
 
 
-def test_any_deformation_is_of_a_rigid_body_and_none_is_the_identity():
+def test_every_deformation_of_a_body_is_a_valid_rigid_body():
     mass, ipos, inertia = 0.4, np.array([0.1, 0.2, 0.3]), np.array([2e-3, 2e-3, 5e-4])
     iquat = np.array([0.5, -0.5, 0.5, 0.5])
     rng = np.random.default_rng(0)
@@ -135,13 +135,13 @@ def test_any_deformation_is_of_a_rigid_body_and_none_is_the_identity():
             numbers = np.concatenate([numbers, rng.normal(size=3)])
             if draw == 0:
                 numbers = np.array([1.0, 0, 0, 0, 1, 1, 1, 0, 0, 0])
-            own_mass, centre, quaternion, own = map(
+            new_mass, centre, quaternion, own = map(
                 np.asarray, deform_body(*map(jnp.asarray, (mass, ipos, iquat, inertia, numbers)))
             )
-            assert own_mass > 0 and (own > 0).all()
+            assert new_mass > 0 and (own > 0).all()
             assert 2 * own.max() < own.sum()
             np.testing.assert_allclose(np.linalg.norm(quaternion), 1)
-            # The same, by sums over point masses of that distribution.
+            # Expected values: sums over six point masses with the same moments.
             axes, turned = np.zeros(9), np.zeros(9)
             mujoco.mju_quat2Mat(axes, iquat)
             mujoco.mju_quat2Mat(turned, quaternion)
@@ -156,8 +156,8 @@ def test_any_deformation_is_of_a_rigid_body_and_none_is_the_identity():
             np.testing.assert_allclose(centre, ipos + axes @ numbers[1:4])
 
 
-def test_derivatives_by_inertia_hold_where_principal_moments_are_equal():
-    """A rod's two moments are equal, and its axes then have no derivative of their own."""
+def test_derivatives_of_inertia_exist_for_equal_principal_moments():
+    """Two principal moments of a rod are equal, so its principal axes have no derivatives."""
     mass, ipos, inertia, iquat = 0.4, np.zeros(3), np.array([2e-3, 2e-3, 5e-4]), np.array([1.0, 0, 0, 0])
 
     def whole(numbers: jax.Array) -> jax.Array:
@@ -170,11 +170,11 @@ def test_derivatives_by_inertia_hold_where_principal_moments_are_equal():
 
     with jax.enable_x64(True):
         nominal = jnp.array([1.0, 0, 0, 0, 1, 1, 1, 0, 0, 0])
-        slopes = np.asarray(jax.jacfwd(whole)(nominal))
+        jacobian = np.asarray(jax.jacfwd(whole)(nominal))
         for place in range(len(BODY_QUANTITIES)):
             step = np.eye(10)[place] * 1e-4
             change = (whole(nominal + step) - whole(nominal - step)) / 2e-4
-            np.testing.assert_allclose(slopes[..., place], change, atol=2e-8)
+            np.testing.assert_allclose(jacobian[..., place], change, atol=2e-8)
 
 
 def test_identified_values_are_model_parameters(tmp_path: Path):
@@ -208,13 +208,13 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_faults_are_named_with_file_and_entry(tmp_path: Path, fault: str):
+def test_errors_in_declarations_name_file_and_entry(tmp_path: Path, fault: str):
     entry, message = FAULTS[fault]
     with pytest.raises(InputError, match=rf'arm\.robot\.json: "identify" .*{message}'):
         arm(tmp_path, entry)
 
 
-def test_what_is_identified_twice_or_not_at_all_is_refused(tmp_path: Path):
+def test_repeated_and_missing_declarations_are_refused(tmp_path: Path):
     damping = {"joint": "left", "field": "damping"}
     with pytest.raises(InputError, match="two parameters left_damping"):
         arm(tmp_path, damping, damping)
@@ -224,7 +224,7 @@ def test_what_is_identified_twice_or_not_at_all_is_refused(tmp_path: Path):
         arm(tmp_path)
 
 
-def test_any_field_goes_by_its_own_name(tmp_path: Path):
+def test_any_model_field_can_be_declared_by_its_mujoco_name(tmp_path: Path):
     parameters, model = arm(
         tmp_path, {"joint": "left", "field": "jnt_range", "index": 1, "bounds": [0, 1], "name": "stop"}
     )

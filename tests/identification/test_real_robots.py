@@ -1,4 +1,4 @@
-"""Values identified on public recordings of real robots, replayed on recordings that no fit saw."""
+"""Parameters identified on public recordings of real robots, replayed on recordings that no fit used."""
 
 from pathlib import Path
 
@@ -26,13 +26,13 @@ def vector(parameters: ParameterSet, **values: float) -> np.ndarray:
     return np.array([values.get(p.name, p.nominal) for p in parameters.parameters])
 
 
-def test_both_descriptions_declare_what_their_models_have():
+def test_descriptions_of_the_real_robots_declare_their_parameters():
     assert len(declared("double_pendulum")) == 9
     assert len(declared("go1")) == 5
 
 
 @needs_data
-def test_the_motor_identified_with_three_loads_moves_a_fourth(monkeypatch: pytest.MonkeyPatch):
+def test_motor_parameters_from_three_loads_predict_a_fourth_load(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.syspath_prepend(EXPERIMENTS / "go1")
     import go1  # pyright: ignore[reportMissingImports]
 
@@ -44,7 +44,7 @@ def test_the_motor_identified_with_three_loads_moves_a_fourth(monkeypatch: pytes
 
 
 @needs_data
-def test_the_double_pendulum_swings_as_recorded(monkeypatch: pytest.MonkeyPatch):
+def test_identified_parameters_predict_the_double_pendulum(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.syspath_prepend(EXPERIMENTS / "double_pendulum")
     import double_pendulum  # pyright: ignore[reportMissingImports]
 

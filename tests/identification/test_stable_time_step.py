@@ -1,4 +1,4 @@
-"""A model that breaks down by itself is found before anything is learned from it."""
+"""The check that a model does not diverge at its time step, before anything is learned in it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _FLOATING = """
 
 
 def sway(robot: RobotDescription, count: int = 60, seed: int = 0) -> Motion:
-    """Small movements of all joints about the reference pose."""
+    """Return a motion with small movements of all joints about the reference pose."""
     model = robot.load_model()
     rng = np.random.default_rng(seed)
     first = 7 if model.nq > model.nv else 0
@@ -46,7 +46,7 @@ def sway(robot: RobotDescription, count: int = 60, seed: int = 0) -> Motion:
     ("model", "commands", "step"),
     [(_HANGING, {"shoulder": "one", "elbow": "two"}, "0.0025"), (_FLOATING, {"push": "one"}, "0.00125")],
 )
-def test_a_model_that_is_too_stiff_for_its_step_is_refused_with_one_that_serves(
+def test_a_model_too_stiff_for_its_time_step_is_refused_with_a_stable_one(
     tmp_path: Path, model: str, commands: dict[str, str], step: str
 ):
     robot = write_arm(tmp_path)
@@ -59,13 +59,13 @@ def test_a_model_that_is_too_stiff_for_its_step_is_refused_with_one_that_serves(
     before = set(os.listdir())
     with pytest.raises(InputError, match=rf'arm\.xml: the model diverges .* within 0\.\d+ s.*write timestep="{step}"'):
         check_stability(robot, [sway(robot)], None)
-    assert set(os.listdir()) == before, "no log of MuJoCo's"
+    assert set(os.listdir()) == before, "MuJoCo wrote a log file"
     (tmp_path / "arm.xml").write_text(model.replace('timestep="0.01"', f'timestep="{step}"')
                                       .replace('timestep="0.005"', f'timestep="{step}"'))  # fmt: skip
     check_stability(read_description(robot.file), [sway(robot)], None)
 
 
-def test_a_stable_model_and_a_single_bad_state_pass(tmp_path: Path):
+def test_a_stable_model_passes_despite_a_single_bad_state(tmp_path: Path):
     robot = write_arm(tmp_path)
     motion = sway(robot)
     check_stability(robot, [motion], None)

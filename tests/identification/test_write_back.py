@@ -1,4 +1,4 @@
-"""Identified values come back from the files they are written to."""
+"""Files of identified parameters: MJCF for plain MuJoCo, and JSON."""
 
 import json
 from pathlib import Path
@@ -22,17 +22,17 @@ def identified(folder: Path, *entries: dict) -> tuple[RobotDescription, Identifi
     return read_description(folder / "arm.robot.json"), IdentifiedParameters(jnp.asarray(values), parameters)
 
 
-def test_plain_mujoco_loads_the_identified_model_and_moves_alike(tmp_path: Path):
+def test_plain_mujoco_simulates_the_written_model_identically(tmp_path: Path):
     robot, found = identified(tmp_path, *EVERYTHING)
     text = identified_xml(robot, found)
     assert f"delay {float(found.drivetrain().delay[0]):.6g}" in text
-    ours = robot.load_model()
-    set_fields(ours, found.fields(ours))
-    mujoco.mj_setConst(ours, mujoco.MjData(ours))
+    fitted = robot.load_model()
+    set_fields(fitted, found.fields(fitted))
+    mujoco.mj_setConst(fitted, mujoco.MjData(fitted))
     written = mujoco.MjModel.from_xml_string(text)
     nominal = robot.load_model()
     ends = []
-    for model in (ours, written, nominal):
+    for model in (fitted, written, nominal):
         data = mujoco.MjData(model)
         data.qpos[:], data.ctrl[:] = [0.5, -0.8], [0.7, 0.2]
         for _ in range(50):
@@ -42,7 +42,7 @@ def test_plain_mujoco_loads_the_identified_model_and_moves_alike(tmp_path: Path)
     assert np.abs(ends[2] - ends[0]).max() > 0.01
 
 
-def test_values_on_a_bound_come_back(tmp_path: Path):
+def test_values_on_a_bound_are_read_back(tmp_path: Path):
     robot, found = identified(tmp_path, {"command": "left", "field": "delay", "bounds": [0, 0.1]})
     assert float(np.float32(0.1)) > 0.1
     path = tmp_path / "identified.json"
@@ -50,13 +50,13 @@ def test_values_on_a_bound_come_back(tmp_path: Path):
     np.testing.assert_allclose(read_identified(path, robot).values, 0.1)
 
 
-def test_a_field_that_mjcf_has_not_is_refused(tmp_path: Path):
+def test_a_field_that_mjcf_cannot_express_is_refused(tmp_path: Path):
     robot, found = identified(tmp_path, {"joint": "left", "field": "dof_invweight0"})
     with pytest.raises(InputError, match="dof_invweight0 cannot be written as MJCF"):
         identified_xml(robot, found)
 
 
-def test_values_come_back_from_json_and_what_is_left_out_is_nominal(tmp_path: Path):
+def test_values_are_read_back_from_json_and_missing_ones_are_nominal(tmp_path: Path):
     robot, found = identified(tmp_path, *EVERYTHING)
     path = tmp_path / "identified.json"
     path.write_text(identified_to_json(robot, found, np.ones(len(found.declared))))

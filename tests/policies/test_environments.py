@@ -1,4 +1,5 @@
-"""Improved simulators in other libraries: their own checks pass, and their own trainers learn."""
+"""Improved simulators as environments of other libraries: they pass those libraries' checks and train with their
+algorithms."""
 
 from __future__ import annotations
 
@@ -31,7 +32,7 @@ from ballu_mjx.runs.folder import Run
 
 SHORT = LocomotionConfig(episode_seconds=0.4, domain_randomization=True)
 PUSH = Task("push", "Push the rod.", lambda step: -abs(step.command[1] - 7.0) / 10, 1.0)
-"""Whatever the robot does, the best command is 7: a task that is learned in seconds."""
+"""A task that is learned in seconds: the best command is always 7."""
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,7 @@ def rover(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
 
 @pytest.fixture(scope="module")
 def run(rover: RobotDescription, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of a fluid that pushes the hull forward."""
+    """A run of a fluid residual whose force of 3 N is directed upwards."""
     folder = tmp_path_factory.mktemp("runs") / "fluid"
     values = np.zeros((len(terms_of("linear")), 6))
     values[2, 2] = -3.0  # along gravity: up
@@ -66,7 +67,7 @@ def test_every_task_is_registered_under_its_name():
     assert list(environments.NAMES.values()) == list(TASKS)
 
 
-def test_a_batch_is_renewed_robot_by_robot_and_repeats_by_its_seed(batch: LocomotionBatch):
+def test_a_batch_resets_each_robot_alone_and_repeats_with_the_same_seed(batch: LocomotionBatch):
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1, 1, (20, 4, 2))
     passes = []
@@ -76,7 +77,7 @@ def test_a_batch_is_renewed_robot_by_robot_and_repeats_by_its_seed(batch: Locomo
     for one, other in zip(passes[0][1], passes[1][1], strict=True):
         np.testing.assert_array_equal(one.observation, other.observation)
     first, steps = passes[0]
-    assert np.ptp(first, axis=0).max() > 0.01  # starts differ
+    assert np.ptp(first, axis=0).max() > 0.01  # starting states differ
     ended = np.array([step.truncated for step in steps])
     assert ended.any(axis=0).all() and not np.array_equal(ended[:, 0], ended[:, 1])
     for step in steps:
@@ -85,7 +86,7 @@ def test_a_batch_is_renewed_robot_by_robot_and_repeats_by_its_seed(batch: Locomo
         np.testing.assert_array_equal(same, ~step.truncated)
 
 
-def test_the_runs_residual_acts_in_the_environment(run: Path, rover: RobotDescription, batch: LocomotionBatch):
+def test_the_residual_of_a_run_acts_in_its_environment(run: Path, rover: RobotDescription, batch: LocomotionBatch):
     simulator = load_simulator(run)
     assert simulator.residual is not None and simulator.robot.sha256 == rover.sha256
     found = batch.step(np.zeros((4, 2)))
@@ -96,19 +97,19 @@ def test_the_runs_residual_acts_in_the_environment(run: Path, rover: RobotDescri
         make_environment("fly", run=run)
 
 
-def test_gymnasium_makes_both_kinds_by_name(run: Path):
+def test_gymnasium_makes_single_and_vector_environments_by_name(run: Path):
     gymnasium = pytest.importorskip("gymnasium")
     from gymnasium.utils.env_checker import check_env
 
     env = gymnasium.make("ballu_mjx/Walk-v0", run=str(run), episode_seconds=0.4)
-    with pytest.warns(UserWarning, match="infinity"):  # of the observation's bounds
+    with pytest.warns(UserWarning, match="infinity"):  # the observation has no bounds
         check_env(env.unwrapped, skip_render_check=True)
     names = env.unwrapped.observation_names
     assert len(names) == env.observation_space.shape[0] and names[2] == "hull position z, m"
     env.reset(seed=1)
     ends = [env.step(env.action_space.sample())[2:4] for _ in range(16)]
     assert any(truncated for _, truncated in ends)
-    # The batch's program, compiled already.
+    # These settings reuse the compiled program of `batch`.
     settings = dataclasses.asdict(SHORT)
     vector = gymnasium.make_vec("ballu_mjx/Walk-v0", num_envs=4, run=str(run), **settings)
     observation, _ = vector.reset(seed=1)
@@ -125,14 +126,14 @@ def test_gymnasium_makes_both_kinds_by_name(run: Path):
 
 @pytest.mark.filterwarnings("ignore:jax.device_put_replicated is deprecated:DeprecationWarning")  # in Brax
 @pytest.mark.slow
-def test_braxs_own_ppo_trains_on_it_unchanged(run: Path):
+def test_brax_ppo_learns_in_an_improved_simulator(run: Path):
     from brax import envs
     from brax.training.agents.ppo import train as ppo
 
     env = envs.get_environment("ballu_mjx/Walk-v0", run=run)
     state = env.reset(jax.random.PRNGKey(0))
     assert int(locomotion_state(state).remaining) > 10**6  # the trainer ends episodes
-    told: list[dict[str, Any]] = []
+    reports: list[dict[str, Any]] = []
     learned = brax_env(load_simulator(run), PUSH)
     assert learned.episode_length == 25
     ppo.train(
@@ -149,9 +150,9 @@ def test_braxs_own_ppo_trains_on_it_unchanged(run: Path):
         learning_rate=3e-3,
         normalize_observations=True,
         deterministic_eval=True,
-        progress_fn=lambda steps, found: told.append(dict(found)),
+        progress_fn=lambda steps, found: reports.append(dict(found)),
     )
-    before, after = (each["eval/episode_reward"] for each in (told[0], told[-1]))
+    before, after = (each["eval/episode_reward"] for each in (reports[0], reports[-1]))
     assert after > before + 1.0, (before, after)
 
 
@@ -160,7 +161,7 @@ def test_braxs_own_ppo_trains_on_it_unchanged(run: Path):
     importlib.util.find_spec("stable_baselines3") is None,
     reason="not installed: pip install -c constraints.txt stable-baselines3 and PyTorch's build for the CPU",
 )
-def test_stable_baselines3_improves_in_an_improved_simulator():
+def test_stable_baselines3_learns_in_an_improved_simulator():
     import torch  # pyright: ignore[reportMissingImports]
     from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
 

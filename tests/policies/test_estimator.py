@@ -1,4 +1,4 @@
-"""From motion capture to the policy: features estimated now, from noisy and partly hidden frames so far."""
+"""The estimator between motion capture and policy: current features from past frames, with noise and hidden markers."""
 
 import copy
 import subprocess
@@ -30,7 +30,7 @@ TURNING = np.array([0.1, -0.2, 0.5])
 
 
 def moving(frames: int, euler: tuple[float, float, float] = (0.05, 0.1, 0.2)) -> Capture:
-    """Noiseless frames of balloon, base and feet at constant velocities, and of constant Euler angle rates."""
+    """Return frames without noise: balloon, base and feet at constant velocities, with constant Euler angle rates."""
     capture = Capture(NAMES)
     for frame in range(frames):
         now = frame * 0.01
@@ -47,7 +47,7 @@ def moving(frames: int, euler: tuple[float, float, float] = (0.05, 0.1, 0.2)) ->
 def expected(
     now: float, euler: tuple[float, float, float] = (0.05, 0.1, 0.2), until: float | None = None
 ) -> np.ndarray:
-    """The features of `moving` at `now`, or of the same coming to rest at `until` (s)."""
+    """Return the features of `moving` at time `now` (s). With `until`, the motion stops at that time (s)."""
     position = START + VELOCITY * (now if until is None else until)
     velocity = VELOCITY if until is None else 0 * VELOCITY
     kinematics = np.concatenate([position, velocity], axis=1)
@@ -57,7 +57,7 @@ def expected(
 
 
 def hide(capture: Capture, frames: range) -> Capture:
-    """All markers hidden in `frames`."""
+    """Return a copy with all markers hidden in `frames`."""
     hidden = copy.deepcopy(capture)
     for values in (hidden.position, hidden.quaternion):
         for frame in frames:
@@ -66,7 +66,7 @@ def hide(capture: Capture, frames: range) -> Capture:
 
 
 def first(capture: Capture, frames: int) -> Capture:
-    """What a controller had seen after `frames` frames."""
+    """Return the capture as it was after `frames` frames."""
     return Capture(
         capture.names,
         capture.time[:frames],
@@ -80,8 +80,8 @@ def test_constant_velocity_is_estimated_exactly():
     np.testing.assert_allclose(estimate(moving(50)), expected(0.49), atol=1e-9)
 
 
-def test_angles_are_those_of_the_training_environment():
-    """One convention on both sides of the deployment, and scipy's intrinsic z-y-x."""
+def test_euler_angles_agree_with_the_training_environment():
+    """The controller, the training environment and scipy's intrinsic z-y-x angles agree."""
     for quaternion in Rotation.random(20, rng=np.random.default_rng(0)).as_quat(scalar_first=True):
         angles = estimator.euler_angles(quaternion)
         with jax.enable_x64(True):
@@ -90,8 +90,8 @@ def test_angles_are_those_of_the_training_environment():
         np.testing.assert_allclose(angles, scipys, atol=1e-9)
 
 
-def test_features_stand_in_the_order_of_the_training_environment():
-    """`simulator.Simulator.observe` on a moving state, and frames of that same motion."""
+def test_features_have_the_order_of_the_training_environment():
+    """Features of `Simulator.observe` for a moving state agree with estimates from frames of the same motion."""
     model = load_model()
     simulator = Simulator(load_robot(), model=model)
     qpos = standing_qpos(model)
@@ -111,8 +111,8 @@ def test_features_stand_in_the_order_of_the_training_environment():
 
 
 @pytest.mark.parametrize("frames", range(28, 36))
-def test_yaw_passes_through_the_seam(frames: int):
-    """Frames on both sides of pi in one window; quaternions there jump in sign, too."""
+def test_yaw_is_estimated_across_the_wrap_at_pi(frames: int):
+    """One window has frames on both sides of pi, where quaternions also change their sign."""
     euler = (0.05, 0.1, np.pi - 0.153)
     assert abs(expected(0.27, euler)[8]) > 3.1 and abs(expected(0.35, euler)[8]) > 3.1
     assert expected(0.27, euler)[8] > 0 > expected(0.35, euler)[8]
@@ -122,19 +122,19 @@ def test_yaw_passes_through_the_seam(frames: int):
 @pytest.mark.parametrize(
     "hidden", [range(47, 49), range(45, 46), range(34, 49), range(48, 50), range(35, 50), range(1, 48)]
 )
-def test_hidden_frames_leave_a_steady_motion_as_it_is(hidden: range):
-    """Within the window, all of it but the newest, the newest ones, all of it; and nearly all since the start."""
+def test_hidden_frames_do_not_change_the_estimate_of_a_steady_motion(hidden: range):
+    """Hidden are some frames in the window, all but the newest, the newest, the whole window, or nearly all frames."""
     np.testing.assert_allclose(estimate(hide(moving(50), hidden)), expected(0.49), atol=1e-9)
 
 
-def test_a_marker_hidden_for_long_comes_to_rest():
-    """Carried on as it was for `EXTRAPOLATION_LIMIT`, not out of the room."""
+def test_a_marker_hidden_for_long_is_estimated_at_rest():
+    """Its last motion is continued for `EXTRAPOLATION_LIMIT`. Then the estimate rests."""
     last = 0.29
     seen = estimate(hide(moving(200), range(30, 200)))
     np.testing.assert_allclose(seen, expected(1.99, until=last + estimator.EXTRAPOLATION_LIMIT), atol=1e-9)
 
 
-def test_the_first_frame_says_nothing_of_velocity():
+def test_velocity_is_zero_after_a_single_frame():
     np.testing.assert_allclose(estimate(moving(1)), expected(0.0, until=0.0), atol=1e-12)
     np.testing.assert_allclose(estimate(hide(moving(5), range(1, 5))), expected(0.04, until=0.0), atol=1e-12)
 
@@ -142,7 +142,7 @@ def test_the_first_frame_says_nothing_of_velocity():
 @pytest.mark.parametrize(
     ("place", "name"), [(0, "balloon"), (None, "balloon's orientation"), (1, "base"), (2, "foot_left")]
 )
-def test_a_marker_never_seen_is_named(place: int | None, name: str):
+def test_error_names_a_marker_that_was_never_seen(place: int | None, name: str):
     capture = moving(20)
     for frame in range(20):
         hidden = capture.quaternion[frame] if place is None else capture.position[frame][place]
@@ -151,14 +151,14 @@ def test_a_marker_never_seen_is_named(place: int | None, name: str):
         estimate(capture)
 
 
-def test_a_robot_of_one_marker_is_estimated():
+def test_a_robot_with_one_marker_is_estimated():
     whole = moving(30)
     alone = Capture(("hull",), whole.time, whole.command, [place[:1] for place in whole.position], whole.quaternion)
     np.testing.assert_allclose(estimate(alone), expected(0.29)[:9], atol=1e-9)
 
 
-def test_a_long_trial_costs_no_more_than_a_short_one():
-    """Old frames are not read: arrays of another size in their place would break any calculation."""
+def test_estimates_do_not_read_old_frames():
+    """Old frames are replaced by arrays of another size. Reading any of them would raise an error."""
     capture, whole = moving(10_000), estimate(moving(10_000))
     for name in ("time", "command", "position", "quaternion"):
         values: list[Any] = getattr(capture, name)
@@ -168,7 +168,8 @@ def test_a_long_trial_costs_no_more_than_a_short_one():
 
 @pytest.fixture(scope="module")
 def walk() -> tuple[Capture, Float[np.ndarray, "steps 27"], Float[np.ndarray, "steps 27"]]:
-    """A virtual robot's 3 s of walking: the capture when it ended, what was estimated in time, and the truth."""
+    """A virtual robot walks for 3 s. Return the final capture, the features estimated at each control step, and the
+    true features."""
     steps = np.arange(60) * CONTROL_TIMESTEP / 0.9
     commands = np.where((steps[:, None] + [0.0, 0.5]) % 1.0 < 0.35, 0.9, 0.0)
     after_backlash = iter(commands)
@@ -199,9 +200,10 @@ def true_features(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray) -> 
     return np.concatenate([*kinematics[:2], [roll, pitch, yaw], *kinematics[2:]])
 
 
-def test_estimates_of_a_walk_are_near_the_truth(walk: tuple):
-    """Limits are about 1.5 times what 12 trials of 10 s on ten robots showed. What noise leaves of a velocity is
-    16 mm/s; the rest is lag, and at the feet the footfall, where no line can follow."""
+def test_estimates_of_a_walk_are_accurate(walk: tuple):
+    """Limits are about 1.5 times the errors in 12 trials of 10 s on ten robots. Noise causes a velocity error of
+    16 mm/s. The rest is lag and, at the feet, the sudden change of velocity at footfall, which
+    a fitted line cannot follow."""
     _, seen, truth = walk
     error = seen - truth
     error[:, EULER] = np.arctan2(np.sin(error[:, EULER]), np.cos(error[:, EULER]))
@@ -212,20 +214,20 @@ def test_estimates_of_a_walk_are_near_the_truth(walk: tuple):
         assert np.sqrt(np.mean(at**2)) < limits[marker][0], marker
         assert np.sqrt(np.mean(speed**2)) < limits[marker][1], marker
     assert np.sqrt(np.mean(error[:, EULER] ** 2)) < np.deg2rad(0.3)
-    # The walk is a motion to be seen, not noise.
+    # The feet's speed is well above the noise.
     assert np.sqrt(np.mean(truth[:, 18:21] ** 2)) > 0.12
 
 
-def test_estimates_do_not_depend_on_what_comes_later(walk: tuple):
-    """The finished capture, cut off at each control step, gives what the controller acted on at the time."""
+def test_estimates_do_not_depend_on_later_frames(walk: tuple):
+    """Estimates from the final capture, cut off at each control step, equal those made during the walk."""
     capture, seen, _ = walk
     assert len(capture.time) == 301 and len(seen) == 60
     for step, features in enumerate(seen):
         np.testing.assert_array_equal(estimate(first(capture, 5 * step + 1)), features)
 
 
-def test_it_runs_where_there_is_no_jax():
-    """And no MuJoCo: on the robot."""
+def test_estimator_imports_neither_jax_nor_mujoco():
+    """The estimator runs on the robot, which has neither JAX nor MuJoCo."""
     script = "import sys, ballu_mjx.policies.deploy.estimator as _; print({'jax', 'mujoco'} & set(sys.modules) or [])"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -1,4 +1,4 @@
-"""The exported controller: alone on NumPy it is the policy, and nothing it is given gets past its limits."""
+"""The exported controller: it needs only NumPy, gives the policy's commands, and keeps its limits for any input."""
 
 import ast
 import dataclasses
@@ -69,13 +69,13 @@ controller = Controller(sys.argv[1])
 features = np.load(sys.argv[2])
 np.save(sys.argv[3], [controller.act(row) for row in features])
 """
-"""Runs an exported policy where there is nothing but NumPy."""
+"""Program that runs an exported policy with NumPy alone."""
 
 
 def write_run(
     folder: Path, task: str = "walk", robot: RobotDescription = BALLU, residual: Path | None = None, **settings: Any
 ) -> Path:
-    """A run whose policy is drawn at random, with commands all over their ranges."""
+    """Write a run with a random policy whose commands cover their ranges."""
     config = PPOConfig(policy_layers=(16, 12), value_layers=(4,), **settings)
     observations = num_observations(robot)
     networks = ppo.make_networks(observations, len(robot.commands), config)
@@ -111,7 +111,7 @@ def random_features(count: int) -> np.ndarray:
 
 
 def frame_at(time: float) -> dict[str, np.ndarray]:
-    """A robot that sways."""
+    """Return a frame of a swaying robot."""
     sway = 0.3 * np.sin(4.0 * time + np.arange(3))
     return {
         "balloon_position": np.array([0.1, 0.0, 1.1]) + 0.2 * sway,
@@ -123,7 +123,7 @@ def frame_at(time: float) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("settings", [{}, {"activation": "tanh"}, {"normalize_observations": False}])
-def test_exported_policy_is_the_policy_without_its_libraries(settings: dict, tmp_path: Path):
+def test_exported_policy_gives_the_same_commands_with_numpy_alone(settings: dict, tmp_path: Path):
     folder = export.export_policy(Options(write_run(tmp_path / "run", **settings), tmp_path / "robot", open_loop=False))
     features = random_features(1000)
     np.save(tmp_path / "features.npy", features)
@@ -132,12 +132,12 @@ def test_exported_policy_is_the_policy_without_its_libraries(settings: dict, tmp
     assert done.returncode == 0, done.stderr
     act = Policy.load(tmp_path / "run").act()
     expected = np.array([act(row) for row in features])
-    assert np.mean((expected > 0.01) & (expected < 0.99)) > 0.2  # not all at the stops
+    assert np.mean((expected > 0.01) & (expected < 0.99)) > 0.2  # not all at the limits
     np.testing.assert_allclose(np.load(tmp_path / "commands.npy"), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("settings", [{}, {"activation": "tanh"}, {"normalize_observations": False}])
-def test_onnx_is_the_policy(settings: dict, tmp_path: Path):
+def test_onnx_network_gives_the_same_commands(settings: dict, tmp_path: Path):
     import onnxruntime
 
     folder = export.export_policy(
@@ -151,7 +151,7 @@ def test_onnx_is_the_policy(settings: dict, tmp_path: Path):
     np.testing.assert_allclose(commands, np.array([act(row) for row in features]), atol=1e-5)
 
 
-def test_onnx_that_is_not_installed_is_told_before_anything_is_written(
+def test_export_reports_missing_onnx_before_it_writes_anything(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
@@ -161,7 +161,7 @@ def test_onnx_that_is_not_installed_is_told_before_anything_is_written(
     assert not (tmp_path / "robot").exists()
 
 
-def test_self_test_passes_and_notices_other_weights(exported: Path, tmp_path: Path):
+def test_self_test_passes_and_detects_other_weights(exported: Path, tmp_path: Path):
     done = subprocess.run([sys.executable, "controller.py"], cwd=exported, capture_output=True, text=True)
     assert done.returncode == 0 and "Passed." in done.stdout and "ms" in done.stdout, done.stderr
     with np.load(exported / "weights.npz") as file:
@@ -170,15 +170,15 @@ def test_self_test_passes_and_notices_other_weights(exported: Path, tmp_path: Pa
     assert controller.self_test(tmp_path, frames=100) == 1
 
 
-def test_exported_source_suits_python_3_9(exported: Path):
+def test_exported_source_runs_on_python_3_9(exported: Path):
     for name in ("controller.py", "estimator.py"):
         text = (exported / name).read_text()
         ast.parse(text, feature_version=(3, 9))
         assert not re.search(r"\bimport (jax|ballu_mjx)|from (jax|ballu_mjx)|strict=", text)
-        assert "from __future__ import annotations" in text  # types may be written as those of later versions
+        assert "from __future__ import annotations" in text  # so annotations may use newer syntax
 
 
-def test_observation_is_named_and_that_of_training():
+def test_observation_agrees_with_training_and_has_names():
     features = random_features(20)
     for row in features:
         np.testing.assert_allclose(
@@ -193,9 +193,9 @@ def test_observation_is_named_and_that_of_training():
     assert [seen[name] for name in some] == [1.1, 0.3, 0.2, 1.0]
 
 
-def test_steps_are_those_of_the_policy_on_estimates(exported: Path):
-    """Frame by frame at 100 Hz, some hidden: the policy on `estimator.estimate`'s features every 50 ms."""
-    robot = Controller(exported, full_travel=1e-3)  # in effect without the limit
+def test_controller_applies_the_policy_to_estimates_at_every_control_step(exported: Path):
+    """Frames come at 100 Hz, some of them hidden. Every 50 ms the controller applies the policy to the estimate."""
+    robot = Controller(exported, full_travel=1e-3)  # fast enough to have no effect
     capture = Capture(NAMES)
     start, rng = 1.7e9, np.random.default_rng(5)
     for number in range(300):
@@ -210,11 +210,11 @@ def test_steps_are_those_of_the_policy_on_estimates(exported: Path):
         if number % 5 == 0:
             assert robot.status == "running"
             expected = robot.act(estimator.estimate(capture))
-        np.testing.assert_allclose(command, expected, atol=1e-4)  # such times have steps of 0.2 us
+        np.testing.assert_allclose(command, expected, atol=1e-4)  # times this large are rounded to 0.2 us
     assert robot.steps == 60
 
 
-def test_calls_at_the_control_rate_are_control_steps(exported: Path):
+def test_every_call_at_the_control_rate_is_a_control_step(exported: Path):
     robot = Controller(exported)
     rng = np.random.default_rng(6)
     for number in range(100):
@@ -222,7 +222,7 @@ def test_calls_at_the_control_rate_are_control_steps(exported: Path):
     assert robot.steps == 100 and robot.status == "running"
 
 
-def test_rate_limit_holds_where_the_policy_jumps(exported: Path, monkeypatch: pytest.MonkeyPatch):
+def test_rate_limit_holds_when_the_policy_output_jumps(exported: Path, monkeypatch: pytest.MonkeyPatch):
     robot = Controller(exported)
     target = np.ones(2)
     monkeypatch.setattr(robot, "act", lambda features: target)
@@ -253,7 +253,9 @@ def without(name: str, value: Any) -> Callable[[float], Any]:
         without("balloon_quaternion", ["w", "x", "y", "z"]),
     ],
 )
-def test_time_out_relaxes_and_ends(exported: Path, monkeypatch: pytest.MonkeyPatch, broken: Callable[[float], Any]):
+def test_controller_relaxes_after_missing_frames_and_resumes(
+    exported: Path, monkeypatch: pytest.MonkeyPatch, broken: Callable[[float], Any]
+):
     robot = Controller(exported)
     monkeypatch.setattr(robot, "act", lambda features: np.ones(2))
     for number in range(101):
@@ -272,7 +274,9 @@ def test_time_out_relaxes_and_ends(exported: Path, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("times", [lambda n: 1.0, lambda n: math.nan, lambda n: 1.0 - 0.01 * n, lambda n: "soon"])
-def test_a_clock_that_does_not_go_relaxes(exported: Path, monkeypatch: pytest.MonkeyPatch, times: Callable):
+def test_controller_relaxes_if_the_clock_does_not_advance(
+    exported: Path, monkeypatch: pytest.MonkeyPatch, times: Callable
+):
     robot = Controller(exported)
     monkeypatch.setattr(robot, "act", lambda features: np.ones(2))
     for number in range(101):
@@ -285,7 +289,7 @@ def test_a_clock_that_does_not_go_relaxes(exported: Path, monkeypatch: pytest.Mo
     assert robot.command.tolist() == [1.0, 1.0]
 
 
-def test_a_clock_set_back_is_followed(exported: Path):
+def test_controller_continues_after_the_clock_is_set_back(exported: Path):
     robot = Controller(exported)
     for origin in (100.0, 3.0, 1e9, -50.0):
         for number in range(100):
@@ -295,8 +299,8 @@ def test_a_clock_set_back_is_followed(exported: Path):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_nothing_gets_past_the_limits(exported: Path, seed: int):
-    """Frames with all sorts of faults at steady times, then at times that are at fault as well."""
+def test_commands_keep_their_limits_for_any_input(exported: Path, seed: int):
+    """Frames with random faults come at steady times first, and then at wrong times, too."""
     rng = np.random.default_rng(seed)
     wild: list[Any] = [math.nan, math.inf, -math.inf, 1e308, -1e308, 50.0, None, "x", [], 10**400, 0.0]
     robot = Controller(exported)
@@ -331,7 +335,9 @@ def test_nothing_gets_past_the_limits(exported: Path, seed: int):
     assert robot.steps > 500
 
 
-def test_command_refuses_what_it_cannot_use(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_export_command_refuses_unsuitable_runs_and_options(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("keep")
     (tmp_path / "other").mkdir()
@@ -362,14 +368,14 @@ def test_commands_are_written_as_pulses(tmp_path: Path):
     ]
 
 
-def test_readme_tells_of_the_run(exported: Path):
+def test_readme_describes_the_run(exported: Path):
     text = (exported / "README.txt").read_text()
     assert "task 'walk'" in text and "step 7" in text and "27: sine of balloon yaw" in text
     assert max(map(len, text.splitlines())) <= 120
 
 
-def test_readme_tells_the_delay_of_training(tmp_path: Path):
-    """With the air's delay, which training has in its commands, the README said that there was none."""
+def test_readme_states_the_command_delay_of_training(tmp_path: Path):
+    """The command delay of an aerodynamic residual counts as a delay of training."""
     text = (export.export_policy(Options(write_run(tmp_path / "plain"), open_loop=False)) / "README.txt").read_text()
     assert "trained without delay" in text
     air = dataclasses.replace(AirParameters.none(), delay=jnp.asarray(0.045))
@@ -385,8 +391,8 @@ def test_readme_tells_the_delay_of_training(tmp_path: Path):
 
 
 @pytest.mark.parametrize("stuck", ["balloon_position", "balloon_quaternion", "foot_right_position"])
-def test_a_pose_that_does_not_change_relaxes(exported: Path, monkeypatch: pytest.MonkeyPatch, stuck: str):
-    """A stream that repeats its last frame, of one marker too, is no measurement."""
+def test_controller_relaxes_if_a_pose_does_not_change(exported: Path, monkeypatch: pytest.MonkeyPatch, stuck: str):
+    """A stream that repeats its last frame, or one marker of it, counts as no measurement."""
     robot = Controller(exported)
     monkeypatch.setattr(robot, "act", lambda features: np.ones(2))
     frames = [frame_at(number * 0.01) for number in range(101)]
@@ -403,15 +409,15 @@ def test_a_pose_that_does_not_change_relaxes(exported: Path, monkeypatch: pytest
     assert command == (1.0, 1.0) and robot.status == "running"
 
 
-def test_a_policy_of_another_robot_is_exported(tmp_path: Path):
-    """Names, ranges, control rate and resting commands are those of its description, in files and controller."""
+def test_export_of_a_policy_of_another_robot(tmp_path: Path):
+    """Files and controller take names, command ranges, control rate and resting commands from the description."""
     rover = write_rover(tmp_path)
     folder = export.export_policy(Options(write_run(tmp_path / "run", robot=rover), open_loop=False))
     done = subprocess.run([sys.executable, "controller.py"], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0 and "Passed." in done.stdout, done.stdout + done.stderr
     robot = Controller(folder)
     assert (robot.names, robot.commands, robot.period) == (("hull", "tip"), ("arm", "push"), 0.04)
-    assert robot.step(0.0, None) == (0.3, 1.0)  # the keyframe's
+    assert robot.step(0.0, None) == (0.3, 1.0)  # the keyframe's commands
     rng = np.random.default_rng(0)
     features = rng.normal(size=(200, rover.features))
     commands = np.array([robot.act(row) for row in features])
@@ -436,14 +442,14 @@ def test_a_policy_of_another_robot_is_exported(tmp_path: Path):
     assert max(map(len, text.splitlines())) <= 120
 
 
-def test_a_policy_of_an_anchored_robot_sees_the_world():
+def test_observation_of_an_anchored_robot_is_in_the_world_frame():
     features = jnp.asarray(np.random.default_rng(0).normal(size=15), jnp.float32)
     seen = controller.observation(np.asarray(features), anchored=True)
     np.testing.assert_allclose(seen, locomotion_observation(features, anchored=True), atol=1e-6)
     np.testing.assert_allclose(seen[:3], features[:3], atol=1e-6)
 
 
-def test_export_can_be_imported_from_anywhere(exported: Path, monkeypatch: pytest.MonkeyPatch):
+def test_exported_controller_can_be_imported_from_any_folder(exported: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.syspath_prepend(str(exported))
     spec = importlib.util.spec_from_file_location("controller", exported / "controller.py")
     assert spec is not None and spec.loader is not None
@@ -454,7 +460,7 @@ def test_export_can_be_imported_from_anywhere(exported: Path, monkeypatch: pytes
 
 @pytest.fixture(scope="module")
 def rover_policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An exported policy of a small robot that hovers, so that contacts are those of C MuJoCo."""
+    """An exported policy of a small robot that floats without contacts, which differ between MJX and C MuJoCo."""
     folder = tmp_path_factory.mktemp("rover")
     path = write_rover(folder).model
     text = path.read_text().replace("<option ", '<option gravity="0 0 0" ')
@@ -463,7 +469,7 @@ def rover_policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return export.export_policy(Options(write_run(folder / "run", robot=rover), open_loop=False, onnx=True))
 
 
-def test_what_a_policy_sees_and_commands_is_named_for_other_programs(rover_policy: Path):
+def test_policy_files_name_observations_and_commands(rover_policy: Path):
     import onnx
 
     described = json.loads((rover_policy / "policy.json").read_text())
@@ -482,11 +488,11 @@ def test_what_a_policy_sees_and_commands_is_named_for_other_programs(rover_polic
 def test_check_runs_an_exported_policy_in_c_mujoco(
     rover_policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    """Side by side with its own simulator; in another robot's simulator, and damaged, it says so."""
+    """The check agrees for a correct export. It refuses the simulator of another robot and damaged files."""
     assert export_command.main(["check", str(rover_policy), "--seconds", "2"]) == 0
-    told = capsys.readouterr().out
-    assert "AGREES" in told and "its own simulator" in told and "from frames" in told
-    trials = [line.split() for line in told.splitlines() if line.strip().startswith(("x (m)", "yaw"))]
+    output = capsys.readouterr().out
+    assert "AGREES" in output and "its own simulator" in output and "from frames" in output
+    trials = [line.split() for line in output.splitlines() if line.strip().startswith(("x (m)", "yaw"))]
     assert all(abs(float(line[2]) - float(line[3])) < 0.02 for line in trials)
     arm = export_simulator(Simulator(write_arm(tmp_path)), tmp_path / "arm", check_seconds=0.0).folder
     damaged = tmp_path / "damaged"
@@ -507,7 +513,7 @@ def test_check_runs_an_exported_policy_in_c_mujoco(
 
 
 def altered(source: Path, copy: Path, file: str, change: Callable[[dict[str, Any]], dict[str, Any]]) -> Path:
-    """A copy of an exported folder in which `change` replaces arrays of `file`."""
+    """Return a copy of an exported folder in which `change` replaces arrays of `file`."""
     shutil.copytree(source, copy)
     with np.load(copy / file) as archive:
         stored: dict[str, Any] = {name: archive[name] for name in archive.files}
@@ -515,8 +521,8 @@ def altered(source: Path, copy: Path, file: str, change: Callable[[dict[str, Any
     return copy
 
 
-def test_wrong_exports_differ(rover_policy: Path, tmp_path: Path):
-    """A weight, the order of observations and a scale are wrong in turn; and a constant of the simulator."""
+def test_check_detects_wrong_exports(rover_policy: Path, tmp_path: Path):
+    """In turn, a weight, the order of observations, a scale, and a constant of the simulator are wrong."""
     right = check_policy(rover_policy, seconds=1.0)
     assert right.agrees and "AGREES" in right.verdict()
     assert right.agreement.compared == pytest.approx(1.0) and right.agreement.apart < 1e-6
@@ -538,8 +544,8 @@ def test_wrong_exports_differ(rover_policy: Path, tmp_path: Path):
     assert "under the same commands" in found.verdict()
 
 
-def test_trials_that_rounding_parts_do_not_make_an_export_differ():
-    """Contacts magnify rounding: what decides is commands and states while they can be predicted."""
+def test_check_agrees_if_trials_differ_only_by_rounding():
+    """Contacts amplify rounding, so only commands and the states of the predictable first part are compared."""
     own, other = Trial("own", 0.01, (0.1, 0.2), 10.0), Trial("c", 0.02, (0.4, -0.2), -80.0)
     found = PolicyCheck(Agreement(1e-6, 1.5, 2e-5, 9e-4), own, other, other, 24.0)
     assert found.agrees
@@ -549,7 +555,7 @@ def test_trials_that_rounding_parts_do_not_make_an_export_differ():
     assert Agreement(0.0, 1.0, 9e-6, 1e-9).problem() is None
 
 
-def test_trials_that_part_are_told():
+def test_check_reports_trials_that_differ():
     own = Trial("own", 0.3, (6.0, 0.5), 10.0)
     assert dataclasses.replace(own, displacement=(6.3, 0.3)).differs_from(own) is None
     assert "1.00 m" in str(dataclasses.replace(own, displacement=(5.0, 0.5)).differs_from(own))

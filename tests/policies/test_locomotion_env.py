@@ -1,4 +1,4 @@
-"""Locomotion tasks: what they reward, what their simulators are made of, and the residual's place in them."""
+"""Locomotion tasks: rewards, observations, randomized simulators and residual forces."""
 
 import dataclasses
 
@@ -30,13 +30,13 @@ from ballu_mjx.sim.step import state_at
 BALLU = load_robot()
 MODEL = BALLU.load_model()
 UNIT = load_units(ForceNetworkConfig(), BALLU)[0]
-"""N."""
+"""Force (N) of an action of 1."""
 INPUTS = 87
-"""Of the residual: three steps of 27 features, and three commands."""
+"""Size of the residual's input: 27 features and two commands for each of three control steps."""
 
 
 def make_residual(action: np.ndarray, width: float = 1e6) -> TrainedResidual:
-    """A residual whose policy always answers `action`, and that has seen inputs within plus and minus `width`."""
+    """Return a residual whose policy always gives `action`, with a training range of -`width` to `width`."""
     bound = np.full(INPUTS, width, np.float32)
     forces = NetworkResidual(
         ForceNetworkConfig(),
@@ -59,20 +59,20 @@ def inner(state) -> LocomotionState:
 
 PLAIN = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig())
 RESET, STEP = jax.jit(lambda setting, key: PLAIN._start(setting, key)), jax.jit(PLAIN.step)
-"""Compiled once: what tells one simulator from another travels in the state."""
+"""Compiled once: parameters that differ between simulators are part of the state."""
 
 
-def test_rewards_are_velocities_of_the_task_s_direction():
+def test_rewards_are_velocities_in_the_direction_of_the_task():
     step = Step(jnp.array([0.3, -0.2, 0.1]), jnp.zeros(27), jnp.zeros(2))
     rewards = {name: float(task.reward(step)) for name, task in TASKS.items()}
     assert rewards == pytest.approx({"walk": 0.3, "turn": -0.2, "turn-right": 0.2, "walk-backward": -0.3})
 
 
-def test_reward_is_the_mean_velocity_of_the_robot_in_c_mujoco():
+def test_reward_is_the_mean_velocity_of_the_centre_of_mass_in_c_mujoco():
     state = RESET(PLAIN.setting, jax.random.key(0))
     data = mujoco.MjData(MODEL)
     for number in range(20):
-        # From the same state every time: over a second a foot's contact may come a step earlier in one of the two.
+        # Both start each step from the same state. Otherwise a foot may make contact a step earlier in one of them.
         physics = inner(state).rollout.physics
         data.qpos[:], data.qvel[:] = physics.qpos, physics.qvel
         mujoco.mj_forward(MODEL, data)
@@ -87,7 +87,7 @@ def test_reward_is_the_mean_velocity_of_the_robot_in_c_mujoco():
     assert np.abs(speed[0]) > 0.02
 
 
-def test_policy_sees_neither_place_nor_direction_but_the_heading():
+def test_observation_is_independent_of_position_and_includes_heading():
     rng = np.random.default_rng(0)
     seen = rng.normal(size=27).astype(np.float32)
     yaw, shift = 0.7, np.array([3.0, -2.0, 0.0])
@@ -100,7 +100,7 @@ def test_policy_sees_neither_place_nor_direction_but_the_heading():
     np.testing.assert_allclose(other[-2:], [np.cos(seen[8] + yaw), np.sin(seen[8] + yaw)], atol=1e-6)
 
 
-def test_randomization_draws_friction_and_start_and_is_off_by_default():
+def test_randomization_of_friction_and_starting_state_is_off_by_default():
     keys = jax.random.split(jax.random.key(1), 200)
     draw = jax.jit(jax.vmap(PLAIN._start, in_axes=(None, 0)))
     plain = inner(draw(PLAIN.setting, keys))
@@ -117,10 +117,10 @@ def test_randomization_draws_friction_and_start_and_is_off_by_default():
     assert (knees >= standing_qpos(MODEL)[7:][KNEES] - 1e-6).all()
 
 
-def test_friction_drawn_is_friction_felt():
-    """A robot thrown along the floor slides further on a smoother one."""
+def test_lower_friction_lets_the_robot_slide_further():
+    """A robot with a horizontal starting velocity slides further on a floor with lower friction."""
     state = RESET(PLAIN.setting, jax.random.key(0))
-    way = []
+    distances = []
     for friction in (0.2, 1.0):
         thrown = inner(state).rollout.physics
         thrown = thrown._replace(qvel=thrown.qvel.at[0].set(1.0))
@@ -129,11 +129,11 @@ def test_friction_drawn_is_friction_felt():
         now = dataclasses.replace(state, pipeline_state=pushed)
         for _ in range(10):
             now = STEP(now, -jnp.ones(2))
-        way.append(float(inner(now).rollout.history[-1, 15]))
-    assert way[0] > way[1] + 0.02
+        distances.append(float(inner(now).rollout.history[-1, 15]))
+    assert distances[0] > distances[1] + 0.02
 
 
-def test_identified_actuators_are_in_the_simulator_and_pass_from_episode_to_episode():
+def test_identified_actuators_act_in_every_episode():
     nominal = ActuatorParameters.nominal(MODEL)
     weak = dataclasses.replace(nominal, torque_limit=nominal.torque_limit * jnp.array([0.1, 1.0]))
     reached = []
@@ -147,7 +147,7 @@ def test_identified_actuators_are_in_the_simulator_and_pass_from_episode_to_epis
     assert left > 15 and abs(right) < left / 3
 
 
-def test_residual_pushes_in_the_balloon_s_heading_and_only_so_hard():
+def test_residual_force_has_its_units_and_is_in_the_heading_frame():
     action, yaw = np.array([0.5, 0.2, -0.1]), 2.0
     env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(), residual=make_residual(action))
     simulator, zeros = env.simulator.simulator, jnp.zeros(MODEL.nv)
@@ -160,13 +160,14 @@ def test_residual_pushes_in_the_balloon_s_heading_and_only_so_hard():
     force = turn @ (UNIT * action)
     pushed = jax.jit(lambda wrench: simulator.step(state_at(qpos, zeros), jnp.zeros(2), wrench))
     expected = pushed(jnp.asarray([[*force, 0, 0, 0]], jnp.float32))
-    np.testing.assert_allclose(inner(state).rollout.physics.qvel, expected.qvel, atol=5e-5)  # another program
+    # The two are compiled into different programs, which round differently.
+    np.testing.assert_allclose(inner(state).rollout.physics.qvel, expected.qvel, atol=5e-5)
     assert np.abs(np.asarray(expected.qvel - pushed(jnp.zeros((1, 6))).qvel)).max() > 1e-3
     assert float(state.metrics["force"]) == pytest.approx(np.linalg.norm(force), rel=1e-5)
 
 
-def test_force_fades_outside_of_what_the_residual_has_seen():
-    history = jnp.zeros((HISTORY, 27)).at[-1, 2].set(2.0)  # the balloon's height, alone outside
+def test_residual_force_decays_outside_its_training_range():
+    history = jnp.zeros((HISTORY, 27)).at[-1, 2].set(2.0)  # only the balloon's height is out of range
     history = history.at[:-1].set(history[-1])
     commands = jnp.zeros((HISTORY, 2))
     width = 1.0
@@ -190,10 +191,10 @@ def test_force_fades_outside_of_what_the_residual_has_seen():
 
 
 GAIN = ppo.Params(ppo.Normalizer(np.zeros(()), {}, {}, {}), None, np.float32(0.8))
-"""Of policies that are no network."""
+"""Parameters of policies that are not networks."""
 
 
-def test_one_program_serves_all_residuals_of_a_kind():
+def test_residuals_of_one_kind_share_one_compiled_program():
     action, network = 3, PPOConfig(policy_layers=(4,), value_layers=(4,))
     infer = ppo.make_inference({ppo.STATE: (INPUTS,)}, action, network)
     nominal = ActuatorParameters.nominal(MODEL)
@@ -220,13 +221,13 @@ def test_one_program_serves_all_residuals_of_a_kind():
     assert closed_loop[0] == closed_loop[1]
 
 
-def test_closed_loop_is_the_environment_step_by_step():
+def test_closed_loop_agrees_with_steps_of_the_environment():
     infer = lambda params, seen: params.value * jnp.sin(10 * seen[:2])  # noqa: E731
     env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(domain_randomization=True))
     loop = ClosedLoop(env, infer)
     still, start = (inner(RESET(x.setting, jax.random.key(k))).rollout.physics for x, k in ((PLAIN, 0), (env, 3)))
     qpos, qvel = (np.stack([x] * 8 + [y]) for x, y in ((still.qpos, start.qpos), (still.qvel, start.qvel)))
-    rollout = loop(GAIN, qpos, qvel, 5)  # the last one is of a batch of its own
+    rollout = loop(GAIN, qpos, qvel, 5)  # the last state is in a second batch
     state = jax.jit(env.at)(jnp.asarray(qpos[-1]), jnp.asarray(qvel[-1]), jax.random.key(0))
     for number in range(5):
         action = 0.8 * jnp.sin(10 * jnp.asarray(state.obs)[:2])

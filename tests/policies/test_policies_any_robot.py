@@ -1,4 +1,5 @@
-"""Locomotion of a robot that is not BALLU: sizes, ranges, starting states and friction by its description and model."""
+"""Locomotion tasks of a robot that is not BALLU. Its description and model set sizes, command ranges, starting states
+and friction."""
 
 from __future__ import annotations
 
@@ -27,23 +28,24 @@ def rover(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
     return write_rover(tmp_path_factory.mktemp("rover"))
 
 
-def test_sizes_and_commands_are_the_robot_s(rover: RobotDescription):
+def test_sizes_and_commands_follow_the_description_of_the_robot(rover: RobotDescription):
     env = LocomotionEnv(rover, TASKS["walk"], LocomotionConfig())
     assert (env.observation_size, env.action_size) == (9 + 6 + 1, 2)
     for action, command in (([-1.0, -1.0], [-0.4, 0.0]), ([1.0, 3.0], [0.6, 10.0]), ([0.0, 0.0], [0.1, 5.0])):
         np.testing.assert_allclose(env.command_of(jnp.array(action)), command, atol=1e-6)
 
 
-def test_starts_are_drawn_about_the_keyframe_within_the_joints_ranges(rover: RobotDescription):
+def test_starting_states_are_drawn_about_the_keyframe_within_joint_ranges(rover: RobotDescription):
     model = rover.load_model()
     env = LocomotionEnv(rover, TASKS["walk"], RANDOMIZED)
     draw = jax.jit(jax.vmap(env.reset))
     now = locomotion_state(draw(jax.random.split(jax.random.key(0), 300)))
     qpos, home = np.asarray(now.rollout.physics.qpos), model.key("home").qpos
     shoulder, rod, lid = qpos[:, 7:].T
-    assert shoulder.min() == pytest.approx(-0.4) and shoulder.max() == pytest.approx(0.6)  # 30 deg go beyond both
-    assert 0.003 < rod.std() < 0.006 and rod.min() >= 0.0  # a slide: metres, not degrees
-    np.testing.assert_allclose(lid, home[9], atol=1e-6)  # held
+    # Offsets of 30 deg exceed both limits of the joint.
+    assert shoulder.min() == pytest.approx(-0.4) and shoulder.max() == pytest.approx(0.6)
+    assert 0.003 < rod.std() < 0.006 and rod.min() >= 0.0  # a slide joint, in metres
+    np.testing.assert_allclose(lid, home[9], atol=1e-6)  # a held joint keeps its angle
     yaw = 2 * np.arctan2(qpos[:, 6], qpos[:, 3])
     assert np.rad2deg(np.abs(yaw - np.pi / 2)).max() <= RANDOMIZED.start_yaw + 2.5  # about the keyframe's heading
     np.testing.assert_allclose(np.linalg.norm(qpos[:, 3:7], axis=1), 1.0, atol=1e-5)
@@ -53,11 +55,11 @@ def test_starts_are_drawn_about_the_keyframe_within_the_joints_ranges(rover: Rob
     plain = make_simulator_setting(rover, model, LocomotionConfig(), None)
     still = locomotion_state(jax.jit(lambda key: env._start(plain, key))(jax.random.key(1)))
     np.testing.assert_allclose(still.rollout.physics.qpos, home, atol=1e-6)
-    np.testing.assert_allclose(still.friction, [0.7, 0.8, 0.6], atol=1e-6)  # floor, hull, arm: each its own
+    np.testing.assert_allclose(still.friction, [0.7, 0.8, 0.6], atol=1e-6)  # floor, hull and arm have their own values
     assert 0.5 <= now.friction.min() and now.friction.max() <= 1.1 and np.ptp(now.friction, axis=1).max() == 0
 
 
-def test_a_step_is_that_of_c_mujoco(rover: RobotDescription):
+def test_a_control_step_and_its_reward_agree_with_c_mujoco(rover: RobotDescription):
     model = rover.load_model()
     env = LocomotionEnv(rover, TASKS["turn"], LocomotionConfig())
     state = env.reset(jax.random.key(0))
@@ -69,12 +71,12 @@ def test_a_step_is_that_of_c_mujoco(rover: RobotDescription):
     data.ctrl[:] = 0.35, 4.0
     mujoco.mj_step(model, data, 4)  # 0.04 s
     now = locomotion_state(state)
-    np.testing.assert_allclose(now.rollout.physics.qpos, data.qpos, atol=2e-3)  # contacts differ a little
+    np.testing.assert_allclose(now.rollout.physics.qpos, data.qpos, atol=2e-3)  # MJX's contacts differ slightly
     mujoco.mj_forward(model, data)
     assert float(state.reward) == pytest.approx((data.subtree_com[1] - before)[1] / 0.04, abs=0.02)
 
 
 @pytest.mark.parametrize("task", list(TASKS))
-def test_an_anchored_robot_is_told_what_a_task_needs(task: str):
+def test_tasks_refuse_an_anchored_robot(task: str):
     with pytest.raises(InputError, match=f"^{task} needs a free-floating robot; tethered balloon is anchored"):
         LocomotionEnv(read_description(BALLOON), TASKS[task], LocomotionConfig())

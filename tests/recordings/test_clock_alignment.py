@@ -1,4 +1,4 @@
-"""Two clocks: known offsets are found to a fraction of a control step, and what cannot be told is said."""
+"""Tests of the alignment of two clocks: known offsets are recovered, and ambiguous offsets have a low confidence."""
 
 from __future__ import annotations
 
@@ -20,15 +20,16 @@ from ballu_mjx.robots.registry import load_robot
 
 
 def wave(time: np.ndarray) -> np.ndarray:
-    """Two legs, of periods that never meet again."""
+    """Return signals of two legs whose sum does not repeat itself."""
     left = np.sin(3.1 * time) + np.sin(np.sqrt(29) * time)
     return np.stack([left, 3 * np.cos(np.sqrt(17) * time) + np.sin(7 * time)], axis=1)
 
 
 @settings(max_examples=40, deadline=None)
 @given(offset=st.floats(-1e4, 1e4), sign=st.sampled_from([1, -1]), seed=st.integers(0, 1000), jitter=st.booleans())
-def test_known_offsets_come_back_between_the_grids_points(offset: float, sign: int, seed: int, jitter: bool):
-    """Other clock, other rate, other unit, other sign, noise and drop-outs: within a tenth of a control step."""
+def test_known_offsets_are_recovered_between_grid_points(offset: float, sign: int, seed: int, jitter: bool):
+    """The error stays below a tenth of a control step. The signals differ in clock, rate, unit and sign, and have noise
+    and drop-outs."""
     rng = np.random.default_rng(seed)
     time = np.cumsum(rng.uniform(0.005, 0.015, 2500) if jitter else np.full(2500, 0.01))
     motion = sign * 0.02 * wave(time) + 0.002 * rng.standard_normal((len(time), 2)) + 0.7
@@ -41,8 +42,8 @@ def test_known_offsets_come_back_between_the_grids_points(offset: float, sign: i
     assert found.confidence > 0.8
 
 
-def test_a_period_is_as_good_as_the_next():
-    """A pure wave fits at every period; the range asked for decides."""
+def test_periodic_signals_have_low_confidence_unless_the_range_is_narrow():
+    """A sine wave fits at every period. A narrower search range makes the offset unique."""
     time, log = np.arange(0, 20, 0.01), np.arange(2, 14, 0.05)
 
     def legs(t: np.ndarray) -> np.ndarray:
@@ -57,7 +58,7 @@ def test_a_period_is_as_good_as_the_next():
     assert narrow is not None and narrow.best.offset == pytest.approx(5.0, abs=0.003) and narrow.second is None
 
 
-def test_a_leg_that_rests_decides_nothing():
+def test_leg_at_rest_does_not_affect_the_offset():
     time = np.arange(0, 15, 0.01)
     motion = wave(time)
     motion[:, 1] = 1e-6 * np.random.default_rng(0).standard_normal(len(time))
@@ -67,7 +68,7 @@ def test_a_leg_that_rests_decides_nothing():
     assert found.best.correlation > 0.95
 
 
-def test_stillness_and_too_little_overlap_have_no_offset():
+def test_signals_at_rest_or_with_little_overlap_give_no_offset():
     time = np.arange(0, 10, 0.01)
     assert align(time, np.ones((len(time), 2)), time, wave(time)) is None
     assert align(time, wave(time), time, np.zeros((len(time), 2))) is None
@@ -77,15 +78,15 @@ def test_stillness_and_too_little_overlap_have_no_offset():
 
 @functools.cache
 def telegraph() -> Recording:
-    """Random jumps of 25 s, motion capture alone."""
+    """Return a recording of 25 s with random steps of the commands, and with motion capture only."""
     (path,) = [path for path in list_bundled("test") if path.name.startswith("far-1")]
     return read_recording(path, load_robot())
 
 
 @pytest.mark.parametrize("offset", [0.0, -37.123, 1234.567])
-def test_a_robots_log_is_found_by_how_its_legs_move(offset: float):
-    """Whatever the offset, the same delay of servos and estimate is left: that of this recording, within the 0.05 s
-    which the command promises of nine in ten."""
+def test_command_log_is_aligned_by_the_leg_motion(offset: float):
+    """The remaining error, from delay of the servos and of the estimate, does not depend on the offset. The command
+    states an error of at most 0.05 s for nine in ten recordings."""
     recording = telegraph()
     rows = slice(200, 2200)
     motion = measured_response(recording)
@@ -100,7 +101,7 @@ def test_a_robots_log_is_found_by_how_its_legs_move(offset: float):
     assert found.best.offset - again.best.offset == pytest.approx(0.0213, abs=0.002)
 
 
-def test_a_walk_cut_out_of_the_middle_is_ambiguous():
+def test_section_of_steady_walking_is_ambiguous():
     (path,) = [path for path in list_bundled("test") if path.name.startswith("near-1")]
     recording = read_recording(path, load_robot())
     motion = measured_response(recording)
@@ -114,7 +115,7 @@ def test_a_walk_cut_out_of_the_middle_is_ambiguous():
     assert apart == pytest.approx(round(apart), abs=0.1)
 
 
-def test_knees_of_a_sweep_follow_within_a_tenth_of_a_second():
+def test_sweep_is_aligned_by_knee_angles_within_a_tenth_of_a_second():
     (path,) = list_bundled("suspended")
     recording = read_recording(path, load_robot())
     motion = measured_response(recording)
@@ -125,7 +126,7 @@ def test_knees_of_a_sweep_follow_within_a_tenth_of_a_second():
     assert 0.0 < found.best.offset < 0.1
 
 
-def test_gaits_have_the_length_and_range_that_is_asked_for():
+def test_gaits_have_the_requested_length_and_valid_range():
     for name, gait in gaits.GAITS.items():
         commands = gait(7.0)
         assert commands.shape == (140, 2), name

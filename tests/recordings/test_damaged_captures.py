@@ -1,7 +1,7 @@
-"""Files that are damaged: each format refuses each kind by a sentence that names the file, the place and what to do.
+"""Tests of damaged capture files. Each format refuses each kind of damage by a message with file, place and remedy.
 
-The kinds: a row that ends early, a header that is missing, a column of another name, a cell that is no number, a unit
-that is none, quaternions of zeros. Damages of one format alone are in test_readers.py and test_importers.py.
+The kinds are: a truncated row, a missing header, a renamed column, a cell that is not a number, an unknown unit, and
+quaternions of zeros. test_readers.py and test_importers.py test damage that concerns one format only.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ FORMATS: Mapping[str, tuple[Callable[[Path], Path], str]] = {
     "table": (write_table, TABLE),
     "npz": (write_npz, ARCHIVE),
 }
-"""How a file is written, and the mapping's part about sites."""
+"""Function that writes a file, and the mapping of its sites, by format."""
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def room(folder: Path, robot: RobotDescription, text: str) -> RoomMapping:
 
 
 def saved(name: str, array: np.ndarray) -> Damage:
-    """Another array in an archive."""
+    """Write `array` into an archive as `name`."""
 
     def damage(path: Path) -> None:
         with np.load(path, allow_pickle=False) as content:
@@ -89,7 +89,7 @@ def saved(name: str, array: np.ndarray) -> Damage:
 
 CUT_OFF, NO_NUMBER = "the file was cut off; copy", "is not a number, or is too large;"
 REFUSALS: list[tuple[str, Damage, list[str]]] = [
-    # a row that ends early
+    # a truncated row
     ("motive", shortened(80, 5), ["line 80: the row ends before 'hull Rotation W'", CUT_OFF]),
     ("qualisys-6d", shortened(80, 9, "\t"), ["line 80: the row ends before 'hull Rot[0]'", CUT_OFF]),
     ("qualisys-3d", shortened(80, 9, "\t"), ["line 80: the row ends before 'hull3 Y'", CUT_OFF]),
@@ -99,7 +99,7 @@ REFUSALS: list[tuple[str, Damage, list[str]]] = [
     ("tum", shortened(2, 5, " "), ["line 2: the row ends before 'qy'", CUT_OFF]),
     ("euroc", shortened(80, 6), ["line 80: the row ends before 'qy'", CUT_OFF]),
     ("table", shortened(80, 5), ["line 80: the row has 5 cells, the header 13", "was cut off, copy it again"]),
-    # a header that is missing, or a line of it
+    # a missing header, or a missing line of it
     ("motive", without_line(1), ["line 1: the line that begins with Format Version", "is missing; export again"]),
     (
         "motive",
@@ -119,7 +119,7 @@ REFUSALS: list[tuple[str, Damage, list[str]]] = [
     ("tracker", without_line(5), ["line 5: it holds numbers instead of units; export again"]),
     ("euroc", without_line(1), ["line 1: it holds numbers instead of column names; write"]),
     ("table", without_line(2), ["line 2: it holds numbers instead of column names; write"]),
-    # a column of another name
+    # a renamed column
     ("motive", in_line(7, 7, "V"), ["line 7: 'hull' has no column Position Y; export again"]),
     ("motive", in_line(7, 2, "V"), ["line 7, hull: its rotation has the columns V, Y, Z, W", "again"]),
     ("qualisys-6d", replaced("hull X\tY", "hull V\tY"), ["line 11: the column 'hull X' is missing; export again"]),
@@ -140,7 +140,7 @@ REFUSALS: list[tuple[str, Damage, list[str]]] = [
     ("euroc", replaced("q_RS_x [], q_RS_y []", "q_RS_y [], q_RS_x []"), ["line 1: the header is not #timestamp"]),
     ("euroc", replaced("p_RS_R_x [m], p_RS_R_y", "p_RS_R_y [m], p_RS_R_x"), ["line 1: the header is not #timestamp"]),
     ("table", replaced("hull_qw", "hull_w"), ["no column 'hull_qw'; fix ", "room.toml, did you mean 'hull_w'"]),
-    # a cell that is no number
+    # a cell that is not a number
     ("motive", in_line(80, 8, "ten"), ["line 80, hull Position Z: 'ten'", NO_NUMBER]),
     ("qualisys-6d", in_line(80, 4, "ten", "\t"), ["line 80, hull Z: 'ten'", NO_NUMBER]),
     ("qualisys-3d", in_line(80, 4, "ten", "\t"), ["line 80, hull1 Z: 'ten'", NO_NUMBER]),
@@ -153,7 +153,7 @@ REFUSALS: list[tuple[str, Damage, list[str]]] = [
     ("table", in_line(80, 3, "ten"), ["line 80, column hull_z: 'ten' is not a number; write a number"]),
     ("npz", saved("hull_pos", np.full((300, 3), "ten")), ["there is no column 'hull_pos[0]'; fix ", "room.toml"]),
     ("npz", saved("hull_pos", np.full((300, 3), np.inf)), ["hull_pos[0], sample 1: it is infinite; write NaN"]),
-    # a unit that is none, or another than the format's
+    # an unknown unit, or one that differs from the format's
     (
         "motive",
         replaced("Length Units,Meters", "Length Units,"),
@@ -177,7 +177,7 @@ REFUSALS: list[tuple[str, Damage, list[str]]] = [
     ("euroc", replaced("[m]", "[mm]"), ["line 1: EuRoC's positions are in m, but the header has 'p_RS_R_x [mm]'"]),
     ("euroc", replaced("0000000,", ","), ["column timestamp: the timestamps are 1 apart, but EuRoC's are in ns;"]),
     ("qualisys-6d", replaced("FRAMES\t300", "FRAMES\tmany"), ["line 1: NO_OF_FRAMES is 'many'", "export again"]),
-    # quaternions of another length
+    # quaternions that are not of unit length
     ("motive", in_line(100, 5, "3"), ["line 7, hull: the quaternion of sample 93 has length 3", "export unit"]),
     ("tracker-quaternion", in_line(80, 5, "3"), ["hull:hull: the quaternion of frame 75 has length 3", "export unit"]),
     ("tum", in_line(80, 7, "3", " "), ["columns qx, qy, qz, qw: the quaternion of sample 79 has length 3"]),
@@ -186,8 +186,10 @@ REFUSALS: list[tuple[str, Damage, list[str]]] = [
 ]
 
 
-@pytest.mark.parametrize("name, damage, said", REFUSALS)
-def test_damage_is_named(tmp_path: Path, robot: RobotDescription, name: str, damage: Damage, said: list[str]):
+@pytest.mark.parametrize("name, damage, words", REFUSALS)
+def test_damaged_file_is_refused_with_place_and_remedy(
+    tmp_path: Path, robot: RobotDescription, name: str, damage: Damage, words: list[str]
+):
     write, text = FORMATS[name]
     path = write(tmp_path)
     read_capture(path, room(tmp_path, robot, text))
@@ -196,7 +198,7 @@ def test_damage_is_named(tmp_path: Path, robot: RobotDescription, name: str, dam
         read_capture(path, room(tmp_path, robot, text))
     message = str(refusal.value)
     assert message.startswith(str(path)) and message.endswith(".") and "\n" not in message
-    for part in said:
+    for part in words:
         assert part in message, message
 
 
@@ -208,12 +210,13 @@ QUATERNIONS: Mapping[str, tuple[int, list[int], str]] = {
     "euroc": (2, [4, 5, 6, 7], ","),
     "table": (3, [4, 5, 6, 7], ","),
 }
-"""The line of the first sample, and where the hull's orientation stands."""
+"""Line of the first sample, columns of the hull's orientation, and delimiter, by format."""
 
 
 @pytest.mark.parametrize("name", QUATERNIONS)
-def test_an_orientation_of_zeros_was_not_seen(tmp_path: Path, robot: RobotDescription, name: str):
-    """In one sample it is a gap, with its position kept; in all of them the file is refused."""
+def test_orientation_of_zeros_is_a_missing_sample(tmp_path: Path, robot: RobotDescription, name: str):
+    """In one sample, zeros are a gap in the orientation, and the position is kept. In all samples, the file is
+    refused."""
     write, text = FORMATS[name]
     first, cells, delimiter = QUATERNIONS[name]
     path, mapping = write(tmp_path), room(tmp_path, robot, text)
@@ -223,8 +226,8 @@ def test_an_orientation_of_zeros_was_not_seen(tmp_path: Path, robot: RobotDescri
     found = read_capture(path, mapping).bodies["hull"]
     assert whole.quaternion is not None and found.quaternion is not None
     np.testing.assert_array_equal(found.position, whole.position)
-    lost = np.isnan(found.quaternion).any(axis=1) & ~np.isnan(whole.quaternion).any(axis=1)
-    assert np.flatnonzero(lost).tolist() == [sample]
+    no_orientation = np.isnan(found.quaternion).any(axis=1) & ~np.isnan(whole.quaternion).any(axis=1)
+    assert np.flatnonzero(no_orientation).tolist() == [sample]
     zeroed(first, cells, delimiter)(path)
     with pytest.raises(InputError, match=rf"{path.name}: the orientation of \[hull\] was never seen; fix the mapping"):
         place(read_capture(path, mapping), mapping, robot, "trial")

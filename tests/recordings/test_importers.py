@@ -1,4 +1,4 @@
-"""Importers: what each vendor's layout holds comes back, and damage is refused with place and fix."""
+"""Tests of the importers of Vicon, C3D and table files and of mappings. Valid files are read, damaged ones refused."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ ROLES = ("balloon", "base", "foot_left", "foot_right")
 BODIES = "\n".join(f'[{role}]\nbody = "ballu:{role}"' for role in ROLES)
 KEPT = "[origin]\nstart = false\n"
 HIDDEN = slice(40, 55)
-"""Samples in which the files' left foot and balloon are missing."""
+"""Samples without a measurement of left foot and balloon in the files."""
 Y_UP = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""From a capture with y up, z forward and x left."""
+"""Rotation matrix from capture axes with y up, z forward and x left to the axes of the recording format."""
 
 
 @functools.cache
 def source() -> Recording:
-    """Three seconds of a bundled recording."""
+    """Return 3 s of a bundled recording."""
     return cut(read_recording(list_bundled("test")[0], ROBOT), slice(300))
 
 
 def poses(recording: Recording) -> dict[str, tuple[np.ndarray, Rotation]]:
-    """Positions (m) and rotations of all roles; the feet are given some turn of their own."""
+    """Return positions (m) and rotations of all roles. The rotations of the feet are arbitrary."""
     assert recording.tracked_position is not None and recording.tracked_quaternion is not None
     balloon = Rotation.from_quat(recording.tracked_quaternion, scalar_first=True)
     base = Rotation.from_quat(recording.orientations["base"], scalar_first=True)
@@ -67,8 +67,10 @@ def poses(recording: Recording) -> dict[str, tuple[np.ndarray, Rotation]]:
 def captured(
     axes: np.ndarray, offset: np.ndarray | None = None, turn: Rotation | None = None
 ) -> dict[str, tuple[np.ndarray, Rotation]]:
-    """The same in a capture that `axes` turns into the format's frame; the balloon's tracked body sits apart from the
-    site, `offset` (m, its own frame) and `turn` lead from the one to the other."""
+    """Return the poses in the frame of a capture, from which `axes` rotates to the frame of the recording format.
+
+    `offset` (m, in the body's frame) and `turn` lead from the captured balloon to the model's site.
+    """
     rename = Rotation.from_matrix(axes)
     found = {
         role: (position @ axes, rename.inv() * rotation * rename)
@@ -95,7 +97,8 @@ def read(folder: Path, text: str, rooms: str, name: str = "walk.csv") -> Recordi
     return place(read_vicon(folder / name, room), room, ROBOT, "walk")
 
 
-def same(actual: Recording, *, start: float = 0.0) -> None:
+def assert_recording(actual: Recording, *, start: float = 0.0) -> None:
+    """Assert that a recording holds the poses of `source`, without the hidden samples. `start`: first time (s)."""
     expected = poses(source())
     assert actual.tracked_position is not None and actual.tracked_quaternion is not None
     np.testing.assert_allclose(actual.time, start + source().time, atol=1e-9)
@@ -119,20 +122,20 @@ def same(actual: Recording, *, start: float = 0.0) -> None:
 
 @pytest.mark.parametrize("angle", ["deg", "rad"])
 @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
-def test_nexus_segments_are_rotation_vectors(tmp_path: Path, angle: str, delimiter: str):
+def test_nexus_segments_are_read_as_rotation_vectors(tmp_path: Path, angle: str, delimiter: str):
     text = "\n\n" + section("Segments", captured(np.eye(3)), angle=angle, delimiter=delimiter, first=212)
-    same(read(tmp_path, text, 'robot = "r"\n' + KEPT + BODIES), start=2.11)
+    assert_recording(read(tmp_path, text, 'robot = "r"\n' + KEPT + BODIES), start=2.11)
 
 
 @pytest.mark.parametrize("rotation", ROTATIONS)
-def test_tracker_objects_are_what_the_mapping_says(tmp_path: Path, rotation: str):
+def test_tracker_rotations_are_read_as_the_mapping_states(tmp_path: Path, rotation: str):
     text = section("Objects", captured(np.eye(3)), prefix="Global Angle ballu:", rotation=rotation, angle="rad")
     bodies = "\n".join(f'[{role}]\nbody = "{role}"\nrotation = "{rotation}"' for role in ROLES)
-    same(read(tmp_path, text, 'robot = "r"\n' + KEPT + bodies))
+    assert_recording(read(tmp_path, text, 'robot = "r"\n' + KEPT + bodies))
 
 
-def test_several_sections_and_subjects_in_one_file(tmp_path: Path):
-    """Segments of one subject, markers of another, a force plate at its own rate, and Windows' line ends."""
+def test_file_with_several_sections_and_subjects_is_read(tmp_path: Path):
+    """The file has segments of one subject, markers of another, a force plate with another rate, and CRLF line ends."""
     everything = captured(np.eye(3))
     rigid = {role: everything[role] for role in ("balloon", "base")}
     feet = {role: everything[role] for role in ("foot_left", "foot_right")}
@@ -145,28 +148,28 @@ def test_several_sections_and_subjects_in_one_file(tmp_path: Path):
         section("Trajectories", feet, prefix="shoes:", rotation=None),
     ]
     rooms = 'robot = "r"\n' + KEPT + BODIES.replace("ballu:foot", "shoes:foot")
-    same(read(tmp_path, "\n".join(parts).replace("\n", "\r\n"), rooms))
+    assert_recording(read(tmp_path, "\n".join(parts).replace("\n", "\r\n"), rooms))
 
 
 @pytest.mark.parametrize("length", ["m", "cm", "mm"])
-def test_lengths_are_read_by_the_units_row_unless_the_mapping_knows_better(tmp_path: Path, length: str):
+def test_unit_of_length_is_that_of_the_mapping_or_else_of_the_units_row(tmp_path: Path, length: str):
     text = section("Segments", captured(np.eye(3)), length=length)
-    same(read(tmp_path, text, 'robot = "r"\n' + KEPT + BODIES))
+    assert_recording(read(tmp_path, text, 'robot = "r"\n' + KEPT + BODIES))
     wrong = text.replace(f",{length},{length},{length}", ",in,in,in")
-    same(read(tmp_path, wrong, f'robot = "r"\n{KEPT}[units]\nlength = "{length}"\n{BODIES}'))
+    assert_recording(read(tmp_path, wrong, f'robot = "r"\n{KEPT}[units]\nlength = "{length}"\n{BODIES}'))
 
 
-def test_axes_offset_and_turn_lead_to_the_models_site(tmp_path: Path):
+def test_axes_offset_and_turn_map_the_capture_to_the_model_s_site(tmp_path: Path):
     offset, turn = np.array([0.03, -0.2, 0.11]), Rotation.from_rotvec(np.deg2rad([10.0, 90.0, -20.0]))
     text = section("Segments", captured(Y_UP, offset, turn))
     axes = '[axes]\nforward = "z"\nleft = "x"\nup = "y"\n'
     site = "offset = [0.03, -0.2, 0.11]\nturn = [10, 90, -20]\n"
     bodies = BODIES.replace('body = "ballu:balloon"\n', f'body = "ballu:balloon"\n{site}')
-    same(read(tmp_path, text, 'robot = "r"\n' + KEPT + axes + bodies))
+    assert_recording(read(tmp_path, text, 'robot = "r"\n' + KEPT + axes + bodies))
 
 
-def test_start_brings_any_place_in_the_room_to_the_origin(tmp_path: Path):
-    """The same walk in another corner of the room, on a floor 0.2 m up, gives the same recording."""
+def test_start_moves_the_recording_to_the_origin(tmp_path: Path):
+    """A walk at another place and heading in the room, on a floor at 0.2 m, gives the same recording."""
     there = Rotation.from_euler("z", 130, degrees=True)
     moved = {
         role: (there.apply(position) + [3.0, -2.0, 0.2], there * rotation)
@@ -182,15 +185,15 @@ def test_start_brings_any_place_in_the_room_to_the_origin(tmp_path: Path):
     assert forward[1] == pytest.approx(0, abs=1e-9) and forward[0] > 0.9
 
 
-def test_feet_find_the_floor(tmp_path: Path):
+def test_floor_feet_sets_the_floor_at_the_lowest_foot(tmp_path: Path):
     lifted = {role: (p + [0, 0, 0.7], r) for role, (p, r) in captured(np.eye(3)).items()}
     actual = read(tmp_path, section("Segments", lifted), f'robot = "r"\n[origin]\nfloor = "feet"\n{BODIES}')
     lowest = min(np.nanmin(actual.points[foot][:, 2]) for foot in ("foot_left", "foot_right"))
     assert abs(lowest - FOOT_RADIUS) < 3e-3
 
 
-def test_turn_start_makes_any_tracked_frame_upright(tmp_path: Path):
-    """However the object was drawn: from standing upright its frame is known all the same."""
+def test_turn_start_aligns_any_tracked_frame(tmp_path: Path):
+    """The frame of the tracked object is arbitrary. Its rotation is known because the robot starts upright."""
     skew = Rotation.from_rotvec([0.7, -1.2, 2.0])
     text = section("Segments", captured(np.eye(3), turn=skew))
     bodies = BODIES.replace('body = "ballu:balloon"', 'body = "ballu:balloon"\nturn = "start"')
@@ -198,26 +201,26 @@ def test_turn_start_makes_any_tracked_frame_upright(tmp_path: Path):
     shown = np.r_[0 : HIDDEN.start, HIDDEN.stop : 300]
     turned = Rotation.from_quat(np.asarray(actual.tracked_quaternion)[shown], scalar_first=True)
     expected = poses(source())["balloon"][1][shown]
-    # What is left is how far it really stands from upright and forward at the start.
-    left = (expected.inv() * turned).magnitude()
-    np.testing.assert_allclose(left, expected[:20].mean().magnitude(), atol=1e-5)
-    assert np.rad2deg(left[0]) < 5 and np.rad2deg(skew.magnitude()) > 90
+    # The remaining error is the true deviation from upright and forward at the start.
+    error = (expected.inv() * turned).magnitude()
+    np.testing.assert_allclose(error, expected[:20].mean().magnitude(), atol=1e-5)
+    assert np.rad2deg(error[0]) < 5 and np.rad2deg(skew.magnitude()) > 90
 
 
-def test_a_body_at_exactly_zero_was_not_seen(tmp_path: Path):
+def test_body_at_exactly_zero_is_a_missing_sample(tmp_path: Path):
     text = section("Segments", captured(np.eye(3)))
-    same(read(tmp_path, zeroed(text), 'robot = "r"\n' + KEPT + BODIES))
+    assert_recording(read(tmp_path, zeroed(text), 'robot = "r"\n' + KEPT + BODIES))
 
 
 def zeroed(text: str) -> str:
-    """Empty cells of samples as zeros."""
+    """Return the file with zeros in the empty cells of its samples."""
     lines = text.split("\n")
     return "\n".join(
         [*lines[:5], *(",".join(cell or "0" for cell in line.split(",")) if line else "" for line in lines[5:])]
     )
 
 
-def test_frames_that_are_missing_stay_missing_in_time(tmp_path: Path):
+def test_missing_frames_leave_gaps_in_time(tmp_path: Path):
     lines = section("Segments", captured(np.eye(3))).split("\n")
     del lines[100:110]
     actual = read(tmp_path, "\n".join(lines), 'robot = "r"\n' + KEPT + BODIES)
@@ -225,7 +228,7 @@ def test_frames_that_are_missing_stay_missing_in_time(tmp_path: Path):
 
 
 def line(number: int, change: Callable[[list[str]], list[str]]) -> Callable[[str], str]:
-    """Change the cells of the line that messages call `number`."""
+    """Return a function that changes the cells of line `number` (counted from 1, as in messages)."""
 
     def damage(text: str) -> str:
         lines = text.split("\n")
@@ -236,7 +239,7 @@ def line(number: int, change: Callable[[list[str]], list[str]]) -> Callable[[str
 
 
 @pytest.mark.parametrize(
-    "damage, said",
+    "damage, words",
     [
         (line(80, lambda cells: cells[:9]), ["line 80", "ends before 'ballu:base'", "cut off"]),
         (line(80, lambda cells: [*cells, "7"]), ["line 80", "more cells than the header", "decimal points"]),
@@ -268,12 +271,14 @@ def line(number: int, change: Callable[[list[str]], list[str]]) -> Callable[[str
         (lambda text: text.replace("Segments", "Objects"), ["rotation vector or Euler angles", 'rotation = "helical"']),
     ],
 )
-def test_damage_is_refused_with_its_place_and_mend(tmp_path: Path, damage: Callable[[str], str], said: list[str]):
+def test_damaged_vicon_file_is_refused_with_place_and_remedy(
+    tmp_path: Path, damage: Callable[[str], str], words: list[str]
+):
     with pytest.raises(InputError) as refusal:
         read(tmp_path, damage(vicon_text()), 'robot = "r"\n' + KEPT + BODIES)
     message = str(refusal.value)
     assert message.startswith(str(tmp_path / "walk.csv")) and message.endswith(".") and "\n" not in message
-    for part in said:
+    for part in words:
         assert part in message
 
 
@@ -282,7 +287,7 @@ def vicon_text() -> str:
     return section("Segments", captured(np.eye(3)))
 
 
-def test_a_marker_cannot_be_the_balloon(tmp_path: Path):
+def test_marker_cannot_be_the_tracked_body(tmp_path: Path):
     text = section("Trajectories", captured(np.eye(3)), rotation=None)
     with pytest.raises(InputError, match=r"room.toml, \[balloon\]: its source has no orientation; name an object"):
         read(tmp_path, text, 'robot = "r"\n' + BODIES)
@@ -310,10 +315,10 @@ def short_rows() -> list[list[str]]:
     cut=st.one_of(st.none(), st.integers(0, 30_000)),
     swapped=st.one_of(st.none(), st.tuples(st.integers(0, 124), st.integers(0, 124))),
 )
-def test_mutated_files_are_refused_or_hold_what_they_held(
+def test_mutated_file_is_refused_or_keeps_its_unchanged_samples(
     edits: list[tuple[int, int, str]], cut: int | None, swapped: tuple[int, int] | None
 ):
-    """No other exception, no infinite number, time in order, and untouched samples as they were."""
+    """No other exception occurs, no number is infinite, times increase, and unchanged samples keep their values."""
     rows = [list(row) for row in short_rows()]
     for row, column, text in edits:
         cells = rows[row]
@@ -344,17 +349,19 @@ def test_mutated_files_are_refused_or_hold_what_they_held(
             np.testing.assert_allclose(recording.points["base"][kept], clean[frames[kept]], atol=2e-6)
 
 
-def test_names_that_stand_twice_matter_only_where_they_are_asked_for(tmp_path: Path):
+def test_duplicate_names_are_refused_only_if_the_mapping_uses_them(tmp_path: Path):
     text = section("Segments", captured(np.eye(3)))
     twins = section("Segments", {"twin": captured(np.eye(3))["base"], "other": captured(np.eye(3))["base"]})
     rooms = 'robot = "r"\n' + KEPT + BODIES
-    same(read(tmp_path, text + "\n" + twins.replace("ballu:other", "ballu:twin").replace("Segments", "Model"), rooms))
+    assert_recording(
+        read(tmp_path, text + "\n" + twins.replace("ballu:other", "ballu:twin").replace("Segments", "Model"), rooms)
+    )
     with pytest.raises(InputError, match="'ballu:base' has RX twice"):
         read(tmp_path, text.replace("ballu:foot_left", "ballu:base"), rooms)
 
 
-def test_messages_count_frames_as_the_file_does(tmp_path: Path):
-    """A trial that was cropped to begin at frame 213; a marker that is off in its 51st sample, frame 263."""
+def test_messages_state_the_frame_numbers_of_the_file(tmp_path: Path):
+    """The trial was cropped to begin at frame 213. A marker is displaced in its 51st sample, which is frame 263."""
     found = poses(source())
     position, rotation = found["balloon"]
     markers = np.stack([position + rotation.apply(place) for place in cluster()], axis=1)
@@ -379,23 +386,23 @@ def cluster(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-0.2, 0.2, (5, 3))
 
 
-def test_markers_give_the_body_that_carries_them():
+def test_body_pose_is_computed_from_its_markers():
     position, rotation = poses(source())["balloon"]
     places = cluster()
     markers = np.stack([position + rotation.apply(place) for place in places])
-    markers[0, 10:40] = markers[1, 30:60] = np.nan  # three of five are enough
-    markers[:3, 80:90] = np.nan  # two are not
+    markers[0, 10:40] = markers[1, 30:60] = np.nan  # three of five markers determine the pose
+    markers[:3, 80:90] = np.nan  # two do not
     body = rigid_body(Path("x"), "balloon", markers, places, 0.01)
-    lost = np.zeros(300, bool)
-    lost[80:90] = True
-    assert body.quaternion is not None and np.isnan(body.quaternion[lost]).all()
-    turned = Rotation.from_quat(body.quaternion[~lost], scalar_first=True)
-    expected = Rotation.from_quat(rotation.as_quat()[~lost])
+    missing = np.zeros(300, bool)
+    missing[80:90] = True
+    assert body.quaternion is not None and np.isnan(body.quaternion[missing]).all()
+    turned = Rotation.from_quat(body.quaternion[~missing], scalar_first=True)
+    expected = Rotation.from_quat(rotation.as_quat()[~missing])
     assert (expected.inv() * turned).magnitude().max() < 1e-7
-    np.testing.assert_allclose(body.position[~lost], position[~lost], atol=1e-9)
+    np.testing.assert_allclose(body.position[~missing], position[~missing], atol=1e-9)
 
 
-def test_markers_on_a_line_or_mixed_up_are_refused():
+def test_collinear_or_exchanged_markers_are_refused():
     position, rotation = poses(source())["balloon"]
     markers = np.stack([position + rotation.apply(place) for place in cluster()])
     on_a_line = np.outer(np.arange(3), [0.1, 0.0, 0.02])
@@ -410,7 +417,7 @@ def test_markers_on_a_line_or_mixed_up_are_refused():
 
 
 def c3d_content(**options: Any) -> bytes:
-    """The recording as a C3D; the balloon by five markers, and all of what is hidden hidden."""
+    """Return the recording as a C3D file. The balloon has five markers. The hidden samples have no measurements."""
     found = poses(source())
     position, rotation = found["balloon"]
     markers = {f"ballu:B{i}": position + rotation.apply(place) for i, place in enumerate(cluster())}
@@ -434,21 +441,21 @@ def c3d_room(folder: Path, more: str = "") -> RoomMapping:
     return read_mapping(folder / "room.toml", ROBOT)
 
 
-def test_c3d_comes_back(c3d_file: Path):
-    """Single precision in the file: a tenth of a micrometre."""
+def test_c3d_file_is_read(c3d_file: Path):
+    """The file's single precision corresponds to 0.1 micrometres."""
     room = c3d_room(c3d_file.parent)
-    same(place(read_c3d(c3d_file, room), room, ROBOT, "walk"))
+    assert_recording(place(read_c3d(c3d_file, room), room, ROBOT, "walk"))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.05, 0.3, 0.9, 0.98])
-def test_a_c3d_cut_anywhere_is_refused(c3d_file: Path, share: float):
+def test_truncated_c3d_file_is_refused(c3d_file: Path, share: float):
     content = c3d_file.read_bytes()
     c3d_file.write_bytes(content[: int(share * len(content))])
     with pytest.raises(InputError, match=r"walk.c3d: (not a|too short)"):
         read_c3d(c3d_file, c3d_room(c3d_file.parent))
 
 
-def test_c3d_without_what_is_asked_for_is_refused(c3d_file: Path):
+def test_c3d_file_without_a_mapped_marker_or_known_unit_is_refused(c3d_file: Path):
     room = c3d_room(c3d_file.parent)
     (c3d_file.parent / "room.toml").write_text((c3d_file.parent / "room.toml").read_text().replace("B4", "B9"))
     with pytest.raises(InputError, match=r"walk.c3d: there is no marker 'B9'; fix .*room\.toml"):
@@ -459,11 +466,13 @@ def test_c3d_without_what_is_asked_for_is_refused(c3d_file: Path):
     c3d_file.write_bytes(content)
     with pytest.raises(InputError, match=r"POINT:UNITS: the unit 'xy' is not a known unit of length"):
         read_c3d(c3d_file, room)
-    same(place(read_c3d(c3d_file, c3d_room(c3d_file.parent, '[units]\nlength = "mm"\n')), room, ROBOT, "walk"))
+    assert_recording(
+        place(read_c3d(c3d_file, c3d_room(c3d_file.parent, '[units]\nlength = "mm"\n')), room, ROBOT, "walk")
+    )
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_a_c3d_with_damaged_parameters_is_refused_or_read_right(c3d_file: Path, seed: int):
+def test_c3d_file_with_damaged_parameters_is_refused_or_read_correctly(c3d_file: Path, seed: int):
     rng = np.random.default_rng(seed)
     content = bytearray(c3d_file.read_bytes())
     content[600:660] = rng.integers(0, 256, 60, np.uint8).tobytes()
@@ -475,22 +484,22 @@ def test_a_c3d_with_damaged_parameters_is_refused_or_read_right(c3d_file: Path, 
     except InputError as error:
         assert "walk.c3d" in str(error)
     else:
-        same(place(found, room, ROBOT, "walk"))
+        assert_recording(place(found, room, ROBOT, "walk"))
 
 
 @pytest.mark.parametrize("processor", [INTEL, DEC, MIPS])
 @pytest.mark.parametrize("analog_words", [0, 6])
-def test_c3d_of_every_processor_comes_back(tmp_path: Path, processor: int, analog_words: int):
-    """Analog words stand in each frame, whether a parameter tells their rate or not."""
+def test_c3d_files_of_every_processor_type_are_read(tmp_path: Path, processor: int, analog_words: int):
+    """Each frame may contain analog words. No parameter states their rate."""
     room = c3d_room(tmp_path)
     (tmp_path / "walk.c3d").write_bytes(c3d_content(processor=processor, analog_words=analog_words))
-    same(place(read_c3d(tmp_path / "walk.c3d", room), room, ROBOT, "walk"))
+    assert_recording(place(read_c3d(tmp_path / "walk.c3d", room), room, ROBOT, "walk"))
 
 
 @pytest.mark.parametrize("processor", [INTEL, DEC, MIPS])
 @pytest.mark.parametrize("scale", [0.1, 0.1449, 0.07])
-def test_c3d_integers_are_scaled_whatever_the_bits_of_the_scale(tmp_path: Path, processor: int, scale: float):
-    """The scale's sign, which says that these are integers, stands in another byte for each processor."""
+def test_c3d_integers_are_read_for_every_scale_and_processor_type(tmp_path: Path, processor: int, scale: float):
+    """The sign of the scale marks integers. The byte of the sign depends on the processor type."""
     position = np.random.default_rng(0).uniform(-1000, 1000, (150, 4, 3))
     position[40:60, 1] = np.nan
     content = c3d_bytes(position, "abcd", processor=processor, scale=scale)
@@ -500,22 +509,22 @@ def test_c3d_integers_are_scaled_whatever_the_bits_of_the_scale(tmp_path: Path, 
 
 @pytest.mark.parametrize("processor", [INTEL, DEC])
 @pytest.mark.parametrize("scale", [-1.0, 0.1])
-def test_c3d_is_read_as_another_reader_does(tmp_path: Path, processor: int, scale: float):
+def test_c3d_positions_match_ezc3d(tmp_path: Path, processor: int, scale: float):
     ezc3d = pytest.importorskip("ezc3d", reason="the independent reader is in the extra `test`")
     position = np.random.default_rng(1).uniform(-1000, 1000, (90, 5, 3))
     content = c3d_bytes(position, "abcde", processor=processor, scale=scale, rate=119.88)
     (tmp_path / "walk.c3d").write_bytes(content)
-    theirs = np.asarray(ezc3d.c3d(str(tmp_path / "walk.c3d"))["data"]["points"])[:3]
-    np.testing.assert_allclose(read_c3d_points(content).position, theirs, rtol=1e-7)
+    expected = np.asarray(ezc3d.c3d(str(tmp_path / "walk.c3d"))["data"]["points"])[:3]
+    np.testing.assert_allclose(read_c3d_points(content).position, expected, rtol=1e-7)
 
 
 @pytest.mark.parametrize("unit", ["m", "meters", "mete", "Metres", "mm", "millimeters", "cm", "centimetre"])
-def test_c3d_units_are_read_as_programs_write_them(tmp_path: Path, unit: str):
+def test_c3d_units_are_read_in_every_common_spelling(tmp_path: Path, unit: str):
     room = c3d_room(tmp_path)
     (tmp_path / "walk.c3d").write_bytes(c3d_content(unit=unit))
     factor = 1.0 if unit.startswith(("mm", "milli")) else {"m": 1e3, "c": 10.0}[unit[0].lower()]
     bodies = read_c3d(tmp_path / "walk.c3d", c3d_room(tmp_path, '[units]\nlength = "mm"\n')).bodies
-    if factor != 1.0:  # the cluster's size is then another
+    if factor != 1.0:  # the markers then contradict the geometry in the mapping
         room = dataclasses.replace(room, sources={role: room.sources[role] for role in ROLES[1:]})
     metres = read_c3d(tmp_path / "walk.c3d", room).bodies
     np.testing.assert_allclose(metres["base"].position, factor * bodies["base"].position, rtol=1e-12)
@@ -523,13 +532,13 @@ def test_c3d_units_are_read_as_programs_write_them(tmp_path: Path, unit: str):
 
 @pytest.mark.parametrize("name", ["Hüfte", "Cadera_ñ", "Ågot"])
 @pytest.mark.parametrize("encoding", ["latin-1", "utf-8"])
-def test_c3d_labels_are_read_in_either_encoding(name: str, encoding: str):
+def test_c3d_labels_are_read_in_latin_1_and_utf_8(name: str, encoding: str):
     found = read_c3d_points(c3d_bytes(np.zeros((10, 2, 3)) + 1, [name.encode(encoding), b"other"]))
     assert found.labels == (name, "other")
 
 
-def test_c3d_frames_beyond_16_bits_are_all_read_or_refused():
-    """A header's count wraps at 65,536, or stops there; other places hold the whole."""
+def test_c3d_file_with_more_than_65535_frames_is_read_whole_or_refused():
+    """The frame count in the header wraps or saturates at 16 bits. Other parameters may hold the full count."""
     position = np.arange(70_000.0)[:, None, None] + np.arange(1.0, 4.0)
     end = {("TRIAL", "ACTUAL_START_FIELD"): (2, [1, 0]), ("TRIAL", "ACTUAL_END_FIELD"): (2, [70_000 & 0xFFFF, 1])}
     counted = {("POINT", "LONG_FRAMES"): (4, [70_000.0])}
@@ -543,19 +552,19 @@ def test_c3d_frames_beyond_16_bits_are_all_read_or_refused():
     assert read_c3d_points(c3d_bytes(position[:300], ["a"], parameters=long)).position.shape == (3, 1, 300)
 
 
-@pytest.mark.parametrize("said", [2, 16])
-def test_the_file_s_length_decides_how_many_analog_words_a_frame_has(said: int):
-    """Public files of one program count channels, not samples, in the header."""
+@pytest.mark.parametrize("header_count", [2, 16])
+def test_number_of_analog_words_follows_from_the_file_length(header_count: int):
+    """In public files of one program, the header counts channels instead of samples."""
     position = np.random.default_rng(2).uniform(-1, 1, (80, 3, 3))
     channels = {("ANALOG", "USED"): (2, [2]), ("ANALOG", "RATE"): (4, [700.0])}
     content = bytearray(c3d_bytes(position, "abc", analog_words=14, parameters=channels))
-    content[4:6] = struct.pack("<H", said)
+    content[4:6] = struct.pack("<H", header_count)
     np.testing.assert_allclose(read_c3d_points(bytes(content)).position.transpose(2, 1, 0), position, rtol=1e-6)
     with pytest.raises(C3DError, match="analog words in a frame"):
         read_c3d_points(bytes(content) + bytes(3000))
 
 
-def test_a_c3d_that_contradicts_itself_is_refused():
+def test_c3d_file_with_contradictory_parameters_is_refused():
     content = bytearray(c3d_bytes(np.ones((30, 2, 3)), "ab", scale=0.1))
     content[12:16] = struct.pack("<f", 0.2)
     with pytest.raises(C3DError, match=r"a scale of 0\.2, POINT:SCALE 0\.1"):
@@ -569,8 +578,8 @@ def test_a_c3d_that_contradicts_itself_is_refused():
 
 
 @pytest.mark.parametrize("first", [1, 0, 213])
-def test_time_counts_from_the_trial_s_first_frame(tmp_path: Path, first: int):
-    """A trial that was cropped at its start, as Nexus does, has not been moved in time."""
+def test_time_of_a_cropped_trial_follows_from_its_frame_number(tmp_path: Path, first: int):
+    """Cropping the start of a trial, as Nexus does, does not shift its times."""
     room = c3d_room(tmp_path)
     (tmp_path / "walk.c3d").write_bytes(c3d_content(first=first))
     start = max(first - 1, 0) / 100
@@ -581,7 +590,7 @@ def test_time_counts_from_the_trial_s_first_frame(tmp_path: Path, first: int):
     assert read_csv.time[0] == pytest.approx(start) and read_csv.first_frame == max(first, 1)
 
 
-def test_what_is_no_c3d_is_refused(tmp_path: Path):
+def test_file_that_is_not_a_c3d_is_refused(tmp_path: Path):
     (tmp_path / "walk.c3d").write_bytes(struct.pack("<256H", *range(256)))
     with pytest.raises(InputError, match="walk.c3d: not a C3D file"):
         read_c3d(tmp_path / "walk.c3d", c3d_room(tmp_path))
@@ -651,16 +660,16 @@ def read_columns(folder: Path, text: str, rooms: str = COLUMNS) -> tuple[Recordi
     return place(found, room, ROBOT, "walk"), found.commands.command
 
 
-def test_tables_come_back(tmp_path: Path):
+def test_table_is_read(tmp_path: Path):
     actual, command = read_columns(tmp_path, table_text())
-    same(actual)
+    assert_recording(actual)
     np.testing.assert_allclose(command, source().command, atol=1e-7)
     for knee in ("knee_left", "knee_right"):
         np.testing.assert_allclose(actual.joint_angles[knee], np.deg2rad(30 * np.sin(source().time)), atol=1e-8)
 
 
 @pytest.mark.parametrize(
-    "damage, said",
+    "damage, words",
     [
         (lambda t, m: (t.replace("lx", "mx"), m), ["walk.csv: there is no column 'lx'", "fix", "room.toml"]),
         (lambda t, m: (t.replace("bx,by", "by,by"), m), ["walk.csv"]),
@@ -675,22 +684,22 @@ def test_tables_come_back(tmp_path: Path):
         (lambda t, m: (t, m.replace('"bw", "bi", "bj", "bk"', '"bi", "bj", "bk", "px"')), ["quaternion", "length"]),
     ],
 )  # fmt: skip
-def test_damaged_tables_are_refused(tmp_path: Path, damage: Callable[[str, str], tuple[str, str]], said: list[str]):
+def test_damaged_tables_are_refused(tmp_path: Path, damage: Callable[[str, str], tuple[str, str]], words: list[str]):
     with pytest.raises(InputError) as refusal:
         read_columns(tmp_path, *damage(table_text(), COLUMNS))
-    for part in said:
+    for part in words:
         assert part in str(refusal.value)
 
 
-def test_logs_hold_commands_until_the_next(tmp_path: Path):
+def test_command_log_holds_each_command_until_the_next(tmp_path: Path):
     log = tmp_path / "log.csv"
     log.write_text("time,command_left,command_right\n5,0.2,0\n5.5,,1\n6.25,0.7,\n")
     time, command = read_commands(open_table(log), Commands.of(ROBOT))
     assert time.tolist() == [5.0, 5.5, 6.25]
     assert command.tolist() == [[0.2, 0.0], [0.2, 1.0], [0.7, 1.0]]
-    with_log, lost = with_commands(log, source(), time - 5.0, command)
-    # From 0 s on, and the last is held for 0.75 s, as long as the longest before.
-    assert lost == pytest.approx((0.0, 0.99)) and with_log.time[-1] == pytest.approx(2.0)
+    with_log, trimmed = with_commands(log, source(), time - 5.0, command)
+    # Commands begin at 0 s. The last one is held for 0.75 s, the longest interval between commands.
+    assert trimmed == pytest.approx((0.0, 0.99)) and with_log.time[-1] == pytest.approx(2.0)
     assert with_log.command[[0, 49, 50, 124, 125, 200]].tolist() == [
         [0.2, 0],
         [0.2, 0],
@@ -704,7 +713,7 @@ def test_logs_hold_commands_until_the_next(tmp_path: Path):
 # ---- mappings ----
 
 
-def test_the_example_is_a_mapping_and_shows_the_defaults(tmp_path: Path):
+def test_example_mapping_is_valid_and_shows_the_defaults(tmp_path: Path):
     (tmp_path / "example.toml").write_text(example_mapping(ROBOT))
     bare = "\n".join(f'[{role}]\nbody = "ballu:{role}"' for role in ROLES)
     (tmp_path / "bare.toml").write_text('robot = "ballu-1"\n' + bare)
@@ -715,7 +724,7 @@ def test_the_example_is_a_mapping_and_shows_the_defaults(tmp_path: Path):
     np.testing.assert_array_equal(example.axes, np.eye(3))
 
 
-def test_json_is_read_alike(tmp_path: Path):
+def test_mapping_may_be_json(tmp_path: Path):
     (tmp_path / "room.json").write_text(
         '{"robot": "r", ' + ", ".join(f'"{role}": {{"body": "{role}"}}' for role in ROLES) + "}"
     )
@@ -723,7 +732,7 @@ def test_json_is_read_alike(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "old, new, said",
+    "old, new, words",
     [
         ('robot = "r"', "", ["key robot", "missing"]),
         ('robot = "r"', 'robot = "r', ["not TOML", "example-mapping"]),
@@ -756,18 +765,18 @@ def test_json_is_read_alike(tmp_path: Path):
         ),
     ],
 )
-def test_broken_mappings_are_refused(tmp_path: Path, old: str, new: str, said: list[str]):
+def test_invalid_mappings_are_refused(tmp_path: Path, old: str, new: str, words: list[str]):
     text = 'robot = "r"\n' + BODIES
     assert old in text
     (tmp_path / "room.toml").write_text(text.replace(old, new))
     with pytest.raises(InputError) as refusal:
         read_mapping(tmp_path / "room.toml", ROBOT)
     assert str(refusal.value).startswith(str(tmp_path / "room.toml"))
-    for part in said:
+    for part in words:
         assert part in str(refusal.value)
 
 
-def test_a_mapping_of_an_earlier_version_has_the_unit_of_times_under_units(tmp_path: Path):
+def test_mapping_of_an_earlier_version_may_have_the_time_unit_under_units(tmp_path: Path):
     (tmp_path / "room.toml").write_text('robot = "r"\n[units]\ntime = "ms"\n' + BODIES)
     assert read_mapping(tmp_path / "room.toml", ROBOT).clock.time_unit == "ms"
 
@@ -786,7 +795,7 @@ KEYS += [("clock", key) for key in ("time", "time_unit", "episode")]
 
 @settings(max_examples=150, deadline=None)
 @given(changes=st.lists(st.tuples(st.sampled_from(KEYS), VALUES), min_size=1, max_size=3))
-def test_whatever_stands_in_a_mapping_is_read_or_refused(changes: list[tuple[tuple[str, str], object]]):
+def test_mapping_with_any_values_is_read_or_refused(changes: list[tuple[tuple[str, str], object]]):
     content: dict = {"robot": "r", **{role: {"body": role} for role in ROLES}}
     for (table, key), value in changes:
         place = content.setdefault(table, {}) if table else content
@@ -803,7 +812,7 @@ def test_whatever_stands_in_a_mapping_is_read_or_refused(changes: list[tuple[tup
             assert np.linalg.det(checked.axes) == pytest.approx(1.0) and checked.robot.strip()
 
 
-def test_names_that_two_subjects_share_need_the_subject(tmp_path: Path):
+def test_names_shared_by_two_subjects_must_include_the_subject(tmp_path: Path):
     found = captured(np.eye(3))
     text = section("Segments", found) + "\n" + section("Segments", {"base": found["base"]}, prefix="twin:")
     with pytest.raises(InputError, match=r"'base' belongs to several subjects; name one in .*: ballu:base, twin:base"):

@@ -1,7 +1,7 @@
-"""Each text format and NumPy's, read by another library too: every number is the same.
+"""Tests that the readers of text formats and NumPy archives give the same numbers as other libraries.
 
-The places of the numbers follow from the vendors' documents, and what rotations mean from MuJoCo. Bags, LeRobot
-datasets and C3D files are compared where they are tested otherwise (test_readers.py, test_importers.py).
+The positions of the numbers in the files follow the vendors' documents, and MuJoCo converts the rotations. The same
+comparisons for bags, LeRobot datasets and C3D files are in test_readers.py and test_importers.py.
 """
 
 from __future__ import annotations
@@ -49,17 +49,17 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
     return write_rover(tmp_path_factory.mktemp("rover"))
 
 
-def ours(path: Path, robot: RobotDescription, text: str, commands: str = NO_COMMANDS) -> Trajectories:
+def read_package(path: Path, robot: RobotDescription, text: str, commands: str = NO_COMMANDS) -> Trajectories:
     room = path.parent / "room.toml"
     room.write_text(f'robot = "r"\n{text}{commands}')
     return read_capture(path, read_mapping(room, robot))
 
 
-# ---- the other readers ----
+# ---- independent readers ----
 
 
 def cells(path: Path, above: int, separator: str = ",", rows: int | None = None) -> Any:
-    """Rows of text by polars, from below the first `above` lines on; `rows`: at most as many."""
+    """Return rows of text, read by polars, without the first `above` lines. `rows`: largest number of rows."""
     polars = pytest.importorskip("polars", reason="polars reads tables independently")
     return polars.read_csv(
         path, has_header=False, skip_lines=above, n_rows=rows, separator=separator, infer_schema=False
@@ -67,19 +67,19 @@ def cells(path: Path, above: int, separator: str = ",", rows: int | None = None)
 
 
 def numbers(frame: Any, columns: Sequence[int]) -> np.ndarray:
-    """NaN where a cell is empty."""
+    """Return columns as numbers, with NaN for empty cells."""
     polars = pytest.importorskip("polars")
     chosen = frame.select(polars.nth(*columns).str.strip_chars().replace("", None).cast(polars.Float64))
     return chosen.to_numpy().astype(float)
 
 
-def same_places(found: Body, expected: np.ndarray) -> None:
-    """Equal but for the last bit of a change of units."""
+def assert_positions(found: Body, expected: np.ndarray) -> None:
+    """Assert that positions are equal, up to the rounding error of a conversion of units."""
     np.testing.assert_allclose(found.position, expected, rtol=4e-16, atol=0)
 
 
-def same_turns(found: Body, expected: np.ndarray, tolerance: float = 1e-14) -> None:
-    """As quaternions w, x, y, z of any length and sign."""
+def assert_orientations(found: Body, expected: np.ndarray, tolerance: float = 1e-14) -> None:
+    """Assert that orientations are equal. `expected`: quaternions w, x, y, z of any length and sign."""
     assert found.quaternion is not None
     unit = expected / np.linalg.norm(expected, axis=1, keepdims=True)
     np.testing.assert_array_equal(np.isnan(found.quaternion), np.isnan(unit))
@@ -89,7 +89,7 @@ def same_turns(found: Body, expected: np.ndarray, tolerance: float = 1e-14) -> N
 
 
 def from_vectors(vectors: np.ndarray) -> np.ndarray:
-    """Quaternions of rotation vectors (rad)."""
+    """Return the quaternions of rotation vectors (rad)."""
     quaternion = np.full((len(vectors), 4), np.nan)
     for row, vector in zip(quaternion, vectors, strict=True):
         angle = float(np.linalg.norm(vector))
@@ -99,16 +99,16 @@ def from_vectors(vectors: np.ndarray) -> np.ndarray:
 
 
 def from_angles(angles: np.ndarray) -> np.ndarray:
-    """Quaternions of turns about the body's own x, y and z in turn (rad)."""
+    """Return the quaternions of intrinsic Euler angles about x, y and z (rad)."""
     quaternion = np.full((len(angles), 4), np.nan)
     for row, turns in zip(quaternion, angles, strict=True):
         if not np.isnan(turns).any():
-            mujoco.mju_euler2Quat(row, turns, "xyz")  # small letters: the axes turn with the body
+            mujoco.mju_euler2Quat(row, turns, "xyz")  # lower case: intrinsic axes
     return quaternion
 
 
 def from_matrices(matrices: np.ndarray) -> np.ndarray:
-    """Quaternions of matrices of nine numbers, row after row."""
+    """Return the quaternions of rotation matrices (nine numbers, row-major)."""
     quaternion = np.full((len(matrices), 4), np.nan)
     for row, matrix in zip(quaternion, matrices, strict=True):
         if not np.isnan(matrix).any():
@@ -121,10 +121,10 @@ def from_matrices(matrices: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("version", ["1.21", "1.22", "1.23", "1.25"])
 @pytest.mark.parametrize("unit, metres", [("Meters", 1.0), ("Centimeters", 0.01), ("Millimeters", 0.001)])
-def test_motive(tmp_path: Path, robot: RobotDescription, version: str, unit: str, metres: float):
-    """Line 3 has the types, line 4 the names, the last two of the header the quantities and their axes."""
+def test_motive_numbers_match_polars(tmp_path: Path, robot: RobotDescription, version: str, unit: str, metres: float):
+    """Line 3 of the header has the types, and line 4 the names. Its last two lines have the quantities and axes."""
     path = write_motive(tmp_path, version, unit)
-    found = ours(path, robot, NAMED)
+    found = read_package(path, robot, NAMED)
     above = 8 if version == "1.25" else 7
     header = cells(path, 2, rows=above - 2).rows()
     kinds, names, parts, axes = header[0], header[1], header[-2], header[-1]
@@ -136,42 +136,42 @@ def test_motive(tmp_path: Path, robot: RobotDescription, version: str, unit: str
         return numbers(frame, [places[letter] for letter in letters])
 
     np.testing.assert_array_equal(found.time, numbers(frame, [1])[:, 0])
-    same_places(found.bodies["hull"], of("Rigid Body", "hull", "Position", "XYZ") * metres)
-    same_turns(found.bodies["hull"], of("Rigid Body", "hull", "Rotation", "WXYZ"))
-    same_places(found.bodies["tip"], of("Marker", "tip", "Position", "XYZ") * metres)
+    assert_positions(found.bodies["hull"], of("Rigid Body", "hull", "Position", "XYZ") * metres)
+    assert_orientations(found.bodies["hull"], of("Rigid Body", "hull", "Rotation", "WXYZ"))
+    assert_positions(found.bodies["tip"], of("Marker", "tip", "Position", "XYZ") * metres)
 
 
-def test_qualisys_bodies(tmp_path: Path, robot: RobotDescription):
-    """16 numbers a body behind frame and time: x, y, z (mm), three angles, the residual, the matrix by columns."""
+def test_qualisys_bodies_match_polars(tmp_path: Path, robot: RobotDescription):
+    """After frame and time, each body has 16 numbers: x, y, z (mm), three angles, residual, column-major matrix."""
     path = write_qualisys_bodies(tmp_path)
-    found = ours(path, robot, NAMED)
+    found = read_package(path, robot, NAMED)
     frame = cells(path, path.read_text().splitlines().index("BODY_NAMES\thull\ttip") + 2, "\t")
     np.testing.assert_array_equal(found.time, numbers(frame, [1])[:, 0])
     for first, name in ((2, "hull"), (18, "tip")):
         table = numbers(frame, range(first, first + 16))
         table[(table == 0).all(axis=1)] = np.nan
-        same_places(found.bodies[name], table[:, :3] / 1000)
+        assert_positions(found.bodies[name], table[:, :3] / 1000)
         by_rows = table[:, [7, 10, 13, 8, 11, 14, 9, 12, 15]]
-        # The matrix has five decimals, so that it is no rotation to the last digit.
-        same_turns(found.bodies[name], from_matrices(by_rows), 1e-9)
+        # The matrix has five decimals, so it is a rotation only up to rounding errors.
+        assert_orientations(found.bodies[name], from_matrices(by_rows), 1e-9)
 
 
-def test_qualisys_markers(tmp_path: Path, robot: RobotDescription):
-    """Three numbers a marker (mm) behind frame and time."""
+def test_qualisys_markers_match_polars(tmp_path: Path, robot: RobotDescription):
+    """After frame and time, each marker has three numbers (mm)."""
     path = write_qualisys_markers(tmp_path)
     frame = cells(path, path.read_text().splitlines().index("\t".join(["MARKER_NAMES", *CORNERS, "tip"])) + 2, "\t")
     for number, name in enumerate([*CORNERS, "tip"]):
         geometry = list(CORNERS.values())
         hull = f"[hull]\nmarkers = {list(CORNERS)}\ngeometry = {geometry}\n"
-        found = ours(path, robot, f'{hull}[tip]\nbody = "{name}"\n')
+        found = read_package(path, robot, f'{hull}[tip]\nbody = "{name}"\n')
         np.testing.assert_array_equal(found.time, numbers(frame, [1])[:, 0])
-        same_places(found.bodies["tip"], numbers(frame, range(2 + 3 * number, 5 + 3 * number)) / 1000)
+        assert_positions(found.bodies["tip"], numbers(frame, range(2 + 3 * number, 5 + 3 * number)) / 1000)
 
 
-def test_vicon_nexus(tmp_path: Path, robot: RobotDescription):
-    """Sections of five lines above the samples; segments are rotation vectors (deg) and places (mm)."""
+def test_vicon_nexus_numbers_match_polars(tmp_path: Path, robot: RobotDescription):
+    """Each section has five lines above the samples. Segments have rotation vectors (deg) and positions (mm)."""
     path = write_nexus(tmp_path)
-    found = ours(path, robot, NAMED)
+    found = read_package(path, robot, NAMED)
     lines = path.read_text().splitlines()
     tables = {
         title: cells(path, lines.index(title) + 5, rows=len(found.time)) for title in ("Segments", "Trajectories")
@@ -180,27 +180,29 @@ def test_vicon_nexus(tmp_path: Path, robot: RobotDescription):
     np.testing.assert_allclose(found.time, (frames - 1) / RATE, rtol=4e-16)
     segment = numbers(tables["Segments"], range(2, 8))
     assert np.isnan(segment[HIDDEN]).all()
-    same_places(found.bodies["hull"], segment[:, 3:] / 1000)
-    same_turns(found.bodies["hull"], from_vectors(np.deg2rad(segment[:, :3])))
-    same_places(found.bodies["tip"], numbers(tables["Trajectories"], range(2, 5)) / 1000)
+    assert_positions(found.bodies["hull"], segment[:, 3:] / 1000)
+    assert_orientations(found.bodies["hull"], from_vectors(np.deg2rad(segment[:, :3])))
+    assert_positions(found.bodies["tip"], numbers(tables["Trajectories"], range(2, 5)) / 1000)
 
 
 @pytest.mark.parametrize("rotation", ["helical", "XYZ", "quaternion"])
-def test_vicon_tracker(tmp_path: Path, robot: RobotDescription, rotation: str):
-    """One section of objects: rotation vector, Euler angles (rad) or a quaternion x, y, z, w, then the place (mm)."""
+def test_vicon_tracker_numbers_match_polars(tmp_path: Path, robot: RobotDescription, rotation: str):
+    """Each object has a rotation vector (rad), Euler angles (rad) or a quaternion x, y, z, w, then a position (mm)."""
     path = write_tracker(tmp_path, rotation)
-    said = f'rotation = "{rotation}"\n'
-    found = ours(path, robot, f'[hull]\nbody = "hull"\n{said}[tip]\nbody = "tip"\n{said}')
+    convention = f'rotation = "{rotation}"\n'
+    found = read_package(path, robot, f'[hull]\nbody = "hull"\n{convention}[tip]\nbody = "tip"\n{convention}')
     frame = cells(path, 5)
     np.testing.assert_allclose(found.time, (numbers(frame, [0])[:, 0] - 1) / RATE, rtol=4e-16)
     width = 7 if rotation == "quaternion" else 6
     for number, name in enumerate(("hull", "tip")):
         table = numbers(frame, range(2 + width * number, 2 + width * (number + 1)))
-        same_places(found.bodies[name], table[:, -3:] / 1000)
+        assert_positions(found.bodies[name], table[:, -3:] / 1000)
         if rotation == "quaternion":
-            same_turns(found.bodies[name], table[:, [3, 0, 1, 2]])
+            assert_orientations(found.bodies[name], table[:, [3, 0, 1, 2]])
         else:
-            same_turns(found.bodies[name], (from_vectors if rotation == "helical" else from_angles)(table[:, :3]))
+            assert_orientations(
+                found.bodies[name], (from_vectors if rotation == "helical" else from_angles)(table[:, :3])
+            )
 
 
 # ---- trajectories, tables, archives ----
@@ -209,35 +211,37 @@ def test_vicon_tracker(tmp_path: Path, robot: RobotDescription, rotation: str):
 @pytest.mark.parametrize(
     "write, reader", [(write_tum, "read_tum_trajectory_file"), (write_euroc, "read_euroc_csv_trajectory")]
 )
-def test_trajectories_of_one_body(tmp_path: Path, robot: RobotDescription, write: Callable[[Path], Path], reader: str):
+def test_trajectories_of_one_body_match_evo(
+    tmp_path: Path, robot: RobotDescription, write: Callable[[Path], Path], reader: str
+):
     files = pytest.importorskip("evo.tools.file_interface", reason="evo reads TUM and EuRoC files independently")
     path = write(tmp_path)
-    found = ours(path, robot, POSE)
-    theirs = getattr(files, reader)(str(path))
-    np.testing.assert_allclose(found.time, theirs.timestamps, rtol=4e-16)
-    same_places(found.bodies["hull"], theirs.positions_xyz)
-    same_turns(found.bodies["hull"], theirs.orientations_quat_wxyz)
+    found = read_package(path, robot, POSE)
+    expected_trajectory = getattr(files, reader)(str(path))
+    np.testing.assert_allclose(found.time, expected_trajectory.timestamps, rtol=4e-16)
+    assert_positions(found.bodies["hull"], expected_trajectory.positions_xyz)
+    assert_orientations(found.bodies["hull"], expected_trajectory.orientations_quat_wxyz)
 
 
-def test_tables(tmp_path: Path, robot: RobotDescription):
+def test_tables_match_polars(tmp_path: Path, robot: RobotDescription):
     polars = pytest.importorskip("polars", reason="polars reads tables independently")
     path = write_table(tmp_path)
-    found = ours(path, robot, TABLE, '[commands]\narm = "arm_cmd"\npush = "push_cmd"\n')
+    found = read_package(path, robot, TABLE, '[commands]\narm = "arm_cmd"\npush = "push_cmd"\n')
     frame = polars.read_csv(path, comment_prefix="#", infer_schema_length=None)
 
     def of(*names: str) -> np.ndarray:
         return frame.select(*names).cast(polars.Float64).to_numpy().astype(float)
 
     np.testing.assert_allclose(found.time, of("time")[:, 0] / 1000, rtol=4e-16)
-    same_places(found.bodies["hull"], of("hull_x", "hull_y", "hull_z"))
-    same_turns(found.bodies["hull"], of("hull_qw", "hull_qx", "hull_qy", "hull_qz"))
-    same_places(found.bodies["tip"], of("tip_x", "tip_y", "tip_z"))
+    assert_positions(found.bodies["hull"], of("hull_x", "hull_y", "hull_z"))
+    assert_orientations(found.bodies["hull"], of("hull_qw", "hull_qx", "hull_qy", "hull_qz"))
+    assert_positions(found.bodies["tip"], of("tip_x", "tip_y", "tip_z"))
     assert found.commands is not None
     np.testing.assert_allclose(found.commands.command, of("arm_cmd", "push_cmd"), rtol=1e-12)
 
 
 def array_of(content: bytes) -> np.ndarray:
-    """An array of numbers from the bytes of an .npy file, by NumPy Enhancement Proposal 1, without NumPy's reader."""
+    """Return an array from the bytes of an .npy file, by NumPy Enhancement Proposal 1, without NumPy's reader."""
     assert content[:6] == b"\x93NUMPY" and content[6] == 1
     (length,) = struct.unpack("<H", content[8:10])
     header = ast.literal_eval(content[10 : 10 + length].decode("latin-1"))
@@ -246,16 +250,16 @@ def array_of(content: bytes) -> np.ndarray:
     return np.reshape(values, header["shape"])
 
 
-def test_archives(tmp_path: Path, robot: RobotDescription):
+def test_archives_match_the_npy_specification(tmp_path: Path, robot: RobotDescription):
     path = write_npz(tmp_path)
-    found = ours(path, robot, ARCHIVE, '[commands]\narm = "command_arm"\npush = "command_push"\n')
+    found = read_package(path, robot, ARCHIVE, '[commands]\narm = "command_arm"\npush = "command_push"\n')
     with zipfile.ZipFile(path) as archive:
         arrays = {name: array_of(archive.read(f"{name}.npy")) for name in
                   ("time", "hull_pos", "hull_quat", "tip_pos", "command_arm", "command_push")}  # fmt: skip
     np.testing.assert_array_equal(found.time, arrays["time"])
-    same_places(found.bodies["hull"], arrays["hull_pos"])
-    same_turns(found.bodies["hull"], arrays["hull_quat"])
-    same_places(found.bodies["tip"], arrays["tip_pos"])
+    assert_positions(found.bodies["hull"], arrays["hull_pos"])
+    assert_orientations(found.bodies["hull"], arrays["hull_quat"])
+    assert_positions(found.bodies["tip"], arrays["tip_pos"])
     assert found.commands is not None
     commands = np.stack([arrays["command_arm"], arrays["command_push"]], axis=1)
     np.testing.assert_allclose(found.commands.command, commands, rtol=1e-12)

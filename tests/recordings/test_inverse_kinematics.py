@@ -1,4 +1,4 @@
-"""Inverse kinematics of robots of any build: postures, turns, closed loops, and joints that nothing shows."""
+"""Tests of inverse kinematics: postures, continuous rotation, closed loops, and joints without measurements."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def describe(folder: Path, xml: str, **keys: object) -> RobotDescription:
 def capture(
     robot: RobotDescription, qpos: np.ndarray, *, noise: float = 5e-4, joints: tuple[str, ...] = (), rate: float = RATE
 ) -> Recording:
-    """What motion capture sees of the model in these poses, and encoders of some joints."""
+    """Return a recording of the model in these poses: noisy motion capture, and encoders of the joints `joints`."""
     model = robot.load_model()
     data = mujoco.MjData(model)
     rng = np.random.default_rng(0)
@@ -59,7 +59,7 @@ def capture(
 
 
 def arm(links: int) -> str:
-    """Links of 0.25 m in a vertical plane, joints within 3 rad."""
+    """Return the MJCF of links of 0.25 m in a vertical plane, with joint angles of at most 3 rad."""
     bodies = "".join(
         f'<body name="l{i}" pos="0 0 {-0.25 if i else 1}"><joint name="j{i}" axis="0 1 0" range="-3 3"/>'
         '<geom type="capsule" fromto="0 0 0 0 0 -0.25" size="0.01" mass="0.05"/>'
@@ -73,9 +73,10 @@ def arm(links: int) -> str:
 
 
 @pytest.mark.parametrize("links", [2, 3])
-def test_bent_arms_are_found_within_their_ranges(tmp_path: Path, links: int):
-    """From the straight pose, where no step shows which way to bend: no posture is wound by turns or refused. Of two
-    links the tip's pose shows the one posture; of three there are two, and either is right."""
+def test_bent_arms_are_reconstructed_within_their_joint_ranges(tmp_path: Path, links: int):
+    """The search starts from the straight pose, which is singular. No posture exceeds the joint ranges, and none is
+    refused. The tip's pose determines the posture of two links. Three links have two postures, and either is correct.
+    """
     robot = describe(tmp_path, arm(links), tracked="tip")
     model, rng = robot.load_model(), np.random.default_rng(0)
     data = mujoco.MjData(model)
@@ -84,7 +85,7 @@ def test_bent_arms_are_found_within_their_ranges(tmp_path: Path, links: int):
         motion = reconstruct(capture(robot, qpos), robot)
         assert np.abs(motion.qpos).max() < 3.01
         assert motion.fit_error_mm["tip"] < 1.0
-        assert np.abs(np.diff(motion.qpos, axis=0)).max() < 0.3, "one posture throughout"
+        assert np.abs(np.diff(motion.qpos, axis=0)).max() < 0.3, "the posture must not change between samples"
         data.qpos[:] = motion.qpos[5]
         mujoco.mj_kinematics(model, data)
         expected = np.asarray(capture(robot, qpos[25:26], noise=0.0).tracked_position)
@@ -93,7 +94,7 @@ def test_bent_arms_are_found_within_their_ranges(tmp_path: Path, links: int):
             np.testing.assert_allclose(motion.qpos[5], qpos[25], atol=0.02)
 
 
-def test_a_keyframe_says_which_posture_is_meant(tmp_path: Path):
+def test_keyframe_selects_among_several_postures(tmp_path: Path):
     for sign in (1.0, -1.0):
         home = f'<keyframe><key name="home" qpos="{-sign} {2 * sign} {-sign}"/></keyframe></mujoco>'
         robot = describe(tmp_path, arm(3).replace("</mujoco>", home), tracked="tip", keyframe="home")
@@ -114,7 +115,7 @@ FOURBAR = """
 LOOP = '<equality><connect body1="b" body2="c" anchor="0.3 0 0"/></equality>'
 
 
-def test_a_closed_loop_shows_the_joint_behind_it(tmp_path: Path):
+def test_closed_loop_determines_the_unmeasured_joint(tmp_path: Path):
     robot = describe(tmp_path, FOURBAR.replace("LOOP", LOOP), tracked="mid")
     angle = 0.5 * np.sin(2 * np.pi * 0.5 * np.arange(150) / RATE)
     qpos = np.stack([angle, -angle, angle], axis=1)  # a parallelogram
@@ -128,8 +129,8 @@ def test_a_closed_loop_shows_the_joint_behind_it(tmp_path: Path):
         reconstruct(capture(robot, qpos), open_chain)
 
 
-def test_coupled_joints_move_together(tmp_path: Path):
-    """An equality of joints shows the one by the other: the second is 0.1 rad and half the first."""
+def test_joint_equality_determines_the_coupled_joint(tmp_path: Path):
+    """The angle of the second joint is 0.1 rad plus half the angle of the first."""
     coupled = '<equality><joint joint1="jc" joint2="ja" polycoef="0.1 0.5 0 0 0"/></equality>'
     robot = describe(tmp_path, FOURBAR.replace("LOOP", coupled), tracked="mid")
     angle = 0.5 * np.sin(2 * np.pi * 0.5 * np.arange(150) / RATE)
@@ -148,9 +149,9 @@ ROVER = """
 
 
 @pytest.mark.parametrize("seen", ["counted on", "wrapped", "by a marker"])
-def test_a_wheel_turns_on_and_on(tmp_path: Path, seen: str):
-    """By an encoder that counts on, one that starts each turn at 0 again, or a marker at the rim: 5 rad/s throughout,
-    through the file."""
+def test_wheel_angle_is_continuous_over_many_turns(tmp_path: Path, seen: str):
+    """The wheel turns at a constant 5 rad/s. It is measured by a continuous encoder, by an encoder that wraps at each
+    turn, or by a marker at the rim. The recording is written to a file and read back."""
     marker = seen == "by a marker"
     robot = describe(
         tmp_path, ROVER, tracked="deck", points=["rim"] if marker else [], joints=[] if marker else ["wheel"]
@@ -178,7 +179,7 @@ TREE = """
 """
 
 
-def test_kinematics_and_jacobians_are_mujocos():
+def test_kinematics_and_jacobians_match_mujoco():
     model = mujoco.MjModel.from_xml_string(TREE)
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     qpos = rng.normal(size=(10, model.nq))
@@ -194,9 +195,9 @@ def test_kinematics_and_jacobians_are_mujocos():
         mujoco.mj_comPos(model, data)
         np.testing.assert_allclose(poses.points[0][i], data.site("tip").xpos, atol=1e-12)
         np.testing.assert_allclose(poses.rotations[0][i].ravel(), data.xmat[body], atol=1e-12)
-        along, about = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-        mujoco.mj_jacSite(model, data, along, about, site.id)
-        np.testing.assert_allclose(tree.point_jacobian(poses, 0)[i], along, atol=1e-12)
-        np.testing.assert_allclose(tree.rotation_jacobian(poses, 0)[i], about, atol=1e-12)
+        linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+        mujoco.mj_jacSite(model, data, linear, angular, site.id)
+        np.testing.assert_allclose(tree.point_jacobian(poses, 0)[i], linear, atol=1e-12)
+        np.testing.assert_allclose(tree.rotation_jacobian(poses, 0)[i], angular, atol=1e-12)
         mujoco.mj_integratePos(model, row, step[i], 1.0)
         np.testing.assert_allclose(moved[i], row, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Every format that is read: written as its vendor lays it out, mapped by `record map`, imported, and compared."""
+"""Tests of every capture format. Files in the vendors' layouts are mapped by `record map`, imported and compared."""
 
 from __future__ import annotations
 
@@ -54,12 +54,14 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
     return write_rover(tmp_path_factory.mktemp("rover"))
 
 
-# ---- the formats that need packages ----
+# ---- formats that need optional packages ----
 
 
 def ros_messages(store: Any) -> Any:
-    """Topic, type, received (ns) and message, in order: the hull at 100 Hz with stamps, the tip between at 50 Hz,
-    commands without a header."""
+    """Yield topic, type, time of arrival (ns) and message, in order of arrival.
+
+    The hull's messages have stamps and a rate of 100 Hz, the tip's 50 Hz. Commands have no header.
+    """
     types = store.types
     version = {"seq": 0} if "seq" in types["std_msgs/msg/Header"].__dataclass_fields__ else {}
 
@@ -78,26 +80,26 @@ def ros_messages(store: Any) -> Any:
         yield (
             "/mocap/hull",
             "geometry_msgs/msg/PoseStamped",
-            ns + LATE,
+            ns + ARRIVAL_DELAY,
             types["geometry_msgs/msg/PoseStamped"](header=header(ns), pose=pose),
         )
         if i % 2 == 0:
             yield (
                 "/mocap/tip",
                 "geometry_msgs/msg/PointStamped",
-                ns + LATE + 1,
+                ns + ARRIVAL_DELAY + 1,
                 types["geometry_msgs/msg/PointStamped"](header=header(ns), point=point(*TIP.place[i].tolist())),
             )
         yield (
             "/cmd",
             "std_msgs/msg/Float64MultiArray",
-            ns + LATE + 2,
+            ns + ARRIVAL_DELAY + 2,
             types["std_msgs/msg/Float64MultiArray"](layout=layout, data=COMMAND[i]),
         )
 
 
-LATE = 3_000_000
-"""ns: how long messages take to be recorded."""
+ARRIVAL_DELAY = 3_000_000
+"""Delay (ns) between a message's stamp and its arrival at the recorder."""
 
 
 def write_bag(folder: Path, kind: str = "ros2") -> Path:
@@ -199,7 +201,7 @@ def run(*line: object) -> None:
 
 
 def imported(folder: Path, path: Path, robot: RobotDescription, change: Mapping[str, str] | None = None) -> Recording:
-    """By the mapping that `record map` writes, completed by `change`."""
+    """Return the recording that is imported with the mapping of `record map`, after the replacements `change`."""
     room, output = folder / "room.toml", folder / "out" / "trial.csv"
     run("map", path, "--output", room, "--robot", robot.file)
     text = room.read_text()
@@ -212,8 +214,12 @@ def imported(folder: Path, path: Path, robot: RobotDescription, change: Mapping[
     return read_recording(output, robot)
 
 
-def same(found: Recording, *, gaps: bool, tip: float = 2e-5) -> None:
+def assert_motion(found: Recording, *, gaps: bool, tip: float = 2e-5) -> None:
     count = len(found.time)
+    """Assert that a recording is that of the motion in `capture_files`.
+
+    `gaps`: whether the format marks the hidden samples as missing. `tip`: tolerance of the tip's position (m).
+    """
     assert SAMPLES - 2 <= count <= SAMPLES
     np.testing.assert_allclose(found.time, TIME[:count], atol=2e-6)
     shown = np.ones(count, bool)
@@ -228,31 +234,31 @@ def same(found: Recording, *, gaps: bool, tip: float = 2e-5) -> None:
 
 
 @pytest.mark.parametrize("version, unit", [("1.22", "Meters"), ("1.25", "Millimeters")])
-def test_motive(tmp_path: Path, robot: RobotDescription, version: str, unit: str):
+def test_motive_csv_is_imported(tmp_path: Path, robot: RobotDescription, version: str, unit: str):
     write_log(tmp_path)
-    same(imported(tmp_path, write_motive(tmp_path, version, unit), robot), gaps=True)
+    assert_motion(imported(tmp_path, write_motive(tmp_path, version, unit), robot), gaps=True)
 
 
 @pytest.mark.parametrize("columns", [0, 3])
-def test_motive_saved_again_by_a_spreadsheet(tmp_path: Path, robot: RobotDescription, columns: int):
-    """Such a program pads every row to the widest, or beyond it."""
+def test_motive_csv_padded_by_a_spreadsheet_is_imported(tmp_path: Path, robot: RobotDescription, columns: int):
+    """Spreadsheets pad every row to the width of the widest row, or beyond it."""
     path = write_motive(tmp_path)
     lines = [line.split(",") for line in path.read_text().splitlines()]
     width = columns + max(map(len, lines))
     path.write_text("\n".join(",".join(cells + [""] * (width - len(cells))) for cells in lines))
     write_log(tmp_path)
-    same(imported(tmp_path, path, robot), gaps=True)
+    assert_motion(imported(tmp_path, path, robot), gaps=True)
 
 
-def test_motive_tells_measured_markers_from_expected_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_map_reports_that_motive_s_expected_markers_are_not_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run("map", write_motive(tmp_path))
-    said = capsys.readouterr().out
-    assert "Expected positions of markers are not measurements and are not read: hull:Marker 001." in said
-    assert "96.3 % seen" in said and 'up = "y"' in said
+    printed = capsys.readouterr().out
+    assert "Expected positions of markers are not measurements and are not read: hull:Marker 001." in printed
+    assert "96.3 % seen" in printed and 'up = "y"' in printed
 
 
-def test_a_body_is_read_and_the_marker_of_its_name_is_not(tmp_path: Path, robot: RobotDescription):
-    """As in takes of skeletons, where the label of a marker may be a bone's name."""
+def test_body_takes_precedence_over_a_marker_of_the_same_name(tmp_path: Path, robot: RobotDescription):
+    """In takes of skeletons, the label of a marker may be the name of a bone."""
     path = write_motive(tmp_path)
     path.write_text(path.read_text().replace("tip,tip,tip", "hull,hull,hull"))
     contents = find_reader(path).list(path)
@@ -263,71 +269,73 @@ def test_a_body_is_read_and_the_marker_of_its_name_is_not(tmp_path: Path, robot:
     np.testing.assert_allclose(found.bodies["hull"].position[seen], (HULL.place @ Y_UP)[seen], atol=1e-6)
 
 
-def test_qualisys_bodies(tmp_path: Path, robot: RobotDescription):
+def test_qualisys_bodies_are_imported(tmp_path: Path, robot: RobotDescription):
     write_log(tmp_path)
-    same(imported(tmp_path, write_qualisys_bodies(tmp_path), robot), gaps=True)
+    assert_motion(imported(tmp_path, write_qualisys_bodies(tmp_path), robot), gaps=True)
 
 
-def test_qualisys_markers(tmp_path: Path, robot: RobotDescription):
+def test_qualisys_markers_are_imported(tmp_path: Path, robot: RobotDescription):
     write_log(tmp_path)
     geometry = f"\ngeometry = {list(CORNERS.values())}"
     line = 'markers = ["hull1", "hull2", "hull3", "hull4"]'
-    same(imported(tmp_path, write_qualisys_markers(tmp_path), robot, {line: line + geometry + " #"}), gaps=True)
+    assert_motion(
+        imported(tmp_path, write_qualisys_markers(tmp_path), robot, {line: line + geometry + " #"}), gaps=True
+    )
 
 
-def test_markers_of_other_names_are_taken_for_the_one_body(tmp_path: Path, robot: RobotDescription):
-    """All but the point's marker are: the mapping says that this is a guess, and the import takes it."""
+def test_map_assigns_markers_with_other_names_to_the_only_body(tmp_path: Path, robot: RobotDescription):
+    """All markers except the point's are assigned to the body. The mapping calls this a guess, and can be imported."""
     write_log(tmp_path)
     path = write_qualisys_markers(tmp_path)
     path.write_text(path.read_text().replace("hull", "rig"))
     line = 'markers = ["rig1", "rig2", "rig3", "rig4"]'
     guessed = f"{line}  # a guess: keep three or more that sit on the body"
-    same(imported(tmp_path, path, robot, {guessed: f"{line}\ngeometry = {list(CORNERS.values())}"}), gaps=True)
+    assert_motion(imported(tmp_path, path, robot, {guessed: f"{line}\ngeometry = {list(CORNERS.values())}"}), gaps=True)
 
 
-def test_archives(tmp_path: Path, robot: RobotDescription):
-    same(imported(tmp_path, write_npz(tmp_path), robot), gaps=True)
+def test_numpy_archives_are_imported(tmp_path: Path, robot: RobotDescription):
+    assert_motion(imported(tmp_path, write_npz(tmp_path), robot), gaps=True)
 
 
-def test_tables(tmp_path: Path, robot: RobotDescription):
-    same(imported(tmp_path, write_table(tmp_path), robot), gaps=True)
+def test_tables_are_imported(tmp_path: Path, robot: RobotDescription):
+    assert_motion(imported(tmp_path, write_table(tmp_path), robot), gaps=True)
 
 
 @pytest.mark.parametrize("kind", ["ros1", "ros2", "mcap"])
-def test_bags(tmp_path: Path, robot: RobotDescription, kind: str):
-    """Commands have no stamps, so that all is on the recorder's clock; the tip, at half the rate, is interpolated."""
+def test_bags_are_imported(tmp_path: Path, robot: RobotDescription, kind: str):
+    """Commands have no stamps, so all times are the recorder's. The tip, at half the rate, is interpolated."""
     found = imported(tmp_path, write_bag(tmp_path, kind), robot)
     assert 'time = "received"' in (tmp_path / "room.toml").read_text()
-    same(found, gaps=False, tip=3e-4)
+    assert_motion(found, gaps=False, tip=3e-4)
 
 
-def test_a_bag_s_stamps_are_another_clock_than_its_recorder_s(tmp_path: Path, robot: RobotDescription):
+def test_bag_times_are_stamps_or_times_of_arrival(tmp_path: Path, robot: RobotDescription):
     path = write_bag(tmp_path)
-    for clock, start in (("header", START), ("received", START + LATE)):
+    for clock, start in (("header", START), ("received", START + ARRIVAL_DELAY)):
         found = read_capture(path, room(tmp_path, robot, BAG + f'[clock]\ntime = "{clock}"\n', commands=NO_COMMANDS))
         assert found.time[0] == pytest.approx(start * 1e-9, abs=1e-6)
         np.testing.assert_allclose(np.diff(found.time), 0.01, atol=1e-6)
         np.testing.assert_allclose(found.bodies["hull"].position, HULL.place, atol=1e-12)
 
 
-def test_a_bag_may_be_the_log_of_a_capture(tmp_path: Path, robot: RobotDescription):
-    """The capture by Motive, the commands by a bag with a clock of its own."""
+def test_commands_of_a_motive_take_are_read_from_a_bag(tmp_path: Path, robot: RobotDescription):
+    """The bag's clock differs from Motive's."""
     take, log = write_motive(tmp_path), write_bag(tmp_path)
     mapping = tmp_path / "room.toml"
     text = 'robot = "r"\n[axes]\nforward = "z"\nleft = "x"\nup = "y"\n[hull]\nbody = "hull"\n[tip]\nbody = "tip"\n'
     mapping.write_text(text + '[commands]\ntime = "received"\narm = "/cmd:data[0]"\npush = "/cmd:data[1]"\n')
     line = ["--mapping", mapping, "--output", tmp_path / "out.csv", "--robot", robot.file, "--commands", log]
-    run("import", take, *line, f"--offset={-(START + LATE) * 1e-9 - 1e-4:.6f}")
-    same(read_recording(tmp_path / "out.csv", robot), gaps=True)
+    run("import", take, *line, f"--offset={-(START + ARRIVAL_DELAY) * 1e-9 - 1e-4:.6f}")
+    assert_motion(read_recording(tmp_path / "out.csv", robot), gaps=True)
 
 
-def test_mcap_with_json(tmp_path: Path, robot: RobotDescription):
+def test_mcap_with_json_messages_is_imported(tmp_path: Path, robot: RobotDescription):
     pytest.importorskip("rosbags")
-    same(imported(tmp_path, write_json_mcap(tmp_path), robot), gaps=False)
+    assert_motion(imported(tmp_path, write_json_mcap(tmp_path), robot), gaps=False)
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
-def test_lerobot_datasets(tmp_path: Path, robot: RobotDescription, version: str):
+def test_lerobot_episodes_are_read_by_number(tmp_path: Path, robot: RobotDescription, version: str):
     path = write_lerobot(tmp_path, version, episodes=2)
     text = LEROBOT + "[clock]\nepisode = 0\n"
     found = read_capture(path, room(tmp_path, robot, text, commands='arm = "action[0]"\npush = "action[1]"\n'))
@@ -344,9 +352,9 @@ def test_lerobot_datasets(tmp_path: Path, robot: RobotDescription, version: str)
         read_capture(path, room(tmp_path, robot, text.replace("episode = 0", "episode = 7")))
 
 
-def test_the_first_mapping_of_several_episodes_names_one(tmp_path: Path, robot: RobotDescription):
+def test_map_selects_one_of_several_episodes(tmp_path: Path, robot: RobotDescription):
     path = write_lerobot(tmp_path, episodes=2)
-    same(imported(tmp_path, path, robot), gaps=False)
+    assert_motion(imported(tmp_path, path, robot), gaps=False)
     text = (tmp_path / "room.toml").read_text()
     assert "episode = 0  # of 2" in text
     (tmp_path / "room.toml").write_text(text.replace("episode = 0", "episode = 1"))
@@ -355,25 +363,25 @@ def test_the_first_mapping_of_several_episodes_names_one(tmp_path: Path, robot: 
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
-def test_lerobot_datasets_are_read_as_another_reader_does(tmp_path: Path, robot: RobotDescription, version: str):
+def test_lerobot_numbers_match_polars(tmp_path: Path, robot: RobotDescription, version: str):
     polars = pytest.importorskip("polars", reason="polars reads parquet independently of pyarrow")
     path = write_lerobot(tmp_path, version, episodes=2)
     frame = polars.read_parquet(sorted((path / "data").rglob("*.parquet")))
     for episode in range(2):
-        rows_of_it = frame.filter(polars.col("episode_index") == episode)
-        state, action = (np.array(rows_of_it[name].to_list()) for name in ("observation.state", "action"))
+        episode_rows = frame.filter(polars.col("episode_index") == episode)
+        state, action = (np.array(episode_rows[name].to_list()) for name in ("observation.state", "action"))
         text = LEROBOT + f"[clock]\nepisode = {episode}\n"
         found = read_capture(path, room(tmp_path, robot, text, commands='arm = "action[0]"\npush = "action[1]"\n'))
         assert found.commands is not None
-        np.testing.assert_array_equal(found.time, rows_of_it["timestamp"].to_numpy())
+        np.testing.assert_array_equal(found.time, episode_rows["timestamp"].to_numpy())
         np.testing.assert_array_equal(found.bodies["hull"].position, state[:, :3])
         np.testing.assert_array_equal(found.bodies["tip"].position, state[:, 7:])
         np.testing.assert_allclose(found.commands.command, action, atol=1e-12)
 
 
-def test_lerobot_datasets_are_mapped_by_the_names_of_their_features(tmp_path: Path, robot: RobotDescription):
+def test_map_uses_the_feature_names_of_a_lerobot_dataset(tmp_path: Path, robot: RobotDescription):
     path = write_lerobot(tmp_path)
-    same(imported(tmp_path, path, robot), gaps=False)
+    assert_motion(imported(tmp_path, path, robot), gaps=False)
     contents = find_reader(path).list(path)
     assert [item.label for item in contents.items if item.name == "observation.state[3]"] == ["qw"]
     assert any("states no units" in note for note in contents.notes)
@@ -383,7 +391,7 @@ def test_lerobot_datasets_are_mapped_by_the_names_of_their_features(tmp_path: Pa
 
 
 @pytest.mark.parametrize("name, text", [("pose.txt", tum_text()), ("data.csv", euroc_text())])
-def test_trajectories_of_one_body(tmp_path: Path, robot: RobotDescription, name: str, text: str):
+def test_trajectories_of_one_body_are_read(tmp_path: Path, robot: RobotDescription, name: str, text: str):
     (tmp_path / name).write_text(text)
     found = read_capture(tmp_path / name, room(tmp_path, robot, '[hull]\nbody = "pose"\n[tip]\nbody = "pose"\n'))
     np.testing.assert_allclose(found.time - found.time[0], TIME, atol=1e-6)
@@ -428,7 +436,7 @@ def cut_bytes(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "write, damage, text, said",
+    "write, damage, text, words",
     [
         (write_motive, cut_text, NAMED, ["the row ends before", "cut off"]),
         (
@@ -538,20 +546,20 @@ def cut_bytes(path: Path) -> None:
             ["line 1: it holds numbers instead of column names"],
         ),
         (
-            write_table,  # `ros2 topic echo --csv`: seconds and nanoseconds apart, a frame's name, no header
+            write_table,  # `ros2 topic echo --csv` writes seconds, nanoseconds and a frame's name, but no header
             lambda path: path.write_text("".join(f"17,{i}0000000,map,0.1,0.2,1.5,0,0,0,1\n" for i in range(50))),
             ARCHIVE,
             ["line 1: it holds numbers instead of column names", "above the numbers"],
         ),
     ],
 )
-def test_damage_is_refused_by_its_name(
+def test_damaged_file_is_refused_with_a_specific_message(
     tmp_path: Path,
     robot: RobotDescription,
     write: Callable[[Path], Path],
     damage: Callable[[Path], object] | None,
     text: str,
-    said: list[str],
+    words: list[str],
 ):
     path = write(tmp_path)
     if damage is not None:
@@ -560,12 +568,12 @@ def test_damage_is_refused_by_its_name(
         read_capture(path, room(tmp_path, robot, text, commands=NO_COMMANDS))
     message = str(refusal.value)
     assert message.startswith(str(tmp_path)) and message.endswith(".") and "\n" not in message
-    for part in said:
+    for part in words:
         assert part in message, message
 
 
-def test_one_pose_file_s_damage(tmp_path: Path, robot: RobotDescription):
-    for name, text, said in (
+def test_damaged_trajectory_files_are_refused(tmp_path: Path, robot: RobotDescription):
+    for name, text, words in (
         ("a.txt", tum_text().replace("\n1700000000.5", "\n1600000000.5", 1), "line 52: time runs back"),
         ("b.txt", tum_text()[:-40], "line 301: the row ends before"),
         ("e.txt", tum_text().replace("\n1700000000.5", "\n# lost\n1700000000.5", 1), "line 52: a line without a pose"),
@@ -573,7 +581,7 @@ def test_one_pose_file_s_damage(tmp_path: Path, robot: RobotDescription):
         ("d.csv", euroc_text()[:-30], "the row ends before"),
     ):
         (tmp_path / name).write_text(text)
-        with pytest.raises(InputError, match=rf"{name}.*{said}"):
+        with pytest.raises(InputError, match=rf"{name}.*{words}"):
             read_capture(tmp_path / name, room(tmp_path, robot, '[hull]\nbody = "pose"\n[tip]\nbody = "pose"\n'))
 
 
@@ -581,7 +589,7 @@ def test_one_pose_file_s_damage(tmp_path: Path, robot: RobotDescription):
     "package, extra, write", [("rosbags", "bags", write_bag), ("mcap", "bags", write_json_mcap),
                               ("pyarrow", "lerobot", write_lerobot)],
 )  # fmt: skip
-def test_a_missing_package_is_named_with_its_extra(
+def test_message_names_the_missing_package_and_its_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, extra: str, write: Callable[[Path], Path]
 ):
     path = write(tmp_path)
@@ -592,20 +600,23 @@ def test_a_missing_package_is_named_with_its_extra(
         find_reader(path).list(path)
 
 
-# ---- the registry and the wizard ----
+# ---- the registry of readers, and `record map` ----
 
 
-def test_every_format_has_its_name_in_the_options():
+def test_format_option_lists_every_reader():
     assert set(typing.get_args(record.Format)) == {"auto", *READERS}
 
 
-def test_a_folder_of_no_format_is_refused(tmp_path: Path):
+def test_folder_of_unknown_format_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match="a folder of unknown format; give a file in it"):
         find_reader(tmp_path)
 
 
 def write_two_clocks(folder: Path, table: str, log: str) -> None:
-    """The capture as a table in ms and the commands as a log in s, 12 s later, with the columns of times so named."""
+    """Write a capture as a table with times in ms, and a command log with times in s.
+
+    The log's clock is 12 s ahead. `table` and `log` are the names of the time columns.
+    """
     names = [table, *(f"hull_{axis}" for axis in range(3)), *(f"turn_{part}" for part in range(4))]
     columns = [1e3 * TIME, *HULL.place.T, *HULL.turn.as_quat(scalar_first=True).T, *TIP.place.T]
     header = ",".join([*names, *(f"tip_{axis}" for axis in range(3))])
@@ -632,25 +643,25 @@ time_unit = "ms"
     [
         ("stamp", "sent", 'time = "stamp"\n', 'time = "sent"\n'),
         ("%time", "time", 'time = "%time"\n', ""),
-        # One key for both files: a sign of a comment before a header's name is no part of it.
+        # One key for both files, because a comment sign before a header's first name is not part of the name.
         ("%time", "time", "", 'time = "%time"\n'),
         ("%time", "time", "", 'time = "time"\n'),
         ("t", "# t", "", 'time = "t"\n'),
         ("stamp", "%stamp", "", 'time = "stamp"\n'),
     ],
 )
-def test_a_table_and_its_log_have_clocks_of_their_own(
+def test_table_and_command_log_may_have_different_clocks(
     tmp_path: Path, robot: RobotDescription, table: str, log: str, clock: str, commands: str
 ):
     write_two_clocks(tmp_path, table, log)
     room(tmp_path, robot, TWO_CLOCKS + clock, commands)
     line = ["import", tmp_path / "trial.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "out.csv"]
     run(*line, "--robot", robot.file, "--commands", tmp_path / "log.csv", "--offset=-12")
-    same(read_recording(tmp_path / "out.csv", robot), gaps=False)
+    assert_motion(read_recording(tmp_path / "out.csv", robot), gaps=False)
 
 
-def test_a_column_s_own_name_goes_before_one_without_its_sign(tmp_path: Path, robot: RobotDescription):
-    """A table may have both: `time` within the trial, and `%time` of the day."""
+def test_time_column_with_a_comment_sign_is_found_by_its_full_name(tmp_path: Path, robot: RobotDescription):
+    """A table may have both `time` and `%time`, for example times in the trial and times of the day."""
     write_two_clocks(tmp_path, "%time", "time")
     lines = (tmp_path / "trial.csv").read_text().splitlines()
     body = [f"{1e6 + 5 * row},{line}" for row, line in enumerate(lines[1:])]
@@ -660,28 +671,28 @@ def test_a_column_s_own_name_goes_before_one_without_its_sign(tmp_path: Path, ro
 
 
 @pytest.mark.parametrize(
-    ("commands", "said"),
+    ("commands", "words"),
     [
-        # The name is the table's: the log's is missing, and where a table's own name stands is told.
+        # The name exists only in the table. The message says that the table's name belongs under [clock].
         ('time = "stamp"\n', ["log.csv: there is no column 'stamp' of times", "under [commands]", "[clock]"]),
-        # The name is the log's: the table's is missing.
+        # The name exists only in the log.
         ('time = "sent"\n', ["trial.csv: there is no column 'sent' of times", "under [clock]"]),
     ],
 )
-def test_one_name_for_two_clocks_is_told_which_key_the_other_has(
-    tmp_path: Path, robot: RobotDescription, capsys: pytest.CaptureFixture[str], commands: str, said: list[str]
+def test_message_says_where_to_name_the_other_file_s_time_column(
+    tmp_path: Path, robot: RobotDescription, capsys: pytest.CaptureFixture[str], commands: str, words: list[str]
 ):
     write_two_clocks(tmp_path, "stamp", "sent")
     room(tmp_path, robot, TWO_CLOCKS, commands)
     line = ["import", tmp_path / "trial.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "out.csv"]
     line += ["--robot", robot.file, "--commands", tmp_path / "log.csv", "--offset=-12"]
     assert record.main([str(each) for each in line]) == 2
-    told = capsys.readouterr().err
-    for part in said:
-        assert part in told, told
+    message_text = capsys.readouterr().err
+    for part in words:
+        assert part in message_text, message_text
 
 
-def test_what_the_wizard_cannot_tell_is_left_empty_and_refused(
+def test_map_leaves_unknown_entries_empty_and_import_refuses_them(
     tmp_path: Path, robot: RobotDescription, capsys: pytest.CaptureFixture[str]
 ):
     path = write_qualisys_bodies(tmp_path)
@@ -696,7 +707,7 @@ def test_what_the_wizard_cannot_tell_is_left_empty_and_refused(
     assert "exists already" in capsys.readouterr().err
 
 
-def test_names_that_break_lines_do_not_break_the_mapping(tmp_path: Path, robot: RobotDescription):
+def test_map_quotes_names_with_line_breaks(tmp_path: Path, robot: RobotDescription):
     np.savez(tmp_path / "x.npz", **{'a"\n[hull]\n': HULL.place, "time": TIME})
     contents = find_reader(tmp_path / "x.npz").list(tmp_path / "x.npz")
     from ballu_mjx.recordings.importers.draft import draft_mapping
@@ -707,14 +718,14 @@ def test_names_that_break_lines_do_not_break_the_mapping(tmp_path: Path, robot: 
 
 
 @pytest.mark.parametrize("first", ["0", "0.0", "-0.0", "0.25"])
-def test_a_header_may_be_the_last_comment_whatever_the_first_time_is(tmp_path: Path, first: str):
+def test_last_comment_may_be_the_header_for_any_first_time(tmp_path: Path, first: str):
     path = tmp_path / "table.csv"
     path.write_text(f"# made by hand\n#time,x\n{first},1\n1.5,2\n")
     table = Table(path)
     assert table.column("time").tolist() == [float(first), 1.5] and table.column("x").tolist() == [1.0, 2.0]
 
 
-def test_a_table_without_telling_names_asks_for_places_alone(tmp_path: Path, robot: RobotDescription):
+def test_map_leaves_only_positions_empty_if_names_are_unclear(tmp_path: Path, robot: RobotDescription):
     names = "t,arm,push,bx,by,bz,qw,qx,qy,qz,kx,ky,kz"
     values = np.column_stack([TIME, COMMAND, HULL.place, HULL.turn.as_quat(scalar_first=True), TIP.place])
     np.savetxt(tmp_path / "x.csv", values, "%.6f", ",", header=names, comments="")
@@ -725,21 +736,21 @@ def test_a_table_without_telling_names_asks_for_places_alone(tmp_path: Path, rob
     (tmp_path / "room.toml").write_text(text)
     line = ["import", tmp_path / "x.csv", "--mapping", tmp_path / "room.toml", "--output", tmp_path / "out.csv"]
     run(*line, "--robot", robot.file)
-    same(read_recording(tmp_path / "out.csv", robot), gaps=False)
+    assert_motion(read_recording(tmp_path / "out.csv", robot), gaps=False)
 
 
 @pytest.mark.parametrize("clock, scale, unit", [("t_ms", 1e3, "ms"), ("Time [us]", 1e6, "us"), ("stamp (s)", 1.0, "s")])
-def test_a_clock_with_its_unit_in_its_name_is_found(
+def test_map_finds_time_columns_with_a_unit_in_the_name(
     tmp_path: Path, robot: RobotDescription, clock: str, scale: float, unit: str
 ):
     names = f"{clock},arm,push,hull_x,hull_y,hull_z,hull_qw,hull_qx,hull_qy,hull_qz,tip_x,tip_y,tip_z"
     values = np.column_stack([scale * TIME, COMMAND, HULL.place, HULL.turn.as_quat(scalar_first=True), TIP.place])
     np.savetxt(tmp_path / "x.csv", values, "%.6f", ",", header=names, comments="")
-    same(imported(tmp_path, tmp_path / "x.csv", robot), gaps=False)
+    assert_motion(imported(tmp_path, tmp_path / "x.csv", robot), gaps=False)
     assert f'time_unit = "{unit}"' in (tmp_path / "room.toml").read_text()
 
 
-def test_a_column_that_rises_under_another_name_is_offered_as_the_time(tmp_path: Path, robot: RobotDescription):
+def test_map_suggests_an_increasing_column_as_the_time(tmp_path: Path, robot: RobotDescription):
     values = np.column_stack([TIME, HULL.place])
     np.savetxt(tmp_path / "x.csv", values, "%.6f", ",", header="elapsed,hull_x,hull_y,hull_z", comments="")
     run("map", tmp_path / "x.csv", "--output", tmp_path / "room.toml", "--robot", robot.file)
@@ -747,7 +758,7 @@ def test_a_column_that_rises_under_another_name_is_offered_as_the_time(tmp_path:
     assert line in (tmp_path / "room.toml").read_text().splitlines()
 
 
-def test_a_point_s_orientation_is_mapped_where_the_robot_may_have_one(tmp_path: Path):
+def test_map_includes_the_orientation_of_an_oriented_point(tmp_path: Path):
     names = [
         "time",
         *(f"{site}_{axis}" for site in ("balloon", "base") for axis in ("x", "y", "z", "qw", "qx", "qy", "qz")),

@@ -1,4 +1,4 @@
-"""Recordings: what is read back, how gaps are filled, and how damage is refused."""
+"""Tests of the recording format: round trips, interpolation of gaps, and refusal of damaged files."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ COLUMNS = {
     "motor": ("motor_left", "motor_right"),
     "knee": ("knee_left", "knee_right"),
 }
-"""BALLU's columns by field of `pairs`, in the order in which they are written."""
+"""BALLU's columns by key of `arrays`, in the order of the file."""
 
 FREE = {"format": "ballu-recording/1", "kind": "free", "robot": "virtual", "notes": "a bow"}
 ARRAYS = [field for field in COLUMNS if field != "time"]
@@ -47,7 +47,7 @@ Table = dict[str, list[str]]
 
 
 def smooth(time: np.ndarray) -> Recording:
-    """A robot that sways, turns and bends its knees smoothly: known at every time."""
+    """Return a recording of a robot that sways, turns and bends its knees, as smooth functions of time."""
     wave = np.sin(2 * np.pi * 0.5 * time)
     swing = np.stack([wave, -wave], 1)
     one, zero = np.ones_like(time), np.zeros_like(time)
@@ -79,7 +79,7 @@ def steady() -> Recording:
     return smooth(np.arange(0, 400) / 100)
 
 
-def pairs(recording: Recording) -> dict[str, np.ndarray | None]:
+def arrays(recording: Recording) -> dict[str, np.ndarray | None]:
     return {
         "time": recording.time,
         "command": recording.command,
@@ -95,19 +95,19 @@ def pairs(recording: Recording) -> dict[str, np.ndarray | None]:
 
 def changed(recording: Recording, **fields: Any) -> Recording:
     named = {name: getattr(recording, name) for name in ("name", "kind", "robot", "notes")}
-    return make_recording(**{**named, **pairs(recording), **fields})  # pyright: ignore[reportArgumentType]
+    return make_recording(**{**named, **arrays(recording), **fields})  # pyright: ignore[reportArgumentType]
 
 
 def without(recording: Recording, *fields: str) -> Recording:
     return changed(recording, **dict.fromkeys(fields))
 
 
-def near(actual: Recording, expected: Recording, tolerance: float) -> None:
+def assert_close(actual: Recording, expected: Recording, tolerance: float) -> None:
     for field in ARRAYS:
-        a, b = pairs(actual)[field], pairs(expected)[field]
+        a, b = arrays(actual)[field], arrays(expected)[field]
         assert (a is None) == (b is None), field
         if a is not None:
-            # Quaternions are written with a decimal less.
+            # Quaternions are written with one decimal less.
             assert b is not None
             allowed = max(tolerance, 1e-4) if field.endswith("quaternion") else tolerance
             np.testing.assert_allclose(a, np.asarray(b), atol=allowed, rtol=0, err_msg=field)
@@ -134,7 +134,7 @@ def written() -> tuple[bytes, bytes]:
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """A recording without fault, with all columns."""
+    """Return the path of a valid recording with all columns."""
     (tmp_path / "walk.csv").write_bytes(written()[0])
     (tmp_path / "walk.json").write_bytes(written()[1])
     return tmp_path / "walk.csv"
@@ -145,25 +145,25 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("name", ["walk.csv", "walk.csv.gz"])
 @pytest.mark.parametrize("left_out", [(), ("base_quaternion", "motor", "knee")])
-def test_round_trip(tmp_path: Path, name: str, left_out: tuple[str, ...]) -> None:
+def test_recording_is_read_back(tmp_path: Path, name: str, left_out: tuple[str, ...]) -> None:
     expected = without(steady(), *left_out)
     write_recording(expected, tmp_path / name)
     actual = read_recording(tmp_path / name)
     assert (actual.name, actual.kind, actual.robot, actual.notes) == ("walk", "free", "virtual", "a bow")
     np.testing.assert_array_equal(actual.time, expected.time)
-    near(actual, expected, 1e-5)
+    assert_close(actual, expected, 1e-5)
     assert actual.interpolated == {} and actual.trimmed == (0, 0)
 
 
-def test_suspended_needs_no_more_than_motors_and_knees(tmp_path: Path) -> None:
+def test_suspended_recording_needs_only_motors_and_knees(tmp_path: Path) -> None:
     positions = ["balloon_position", "balloon_quaternion", "base_position", "base_quaternion", "foot_position"]
     expected = dataclasses.replace(without(steady(), *positions), kind="suspended")
     write_recording(expected, tmp_path / "sweep.csv")
-    near(read_recording(tmp_path / "sweep.csv"), expected, 1e-5)
+    assert_close(read_recording(tmp_path / "sweep.csv"), expected, 1e-5)
 
 
 @pytest.mark.parametrize("ending", [".csv", ".csv.gz"])
-def test_same_recording_same_bytes(tmp_path: Path, ending: str) -> None:
+def test_files_are_reproducible_to_the_byte(tmp_path: Path, ending: str) -> None:
     for name in ("one", "two"):
         write_recording(steady(), tmp_path / f"{name}{ending}")
     assert (tmp_path / f"one{ending}").read_bytes() == (tmp_path / f"two{ending}").read_bytes()
@@ -174,7 +174,7 @@ def test_26_bundled_recordings_fit_in_two_megabytes(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     clean = smooth(np.arange(2000) / 100)
     noisy: dict[str, Any] = {
-        f: v + 5e-4 * rng.standard_normal(v.shape) for f, v in pairs(clean).items() if "pos" in f and v is not None
+        f: v + 5e-4 * rng.standard_normal(v.shape) for f, v in arrays(clean).items() if "pos" in f and v is not None
     }
     turn = Rotation.from_rotvec(np.deg2rad(0.3) * rng.standard_normal((2000, 3)))
     turned = Rotation.from_quat(np.asarray(clean.tracked_quaternion), scalar_first=True) * turn
@@ -184,24 +184,24 @@ def test_26_bundled_recordings_fit_in_two_megabytes(tmp_path: Path) -> None:
     assert 26 * (tmp_path / "walk.csv.gz").stat().st_size < 2e6
 
 
-def test_column_order_is_free(path: Path) -> None:
+def test_columns_may_have_any_order(path: Path) -> None:
     table = load(path)
     shuffled = list(np.random.default_rng(0).permutation(list(table)))
     save({name: table[name] for name in shuffled}, path)
-    near(read_recording(path), steady(), 1e-5)
+    assert_close(read_recording(path), steady(), 1e-5)
 
 
-def test_jittered_rate(tmp_path: Path) -> None:
+def test_recording_with_jittered_times_is_read_back(tmp_path: Path) -> None:
     time = 1e5 + np.cumsum(np.random.default_rng(0).uniform(0.002, 0.03, 200))
     expected = smooth(time)
     write_recording(expected, tmp_path / "walk.csv")
     actual = read_recording(tmp_path / "walk.csv")
     np.testing.assert_allclose(actual.time, time, atol=1e-6, rtol=0)
-    near(actual, expected, 1e-5)
+    assert_close(actual, expected, 1e-5)
 
 
 @pytest.mark.parametrize(
-    "dress",
+    "change",
     [
         lambda b: b"\xef\xbb\xbf" + b,
         lambda b: b.replace(b"\n", b"\r\n"),
@@ -213,16 +213,17 @@ def test_jittered_rate(tmp_path: Path) -> None:
     ],
     ids=["byte order mark", "CRLF", "blank lines", "blank cells", "no last newline", "spaces", "quotes"],
 )
-def test_what_spreadsheets_add_is_no_fault(path: Path, dress: Callable[[bytes], bytes]) -> None:
-    path.write_bytes(dress(path.read_bytes()))
-    near(read_recording(path), steady(), 1e-5)
+def test_changes_that_spreadsheets_make_are_accepted(path: Path, change: Callable[[bytes], bytes]) -> None:
+    path.write_bytes(change(path.read_bytes()))
+    assert_close(read_recording(path), steady(), 1e-5)
 
 
 # ---- gaps ----
 
 
-def test_short_gaps_are_interpolated_and_counted(path: Path) -> None:
-    """Over 0.3 s of the known motion a straight line errs by at most w^2 A h^2 / 8, a slerp likewise."""
+def test_short_gaps_are_interpolated_and_counted_by_column(path: Path) -> None:
+    """Over a gap h of 0.3 s, the error of linear interpolation of the known motion is at most w^2 A h^2 / 8. The
+    same bound holds for slerp."""
     table = load(path)
     for name in table.keys() - {"time", "command_left", "command_right"}:
         table[name][100:130] = [""] * 30
@@ -232,7 +233,7 @@ def test_short_gaps_are_interpolated_and_counted(path: Path) -> None:
     bend = (2 * np.pi * 0.5) ** 2 * 0.31**2 / 8
     amplitudes = {"balloon_position": 0.02, "base_position": 0.01, "foot_position": 0.05, "motor": 0.7, "knee": 0.4}
     for field in ARRAYS:
-        error = np.abs(np.asarray(pairs(actual)[field]) - pairs(steady())[field]).max()
+        error = np.abs(np.asarray(arrays(actual)[field]) - arrays(steady())[field]).max()
         assert error < amplitudes.get(field, 0.15) * bend + 1e-5, field
     counts = dict.fromkeys(table.keys() - {"time", "command_left", "command_right"}, 30)
     quaternion = dict.fromkeys(COLUMNS["balloon_quaternion"], 31)
@@ -240,8 +241,8 @@ def test_short_gaps_are_interpolated_and_counted(path: Path) -> None:
     assert actual.trimmed == (0, 0)
 
 
-def test_orientations_are_interpolated_along_the_shortest_turn(path: Path) -> None:
-    """A constant turn comes back exactly, whichever sign the samples beside the gap carry."""
+def test_orientations_are_interpolated_along_the_shortest_rotation(path: Path) -> None:
+    """A constant rate of turn is recovered exactly, for any sign of the quaternions beside the gap."""
     table = load(path)
     yaw = np.linspace(0, 3, 400)
     for name, value in zip(
@@ -255,7 +256,7 @@ def test_orientations_are_interpolated_along_the_shortest_turn(path: Path) -> No
     np.testing.assert_allclose(actual, expected, atol=1e-8)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 
-def test_half_a_second_is_filled_and_more_is_not(path: Path) -> None:
+def test_gaps_of_half_a_second_are_interpolated_and_longer_ones_refused(path: Path) -> None:
     table = load(path)
     table["knee_left"][100:150] = [""] * 50
     save(table, path)
@@ -266,7 +267,7 @@ def test_half_a_second_is_filled_and_more_is_not(path: Path) -> None:
         read_recording(path)
 
 
-def test_gaps_at_the_ends_are_cut_not_invented(path: Path) -> None:
+def test_gaps_at_the_ends_are_trimmed(path: Path) -> None:
     table = load(path)
     table["base_x"][:20] = [""] * 20
     table["balloon_qx"][390:] = [""] * 10
@@ -276,11 +277,11 @@ def test_gaps_at_the_ends_are_cut_not_invented(path: Path) -> None:
     assert actual.trimmed == (20, 10)
     assert actual.interpolated == {"base_y": 5}
     np.testing.assert_allclose(actual.time, steady().time[20:390])
-    np.testing.assert_allclose(pairs(actual)["knee"], pairs(steady())["knee"][20:390], atol=1e-5)  # pyright: ignore
+    np.testing.assert_allclose(arrays(actual)["knee"], arrays(steady())["knee"][20:390], atol=1e-5)  # pyright: ignore
 
 
 def test_missing_samples_are_written_as_empty_cells(tmp_path: Path) -> None:
-    base = np.array(pairs(steady())["base_position"])
+    base = np.array(arrays(steady())["base_position"])
     base[50:60] = np.nan
     write_recording(changed(steady(), base_position=base), tmp_path / "walk.csv")
     assert load(tmp_path / "walk.csv")["base_x"][49:61].count("") == 10
@@ -291,7 +292,7 @@ def test_missing_samples_are_written_as_empty_cells(tmp_path: Path) -> None:
 
 
 def cell(name: str, row: int, text: str) -> Callable[[Table], object]:
-    """Set one cell; `row` as a spreadsheet counts."""
+    """Return a function that sets one cell. `row` counts the header as row 1."""
     return lambda table: table[name].__setitem__(row - 2, text)
 
 
@@ -385,24 +386,24 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize(("damage", "column", "row", "words"), DAMAGE.values(), ids=DAMAGE.keys())
-def test_damage_is_refused(
+def test_damaged_table_is_refused_with_column_and_row(
     path: Path, damage: Callable[[Table], object], column: str, row: int | None, words: str
 ) -> None:
     table = load(path)
     damage(table)
     save(table, path)
-    refused(path, words, f"column {column}", "" if row is None else f"row {row}: ")
+    assert_refused(path, words, f"column {column}", "" if row is None else f"row {row}: ")
 
 
-def refused(path: Path, *words: str, file: str = "walk.csv") -> str:
-    """The one sentence that `path` is refused with; it holds the file's name and `words`."""
+def assert_refused(path: Path, *words: str, file: str = "walk.csv") -> str:
+    """Assert that `path` is refused by one sentence that contains the file's name and `words`. Return the message."""
     with pytest.raises(InputError) as caught:
         read_recording(path)
-    sentence = str(caught.value)
+    message = str(caught.value)
     for word in (file, *words):
-        assert word in sentence
-    assert sentence.endswith(".") and "\n" not in sentence and "; " in sentence
-    return sentence
+        assert word in message
+    assert message.endswith(".") and "\n" not in message and "; " in message
+    return message
 
 
 TEXT_DAMAGE = {
@@ -430,9 +431,9 @@ TEXT_DAMAGE = {
 
 
 @pytest.mark.parametrize(("damage", "words"), TEXT_DAMAGE.values(), ids=TEXT_DAMAGE.keys())
-def test_damaged_text_is_refused(path: Path, damage: Callable[[bytes], bytes], words: str) -> None:
+def test_file_that_is_not_a_valid_table_is_refused(path: Path, damage: Callable[[bytes], bytes], words: str) -> None:
     path.write_bytes(damage(path.read_bytes()))
-    refused(path, words)
+    assert_refused(path, words)
 
 
 JSON_DAMAGE = {
@@ -454,43 +455,43 @@ JSON_DAMAGE = {
 @pytest.mark.parametrize(("text", "words"), JSON_DAMAGE.values(), ids=JSON_DAMAGE.keys())
 def test_damaged_description_is_refused(path: Path, text: str, words: str) -> None:
     path.with_suffix(".json").write_text(text)
-    refused(path, words, file="walk.json")
+    assert_refused(path, words, file="walk.json")
 
 
 def test_missing_description_is_refused(path: Path) -> None:
     path.with_suffix(".json").unlink()
-    refused(path, '"format": "ballu-recording/1"', file="walk.json")
+    assert_refused(path, '"format": "ballu-recording/1"', file="walk.json")
 
 
-def test_users_own_keys_in_the_description_are_no_fault(path: Path) -> None:
+def test_unknown_keys_in_the_description_are_accepted(path: Path) -> None:
     path.with_suffix(".json").write_text(json.dumps({**FREE, "date": "2024-02-03"}))
     assert read_recording(path).robot == "virtual"
 
 
 @pytest.mark.parametrize("column", ["motor_left", "knee_left"])
-def test_suspended_without_angles_is_refused(path: Path, column: str) -> None:
+def test_suspended_recording_without_angles_is_refused(path: Path, column: str) -> None:
     path.with_suffix(".json").write_text(json.dumps({**FREE, "kind": "suspended"}))
     table = load(path)
     dropped(column, column.replace("left", "right"))(table)
     save(table, path)
-    refused(path, f"column {column}, row 1: the column is missing, and suspended recordings need it")
+    assert_refused(path, f"column {column}, row 1: the column is missing, and suspended recordings need it")
 
 
-def test_suspended_with_part_of_a_group_is_refused(path: Path) -> None:
+def test_suspended_recording_with_part_of_a_column_group_is_refused(path: Path) -> None:
     path.with_suffix(".json").write_text(json.dumps({**FREE, "kind": "suspended"}))
     table = load(path)
     dropped("balloon_y")(table)
     save(table, path)
-    refused(path, "column balloon_y, row 1", "add it or delete balloon_x, balloon_z")
+    assert_refused(path, "column balloon_y, row 1", "add it or delete balloon_x, balloon_z")
 
 
-def test_half_seconds_that_leave_too_little_are_refused(tmp_path: Path) -> None:
+def test_recording_too_short_after_trimming_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "walk.csv"
     write_recording(smooth(np.arange(121) / 100), path)
     table = load(path)
     emptied("base_x", 2, 41)(table)
     save(table, path)
-    refused(path, "all columns have samples for 0.8 s only", "row 42")
+    assert_refused(path, "all columns have samples for 0.8 s only", "row 42")
 
 
 def test_damaged_gzip_is_refused(tmp_path: Path) -> None:
@@ -500,20 +501,20 @@ def test_damaged_gzip_is_refused(tmp_path: Path) -> None:
     flipped = bytes(b ^ 255 if i == 5000 else b for i, b in enumerate(whole))
     for damaged in (whole[:-1000], b"time,command_left\n", flipped):
         path.write_bytes(damaged)
-        refused(path, "not a whole gzip file", file="walk.csv.gz")
+        assert_refused(path, "not a whole gzip file", file="walk.csv.gz")
 
 
-def test_a_gzip_bomb_is_refused_before_it_fills_the_memory(path: Path) -> None:
+def test_gzip_that_expands_beyond_the_limit_is_refused(path: Path) -> None:
     with gzip.open(path.with_name("walk.csv.gz"), "wb", compresslevel=1) as stream:
         for _ in range(130):
             stream.write(bytes(2**20))
-    refused(path.with_name("walk.csv.gz"), "more than 128 MiB", "split it", file="walk.csv.gz")
+    assert_refused(path.with_name("walk.csv.gz"), "more than 128 MiB", "split it", file="walk.csv.gz")
 
 
 # ---- paths ----
 
 
-def test_paths_expand_to_files_once_and_sorted(tmp_path: Path) -> None:
+def test_paths_expand_to_sorted_files_without_duplicates(tmp_path: Path) -> None:
     for name in ("b.csv", "a.csv.gz", "c.csv"):
         write_recording(smooth(np.arange(3) / 100), tmp_path / name)
     (tmp_path / "._a.csv").touch()
@@ -540,7 +541,7 @@ def test_paths_without_a_recording_are_refused(tmp_path: Path) -> None:
         list_recordings([tmp_path])
 
 
-def test_bundled_looks_in_the_packages_assets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bundled_recordings_are_listed_from_the_assets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(csv_format, "assets", lambda: tmp_path)
     (tmp_path / "recordings" / "test").mkdir(parents=True)
     write_recording(steady(), tmp_path / "recordings" / "test" / "far.csv.gz")
@@ -559,7 +560,7 @@ def test_bundled_looks_in_the_packages_assets(tmp_path: Path, monkeypatch: pytes
     compressed=st.booleans(),
     text=st.text(st.characters(codec="utf-8")),
 )
-def test_any_recording_comes_back(
+def test_any_valid_recording_is_read_back(
     seed: int, rate: float, origin: float, left_out: set[str], compressed: bool, text: str
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -573,7 +574,7 @@ def test_any_recording_comes_back(
     assert actual.notes == text and not actual.interpolated
     np.testing.assert_allclose(actual.time, recording.time, atol=1e-6, rtol=0)
     np.testing.assert_allclose(actual.command, recording.command, atol=5.1e-5)
-    near(dataclasses.replace(actual, command=recording.command), recording, 2e-5)
+    assert_close(dataclasses.replace(actual, command=recording.command), recording, 2e-5)
 
 
 CELLS = st.one_of(
@@ -596,8 +597,9 @@ def short_text() -> list[list[str]]:
 
 @settings(max_examples=150, deadline=None)
 @given(row=st.integers(0, 101), column=st.integers(0, 26), text=CELLS)
-def test_one_changed_cell_is_read_or_refused(row: int, column: int, text: str) -> None:
-    """Whatever stands in one cell: a complete recording, or a sentence; warnings are errors here."""
+def test_file_with_one_changed_cell_is_read_completely_or_refused(row: int, column: int, text: str) -> None:
+    """For any text in one cell, the reader returns a complete recording or refuses the file. Warnings count as
+    errors."""
     rows = [list(cells) for cells in short_text()]
     rows[row][column] = text
     with tempfile.TemporaryDirectory() as folder:
@@ -610,5 +612,5 @@ def test_one_changed_cell_is_read_or_refused(row: int, column: int, text: str) -
             assert str(path) in str(error)
         else:
             assert all(
-                np.isfinite(np.asarray(value, float)).all() for value in pairs(recording).values() if value is not None
+                np.isfinite(np.asarray(value, float)).all() for value in arrays(recording).values() if value is not None
             )

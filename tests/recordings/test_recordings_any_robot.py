@@ -1,4 +1,4 @@
-"""Recordings of robots that are not BALLU: their own units, rates and limits, through files and importers."""
+"""Tests of recordings of robots other than BALLU, with their own units, rates and limits, in files and importers."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def describe(folder: Path, **keys: Any) -> RobotDescription:
 
 
 def swing(rate: float = 100.0, seconds: float = 3.0) -> Recording:
-    """Hanging below its model's origin."""
+    """Return a recording of the arm, which hangs below the model's origin."""
     time = np.arange(round(rate * seconds)) / rate
     angle, reach = 0.8 * np.sin(3 * time), 0.05 + 0.04 * np.sin(2 * time)
     down = -np.stack([np.sin(angle), 0 * time, np.cos(angle)], 1)
@@ -53,18 +53,18 @@ def swing(rate: float = 100.0, seconds: float = 3.0) -> Recording:
     )  # fmt: skip
 
 
-def test_everything_that_the_description_names_comes_back(tmp_path: Path):
+def test_recording_with_all_described_quantities_is_read_back(tmp_path: Path):
     robot, expected = describe(tmp_path), swing()
     write_recording(expected, tmp_path / "swing.csv", robot)
     found = read_recording(tmp_path / "swing.csv", robot)
-    np.testing.assert_allclose(found.command, expected.command, atol=1e-7)  # milli-units keep their digits
+    np.testing.assert_allclose(found.command, expected.command, atol=1e-7)  # small commands keep their digits
     np.testing.assert_allclose(np.asarray(found.tracked_position), np.asarray(expected.tracked_position), atol=6e-6)
     np.testing.assert_allclose(found.orientations["elbow"], expected.orientations["elbow"], atol=6e-5)
     for joint in robot.joints:
         np.testing.assert_allclose(found.joint_angles[joint], expected.joint_angles[joint], atol=6e-6)
 
 
-def test_joints_and_orientations_may_be_left_out_and_are_all_that_a_suspended_recording_needs(tmp_path: Path):
+def test_free_recordings_need_no_joints_and_suspended_ones_need_only_joints(tmp_path: Path):
     robot = describe(tmp_path)
     write_recording(dataclasses.replace(swing(), orientations={}, joint_angles={}), tmp_path / "free.csv", robot)
     free = read_recording(tmp_path / "free.csv", robot)
@@ -81,9 +81,9 @@ def test_joints_and_orientations_may_be_left_out_and_are_all_that_a_suspended_re
         read_recording(tmp_path / "half.csv", robot)
 
 
-def test_limits_are_the_description_s_and_rates_the_control_step_s(tmp_path: Path):
-    """Below the origin, far up and fast: no fault unless the description says so. One sample a control step of 25 ms
-    must be there."""
+def test_description_sets_the_limits_and_the_lowest_sampling_rate(tmp_path: Path):
+    """Without limits in the description, a site may be below the origin, 4 m higher, or fast. Each control step of
+    25 ms needs at least one sample."""
     robot, path = describe(tmp_path), tmp_path / "swing.csv"
     up = dataclasses.replace(swing(), tracked_position=np.asarray(swing().tracked_position) + [0.0, 0.0, 4.0])
     for each in (swing(), up, swing(rate=41.0)):
@@ -108,22 +108,22 @@ def test_limits_are_the_description_s_and_rates_the_control_step_s(tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"command": swing().command * [2, 1]}, "column command_turn, row 2: -23 is outside -12 to 12"),
         ({"joint_angles": {"shoulder": np.rad2deg(swing().joint_angles["shoulder"])}}, "convert degrees to radians"),
         ({"joint_angles": {"reach": 1e3 * swing().joint_angles["reach"]}}, "millimetres to metres"),
     ],
 )
-def test_what_the_model_cannot_be_meant_to_do_is_refused(tmp_path: Path, changes: dict[str, Any], said: str):
+def test_values_outside_the_model_s_ranges_are_refused(tmp_path: Path, changes: dict[str, Any], message: str):
     robot = describe(tmp_path)
     write_recording(dataclasses.replace(swing(), **changes), tmp_path / "swing.csv", robot)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         read_recording(tmp_path / "swing.csv", robot)
 
 
-def test_check_and_import_take_the_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """A table of another robot, with its own units, becomes its recording; `check` tells orientations and joints."""
+def test_import_and_check_accept_another_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """`import` converts a table of another robot, with its own units. `check` prints its orientations and joints."""
     robot, made = describe(tmp_path), swing()
     assert made.tracked_position is not None and made.tracked_quaternion is not None
     columns = [
@@ -144,16 +144,16 @@ def test_check_and_import_take_the_robot(tmp_path: Path, capsys: pytest.CaptureF
     assert record.main([str(tmp_path / each) if "." in each else each for each in line]) == 0
     found = read_recording(tmp_path / "out" / "take.csv", robot)
     np.testing.assert_allclose(found.command, made.command, atol=1e-4)
-    # An anchored robot stays where its model stands.
+    # Import does not move the origin of an anchored robot.
     np.testing.assert_allclose(np.asarray(found.tracked_position), made.tracked_position, atol=1e-5)
     np.testing.assert_allclose(found.joint_angles["reach"], made.joint_angles["reach"], atol=1e-5)
     capsys.readouterr()
     figures = ["--output", str(tmp_path / "figures")]
     assert record.main(["check", str(tmp_path / "out"), "--robot", str(robot.file), *figures]) == 0
-    said = capsys.readouterr().out
-    assert "tip yaw, pitch, roll (deg): 0.000 to 0.000, -45.8" in said and "reach (rad or m): 0.010 to" in said
-    assert "command_turn: -11.50 to -11.50" in said
+    printed = capsys.readouterr().out
+    assert "tip yaw, pitch, roll (deg): 0.000 to 0.000, -45.8" in printed and "reach (rad or m): 0.010 to" in printed
+    assert "command_turn: -11.50 to -11.50" in printed
     assert (tmp_path / "figures" / "take.png").stat().st_size > 2e4
     assert record.main(["check", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert "unknown column" in said and "--robot" in said
+    printed = capsys.readouterr().err
+    assert "unknown column" in printed and "--robot" in printed

@@ -1,4 +1,4 @@
-"""The air around the balloon: is it physics, in the right frame, and is it found again in recordings?"""
+"""Aerodynamics of the balloon: equations, frames, and recovery of known parameters from recordings."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ AIR = AirParameters(
     delay=jnp.array(0.05),
 )
 CONFIG = AirConfig(window_seconds=0.5, interval_seconds=0.5)
-"""Over windows as short as these contacts leave little to chance."""
+"""In windows this short, contacts hardly amplify errors."""
 COMMANDS = jnp.zeros((HISTORY, 2))
 
 
 def windy_model() -> mujoco.MjModel:
-    """The robot in C MuJoCo with `AIR`'s mass, inertia, centre and lift, from the definitions."""
+    """Return C MuJoCo's model of the robot with the mass, inertia, centre and lift of `AIR`, from their definitions."""
     model = load_model()
     body = model.body("balloon").id
     lift = model.body_gravcomp[body] * model.body_mass[body] * 9.81 - 0.12 + 0.12 * 9.81
@@ -63,7 +63,7 @@ def windy_model() -> mujoco.MjModel:
 
 
 def blown(name: str, period: float, phase: float, steps: int = 160) -> Motion:
-    """The nominal robot in `AIR`, in C MuJoCo; drag from MuJoCo's own velocities, at every physics step."""
+    """Simulate the nominal robot in `AIR` in C MuJoCo. Drag uses MuJoCo's velocities in every physics step."""
     model = windy_model()
     data = mujoco.MjData(model)
     data.qpos[:] = standing_qpos(model)
@@ -73,7 +73,7 @@ def blown(name: str, period: float, phase: float, steps: int = 160) -> Motion:
     phases = time[:, None] / period + np.array([0.0, phase])
     command = np.where(phases % 1.0 < 0.45, 0.9, 0.0)
     states = [(data.qpos.copy(), data.qvel.copy())]
-    for row in np.concatenate([command[:1], command[:-1]]):  # one control step late
+    for row in np.concatenate([command[:1], command[:-1]]):  # commands arrive one control step late
         data.ctrl[:] = row
         for _ in range(round(CONTROL_TIMESTEP / model.opt.timestep)):
             mujoco.mj_forward(model, data)
@@ -92,7 +92,12 @@ def blown(name: str, period: float, phase: float, steps: int = 160) -> Motion:
 
 
 def history(euler: np.ndarray, velocity: np.ndarray, turning: np.ndarray) -> jnp.ndarray:
-    """Features of a balloon that moves and turns; `turning` in its own frame."""
+    """Return features of a balloon that moves and turns.
+
+    - `euler`: roll, pitch and yaw (rad).
+    - `velocity`: linear velocity (m/s, world frame).
+    - `turning`: angular velocity (rad/s, body frame).
+    """
     now = euler_to_matrix(jnp.asarray(euler))
     hat = np.array([[0, -turning[2], turning[1]], [turning[2], 0, -turning[0]], [-turning[1], turning[0], 0]])
 
@@ -105,7 +110,7 @@ def history(euler: np.ndarray, velocity: np.ndarray, turning: np.ndarray) -> jnp
     return seen.at[:, 6:9].set(jnp.stack([angles(age) for age in (2, 1, 0)]))
 
 
-def test_no_air_is_the_nominal_model():
+def test_parameters_without_air_leave_the_nominal_model():
     air, none = Aerodynamics(load_robot(), MODEL), AirParameters.none()
     for name, value in air.fields(none).items():
         np.testing.assert_allclose(value, getattr(MODEL, name), rtol=1e-6, atol=1e-8)
@@ -113,31 +118,31 @@ def test_no_air_is_the_nominal_model():
     assert not np.any(air.act(none, seen, COMMANDS).wrench)
 
 
-def test_added_mass_weighs_nothing_and_lift_lifts():
+def test_added_mass_has_no_weight_and_lift_is_a_vertical_force():
     model = load_model()
     set_fields(model, Aerodynamics(load_robot(), MODEL).fields(AIR))
     for name in ("body_mass", "body_inertia", "body_ipos", "body_gravcomp"):
         np.testing.assert_allclose(getattr(model, name), getattr(windy_model(), name), rtol=1e-5, atol=1e-7)
 
-    def push_on_the_floor(model: mujoco.MjModel) -> float:
-        """Net vertical force at rest, by Newton's second law over the whole robot in free fall."""
+    def net_vertical_force(model: mujoco.MjModel) -> float:
+        """Return the net vertical force (N) of weight and lift on the whole robot, above the floor and at rest."""
         data = mujoco.MjData(model)
         data.qpos[2] += 5.0
         mujoco.mj_forward(model, data)
         return float(data.qfrc_passive[2] - data.qfrc_bias[2])
 
-    assert push_on_the_floor(model) - push_on_the_floor(MODEL) == pytest.approx(-0.12, rel=1e-3)
+    assert net_vertical_force(model) - net_vertical_force(MODEL) == pytest.approx(-0.12, rel=1e-3)
 
 
-def test_late_commands_arrive_physics_step_by_physics_step():
+def test_command_delay_is_resolved_in_physics_steps():
     air, sent = Aerodynamics(load_robot(), MODEL), jnp.array([[0.0, 0.2], [1.0, 0.4], [0.0, 1.0]])
     for delay, ages in ((0.0, [0] * 5), (0.05, [1] * 5), (0.02, [1, 1, 0, 0, 0]), (0.08, [2, 2, 2, 1, 1])):
         late = dataclasses.replace(AIR, delay=jnp.array(delay))
         np.testing.assert_array_equal(air.command(late, sent), sent[2 - np.array(ages)])
 
 
-def test_rounding_a_delay_moves_what_passes_for_it():
-    """On a quadratic cost, whose optimum is known."""
+def test_rounding_a_delay_adjusts_correlated_parameters():
+    """The cost is quadratic, so its optimum is known."""
     step, truth = 0.01, np.array([0.062, 0.12])
     covariance = np.array([[4e-5, -9e-5], [-9e-5, 2.5e-4]])  # of (delay, mass)
     precision = np.linalg.inv(covariance)
@@ -153,7 +158,7 @@ def test_rounding_a_delay_moves_what_passes_for_it():
     np.testing.assert_allclose(np.diag(found.covariance), np.diag(covariance) + rounding, rtol=1e-6)
 
 
-def test_drag_opposes_the_motion_whatever_the_heading():
+def test_drag_opposes_the_motion_for_any_heading():
     air = Aerodynamics(load_robot(), MODEL)
     velocity, turning = np.array([0.4, -0.3, 0.2]), np.array([0.3, -0.5, 0.7])
     level = np.asarray(air.act(AIR, history(np.zeros(3), velocity, turning), COMMANDS).wrench)[0]
@@ -180,23 +185,24 @@ def found(motions: list[Motion]) -> AirFit:
     return identify_air(SIMULATOR, motions, CONFIG)
 
 
-def test_known_air_is_found_again_in_another_simulator_s_motion(found: AirFit):
-    """Would catch a sign or a frame error in any of them."""
+def test_fit_recovers_known_air_from_another_simulator(found: AirFit):
+    """Errors of sign and frame in any parameter would be detected."""
     got, errors = found.parameters, found.standard_errors
     assert float(got.delay) == pytest.approx(0.05, abs=1e-6)
     assert float(got.added_mass) == pytest.approx(0.12, rel=0.05)
     assert float(got.added_inertia) == pytest.approx(3e-3, rel=0.1)
     assert float(got.lift) == pytest.approx(-0.12, abs=0.004)
     np.testing.assert_allclose(got.centre[:2], [0.004, 0.013], atol=7e-4)
-    speed = 0.3  # linear and quadratic drag are hard to tell apart, their sum at walking speed is not
+    speed = 0.3  # the sum of linear and quadratic drag at walking speed is identified better than each of them
     drag, true = (np.array(p.linear_drag + p.quadratic_drag * speed) for p in (got, AIR))
-    assert drag[0] == pytest.approx(true[0], rel=0.15)  # forwards; hardly any of the motion is along the other axes
+    # Only the forward axis, because the robot hardly moves along the others.
+    assert drag[0] == pytest.approx(true[0], rel=0.15)
     assert found.cost[1] < 0.02 * found.cost[0]
     assert 0 < float(errors.added_mass) < 0.3 * float(got.added_mass)
 
 
-def test_a_search_begun_elsewhere_ends_at_the_same_air(motions: list[Motion], found: AirFit):
-    """A delay and an added mass explain much the same motion: a search may walk from one to the other, or stop."""
+def test_fits_from_different_starting_values_agree(motions: list[Motion], found: AirFit):
+    """Delay and added mass have similar effects, so a search could stop at a wrong combination."""
     began = dataclasses.replace(jax.tree.map(lambda x: x / 2, AIR), delay=jnp.array(0.1))
     again = identify_air(SIMULATOR, motions, CONFIG, fixed_from=began).parameters
     assert float(again.delay) == pytest.approx(float(found.parameters.delay))
@@ -204,9 +210,9 @@ def test_a_search_begun_elsewhere_ends_at_the_same_air(motions: list[Motion], fo
     assert float(again.added_mass) == pytest.approx(float(found.parameters.added_mass), abs=little)
 
 
-def test_lost_lift_is_found_with_the_rest_kept(motions: list[Motion]):
-    """A balloon that loses gas: one number. With the old lift feet come down at other times, and the robot is elsewhere
-    within 2 s: no derivative there points to the right one."""
+def test_lift_can_be_fitted_with_all_other_parameters_fixed(motions: list[Motion]):
+    """A balloon that loses gas changes one parameter. With the old lift, feet land at other times and the robot is
+    elsewhere within 2 s, so derivatives there do not lead to the correct lift."""
     known = dataclasses.replace(AIR, lift=jnp.array(1e-4))
     fit = identify_air(SIMULATOR, motions, AirConfig(), fixed_from=known, free=("lift",))
     assert float(fit.parameters.lift) == pytest.approx(-0.12, abs=0.002)
@@ -214,8 +220,8 @@ def test_lost_lift_is_found_with_the_rest_kept(motions: list[Motion]):
     assert float(fit.standard_errors.turning_drag[0]) == 0.0
 
 
-def test_what_is_not_free_stays_nominal(motions: list[Motion]):
-    """Lift that was weighed; what nothing is known of is no air."""
+def test_fixed_parameters_stay_nominal(motions: list[Motion]):
+    """Without other values, the nominal parameters are those without air."""
     fit = identify_air(SIMULATOR, motions, CONFIG, free=("added_mass",))
     assert float(fit.parameters.added_mass) > 0
     assert not any(np.any(getattr(fit.parameters, name)) for name in AIR_PARAMETERS if name != "added_mass")
@@ -226,7 +232,7 @@ def test_recordings_shorter_than_a_window_are_refused(motions: list[Motion]):
         identify_air(SIMULATOR, motions[:1], AirConfig(window_seconds=30.0))
 
 
-def test_file_says_what_was_found(tmp_path: Path):
+def test_parameters_are_read_back_from_their_file(tmp_path: Path):
     path = tmp_path / AERODYNAMICS_FILE
     path.write_text(json.dumps({"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(AIR)}))
     read = read_air_parameters(path, load_robot())
@@ -235,7 +241,7 @@ def test_file_says_what_was_found(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"added_mass": -0.1}, "added_mass is -0.1; it must be 0 or more"),
         ({"centre": [0.0, 0.1]}, "centre must be three numbers"),
@@ -244,9 +250,9 @@ def test_file_says_what_was_found(tmp_path: Path):
         ({"viscosity": 1.0}, "no parameter 'viscosity'"),
     ],
 )
-def test_damaged_file_is_refused(tmp_path: Path, change: dict, says: str):
+def test_damaged_file_is_refused(tmp_path: Path, change: dict, message: str):
     path = tmp_path / AERODYNAMICS_FILE
     path.write_text(json.dumps({"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(AIR) | change}))
-    with pytest.raises(InputError, match=says) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         read_air_parameters(path, load_robot())
     assert str(path) in str(caught.value)

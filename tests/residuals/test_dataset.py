@@ -1,4 +1,4 @@
-"""Which recordings serve for what: what is refused, and what the user is told."""
+"""Use of recordings for training, validation and test: warnings and errors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def prepared(training: list[Path], validation: list[Path], test: list[Path]) -> 
 
 
 @pytest.mark.parametrize(
-    ("validation", "test", "told", "replayed"),
+    ("validation", "test", "warnings", "replayed"),
     [
         ([THREE], [FOUR], [], "of the test recordings"),
         ([THREE, FOUR], [FOUR, THREE], ["test is on the validation"], "of the validation recordings (they chose the"),
@@ -30,16 +30,18 @@ def prepared(training: list[Path], validation: list[Path], test: list[Path]) -> 
         ([ONE], [ONE], ["Validation is on the training", "test is on the training"], "of the training recordings"),
     ],
 )
-def test_recordings_that_serve_twice_are_told_where_it_matters(
-    validation: list[Path], test: list[Path], told: list[str], replayed: str
+def test_recordings_with_two_uses_give_warnings(
+    validation: list[Path], test: list[Path], warnings: list[str], replayed: str
 ) -> None:
     found = prepared([ONE], validation, test)
-    assert len(found.reused) == len(told) and all(part in line for part, line in zip(told, found.reused, strict=True))
+    assert len(found.reused) == len(warnings) and all(
+        part in line for part, line in zip(warnings, found.reused, strict=True)
+    )
     assert replayed in found.replayed
 
 
 @pytest.mark.parametrize(("one", "other"), list(itertools.combinations(USES, 2)))
-def test_two_uses_that_share_some_recordings_are_refused(one: str, other: str) -> None:
+def test_two_uses_that_share_only_some_recordings_are_refused(one: str, other: str) -> None:
     files = {use: [path] for use, path in zip(USES, (ONE, THREE, FOUR), strict=True)}
     check_overlap(files)
     files[other] = [*files[one], TWO]
@@ -50,7 +52,7 @@ def test_two_uses_that_share_some_recordings_are_refused(one: str, other: str) -
 
 
 def test_bundled_recordings_of_different_uses_do_not_overlap() -> None:
-    """Neither a file nor the commands of one serve two uses: no take of a training gait is tested on."""
+    """Recordings of different uses have different commands, so no test repeats a gait of the training recordings."""
     files = {use: list_bundled(use) for use in USES}
     commands = {
         use: {read_recording(path, load_robot()).command.tobytes() for path in paths} for use, paths in files.items()

@@ -1,4 +1,4 @@
-"""The residual-force task: its equations, its frames, its resets."""
+"""The EnvMimic task: reward, observations, frames, resets and open-loop evaluation."""
 
 import dataclasses
 import json
@@ -34,7 +34,8 @@ STEPS = 30
 
 
 def make_motion(force: np.ndarray, name: str = "made", steps: int = STEPS) -> Motion:
-    """Nominal robot in C MuJoCo at the training time step, stepping, with a constant force on the balloon."""
+    """Simulate the stepping nominal robot in C MuJoCo at the training time step, with a constant force on the balloon
+    (N, world frame)."""
     model = load_model()
     data = mujoco.MjData(model)
     data.qpos[:] = standing_qpos(model)
@@ -70,7 +71,7 @@ def pushed() -> Motion:
     return make_motion(np.array([0.04, 0.0, 0.02]))
 
 
-def test_reward_is_the_papers():
+def test_reward_is_that_of_the_paper():
     config = EnvMimicConfig(fine_position_weight=0.0, fine_orientation_weight=0.0)
     seen, target = np.zeros(27, np.float32), np.zeros(27, np.float32)
     seen[:3] = [0.1, -0.2, 0.05]
@@ -112,8 +113,8 @@ def test_features_agree_with_c_mujoco(still: Motion):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_observation_and_force_turn_with_the_robot(still: Motion, seed: int):
-    """The same motion elsewhere in the room, in another direction: same observation, force turned along."""
+def test_observation_is_relative_and_force_is_in_the_heading_frame(still: Motion, seed: int):
+    """A motion moved horizontally and turned about the vertical has the same observation, and its force is turned."""
     rng = np.random.default_rng(seed)
     simulator = Simulator(load_robot())
     reference, _ = stack_motions(simulator, [still])
@@ -133,8 +134,8 @@ def test_observation_and_force_turn_with_the_robot(still: Motion, seed: int):
     np.testing.assert_allclose(turn.apply(loads), moved_loads, atol=1e-5)
 
 
-def test_the_paper_s_state_and_force_are_the_room_s(still: Motion):
-    """Without relative observation and heading frame: features as they are, forces whatever the heading."""
+def test_options_give_the_paper_s_observation_and_force_in_the_world_frame(still: Motion):
+    """Without relative observation and heading frame, inputs are plain features and forces are in the world frame."""
     config = EnvMimicConfig(forces="force", relative_observation=False, heading_frame=False, observe_command=False)
     robot = load_robot()
     reference, _ = stack_motions(Simulator(robot), [still])
@@ -149,7 +150,7 @@ def test_the_paper_s_state_and_force_are_the_room_s(still: Motion):
 
 
 @pytest.mark.parametrize(("spread", "lengths"), [(0.0, {10}), (0.5, set(range(5, 16)))])
-def test_episodes_are_as_long_as_the_options_say(spread: float, lengths: set[int], still: Motion):
+def test_episode_lengths_follow_the_options(spread: float, lengths: set[int], still: Motion):
     config = EnvMimicConfig(episode_seconds=10 * CONTROL_TIMESTEP, episode_spread=spread)
     env = EnvMimicEnv(Simulator(load_robot()), [still], config)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 200))
@@ -186,7 +187,7 @@ def test_start_noise_stays_small_and_keeps_the_quaternion_a_unit(still: Motion):
     assert 0.3 < np.rad2deg(angle).mean() < 1.5
     hinges = np.rad2deg(qpos[:, 7:] - recorded[:, 7:])
     assert 0.4 < hinges[:, 0].std() < 0.6
-    assert np.abs(hinges[:, 3]).max() == 0.0  # motors stay
+    assert np.abs(hinges[:, 3]).max() == 0.0  # motors have no noise
 
 
 def test_time_limits_truncate_and_divergence_terminates(still: Motion):
@@ -212,9 +213,9 @@ def test_time_limits_truncate_and_divergence_terminates(still: Motion):
     assert all(np.isfinite(x).all() for x in state.obs.values()) and np.isfinite(float(state.reward))
 
 
-def test_the_missing_force_earns_more_than_none_and_its_opposite_less(pushed: Motion):
-    """A constant force on the reference robot: would catch a sign or frame error. Of forces at balloon, base and feet,
-    only the first is not zero."""
+def test_the_missing_force_earns_more_reward_than_zero_or_opposite_force(pushed: Motion):
+    """A constant force acts on the reference robot, so this test detects errors of sign and frame. Among the forces at
+    balloon, base and feet, only the first is not zero."""
     env = EnvMimicEnv(
         Simulator(load_robot()), [pushed], EnvMimicConfig(start_noise=0.0, force_cost=0.0, forces="multi")
     )
@@ -246,29 +247,30 @@ def test_the_missing_force_earns_more_than_none_and_its_opposite_less(pushed: Mo
 
 
 FORCE = np.array([0.04, 0.0, 0.02])
+"""Force on the balloon (N, world frame)."""
 
 
 @pytest.fixture(scope="module")
 def evaluator() -> OpenLoopEvaluator:
-    """Of a recording without and a shorter one with `FORCE`; the policy's parameters are the force it gives."""
+    """Evaluator on a recording without and a shorter one with `FORCE`. The residual's parameters are its force (N)."""
     config = ForceNetworkConfig()
     motions = [make_motion(np.zeros(3), "near-own", 60), make_motion(FORCE, "far-pushed", 50)]
     constant = NetworkResidual(config, load_robot(), lambda params, _: params / load_units(config, load_robot()))
     return OpenLoopEvaluator(Simulator(load_robot()), motions, constant)
 
 
-def test_evaluator_finds_no_error_in_its_own_physics_and_some_in_pushed_ones(evaluator: OpenLoopEvaluator):
+def test_evaluation_finds_errors_only_where_a_force_is_missing(evaluator: OpenLoopEvaluator):
     result = evaluator(jnp.array(FORCE))
     own, pushed = result.vanilla
     assert own.group == "near" and pushed.group == "far"
     assert own.position[1.0][0] < 1e-3 and own.orientation[1.0][0] < 0.1
     assert pushed.position[2.0][0] > 0.03
-    # The force that made the recording explains it; on the other recording it does harm, and the bound says so.
+    # The true force removes the error on its recording. On the other recording, the error exceeds the bound.
     assert result.ratio("far", "position", 2.0) < 0.1
     assert result.excess()[0] > 0 and "near-own" in result.excess()[1]
 
 
-def test_a_residual_that_breaks_the_simulation_down_is_counted_and_never_averaged(evaluator: OpenLoopEvaluator):
+def test_diverged_replays_are_counted_and_not_averaged(evaluator: OpenLoopEvaluator):
     result = evaluator(jnp.full(3, jnp.nan))
     for errors in result.residual:
         some, starts = errors.diverged[1.0]
@@ -278,8 +280,8 @@ def test_a_residual_that_breaks_the_simulation_down_is_counted_and_never_average
     assert "diverged" in result.table() and "nan" not in result.table() + json.dumps(evaluation_to_json(result)).lower()
 
 
-def test_the_nominal_robot_stands_beside_the_one_with_identified_actuators(evaluator: OpenLoopEvaluator):
-    """The first recording is the nominal robot's own: only without the identified actuators is there no error."""
+def test_evaluation_with_identified_actuators_includes_the_nominal_robot(evaluator: OpenLoopEvaluator):
+    """The first recording is from the nominal robot, so it has no error only without the identified actuators."""
     assert evaluator(jnp.array(FORCE)).nominal == ()
     nominal = ActuatorParameters.nominal(load_model())
     stiffer = dataclasses.replace(nominal, knee_spring_stiffness=1.5 * nominal.knee_spring_stiffness)
@@ -289,8 +291,8 @@ def test_the_nominal_robot_stands_beside_the_one_with_identified_actuators(evalu
     assert result.nominal[0].position[1.0][0] < 1e-3 < 5e-3 < result.vanilla[0].position[1.0][0]
 
 
-def test_errors_of_starts_are_how_far_the_starts_lie_apart(evaluator: OpenLoopEvaluator):
-    """A robot that starts 2 cm beside itself walks 2 cm beside itself."""
+def test_errors_of_starting_states_are_the_distance_between_them(evaluator: OpenLoopEvaluator):
+    """A robot whose starting states are moved by 2 cm walks at a distance of 2 cm."""
     assert all(e.position[2.0][0] == 0.0 for e in evaluator.of_starts(evaluator.motions, jnp.array(FORCE)))
     beside = [dataclasses.replace(m, qpos=m.qpos + 0.02 * np.eye(m.qpos.shape[1])[1]) for m in evaluator.motions]
     for errors in evaluator.of_starts(beside, jnp.array(FORCE)):
@@ -298,8 +300,8 @@ def test_errors_of_starts_are_how_far_the_starts_lie_apart(evaluator: OpenLoopEv
         assert errors.orientation[2.0][0] < 0.1 and errors.mean_com_error == pytest.approx(0.02, rel=0.02)
 
 
-def test_a_group_s_errors_are_not_those_of_its_luckiest_recording():
-    """Two recordings that trade their errors: either alone makes one bound look broken, their mean does not."""
+def test_errors_of_a_group_are_means_over_its_recordings():
+    """Two recordings exchange their errors. One of them alone exceeds the bound, but the mean does not."""
 
     def errors(name: str, size: float) -> Errors:
         return Errors(name, "near", {5.0: (size, 0.1)}, {5.0: (10 * size, 1.0)}, size, 10 * size, 0.0)
@@ -314,7 +316,7 @@ def test_a_group_s_errors_are_not_those_of_its_luckiest_recording():
     assert means.ratio("near", "orientation", 5.0) == result.ratio("near", "orientation", 5.0) == 1.0
 
 
-def test_one_program_serves_all_recordings_and_actuators(still: Motion, pushed: Motion):
+def test_recordings_and_actuators_share_one_compiled_program(still: Motion, pushed: Motion):
     other = load_model()
     nominal = ActuatorParameters.nominal(other)
     stiffer = dataclasses.replace(nominal, knee_spring_stiffness=1.2 * nominal.knee_spring_stiffness)
@@ -340,7 +342,7 @@ def test_one_program_serves_all_recordings_and_actuators(still: Motion, pushed: 
     assert replaying[0] == replaying[1]
 
 
-def test_replays_kept_to_be_looked_at_are_those_evaluated(evaluator: OpenLoopEvaluator):
+def test_stored_replays_are_those_evaluated(evaluator: OpenLoopEvaluator):
     replays = {"vanilla": evaluator.replay(jnp.array(FORCE), scale=0.0), "envmimic": evaluator.replay(jnp.array(FORCE))}
     takes = artifacts.stored_rollouts(evaluator, replays)
     assert [take.name for take in takes] == ["near-own", "far-pushed"]
@@ -355,6 +357,6 @@ def test_replays_kept_to_be_looked_at_are_those_evaluated(evaluator: OpenLoopEva
             np.testing.assert_allclose(seen.yaw, replay.yaw[run, :states], atol=1e-3)
         assert take.force is not None
         np.testing.assert_allclose(take.force, np.tile(FORCE, (len(take.time) - 1, 1)), atol=0.02)
-    # Of each recording, the simulator that it was made in.
+    # Each recording is reproduced by the simulator that made it.
     for take, name in zip(takes, ("vanilla", "envmimic"), strict=True):
         np.testing.assert_allclose(take.qpos[name], take.qpos["recording"], atol=0.02)

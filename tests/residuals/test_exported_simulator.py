@@ -1,4 +1,4 @@
-"""The exported simulator: on NumPy and MuJoCo alone it is ours, with every kind of residual and a drivetrain."""
+"""The exported simulator: it needs only NumPy and MuJoCo and agrees with ours, for all residuals and a drivetrain."""
 
 from __future__ import annotations
 
@@ -56,17 +56,17 @@ import residual
 
 sys.exit(residual.self_test(sys.argv[1]))
 """
-"""Runs an exported simulator where there are NumPy and MuJoCo only."""
+"""Program that runs an exported simulator with NumPy and MuJoCo alone."""
 
 
 SCALES: dict[ForceSet, tuple[float, ...]] = {"joints": (0.05, 0.02), "commands": (0.1, 0.2)}
-"""Of the arm."""
+"""Scales of the arm's loads."""
 
 
 def network(
     robot: RobotDescription, forces: ForceSet, seed: int = 0, activation: Any = "swish", **settings: bool
 ) -> BoundResidual:
-    """A network drawn at random, that pushes with tenths of a newton."""
+    """Return a random network residual with forces of tenths of a newton."""
     config = ForceNetworkConfig(
         forces=forces, force_scale=0.1, torque_scale=0.01, force_limit=1.0, scales=SCALES.get(forces, ()), **settings
     )
@@ -103,10 +103,11 @@ def air(robot: RobotDescription, delay: float) -> BoundResidual:
 
 
 def rover(folder: Path) -> AugmentedSimulator:
-    """Forces at the points by a network, and a fluid, below a second network that sees and pushes in the world."""
+    """Return a simulator with three residuals: a network for forces at the points, a fluid, and a second network with
+    input and forces in the world frame."""
     robot = write_rover(folder)
     text = robot.model.read_text()
-    # MJX finds other points of contact between a box and a plane than C MuJoCo.
+    # Contacts are disabled, because MJX and C MuJoCo find different points of contact between a box and a plane.
     robot.model.write_text(text.replace("<option ", '<option gravity="0 0 -0.1" ').replace("<worldbody>", OFF, 1))
     robot = read_description(robot.file)
     simulator = Simulator(robot).with_residual(network(robot, "multi"))
@@ -115,14 +116,14 @@ def rover(folder: Path) -> AugmentedSimulator:
 
 
 def arm(folder: Path) -> AugmentedSimulator:
-    """An anchored robot with an identified drivetrain, and networks for its body, its joints and its commands."""
+    """Return an anchored robot with an identified drivetrain and networks for its body, its joints and its commands."""
     robot = write_arm(folder)
     simulator = Simulator(robot, identified(robot, **TRUTH)).with_residual(network(robot, "force"))
     return simulator.with_residual(network(robot, "joints", 1)).with_residual(network(robot, "commands", 2))
 
 
 def balloon(folder: Path) -> AugmentedSimulator:
-    """Air whose mass stands in the model, with late commands."""
+    """Return a simulator with aerodynamics, which change the model's mass and delay commands."""
     robot = read_description(BALLOON)
     return Simulator(robot).with_residual(air(robot, 0.07))
 
@@ -133,7 +134,7 @@ CASES: dict[str, tuple[AugmentedSimulator, Path, tuple[float, float]]] = {}
 
 
 def exported(name: str, folder: Path) -> tuple[AugmentedSimulator, Path, tuple[float, float]]:
-    """Export a case once for all tests of this file."""
+    """Return a case, exported once for all tests of this file."""
     if name not in CASES:
         simulator = MAKERS[name](folder)
         found = export_simulator(simulator, folder / "simulator", onnx=name == "rover", check_seconds=2.0)
@@ -143,12 +144,12 @@ def exported(name: str, folder: Path) -> tuple[AugmentedSimulator, Path, tuple[f
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_the_exported_simulator_is_ours(name: str, tmp_path_factory: pytest.TempPathFactory):
+def test_exported_simulator_agrees_with_the_original(name: str, tmp_path_factory: pytest.TempPathFactory):
     simulator, folder, (distance, angle) = exported(name, tmp_path_factory.mktemp(name))
     assert distance < 1e-6 and angle < 1e-3
     with np.load(folder / "check.npz") as check:
         assert np.ptp(check["position"], axis=0).max() > 0.02  # it moves
-        # What is identified and learned makes a difference.
+        # Actuators and residual have a visible effect.
         there, nominal = ImprovedSimulator(folder), simulator.robot.load_model()
         there.reset(check["qpos"], check["qvel"], check["commands"][0])
         plain = mujoco.MjData(nominal)
@@ -161,7 +162,7 @@ def test_the_exported_simulator_is_ours(name: str, tmp_path_factory: pytest.Temp
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_the_folder_runs_alone(name: str, tmp_path_factory: pytest.TempPathFactory):
+def test_exported_folder_runs_with_numpy_and_mujoco_alone(name: str, tmp_path_factory: pytest.TempPathFactory):
     _, folder, _ = exported(name, tmp_path_factory.mktemp(name))
     done = subprocess.run([sys.executable, "-I", "-c", CLEAN, str(folder)], capture_output=True, text=True)
     assert done.returncode == 0 and "Passed." in done.stdout, done.stdout + done.stderr
@@ -171,8 +172,8 @@ def test_the_folder_runs_alone(name: str, tmp_path_factory: pytest.TempPathFacto
     assert "ImprovedSimulator" in text and "double precision" in text
 
 
-def test_states_of_a_recorded_robot_are_ours_after_five_seconds(tmp_path: Path):
-    """On a bundled recording, with its actuators and air: contacts and cables as in our solver."""
+def test_exported_simulator_agrees_over_five_seconds_with_contacts(tmp_path: Path):
+    """The test uses a bundled recording with its actuators and air, so it includes contacts and cables."""
     robot = load_robot()
     _, actuators = read_actuators(robot, assets() / "recordings" / "actuators.json")
     simulator = Simulator(robot, actuators).with_residual(air(robot, 0.03))
@@ -188,7 +189,7 @@ def test_states_of_a_recorded_robot_are_ours_after_five_seconds(tmp_path: Path):
     assert np.rad2deg(np.abs(ours[:, 3:] - theirs[:, 3:]).max()) < 1e-3
 
 
-def test_a_scene_of_ones_own_takes_the_robot(tmp_path_factory: pytest.TempPathFactory):
+def test_exported_robot_can_be_simulated_in_another_scene(tmp_path_factory: pytest.TempPathFactory):
     _, folder, _ = exported("rover", tmp_path_factory.mktemp("rover"))
     alone = ImprovedSimulator(folder)
     scene = mujoco.MjSpec.from_file(str(folder / "identified.xml"))
@@ -208,7 +209,7 @@ def test_a_scene_of_ones_own_takes_the_robot(tmp_path_factory: pytest.TempPathFa
         ImprovedSimulator(folder, other)
 
 
-def test_onnx_networks_are_the_networks_and_name_their_inputs(tmp_path_factory: pytest.TempPathFactory):
+def test_onnx_networks_agree_and_name_their_inputs(tmp_path_factory: pytest.TempPathFactory):
     import onnx
     import onnxruntime
 
@@ -226,7 +227,7 @@ def test_onnx_networks_are_the_networks_and_name_their_inputs(tmp_path_factory: 
         assert len(described["outputs"]) == loads.shape[1] and described["outputs"][0] == "force on hull x, N"
 
 
-def test_names_say_what_a_network_sees_and_gives(tmp_path: Path):
+def test_names_describe_inputs_and_loads_of_a_network(tmp_path: Path):
     robot = write_rover(tmp_path)
     config = ForceNetworkConfig(forces="multi", force_scale=0.1, force_limit=1.0)
     names = network_input_names(config, robot)
@@ -259,7 +260,7 @@ SPLIT = """
 """
 
 
-def test_a_model_of_several_files_is_written_as_one(tmp_path: Path):
+def test_a_model_of_several_files_is_written_as_one_file(tmp_path: Path):
     for folder, size in (("meshes", "0.1"), ("meshes/more", "0.2")):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "wedge.obj").write_text(MESH.replace("0.1", size))
@@ -285,7 +286,7 @@ def test_a_model_of_several_files_is_written_as_one(tmp_path: Path):
     assert {"model/dof_damping", "model/jnt_range", "model/body_mass"} <= set(exact)
 
 
-def test_what_cannot_be_exported_is_said_in_a_sentence(tmp_path: Path):
+def test_export_refuses_unsuitable_simulators_and_folders(tmp_path: Path):
     robot = write_arm(tmp_path)
     plain, full = Simulator(robot), tmp_path / "full"
     full.mkdir()
@@ -302,7 +303,7 @@ def test_what_cannot_be_exported_is_said_in_a_sentence(tmp_path: Path):
     assert not any((tmp_path / name).exists() for name in "abc")
 
 
-def test_a_damaged_folder_is_refused(tmp_path: Path):
+def test_damaged_exported_folder_is_refused(tmp_path: Path):
     robot = write_arm(tmp_path)
     folder = export_simulator(Simulator(robot), tmp_path / "simulator", check_seconds=0.0).folder
     assert ImprovedSimulator(folder).step(np.zeros(2)).time == pytest.approx(robot.control_timestep)

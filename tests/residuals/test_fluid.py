@@ -1,4 +1,4 @@
-"""Fluid forces: symmetry, files, and known drag and lift found again in flights that C MuJoCo made."""
+"""Fluid forces: symmetry, files, and recovery of known drag and lift from flights simulated in C MuJoCo."""
 
 from __future__ import annotations
 
@@ -41,9 +41,11 @@ GLIDER = """
 <general name="right" site="right" gear="1 0 0 0 0 0" ctrlrange="0 1" gainprm="0.1"/></actuator></mujoco>
 """
 LINEAR = np.array([0.08, 0.25, 0.3])
+"""Linear drag (N s/m, body frame)."""
 TURNING = np.array([0.02, 0.03, 0.012])
+"""Rotary drag (N m s, body frame)."""
 LIFT = 0.15
-"""N s^2/m^2, of the product of forward and downward velocity."""
+"""Lift coefficient (N s^2/m^2): upward force per product of forward and downward velocity."""
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +56,7 @@ def glider(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
 
 
 def flights(robot: RobotDescription, seed: int, count: int) -> list[Motion]:
-    """Fly in C MuJoCo, with air that acts in every physics step."""
+    """Simulate flights in C MuJoCo, with drag and lift in every physics step."""
     model, rng = robot.load_model(), np.random.default_rng(seed)
     data, substeps, found = mujoco.MjData(model), 5, []
     for number in range(count):
@@ -68,7 +70,8 @@ def flights(robot: RobotDescription, seed: int, count: int) -> list[Motion]:
                 frame = data.body("hull").xmat.reshape(3, 3)
                 velocity = frame.T @ data.qvel[:3]
                 forward, _, up = velocity
-                force = -LINEAR * velocity + LIFT * up * np.array([up, 0, -forward])  # lift: across the motion
+                # The lift is perpendicular to the velocity.
+                force = -LINEAR * velocity + LIFT * up * np.array([up, 0, -forward])
                 data.xfrc_applied[1] = np.concatenate([frame @ force, frame @ (-TURNING * data.qvel[3:])])
                 data.ctrl[:] = command
                 mujoco.mj_step(model, data)
@@ -84,7 +87,7 @@ def fit(glider: RobotDescription) -> FluidFit:
     return fit_fluid_forces(Simulator(glider), flights(glider, 0, 16), flights(glider, 1, 2), config)
 
 
-def test_known_air_is_found_in_flights_of_another_simulator(fit: FluidFit):
+def test_fit_recovers_known_drag_and_lift_from_another_simulator(fit: FluidFit):
     found = fit.coefficients
     names = [term.name for term in terms_of(found.term_set)]
     for axis, names_of, wanted in (
@@ -98,7 +101,8 @@ def test_known_air_is_found_in_flights_of_another_simulator(fit: FluidFit):
 
 
 def power(coefficients: np.ndarray, centre: np.ndarray, seed: int) -> np.ndarray:
-    """What the wrench gives a body at random motions (W), about its centre of mass; without gravity's part."""
+    """Return the power of the wrench on a body in random motions, divided by the cube of the norm of the motion. The
+    wrench acts at the centre of mass `centre`. Terms of gravity are left out."""
     terms, rng = terms_of("cubic"), np.random.default_rng(seed)
     found = []
     for motion in rng.normal(size=(500, 6)) * rng.choice([0.1, 1.0, 10.0], (500, 1)):
@@ -113,22 +117,22 @@ def power(coefficients: np.ndarray, centre: np.ndarray, seed: int) -> np.ndarray
 
 @pytest.mark.parametrize("symmetric", [False, True])
 @pytest.mark.parametrize("name", PASSIVE_SETS)
-def test_passive_coefficients_never_give_energy(name: TermSet, symmetric: bool):
+def test_passive_coefficients_never_add_energy(name: TermSet, symmetric: bool):
     rng, terms = np.random.default_rng(5), terms_of("cubic")
     prior, centre = rng.uniform(0.1, 3.0, (len(terms), 6)), np.array([-0.04, 0.0 if symmetric else 0.02, 0.01])
     passive = PassiveCoefficients(name, prior, centre, symmetric=symmetric)
     vector = rng.normal(size=len(passive.start))
     table = passive.table(vector)
     assert power(table, centre, 6).max() < 1e-9
-    assert power(table, centre + 5.0, 6).max() > 1e-3, "about another point it would"
+    assert power(table, centre + 5.0, 6).max() > 1e-3, "about another point the power should be positive"
     assert not symmetric or np.all(table[~symmetric_mask(terms)] == 0)
     step = 1e-6 * np.eye(len(vector))
     differences = [(passive.table(vector + each) - passive.table(vector - each)) / 2e-6 for each in step]
     np.testing.assert_allclose(passive.directions(vector), differences, atol=1e-7)
 
 
-def test_any_wrench_that_is_linear_and_takes_energy_is_passive():
-    """Nothing but what gives energy is excluded: some vector stands for any damping matrix."""
+def test_any_dissipative_linear_wrench_has_passive_coefficients():
+    """The parametrization covers every damping matrix that dissipates energy."""
     rng = np.random.default_rng(7)
     root, skew = rng.normal(size=(2, 6, 6))
     wanted = -(root @ root.T + skew - skew.T)
@@ -137,8 +141,8 @@ def test_any_wrench_that_is_linear_and_takes_energy_is_passive():
     assert np.abs(found.fun).max() < 1e-6
 
 
-def test_a_glider_that_the_recordings_never_showed_stays_bounded(glider: RobotDescription, fit: FluidFit):
-    """Ten times as fast as any recorded flight, and tumbling."""
+def test_a_glider_far_outside_the_recordings_slows_down(glider: RobotDescription, fit: FluidFit):
+    """It tumbles and is ten times as fast as any recorded flight."""
     simulator = Simulator(glider)
     forces = FluidResidual(glider, simulator.mj_model, fit.coefficients.term_set)
     improved = simulator.with_residual(BoundResidual(forces, jnp.asarray(fit.coefficients.values, jnp.float32)))
@@ -153,7 +157,7 @@ def test_held_out_flights_are_predicted(fit: FluidFit):
     assert fit.scores["quadratic"] < 0.15 * fit.scores["none"]
 
 
-def test_the_mirror_image_of_a_motion_gets_the_mirror_image_of_the_wrench(glider: RobotDescription):
+def test_mirrored_motion_gives_the_mirrored_wrench(glider: RobotDescription):
     forces = FluidResidual(glider, glider.load_model(), "cubic")
     rng = np.random.default_rng(2)
     params = jnp.asarray(rng.normal(size=(len(forces.terms), 6)) * symmetric_mask(forces.terms), jnp.float32)
@@ -165,7 +169,7 @@ def test_the_mirror_image_of_a_motion_gets_the_mirror_image_of_the_wrench(glider
     np.testing.assert_allclose(other, one * np.array([1, -1, 1, -1, 1, -1]), rtol=2e-3, atol=2e-4)
 
 
-def test_the_wrench_turns_with_the_body_s_heading(glider: RobotDescription):
+def test_wrench_turns_with_the_heading_of_the_body(glider: RobotDescription):
     forces = FluidResidual(glider, glider.load_model(), "cubic")
     rng = np.random.default_rng(3)
     params = jnp.asarray(rng.normal(size=(len(forces.terms), 6)), jnp.float32)
@@ -180,7 +184,7 @@ def test_the_wrench_turns_with_the_body_s_heading(glider: RobotDescription):
     np.testing.assert_allclose(other.reshape(2, 3), one.reshape(2, 3) @ frame.T, rtol=2e-3, atol=2e-4)
 
 
-def test_a_file_gives_back_what_was_written_and_damaged_ones_are_refused(fit: FluidFit, tmp_path: Path):
+def test_files_are_read_back_and_damaged_files_are_refused(fit: FluidFit, tmp_path: Path):
     path = tmp_path / "fluid.json"
     path.write_text(fit.coefficients.to_json())
     found = read_fluid(path)
@@ -208,6 +212,6 @@ def test_a_file_gives_back_what_was_written_and_damaged_ones_are_refused(fit: Fl
         ({"terms": "cubic"}, "no-passive"),
     ],
 )
-def test_options_out_of_range_are_named(change: dict, option: str):
+def test_error_names_an_option_out_of_range(change: dict, option: str):
     with pytest.raises(InputError, match=option):
         check_fluid_config(FluidConfig(**change), 0.05)

@@ -1,4 +1,4 @@
-"""Force sets on a servo arm: what each does, that labels and gradients find it, and scales from the data."""
+"""Force sets on a servo arm: their effect in simulation, their labels, and their scales from data."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from ballu_mjx.sim.step import count_substeps, state_at
 
 STEPS = 80
 TORQUE = np.array([0.08, -0.03])
-"""N m, at shoulder and elbow."""
+"""Torque at shoulder and elbow (N m)."""
 SHIFT = np.array([0.05, -0.1])
-"""Of the commands, rad."""
+"""Change of the commands (rad)."""
 
 
 @pytest.fixture(scope="module")
@@ -50,22 +50,22 @@ def simulator(robot: RobotDescription) -> Simulator:
 
 
 def move(robot: RobotDescription, torque: Any = 0.0, shift: Any = 0.0, friction: float = 0.0) -> Motion:
-    """The arm in C MuJoCo with torques at its joints, other commands than told, or friction at the shoulder."""
-    model, told = robot.load_model(), 0.8 * wandering(0, STEPS)
+    """Simulate the arm in C MuJoCo with a joint torque, a shift of its commands, or friction at the shoulder."""
+    model, sent = robot.load_model(), 0.8 * wandering(0, STEPS)
     model.dof_frictionloss[0] = friction
     data = mujoco.MjData(model)
     data.qfrc_applied[:] = torque
     states = [(data.qpos.copy(), data.qvel.copy())]
-    for command in told:
+    for command in sent:
         data.ctrl[:] = command + shift
         mujoco.mj_step(model, data, count_substeps(model, robot.control_timestep))
         states.append((data.qpos.copy(), data.qvel.copy()))
     qpos, qvel = map(np.array, zip(*states, strict=True))
-    return Motion("near-arm", np.arange(STEPS + 1) * robot.control_timestep, told, qpos, qvel, {})
+    return Motion("near-arm", np.arange(STEPS + 1) * robot.control_timestep, sent, qpos, qvel, {})
 
 
 def constant(robot: RobotDescription, forces: ForceSet, loads: np.ndarray) -> BoundResidual:
-    """A residual that always gives `loads`."""
+    """Return a residual that always gives `loads`."""
     config = ForceNetworkConfig(forces=forces, force_scale=1.0, force_limit=20.0, scales=(1.0,) * len(loads))
     return BoundResidual(NetworkResidual(config, robot, lambda params, _: params), jnp.asarray(loads, jnp.float32))
 
@@ -83,20 +83,20 @@ SETS: list[tuple[ForceSet, np.ndarray, dict[str, Any]]] = [
 
 
 @pytest.mark.parametrize(("forces", "loads", "truth"), SETS)
-def test_a_simulator_with_what_is_missing_stays_on_the_recording(
+def test_a_simulator_with_the_missing_load_follows_the_recording(
     robot: RobotDescription, simulator: Simulator, forces: ForceSet, loads: np.ndarray, truth: dict[str, Any]
 ):
-    """A share of it as the share says."""
+    """A share scales the residual. The sum of two residuals gives the sum of their loads."""
     motion = move(robot, **truth)
     both = constant(robot, forces, 2 * loads)
     step = jax.jit(lambda share, state, command: simulator.with_residual(both, share).step(state, command).state)
-    far = []
+    errors = []
     for share in (0.5, 0.0):
         state = begin(simulator, motion)
         for time in range(2, 42):
             state = step(share, state, jnp.asarray(motion.command[time], jnp.float32))
-        far.append(np.abs(np.asarray(state.physics.qpos) - motion.qpos[42]).max())
-    assert far[0] < 1e-4 and far[1] > 5e-3
+        errors.append(np.abs(np.asarray(state.physics.qpos) - motion.qpos[42]).max())
+    assert errors[0] < 1e-4 and errors[1] > 5e-3
     one, other = constant(robot, forces, loads), BoundResidual(PlainPush(), 1.0)
     seen = state.history, state.with_command(jnp.zeros(2))
     for base in (one.plus(one), one.plus(other).plus(one)):
@@ -105,23 +105,23 @@ def test_a_simulator_with_what_is_missing_stays_on_the_recording(
             assert found is None if kind != forces else np.allclose(np.asarray(found), 2 * loads)
 
 
-def test_commands_stay_within_their_range(robot: RobotDescription, simulator: Simulator):
+def test_changed_commands_stay_within_their_range(robot: RobotDescription, simulator: Simulator):
     motion = move(robot)
     bound = constant(robot, "commands", np.array([10.0, -10.0]))
     step = jax.jit(lambda share, state, command: simulator.with_residual(bound, share).step(state, command))
     start = begin(simulator, motion)
     one, other = step(1.0, start, jnp.zeros(2)), step(0.0, start, jnp.array([1.0, -1.0]))
     np.testing.assert_allclose(one.state.physics.qvel, other.state.physics.qvel, atol=1e-6)
-    np.testing.assert_array_equal(one.state.commands[-1], jnp.zeros(2))  # what was told is remembered
+    np.testing.assert_array_equal(one.state.commands[-1], jnp.zeros(2))  # the history has the command before its change
 
 
 @pytest.mark.parametrize(("forces", "loads", "truth"), SETS)
-def test_labels_and_scales_are_what_is_missing(
+def test_labels_and_scales_recover_the_missing_load(
     robot: RobotDescription, simulator: Simulator, forces: ForceSet, loads: np.ndarray, truth: dict[str, Any]
 ):
     motion = move(robot, **truth)
     np.testing.assert_allclose(missing_loads(simulator, [motion], forces), np.abs(loads), rtol=0.1)
-    # With half of it in a base residual, half is missing.
+    # If a base residual already gives half of the load, the other half is missing.
     base = simulator.with_residual(constant(robot, forces, loads / 2))
     np.testing.assert_allclose(missing_loads(base, [motion], forces), np.abs(loads) / 2, rtol=0.15)
     config = resolve_scales(ForceNetworkConfig(forces=forces), simulator, [motion])
@@ -131,7 +131,7 @@ def test_labels_and_scales_are_what_is_missing(
     np.testing.assert_allclose(np.median(actions, axis=0), np.sign(loads), rtol=0.2)
 
 
-def test_the_environment_rewards_the_missing_torque(robot: RobotDescription, simulator: Simulator):
+def test_the_missing_torque_makes_the_environment_follow_the_recording(robot: RobotDescription, simulator: Simulator):
     motion = move(robot, torque=TORQUE)
     env = EnvMimicEnv(simulator, [motion], EnvMimicConfig(forces="joints", start_noise=0.0))
     scales = load_scales(env.config, robot)
@@ -149,7 +149,7 @@ def test_the_environment_rewards_the_missing_torque(robot: RobotDescription, sim
     assert distances[0] < 0.02 * distances[1]
 
 
-def test_what_is_given_stays_and_ballus_are_its_own(robot: RobotDescription, simulator: Simulator):
+def test_given_scales_are_kept_and_ballu_has_its_own_defaults(robot: RobotDescription, simulator: Simulator):
     given = ForceNetworkConfig(forces="wrench", force_scale=0.3, torque_scale=0.2, force_limit=0.9)
     assert resolve_scales(given, simulator, []) == given
     ballu = load_robot()
@@ -162,12 +162,12 @@ def test_what_is_given_stays_and_ballus_are_its_own(robot: RobotDescription, sim
         load_scales(ForceNetworkConfig(forces="joints"), robot)
 
 
-def test_friction_at_a_joint_is_seen_at_that_joint(robot: RobotDescription, simulator: Simulator):
+def test_friction_at_a_joint_gives_a_missing_load_at_that_joint(robot: RobotDescription, simulator: Simulator):
     missing = missing_loads(simulator, [move(robot, friction=0.1)], "joints")
     assert 0.03 < missing[0] < 0.11 and missing[1] < 0.2 * missing[0]
 
 
-def test_a_robot_without_joints_to_act_along_is_refused(robot: RobotDescription, tmp_path: Path):
+def test_joint_forces_need_suitable_joints(robot: RobotDescription, tmp_path: Path):
     content = json.loads(robot.file.read_text()) | {"force_joints": [], "model": str(robot.model)}
     (tmp_path / "stiff.robot.json").write_text(json.dumps(content))
     stiff = read_description(tmp_path / "stiff.robot.json")

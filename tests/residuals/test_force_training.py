@@ -1,4 +1,4 @@
-"""Regression and gradients as the package's root offers them: a residual that simulators take and evaluation scores."""
+"""Regression and gradients by the functions of the package's root. Their residuals can be simulated and evaluated."""
 
 from __future__ import annotations
 

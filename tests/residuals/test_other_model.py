@@ -1,4 +1,4 @@
-"""What was learned with one load or link, replayed with another: `evaluate --robot`."""
+"""Replay of a residual and identified actuators with another load or link of the robot (`evaluate --robot`)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
 
 @pytest.fixture(scope="module")
 def run(robot: RobotDescription) -> Path:
-    """A run of fluid forces on the arm with identified actuators."""
+    """A run of fluid forces on the arm, with identified actuators."""
     folder, nothing = robot.file.parent / "run", np.zeros((len(terms_of("drag")), 6))
     actuators = identified(robot, elbow_damping=0.3, shoulder_delay=0.02)
     config = describe_run("fluid", {"fit": FluidConfig()}, {}, [], actuators, robot)
@@ -39,7 +39,7 @@ def run(robot: RobotDescription) -> Path:
 
 
 def altered(robot: RobotDescription, folder: Path, old: str, new: str, **keys: object) -> RobotDescription:
-    """The arm with another text in its model and other keys in its description."""
+    """Return the arm with a text of its model replaced, and other keys in its description."""
     text = robot.model.read_text()
     assert old in text
     (folder / "other.xml").write_text(text.replace(old, new))
@@ -48,18 +48,20 @@ def altered(robot: RobotDescription, folder: Path, old: str, new: str, **keys: o
     return read_description(folder / "other.robot.json")
 
 
-def test_another_load_takes_what_was_learned(robot: RobotDescription, run: Path, tmp_path: Path):
+def test_residual_and_actuators_apply_to_the_robot_with_another_load(
+    robot: RobotDescription, run: Path, tmp_path: Path
+):
     heavier = altered(robot, tmp_path, 'mass="0.15"', 'mass="0.4"', name="heavier arm")
     with pytest.raises(InputError, match="is of the robot arm, not of heavier arm"):
         TrainedResidual.load(run, heavier)
     found = TrainedResidual.load(run, heavier, other_model=True)
     assert isinstance(found.model, FluidResidual) and found.model.robot is heavier
-    # What was identified holds for the new model too.
+    # The identified actuators apply to the new model, too.
     assert heavier.load_model(found.actuators).dof_damping[1] == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "keys", "says"),
+    ("old", "new", "keys", "message"),
     [
         ('kp="6" kv="0.1" ctrlrange="-1 1"', 'kp="6" kv="0.1" ctrlrange="-2 2"', {}, "commands' ranges differ"),
         ('name="tip"', 'name="tip"', {"control_timestep": 0.02}, "control time step differ"),
@@ -67,15 +69,15 @@ def test_another_load_takes_what_was_learned(robot: RobotDescription, run: Path,
         ('name="tip"', 'name="tip"', {"force_joints": ["elbow"]}, "joints that forces act along differ"),
     ],
 )
-def test_a_robot_of_other_parts_is_refused(
-    robot: RobotDescription, run: Path, tmp_path: Path, old: str, new: str, keys: dict, says: str
+def test_a_robot_with_another_interface_is_refused(
+    robot: RobotDescription, run: Path, tmp_path: Path, old: str, new: str, keys: dict, message: str
 ):
     other = altered(robot, tmp_path, old, new, **keys)
-    with pytest.raises(InputError, match=f"cannot stand in for arm.*{says}") as refused:
+    with pytest.raises(InputError, match=f"cannot stand in for arm.*{message}") as refused:
         TrainedResidual.load(run, other, other_model=True)
     assert str(refused.value).count(". ") == 0
 
 
-def test_another_robot_needs_its_recordings(robot: RobotDescription, run: Path, capsys: pytest.CaptureFixture[str]):
+def test_option_robot_requires_recordings(robot: RobotDescription, run: Path, capsys: pytest.CaptureFixture[str]):
     assert evaluate.main([str(run), "--robot", str(robot.file)]) == 2
     assert "--robot goes with --recordings" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The residual methods on a robot that is no BALLU: a tethered balloon, anchored, in commands of any unit."""
+"""The residual methods on a robot that is not BALLU: an anchored balloon on a tether, with commands in any unit."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ FOLDER = Path(__file__).parents[2] / "experiments" / "tethered_balloon"
 ROBOT = read_description(FOLDER / "balloon.robot.json")
 SIMULATOR = Simulator(ROBOT)
 PUSH = np.array([0.02, -0.03, 0.015])
-"""N, world."""
+"""Force on the balloon (N, world frame)."""
 CONFIG = EnvMimicConfig(forces="force", force_scale=0.05, torque_scale=0.005, force_limit=1.0, force_cost=20.0)
 PRIORS = SupervisedConfig(force_spread=0.3, force_change=0.1, torque_spread=0.05)
 NETWORK = PPOConfig(policy_layers=(16,), value_layers=(4,))
@@ -45,7 +45,11 @@ STEPS = 60
 
 
 def flight(robot: RobotDescription = ROBOT, push: np.ndarray = PUSH, added_mass: float = 0.0, seed: int = 0) -> Motion:
-    """The balloon in C MuJoCo under random commands, with `push` on it, or with so much air that moves along."""
+    """Simulate the balloon in C MuJoCo under random commands.
+
+    - `push`: force on the balloon (N, world frame).
+    - `added_mass`: mass (kg) of air that moves with the balloon. It has no weight.
+    """
     model, rng = robot.load_model(), np.random.default_rng(seed)
     body = model.body("balloon").id
     lift = model.body_gravcomp[body] * model.body_mass[body] + added_mass
@@ -75,17 +79,17 @@ def linearize() -> Linearizer:
     return Linearizer(SIMULATOR)
 
 
-def test_labels_are_the_push(motions: list[Motion], linearize: Linearizer):
-    """In the world's frame, whichever way the balloon faces."""
+def test_labels_recover_a_known_force(motions: list[Motion], linearize: Linearizer):
+    """Labels of an anchored robot are in the world frame, independent of the balloon's heading."""
     labels = force_regression.ForceLabeller(linearize, PRIORS, CONFIG)(motions[0])
     np.testing.assert_allclose(np.median(labels, axis=0), PUSH, atol=0.1 * float(np.linalg.norm(PUSH)))
     _, actions = force_regression.examples(SIMULATOR, motions[:1], [np.tile(PUSH, (STEPS, 1))], CONFIG)
     np.testing.assert_allclose(load_units(CONFIG, ROBOT) * actions, np.tile(PUSH, (len(actions), 1)), atol=1e-6)
     yaw = stack_motions(SIMULATOR, motions)[0].features[0, :, ObservationLayout.yaw]
-    assert np.ptp(np.asarray(yaw)) > 0.1  # in a heading frame these would be other actions
+    assert np.ptp(np.asarray(yaw)) > 0.1  # so actions in a heading frame would differ
 
 
-def test_gradients_through_the_simulation_find_the_push(motions: list[Motion], linearize: Linearizer):
+def test_gradients_through_the_simulation_recover_a_known_force(motions: list[Motion], linearize: Linearizer):
     reference, _ = stack_motions(SIMULATOR, motions)
     inputs = np.asarray(recorded_inputs(reference, CONFIG, ROBOT))
     sizes = {ppo.STATE: (num_inputs(CONFIG, ROBOT),)}, num_loads(CONFIG, ROBOT), NETWORK
@@ -110,27 +114,27 @@ def test_gradients_through_the_simulation_find_the_push(motions: list[Motion], l
     policy, metrics = found[-1]
     actions = np.asarray(forces.infer(start._replace(policy=policy), jnp.asarray(inputs)))
     found_push = (load_units(CONFIG, ROBOT) * actions).mean(axis=0)
-    # A force along the taut tether moves the balloon no more than another one: only the horizontal part shows.
+    # A force along the taut tether does not move the balloon, so only the horizontal force can be identified.
     np.testing.assert_allclose(found_push[:2], PUSH[:2], atol=0.05 * float(np.linalg.norm(PUSH)))
     assert metrics["loss"] < 0.1 * found[0][1]["loss"]
 
 
-def test_added_mass_is_found():
-    windy = [flight(push=np.zeros(3), added_mass=0.03, seed=seed) for seed in range(2)]
+def test_aerodynamic_fit_recovers_a_known_added_mass():
+    flights = [flight(push=np.zeros(3), added_mass=0.03, seed=seed) for seed in range(2)]
     config = AirConfig(window_seconds=1.0, interval_seconds=1.0)
-    fit = identify_air(SIMULATOR, windy, config, free=("added_mass",))
+    fit = identify_air(SIMULATOR, flights, config, free=("added_mass",))
     assert float(fit.parameters.added_mass) == pytest.approx(0.03, rel=0.05)
     assert fit.cost[1] < 0.05 * fit.cost[0]
 
 
-def test_a_robot_without_buoyancy_has_no_aerodynamics(tmp_path: Path):
+def test_aerodynamics_refuse_a_robot_without_buoyancy(tmp_path: Path):
     robot = altered(tmp_path, ' gravcomp="1.631"', "")
     with pytest.raises(InputError, match=r"balloon\.xml: the body balloon has no buoyancy.*gravcomp"):
         Aerodynamics(robot, robot.load_model())
 
 
 def altered(folder: Path, *texts: str) -> RobotDescription:
-    """The robot with an altered model: pairs of texts, the old and the new."""
+    """Return the robot with an altered model. `texts` are pairs of an old text and its replacement."""
     shutil.copy(ROBOT.file, folder)
     text = ROBOT.model.read_text()
     for old, new in zip(texts[::2], texts[1::2], strict=True):
@@ -140,8 +144,8 @@ def altered(folder: Path, *texts: str) -> RobotDescription:
     return read_description(folder / ROBOT.file.name)
 
 
-def test_commands_in_other_units_are_the_same_robot(tmp_path: Path):
-    """Propellers that take -2 to 2 for what the others take 0 to 1 for: motion, inputs and what is learned agree."""
+def test_learning_does_not_depend_on_the_unit_of_commands(tmp_path: Path):
+    """With commands of -2 to 2 instead of 0 to 1, motion, inputs and learned forces stay the same."""
     twin = altered(
         tmp_path, 'gainprm="0.04" ctrlrange="0 1"', 'gainprm="0.01" biastype="affine" biasprm="0.02" ctrlrange="-2 2"'
     )
@@ -170,8 +174,8 @@ def test_commands_in_other_units_are_the_same_robot(tmp_path: Path):
         np.testing.assert_allclose(one, other, atol=tolerance)
 
 
-def test_the_air_s_delay_is_counted_in_the_robot_s_control_steps(tmp_path: Path):
-    """A robot commanded every 0.02 s: a delay of 0.03 s brings the command of two steps ago first, then the last."""
+def test_command_delay_of_the_air_uses_the_robot_s_control_time_step(tmp_path: Path):
+    """With steps of 0.02 s and a delay of 0.03 s, the command of two steps ago acts first, and then the previous one."""
     description = json.loads(ROBOT.file.read_text()) | {"control_timestep": 0.02, "model": str(ROBOT.model)}
     (tmp_path / "fast.robot.json").write_text(json.dumps(description))
     fast = read_description(tmp_path / "fast.robot.json")

@@ -1,4 +1,4 @@
-"""Forces by regression and by gradients: are the derivatives the simulation's, and is a known push found again?"""
+"""Forces by regression and by gradients: derivatives of control steps, and recovery of a known force and torque."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ BALLU = load_robot()
 SIMULATOR = Simulator(BALLU)
 MODEL = SIMULATOR.mj_model
 PUSH = np.array([0.02, -0.03, 0.015])
-"""N, world."""
+"""Force on the balloon (N, world frame)."""
 TWIST = np.array([1e-3, -1.5e-3, 2e-3])
-"""N m, world."""
+"""Torque on the balloon (N m, world frame)."""
 CLOSE = 0.05 * float(np.linalg.norm(PUSH))
 CLOSE_TWIST = 0.05 * float(np.linalg.norm(TWIST))
 SECONDS = 0.5
@@ -52,8 +52,10 @@ FORCES = NetworkResidual(WRENCH, BALLU, ppo.make_inference({ppo.STATE: (INPUTS,)
 
 
 def pushed(name: str, height: float, model: mujoco.MjModel = MODEL, twist: float = 0.0, steps: int = 60) -> Motion:
-    """The nominal robot in C MuJoCo, stepping or, above the floor, falling, with `PUSH` and `twist` times `TWIST` on
-    the balloon."""
+    """Simulate the nominal robot in C MuJoCo with `PUSH` and `twist` times `TWIST` on the balloon.
+
+    - `height`: distance (m) of the start above the floor. The robot steps if it is 0, and falls otherwise.
+    """
     data = mujoco.MjData(model)
     data.qpos[:] = standing_qpos(model)
     mujoco.mj_step(model, data, 100)
@@ -88,7 +90,7 @@ def linearize() -> Linearizer:
 
 @pytest.fixture(scope="module")
 def inputs(motions: list[Motion], recorded: MotionWindows) -> np.ndarray:
-    """What networks see of the states in the windows."""
+    """Network inputs for the states in the windows."""
     reference, _ = stack_motions(SIMULATOR, motions)
     seen = np.asarray(recorded_inputs(reference, EnvMimicConfig(), BALLU)).reshape(len(motions), -1, INPUTS)
     states = recorded.features.shape[0] * recorded.features.shape[1] // len(motions)
@@ -106,9 +108,9 @@ def unforced(recorded: MotionWindows, start: ppo.Params) -> ControlSteps:
     return force_gradients.compile_rollout(SIMULATOR.with_residual(None), FORCES)(still, recorded)[0]
 
 
-def test_derivatives_are_those_of_c_mujoco(unforced: ControlSteps, linearize: Linearizer):
-    """Through contacts and taut cables; where a foot lands within the step, differences of any size are no derivative,
-    so most steps must agree, not all."""
+def test_derivatives_of_control_steps_agree_with_c_mujoco(unforced: ControlSteps, linearize: Linearizer):
+    """Steps include contacts and taut cables. Where a foot lands within a step, finite differences do not approximate
+    the derivative. So most steps must agree, not all."""
     few = jax.tree.map(lambda x: x[::4], unforced)
     linear = linearize(few._replace(loads=np.zeros((len(few.loads), linearize.loads))))
     data, body, nv = mujoco.MjData(MODEL), MODEL.body("balloon").id, MODEL.nv
@@ -139,9 +141,9 @@ def test_derivatives_are_those_of_c_mujoco(unforced: ControlSteps, linearize: Li
     assert np.quantile(wrong, 0.75) < 0.1
 
 
-def test_labels_are_the_push(linearize: Linearizer):
-    """Of motions seen without noise, by a model that is right in all else. All of it in the air; on its legs the robot
-    does not show what lifts it."""
+def test_labels_recover_a_known_force_and_torque(linearize: Linearizer):
+    """The motions have no noise, and the model is correct except for the force. In the air, all components are
+    recovered. On its legs, the robot does not show vertical forces."""
     config = SupervisedConfig(
         position_noise=1e-5,
         angle_noise=1e-3,
@@ -156,13 +158,13 @@ def test_labels_are_the_push(linearize: Linearizer):
     stepping, falling = (label(motion).mean(axis=0) for motion in motions)
     np.testing.assert_allclose(falling[:3], PUSH, atol=CLOSE)
     np.testing.assert_allclose(falling[3:], TWIST, atol=CLOSE_TWIST)
-    # On legs, whose own torques are unknowns too, a sixth of the sideways push is missed.
+    # On legs, a sixth of the horizontal force is missed, because the torques of the legs are unknown, too.
     np.testing.assert_allclose(stepping[:2], PUSH[:2], atol=3 * CLOSE)
 
 
-def test_legs_that_differ_are_not_taken_for_forces(linearize: Linearizer):
-    """Knee springs by a fifth stiffer than the model's: their torques are unknowns of their own. In the median step:
-    where a foot lands within a step, derivatives are none, and a single label may be far off."""
+def test_labels_tolerate_legs_that_differ_from_the_model(linearize: Linearizer):
+    """Knee springs are stiffer than the model's by a fifth. Joint torques are separate unknowns, so the labels do not
+    absorb them. The test uses the median, because labels may be wrong where a foot lands within a step."""
     nominal = ActuatorParameters.nominal(MODEL)
     stiffer = dataclasses.replace(nominal, knee_spring_stiffness=1.2 * nominal.knee_spring_stiffness)
     motion = pushed("stiff knees", 0.0, load_model(stiffer))
@@ -174,8 +176,8 @@ def test_legs_that_differ_are_not_taken_for_forces(linearize: Linearizer):
     assert wrong(SupervisedConfig()) < 0.5 * wrong(SupervisedConfig(torque_spread=1e-5))
 
 
-def test_examples_are_in_the_balloon_s_heading(motions: list[Motion]):
-    """Seen by a robot that has turned, a force keeps its side."""
+def test_training_examples_are_in_the_heading_frame(motions: list[Motion]):
+    """Forces in the world frame become actions in the heading frame."""
     simulator = SIMULATOR
     loads = [np.tile(np.r_[PUSH, TWIST], (len(motion.command), 1)) for motion in motions]
     seen, actions = force_regression.examples(simulator, motions, loads, WRENCH)
@@ -190,7 +192,9 @@ def test_examples_are_in_the_balloon_s_heading(motions: list[Motion]):
     assert len(seen) == len(actions)
 
 
-def test_gradients_find_the_push(recorded: MotionWindows, inputs: np.ndarray, start: ppo.Params, linearize: Linearizer):
+def test_gradients_recover_a_known_force(
+    recorded: MotionWindows, inputs: np.ndarray, start: ppo.Params, linearize: Linearizer
+):
     config = AnalyticConfig(
         window_seconds=SECONDS,
         relinearizations=4,
@@ -215,13 +219,13 @@ def test_gradients_find_the_push(recorded: MotionWindows, inputs: np.ndarray, st
     stepping, falling = (load_units(WRENCH, BALLU) * actions_found).reshape(2, -1, ACTIONS).mean(axis=1)
     np.testing.assert_allclose(falling[:3], PUSH, atol=CLOSE)
     np.testing.assert_allclose(falling[3:], 0.0, atol=CLOSE_TWIST)
-    # On legs other forces and torques, which change from step to step, move the balloon almost as this force does.
+    # On legs, other forces and torques that vary between steps move the balloon almost as this force does.
     np.testing.assert_allclose(stepping[:2], PUSH[:2], atol=2 * CLOSE)
-    assert metrics["loss"] < 0.05 * found[0][1]["loss"]  # of the last simulation, beside the first
+    assert metrics["loss"] < 0.05 * found[0][1]["loss"]  # last simulation against first
 
 
 @pytest.mark.parametrize(
-    ("config", "says"),
+    ("config", "message"),
     [
         (AnalyticConfig(relinearizations=0), "--relinearizations is 0"),
         (AnalyticConfig(window_seconds=0.01), "--window-seconds"),
@@ -231,23 +235,23 @@ def test_gradients_find_the_push(recorded: MotionWindows, inputs: np.ndarray, st
         (AnalyticConfig(interval_seconds=float("inf")), "--interval-seconds"),
     ],
 )
-def test_options_out_of_range_are_refused(config: AnalyticConfig | SupervisedConfig, says: str):
-    with pytest.raises(InputError, match=says):
+def test_options_out_of_range_are_refused(config: AnalyticConfig | SupervisedConfig, message: str):
+    with pytest.raises(InputError, match=message):
         if isinstance(config, AnalyticConfig):
             check_analytic_config(config, 0.05)
         else:
             check_supervised_config(config)
 
 
-def test_a_share_of_a_policy_s_forces(start: ppo.Params, inputs: np.ndarray):
+def test_forces_of_a_policy_scale_with_their_share(start: ppo.Params, inputs: np.ndarray):
     whole = np.asarray(FORCES.infer(start, jnp.asarray(inputs)))
     half = np.asarray(FORCES.infer(start._replace(policy=ppo.with_share(start.policy, 0.5)), jnp.asarray(inputs)))
     assert np.abs(whole).max() > 0
     np.testing.assert_allclose(half, 0.5 * whole, rtol=1e-5)
 
 
-def test_a_run_is_read_as_its_kind(tmp_path: Path, start: ppo.Params):
-    """What `force_fit` leaves, `Residual.load` understands."""
+def test_a_supervised_run_is_loaded_as_a_residual(tmp_path: Path, start: ppo.Params):
+    """`TrainedResidual.load` reads a run of supervised forces."""
     from ballu_mjx.residuals.run_config import describe_run
     from ballu_mjx.residuals.trained_residual import write_observed
     from ballu_mjx.runs.folder import Run

@@ -1,4 +1,4 @@
-"""Does one training in two processes learn what it learns in one, and is it kept by the first alone?"""
+"""Training in two processes: it agrees with training in one, and only the first process writes the run."""
 
 from __future__ import annotations
 
@@ -83,8 +83,8 @@ def start(code: str, folder: Path, devices: int, **options: Any) -> subprocess.P
 def finish(*processes: subprocess.Popen[str]) -> None:
     try:
         for process in processes:
-            _, said = process.communicate(timeout=300)
-            assert process.returncode == 0, said
+            _, errors = process.communicate(timeout=300)
+            assert process.returncode == 0, errors
     finally:
         for process in processes:
             process.kill()
@@ -98,7 +98,7 @@ def together() -> dict[str, Any]:
     return {"coordinator": f"127.0.0.1:{port}", "num_processes": 2}
 
 
-def test_two_processes_learn_what_one_with_two_devices_does(tmp_path: Path) -> None:
+def test_two_processes_agree_with_one_process_with_two_devices(tmp_path: Path) -> None:
     options = together()
     both = [start(TRAINING, tmp_path / f"process-{i}", 1, **options, process_id=i) for i in range(2)]
     finish(*both, start(TRAINING, tmp_path / "alone", 2))
@@ -113,16 +113,16 @@ def test_two_processes_learn_what_one_with_two_devices_does(tmp_path: Path) -> N
     kept, expected = (last_checkpoint(tmp_path / name, training=True) for name in ("process-0", "alone"))
     assert kept.step == expected.step
     assert kept.training is not None and expected.training is not None
-    for name, values in expected.training.items():  # the environments of both processes among them
+    for name, values in expected.training.items():  # including the environments of both processes
         np.testing.assert_allclose(kept.training[name], values, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
-def test_every_process_reads_the_robot_it_simulates(tmp_path: Path) -> None:
+def test_every_process_holds_the_model_on_its_own_devices(tmp_path: Path) -> None:
     options = together()
     finish(*(start(PHYSICS, tmp_path, 1, **options, process_id=i) for i in range(2)))
 
 
-def test_a_process_that_fails_does_not_wait_for_those_that_wait_for_it(tmp_path: Path) -> None:
+def test_a_failing_process_exits_while_others_wait_for_it(tmp_path: Path) -> None:
     options = together()
     waiting, failing = (start(FAILURE, tmp_path, 1, **options, process_id=i) for i in range(2))
     try:
@@ -135,7 +135,7 @@ def test_a_process_that_fails_does_not_wait_for_those_that_wait_for_it(tmp_path:
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("given", "message"),
     [
         ({"process_id": 1}, "--process-id needs --coordinator"),
         ({"coordinator": "here:1"}, "needs --num-processes and --process-id"),
@@ -143,6 +143,6 @@ def test_a_process_that_fails_does_not_wait_for_those_that_wait_for_it(tmp_path:
         ({"coordinator": "here", "num_processes": 2, "process_id": 1}, "give host:port"),
     ],
 )
-def test_options_that_do_not_go_together_are_refused(given: dict[str, Any], told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_inconsistent_options_are_refused(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
         distributed.join(DistributedOptions(**given))

@@ -1,4 +1,4 @@
-"""Does PPO learn, restart where it should, treat time limits as such, repeat itself, and go on as if never stopped?"""
+"""PPO: learning, resets, time limits, reproducibility and resuming."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Calls = list[tuple[int, ppo.Params, dict[str, float]]]
 
 @pytest.fixture(scope="module")
 def trained() -> tuple[dict[str, np.ndarray], Calls]:
-    """All of the last state, and what every call brought."""
+    """The complete last state, and the arguments of every callback."""
     calls: Calls = []
     last, metrics = learner.train(
         Follower(), SMALL, lambda step, state, metrics: calls.append((step, training_state.params(state), metrics))
@@ -48,7 +48,7 @@ def trained() -> tuple[dict[str, np.ndarray], Calls]:
 
 
 def test_orthogonal_hidden_layers_keep_lengths():
-    """Times the root of 2, as Stable-Baselines3 draws them; the output's layer is drawn as always."""
+    """Hidden layers are orthogonal times the root of 2, as in Stable-Baselines3. The output layer is not affected."""
     config = dataclasses.replace(SMALL, orthogonal_init=True, policy_layers=(24, 16))
     layers = ppo.make_networks({ppo.STATE: (32,)}, 3, config).policy_network.init(jax.random.key(0))["params"]
     hidden = [np.asarray(x) for x in jax.tree.leaves(layers) if x.shape in ((32, 24), (24, 16))]
@@ -66,7 +66,7 @@ def test_learning_curve_rises(trained):
     assert np.mean(distances[-3:]) < 0.5 * distances[0]
 
 
-def test_policy_used_alone_gains_what_training_reported(trained):
+def test_policy_alone_gains_the_reward_that_training_reported(trained):
     _, calls = trained
     params = calls[-1][1]
     env = Follower()
@@ -82,10 +82,10 @@ def test_policy_used_alone_gains_what_training_reported(trained):
         return jnp.mean(jax.lax.scan(step, env.reset(key), length=env.limit)[1])
 
     alone = float(jnp.mean(mean_reward(jax.random.split(jax.random.key(7), 256))))
-    assert alone > calls[-1][2]["reward"] - 0.03  # without exploration no worse, but for chance
+    assert alone > calls[-1][2]["reward"] - 0.03  # without exploration, the reward is not lower, except for noise
 
 
-def test_calls_count_every_control_step_once(trained):
+def test_callbacks_count_every_control_step_once(trained):
     _, calls = trained
     size = SMALL.batch_size * SMALL.num_minibatches * SMALL.unroll_length
     assert [step for step, *_ in calls] == list(range(0, SMALL.num_timesteps + size, size))
@@ -93,22 +93,22 @@ def test_calls_count_every_control_step_once(trained):
     assert calls[-1][1].normalizer.count == calls[-1][0]
 
 
-class Braxs(training_env._Training):
-    """With what only Brax's own loop reads."""
+class BraxTraining(training_env._Training):
+    """Environment with the additional entries that only Brax's own loop reads."""
 
     def _with_extras(self, shown: State, outcome: State, keys: jax.Array) -> State:
         state = super()._with_extras(shown, outcome, keys)
         return dataclasses.replace(state, info=state.info | {"episode_done": state.done, "episode_metrics": {}})
 
 
-# Brax 0.14.2 places parameters with a function that newer JAX means to drop.
+# Brax 0.14.2 uses a function that JAX has deprecated.
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:brax")
-def test_learns_what_brax_s_own_loop_learns():
+def test_training_agrees_with_brax_s_own_loop():
     steps, config = 3, SMALL
     size = config.batch_size * config.num_minibatches * config.unroll_length
     _, params, losses = brax_ppo.train(
         environment=Follower(),
-        wrap_env_fn=lambda env, **_: Braxs(env),
+        wrap_env_fn=lambda env, **_: BraxTraining(env),
         network_factory=lambda observation_size, action_size, preprocess_observations_fn=None: ppo.make_networks(
             observation_size, action_size, config
         ),
@@ -135,7 +135,7 @@ def test_learns_what_brax_s_own_loop_learns():
     state, metrics = learner.train(Follower(), dataclasses.replace(config, num_timesteps=steps * size))
     ours = training_state.params(state)
     statistics, policy, value = jax.device_get(params)
-    # The two are compiled differently, which may cost the last digits.
+    # The two are different compiled programs, so the last digits may differ.
     close: Any = {"rtol": 1e-3, "atol": 2e-5}
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, **close), (state.networks.policy, ours.value), (policy, value)
@@ -162,16 +162,16 @@ def after(learned: Learner, state: training_state.TrainingState, steps: int) -> 
     return training_state.stored(state)
 
 
-def test_going_on_from_a_stored_state_is_as_if_never_stopped(short):
+def test_resuming_from_a_stored_state_equals_uninterrupted_training(short):
     straight = after(short, short.init(3), 5)
     part = after(short, short.init(3), 2)
     other = Learner(Follower(), SMALL)  # as in another process
     state, whole = other.resume(part)
     assert whole and same(after(other, state, 3), straight)
-    assert not same(after(short, short.init(4), 5), straight), "another seed"
+    assert not same(after(short, short.init(4), 5), straight), "another seed should give another result"
 
 
-def test_the_policy_that_is_handed_out_is_an_average(short):
+def test_the_returned_policy_is_an_average_over_training_steps(short):
     state = short.init(0)
     average: Any = None
     for count in (1, 2, 3, 3, 3):
@@ -197,7 +197,7 @@ def test_the_training_step_is_compiled_once(short):
     assert short._step._cache_size() == 1
 
 
-def test_one_device_compiles_the_training_step_once_too(monkeypatch: pytest.MonkeyPatch):
+def test_the_training_step_is_compiled_once_on_one_device(monkeypatch: pytest.MonkeyPatch):
     first = jax.devices()[:1]
     monkeypatch.setattr(jax, "devices", lambda: first)
     monkeypatch.setattr(jax, "device_count", lambda: 1)
@@ -208,7 +208,7 @@ def test_one_device_compiles_the_training_step_once_too(monkeypatch: pytest.Monk
     assert step._cache_size() == 1
 
 
-def test_copies_of_a_state_outlive_it(short):
+def test_copies_of_a_training_state_survive_later_steps(short):
     state = short.init(0)
     copies = training_state.stored(state), training_state.params(state)
     before = jax.tree.map(np.copy, copies)
@@ -217,7 +217,7 @@ def test_copies_of_a_state_outlive_it(short):
     jax.tree.map(np.testing.assert_array_equal, copies, before)
 
 
-def test_with_other_environments_the_optimizer_goes_on(short):
+def test_the_optimizer_continues_with_another_number_of_environments(short):
     stored = after(short, short.init(0), 2)
     fewer = Learner(Follower(), dataclasses.replace(SMALL, num_envs=32))
     state, whole = fewer.resume(training_state.with_learning_rate(stored, 0.125))
@@ -235,7 +235,7 @@ def test_with_other_environments_the_optimizer_goes_on(short):
         wider.resume(stored)
 
 
-def test_training_goes_on_from_parameters_alone(trained):
+def test_training_can_resume_from_parameters_alone(trained):
     _, calls = trained
     params = ppo.from_tree(ppo.as_tree(calls[-1][1]))
     steps = []
@@ -252,9 +252,9 @@ def test_training_goes_on_from_parameters_alone(trained):
     assert training_state.params(state).normalizer.count == params.normalizer.count + 2560
 
 
-def test_long_trainings_call_less_often_and_go_on_in_the_same_rhythm():
+def test_long_trainings_call_back_less_often_and_resume_at_the_same_intervals():
     size = SMALL.batch_size * SMALL.num_minibatches * SMALL.unroll_length
-    config = dataclasses.replace(SMALL, num_timesteps=801 * size)  # more than twice as many as there are calls
+    config = dataclasses.replace(SMALL, num_timesteps=801 * size)  # more than twice the number of callbacks
     assert learner._schedule(config, 0) == (3, 267)
     assert learner._schedule(config, 300 * size) == (3, 167)
     assert learner.total_timesteps(config, 300 * size) == learner.total_timesteps(config) == 801 * size
@@ -262,7 +262,7 @@ def test_long_trainings_call_less_often_and_go_on_in_the_same_rhythm():
 
 
 class Exploding(Follower):
-    """Whose observation, reward or metric is no number right of 0.5, and which does not notice."""
+    """Environment whose observation, reward or metric is NaN at positions above 0.5. It does not end the episode."""
 
     part = "obs"
 
@@ -274,7 +274,7 @@ class Exploding(Follower):
 
 
 @pytest.mark.parametrize("part", ["obs", "reward", "metrics"])
-def test_numbers_that_are_none_reach_neither_learner_nor_means(part):
+def test_values_of_nan_reach_neither_learner_nor_metrics(part):
     environment = Exploding()
     environment.part = part
     env = training_env.wrap_for_training(environment)
@@ -291,7 +291,7 @@ def test_numbers_that_are_none_reach_neither_learner_nor_means(part):
     )
 
 
-def test_fresh_policy_pushes_little(trained):
+def test_actions_of_an_untrained_policy_are_small(trained):
     _, calls = trained
     fresh = calls[0][1]
     policy = ppo.make_inference(2, 1, SMALL)
@@ -302,7 +302,7 @@ def test_fresh_policy_pushes_little(trained):
     np.testing.assert_allclose(std, SMALL.initial_std, rtol=1e-6)
 
 
-def test_every_reset_draws_a_fresh_state():
+def test_every_reset_draws_a_new_state():
     env = training_env.wrap_for_training(Follower())
     step = jax.jit(env.step)
     state = jax.jit(env.reset)(jax.random.split(jax.random.key(0), 8))
@@ -311,7 +311,7 @@ def test_every_reset_draws_a_fresh_state():
         state = step(state, jnp.zeros((8, 1)))
         if state.done.all():
             goals.append(np.asarray(physics(state)["goal"]))
-            # What the policy sees next is the fresh state, and the clock starts anew.
+            # The next observation is that of the new state, and its time is 0.
             np.testing.assert_allclose(state.obs["state"][:, 0], -goals[-1], atol=1e-6)
             np.testing.assert_array_equal(physics(state)["time"], 0)
     assert len(np.unique(np.stack(goals))) == 6 * 8
@@ -323,19 +323,19 @@ def test_only_finished_environments_are_reset():
     goals = np.asarray(physics(state)["goal"])
     for _ in range(3):
         state = env.step(state, jnp.array([[1.0], [0.0]]))
-    # The first is beyond 3 by now, which ends it, and not by time.
+    # The first position is beyond 3, which terminates the episode without truncation.
     np.testing.assert_array_equal(state.done, [1.0, 0.0])
     np.testing.assert_array_equal(state.info["truncation"], [0.0, 0.0])
     assert physics(state)["goal"][0] != goals[0]
     assert physics(state)["goal"][1] == goals[1]
     assert physics(state)["time"][1] == 3
-    # Reward and metrics are the finished episode's, not the fresh one's.
+    # Reward and metrics belong to the finished episode.
     assert state.reward[0] < 0.01 and state.metrics["distance"][0] > 2.0
     np.testing.assert_array_equal(state.info["measured"]["reward"], state.reward)
     np.testing.assert_array_equal(state.info["measured"]["distance"], state.metrics["distance"])
 
 
-def test_time_limit_is_told_from_an_end():
+def test_a_time_limit_truncates_the_episode():
     env = training_env.wrap_for_training(Follower())
     state = env.reset(jax.random.split(jax.random.key(0), 2))
     ends = []
@@ -345,8 +345,9 @@ def test_time_limit_is_told_from_an_end():
     assert ends == [(0.0, 0.0)] * (Follower.limit - 1) + [(1.0, 1.0), (0.0, 0.0)]
 
 
-def test_truncation_bootstraps_in_brax():
-    """What `wrap_for_training` says of Brax's advantages: one value per step, truncated or ended at step 2 of 4."""
+def test_brax_bootstraps_at_truncation():
+    """Brax's advantages are as the docstring of `wrap_for_training` states. A trajectory of four steps, with one
+    value for each, is truncated or terminated at step 2."""
     rewards = jnp.array([[1.0], [2.0], [3.0], [4.0]])
     values = jnp.array([[10.0], [20.0], [30.0], [1000.0]])
     end = jnp.array([[0.0], [0.0], [1.0], [0.0]])
@@ -379,7 +380,7 @@ def test_truncation_bootstraps_in_brax():
         ({"initial_std": 0.0}, "--initial-std", "greater than 0"),
     ],
 )
-def test_sizes_that_do_not_fit_are_refused(change, option, fix):
+def test_options_out_of_range_are_refused(change, option, fix):
     with pytest.raises(InputError, match=fix) as error:
         ppo.check(dataclasses.replace(SMALL, **change), devices=2)
     assert str(error.value).startswith(option)

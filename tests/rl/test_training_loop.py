@@ -1,4 +1,4 @@
-"""Between PPO and the run's folder: what interrupts, breaks or doubles a training."""
+"""The training loop between PPO and the folder of a run: interruption, errors, validation, resuming and warnings."""
 
 import dataclasses
 import io
@@ -44,7 +44,7 @@ CONFIG = PPOConfig(
 
 
 def state(value: float) -> TrainingState:
-    """One that nobody will go on from."""
+    """Return a training state from which no training is resumed."""
     weights = {"w": jnp.full(3, value)}
     array: Any = jnp.full(2, value)
     return TrainingState(
@@ -74,10 +74,10 @@ def open_run(folder: Path) -> Run:
 
 
 def session_in(run: Run, *, greatest: bool = False, stream: io.StringIO | None = None) -> TrainingLoop:
-    return TrainingLoop(run, Progress(1000, stream=stream or io.StringIO()), 100, Validation(weight, "way", greatest))
+    return TrainingLoop(run, Progress(1000, stream=stream or io.StringIO()), 100, Validation(weight, "error", greatest))
 
 
-def test_a_run_is_written_by_one_process_at_a_time(tmp_path):
+def test_only_one_process_at_a_time_writes_a_run(tmp_path):
     with open_run(tmp_path / "run"), pytest.raises(InputError, match="another process is writing"):
         open_run(tmp_path / "run")
     with open_run(tmp_path / "run"):
@@ -85,7 +85,7 @@ def test_a_run_is_written_by_one_process_at_a_time(tmp_path):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_training_after_the_step_and_is_told_to_the_shell(tmp_path, number):
+def test_a_signal_ends_training_after_the_step_and_sets_the_exit_status(tmp_path, number):
     before = signal.getsignal(number)
     signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     try:
@@ -99,13 +99,13 @@ def test_a_signal_ends_training_after_the_step_and_is_told_to_the_shell(tmp_path
         assert session.exit_status == 128 + number
         stopped = last_checkpoint(tmp_path / "run", training=True)
         assert (stopped.step, stopped.notes["due"]) == (120, 100) and stopped.training is not None
-        assert restore_checkpoint(tmp_path / "run", "best")[0] == 100, "nobody has measured the other"
-        assert signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL), "given back"
+        assert restore_checkpoint(tmp_path / "run", "best")[0] == 100, "the last checkpoint has no validation"
+        assert signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL), "handler not restored"
     finally:
         signal.signal(number, before)
 
 
-def test_a_loss_that_is_no_number_ends_training_with_the_last_good_checkpoint(tmp_path):
+def test_training_stops_at_a_loss_of_nan_and_keeps_the_last_good_checkpoint(tmp_path):
     with open_run(tmp_path / "run") as run:
         session = session_in(run)
         session._step_done(100, state(1.0), GOOD)
@@ -118,7 +118,7 @@ def test_a_loss_that_is_no_number_ends_training_with_the_last_good_checkpoint(tm
     assert {row["step"] for row in read_metrics(tmp_path / "run")} == {100}
 
 
-def test_diverging_physics_is_told_once_and_only_above_a_thousandth(tmp_path):
+def test_divergence_above_a_thousandth_gives_one_warning(tmp_path):
     stream = io.StringIO()
     with open_run(tmp_path / "run") as run:
         session = session_in(run, stream=stream)
@@ -129,7 +129,7 @@ def test_diverging_physics_is_told_once_and_only_above_a_thousandth(tmp_path):
 
 
 @pytest.mark.parametrize(("greatest", "best"), [(False, 300), (True, 100)])
-def test_validation_tells_the_best_checkpoint_whatever_the_reward(tmp_path: Path, greatest: bool, best: int):
+def test_validation_selects_the_best_checkpoint_independent_of_the_reward(tmp_path: Path, greatest: bool, best: int):
     measured = {100: 3.0, 200: 2.0, 300: 1.0}
     with open_run(tmp_path / "run") as run:
         session = session_in(run, greatest=greatest)
@@ -137,7 +137,7 @@ def test_validation_tells_the_best_checkpoint_whatever_the_reward(tmp_path: Path
         for step, reward in ((100, 0.1), (200, 0.3), (300, 0.2)):
             session._step_done(step, state(measured[step]), GOOD | {"reward": reward})
     assert restore_checkpoint(tmp_path / "run", "best")[0] == best
-    assert [row["way"] for row in read_metrics(tmp_path / "run") if "way" in row] == [2.5, *measured.values()]
+    assert [row["error"] for row in read_metrics(tmp_path / "run") if "error" in row] == [2.5, *measured.values()]
 
 
 @pytest.fixture(scope="module")
@@ -156,30 +156,30 @@ def resumed(folder: Path, config: PPOConfig) -> ResumePoint:
     return find_resume_point("walk", folder, config, output=None, quick=False)
 
 
-def test_a_run_goes_on_with_its_whole_state(tmp_path, small):
+def test_a_resumed_run_restores_its_whole_state(tmp_path, small):
     before = small.init(5)
     start = resumed(saved(tmp_path / "run", before, content(env={"friction": (1.0, 2.0)})), CONFIG)
-    said: list[str] = []
-    again = start.state(small, CONFIG, training_facts(content(env={"friction": [1.0, 2.0]})), said.append)
+    messages: list[str] = []
+    again = start.state(small, CONFIG, training_facts(content(env={"friction": [1.0, 2.0]})), messages.append)
     for name, value in training_state.stored(before).items():
         np.testing.assert_array_equal(training_state.stored(again)[name], value)
-    assert start.step == 160 and start.notice is None and said == []
+    assert start.step == 160 and start.notice is None and messages == []
 
 
 @pytest.mark.parametrize(
     ("ppo_change", "sections"),
     [({"seed": 1}, {}), ({}, {"env": {"friction": 2}}), ({}, {"recordings": {"training": [{"sha256": "1"}]}})],
 )
-def test_changed_options_start_the_environments_anew(tmp_path, small, ppo_change, sections):
+def test_changed_options_reset_the_environments_of_a_resumed_run(tmp_path, small, ppo_change, sections):
     before = small.init(5)
     start = resumed(saved(tmp_path / "run", before, content()), CONFIG)
     changed = dataclasses.replace(CONFIG, learning_rate=0.5, **ppo_change)
-    told: list[str] = []
+    messages: list[str] = []
     again = training_state.stored(
-        start.state(small, changed, training_facts(content(changed, **sections)), told.append)
+        start.state(small, changed, training_facts(content(changed, **sections)), messages.append)
     )
-    (said,) = told
-    assert "options have changed; the environments are reset, the optimizer continues" in said
+    (message,) = messages
+    assert "options have changed; the environments are reset, the optimizer continues" in message
     stored = training_state.stored(before)
     assert np.array_equal(again["optimizer.1.count"], stored["optimizer.1.count"])
     assert again["optimizer.1.hyperparams.learning_rate"] == 0.5
@@ -187,7 +187,7 @@ def test_changed_options_start_the_environments_anew(tmp_path, small, ppo_change
     assert again[goal].shape == stored[goal].shape and not np.array_equal(again[goal], stored[goal])
 
 
-def test_a_run_of_an_older_version_goes_on_from_its_parameters(tmp_path, small):
+def test_a_run_of_an_older_version_resumes_from_its_parameters(tmp_path, small):
     before = small.init(5)
     folder = tmp_path / "run"
     params = training_state.params(before)
@@ -199,14 +199,15 @@ def test_a_run_of_an_older_version_goes_on_from_its_parameters(tmp_path, small):
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config | {"format": "ballu-run/1"}))
     start = resumed(folder, CONFIG)
-    told: list[str] = []
-    again = training_state.params(start.state(small, CONFIG, training_facts(content()), told.append))
-    assert "an older version saved only the parameters" in told[0]
+    messages: list[str] = []
+    again = training_state.params(start.state(small, CONFIG, training_facts(content()), messages.append))
+    assert "an older version saved only the parameters" in messages[0]
     assert start.step == 160
     for name, value in training_state.stored(before).items():
         if name.startswith("networks"):
             np.testing.assert_array_equal(
-                training_state.stored(start.state(small, CONFIG, training_facts(content()), told.append))[name], value
+                training_state.stored(start.state(small, CONFIG, training_facts(content()), messages.append))[name],
+                value,
             )
     np.testing.assert_array_equal(again.normalizer.mean["state"], params.normalizer.mean["state"])
     with Run(folder, content(), resumed_at=160) as run:
@@ -214,7 +215,7 @@ def test_a_run_of_an_older_version_goes_on_from_its_parameters(tmp_path, small):
     assert list_checkpoints(folder) == [160, 240] and last_checkpoint(folder).step == 240
 
 
-def test_the_seconds_of_a_run_that_goes_on_go_on_too(tmp_path: Path) -> None:
+def test_elapsed_seconds_continue_in_a_resumed_run(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with Run(folder, content()) as run:
         TrainingLoop(run, None, 10_000, Validation(weight)).train(Follower(), CONFIG, ResumePoint(), content())
@@ -228,17 +229,17 @@ def test_the_seconds_of_a_run_that_goes_on_go_on_too(tmp_path: Path) -> None:
     assert seconds == sorted(seconds)
 
 
-def test_a_run_without_a_checkpoint_begins_again_in_its_folder(tmp_path):
+def test_a_run_without_a_checkpoint_restarts_in_its_folder(tmp_path):
     folder = tmp_path / "run"
     with open_run(folder) as run:
         run.log(0, {"validation_error": 1.0})
     start = resumed(folder, CONFIG)
     assert start.notice is not None and "starting from the beginning" in start.notice
     with Run(folder, content(), resumed_at=start.resumed_at):
-        assert read_metrics(folder) == [], "it will be measured again"
+        assert read_metrics(folder) == [], "metrics should be empty"
 
 
-def test_a_run_that_ended_without_its_results_may_go_on_to_them(tmp_path, small):
+def test_a_trained_run_can_be_resumed_only_while_its_results_are_missing(tmp_path, small):
     folder = saved(tmp_path / "run", small.init(5), content(), step=1120)
     assert resumed(folder, CONFIG).step == 1120
     (folder / "replay.npz").write_bytes(b"")
@@ -246,36 +247,36 @@ def test_a_run_that_ended_without_its_results_may_go_on_to_them(tmp_path, small)
         resumed(folder, CONFIG)
 
 
-def test_the_user_is_told_once_of_each_standstill_and_of_compiling_in_other_words(
+def test_watchdog_warns_once_per_standstill_and_differently_for_compilation(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now = [1000.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "compiled/here")
-    told: list[str] = []
-    watchdog = Watchdog(Path("runs/walk"), told.append, limit=300.0)
+    messages: list[str] = []
+    watchdog = Watchdog(Path("runs/walk"), messages.append, limit=300.0)
 
-    def told_at(moment: float) -> list[str]:
+    def messages_at(moment: float) -> list[str]:
         watchdog.look(moment)
-        return list(told)
+        return list(messages)
 
     watchdog.step_done(None)
-    assert not told_at(1299.0)
-    (compiling,) = told_at(1300.0)
+    assert not messages_at(1299.0)
+    (compiling,) = messages_at(1300.0)
     assert "a first compilation takes" in compiling and "--num-envs" in compiling
     assert compiling.endswith("the cache of compiled programs, compiled/here.")
-    assert len(told_at(1900.0)) == 1, "said again"
-    for step in range(20, 120, 20):  # goes on for longer than the limit
+    assert len(messages_at(1900.0)) == 1, "warned twice"
+    for step in range(20, 120, 20):  # progress for longer than the limit
         now[0] += 200.0
         watchdog.step_done(step)
-        assert len(told_at(now[0] + 199.0)) == 1
-    _, standing = told_at(now[0] + 300.0)
+        assert len(messages_at(now[0] + 199.0)) == 1
+    _, standing = messages_at(now[0] + 300.0)
     assert "since step 100" in standing and "--resume runs/walk" in standing
-    assert watchdog.look(now[0] + 100.0) == 200.0, "it would sleep beyond the next standstill"
+    assert watchdog.look(now[0] + 100.0) == 200.0, "the next check would be too late"
 
 
 def eventually(condition: Callable[[], bool]) -> bool:
-    """Return whether a condition holds within a minute: on a busy machine threads wait for long."""
+    """Return whether a condition holds within a minute. On a busy machine, threads may wait for long."""
     end = time.monotonic() + 60.0
     while not condition() and time.monotonic() < end:
         time.sleep(0.01)
@@ -286,19 +287,19 @@ def watchdogs() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if thread.name == "watchdog"]
 
 
-def test_a_training_is_watched_until_it_ends(tmp_path: Path) -> None:
-    told: list[str] = []
-    with Watchdog(tmp_path, told.append, limit=0.01):
-        assert eventually(lambda: "No training step has finished" in "".join(told))
+def test_watchdog_runs_until_training_ends(tmp_path: Path) -> None:
+    messages: list[str] = []
+    with Watchdog(tmp_path, messages.append, limit=0.01):
+        assert eventually(lambda: "No training step has finished" in "".join(messages))
     with open_run(tmp_path / "run") as run:
         session = session_in(run)
         assert session._watchdog._limit == 300.0
         with session._watchdog:
             assert all(thread.daemon for thread in watchdogs()) and watchdogs()
-        assert eventually(lambda: not watchdogs()), "it is left behind"
+        assert eventually(lambda: not watchdogs()), "the watchdog is still running"
 
 
-def test_a_folder_that_takes_no_results_is_found_before_the_work(tmp_path):
+def test_a_folder_without_write_access_is_refused_before_training(tmp_path):
     (tmp_path / "file").write_text("")
     places = [tmp_path / "file" / "run"]
     if Path("/proc").is_dir():
@@ -313,4 +314,4 @@ def test_a_folder_that_takes_no_results_is_found_before_the_work(tmp_path):
             new_folder(place, "walk")
     files.check_folder(tmp_path / "new" / "run")
     left = {path.name for path in tmp_path.iterdir()} - {"locked"}
-    assert left == {"file"}, "what was tried is left behind"
+    assert left == {"file"}, "the check left files behind"

@@ -1,4 +1,4 @@
-"""Robots other than BALLU: what is refused of a description, whether the second robot is simulated and recovered."""
+"""Robots other than BALLU: invalid descriptions, and simulation and reconstruction of a tethered balloon."""
 
 import dataclasses
 import gzip
@@ -40,25 +40,25 @@ SECONDS = 6.0
 
 
 def fly(seconds: float = SECONDS) -> tuple[Recording, np.ndarray, np.ndarray]:
-    """A flight of the balloon's own model under a steady push, without noise; positions and velocities at 100 Hz."""
+    """Return a flight of the balloon's model under a constant push, without noise, and its qpos and qvel at 100 Hz."""
     model = DESCRIPTION.load_model()
     data = mujoco.MjData(model)
     data.xfrc_applied[model.body("balloon").id, :3] = PUSH
-    sent = np.repeat(np.random.default_rng(0).uniform(0, 1, (round(seconds / 0.5), 2)), 50, axis=0)
-    places, turns, qpos, qvel = [], [], [], []
-    for command in sent:
+    commands = np.repeat(np.random.default_rng(0).uniform(0, 1, (round(seconds / 0.5), 2)), 50, axis=0)
+    site_positions, quaternions, qpos, qvel = [], [], [], []
+    for command in commands:
         data.ctrl[:] = command
         mujoco.mj_kinematics(model, data)
-        places.append([data.site(site).xpos.copy() for site in ("balloon", "knot")])
-        turns.append(data.body("balloon").xquat.copy())
+        site_positions.append([data.site(site).xpos.copy() for site in ("balloon", "knot")])
+        quaternions.append(data.body("balloon").xquat.copy())
         qpos.append(data.qpos.copy())
         qvel.append(data.qvel.copy())
         mujoco.mj_step(model, data)
-    seen = np.array(places)
+    positions = np.array(site_positions)
     flight = Recording(
-        name="flight", kind="free", robot="balloon-0", time=np.arange(len(sent)) / 100, command=sent,
-        tracked_position=seen[:, 0], tracked_quaternion=np.array(turns),
-        points={"knot": seen[:, 1]},
+        name="flight", kind="free", robot="balloon-0", time=np.arange(len(commands)) / 100, command=commands,
+        tracked_position=positions[:, 0], tracked_quaternion=np.array(quaternions),
+        points={"knot": positions[:, 1]},
     )  # fmt: skip
     return flight, np.array(qpos), np.array(qvel)
 
@@ -80,7 +80,7 @@ def copy(tmp_path: Path) -> Path:
     return tmp_path / "balloon.robot.json"
 
 
-def test_ballu_s_description_says_what_its_recordings_hold():
+def test_ballus_description_has_the_columns_of_its_recordings():
     description = load_robot()
     header = (assets() / "recordings" / "training" / "gait-00-take-1.csv.gz").open("rb")
     with header, gzip.open(header) as stream:
@@ -111,7 +111,7 @@ SWIVEL = '<joint name="swivel" axis="0 0 1" stiffness="0.008"/>'
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "message"),
     [
         (lambda path: path.unlink(), "no such file"),
         (lambda path: path.write_text("{"), "not JSON"),
@@ -150,17 +150,17 @@ SWIVEL = '<joint name="swivel" axis="0 0 1" stiffness="0.008"/>'
         (in_model('<body name="lower"', '<site name="tripod"/><body name="lower"'), ""),
     ],
 )  # fmt: skip
-def test_a_damaged_description_is_refused_by_file_key_and_mend(
-    copy: Path, damage: Callable[[Path], None], said: str
+def test_damaged_description_is_refused_with_file_and_key(
+    copy: Path, damage: Callable[[Path], None], message: str
 ) -> None:
     damage(copy)
-    if not said:  # harmless, until it is asked for
+    if not message:  # a site that does not move is valid unless it is a point
         read_description(copy)
         in_json(points=["tripod"])(copy)
-        said = "does not move"
+        message = "does not move"
     with pytest.raises(InputError) as refused:
         read_description(copy)
-    assert said in str(refused.value) and copy.name in str(refused.value) and "\n" not in str(refused.value)
+    assert message in str(refused.value) and copy.name in str(refused.value) and "\n" not in str(refused.value)
 
 
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
@@ -177,7 +177,7 @@ THRUSTER = '<mujoco><actuator><general site="thruster" name="thruster" ctrlrange
 
 @pytest.fixture
 def split_model(tmp_path: Path) -> Path:
-    """A description whose model includes a file that includes another, and has meshes in two places."""
+    """Return a description whose model has nested include files, and meshes in two folders."""
     (tmp_path / "parts").mkdir()
     (tmp_path / "meshes").mkdir()
     (tmp_path / "robot.xml").write_text(
@@ -186,7 +186,7 @@ def split_model(tmp_path: Path) -> Path:
     )
     (tmp_path / "parts" / "hull.xml").write_text(HULL)
     (tmp_path / "parts" / "thruster.xml").write_text(THRUSTER)
-    (tmp_path / "parts" / "hull.obj").write_text(TETRAHEDRON)  # MuJoCo finds it beside what names it
+    (tmp_path / "parts" / "hull.obj").write_text(TETRAHEDRON)  # MuJoCo finds it beside the file that names it
     (tmp_path / "meshes" / "fin.obj").write_text(TETRAHEDRON)
     content = {"format": "ballu-robot/1", "name": "blimp", "model": "robot.xml", "tracked": "imu"}
     content |= {"points": [], "commands": {"up": "thruster"}}
@@ -204,8 +204,8 @@ def split_model(tmp_path: Path) -> Path:
         ("meshes/fin.obj", "v 1 0 0", "v 2 0 0"),
     ],
 )
-def test_a_change_of_any_file_of_the_model_is_noticed(split_model: Path, name: str, old: str, new: str) -> None:
-    # Through JSON, as in a run's folder. Runs of earlier versions have one hash of all files alone.
+def test_change_of_any_file_of_the_model_is_refused(split_model: Path, name: str, old: str, new: str) -> None:
+    # The description passes through JSON, as in a run's folder. Runs of earlier versions have one hash of all files.
     described = json.loads(json.dumps(describe_robot(read_description(split_model))))
     stored, earlier = ({"robot_description": each} for each in (described, {**described, "files": None}))
     run_robot(stored, split_model.parent)
@@ -222,7 +222,7 @@ def test_a_change_of_any_file_of_the_model_is_noticed(split_model: Path, name: s
     run_robot(stored, split_model.parent)
 
 
-def test_a_change_of_a_recording_or_of_its_description_is_noticed(
+def test_change_of_the_json_file_of_a_recording_is_refused(
     flight: tuple[Recording, np.ndarray, np.ndarray], tmp_path: Path
 ) -> None:
     path = tmp_path / "flight.csv"
@@ -235,14 +235,16 @@ def test_a_change_of_a_recording_or_of_its_description_is_noticed(
         find_recordings({"recordings": {"test": [before]}}, "test", tmp_path)
 
 
-def test_another_robot_needs_recordings_of_its_own(capsys: pytest.CaptureFixture[str]):
+def test_other_robots_require_the_option_recordings(capsys: pytest.CaptureFixture[str]):
     for command in ("sysid", "envmimic", "supervised", "analytic", "aerodynamic"):
         assert train.main([command, "--robot", str(DESCRIPTION.file)]) == 2
-        told = capsys.readouterr().err
-        assert "--recordings" in told and DESCRIPTION.name in told and told.count("\n") == 1
+        error = capsys.readouterr().err
+        assert "--recordings" in error and DESCRIPTION.name in error and error.count("\n") == 1
 
 
-def test_recordings_go_through_files(flight: tuple[Recording, np.ndarray, np.ndarray], tmp_path: Path):
+def test_recordings_are_the_same_after_writing_and_reading(
+    flight: tuple[Recording, np.ndarray, np.ndarray], tmp_path: Path
+):
     write_recording(flight[0], tmp_path / "flight.csv", DESCRIPTION)
     found = read_recording(tmp_path / "flight.csv", DESCRIPTION)
     np.testing.assert_allclose(found.points["knot"], flight[0].points["knot"], atol=6e-6)
@@ -256,9 +258,11 @@ def test_recordings_go_through_files(flight: tuple[Recording, np.ndarray, np.nda
         read_recording(tmp_path / "flight.csv", DESCRIPTION)
 
 
-def test_states_are_recovered(flight: tuple[Recording, np.ndarray, np.ndarray], motion: Motion):
+def test_reconstruction_recovers_the_states_of_the_balloon(
+    flight: tuple[Recording, np.ndarray, np.ndarray], motion: Motion
+):
     every = round(CONTROL_TIMESTEP * 100)
-    inner = slice(4, -4)  # a filter has less to go by at the ends
+    inner = slice(4, -4)  # filters have fewer samples at the ends
     count = len(motion.qpos)
     qpos, qvel = (values[::every][:count] for values in flight[1:])
     assert np.abs(motion.qpos - qpos)[inner].max() < 0.01
@@ -267,8 +271,8 @@ def test_states_are_recovered(flight: tuple[Recording, np.ndarray, np.ndarray], 
     assert max(motion.fit_error_mm.values()) < 0.1
 
 
-def test_a_free_robot_is_recovered_wherever_it_is(tmp_path: Path):
-    """The balloon, cut loose and turned over: its root is found from far away."""
+def test_reconstruction_recovers_a_free_robot_far_from_its_initial_pose(tmp_path: Path):
+    """The balloon's model has a free joint here. Its pose is far from the one where the search begins."""
     text = (BALLOON / "balloon.xml").read_text()
     joints = '<joint name="tilt_x" axis="1 0 0"/>\n      <joint name="tilt_y" axis="0 1 0"/>'
     assert joints in text
@@ -281,29 +285,31 @@ def test_a_free_robot_is_recovered_wherever_it_is(tmp_path: Path):
     model = found.load_model()
     data = mujoco.MjData(model)
     time = np.arange(150) / 100
-    turn = Rotation.from_euler("ZY", np.column_stack([2.0 + time, 0.5 * np.sin(2 * time)])).as_quat(scalar_first=True)
-    places, turns = [], []
-    for t, quaternion in zip(time, turn, strict=True):
+    rotation = Rotation.from_euler("ZY", np.column_stack([2.0 + time, 0.5 * np.sin(2 * time)])).as_quat(
+        scalar_first=True
+    )
+    site_positions, quaternions = [], []
+    for t, quaternion in zip(time, rotation, strict=True):
         data.qpos[:] = [1 + 0.3 * t, -2, 0.5, *quaternion, 0.2 * np.sin(3 * t), 0.1, 0.3 * t]
         mujoco.mj_kinematics(model, data)
-        places.append([data.site(site).xpos.copy() for site in ("balloon", "knot")])
-        turns.append(data.body("balloon").xquat.copy())
-    seen = np.array(places)
-    made = Recording(
+        site_positions.append([data.site(site).xpos.copy() for site in ("balloon", "knot")])
+        quaternions.append(data.body("balloon").xquat.copy())
+    positions = np.array(site_positions)
+    recording = Recording(
         name="loose", kind="free", robot="loose", time=time, command=np.zeros((len(time), 2)),
-        tracked_position=seen[:, 0], tracked_quaternion=np.array(turns),
-        points={"knot": seen[:, 1]},
+        tracked_position=positions[:, 0], tracked_quaternion=np.array(quaternions),
+        points={"knot": positions[:, 1]},
         joint_angles={"bend_x": 0.2 * np.sin(3 * time), "bend_y": np.full(len(time), 0.1), "swivel": 0.3 * time},
     )  # fmt: skip
-    motion = reconstruct(made, found, model)
+    motion = reconstruct(recording, found, model)
     np.testing.assert_allclose(motion.qvel[10, :3], [0.3, 0, 0], atol=0.02)
     np.testing.assert_allclose(motion.qvel[10, -1], 0.3, atol=0.02)
     np.testing.assert_allclose(motion.qpos[10, :3], [1.15, -2, 0.5], atol=0.005)
     with pytest.raises(InputError, match="nothing that is measured shows the joint"):
-        reconstruct(dataclasses.replace(made, joint_angles={}), open_ended, model)
+        reconstruct(dataclasses.replace(recording, joint_angles={}), open_ended, model)
 
 
-def test_a_joint_that_nothing_shows_is_named(flight: tuple[Recording, np.ndarray, np.ndarray], copy: Path):
+def test_joint_that_no_measurement_shows_is_named(flight: tuple[Recording, np.ndarray, np.ndarray], copy: Path):
     inertia = '<inertial pos="0 0 0" mass="0.001" diaginertia="1e-6 1e-6 1e-6"/>'
     site = '<site name="propeller_left"'
     in_model(site, f'<body><joint name="fan"/>{inertia}</body>{site}')(copy)
@@ -312,7 +318,7 @@ def test_a_joint_that_nothing_shows_is_named(flight: tuple[Recording, np.ndarray
         reconstruct(flight[0], hidden)
 
 
-def test_places_that_are_not_the_model_s_are_refused(flight: tuple[Recording, np.ndarray, np.ndarray]):
+def test_points_that_do_not_fit_the_model_are_refused(flight: tuple[Recording, np.ndarray, np.ndarray]):
     moved = {"knot": flight[0].points["knot"] + [0.0, 0.0, 0.4]}
     with pytest.raises(InputError, match="from the model's best fit"):
         reconstruct(dataclasses.replace(flight[0], points=moved), DESCRIPTION)
@@ -324,9 +330,8 @@ def env(motion: Motion) -> EnvMimicEnv:
     return EnvMimicEnv(Simulator(DESCRIPTION), [motion], config)
 
 
-def test_the_environment_steps_as_c_mujoco_does(env: EnvMimicEnv):
-    """The push that is in the recording, found again: with it as the action the simulation stays on it, and without it
-    drifts off."""
+def test_environment_steps_as_c_mujoco_does(env: EnvMimicEnv):
+    """The action is the push in the recording. The simulation matches C MuJoCo and stays on the recording."""
     state = jax.jit(env.reset)(jax.random.key(3))
     start = tracking_state(state)
     model = DESCRIPTION.load_model()
@@ -352,25 +357,25 @@ def test_the_environment_steps_as_c_mujoco_does(env: EnvMimicEnv):
     assert float(jnp.linalg.norm(features[:3] - target[:3])) < 0.01
 
 
-def test_an_anchored_robot_sees_the_world(motion: Motion, env: EnvMimicEnv):
-    """Wind does not turn with the robot: neither do what it sees and the force on it."""
+def test_observation_and_force_of_an_anchored_robot_are_in_world_frame(motion: Motion, env: EnvMimicEnv):
+    """Wind does not turn with the robot. The residual's input and its force do not turn either."""
     history = env.reference.features[0, 10:13]
-    turned = history.at[:, 8].add(1.0)
-    seen, other = (heading_observation(each, anchored=True) for each in (history, turned))
-    changed = np.flatnonzero(np.abs(seen - other) > 1e-6)
-    assert len(changed) == HISTORY, "the yaw alone"
-    np.testing.assert_allclose(np.sort(np.asarray(seen)[:3]), np.sort(np.asarray(history[0, :3])), atol=1e-6)
+    rotated = history.at[:, 8].add(1.0)
+    observation, rotated_observation = (heading_observation(each, anchored=True) for each in (history, rotated))
+    changed = np.flatnonzero(np.abs(observation - rotated_observation) > 1e-6)
+    assert len(changed) == HISTORY, "only the yaw may change"
+    np.testing.assert_allclose(np.sort(np.asarray(observation)[:3]), np.sort(np.asarray(history[0, :3])), atol=1e-6)
     force = world_loads(
         jnp.array([1.0, 2.0, 3.0]),
-        turned[-1, 8],
+        rotated[-1, 8],
         EnvMimicConfig(forces="force", force_scale=0.05, force_limit=1.0),
         DESCRIPTION,
     )
     np.testing.assert_allclose(force, [0.05, 0.1, 0.15], atol=1e-6)
 
 
-def test_envmimic_runs_from_files_to_an_evaluation(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """The command on a description and recordings, and the evaluation of what it leaves."""
+def test_envmimic_trains_and_evaluates_another_robot_from_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Run the command with a description and a recording, and evaluate the run."""
     from ballu_mjx.cli import evaluate
 
     write_recording(fly(7.0)[0], tmp_path / "flight.csv", DESCRIPTION)
@@ -388,5 +393,5 @@ def test_envmimic_runs_from_files_to_an_evaluation(tmp_path: Path, capsys: pytes
     assert f"{stored['residual'][0]['position']['5.0'][0]:.3f}" in capsys.readouterr().out
     assert train.main(["walk", "--robot", "ballu", "--residual", str(tmp_path / "run")]) == 2
     assert "is of the robot tethered balloon, not of BALLU" in capsys.readouterr().err
-    assert train.main(["walk", "--residual", str(tmp_path / "run")]) == 2  # whose robot is known
+    assert train.main(["walk", "--residual", str(tmp_path / "run")]) == 2  # the robot is the one of the residual
     assert "needs a free-floating robot; tethered balloon is anchored" in capsys.readouterr().err

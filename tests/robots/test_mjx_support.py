@@ -1,4 +1,4 @@
-"""What MJX cannot simulate is found before anything is compiled, and said with its place and a fix."""
+"""Features that MJX cannot simulate are found before compilation, and reported with their place and a fix."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def load(**parts: str) -> mujoco.MjModel:
 
 
 def ball(vertices: int, **more: str) -> str:
-    """A mesh with that many vertices in its hull."""
+    """Return a mesh with `vertices` vertices in its convex hull."""
     points = np.random.default_rng(0).normal(size=(vertices, 3))
     points *= 0.03 / np.linalg.norm(points, axis=1, keepdims=True)
     keys = "".join(f' {name}="{value}"' for name, value in more.items())
@@ -52,7 +52,7 @@ def test_fine_collision_meshes_are_refused_with_limit_and_fix(vertices: int):
 
 
 @pytest.mark.parametrize("other", [MESH.replace("foot", "other"), 'name="other" type="box" size="0.1 0.1 0.1"'])
-def test_meshes_against_meshes_and_boxes_must_be_coarser(other: str):
+def test_meshes_that_collide_with_meshes_or_boxes_must_be_coarser(other: str):
     vertices = (LARGEST_HULL + LARGEST_PAIR) // 2
     assert check_mjx(load(asset=ball(vertices), left=MESH)) is None
     found = check_mjx(load(asset=ball(vertices), left=MESH, right=other))
@@ -61,7 +61,7 @@ def test_meshes_against_meshes_and_boxes_must_be_coarser(other: str):
     assert check_mjx(load(asset=ball(LARGEST_PAIR), left=MESH, right=other)) is None
 
 
-def test_meshes_for_looks_may_be_as_fine_as_they_like():
+def test_visual_meshes_may_have_any_number_of_vertices():
     assert check_mjx(load(asset=ball(3000), left=MESH + ' contype="0" conaffinity="0"')) is None
 
 
@@ -81,11 +81,11 @@ def test_meshes_for_looks_may_be_as_fine_as_they_like():
          'an actuator on "body" (sticky)', "put it on a joint"),
     ],
 )  # fmt: skip
-def test_what_mjx_lacks_is_said_in_words_of_the_model(parts: dict[str, str], problem: str, fix: str):
+def test_features_that_mjx_lacks_are_reported_with_a_fix(parts: dict[str, str], problem: str, fix: str):
     found = check_mjx(load(**parts))
     assert found is not None and problem in found[0] and fix in found[1]
 
 
-def test_what_mjx_simulates_passes():
+def test_features_that_mjx_simulates_are_accepted():
     for option in ('integrator="Euler" density="1.2"', 'integrator="RK4"', 'cone="elliptic"', 'solver="CG"'):
         assert check_mjx(load(option=option)) is None

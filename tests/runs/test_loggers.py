@@ -1,4 +1,4 @@
-"""Measurements reach every place they are logged to, as those who read them there find them."""
+"""Logging of metrics to JSON lines, TensorBoard, and Weights & Biases."""
 
 import importlib.util
 import json
@@ -32,25 +32,25 @@ def log(logger: Logger | Run, logged=LOGGED) -> None:
 
 
 def tensorboard_values(folder: Path) -> dict[tuple[str, int], float]:
-    """Event files: records of length, checksum, event, checksum."""
+    """Return the values in event files. Their records consist of length, checksum, event and checksum."""
     found = {}
     for path in folder.glob("events.out.tfevents.*"):
-        content, place = path.read_bytes(), 0
-        while place < len(content):
-            (length,) = struct.unpack_from("<Q", content, place)
-            event = Event.FromString(content[place + 12 : place + 12 + length])
+        content, offset = path.read_bytes(), 0
+        while offset < len(content):
+            (length,) = struct.unpack_from("<Q", content, offset)
+            event = Event.FromString(content[offset + 12 : offset + 12 + length])
             found |= {(value.tag, event.step): value.simple_value for value in event.summary.value}
-            place += length + 16
+            offset += length + 16
     return found
 
 
 def wandb_records(folder: Path) -> Iterator:
-    """What would be uploaded, of all stretches of a run kept offline."""
+    """Yield the records that would be uploaded, from all parts of an offline run."""
     import wandb
     from wandb.proto.wandb_internal_pb2 import Record  # pyright: ignore[reportAttributeAccessIssue]
     from wandb.sdk.internal.datastore import DataStore
 
-    wandb.teardown()  # its process writes the last records when it likes, or now
+    wandb.teardown()  # makes its process write the last records
     for path in sorted(folder.glob("wandb/offline-run-*/*.wandb")):
         store = DataStore()
         store.open_for_scan(str(path))
@@ -68,7 +68,7 @@ def wandb_history(folder: Path) -> dict[tuple[str, int], float]:
     return found
 
 
-def test_json_lines_and_tensorboard_hold_the_same(tmp_path: Path):
+def test_json_lines_and_tensorboard_hold_the_same_metrics(tmp_path: Path):
     with open_run(tmp_path / "run") as run:
         log(run)
     assert tensorboard_values(tmp_path / "run" / "tensorboard") == FINITE
@@ -78,7 +78,7 @@ def test_json_lines_and_tensorboard_hold_the_same(tmp_path: Path):
 
 
 @has_wandb
-def test_weights_and_biases_holds_them_on_demand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_weights_and_biases_receives_the_metrics_on_request(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
     with open_run(tmp_path / "run", wandb="balloons") as run:
@@ -86,17 +86,17 @@ def test_weights_and_biases_holds_them_on_demand(tmp_path: Path, monkeypatch: py
     with open_run(tmp_path / "run", wandb="balloons", resumed_at=20) as run:
         log(run, LOGGED[2:])
     assert wandb_history(tmp_path / "run") == FINITE
-    begun = [record.run for record in wandb_records(tmp_path / "run") if record.HasField("run")]
-    assert len({run.run_id for run in begun}) == 1, "a run that goes on is one run there too"
-    assert begun[0].project == "balloons" and begun[0].display_name == "run"
-    config = {item.key or item.nested_key[0]: json.loads(item.value_json) for item in begun[0].config.update}
+    runs = [record.run for record in wandb_records(tmp_path / "run") if record.HasField("run")]
+    assert len({run.run_id for run in runs}) == 1, "a resumed run must be the same run in Weights & Biases"
+    assert runs[0].project == "balloons" and runs[0].display_name == "run"
+    config = {item.key or item.nested_key[0]: json.loads(item.value_json) for item in runs[0].config.update}
     assert config["ppo"] == {"seed": 7}
     exits = [record.exit.exit_code for record in wandb_records(tmp_path / "run") if record.HasField("exit")]
     assert exits == [0, 0]
 
 
 @has_wandb
-def test_weights_and_biases_learns_of_a_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_weights_and_biases_receives_the_exit_code_of_a_failed_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
     with pytest.raises(ZeroDivisionError), open_run(tmp_path / "run", wandb="balloons"):
@@ -106,7 +106,7 @@ def test_weights_and_biases_learns_of_a_failure(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize("task", ["sysid", "envmimic", "walk"])
-def test_a_missing_package_is_told_before_training(task, tmp_path, monkeypatch, capsys):
+def test_missing_wandb_package_is_reported_before_training(task, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "wandb", None)  # as if it were not installed
     output = tmp_path / "run"
     assert train.main([task, "--quick", "--wandb", "balloons", "--output", str(output)]) == 2

@@ -1,4 +1,4 @@
-"""Models whose masses are altered in MJX: are they the models that C MuJoCo makes of the same masses?"""
+"""Constants that MuJoCo derives from masses: MJX models with altered masses agree with C MuJoCo's."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from ballu_mjx.sim.step import PhysicsState
 BALLOON = Path(__file__).parents[2] / "experiments" / "tethered_balloon" / "balloon.robot.json"
 DERIVED = ("body_invweight0", "body_subtreemass", "dof_invweight0", "tendon_invweight0")
 ADDED_MASS, ADDED_INERTIA, MOVED = 0.105, 0.0035, np.array([0.0048, 0.0143, 0.0])
-"""Of the air that the bundled recordings identify."""
+"""Added mass (kg), added inertia (kg m^2) and offset (m) of the air that is identified from the bundled recordings."""
 
 
 def heavier(model: mujoco.MjModel, body: int) -> dict[str, np.ndarray]:
-    """Fields with mass, inertia and centre of a body altered, and its lift such that the added mass is weightless."""
+    """Return fields with altered mass, inertia, centre and lift of a body. The added mass has no weight."""
     names = ("body_mass", "body_inertia", "body_ipos", "body_gravcomp")
     fields = {name: getattr(model, name).copy() for name in names}
     lift = fields["body_gravcomp"][body] * fields["body_mass"][body] + ADDED_MASS
@@ -42,18 +42,18 @@ def compiled(robot: RobotDescription, fields: dict[str, np.ndarray]) -> mujoco.M
 
 
 @pytest.mark.parametrize("robot", [load_robot(), read_description(BALLOON)], ids=lambda robot: robot.name)
-def test_constants_are_those_of_mj_setconst(robot: RobotDescription) -> None:
+def test_constants_agree_with_mj_setconst(robot: RobotDescription) -> None:
     model = robot.load_model()
     altered = {name: jnp.asarray(x) for name, x in heavier(model, model.body("balloon").id).items()}
     found = Simulator(robot, model=model).with_fields(altered).model
     expected = compiled(robot, heavier(model, model.body("balloon").id))
     change = np.abs(np.asarray(found.dof_invweight0) / model.dof_invweight0 - 1).max()
-    assert change > 0.1, "nothing to derive"
+    assert change > 0.1, "the altered masses hardly change the constants"
     for name in DERIVED:
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-3, atol=1e-6, err_msg=name)
 
 
-def test_constants_follow_from_armature_alone() -> None:
+def test_constants_agree_with_mj_setconst_after_a_change_of_armature() -> None:
     robot = read_description(BALLOON)
     model = robot.load_model()
     armature = model.dof_armature + 1e-3
@@ -64,7 +64,7 @@ def test_constants_follow_from_armature_alone() -> None:
     assert np.abs(expected.dof_invweight0 / model.dof_invweight0 - 1).max() > 0.01
 
 
-def test_constants_of_unaltered_masses_are_the_models_own() -> None:
+def test_constants_of_unaltered_masses_are_unchanged() -> None:
     robot = load_robot()
     model = robot.load_model()
     found = Simulator(robot).with_fields({"body_mass": jnp.asarray(model.body_mass)}).model
@@ -72,7 +72,7 @@ def test_constants_of_unaltered_masses_are_the_models_own() -> None:
         np.testing.assert_allclose(getattr(found, name), getattr(model, name), rtol=1e-6, err_msg=name)
 
 
-def test_constants_change_with_mass_as_mj_setconst_s_do() -> None:
+def test_derivatives_of_constants_agree_with_mj_setconst() -> None:
     robot = load_robot()
     model = robot.load_model()
     simulator, body = Simulator(robot), model.body("balloon").id
@@ -82,15 +82,16 @@ def test_constants_change_with_mass_as_mj_setconst_s_do() -> None:
             {"body_mass": jnp.asarray(model.body_mass).at[body].add(added)}
         ).model.body_invweight0
 
-    slope = jax.jacfwd(weights)(jnp.array(0.05))
+    derivative = jax.jacfwd(weights)(jnp.array(0.05))
     high, low = (compiled(robot, {"body_mass": model.body_mass + added * (np.arange(model.nbody) == body)})
                  for added in (0.051, 0.049))  # fmt: skip
     expected = (high.body_invweight0 - low.body_invweight0) / 0.002
-    np.testing.assert_allclose(slope, expected, rtol=0.01, atol=1e-3 * np.abs(expected).max())
+    np.testing.assert_allclose(derivative, expected, rtol=0.01, atol=1e-3 * np.abs(expected).max())
 
 
-def test_an_altered_robot_walks_as_in_c_mujoco() -> None:
-    """Open loop over 5 s, in double precision: with the constants of the old masses they end 7 mm apart."""
+def test_a_robot_with_altered_masses_walks_as_in_c_mujoco() -> None:
+    """The walk is open-loop over 5 s, in double precision. With the constants of the original masses, the end would be
+    off by 7 mm."""
     robot = load_robot()
     model = robot.load_model()
     fields, qpos = heavier(model, model.body("balloon").id), robot.adapter.initial_qpos(robot, model)
@@ -120,5 +121,5 @@ def test_an_altered_robot_walks_as_in_c_mujoco() -> None:
         mujoco.mj_step(expected, data, round(robot.control_timestep / model.opt.timestep))
         mujoco.mj_kinematics(expected, data)
         places.append(data.site_xpos[site].copy())
-    assert np.linalg.norm(places[-1] - places[0]) > 0.2, "it does not walk"
+    assert np.linalg.norm(places[-1] - places[0]) > 0.2, "the robot does not walk"
     assert np.linalg.norm(found - places, axis=1).max() < 1e-3

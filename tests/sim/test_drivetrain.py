@@ -1,4 +1,4 @@
-"""The drivetrain against a plain reference."""
+"""The drivetrain against a plain reference implementation."""
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ def wandering(seed: int = 0, steps: int = 400, commands: int = 2) -> np.ndarray:
 
 
 def reference(values: dict[str, float], commands: np.ndarray) -> np.ndarray:
-    """One command, one step after the other, as the page says it."""
+    """Filter one command step by step, by the documented equations."""
     found = []
     limited = lagged = after_backlash = values["scale"] * commands[0] + values["offset"]
     for step in range(len(commands)):
@@ -41,7 +41,7 @@ def reference(values: dict[str, float], commands: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
-def test_the_identity_passes_commands_on_to_the_last_bit():
+def test_the_identity_drivetrain_does_not_change_commands():
     commands = jnp.asarray(wandering(), jnp.float32)
     passed = filter_commands(identity_drivetrain(2), commands, STEP, count_slots(0.1, STEP))
     np.testing.assert_array_equal(passed, commands)
@@ -59,7 +59,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_each_part_is_as_in_a_plain_reference(case: str):
+def test_each_effect_agrees_with_the_reference(case: str):
     values = {"scale": 1.0, "offset": 0.0, "delay": 0.0, "backlash": 0.0, "rate_limit": np.inf, "lag": 0.0}
     other = values | CASES[case]
     commands = wandering()
@@ -70,7 +70,7 @@ def test_each_part_is_as_in_a_plain_reference(case: str):
     np.testing.assert_allclose(found[:, 1], reference(other, commands[:, 1]), atol=1e-12)
 
 
-def test_derivatives_are_those_of_differences_and_finite_at_the_identity():
+def test_derivatives_agree_with_finite_differences_and_exist_at_the_identity():
     commands = wandering()
     with jax.enable_x64(True):
 
@@ -79,21 +79,21 @@ def test_derivatives_are_those_of_differences_and_finite_at_the_identity():
             return filter_commands(DrivetrainParameters(*each), jnp.asarray(commands), STEP, count_slots(0.1, STEP))
 
         values = np.repeat([0.9, 0.1, 0.0171, 0.1, 6.03, 0.02], 2)
-        slopes, passed_at = np.asarray(jax.jacfwd(passed)(jnp.asarray(values))), jax.jit(passed)
+        jacobian, passed_at = np.asarray(jax.jacfwd(passed)(jnp.asarray(values))), jax.jit(passed)
         for place in range(len(values)):
             step = np.zeros(len(values))
             step[place] = 1e-7
             change = (passed_at(values + step) - passed_at(values - step)) / 2e-7
-            np.testing.assert_allclose(slopes[..., place], change, atol=1e-4)
+            np.testing.assert_allclose(jacobian[..., place], change, atol=1e-4)
         identity = jnp.concatenate(list(identity_drivetrain(2)))
         at_identity = np.asarray(jax.jacfwd(passed)(identity))
     assert np.isfinite(at_identity).all()
-    # Just beyond no delay, what comes late is what was sent before.
+    # At a delay of 0, the derivative with respect to delay is the decrease of the command per time.
     early = commands[:-1, 0] - commands[1:, 0]
     np.testing.assert_allclose(at_identity[1:, 0, 4], early / STEP, atol=1e-9)
 
 
-def test_robots_side_by_side_are_each_as_alone():
+def test_drivetrains_in_a_batch_agree_with_single_ones():
     commands = jnp.asarray(wandering(), jnp.float32)
     delays = jnp.array([0.0, 0.01, 0.05])
     slots = count_slots(0.05, STEP)

@@ -1,4 +1,4 @@
-"""The robot's physics: MJX against C MuJoCo, symmetry, cable, servo, weight, and what the parameters move."""
+"""BALLU's physics: MJX against C MuJoCo, symmetry, cables, servos, weight, and effects of the actuator parameters."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FIELDS = [f.name for f in dataclasses.fields(ActuatorParameters) if f.default is
 
 
 def tight_model() -> mujoco.MjModel:
-    """The robot with the contact solver run to convergence."""
+    """Return the robot's model with a contact solver that runs to convergence."""
     model = load_model()
     model.opt.iterations, model.opt.tolerance = 100, 1e-14
     model.opt.ls_iterations, model.opt.ls_tolerance = 50, 1e-6
@@ -47,11 +47,11 @@ def advance(model: mujoco.MjModel, data: mujoco.MjData, command: np.ndarray, sec
 
 
 def weightless() -> mujoco.MjModel:
-    """The robot afloat in still space, its base held by thick air: for the actuators alone."""
+    """Return a model for tests of the actuators alone: without gravity and contacts, with a strongly damped base."""
     model = load_model()
     model.opt.gravity[:] = 0
     model.dof_damping[:6] = 5
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # nothing touches: less to compile
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # compiles faster
     return model
 
 
@@ -67,7 +67,7 @@ def afloat(model: mujoco.MjModel) -> mujoco.MjData:
 
 @dataclasses.dataclass(frozen=True)
 class Samples:
-    """States along pushed walks with the commands and forces to come, and whether each is in the named regimes."""
+    """States along walks with random forces, commands and forces of the next step, and the regimes of each state."""
 
     qpos: np.ndarray
     qvel: np.ndarray
@@ -106,14 +106,15 @@ def samples() -> Samples:
     return Samples(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def test_samples_visit_every_regime() -> None:
+def test_samples_include_contact_taut_cables_and_saturated_servos() -> None:
     s = samples()
     for regime in (s.contact, s.taut, s.saturated):
         assert 0.1 < regime.mean() < 0.95
 
 
-def test_mjx_follows_c_mujoco_over_a_control_step() -> None:
-    """The same step in float32 and in double precision, under a wrench on the balloon and forces at base and feet."""
+def test_mjx_agrees_with_c_mujoco_over_a_control_step() -> None:
+    """MJX computes a step in float32, and C MuJoCo in double precision. A wrench acts on the balloon, and forces act at
+    base and feet."""
     s, model = samples(), load_model()
     count, balloon = count_substeps(model, CONTROL_TIMESTEP), model.body("balloon").id
     points = tuple(model.site(name).id for name in load_robot().points)
@@ -155,7 +156,7 @@ def test_mjx_follows_c_mujoco_over_a_control_step() -> None:
 
 
 def mirrored_qpos(qpos: np.ndarray) -> np.ndarray:
-    """Reflection in the plane y = 0: left and right change places."""
+    """Return the reflection in the plane y = 0, which exchanges left and right."""
     neck, left, right = np.split(qpos[7:], [1, 4])
     return np.concatenate([qpos[:7] * [1, -1, 1, 1, -1, 1, -1], neck, right, left])
 
@@ -165,7 +166,7 @@ def mirrored_qvel(qvel: np.ndarray) -> np.ndarray:
     return np.concatenate([qvel[:6] * [1, -1, 1, -1, 1, -1], neck, right, left])
 
 
-def test_the_mirrored_robot_moves_in_mirror_image() -> None:
+def test_mirrored_states_and_commands_give_mirrored_motion() -> None:
     s, model = samples(), tight_model()
     worst = 0.0
     for qpos, qvel, command in zip(s.qpos[::4], s.qvel[::4], s.command[::4], strict=True):
@@ -182,7 +183,7 @@ def test_the_mirrored_robot_moves_in_mirror_image() -> None:
 # ---- cable and servo ----
 
 
-def test_the_cable_pulls_when_stretched_and_never_pushes() -> None:
+def test_a_cable_pulls_when_taut_and_never_pushes() -> None:
     model = load_model()
     cut = load_model()
     cut.tendon_stiffness[:] = 0
@@ -203,12 +204,12 @@ def test_the_cable_pulls_when_stretched_and_never_pushes() -> None:
     assert seen == {True, False}
 
 
-def test_a_slack_cable_transmits_nothing_however_it_moves() -> None:
-    """MuJoCo's tendon damping would: by a force of 0.04 to 0.06 N here, where a taut cable carries 0.8 N."""
+def test_a_slack_cable_transmits_no_force_at_any_velocity() -> None:
+    """MuJoCo's tendon damping would transmit a force of 0.04 to 0.06 N here. A taut cable carries 0.8 N."""
     model = load_model()
     cut = load_model()
     cut.tendon_stiffness[:] = cut.tendon_damping[:] = 0
-    ways = []
+    accelerations = []
     for each in (model, cut):
         data = mujoco.MjData(each)
         data.qpos[:] = standing_qpos(each)
@@ -217,11 +218,11 @@ def test_a_slack_cable_transmits_nothing_however_it_moves() -> None:
         mujoco.mj_forward(each, data)
         assert np.all(data.ten_length < model.tendon_lengthspring[:, 1])
         assert np.all(np.abs(data.ten_velocity) > 0.04)
-        ways.append(data.qacc.copy())
-    np.testing.assert_allclose(ways[0], ways[1], atol=1e-9)
+        accelerations.append(data.qacc.copy())
+    np.testing.assert_allclose(accelerations[0], accelerations[1], atol=1e-9)
 
 
-def test_cable_length_is_the_models_own() -> None:
+def test_cable_length_agrees_with_the_model() -> None:
     model = load_model()
     data = mujoco.MjData(model)
     knee, motor = np.array([0.6, 1.2]), np.array([0.3, 1.4])
@@ -230,7 +231,7 @@ def test_cable_length_is_the_models_own() -> None:
     np.testing.assert_allclose(cable_length(model, jnp.asarray(knee), jnp.asarray(motor)), data.ten_length, rtol=1e-6)
 
 
-def test_the_cables_rest_length_leaves_the_stated_slack() -> None:
+def test_rest_length_of_the_cables_gives_the_stated_slack() -> None:
     model = load_model()
     nominal = ActuatorParameters.nominal(model)
     np.testing.assert_allclose(nominal.cable_slack, CABLE_SLACK, atol=1e-5)
@@ -241,7 +242,7 @@ def test_the_cables_rest_length_leaves_the_stated_slack() -> None:
     np.testing.assert_allclose(longer, [1e-3, 0.0], atol=1e-7)
 
 
-def test_the_servo_saturates_at_its_torque() -> None:
+def test_servo_saturates_at_its_torque_limit() -> None:
     model = load_model()
     data = mujoco.MjData(model)
     data.ctrl[:] = [1.0, 0.05]
@@ -253,8 +254,8 @@ def test_the_servo_saturates_at_its_torque() -> None:
     np.testing.assert_allclose(data.actuator_force, -0.085, rtol=1e-6)
 
 
-def test_commands_map_monotonically_to_settled_knees() -> None:
-    """From the stop, at the command where the cable comes taut, to 72 deg; left and right alike."""
+def test_settled_knee_angle_increases_with_the_command() -> None:
+    """Left and right knees agree. They move from the stop, at the command where the cable becomes taut, to 72 deg."""
     model = weightless()
     knees = []
     for command in np.linspace(0, 1, 9):
@@ -272,7 +273,7 @@ def test_commands_map_monotonically_to_settled_knees() -> None:
 # ---- weight ----
 
 
-def test_weight_and_lift() -> None:
+def test_net_force_is_buoyancy_minus_weight() -> None:
     model = load_model()
     assert model.body_mass.sum() == pytest.approx(0.28679, abs=1e-9)
     assert buoyancy_ratio(model) == pytest.approx(0.84, abs=1e-4)
@@ -282,14 +283,14 @@ def test_weight_and_lift() -> None:
         data = afloat(model)
         mujoco.mj_forward(model, data)
         acceleration = sum(model.body_mass) * 9.81 * (ratio - 1)
-        # Nothing touches it: what accelerates the robot as a whole is weight less lift.
+        # Without contacts, the net force on the robot is lift minus weight.
         momentum = np.zeros((3, model.nv))
         mujoco.mj_jacSubtreeCom(model, data, momentum, 1)
         force = model.body_subtreemass[1] * momentum @ data.qacc
         np.testing.assert_allclose(force, [0, 0, acceleration], atol=1e-4)
 
 
-def test_it_stands_with_its_feet_on_the_floor() -> None:
+def test_robot_stands_with_its_feet_on_the_floor() -> None:
     model = load_model()
     qpos = standing_qpos(model)
     data = mujoco.MjData(model)
@@ -309,10 +310,10 @@ def test_it_stands_with_its_feet_on_the_floor() -> None:
 
 @functools.cache
 def settled_in_mjx() -> tuple[np.ndarray, np.ndarray]:
-    """Settled knees [case, knee] and what a change of each parameter changes [case, field, parameter's side, knee], per
-    unit of the parameter.
+    """Return settled knee angles [case, knee] and their derivatives with respect to the actuator parameters.
 
-    All rows of `CASES` side by side: vmapped, with a set of parameters each.
+    Angles are in rad. Derivatives have the axes [case, field, parameter's side, knee]. All `CASES` are simulated in
+    one batch, each with its own parameters.
     """
     model = weightless()
     mjx_model = put_model(model)
@@ -335,12 +336,12 @@ def settled_in_mjx() -> tuple[np.ndarray, np.ndarray]:
 
 
 def change_of(parameters: ActuatorParameters, name: str, side: int) -> float:
-    """2 % of a parameter; 5 mrad where it is an angle of 0, 0.05 mm of slack."""
+    """Return the step of finite differences: 2 % of a parameter, 5 mrad for an angle of 0, and 0.05 mm for slack."""
     return 5e-5 if name == "cable_slack" else 0.02 * abs(float(getattr(parameters, name)[side])) or 5e-3
 
 
 def changed(parameters: ActuatorParameters, name: str, side: int) -> list[ActuatorParameters]:
-    """With a parameter of one side increased, and decreased."""
+    """Return the parameters with one of them increased, and decreased, on one side."""
     value, change = getattr(parameters, name), change_of(parameters, name, side)
     return [dataclasses.replace(parameters, **{name: value.at[side].add(sign * change)}) for sign in (1, -1)]
 
@@ -353,9 +354,9 @@ CASES = (
         (0.7, 0.9),
         {"knee_spring_stiffness": (0.012, 0.02), "motor_gain": (0.05, 0.3), "default_knee_angle": (0.5, 0.44)},
     ),
-    ((1.0, 1.0), {"knee_spring_stiffness": (0.08, 0.09)}),  # servos saturated: the springs are too strong for them
+    ((1.0, 1.0), {"knee_spring_stiffness": (0.08, 0.09)}),  # servos saturated by strong springs
 )
-"""Commands, and parameters other than nominal."""
+"""Commands, and parameters that differ from nominal."""
 SATURATED = 3
 
 
@@ -373,8 +374,8 @@ def settled_in_c(parameters: ActuatorParameters, command: tuple[float, float]) -
 
 
 @pytest.mark.parametrize("case", range(len(CASES)))
-def test_settled_knees_and_what_moves_them_agree_with_c_mujoco(case: int) -> None:
-    values, slopes = settled_in_mjx()
+def test_settled_knees_and_their_derivatives_agree_with_c_mujoco(case: int) -> None:
+    values, derivatives = settled_in_mjx()
     command, parameters = CASES[case][0], case_parameters(CASES[case])
     data = settled_in_c(parameters, command)
     np.testing.assert_allclose(values[case], data.qpos[7:][KNEES], atol=2e-4)
@@ -384,10 +385,10 @@ def test_settled_knees_and_what_moves_them_agree_with_c_mujoco(case: int) -> Non
         for side in range(2):
             delta = change_of(parameters, name, side)
             high, low = (settled_in_c(each, command).qpos for each in changed(parameters, name, side))
-            # Per 1 % of the parameter (of 1 rad, where it is an angle of 0; 0.025 mm of slack), in rad at the knee.
+            # Change of the knee angle (rad) for 1 % of the parameter, 2.5 mrad of an angle of 0, or 0.025 mm of slack.
             scale = delta / 0.02 * 0.01
             np.testing.assert_allclose(
-                slopes[case, f, side] * scale,
+                derivatives[case, f, side] * scale,
                 (high - low)[7:][KNEES] / (2 * delta) * scale,
                 rtol=0.05,
                 atol=1e-5,
@@ -395,12 +396,12 @@ def test_settled_knees_and_what_moves_them_agree_with_c_mujoco(case: int) -> Non
             )
 
 
-def test_each_parameter_moves_its_own_side_as_described() -> None:
-    _, slopes = settled_in_mjx()
-    at_stop, taut, saturated = slopes[0], slopes[1], slopes[SATURATED]
+def test_each_parameter_moves_the_knee_of_its_side() -> None:
+    _, derivatives = settled_in_mjx()
+    at_stop, taut, saturated = derivatives[0], derivatives[1], derivatives[SATURATED]
     own, other = np.eye(2, dtype=bool), ~np.eye(2, dtype=bool)
     limit = FIELDS.index("torque_limit")
-    # A servo that does not saturate at rest did so on the way: the legs still swing a little from that.
+    # Servos that do not saturate at rest saturate during the motion, so the legs still swing slightly.
     assert np.all(saturated[limit][own] > 1e-2) and np.abs(taut[limit]).max() < 0.1 * saturated[limit][own].min()
     for f, name in enumerate(FIELDS):
         if f == limit:
@@ -415,8 +416,8 @@ def test_each_parameter_moves_its_own_side_as_described() -> None:
 # ---- the solver's derivative ----
 
 
-def test_the_step_that_tells_whether_the_solver_has_arrived_is_newtons() -> None:
-    """Beside MJX's own search direction, from where too few iterations leave the solver."""
+def test_the_step_of_the_convergence_check_is_a_newton_step() -> None:
+    """The step equals MJX's own search direction at points where the solver stopped too early."""
     s, model = samples(), load_model()
     model.opt.iterations = 1
     mjx_model, template = put_model(model), make_data(model)
@@ -434,7 +435,7 @@ def test_the_step_that_tells_whether_the_solver_has_arrived_is_newtons() -> None
 
     found, expected = steps(*(jnp.asarray(x, jnp.float32) for x in (s.qpos, s.qvel, s.command)))
     size = np.linalg.norm(expected, axis=1)
-    assert np.mean(size > 1.0) > 0.2, "the solver has arrived everywhere"
+    assert np.mean(size > 1.0) > 0.2, "the solver has converged everywhere"
     np.testing.assert_allclose(np.linalg.norm(found - expected, axis=1), 0.0, atol=1e-2 * size.max())
     far = size > 1.0
     np.testing.assert_allclose(np.linalg.norm(found, axis=1)[far] / size[far], 1.0, atol=1e-2)

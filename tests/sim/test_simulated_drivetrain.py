@@ -1,4 +1,4 @@
-"""The drivetrain in the simulator: what is identified is what is simulated, wherever a rollout begins."""
+"""The identified drivetrain in the simulator, in rollouts, windows, episodes and policies."""
 
 import json
 from pathlib import Path
@@ -59,7 +59,7 @@ def run(simulator: AugmentedSimulator, start: RolloutState, commands: Array) -> 
     return jax.lax.scan(step, start, commands)[1]
 
 
-def test_control_steps_are_those_of_c_under_filtered_commands(robot: RobotDescription, simulator: Simulator):
+def test_control_steps_agree_with_c_mujoco_under_filtered_commands(robot: RobotDescription, simulator: Simulator):
     commands = wandering(0, STEPS)
     qpos, qvel = true_path(robot, identified(robot, **TRUTH), commands)
     start = begin(simulator, jnp.asarray(commands[0]))
@@ -71,7 +71,7 @@ def test_control_steps_are_those_of_c_under_filtered_commands(robot: RobotDescri
     assert np.abs(true_path(robot, identified(robot, **without), commands)[0] - qpos).max() > 0.2
 
 
-def test_derivatives_by_the_drivetrain_are_those_of_differences(robot: RobotDescription):
+def test_derivatives_by_drivetrain_parameters_agree_with_finite_differences(robot: RobotDescription):
     places = np.array([0, 4, 6, 10])  # scale, delay, backlash and lag of the shoulder
     with jax.enable_x64(True):
         simulator, commands = Simulator(robot, identified(robot, **TRUTH)), jnp.asarray(wandering(0, 8, hold=1))
@@ -83,15 +83,15 @@ def test_derivatives_by_the_drivetrain_are_those_of_differences(robot: RobotDesc
             return run(driven.with_residual(None), begin(driven, commands[0]), commands)[0][-1]
 
         both = jax.jit(lambda values: (jax.jacfwd(angles)(values), angles(values)))
-        slopes = np.asarray(both(whole[places])[0])
+        jacobian = np.asarray(both(whole[places])[0])
         for place in range(len(places)):
             step = jnp.zeros(len(places)).at[place].set(1e-6)
             change = np.asarray(both(whole[places] + step)[1] - both(whole[places] - step)[1]) / 2e-6
-            np.testing.assert_allclose(slopes[:, place], change, atol=0.01, rtol=0.02)
-            assert np.abs(slopes[:, place]).max() > 0.03
+            np.testing.assert_allclose(jacobian[:, place], change, atol=0.01, rtol=0.02)
+            assert np.abs(jacobian[:, place]).max() > 0.03
 
 
-def test_without_a_drivetrain_nothing_is_carried_or_changed(robot: RobotDescription):
+def test_a_simulator_without_a_drivetrain_has_no_drivetrain_state(robot: RobotDescription):
     commands = jnp.asarray(wandering(0, STEPS), jnp.float32)
     nominal, same = Simulator(robot), Simulator(robot, identified(robot))
     assert same.drivetrain is None and begin(same, commands[0]).drivetrain is None
@@ -107,7 +107,7 @@ def test_without_a_drivetrain_nothing_is_carried_or_changed(robot: RobotDescript
 
 
 class Scaled(Residual):
-    """Commands times a parameter, and no forces."""
+    """Residual that multiplies commands by a parameter and gives no forces."""
 
     @property
     def name(self) -> str:
@@ -120,7 +120,7 @@ class Scaled(Residual):
         return commands.ravel()
 
 
-def test_a_residuals_command_comes_before_the_drivetrain(simulator: Simulator):
+def test_a_residual_changes_commands_before_the_drivetrain(simulator: Simulator):
     commands, start = jnp.asarray(wandering(1, 6)), begin(simulator, jnp.zeros(2))
     halving = BoundResidual(Scaled(), jnp.float32(0.5))
     ours = run(simulator.with_residual(halving), start, commands)
@@ -130,21 +130,21 @@ def test_a_residuals_command_comes_before_the_drivetrain(simulator: Simulator):
 
 @pytest.fixture(scope="module")
 def motion(robot: RobotDescription) -> Motion:
-    """4 s of the true arm, from the rest pose on."""
+    """Motion of the true arm over 4 s, from the rest pose."""
     commands = wandering(2, 80)
     qpos, qvel = true_path(robot, identified(robot, **TRUTH), commands)
     qpos, qvel = (np.concatenate([np.zeros((1, 2)), x[9::10]]) for x in (qpos, qvel))
     return Motion(name="near", time=np.arange(81) * 0.05, command=commands, qpos=qpos, qvel=qvel, fit_error_mm={})
 
 
-def test_recorded_motion_is_followed_from_any_start(simulator: Simulator, motion: Motion):
+def test_replay_follows_the_recording_from_any_starting_state(simulator: Simulator, motion: Motion):
     evaluator, params = OpenLoopEvaluator(simulator, [motion], Scaled()), jnp.float32(1.0)
     (ours,), (nominal,) = evaluator.errors(evaluator.replay(params)), evaluator.nominal_errors(params)
     assert ours.position[1.0][0] < 1e-3
     assert nominal.position[1.0][0] > 10e-3
 
 
-def test_windows_and_episodes_begin_in_the_drivetrains_recorded_state(simulator: Simulator, motion: Motion):
+def test_windows_and_episodes_start_with_the_recorded_drivetrain_state(simulator: Simulator, motion: Motion):
     def after(state: RolloutState, commands: Array) -> np.ndarray:
         return np.asarray(run(simulator.with_residual(None), state, commands)[0])
 
@@ -163,7 +163,7 @@ def test_windows_and_episodes_begin_in_the_drivetrains_recorded_state(simulator:
     assert np.asarray(stack_motions(simulator, [motion])[0].steps) == [80]
 
 
-def test_control_steps_are_linearized_about_the_drivetrains_state(simulator: Simulator, motion: Motion):
+def test_linearization_uses_the_state_of_the_drivetrain(simulator: Simulator, motion: Motion):
     states, commands = jax.vmap(start_motion_window)(cut_motion_windows(simulator, [motion], 0.1, 0.5))
     linear = Linearizer(simulator)(ControlSteps(states, commands[:, 0], np.zeros((len(commands), 3))))
     first = HISTORY - 1 + 10 * np.arange(len(commands))
@@ -171,7 +171,7 @@ def test_control_steps_are_linearized_about_the_drivetrains_state(simulator: Sim
     assert np.isfinite(linear.state).all() and np.abs(linear.state).max() > 0.1
 
 
-def test_policies_are_trained_under_late_commands(tmp_path: Path):
+def test_policies_are_trained_with_the_identified_delay(tmp_path: Path):
     path = write_rover(tmp_path).file
     content = json.loads(path.read_text()) | {"identify": [{"command": "push", "field": "delay"}]}
     path.write_text(json.dumps(content))
@@ -190,11 +190,11 @@ def test_policies_are_trained_under_late_commands(tmp_path: Path):
         rods.append(np.array(path))
     late_rod, rod = rods
     resting = late_rod[0]
-    assert abs(rod[0] - resting) > 0.05  # the push is there at once, or one and a half control steps later
+    assert abs(rod[0] - resting) > 0.05  # the push acts at once, or one and a half control steps later
     assert abs(late_rod[1] - rod[1]) > 0.05
 
 
-def test_constants_follow_from_identified_masses(robot: RobotDescription):
+def test_derived_constants_follow_from_identified_masses(robot: RobotDescription):
     spec = mujoco.MjSpec.from_file(str(robot.model))
     lower = spec.body("lower")
     lower.mass, lower.inertia = 0.2, lower.inertia * 0.2 / 0.15

@@ -1,4 +1,4 @@
-"""The improved simulator's step, against the sequence written out."""
+"""The improved simulator's step, against the same operations written out one by one."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BODY = SIMULATOR.mj_model.body("balloon").id
 
 
 class Springs(Residual):
-    """A residual that changes everything a residual can: heavier, late by a step, pulled towards its last places."""
+    """A residual that uses all effects: it adds mass, delays commands by a step, and pulls to an earlier position."""
 
     @property
     def name(self) -> str:
@@ -61,7 +61,7 @@ PARAMS = jnp.float32(1.5)
 
 
 @jax.jit
-def by_hand(start: RolloutState, scale: Float[Array, ""]) -> tuple[PhysicsState, Array, Array, Array]:
+def written_out(start: RolloutState, scale: Float[Array, ""]) -> tuple[PhysicsState, Array, Array, Array]:
     kind, commands = Springs(), jnp.concatenate([start.commands, COMMAND[None]])
     mass = jnp.asarray(SIMULATOR.mj_model.body_mass, jnp.float32)
     altered = SIMULATOR.with_fields({"body_mass": (1 - scale) * mass + scale * kind.fields(PARAMS)["body_mass"]})
@@ -78,8 +78,8 @@ def stepped(start: RolloutState, scale: Float[Array, ""]) -> Any:
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.4, 0.0])
-def test_a_step_is_ask_step_observe_and_shift(start: RolloutState, scale: float):
-    physics, features, com, wrench = by_hand(start, jnp.float32(scale))
+def test_a_step_applies_the_residual_simulates_and_updates_the_history(start: RolloutState, scale: float):
+    physics, features, com, wrench = written_out(start, jnp.float32(scale))
     after = stepped(start, jnp.float32(scale))
     for found, expected in zip(after.state.physics, physics, strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-5)
@@ -90,13 +90,13 @@ def test_a_step_is_ask_step_observe_and_shift(start: RolloutState, scale: float)
     np.testing.assert_array_equal(after.state.commands, jnp.stack([start.commands[1], COMMAND]))
     if scale == 1.0:
         whole = jax.jit(lambda state: SIMULATOR.with_residual(BoundResidual(Springs(), PARAMS)).step(state, COMMAND))
-        np.testing.assert_allclose(whole(start).state.physics.qvel, physics.qvel, atol=1e-4)  # another program
+        np.testing.assert_allclose(whole(start).state.physics.qvel, physics.qvel, atol=1e-4)  # another compiled program
         plain = jax.jit(lambda state: SIMULATOR.with_residual(None).step(state, COMMAND))
         assert np.abs(plain(start).state.physics.qvel - physics.qvel).max() > 1e-3
 
 
-def test_further_wrenches_and_residuals_add_up(start: RolloutState):
-    """Two residuals in a row, a scaled wrench and another one on the base: their sum pushes."""
+def test_wrenches_of_residuals_and_actions_add_up(start: RolloutState):
+    """The wrench is the sum of two residuals, a scaled wrench and another one on the base."""
 
     def both(simulator: Simulator | AugmentedSimulator) -> AugmentedSimulator:
         return simulator.with_residual(BoundResidual(Springs(), PARAMS)).with_residual(BoundResidual(PlainPush(), 0.02))
@@ -115,7 +115,7 @@ def test_further_wrenches_and_residuals_add_up(start: RolloutState):
         altered.with_residual(BoundResidual(Springs(), PARAMS))
 
 
-def test_numbers_that_are_not_finite_keep_the_earlier_state(start: RolloutState):
+def test_a_state_that_is_not_finite_is_replaced_by_the_earlier_state(start: RolloutState):
     broken = start._replace(physics=start.physics._replace(qvel=start.physics.qvel.at[0].set(jnp.nan)))
     instead = start.features + 1.0
     kept, finite = broken.keep_finite(start, instead)
@@ -127,7 +127,7 @@ def test_numbers_that_are_not_finite_keep_the_earlier_state(start: RolloutState)
     np.testing.assert_array_equal(same.features, start.features)
 
 
-def test_names_say_where_features_stand():
+def test_layout_names_the_features():
     model = SIMULATOR.mj_model
     rng = np.random.default_rng(0)
     qpos = ROBOT.adapter.initial_qpos(ROBOT, model)

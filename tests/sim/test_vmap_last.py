@@ -1,4 +1,4 @@
-"""Does a batch along the last axis give what `jax.vmap` gives?"""
+"""`vmap` with the batch along the last axis agrees with `jax.vmap`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def symmetric(x: Any) -> Any:
 
 
 def countdown(x: Any) -> Any:
-    """As many steps as the number says, another one for each of the batch."""
+    """Run a loop whose number of steps differs within the batch."""
     return jax.lax.while_loop(lambda c: c[0] > 0.3, lambda c: (c[0] - 0.2, c[1] + c[0] ** 2), (x[0, 0], 0.0))
 
 
@@ -78,7 +78,7 @@ def assert_same(found: Any, expected: Any, tolerance: float = 1e-5) -> None:
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_same_as_vmap(name: str):
+def test_results_agree_with_vmap(name: str):
     function = FUNCTIONS[name]
     x = jax.random.normal(jax.random.key(1), (SIZE, 3, 3))
     assert_same(jax.jit(nested_vmap(function))(x), jax.vmap(function)(x))
@@ -94,7 +94,7 @@ def test_large_batches_run_in_parts(size: int, monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize("name", ["products", "solve", "scan", "gather and scatter"])
-def test_derivatives_are_the_same(name: str):
+def test_derivatives_agree_with_vmap(name: str):
     function = FUNCTIONS[name]
     x, change = jax.random.normal(jax.random.key(2), (2, SIZE, 3, 3))
     ours, theirs = (jax.jvp(f, (x,), (change,)) for f in (nested_vmap(function), jax.vmap(function)))
@@ -102,8 +102,8 @@ def test_derivatives_are_the_same(name: str):
 
 
 @pytest.mark.parametrize("name", ["products", "solve", "scan", "gather and scatter"])
-def test_batches_within_a_batch(name: str, monkeypatch: pytest.MonkeyPatch):
-    """Derivatives of each along many directions; in parts."""
+def test_nested_batches_agree_with_vmap(name: str, monkeypatch: pytest.MonkeyPatch):
+    """The inner batch has derivatives along several directions. The outer batch runs in parts."""
     monkeypatch.setattr(vmap_last, "_WIDEST", 8)
     x, changes = jax.random.normal(jax.random.key(7), (SIZE, 3, 3)), jax.random.normal(jax.random.key(8), (4, 3, 3))
 
@@ -113,7 +113,7 @@ def test_batches_within_a_batch(name: str, monkeypatch: pytest.MonkeyPatch):
     assert_same(jax.jit(nested_vmap(function, inner=4))(x), jax.vmap(function)(x), 1e-4)
 
 
-def test_arguments_without_a_batch():
+def test_arguments_without_a_batch_are_shared():
     def function(shared: Any, own: Any) -> Any:
         return {"sum": shared["a"] + own, "product": shared["m"] @ own, "shared": shared["m"].T}
 
@@ -126,7 +126,7 @@ def test_arguments_without_a_batch():
     assert_same((found["sum"], found["product"]), (expected["sum"], expected["product"]))
 
 
-def test_what_a_loop_leaves_alone_gets_no_batch():
+def test_loop_variables_independent_of_the_batch_get_no_batch():
     def function(own: Any, shared: Any) -> Any:
         def step(number: Any, carry: Any) -> Any:
             return carry[0] + own * number, 2 * carry[1]
@@ -138,8 +138,8 @@ def test_what_a_loop_leaves_alone_gets_no_batch():
     assert summed.shape == (SIZE, 2) and doubled.tolist() == [8.0, 8.0]
 
 
-def test_derivatives_along_many_directions_leave_the_values_alone():
-    """As `jax.jacfwd` does, whose values must not get the directions' batch."""
+def test_values_beside_a_jacobian_get_no_batch():
+    """`jax.jacfwd` batches directions of derivatives. Values must not get this batch."""
     x = jax.random.normal(jax.random.key(6), (3, 3))
     jacobian, value = jax.jacfwd(lambda x: (vmap_with_trailing_batch(halving)(x)[0],) * 2, has_aux=True)(x)
     assert_same(value, halving(x)[0])
@@ -148,7 +148,7 @@ def test_derivatives_along_many_directions_leave_the_values_alone():
 
 @pytest.fixture(scope="module")
 def robots() -> tuple[mjx.Model, mjx.Data, PhysicsState, Any, int]:
-    """Eight robots that stand, fall and fly, with their commands."""
+    """Eight robots on and slightly above the floor, with their commands."""
     model = load_model()
     rng = np.random.default_rng(0)
     qpos = np.tile(standing_qpos(model), (8, 1))
@@ -158,7 +158,7 @@ def robots() -> tuple[mjx.Model, mjx.Data, PhysicsState, Any, int]:
     return put_model(model), make_data(model), state, command, model.body("balloon").id
 
 
-def test_a_batch_of_robots_moves_as_each_alone(robots: tuple[mjx.Model, mjx.Data, PhysicsState, Any, int]):
+def test_robots_in_a_batch_move_as_single_robots(robots: tuple[mjx.Model, mjx.Data, PhysicsState, Any, int]):
     model, template, state, command, balloon = robots
 
     def step(model: mjx.Model, state: PhysicsState, command: Any, lift: Any) -> PhysicsState:

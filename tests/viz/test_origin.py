@@ -1,4 +1,4 @@
-"""The live viewer is for its own page: web pages of other origins cannot talk to it."""
+"""The live viewer accepts connections from local pages and programs, and refuses web pages of other origins."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def server() -> Iterator[LocalServer]:
 
 
 def talk(server: LocalServer, origin: str | None) -> bytes | str:
-    """The first message that a page of an origin is sent; None: a client that is no browser."""
+    """Return the first message from the server to a page of an origin. None for a client that is not a browser."""
     protocol = Subprotocol(f"viser-v{importlib.metadata.version('viser')}")
     headers = {} if origin is None else {"Origin": origin}
     with connect(
@@ -34,7 +34,7 @@ def talk(server: LocalServer, origin: str | None) -> bytes | str:
 
 
 @pytest.mark.parametrize("origin", ["http://127.0.0.1:{port}", "http://localhost:{port}", "http://localhost:9", None])
-def test_its_own_page_and_programs_are_let_in(server: LocalServer, origin: str | None):
+def test_its_own_page_and_local_programs_can_connect(server: LocalServer, origin: str | None):
     assert talk(server, None if origin is None else origin.format(port=server.get_port()))
 
 
@@ -43,12 +43,12 @@ def test_its_own_page_and_programs_are_let_in(server: LocalServer, origin: str |
     ["http://example.org", "https://127.0.0.1:{port}", "http://127.0.0.2:{port}", "file://", "null",
      "http://127.0.0.1:{port}.example.org", "http://example.org:{port}"],
 )  # fmt: skip
-def test_other_pages_are_refused(server: LocalServer, origin: str):
+def test_pages_of_other_origins_are_refused(server: LocalServer, origin: str):
     with pytest.raises(InvalidStatus, match="403"):
         talk(server, origin.format(port=server.get_port()))
 
 
-def test_a_port_that_the_system_gives_is_guarded_too():
+def test_a_port_chosen_by_the_system_also_refuses_other_origins():
     server = serve(0)
     try:
         assert talk(server, f"http://127.0.0.1:{server.get_port()}")

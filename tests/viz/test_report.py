@@ -1,4 +1,4 @@
-"""What is shown of a run: the page and its numbers, the replay in a real browser, the live viewer, the video."""
+"""Views of a run: the report page and its numbers, the replay in a real browser, the live viewer and the video."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ SECONDS = 25.0
 
 
 def walk(states: int, speed: float, turn: float, seed: int) -> np.ndarray:
-    """A robot that goes ahead, turns and moves its legs; its noise leaves nothing for packing."""
+    """Return states of a robot that walks ahead, turns and moves its legs. Noise makes them hard to compress."""
     time = np.arange(states) * CONTROL_TIMESTEP
     qpos = np.tile(standing_qpos(load_model()), (states, 1))
     qpos[:, 0] += speed * time
@@ -88,7 +88,7 @@ def errors(name: str, seed: int) -> Errors:
 
 
 def write_run(folder: Path, takes: list[StoredRollout]) -> Path:
-    """The folder of an EnvMimic run, as training leaves it, but for checkpoints and figures."""
+    """Write the folder of an EnvMimic run as training does, without checkpoints and figures."""
     sections = {"env": EnvMimicConfig(), "ppo": PPOConfig(), "data": train_envmimic.Data(output=Path(HOSTILE))}
     with Run(folder, describe_run("envmimic", sections, {}, [])) as run:
         for step in range(0, 500, 100):
@@ -103,7 +103,7 @@ def write_run(folder: Path, takes: list[StoredRollout]) -> Path:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run on four recordings of the bundled ones' length; the second has a hostile name, of a hostile robot."""
+    """A run on four recordings as long as the bundled ones. The names of the second and of its robot are hostile."""
     names = ("near-1", HOSTILE, "far-1", "far-2")
     states = round(SECONDS / CONTROL_TIMESTEP)
     takes = [take(name, states, 10 * i, HOSTILE if i == 1 else "virtual") for i, name in enumerate(names)]
@@ -122,7 +122,7 @@ def page(run: Path) -> Path:
 
 
 class Elements(html.parser.HTMLParser):
-    """Every element of a page with its attributes, scripts with their text."""
+    """Parser of the elements of a page and their attributes."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -136,7 +136,7 @@ class Elements(html.parser.HTMLParser):
 # ---- the page ----
 
 
-def test_page_is_small_and_refers_to_nothing_outside(page: Path):
+def test_page_is_small_and_has_no_external_references(page: Path):
     text = page.read_text(encoding="utf-8")
     assert len(text.encode()) < LARGEST_PAGE
     elements = Elements(text).elements
@@ -149,7 +149,7 @@ def test_page_is_small_and_refers_to_nothing_outside(page: Path):
     assert "default-src 'none'" in (policy or "") and "http" not in (policy or "")
 
 
-def test_numbers_are_those_of_the_evaluation(run: Path, page: Path):
+def test_numbers_agree_with_the_evaluation(run: Path, page: Path):
     stored = json.loads((run / "evaluation.json").read_text())
     shown = [a["title"] for tag, a in Elements(page.read_text()).elements if tag == "td" and "title" in a]
     expected: list[float] = []
@@ -164,7 +164,7 @@ def test_numbers_are_those_of_the_evaluation(run: Path, page: Path):
     assert [float(value or "nan") for value in shown] == expected
 
 
-def test_curves_and_plots_are_those_of_the_run(run: Path):
+def test_curves_and_plots_agree_with_the_run(run: Path):
     content = report_content.collect(run)
     assert [(curve.title, *curve.values) for curve in content.curves] == [
         ("reward per control step", "envmimic"),
@@ -174,15 +174,15 @@ def test_curves_and_plots_are_those_of_the_run(run: Path):
     rows = dict(report._take_rows(content.takes[0]))
     assert [line.name for line in rows["x (m)"]] == ["recording", "vanilla", "EnvMimic"]
     assert [line.colour for line in rows["x (m)"]] == ["#000000", "#d55e00", "#009e73"]
-    # 25 s at 0.10 m/s; a quaternion of half the angle turns by 2 x 25 / 40 rad.
-    way = rows["x (m)"][0].y
-    assert way[-1] - way[0] == pytest.approx(2.5, abs=0.15)
+    # 25 s at 0.10 m/s. The quaternion has half the angle, so the robot turns by 2 x 25 / 40 rad.
+    path = rows["x (m)"][0].y
+    assert path[-1] - path[0] == pytest.approx(2.5, abs=0.15)
     yaw = rows["yaw (deg)"][0].y
     assert yaw[-1] - yaw[0] == pytest.approx(np.rad2deg(2 * 25 / 40), abs=3.0)
     assert len(rows["residual force (N)"]) == 3 and len(rows["command"]) == 2
 
 
-def test_options_and_names_are_shown_as_text(run: Path, page: Path):
+def test_options_and_names_are_escaped(run: Path, page: Path):
     elements = Elements(page.read_text()).elements
     assert not [a for tag, a in elements if tag == "img" or "onerror" in a]
     content = report_content.collect(run)
@@ -191,7 +191,7 @@ def test_options_and_names_are_shown_as_text(run: Path, page: Path):
 
 
 class Bomb:
-    """Loading it leaves a file."""
+    """Object that creates a file when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -201,7 +201,7 @@ class Bomb:
 
 
 @pytest.mark.parametrize(
-    ("damage", "says"),
+    ("damage", "message"),
     [
         (
             lambda arrays, path: arrays | {"0/qpos/vanilla": np.array([Bomb(path)], object)},
@@ -215,7 +215,7 @@ class Bomb:
         (lambda arrays, path: arrays | {"format": np.array("other/1")}, "the format is not ballu-replay/2"),
     ],
 )
-def test_damaged_replay_is_refused(short: Path, tmp_path: Path, capsys, damage: Callable, says: str):
+def test_damaged_replay_is_refused(short: Path, tmp_path: Path, capsys, damage: Callable, message: str):
     folder = shutil.copytree(short, tmp_path / "run")
     with np.load(folder / ROLLOUT_FILE) as file:
         arrays: dict[str, np.ndarray] = {name: file[name] for name in file.files}
@@ -223,12 +223,12 @@ def test_damaged_replay_is_refused(short: Path, tmp_path: Path, capsys, damage: 
     for command in (main, view.main):
         assert command([str(folder)]) == 2
         error = capsys.readouterr().err
-        assert says in error and ROLLOUT_FILE in error and error.count("\n") == 1
+        assert message in error and ROLLOUT_FILE in error and error.count("\n") == 1
     assert not (tmp_path / "exploded").exists()
     assert not (folder / report.REPORT_FILE).exists()
 
 
-def test_file_that_is_no_archive_is_refused(tmp_path: Path):
+def test_a_replay_file_that_is_not_an_archive_is_refused(tmp_path: Path):
     single = io.BytesIO()
     np.save(single, np.zeros(3))
     for content in (b"", b"PK\x03\x04 cut off", b"\x80\x04\x95 pickle", single.getvalue()):
@@ -237,7 +237,7 @@ def test_file_that_is_no_archive_is_refused(tmp_path: Path):
             read_rollouts(tmp_path / ROLLOUT_FILE)
 
 
-def test_replay_comes_back_in_single_precision(tmp_path: Path):
+def test_replay_is_stored_in_single_precision(tmp_path: Path):
     takes = [take("a", 30), dataclasses.replace(take("b", 12, 5), command=None, force=None)]
     write_rollouts(tmp_path / ROLLOUT_FILE, takes)
     for found, expected in zip(read_rollouts(tmp_path / ROLLOUT_FILE), takes, strict=True):
@@ -251,17 +251,17 @@ def test_replay_comes_back_in_single_precision(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (["{}/nowhere"], "there is no run"),
         (["{}", "--output", "{}"], "is a folder; give a file"),
         (["{}", "--show", "far-9"], "there is no such replay; give one of near-1"),
     ],
 )
-def test_what_cannot_be_reported_is_refused(short: Path, capsys, arguments: list[str], says: str):
+def test_report_refuses_unsuitable_arguments(short: Path, capsys, arguments: list[str], message: str):
     assert main([argument.format(short) for argument in arguments]) == 2
     error = capsys.readouterr().err
-    assert says in error and error.count("\n") == 1
+    assert message in error and error.count("\n") == 1
 
 
 def test_damaged_evaluation_is_refused(short: Path, tmp_path: Path, capsys):
@@ -273,7 +273,7 @@ def test_damaged_evaluation_is_refused(short: Path, tmp_path: Path, capsys):
         assert "evaluation.json: " in error and "writes it again" in error and error.count("\n") == 1
 
 
-def test_story_shows_its_tables_and_policies_over_each_other(tmp_path: Path):
+def test_report_of_the_pipeline_shows_tables_and_overlaid_policies(tmp_path: Path):
     transfer = Transfer(*np.arange(1.0, 12.0))
     results = {"vanilla+dr": [[transfer]], "envmimic": [[transfer]], HOSTILE: [[transfer]]}
     pipeline_layout.table_file(tmp_path, "walk").write_text(walking_table(results))
@@ -301,7 +301,8 @@ def test_story_shows_its_tables_and_policies_over_each_other(tmp_path: Path):
     assert [list(curve.values) for curve in content.curves] == [["vanilla+dr", "envmimic", "envmimic-2"]]
     text = report.render(content)
     assert "EnvMimic, round 2" in text
-    assert re.search(r"<td>vanilla\+dr</td>\s*<td[^>]*>1\.00</td>\s*<td[^>]*>1\.24</td>", text)  # ours, and the paper's
+    # Our value and the paper's are in neighbouring cells.
+    assert re.search(r"<td>vanilla\+dr</td>\s*<td[^>]*>1\.00</td>\s*<td[^>]*>1\.24</td>", text)
     assert "hacked" not in " ".join(str(a) for tag, a in Elements(text).elements if tag == "img")
     assert "<img src=x" not in text
 
@@ -309,7 +310,7 @@ def test_story_shows_its_tables_and_policies_over_each_other(tmp_path: Path):
 # ---- geometry ----
 
 
-def test_shape_stands_on_the_floor_as_high_as_the_model():
+def test_shape_has_the_height_of_the_model_and_stands_on_the_floor():
     model = load_model()
     qpos = standing_qpos(model)
     poses = robot_meshes.poses(model, load_robot(), qpos[None])
@@ -333,7 +334,7 @@ def test_shape_stands_on_the_floor_as_high_as_the_model():
     assert {part.body for part in robot_meshes.parts(model)} == set(range(1, model.nbody))
 
 
-def test_mujoco_scene_holds_every_robot_in_its_colour_and_the_force():
+def test_mujoco_scene_shows_robots_in_their_colours_and_the_force():
     model = load_model()
     data = mujoco.MjData(model)
     scene = mujoco.MjvScene(model, 500)
@@ -355,18 +356,18 @@ def test_mujoco_scene_holds_every_robot_in_its_colour_and_the_force():
 # ---- in the browser ----
 
 _PATIENCE = 120.0
-"""Seconds that the browser is waited for."""
+"""Longest time to wait for the browser (s)."""
 
 
 @pytest.fixture
 def browser() -> Iterator[Any]:
-    """Chromium without a screen, its console and network listened to."""
+    """Headless Chromium with logs of its console and network."""
     chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     driver = shutil.which("chromedriver")
     if chromium is None or driver is None:
         pytest.skip("no Chromium here: apt-get install chromium chromium-driver")
-    if "PYTEST_XDIST_WORKER" in os.environ:  # without a graphics card it loses its canvas beside tests that compile
-        pytest.skip("wants the machine to itself: pytest --numprocesses=0 tests/viz/test_report.py -k browser")
+    if "PYTEST_XDIST_WORKER" in os.environ:  # rendering without a GPU fails while other tests use the processors
+        pytest.skip("needs the machine to itself: pytest --numprocesses=0 tests/viz/test_report.py -k browser")
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service
 
@@ -383,7 +384,7 @@ def browser() -> Iterator[Any]:
         options.add_argument(argument)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     chrome = webdriver.Chrome(options=options, service=Service(driver))
-    chrome.implicitly_wait(_PATIENCE)  # a busy machine takes its time to draw a page
+    chrome.implicitly_wait(_PATIENCE)  # a busy machine draws slowly
     try:
         yield chrome
     finally:
@@ -391,10 +392,10 @@ def browser() -> Iterator[Any]:
 
 
 def wait(found: Callable[[], Any]) -> Any:
-    """What `found` returns as soon as it is true."""
+    """Wait until `found` returns a true value, and return it."""
     end = time.monotonic() + _PATIENCE
     while not (value := found()):
-        assert time.monotonic() < end, "nothing happened"
+        assert time.monotonic() < end, "the browser did not respond in time"
         time.sleep(0.2)
     return value
 
@@ -407,8 +408,8 @@ return [frame.left + canvas.left, frame.top + canvas.top, frame.left + canvas.ri
 
 
 def picture(chrome: Any) -> np.ndarray:
-    """Pixels of what the player shows, inside of its frame: cut out of the window, for the driver now and then fails to
-    picture an element of a frame on a busy machine."""
+    """Return the pixels of the player, from within its frame. They are cut out of a screenshot of the window, because
+    the driver sometimes fails to capture an element of a frame on a busy machine."""
     window = Image.open(io.BytesIO(chrome.get_screenshot_as_png())).convert("RGB")
     left, top, right, bottom = map(round, chrome.execute_script(_CANVAS))
     shown = window.crop((max(left, 0), max(top, 0), min(right, window.width), min(bottom, window.height)))
@@ -416,7 +417,7 @@ def picture(chrome: Any) -> np.ndarray:
 
 
 def clock(chrome: Any) -> float:
-    """The time that the player shows, inside of its frame."""
+    """Return the time (s) that the player shows, from within its frame."""
     return float(wait(lambda: chrome.execute_script("return document.querySelector('input')?.value")))
 
 
@@ -433,7 +434,7 @@ def test_page_plays_in_a_browser(page: Path, browser: Any, tmp_path: Path):
     wait(lambda: clock(browser) > 0.5)
 
     def colours(pixels: np.ndarray) -> dict[str, int]:
-        """Pixels in a robot's colour, whatever shines through."""
+        """Return the number of pixels in each robot's colour, with a tolerance for transparency."""
         red, green, blue = pixels.reshape(-1, 3).T
         return {
             "recording": int(np.sum((red < 70) & (green < 70) & (blue < 70))),
@@ -446,7 +447,7 @@ def test_page_plays_in_a_browser(page: Path, browser: Any, tmp_path: Path):
     play.click()
 
     def changed(since: np.ndarray) -> float:
-        """Part of the pixels."""
+        """Return the fraction of pixels that changed."""
         return float(np.mean(np.abs(picture(browser) - since).max(axis=-1) > 30))
 
     def settled() -> bool:
@@ -454,7 +455,7 @@ def test_page_plays_in_a_browser(page: Path, browser: Any, tmp_path: Path):
         time.sleep(0.5)
         return changed(before) < 1e-4
 
-    wait(settled)  # the frame that was being drawn
+    wait(settled)  # the last frame may still be drawn
     stopped, still = clock(browser), picture(browser)
     time.sleep(1.0)
     assert clock(browser) == stopped
@@ -464,7 +465,7 @@ def test_page_plays_in_a_browser(page: Path, browser: Any, tmp_path: Path):
     wait(lambda: abs(clock(browser) - stopped) > 0.5)
     wait(lambda: changed(still) > 0.002)
     slider = browser.find_element(By.CSS_SELECTOR, ".mantine-Slider-root")
-    side = -1 if stopped > SECONDS / 2 else 1  # a busy machine may have played on to anywhere
+    side = -1 if stopped > SECONDS / 2 else 1  # the other half of the replay, which a busy machine may have reached
     ActionChains(browser).move_to_element_with_offset(slider, side * slider.size["width"] // 4, 0).click().perform()
     scrubbed = SECONDS / 2 + side * SECONDS / 4
     wait(lambda: abs(clock(browser) - scrubbed) < 1.0)
@@ -477,7 +478,7 @@ def test_page_plays_in_a_browser(page: Path, browser: Any, tmp_path: Path):
     browser.find_elements(By.CSS_SELECTOR, "[data-take]")[1].click()
     assert browser.execute_script("return JSON.stringify(document.getElementById('plots').data[0].y)") != before
     browser.switch_to.frame(browser.find_element(By.ID, "stage"))
-    wait(lambda: abs(clock(browser) - scrubbed) > 1.5)  # the other one plays from its start
+    wait(lambda: abs(clock(browser) - scrubbed) > 1.5)  # the other replay starts at its beginning
     assert browser.execute_script("return window.hacked") is None
     browser.switch_to.default_content()
     assert browser.execute_script("return window.hacked") is None
@@ -499,11 +500,11 @@ def listening(host: str, port: int) -> bool:
         return client.connect_ex((host, port)) == 0
 
 
-def test_live_viewer_plays_and_serves_this_machine_alone():
+def test_live_viewer_plays_and_accepts_only_local_connections():
     server = viser_scene.serve(0)
     try:
         assert listening("127.0.0.1", server.get_port())
-        # Another of this machine's addresses, where a server for all of them would answer.
+        # A server on all addresses of the machine would also answer here.
         assert not listening("127.0.0.2", server.get_port())
         assert server.request_share_url() is None
         player = view.Player(server, [take("near-1", 41), take(HOSTILE, 21, 7)], 0)
@@ -522,7 +523,7 @@ def test_live_viewer_plays_and_serves_this_machine_alone():
         player.play.value = True
         for _ in range(2):
             player.advance(5.0)
-        assert player.state == 0  # from the start again
+        assert player.state == 0  # restarted
         player.take.value = HOSTILE
         player.advance(0.0)
         assert player.clock.max == pytest.approx(1.0) and player.state == 0
@@ -530,13 +531,13 @@ def test_live_viewer_plays_and_serves_this_machine_alone():
         server.stop()
 
 
-def test_suspended_recording_has_nothing_to_view(capsys):
+def test_view_refuses_a_suspended_recording(capsys):
     assert view.main([str(list_bundled("suspended")[0])]) == 2
     assert "is a suspended recording" in capsys.readouterr().err
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere there is a screen always")
-def test_mujoco_viewer_without_a_screen_is_one_line(short: Path):
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux runs without a screen")
+def test_mujoco_viewer_without_a_screen_gives_a_one_line_error(short: Path):
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
     line = [sys.executable, "-m", "ballu_mjx", "view", str(short), "--mujoco"]
     done = subprocess.run(line, capture_output=True, text=True, env=environment, timeout=300)
@@ -570,7 +571,7 @@ def test_video_shows_the_robots(short: Path):
     assert np.mean(np.abs(pictures[0] - pictures[-1]).max(axis=-1) > 40) > 0.002
 
 
-def test_without_opengl_the_page_is_written_and_one_line_says_what_is_missing(short: Path):
+def test_without_opengl_the_page_is_written_with_a_one_line_warning(short: Path):
     (short / report.REPORT_FILE).unlink(missing_ok=True)
     done = command(short, MUJOCO_GL="disable")
     assert done.returncode == 0

@@ -1,4 +1,4 @@
-"""Colours and labels: every simulator that the commands can make has its own, and every figure draws it."""
+"""Colours and labels of simulators: each simulator has its own, and every figure uses them."""
 
 import itertools
 from pathlib import Path
@@ -17,7 +17,7 @@ RESIDUALS = ("envmimic", "supervised", "analytic", "aerodynamic")
 SUMS = ["+".join(pair) for pair in itertools.product(RESIDUALS, RESIDUALS)]
 
 
-def test_every_simulator_has_a_colour_of_its_own():
+def test_every_simulator_has_its_own_colour():
     names = [*RESIDUALS, *SUMS, "vanilla", "vanilla+sysid", "vanilla+dr", "vanilla+sysid+dr", "envmimic-2", "recording"]
     for one, other in itertools.combinations(names, 2):
         assert np.linalg.norm(np.subtract(colour_of(one), colour_of(other))) > 0.1, (one, other)
@@ -26,12 +26,12 @@ def test_every_simulator_has_a_colour_of_its_own():
 
 
 @pytest.mark.parametrize("name", ["", "+", "vanilla+", "nobody", "envmimic-0", "a+b+c", "supervised-7"])
-def test_every_name_has_a_colour_that_stays(name: str):
+def test_unknown_names_have_a_constant_colour(name: str):
     assert colour_of(name) == colour_of(name) and all(0 <= part <= 1 for part in colour_of(name))
     assert label_of(name) == name
 
 
-def test_later_rounds_are_paler():
+def test_later_rounds_have_paler_colours():
     first, second, third = (colour_of(name) for name in ("envmimic", "envmimic-2", "envmimic-3"))
     assert all(a <= b <= c for a, b, c in zip(first, second, third, strict=True)) and sum(first) < sum(third)
     assert label_of("envmimic-3") == "EnvMimic, round 3"
@@ -39,21 +39,21 @@ def test_later_rounds_are_paler():
 
 @pytest.mark.parametrize("name", [*SUMS, "aerodynamic+envmimic+analytic", "nobody"])
 def test_every_figure_draws_every_combination(name: str, tmp_path: Path):
-    """A residual on another one's run used to end in a KeyError after the training."""
+    """A residual learned on top of another one once caused a KeyError after training."""
     time, steps = np.arange(30) * 0.05, np.arange(1.0, 5.0)
-    way = np.column_stack([time, 0.1 * time, 0.0 * time])
-    panel = plots.TrackingPanel("near-1", time, way, {"vanilla+sysid": 0.9 * way, name: 1.1 * way})
+    path = np.column_stack([time, 0.1 * time, 0.0 * time])
+    panel = plots.TrackingPanel("near-1", time, path, {"vanilla+sysid": 0.9 * path, name: 1.1 * path})
     plots.tracking(tmp_path / "tracking.png", [panel])
     plots.reward_curve(tmp_path / "reward.png", steps, steps, steps, steps, name)
     plots.fit_curve(tmp_path / "fit.png", {"training": (steps, steps)}, (steps, steps), "error", name, 2)
-    ballu_plots.draw_trajectories(tmp_path / "ways.png", [way], [1.2 * way], name)
+    ballu_plots.draw_trajectories(tmp_path / "trajectories.png", [path], [1.2 * path], name)
     expected = np.round(255 * np.array(colour_of(name)))
-    for picture in ("tracking", "reward", "fit", "ways"):
+    for picture in ("tracking", "reward", "fit", "trajectories"):
         pixels = np.asarray(Image.open(tmp_path / f"{picture}.png").convert("RGB")).reshape(-1, 3).astype(float)
         assert np.sum(np.abs(pixels - expected).max(axis=1) < 3) > 50, picture
 
 
-def test_names_of_simulators_are_read_back():
+def test_names_of_simulator_variants_are_parsed():
     variants = [
         SimulatorVariant(),
         SimulatorVariant(identified=True),

@@ -1,4 +1,4 @@
-"""Robots that are not BALLU, looked at: their shapes, and every command on a run of the tethered balloon."""
+"""Viewing of robots that are not BALLU: shapes, replays, and every command on a run of the tethered balloon."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BALLOON = Path(__file__).parents[2] / "experiments" / "tethered_balloon" / "ball
 
 
 def swing(robot: RobotDescription, states: int, seed: int) -> StoredRollout:
-    """A robot whose joints swing, recorded and simulated."""
+    """Return a rollout of a robot whose joints swing, as recording and in two simulators."""
     rng, model = np.random.default_rng(seed), robot.load_model()
     time = np.arange(states) * robot.control_timestep
     first = 0 if robot.anchored else 7
@@ -55,7 +55,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_replay_of_any_robot_comes_back(tmp_path: Path):
+def test_replays_of_any_robot_are_read_back(tmp_path: Path):
     for robot in (read_description(BALLOON), write_rover(tmp_path)):
         stored = swing(robot, 12, 1)
         write_rollouts(tmp_path / "replay.npz", [stored])
@@ -67,7 +67,7 @@ def test_replay_of_any_robot_comes_back(tmp_path: Path):
         np.testing.assert_allclose(found.command, stored.command, atol=1e-5)
 
 
-def test_replay_of_a_robot_that_has_changed_is_refused(tmp_path: Path):
+def test_replay_of_a_changed_robot_is_refused(tmp_path: Path):
     robot = write_rover(tmp_path)
     write_rollouts(tmp_path / "replay.npz", [swing(robot, 12, 1)])
     robot.model.write_text(robot.model.read_text().replace('mass="1.5"', 'mass="1.6"'))
@@ -84,17 +84,17 @@ def test_replay_of_a_robot_that_has_changed_is_refused(tmp_path: Path):
         read_rollouts(tmp_path / "replay.npz")
 
 
-def test_rollouts_of_two_robots_are_no_file(tmp_path: Path):
+def test_rollouts_of_two_robots_in_one_file_are_refused(tmp_path: Path):
     with pytest.raises(ValueError, match="one robot"):
         write_rollouts(tmp_path / "x.npz", [swing(read_description(BALLOON), 5, 0), swing(write_rover(tmp_path), 5, 0)])
 
 
-def test_shapes_of_primitives_and_meshes_are_the_model_s(tmp_path: Path):
-    """Every vertex of each kind of geom is on or within what MuJoCo takes for its bounds, and reaches them."""
+def test_shapes_of_primitives_and_meshes_agree_with_the_model(tmp_path: Path):
+    """The bounds of the vertices of each kind of geom are those that MuJoCo computes."""
     robot = write_rover(tmp_path)
     model = robot.load_model()
     parts = {model.body(part.body).name: part for part in robot_meshes.parts(model)}
-    assert set(parts) == {"hull", "arm", "rod", "lid"}  # not the floor
+    assert set(parts) == {"hull", "arm", "rod", "lid"}  # without the floor
     for name, part in parts.items():
         geom = int(np.flatnonzero(model.geom_bodyid == model.body(name).id)[0])
         rotation = np.zeros(9)
@@ -112,7 +112,7 @@ def test_shapes_of_primitives_and_meshes_are_the_model_s(tmp_path: Path):
     }
 
 
-def test_force_stands_on_the_tracked_body_and_is_scaled_by_the_robot(tmp_path: Path):
+def test_force_arrow_starts_at_the_tracked_body_and_scales_with_the_robot(tmp_path: Path):
     for robot in (read_description(BALLOON), write_rover(tmp_path)):
         shapes, rollout = robot_meshes.RobotShapes(robot), swing(robot, 5, 2)
         data = mujoco.MjData(shapes.model)
@@ -123,12 +123,12 @@ def test_force_stands_on_the_tracked_body_and_is_scaled_by_the_robot(tmp_path: P
         np.testing.assert_allclose(poses.pushed[3], data.xipos[body], atol=1e-9)
         np.testing.assert_allclose(poses.tracked[3], data.site(robot.tracked).xpos, atol=1e-9)
         weight = 9.81 * shapes.model.body_mass.sum()
-        # The force of 6.5 % of the weight is as long as the robot.
+        # A force of 6.5 % of the weight has an arrow as long as the robot.
         assert shapes.arrow_scale * 0.065 * weight == pytest.approx(shapes.extent, rel=0.2)
         assert robot_meshes.pushed_robot(rollout) == "envmimic"
 
 
-def test_scene_of_any_robot_plays(tmp_path: Path):
+def test_scene_of_any_robot_is_played(tmp_path: Path):
     rollout = swing(write_rover(tmp_path), 10, 3)
     server = viser_scene.serve(0)
     try:
@@ -154,14 +154,14 @@ def test_view_of_the_tethered_balloon(run: Path):
     assert rollout.description.name == "tethered balloon" and rollout.qpos["envmimic"].shape == (30, 5)
 
 
-def test_export_of_a_residual_says_what_it_needs(run: Path, capsys: pytest.CaptureFixture[str]):
+def test_export_of_a_residual_as_a_policy_is_refused(run: Path, capsys: pytest.CaptureFixture[str]):
     assert export.main(["policy", str(run)]) == 2
     error = capsys.readouterr().err
     assert "is a residual (envmimic)" in error and "export that" in error and error.count("\n") == 1
     assert not (run / "export").exists()
 
 
-def test_replay_is_of_the_format_that_the_documentation_names(run: Path):
+def test_replay_has_the_documented_format(run: Path):
     with np.load(run / ROLLOUT_FILE) as file:
         assert str(file["format"]) == "ballu-replay/2" and str(file["robot/path"]).endswith("balloon.robot.json")
         assert json.loads((run / "config.json").read_text())["robot_description"]["sha256"] == str(file["robot/sha256"])
@@ -179,7 +179,7 @@ def test_a_rerun_file_holds_the_poses_of_every_robot(run: Path, tmp_path: Path):
     data = mujoco.MjData(model)
     data.qpos[:] = rollout.qpos["envmimic"][7]
     mujoco.mj_kinematics(model, data)
-    # Down the tree of bodies, as the viewer does.
+    # Compose the poses down the tree of bodies, as the viewer does.
     body, place, turn = model.nbody - 1, np.zeros(3), np.array([1.0, 0, 0, 0])
     above = [body]
     while model.body_parentid[above[0]] != 0:
@@ -197,9 +197,9 @@ def test_a_rerun_file_holds_the_poses_of_every_robot(run: Path, tmp_path: Path):
     assert f"/command/{rollout.description.commands[0]}" in chunks
 
 
-def test_without_rerun_one_line_says_what_to_install(run: Path, tmp_path: Path, monkeypatch, capsys):
+def test_missing_rerun_gives_one_line_with_the_package_to_install(run: Path, tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert view.main([str(run), "--rerun", str(tmp_path / "replay.rrd")]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1 and 'pip install -c constraints.txt -e ".[rerun]"' in told
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and 'pip install -c constraints.txt -e ".[rerun]"' in error
     assert view.main([str(run), "--rerun", "x.rrd", "--mujoco"]) == 2
