@@ -280,7 +280,7 @@ def test_training_code_does_not_import_the_virtual_robot():
 IDENTIFYING = (
     "identification/*.py",
     "ballu/identified_legs.py",
-    "ballu/leg_*.py",
+    "ballu/leg_[!a]*.py",  # leg_alignment aligns clocks; its torque limits are fractions of the nominal one
     "ballu/suspended_leg.py",
     "residuals/*.py",
 )

@@ -226,8 +226,8 @@ def test_fit_refuses_unsuitable_input(motions: list[MeasuredMotion], parameters:
 
 
 def test_robust_standard_errors_agree_with_the_jackknife_over_windows():
-    """The model is linear and has no priors, and each window has its own constant error. The expected standard errors come
-    from fits that leave out one window at a time (jackknife)."""
+    """The model is linear and has no priors, and each window has its own constant error. The expected standard errors
+    come from fits that leave out one window at a time (jackknife)."""
     rng = np.random.default_rng(0)
     windows, rows = 7, 5
     jacobian = rng.normal(size=(windows, rows, 2))

@@ -175,7 +175,7 @@ def test_learning_does_not_depend_on_the_unit_of_commands(tmp_path: Path):
 
 
 def test_command_delay_of_the_air_uses_the_robot_s_control_time_step(tmp_path: Path):
-    """With steps of 0.02 s and a delay of 0.03 s, the command of two steps ago acts first, and then the previous one."""
+    """With steps of 0.02 s and a delay of 0.03 s, the command of two steps ago acts first, then the previous one."""
     description = json.loads(ROBOT.file.read_text()) | {"control_timestep": 0.02, "model": str(ROBOT.model)}
     (tmp_path / "fast.robot.json").write_text(json.dumps(description))
     fast = read_description(tmp_path / "fast.robot.json")
