@@ -245,7 +245,7 @@ def test_help_lists_the_options_of_envmimic(folder: Path):
     assert done.returncode == 0
     for option in ("--quick", "--recordings", "--validation", "--test", "--seed", "--output", "--num-timesteps"):
         assert option in done.stdout
-    for option in ("--num-envs", "--resume", "--force-limit", "--learning-rate", "Adam's"):
+    for option in ("--num-envs", "--resume", "--force-limit", "--learning-rate", "of Adam"):
         assert option in done.stdout
 
 

@@ -8,6 +8,8 @@ import pytest
 import ballu_mjx as bm
 from ballu_mjx.recordings.recording import cut
 
+pytestmark = pytest.mark.optimized
+
 
 @pytest.fixture(scope="module")
 def simulator() -> bm.Simulator:
