@@ -45,7 +45,7 @@ from ballu_mjx.identification.batched_solver import BatchedSolver, Evaluate
 
 _PATIENCE = 4
 """Number of successive iterations without enough gain after which a search ends."""
-_WORTH = 1e-5
+_LEAST_GAIN = 1e-5
 """Smallest gain of an iteration, as a fraction of the loss. With thousands of samples, 1e-4 is 0.4 in chi-squared."""
 _FIRST_DAMPING = 5 * DEGREE
 """Unit of angles (rad) in a search, whose first Levenberg damping is 1 in this unit. In radians, weak directions would
@@ -107,7 +107,7 @@ class Identifier:
         self.physics = CompiledLeg(self.space, starts * len(SIDES), data, motion=config.motion)
         report("compiling", 1, 1, float("nan"))
         self._starts, self._size = starts, int(self.space.free.sum())
-        self._squares = BatchedSolver(_levenberg_marquardt(), _WORTH)
+        self._squares = BatchedSolver(_levenberg_marquardt(), _LEAST_GAIN)
         self._shape = BatchedSolver(optx.LBFGS(rtol=1e-5, atol=1e-5))
 
         def objective(angles: Array, command: Array, measured: Array) -> Array:

@@ -45,9 +45,9 @@ class BatchedSolver:
     tries next. MJX takes by far the longest to compile. It is thus compiled only once for all solvers and stages.
     """
 
-    def __init__(self, solver: Any, worth: float = 1e-4) -> None:
-        """`worth`: relative decrease of the loss below which an iteration counts as idle."""
-        self._worth = worth
+    def __init__(self, solver: Any, least_gain: float = 1e-4) -> None:
+        """`least_gain`: relative decrease of the loss below which an iteration counts as idle."""
+        self._least_gain = least_gain
         least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
 
         @jax.custom_jvp
@@ -98,7 +98,7 @@ class BatchedSolver:
         for iteration in range(steps):
             y, state, loss, done = self._step(y, evaluated, state)
             report(iteration + 1, steps, float(jnp.min(loss)))
-            idle = idle + 1 if bool(np.all(loss >= (1 - self._worth) * lowest)) else 0
+            idle = idle + 1 if bool(np.all(loss >= (1 - self._least_gain) * lowest)) else 0
             lowest = np.minimum(lowest, loss)
             if bool(jnp.all(done)) or idle == patience:
                 break

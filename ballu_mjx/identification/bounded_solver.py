@@ -42,7 +42,7 @@ def bounded_least_squares(
         tried = np.clip(point + change, 0.0, 1.0)
         new, new_slopes = evaluate(tried)
         gained = loss - float(new @ new)
-        idle = 0 if gained > _WORTH * loss else idle + 1
+        idle = 0 if gained > _LEAST_GAIN * loss else idle + 1
         if gained > 0:
             point, values, slopes, loss = tried, new, new_slopes, loss - gained
             damping, failed = damping * _BOLDER, 0
@@ -76,7 +76,7 @@ _LEAST = 1e-7
 """Smallest damping to which the factor of a failed step is applied."""
 _TINY = 1e-300
 """Damping that remains if the Jacobian is 0."""
-_WORTH = 1e-4
+_LEAST_GAIN = 1e-4
 """Relative decrease of the loss below which an evaluation counts as idle."""
 _PROMISED = 1e-8
 """Predicted relative decrease of the loss below which the search ends."""

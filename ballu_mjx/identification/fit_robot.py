@@ -229,12 +229,12 @@ def fit_robot(
             objective.rescale(objective.simulator.differences(parameters.nominal))
         searches, lowest = [], np.inf
 
-        def told(stage: str, before: int, whole: int, iteration: int, steps: int, value: float) -> None:
+        def report_search(stage: str, before: int, whole: int, iteration: int, steps: int, value: float) -> None:
             report(stage, before + iteration, whole, min(value, lowest))
 
         for number, begin in enumerate(parameters.draw(config.seed, config.starts)):
             search, before = WindowSearch(objective, objective.measured_start(), on_evaluation), number * config.steps
-            tell = partial(told, "search", before, config.starts * config.steps)
+            tell = partial(report_search, "search", before, config.starts * config.steps)
             found, loss = bounded_least_squares(search, parameters.shares(begin), config.steps, tell, _PATIENCE)
             lowest = min(lowest, loss)
             searches.append((loss, found, search))
@@ -243,7 +243,7 @@ def fit_robot(
         if config.reweigh:
             objective.rescale(best.residuals)
             best, lowest = WindowSearch(objective, best.start, on_evaluation), np.inf
-            tell = partial(told, "refinement", 0, config.steps)
+            tell = partial(report_search, "refinement", 0, config.steps)
             shares, _ = bounded_least_squares(best, shares, config.steps, tell, _PATIENCE)
             objective.rescale(best.residuals)
         values = parameters.at_shares(shares)

@@ -47,8 +47,8 @@ def summarize_recording(
     for spans, names in groups.items():
         lengths = [b - a + step for a, b in spans]
         shown = names[0] if len(names) == 1 else f"{names[0]} ... {names[-1]}"
-        told = f"{len(spans)} drop-outs, {sum(lengths):.2f} s in all, the longest {max(lengths):.2f} s"
-        lines.append(f"  {shown}: " + (told if len(spans) > 1 else f"1 drop-out of {lengths[0]:.2f} s"))
+        described = f"{len(spans)} drop-outs, {sum(lengths):.2f} s in all, the longest {max(lengths):.2f} s"
+        lines.append(f"  {shown}: " + (described if len(spans) > 1 else f"1 drop-out of {lengths[0]:.2f} s"))
     for sites, count in held_sites(recording):
         lines.append(f"  {sites}: {count} samples repeat the one before to the last digit; they count as not seen")
     if not gaps and not recording.held:

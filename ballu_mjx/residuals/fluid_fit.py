@@ -143,7 +143,7 @@ def fit_fluid_forces(
         search = _Search(windows, coefficients)
         # The search starts from the result for the previous set, whose entries come first.
         start = np.concatenate([vector, coefficients.start[len(vector) :]])
-        vector = search.run(start, config, lambda *told, name=name: report(f"{name}, {told[0]}", *told[1:]))
+        vector = search.run(start, config, lambda *progress, name=name: report(f"{name}, {progress[0]}", *progress[1:]))
         table = coefficients.table(vector)
         scores[name] = held_out.score(table)
         if config.terms in ("auto", name) and (best is None or scores[name] < best[0]):
@@ -262,7 +262,7 @@ class _Search:
                 evaluate,
                 vector[None],
                 config.steps,
-                lambda *told, seconds=seconds: report(f"windows of {seconds:g} s", *told),
+                lambda *progress, seconds=seconds: report(f"windows of {seconds:g} s", *progress),
                 patience=_PATIENCE,
             )
             vector = found[0]

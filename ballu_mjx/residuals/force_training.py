@@ -206,8 +206,8 @@ class _Supervised(_Fit):
         _, step, policy = best
         parts = {share: ppo.with_share(policy, share) for share in config.force_scales}
         errors = {share: self.validate(setup.with_policy(part)) for share, part in parts.items()}
-        told = ", ".join(f"{share:.0%}: {error:.2f}" for share, error in errors.items())
-        self.notes.append(f"Validation error by share of the forces (ratio): {told}.")
+        summary = ", ".join(f"{share:.0%}: {error:.2f}" for share, error in errors.items())
+        self.notes.append(f"Validation error by share of the forces (ratio): {summary}.")
         share = min(errors, key=lambda share: errors[share])
         if share == 0.0:
             self.notes.append("No share of the forces improves the validation error: the residual is 0.")

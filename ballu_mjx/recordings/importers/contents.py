@@ -69,16 +69,16 @@ def describe_contents(contents: Contents, *, most: int = 60) -> list[str]:
     """Return lines for the user: one for each of the first `most` items, and one for each note."""
     lines = [f"{contents.path} is {contents.program}."]
     for item in contents.items[:most]:
-        told = [item.kind, shorten(item.name) + (f" ({aside})" if (aside := item.section or item.label) else "")]
-        told.append(f"{item.samples} samples" + ("" if item.rate is None else f" at {item.rate:.4g} Hz"))
+        described = [item.kind, shorten(item.name) + (f" ({aside})" if (aside := item.section or item.label) else "")]
+        described.append(f"{item.samples} samples" + ("" if item.rate is None else f" at {item.rate:.4g} Hz"))
         if item.share < 1:
-            told.append(f"{100 * item.share:.1f} % seen")
+            described.append(f"{100 * item.share:.1f} % seen")
         if item.low is not None and item.high is not None:
-            told.append(f"from {item.low:.4g} to {item.high:.4g}")
-        told.append("unit not stated" if item.unit is None else item.unit)
+            described.append(f"from {item.low:.4g} to {item.high:.4g}")
+        described.append("unit not stated" if item.unit is None else item.unit)
         if item.clock is not None:
-            told.append(f"clock {item.clock}")
-        lines.append("  " + ", ".join(told))
+            described.append(f"clock {item.clock}")
+        lines.append("  " + ", ".join(described))
     if len(contents.items) > most:
         lines.append(f"  and {len(contents.items) - most} more")
     return [printable(line) for line in (*lines, *(f"  {note}" for note in contents.notes))]
