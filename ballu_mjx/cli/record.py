@@ -216,25 +216,25 @@ def _offset(
             "--offset-range."
         )
     best, offset = found.best, found.best.offset - options.delay
-    found_offset = f"offset {offset:+.3f} s: correlation {best.correlation:.2f} over {found.overlap:.1f} s"
+    answer = f"offset {offset:+.3f} s: correlation {best.correlation:.2f} over {found.overlap:.1f} s"
     if abs(best.correlation) < LEAST_CORRELATION:
         raise InputError(
-            f"{log}: the commands do not fit the motion at any offset; best is {found_offset}. Give this trial's log, correct "
-            f"[commands] in {options.mapping}, or {by_hand}."
+            f"{log}: the commands do not fit the motion at any offset; best is {answer}. Give this trial's log, "
+            f"correct [commands] in {options.mapping}, or {by_hand}."
         )
     if best.correlation < 0:
         raise InputError(
-            f"{log}: the robot moves against the commands, at {found_offset}; reverse the ranges of [commands] in "
+            f"{log}: the robot moves against the commands, at {answer}; reverse the ranges of [commands] in "
             f"{options.mapping}, or {by_hand}."
         )
     other = found.second
     if other is not None and found.confidence < LEAST_CONFIDENCE:
         raise InputError(
-            f"{log}: the commands repeat themselves, so that two offsets fit: {found_offset}, and "
+            f"{log}: the commands repeat themselves, so that two offsets fit: {answer}, and "
             f"{other.offset - options.delay:+.3f} s ({other.correlation:.2f}), a confidence of {found.confidence:.2f}; "
             "give the right one by --offset, or a range by --offset-range."
         )
-    print(f"{log}: {found_offset}; good to about {_ALIGNMENT_ERROR:g} s")
+    print(f"{log}: {answer}; good to about {_ALIGNMENT_ERROR:g} s")
     if other is not None:
         apart = f"{other.offset - options.delay:+.3f} s, correlation {other.correlation:.2f}"
         print(f"  next best {apart}: confidence {found.confidence:.2f} of 1")
@@ -293,7 +293,9 @@ def _map(options: Map) -> None:
     print("\n".join(describe_contents(contents)))
     files.write(options.output, text)
     guesses, empty = text.count("# a guess"), text.count("# choose ")
-    remaining = f"{guesses} {'guess' if guesses == 1 else 'guesses'} to check, {empty} {'place' if empty == 1 else 'places'}"
+    remaining = (
+        f"{guesses} {'guess' if guesses == 1 else 'guesses'} to check, {empty} {'place' if empty == 1 else 'places'}"
+    )
     print(f"{options.output}: {remaining} to complete; then `record import` takes it")
 
 
