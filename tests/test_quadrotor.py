@@ -174,7 +174,7 @@ def test_conversion_keeps_all_numbers(
 
 def test_yaw_commands_continue_beyond_half_a_turn(experiment: ModuleType, tmp_path: Path):
     yaw = np.linspace(3, 3.5, 60)
-    turned = Rotation.from_euler("z", yaw).as_quat().tolist()
+    turned = Rotation.from_euler("z", yaw[:, None]).as_quat().tolist()
     rows = [{**row, "q_sp": each} for row, each in zip(random_rows(0), turned, strict=True)]
     found = experiment.convert(write(tmp_path / "flight.csv", rows, USED), "70wind-NF")
     np.testing.assert_allclose(found.command[:, 3], yaw, atol=1e-12)
