@@ -51,9 +51,9 @@ class FluidConfig:
     of two velocities) or cubic (products of three velocities, divided by the speed). Each set includes the sets before
     it. auto fits every set, and takes the one with the lowest error on the validation recordings."""
     passive: bool = True
-    """Allow only forces that add no energy to the body, as those of still air or water. Corrections of the weight and of
-    the centre of mass are exempt. Simulations then stay bounded, even far from the recordings. Passive forces have no
-    cubic terms."""
+    """Allow only forces that add no energy to the body, as those of still air or water. Corrections of weight and
+    centre of mass are exempt. Simulations then stay bounded, even far from the recordings. Passive forces have no cubic
+    terms."""
     mirror: bool = True
     """Fit forces that are symmetric about the body's xz plane, if the robot's description declares `mirror`."""
     window_seconds: tuple[float, ...] = (0.5, 1.0, 2.0)
