@@ -87,6 +87,7 @@ def fit(glider: RobotDescription) -> FluidFit:
     return fit_fluid_forces(Simulator(glider), flights(glider, 0, 16), flights(glider, 1, 2), config)
 
 
+@pytest.mark.optimized
 def test_fit_recovers_known_drag_and_lift_from_another_simulator(fit: FluidFit):
     found = fit.coefficients
     names = [term.name for term in terms_of(found.term_set)]
