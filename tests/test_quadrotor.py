@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import csv
-import importlib.util
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from experiment_modules import experiment_module
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.common.errors import InputError
@@ -45,12 +45,7 @@ Row = Mapping[str, object]
 
 @pytest.fixture(scope="module")
 def experiment() -> Iterator[ModuleType]:
-    spec = importlib.util.spec_from_file_location("quadrotor", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(SCRIPT.parents[2]))
-        spec.loader.exec_module(module)
+    with experiment_module(SCRIPT) as module:
         yield module
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
+from experiment_modules import experiment_module
 
 from ballu_mjx.cli import compare, evaluate, export, report, view
 from ballu_mjx.evaluation.errors_file import read_evaluation
@@ -23,12 +23,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def experiment() -> Iterator[ModuleType]:
-    spec = importlib.util.spec_from_file_location("tethered_balloon", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(SCRIPT.parents[1]))
-        spec.loader.exec_module(module)
+    with experiment_module(SCRIPT) as module:
         yield module
 
 

@@ -139,8 +139,8 @@ def list_vicon(path: Path) -> Contents:
 def read_vicon(path: Path, mapping: RoomMapping) -> Trajectories:
     """Return the bodies and markers that `mapping` names from the Vicon CSV at `path`.
 
-    **Raises** `InputError` naming file and line if a part is missing or cut off, if a cell is not a number, if frame
-    numbers do not increase, or if a unit or a rotation convention is unknown.
+    **Raises** `InputError` naming file and line if a part is missing or cut off, or if a cell is not a number. It also
+    does so if frame numbers do not increase, or if a unit or a rotation convention is unknown.
     """
     lines = read_text(path).splitlines()
     delimiter = _delimiter(path, lines)

@@ -87,8 +87,8 @@ def export_simulator(
     - `check_seconds`: length of a rollout in double precision that the folder's self-test repeats (s). If 0, the folder
       has no rollout.
 
-    **Raises** `InputError` if the folder is not empty, if the model cannot be written, if the residual is scaled or has
-    a part of a kind that cannot be exported, or if `onnx` is set and the residual has no network.
+    **Raises** `InputError` if the folder is not empty, or if the model cannot be written. It also does so if the
+    residual is scaled, has a part of a kind that cannot be exported, or has no network although `onnx` is set.
     """
     augmented = simulator.with_residual(None)
     if augmented.scale is not None:

@@ -1,0 +1,25 @@
+"""Experiments as modules, for tests that call their functions."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+
+
+@contextlib.contextmanager
+def experiment_module(script: Path) -> Iterator[ModuleType]:
+    """Import an experiment from its script, with the modules that experiments share on the path meanwhile."""
+    spec = importlib.util.spec_from_file_location(script.stem, script)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(EXPERIMENTS))
+        spec.loader.exec_module(module)
+        yield module
