@@ -31,6 +31,8 @@ from scipy.spatial.transform import Rotation
 from ballu_mjx.ballu.gaits import Gait, telegraph, waves
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES
 from ballu_mjx.ballu.recordings import make_recording
+from ballu_mjx.ballu.virtual.robot import NAMES, CaptureController, open_loop
+from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.recording import Recording
 
 ROBOTS = range(5)
@@ -197,37 +199,112 @@ def walking_commands(seconds: float) -> dict[str, Float[np.ndarray, "steps 2"]]:
 
 
 def record_walking(robot: BulletRobot, commands: Float[np.ndarray, "steps 2"], name: str, seed: int = 0) -> Recording:
-    """Return a recording of commands at 20 Hz, after two seconds of standing.
+    """Return a recording of commands at 20 Hz, after two seconds of standing, in still air."""
+    notes = "Hand-designed commands, open loop."
+    conditions, noise = Conditions(), np.random.default_rng([seed, 44])
+    return _record(robot, conditions, noise, open_loop(commands), len(commands) * CONTROL_TIMESTEP, name, notes)
 
-    It has the poses of balloons and base, and the positions of the feet.
+
+@dataclasses.dataclass(frozen=True)
+class Conditions:
+    """Conditions of a trial."""
+
+    draught: tuple[float, float] = (0.0, 0.0)
+    """Mean horizontal velocity of the air (m/s)."""
+    swing: float = 0.0
+    """Amplitude (m/s) of the velocity's variation along x and y."""
+    period: float = 10.0
+    """Period (s) of this variation."""
+    yaw: float = 0.0
+    """Heading at the start (rad)."""
+
+    def wind(self, time: float) -> Float[np.ndarray, " 3"]:
+        """Return the air's velocity (m/s) at `time` (s)."""
+        phase = 2 * math.pi * time / self.period
+        return np.array([*self.draught, 0.0]) + self.swing * np.array([math.sin(phase), math.cos(phase), 0.0])
+
+
+def draw_conditions(number: int) -> Conditions:
+    """Draw the conditions of a trial: a draught of up to 0.06 m/s that varies slowly, and the heading at the start."""
+    rng = np.random.default_rng([number, 45])
+    direction, speed = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, 0.06)
+    return Conditions(
+        draught=(float(speed * math.cos(direction)), float(speed * math.sin(direction))),
+        swing=float(rng.uniform(0.0, 0.03)),
+        period=float(rng.uniform(8.0, 25.0)),
+        yaw=float(rng.normal(0.0, 2 * _DEGREE)),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class BulletHardware:
+    """A robot of the family as `ballu_mjx.ballu.virtual.hardware.Hardware`."""
+
+    robot: BulletRobot
+    seed: int
+
+    @staticmethod
+    def draw(seed: int) -> BulletHardware:
+        """Draw the robot with this seed."""
+        return BulletHardware(draw(seed), seed)
+
+    @property
+    def name(self) -> str:
+        return self.robot.name
+
+    def record_sweep(self, name: str) -> Recording:
+        return record_sweep(self.robot, sweep_commands(), name, self.seed)
+
+    def record(self, trial: int, controller: CaptureController, seconds: float, name: str, notes: str) -> Recording:
+        noise = np.random.default_rng([trial, 46])
+        return _record(self.robot, draw_conditions(trial), noise, controller, seconds, name, notes)
+
+
+def _record(
+    robot: BulletRobot,
+    conditions: Conditions,
+    rng: np.random.Generator,
+    controller: CaptureController,
+    seconds: float,
+    name: str,
+    notes: str,
+) -> Recording:
+    """Return a recording of a controller, after two seconds of standing.
+
+    It has the poses of balloons and base, and the positions of the feet. `rng` draws the noise of the motion capture.
     """
-    world = World(robot)
-    rng = np.random.default_rng([seed, 44])
+    world = World(robot, conditions)
     world.run(np.zeros(2), 2.0)
-    world.face_forward()
+    world.begin_trial()
     frames = round(CONTROL_TIMESTEP / CAPTURE_TIMESTEP)
-    positions, balloons, bases, sent = [], [], [], []
-    for number in range(len(commands) * frames + 1):
-        command = commands[min(number // frames, len(commands) - 1)]
+    capture, bases = Capture(NAMES), []
+    command = np.zeros(2)
+    for number in range(round(seconds / CAPTURE_TIMESTEP) + 1):
         places, balloon, base = world.look()
-        positions.append(places + rng.normal(0, POSITION_NOISE, places.shape))
-        noise = Rotation.from_rotvec(rng.normal(0, ANGLE_NOISE, (2, 3)))
-        balloons.append((noise[0] * balloon).as_quat(scalar_first=True, canonical=True))
-        bases.append((noise[1] * base).as_quat(scalar_first=True, canonical=True))
-        sent.append(command)
-        if number < len(commands) * frames:
-            world.run(command, CAPTURE_TIMESTEP)
+        noisy = places + rng.normal(0, POSITION_NOISE, places.shape)
+        turns = Rotation.from_rotvec(rng.normal(0, ANGLE_NOISE, (2, 3)))
+        capture.time.append(number * CAPTURE_TIMESTEP)
+        capture.position.append(noisy)
+        capture.quaternion.append((turns[0] * balloon).as_quat(scalar_first=True, canonical=True))
+        bases.append((turns[1] * base).as_quat(scalar_first=True, canonical=True))
+        if number == round(seconds / CAPTURE_TIMESTEP):
+            break
+        if number % frames == 0:
+            command = np.clip(np.asarray(controller(capture), float), 0.0, 1.0)
+        capture.command.append(command)
+        world.run(command, CAPTURE_TIMESTEP)
+    capture.command.append(command)
     world.close()
-    seen = np.array(positions)
+    seen = np.array(capture.position)
     return make_recording(
         name=name,
         kind="free",
         robot=robot.name,
-        notes="Hand-designed commands, open loop.",
+        notes=notes,
         time=np.arange(len(seen)) * CAPTURE_TIMESTEP,
-        command=np.array(sent),
+        command=np.array(capture.command),
         balloon_position=seen[:, 0],
-        balloon_quaternion=np.array(balloons),
+        balloon_quaternion=np.array(capture.quaternion),
         base_position=seen[:, 1],
         base_quaternion=np.array(bases),
         foot_position=seen[:, 2:],
@@ -240,8 +317,10 @@ def record_walking(robot: BulletRobot, commands: Float[np.ndarray, "steps 2"], n
 class World:
     """A robot in Bullet, standing on a floor or with a fixed base (`held`)."""
 
-    def __init__(self, robot: BulletRobot, *, held: bool = False) -> None:
-        self.robot = robot
+    def __init__(self, robot: BulletRobot, conditions: Conditions | None = None, *, held: bool = False) -> None:
+        """`conditions` None: still air."""
+        self.robot, self._conditions = robot, conditions or Conditions()
+        self._time = 0.0
         self._world, self._body = open_world(urdf(robot), (0.0, 0.0, -GRAVITY), TIMESTEP, held=held)
         infos = [self._world.getJointInfo(self._body, index) for index in range(self._world.getNumJoints(self._body))]
         self._links = {info[12].decode(): info[0] for info in infos}
@@ -305,21 +384,24 @@ class World:
         robot, link = self.robot, self._links["balloon"]
         state = self._world.getLinkState(self._body, link, computeLinkVelocity=1)
         velocity, spin = np.array(state[6]), np.array(state[7])
+        relative = velocity - self._conditions.wind(self._time)
+        self._time += TIMESTEP
         last, felt = self._air
         felt = felt + (TIMESTEP / _AIR_FILTER) * ((velocity - last) / TIMESTEP - felt)
         self._air = velocity, felt
-        force = -robot.drag * math.sqrt(velocity @ velocity) * velocity - robot.added_mass * felt
+        force = -robot.drag * math.sqrt(relative @ relative) * relative - robot.added_mass * felt
         force[2] += robot.buoyancy * TOTAL_MASS * GRAVITY
         self._world.applyExternalForce(self._body, link, force.tolist(), state[0], pybullet.WORLD_FRAME)
         torque = -robot.turning_drag * math.sqrt(spin @ spin) * spin
         self._world.applyExternalTorque(self._body, link, torque.tolist(), pybullet.WORLD_FRAME)
         self._world.stepSimulation()
 
-    def face_forward(self) -> None:
-        """Move the robot above the origin and turn its base to face x."""
+    def begin_trial(self) -> None:
+        """Move the robot above the origin, turn its base to the heading of the conditions, and set the time to 0."""
+        self._time = 0.0
         place, quaternion = self._world.getBasePositionAndOrientation(self._body)
         turn = Rotation.from_quat(quaternion)
-        back = Rotation.from_euler("z", -turn.as_euler("ZYX")[0])
+        back = Rotation.from_euler("z", self._conditions.yaw - turn.as_euler("ZYX")[0])
         linear, angular = self._world.getBaseVelocity(self._body)
         self._world.resetBasePositionAndOrientation(self._body, [0.0, 0.0, place[2]], (back * turn).as_quat().tolist())
         self._world.resetBaseVelocity(self._body, back.apply(linear).tolist(), back.apply(angular).tolist())

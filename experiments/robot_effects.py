@@ -31,7 +31,8 @@ import transfer_tables
 from ballu_mjx.ballu.actuators import CABLE_SLACK, ActuatorParameters
 from ballu_mjx.ballu.model import load_model
 from ballu_mjx.ballu.virtual import robot as virtual_robot
-from ballu_mjx.ballu.virtual.robot import VirtualRobot
+from ballu_mjx.ballu.virtual.hardware import VirtualHardware
+from ballu_mjx.ballu.virtual.robot import TrialConditions, VirtualRobot
 from ballu_mjx.ballu.virtual.trials import run_trials
 from ballu_mjx.cli import pipeline
 from ballu_mjx.common.results import Cell, Table
@@ -111,13 +112,18 @@ def measure(policy: Policy, robots: dict[str, VirtualRobot], count: int, folder:
     Recordings go to `folder`.
     """
     loop = policy.closed_loop()
-    draws = [virtual_robot.still(virtual_robot.draw_trial(5_000_000 + number)) for number in range(count)]
+    numbers = range(5_000_000, 5_000_000 + count)
     results = {}
     for name, variant in robots.items():
         place = folder / name.replace(" ", "-")
         place.mkdir(parents=True, exist_ok=True)
-        results[name] = run_trials(policy, variant, draws, place, loop)
+        results[name] = run_trials(policy, VirtualHardware(variant, conditions=still_air), numbers, place, loop)
     return results
+
+
+def still_air(number: int) -> TrialConditions:
+    """Return the conditions of a trial without draught."""
+    return virtual_robot.still(virtual_robot.draw_trial(number))
 
 
 def table(results: dict[str, dict[str, list[Transfer]]], distance: str) -> Table:
@@ -169,8 +175,8 @@ def main() -> None:
     quick = arguments.quick
     output = arguments.output or (transfer_tables.QUICK_OUTPUT if quick else transfer_tables.OUTPUT)
     options = pipeline.Options(output=output, robot_seed=arguments.robot_seed, quick=quick)
-    stages, trials = pipeline.PipelineStages(options, arguments.seed), 1 if quick else arguments.trials
-    robots = variants(virtual_robot.draw_robot(arguments.robot_seed))
+    hardware, trials = VirtualHardware.draw(arguments.robot_seed), 1 if quick else arguments.trials
+    stages, robots = pipeline.PipelineStages(options, arguments.seed, hardware), variants(hardware.robot)
     folder = output / f"effects-{arguments.task}-seed-{arguments.seed}"
     results = {}
     for setting in arguments.settings:

@@ -11,6 +11,8 @@ import pytest
 
 import ballu_mjx
 from ballu_mjx.ballu.sweep import read_sweep
+from ballu_mjx.ballu.virtual.robot import open_loop
+from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.robots.registry import load_robot
 
@@ -70,3 +72,37 @@ def test_package_does_not_import_the_bullet_family() -> None:
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             assert not any("bullet" in name for name in names), file
+
+
+def test_trials_with_equal_numbers_are_equal_and_the_draught_moves_the_robot() -> None:
+    hardware = family.BulletHardware.draw(0)
+    commands = np.zeros((40, 2))
+    first, same, other = (hardware.record(trial, open_loop(commands), 2.0, "trial", "") for trial in (1, 1, 2))
+    assert first.tracked_position is not None and same.tracked_position is not None
+    np.testing.assert_array_equal(first.tracked_position, same.tracked_position)
+    assert not np.array_equal(first.tracked_position, other.tracked_position)
+
+
+def test_draught_leans_the_standing_robot_downwind() -> None:
+    robot, leans = family.draw(0), []
+    for wind in (0.0, 0.5):
+        world = family.World(robot, family.Conditions(draught=(0.0, wind)))
+        world.run(np.zeros(2), 2.0)
+        world.begin_trial()
+        places, *_ = world.look()
+        leans.append(places[0, 1] - places[1, 1])  # balloons relative to the base
+        world.close()
+    assert leans[1] - leans[0] > 0.01
+
+
+def test_controllers_see_the_frames_so_far_and_command_twenty_times_a_second() -> None:
+    seen = []
+
+    def controller(capture: Capture) -> np.ndarray:
+        seen.append((len(capture.time), capture.time[-1]))
+        return np.array([1.5, 0.25])
+
+    recording = family.BulletHardware.draw(0).record(3, controller, 0.5, "trial", "")
+    assert [frames for frames, _ in seen] == list(range(1, 51, 5))
+    assert [time for _, time in seen] == pytest.approx(np.arange(0.0, 0.5, 0.05))
+    np.testing.assert_array_equal(recording.command, np.tile([1.0, 0.25], (51, 1)))

@@ -1,4 +1,6 @@
-"""All experiments of the paper in one command, on a virtual robot: `python -m ballu_mjx.train all`.
+"""All experiments of the paper in one command: `python -m ballu_mjx.train all`.
+
+The command uses a virtual robot. `measure_transfer` takes any `Hardware`.
 
 The stages are, in the paper's order:
 
@@ -28,8 +30,8 @@ import numpy as np
 
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP
-from ballu_mjx.ballu.virtual import robot as virtual_robot
-from ballu_mjx.ballu.virtual.robot import CaptureController
+from ballu_mjx.ballu.virtual.hardware import Hardware, VirtualHardware
+from ballu_mjx.ballu.virtual.robot import CaptureController, open_loop
 from ballu_mjx.ballu.virtual.trials import ExportedPolicy, run_trials
 from ballu_mjx.cli import train_aerodynamics, train_envmimic, train_forces, train_policy, train_sysid
 from ballu_mjx.cli._command import TrainCommand, written_to
@@ -107,27 +109,38 @@ class Options(loggers.LoggingOptions):
 
 def run(options: Options) -> int:
     """Run the missing stages, print the tables, and return the exit status."""
+    with written_to() as written:
+        written.folder = options.output
+        for task, result in measure_transfer(options).items():
+            text = TABLES[task](result)
+            table_file(options.output, task).write_text(text + "\n", encoding="utf-8")
+            print(f"\n### {task}\n\n{text}\n")
+        if options.quick:
+            print("These numbers mean nothing: --quick trains for seconds.")
+    return 0
+
+
+def measure_transfer(options: Options, hardware: Hardware | None = None) -> dict[str, dict[str, list[list[Transfer]]]]:
+    """Run the missing stages and return the trials, `[task][setting][seed][trial]`.
+
+    `hardware` is the robot. None for the virtual robot `options.robot_seed`.
+
+    **Raises** `InputError` if options are out of range.
+    """
     _check(options)
+    hardware = VirtualHardware.draw(options.robot_seed) if hardware is None else hardware
     settings = settings_of(options)
     if options.quick:
         options = dataclasses.replace(options, trials=min(options.trials, 2), takes=1, tasks=options.tasks[:1])
     results: dict[str, dict[str, list[list[Transfer]]]] = {
         task: {setting: [] for setting in settings} for task in options.tasks
     }
-    with written_to() as written:
-        written.folder = options.output
-        for seed in options.seeds:
-            stages = PipelineStages(options, seed)
-            for task in options.tasks:
-                for setting in settings:
-                    results[task][setting].append(stages.transfers(task, setting))
+    for seed in options.seeds:
+        stages = PipelineStages(options, seed, hardware)
         for task in options.tasks:
-            text = TABLES[task](results[task])
-            table_file(options.output, task).write_text(text + "\n", encoding="utf-8")
-            print(f"\n### {task}\n\n{text}\n")
-        if options.quick:
-            print("These numbers mean nothing: --quick trains for seconds.")
-    return 0
+            for setting in settings:
+                results[task][setting].append(stages.transfers(task, setting))
+    return results
 
 
 def settings_of(options: Options) -> tuple[str, ...]:
@@ -154,19 +167,19 @@ class _Job(NamedTuple):
 class PipelineStages:
     """Stages of one seed. Each method makes its stage, and the stages that it needs, unless they exist already."""
 
-    def __init__(self, options: Options, seed: int) -> None:
+    def __init__(self, options: Options, seed: int, hardware: Hardware) -> None:
         self.options, self.seed = options, seed
-        self._robot = virtual_robot.draw_robot(options.robot_seed)
+        self._robot = hardware
         self._shared, self._own = options.output, options.output / f"seed-{seed}"
 
     def sweep(self) -> Path:
         """Return the folder of an actuator sweep of the robot."""
 
         def make(folder: Path) -> None:
-            sweep = virtual_robot.record_sweep(self._robot, seed=self.options.robot_seed, name="sweep")
+            sweep = self._robot.record_sweep("sweep")
             write_recording(sweep, folder / "sweep.csv.gz", load_robot(), decimals=_DECIMALS)
 
-        return cached_stage(self._shared / "sweep", {"robot": self.options.robot_seed}, [], make)
+        return cached_stage(self._shared / "sweep", {"robot": self._robot.name}, [], make)
 
     def identified(self) -> Path:
         """Return the run folder of the identification."""
@@ -226,7 +239,7 @@ class PipelineStages:
                 played = commands if use == "validation" else commands[: round(seconds / CONTROL_TIMESTEP)]
                 for take in range(self.options.takes):
                     name, length = f"actions-{index}-take-{take + 1}", len(played) * CONTROL_TIMESTEP
-                    yield _Job(use, name, virtual_robot.open_loop(played), length)
+                    yield _Job(use, name, open_loop(played), length)
 
         notes = f"Actions of a vanilla policy for {task}."
         return self._recorded(f"recordings-{task}", sources, task, "recordings", jobs, notes)
@@ -268,14 +281,14 @@ class PipelineStages:
         def make(folder: Path) -> None:
             listed = list(jobs(seconds))
             for number, job in enumerate(listed):
-                trial = virtual_robot.draw_trial(_draw(self.seed, task, draws, number))
-                recording = virtual_robot.record(self._robot, trial, job.controller, job.seconds, job.name, notes)
+                trial = _draw(self.seed, task, draws, number)
+                recording = self._robot.record(trial, job.controller, job.seconds, job.name, notes)
                 where = folder / job.use
                 where.mkdir(exist_ok=True)
                 write_recording(recording, where / f"{job.name}.csv.gz", load_robot(), decimals=_DECIMALS)
                 print(f"Recorded {job.name} ({job.use}), {number + 1} of {len(listed)}", flush=True)
 
-        made = {"robot": self.options.robot_seed, "seed": self.seed, "takes": self.options.takes, "seconds": seconds}
+        made = {"robot": self._robot.name, "seed": self.seed, "takes": self.options.takes, "seconds": seconds}
         return cached_stage(self._own / stage, made, sources, make)
 
     def residual(self, task: str, setting: str) -> Path:
@@ -342,11 +355,11 @@ class PipelineStages:
 
         def make(folder: Path) -> None:
             policy = Policy.load(source)
-            draws = [virtual_robot.draw_trial(_draw(self.seed, task, "trials", number)) for number in range(count)]
-            found = run_trials(policy, self._robot, draws, folder, tell=functools.partial(print, flush=True))
+            numbers = [_draw(self.seed, task, "trials", number) for number in range(count)]
+            found = run_trials(policy, self._robot, numbers, folder, tell=functools.partial(print, flush=True))
             transfer.write_transfer(folder / "transfer.json", found)
 
-        options = {"robot": self.options.robot_seed, "seed": self.seed, "trials": count}
+        options = {"robot": self._robot.name, "seed": self.seed, "trials": count}
         folder = cached_stage(self._own / f"trials-{task}-{setting}", options, [source], make)
         return transfer.read_transfer(folder / "transfer.json")
 

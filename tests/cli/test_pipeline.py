@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from ballu_mjx.ballu.virtual.hardware import VirtualHardware
 from ballu_mjx.cli import pipeline
 from ballu_mjx.cli.cached_stages import cached_stage
 from ballu_mjx.cli.pipeline import Options
@@ -107,7 +108,7 @@ def test_each_round_learns_from_all_recordings_so_far(tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "cached_stage", stage)
     also = "envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised"
     options = Options(output=tmp_path, rounds=3, also=also, outside_cost=2.0)
-    stages = pipeline.PipelineStages(options, seed=0)
+    stages = pipeline.PipelineStages(options, 0, VirtualHardware.draw(0))
     for setting in pipeline.settings_of(options):
         stages.policy("walk", setting)
     assert pipeline.settings_of(options) == (*pipeline.PAPER_SIMULATORS, "envmimic-2", "envmimic-3", *options.also)

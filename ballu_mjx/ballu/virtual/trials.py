@@ -1,4 +1,4 @@
-"""Trials of a policy on the virtual robot, compared with the same policy in its own simulator."""
+"""Trials of a policy on the robot, compared with the same policy in its own simulator."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from ballu_mjx.ballu import plots as ballu_plots
 from ballu_mjx.ballu.features import foot_positions
 from ballu_mjx.ballu.gait import count_steps
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP
-from ballu_mjx.ballu.virtual import robot as virtual_robot
-from ballu_mjx.ballu.virtual.robot import TrialConditions, VirtualRobot
+from ballu_mjx.ballu.virtual.hardware import Hardware
 from ballu_mjx.evaluation.transfer import Trajectory, Transfer, compare_trajectories
 from ballu_mjx.policies.closed_loop import ClosedLoop
 from ballu_mjx.policies.deploy.controller import Controller
@@ -52,8 +51,8 @@ class ExportedPolicy:
 
 def run_trials(
     policy: Policy,
-    hardware: VirtualRobot,
-    draws: Sequence[TrialConditions],
+    hardware: Hardware,
+    numbers: Sequence[int],
     folder: Path,
     loop: ClosedLoop | None = None,
     tell: Callable[[str], None] = lambda text: None,
@@ -66,21 +65,21 @@ def run_trials(
 
     **Arguments**
 
-    - `draws`: conditions of each trial.
+    - `numbers`: number of each trial for `Hardware.record`, which determines its conditions.
     - `loop`: the policy in its own simulator. None to make it.
     - `tell`: function that is called with a sentence after each trial.
     """
     stored = weights(policy)
     seconds, setting = policy.task.trial_seconds, policy.variant.name
     recordings = []
-    for number, draw in enumerate(draws):
-        name = f"trial-{number + 1}"
+    for index, number in enumerate(numbers):
+        name = f"trial-{index + 1}"
         notes = f"{policy.task.name}, trained in {setting}, closed loop."
-        recording = virtual_robot.record(hardware, draw, ExportedPolicy(stored), seconds, name, notes)
+        recording = hardware.record(number, ExportedPolicy(stored), seconds, name, notes)
         path = folder / f"{name}.csv.gz"
         write_recording(recording, path, load_robot(), decimals=4)
         recordings.append(read_recording(path, load_robot()))  # reading fills the gaps of hidden points
-        tell(f"{policy.task.name}, {setting}: {name} of {len(draws)} done")
+        tell(f"{policy.task.name}, {setting}: {name} of {len(numbers)} done")
 
     simulator = Simulator(load_robot(), policy.actuators)
     restore = partial(reconstruct, robot=simulator.robot, model=simulator.mj_model, drivetrain=simulator.drivetrain)
