@@ -34,7 +34,7 @@ from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.cli import train_aerodynamics
 from ballu_mjx.common.results import Cell, Table
-from ballu_mjx.evaluation.errors import Evaluation, base_name
+from ballu_mjx.evaluation.errors import Evaluation
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.recordings.motion import Motion
@@ -129,8 +129,8 @@ def main() -> None:
     every = motions(deflated, training if options.anew else training[:1], 2000, "after")
     fit = identify_air(simulator, every[:1], AirConfig(), fixed_from=known.params, free=("lift",))
 
-    sound = OpenLoopEvaluator(simulator, before, known.model, base_name(True))(known.params)
-    evaluator = OpenLoopEvaluator(simulator, after, known.model, base_name(True))
+    sound = OpenLoopEvaluator(simulator, before, known.model)(known.params)
+    evaluator = OpenLoopEvaluator(simulator, after, known.model)
     less = f"{options.loss:.0%} less"
     results = {
         "all of the lift": sound,

@@ -112,8 +112,7 @@ class Evaluators:
             if known is residual and on is motions:
                 return evaluator
             made = evaluator if known is residual else made
-        base = base_name(self._simulator.actuators is not None)
-        made = OpenLoopEvaluator(self._simulator, motions, residual, base) if made is None else made.on(motions)
+        made = OpenLoopEvaluator(self._simulator, motions, residual) if made is None else made.on(motions)
         self._made.append((residual, motions, made))
         return made
 
@@ -138,18 +137,9 @@ class OpenLoopEvaluator:
     One compiled program serves all parameters of the residual, all recordings and all actuators.
     """
 
-    def __init__(
-        self,
-        simulator: Simulator,
-        motions: Sequence[Motion],
-        residual: Residual,
-        base: str = "vanilla",
-    ) -> None:
-        """Prepare to replay `motions` in `simulator`, without and with `residual`.
-
-        `base` is the name of the simulator without it.
-        """
-        self.base, self.name = base, residual.name
+    def __init__(self, simulator: Simulator, motions: Sequence[Motion], residual: Residual) -> None:
+        """Prepare to replay `motions` in `simulator`, without and with `residual`."""
+        self.base, self.name = base_name(simulator.actuators is not None), residual.name
         self._residual = residual
         self._simulator = simulator
         self.robot = simulator.robot

@@ -286,7 +286,7 @@ def test_evaluation_with_identified_actuators_includes_the_nominal_robot(evaluat
     nominal = ActuatorParameters.nominal(load_model())
     stiffer = dataclasses.replace(nominal, knee_spring_stiffness=1.5 * nominal.knee_spring_stiffness)
     identified = Simulator(load_robot(), stiffer)
-    result = OpenLoopEvaluator(identified, evaluator.motions, evaluator._residual, "vanilla+sysid")(jnp.array(FORCE))
+    result = OpenLoopEvaluator(identified, evaluator.motions, evaluator._residual)(jnp.array(FORCE))
     assert list(result.simulators) == ["vanilla", "vanilla+sysid", "envmimic"]
     assert result.nominal[0].position[1.0][0] < 1e-3 < 5e-3 < result.vanilla[0].position[1.0][0]
 
