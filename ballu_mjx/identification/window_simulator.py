@@ -29,7 +29,7 @@ from ballu_mjx.robots.model import with_fields
 from ballu_mjx.sim.derived_constants import ReferencePose, with_derived_constants
 from ballu_mjx.sim.drivetrain import filter_commands
 from ballu_mjx.sim.sharding import chunks, shard_over_devices
-from ballu_mjx.sim.step import PhysicsState, make_data, physics_step, put_model, state_at
+from ballu_mjx.sim.step import PhysicsState, has_dry_friction, make_data, physics_step, put_model, state_at
 from ballu_mjx.sim.vmap_last import nested_vmap, vmap_with_trailing_batch
 
 
@@ -114,7 +114,7 @@ class WindowSimulator:
             *(value[windows.motion] for value in own_values),
         )
         self._values = shard_over_devices(self._path, shared=0)
-        over = partial(nested_vmap, inner=len(parameters) + self.channels)
+        over = partial(nested_vmap, inner=len(parameters) + self.channels, store_operands=has_dry_friction(self._mjx))
         self._linear = shard_over_devices(self._linearized, shared=0, over=over)
         self._ctrl = jax.jit(self._filtered)
         self._ctrl_slopes = jax.jit(self._filtered_slopes)
@@ -219,7 +219,9 @@ class WindowSimulator:
             _, (places, rates) = jax.lax.scan(sample, first, ctrl.reshape(-1, self.every, self._commands.shape[-1]))
             return jnp.concatenate([first.qpos[None], places]), jnp.concatenate([first.qvel[None], rates])
 
-        qpos, qvel = vmap_with_trailing_batch(path)(values, start * noise, ctrl, qpos, qvel, *own)
+        qpos, qvel = vmap_with_trailing_batch(path, has_dry_friction(self._mjx))(
+            values, start * noise, ctrl, qpos, qvel, *own
+        )
         places = jax.vmap(self._difference)(qpos, measured_qpos)
         return jnp.concatenate([places, qvel - measured_qvel], axis=1) / noise
 

@@ -22,7 +22,7 @@ from ballu_mjx.sim.coordinates import compress, expand, has_free_joint
 from ballu_mjx.sim.force_sets import FORCE_SETS, ForceSet, num_loads
 from ballu_mjx.sim.sharding import chunks, shard_over_devices
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
-from ballu_mjx.sim.step import PhysicsState
+from ballu_mjx.sim.step import PhysicsState, has_dry_friction
 from ballu_mjx.sim.vmap_last import nested_vmap
 
 _CHUNK = 64
@@ -75,7 +75,7 @@ class Linearizer:
         self._forces: ForceSet = forces
         self._joints = np.array([plain.mj_model.joint(name).dofadr[0] for name in joints], int)
         self.loads = num_loads(forces, plain.robot)
-        over = functools.partial(nested_vmap, inner=self.directions)
+        over = functools.partial(nested_vmap, inner=self.directions, store_operands=has_dry_friction(plain.model))
         self._each = shard_over_devices(self._one, shared=0, over=over)
 
     @property

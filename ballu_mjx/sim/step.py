@@ -137,7 +137,12 @@ def control_step(
 
         return jax.lax.fori_loop(0, count, step, state)
 
-    return vmap_with_trailing_batch(steps)(model, template, state, commands, wrench)
+    return vmap_with_trailing_batch(steps, has_dry_friction(model))(model, template, state, commands, wrench)
+
+
+def has_dry_friction(model: mjx.Model) -> bool:
+    """Return whether joints or tendons of a model have dry friction."""
+    return bool(model._impl.dof_hasfrictionloss.any() or model._impl.tendon_hasfrictionloss.any())  # pyright: ignore
 
 
 def put_model(model: mujoco.MjModel) -> mjx.Model:

@@ -24,11 +24,15 @@ from jax.interpreters.partial_eval import dce_jaxpr
 from jaxtyping import Array, PyTree
 
 from ballu_mjx.sim.custom_jvp import directional_derivative, nonzero_tangents
-from ballu_mjx.sim.vmap_last_rules import Batched, depends_on_batch, evaluate, unwrap
+from ballu_mjx.sim.vmap_last_rules import Batch, Batched, depends_on_batch, evaluate, unwrap
 
 
 def vmap(
-    function: Callable[..., Any], in_batched: Sequence[PyTree[bool]], size: int, widest: int | None = None
+    function: Callable[..., Any],
+    in_batched: Sequence[PyTree[bool]],
+    size: int,
+    widest: int | None = None,
+    store_operands: bool = False,
 ) -> Callable[..., Any]:
     """Return a batched version of `function`, like `jax.vmap(function)`, for functions of arrays and trees of arrays.
 
@@ -39,6 +43,7 @@ def vmap(
     - `size`: batch size.
     - `widest`: largest batch that is evaluated at once. Larger batches are split into parts that run one after another.
       None for 512.
+    - `store_operands`: see `vmap_last_rules.Batch`.
 
     **Returns** a function that returns the results, and a tree that says which results have a batch along their first
     axis. These are the results that depend on a batched argument.
@@ -58,7 +63,8 @@ def vmap(
         def part(width: int, own: Sequence[Array]) -> list[Array]:
             rows = iter(own)
             values = [Batched(jnp.moveaxis(next(rows), 0, -1)) if f else x for x, f in zip(arrays, flags, strict=True)]
-            found = unwrap(evaluate(recorded, values, width), depends, width)
+            batch = Batch(width, store_operands)
+            found = unwrap(evaluate(recorded, values, batch), depends, batch)
             return [jnp.moveaxis(x, -1, 0) if d else jnp.asarray(x) for x, d in zip(found, depends, strict=True)]
 
         own = [x for x, f in zip(arrays, flags, strict=True) if f]
@@ -80,11 +86,12 @@ _WIDEST = 512
 """Largest batch whose working data in a robot's step stay in a core's cache (`benchmarks/step_profile.py`)."""
 
 
-def nested_vmap(function: Callable[..., PyTree], inner: int = 1) -> Callable[..., PyTree]:
+def nested_vmap(function: Callable[..., PyTree], inner: int = 1, store_operands: bool = False) -> Callable[..., PyTree]:
     """Return `jax.vmap(function)`; on the CPU, a version with the batch along the last axis.
 
     Operations that `function` itself batches have the new batch axis last as well. Their batch size is about `inner`,
-    and the largest batch that is evaluated at once is smaller by this factor.
+    and the largest batch that is evaluated at once is smaller by this factor. `store_operands`: see
+    `vmap_last_rules.Batch`.
     """
     if jax.default_backend() != "cpu":
         return jax.vmap(function)
@@ -92,17 +99,18 @@ def nested_vmap(function: Callable[..., PyTree], inner: int = 1) -> Callable[...
     def whole(*arguments: PyTree) -> PyTree:
         size = len(jax.tree.leaves(arguments)[0])
         everything = jax.tree.map(lambda _: True, arguments)
-        found, depends = vmap(function, everything, size, max(_WIDEST // inner, 1))(*arguments)
+        found, depends = vmap(function, everything, size, max(_WIDEST // inner, 1), store_operands)(*arguments)
         return jax.tree.map(lambda x, d: x if d else jnp.broadcast_to(x, (size, *x.shape)), found, depends)
 
     return whole
 
 
-def vmap_with_trailing_batch(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+def vmap_with_trailing_batch(function: Callable[..., PyTree], store_operands: bool = False) -> Callable[..., PyTree]:
     """Return `function` with a rule that makes `jax.vmap` put the batch along the last axis.
 
     The rule applies to forward derivatives too. It exists on the CPU only: on other devices, the result calls
-    `function` unchanged. Reverse mode is not supported.
+    `function` unchanged. Reverse mode is not supported. `store_operands`: see `vmap_last_rules.Batch`; true for models
+    with dry friction (`step.has_dry_friction`).
     """
 
     def whole(*arguments: PyTree) -> PyTree:
@@ -114,7 +122,7 @@ def vmap_with_trailing_batch(function: Callable[..., PyTree]) -> Callable[..., P
 
         @jax.custom_jvp
         def apply(*leaves: Array) -> PyTree:
-            return _with_batch_last(flat)(list(leaves))
+            return _with_batch_last(flat, store_operands)(list(leaves))
 
         @functools.partial(apply.defjvp, symbolic_zeros=True)
         def _(leaves: Sequence[Array], changes: Sequence[Any]) -> tuple[PyTree, PyTree]:
@@ -125,7 +133,7 @@ def vmap_with_trailing_batch(function: Callable[..., PyTree]) -> Callable[..., P
                 return directional_derivative(flat, leaves, places, changes)
 
             moving = list(leaves), [changes[i] for i in places]
-            return _with_batch_last(_recorded(along, *moving))(*moving)
+            return _with_batch_last(_recorded(along, *moving), store_operands)(*moving)
 
         return apply(*leaves)
 
@@ -144,11 +152,11 @@ def _recorded(function: Callable[..., PyTree], *arguments: PyTree) -> Callable[.
     return lambda *arguments: jax.tree.unflatten(tree, run(*jax.tree.leaves(arguments)))
 
 
-def _with_batch_last(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+def _with_batch_last(function: Callable[..., PyTree], store_operands: bool) -> Callable[..., PyTree]:
     whole = jax.custom_batching.custom_vmap(function)
 
     @whole.def_vmap
     def _(size: int, in_batched: Sequence[PyTree[bool]], *arguments: PyTree) -> tuple[PyTree, PyTree[bool]]:
-        return vmap(function, in_batched, size)(*arguments)
+        return vmap(function, in_batched, size, store_operands=store_operands)(*arguments)
 
     return whole

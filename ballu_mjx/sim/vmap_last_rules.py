@@ -6,7 +6,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+import operator
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -16,6 +18,21 @@ from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jaxtyping import Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Batch:
+    """How a function is evaluated for a batch."""
+
+    size: int
+    """Batch size."""
+    store_operands: bool = False
+    """Whether factors of matrix products are computed before the product, and sums over rows are written out.
+
+    By default, XLA merges the computation of a factor into the product, and repeats it for each of its elements. This
+    saves memory traffic if the computation is short. In MJX's solver it is long if joints have dry friction: their
+    constraints have three cases. The step then takes seven times as long.
+    """
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,12 +51,12 @@ def _is_batched(value: Any) -> bool:
     return isinstance(value, Batched)
 
 
-def _full(value: Any, size: int) -> Array:
+def _full(value: Any, batch: Batch) -> Array:
     """Return the array of a value, repeated over the batch if the value has none."""
     if isinstance(value, Batched):
         return value.array
     array = jnp.asarray(value)
-    return lax.broadcast_in_dim(array, (*array.shape, size), tuple(range(array.ndim)))
+    return lax.broadcast_in_dim(array, (*array.shape, batch.size), tuple(range(array.ndim)))
 
 
 def _ranked(array: Array, like: Array) -> Array:
@@ -50,8 +67,8 @@ def _ranked(array: Array, like: Array) -> Array:
     return array if array.ndim == like.ndim else lax.broadcast_in_dim(array, like.shape, (like.ndim - 1,))
 
 
-def evaluate(closed: ClosedJaxpr, arguments: Iterable[Any], size: int) -> list[Any]:
-    """Return the results of a recorded function. `size` is the batch size."""
+def evaluate(closed: ClosedJaxpr, arguments: Iterable[Any], batch: Batch) -> list[Any]:
+    """Return the results of a recorded function."""
     known: dict[Any, Any] = dict(zip(closed.jaxpr.constvars, closed.consts, strict=True))
     known.update(zip(closed.jaxpr.invars, arguments, strict=True))
 
@@ -59,31 +76,44 @@ def evaluate(closed: ClosedJaxpr, arguments: Iterable[Any], size: int) -> list[A
         return variable.val if isinstance(variable, Literal) else known[variable]
 
     for equation in closed.jaxpr.eqns:
-        results = _apply(equation, [read(v) for v in equation.invars], size)
+        results = _apply(equation, [read(v) for v in equation.invars], batch)
         known.update(zip(equation.outvars, results, strict=True))
     return [read(v) for v in closed.jaxpr.outvars]
 
 
-def _apply(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
+def _apply(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
     """Return the results of one operation."""
     name, bind, params = equation.primitive.name, equation.primitive.bind, equation.params
     if name in _CALLS:
-        return evaluate(params[_CALLS[name]], inputs, size)
+        return evaluate(params[_CALLS[name]], inputs, batch)
     if not any(map(_is_batched, inputs)):
         return _as_list(bind(*inputs, **params), equation)
     if name in _ELEMENTWISE:
-        full = [_full(x, size) for x in inputs]
+        full = [_full(x, batch) for x in inputs]
         widest = max(full, key=jnp.ndim)
         return [Batched(bind(*(_ranked(x, widest) for x in full), **params))]
     if name in _REDUCTIONS:
-        return [Batched(bind(_bare(inputs[0]), **params))]
+        array = _bare(inputs[0])
+        if batch.store_operands and name == "reduce_sum" and params["axes"] == (0,) and array.ndim > 2:
+            return [Batched(functools.reduce(operator.add, array))]
+        return [Batched(bind(array, **params))]
     if name in _RULES:
-        found = _RULES[name](equation, inputs, size)
+        found = _RULES[name](equation, inputs, batch)
         if found is not None:
             return found
     axes = [-1 if _is_batched(x) else None for x in inputs]
     found = jax.vmap(lambda *values: bind(*values, **params), in_axes=axes, out_axes=-1)(*map(_bare, inputs))
     return [Batched(x) for x in _as_list(found, equation)]
+
+
+def _stored(array: Array) -> Array:
+    """Return `array` in a form that XLA computes only once.
+
+    XLA does not repeat divisions. The divisor is 1, which XLA does not know, and no number changes.
+    """
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    return array / (1 + 0 * array[(0,) * (array.ndim - 1)])
 
 
 def _as_list(found: Any, equation: JaxprEqn) -> list[Any]:
@@ -106,8 +136,8 @@ _ELEMENTWISE = frozenset(
 )
 _REDUCTIONS = frozenset("argmax argmin reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum".split())
 
-Rule = Callable[[JaxprEqn, list[Any], int], list[Any] | None]
-"""Function of an operation, its inputs and the batch size. It returns the results, or None if `jax.vmap` has to do
+Rule = Callable[[JaxprEqn, list[Any], Batch], list[Any] | None]
+"""Function of an operation, its inputs and the batch. It returns the results, or None if `jax.vmap` has to do
 it."""
 _RULES: dict[str, Rule] = {}
 
@@ -124,66 +154,66 @@ def _rule(*names: str) -> Callable[[Rule], Rule]:
 
 
 @_rule("select_n")
-def _select(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
-    which, *cases = (_full(x, size) for x in inputs)
+def _select(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
+    which, *cases = (_full(x, batch) for x in inputs)
     return [Batched(lax.select_n(_ranked(which, cases[0]), *cases))]
 
 
 @_rule("broadcast_in_dim")
-def _broadcast(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
+def _broadcast(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
     shape, axes = equation.params["shape"], equation.params["broadcast_dimensions"]
-    return [Batched(lax.broadcast_in_dim(_bare(inputs[0]), (*shape, size), (*axes, len(shape))))]
+    return [Batched(lax.broadcast_in_dim(_bare(inputs[0]), (*shape, batch.size), (*axes, len(shape))))]
 
 
 @_rule("reshape")
-def _reshape(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any] | None:
+def _reshape(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any] | None:
     if equation.params["dimensions"] is not None:
         return None
-    return [Batched(lax.reshape(_bare(inputs[0]), (*equation.params["new_sizes"], size)))]
+    return [Batched(lax.reshape(_bare(inputs[0]), (*equation.params["new_sizes"], batch.size)))]
 
 
 @_rule("squeeze", "expand_dims", "rev")
-def _same_axes(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
+def _same_axes(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
     return [Batched(equation.primitive.bind(_bare(inputs[0]), **equation.params))]
 
 
 @_rule("transpose")
-def _transpose(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
+def _transpose(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
     axes = equation.params["permutation"]
     return [Batched(lax.transpose(_bare(inputs[0]), (*axes, len(axes))))]
 
 
 @_rule("slice")
-def _slice(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
+def _slice(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
     start, limit, strides = (equation.params[name] for name in ("start_indices", "limit_indices", "strides"))
     strides = None if strides is None else (*strides, 1)
-    return [Batched(lax.slice(_bare(inputs[0]), (*start, 0), (*limit, size), strides))]
+    return [Batched(lax.slice(_bare(inputs[0]), (*start, 0), (*limit, batch.size), strides))]
 
 
 @_rule("concatenate")
-def _concatenate(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
-    return [Batched(lax.concatenate([_full(x, size) for x in inputs], equation.params["dimension"]))]
+def _concatenate(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
+    return [Batched(lax.concatenate([_full(x, batch) for x in inputs], equation.params["dimension"]))]
 
 
 @_rule("tile")
-def _tile(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
+def _tile(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
     return [Batched(lax.tile(_bare(inputs[0]), (*equation.params["reps"], 1)))]
 
 
 @_rule("pad")
-def _pad(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any] | None:
+def _pad(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any] | None:
     if _is_batched(inputs[1]):
         return None
-    return [Batched(lax.pad(_full(inputs[0], size), inputs[1], (*equation.params["padding_config"], (0, 0, 0))))]
+    return [Batched(lax.pad(_full(inputs[0], batch), inputs[1], (*equation.params["padding_config"], (0, 0, 0))))]
 
 
 @_rule("dynamic_slice")
-def _dynamic_slice(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
+def _dynamic_slice(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
     """Select among all possible start positions if they differ over the batch.
 
     There are few positions, and the selection needs no loop over the batch.
     """
-    array, sizes = _full(inputs[0], size), equation.params["slice_sizes"]
+    array, sizes = _full(inputs[0], batch), equation.params["slice_sizes"]
     for axis, (start, width) in enumerate(zip(inputs[1:], sizes, strict=True)):
         places = array.shape[axis] - width + 1
         if not _is_batched(start):
@@ -199,41 +229,41 @@ def _dynamic_slice(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any
 
 
 @_rule("dynamic_update_slice")
-def _dynamic_update_slice(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any] | None:
+def _dynamic_update_slice(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any] | None:
     array, update, *starts = inputs
     if any(map(_is_batched, starts)):
         return None
-    return [Batched(lax.dynamic_update_slice(_full(array, size), _full(update, size), (*starts, 0)))]
+    return [Batched(lax.dynamic_update_slice(_full(array, batch), _full(update, batch), (*starts, 0)))]
 
 
 @_rule("gather")
-def _gather(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any] | None:
+def _gather(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any] | None:
     array, indices = inputs
     if _is_batched(indices):
         return None
     numbers = equation.params["dimension_numbers"]
     numbers = numbers._replace(offset_dims=(*numbers.offset_dims, _result(equation).ndim))
-    sizes = (*equation.params["slice_sizes"], size)
+    sizes = (*equation.params["slice_sizes"], batch.size)
     params = {**equation.params, "dimension_numbers": numbers, "slice_sizes": sizes}
     return [Batched(equation.primitive.bind(_bare(array), indices, **params))]
 
 
 @_rule("scatter", "scatter-add", "scatter-mul", "scatter-min", "scatter-max")
-def _scatter(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any] | None:
+def _scatter(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any] | None:
     array, indices, updates = inputs
     if _is_batched(indices):
         return None
-    numbers, updates = equation.params["dimension_numbers"], _full(updates, size)
+    numbers, updates = equation.params["dimension_numbers"], _full(updates, batch)
     numbers = numbers._replace(update_window_dims=(*numbers.update_window_dims, updates.ndim - 1))
     params = {**equation.params, "dimension_numbers": numbers}
-    return [Batched(equation.primitive.bind(_full(array, size), indices, updates, **params))]
+    return [Batched(equation.primitive.bind(_full(array, batch), indices, updates, **params))]
 
 
 # 2. Linear algebra: matrices with about a dozen rows, processed column by column for the whole batch
 
 
 @_rule("dot_general")
-def _dot(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
+def _dot(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
     contracted, together = equation.params["dimension_numbers"]
     dtype = _result(equation).dtype
 
@@ -248,6 +278,8 @@ def _dot(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
 
     left, left_others = arranged(inputs[0], contracted[0], together[0])
     right, right_others = arranged(inputs[1], contracted[1], together[1])
+    if batch.store_operands:
+        left, right = _stored(left) if right_others else left, _stored(right) if left_others else right
     first = 1 + len(together[0])
     left = jnp.expand_dims(left, tuple(range(first + left_others, first + left_others + right_others)))
     right = jnp.expand_dims(right, tuple(range(first, first + left_others)))
@@ -258,7 +290,7 @@ def _dot(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
 
 
 @_rule("cholesky")
-def _cholesky(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any] | None:
+def _cholesky(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any] | None:
     matrix = _bare(inputs[0])
     if matrix.ndim != 3:
         return None
@@ -271,8 +303,8 @@ def _cholesky(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any] | N
 
 
 @_rule("triangular_solve")
-def _triangular_solve(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any] | None:
-    matrix, right = (_full(x, size) for x in inputs)
+def _triangular_solve(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any] | None:
+    matrix, right = (_full(x, batch) for x in inputs)
     params = equation.params
     if matrix.ndim != 3 or params["unit_diagonal"]:
         return None
@@ -357,46 +389,46 @@ def _wrapped(values: Iterable[Any], batched: Iterable[bool]) -> list[Any]:
     return [Batched(x) if b else x for x, b in zip(values, batched, strict=True)]
 
 
-def unwrap(values: Iterable[Any], batched: Iterable[bool], size: int) -> list[Any]:
+def unwrap(values: Iterable[Any], batched: Iterable[bool], batch: Batch) -> list[Any]:
     """Return bare arrays. Those that are `batched` have a batch, even if the value had none."""
-    return [_full(x, size) if b else x for x, b in zip(values, batched, strict=True)]
+    return [_full(x, batch) if b else x for x, b in zip(values, batched, strict=True)]
 
 
 @_rule("cond")
-def _cond(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
+def _cond(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
     which, *operands = inputs
     branches = equation.params["branches"]
     if _is_batched(which):
-        cases = [unwrap(evaluate(b, operands, size), [True] * len(equation.outvars), size) for b in branches]
+        cases = [unwrap(evaluate(b, operands, batch), [True] * len(equation.outvars), batch) for b in branches]
         chosen = _bare(which) if len(branches) > 2 else _bare(which) != 0
         return [Batched(lax.select_n(_ranked(chosen, case[0]), *case)) for case in zip(*cases, strict=True)]
     batched = list(map(_is_batched, operands))
     after = [any(each) for each in zip(*(depends_on_batch(b, batched) for b in branches), strict=True)]
 
     def branch(closed: ClosedJaxpr) -> Callable[..., list[Array]]:
-        return lambda *values: unwrap(evaluate(closed, _wrapped(values, batched), size), after, size)
+        return lambda *values: unwrap(evaluate(closed, _wrapped(values, batched), batch), after, batch)
 
     return _wrapped(lax.switch(which, [branch(b) for b in branches], *map(_bare, operands)), after)
 
 
 @_rule("while")
-def _while(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
+def _while(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
     cond, body = equation.params["cond_jaxpr"], equation.params["body_jaxpr"]
     of_cond, of_body, start = _parts(inputs, equation.params["cond_nconsts"], equation.params["body_nconsts"])
     batched, each = _while_depends(equation, list(map(_is_batched, inputs)))
 
     def goes_on(carry: list[Any]) -> Any:
-        return _bare(evaluate(cond, [*of_cond, *_wrapped(carry, batched)], size)[0])
+        return _bare(evaluate(cond, [*of_cond, *_wrapped(carry, batched)], batch)[0])
 
     def step(carry: list[Any]) -> list[Any]:
-        return unwrap(evaluate(body, [*of_body, *_wrapped(carry, batched)], size), batched, size)
+        return unwrap(evaluate(body, [*of_body, *_wrapped(carry, batched)], batch), batched, batch)
 
     def step_each(carry: tuple[Array, list[Any]]) -> tuple[Array, list[Any]]:
         going, values = carry
         values = [lax.select(_ranked(going, old), new, old) for new, old in zip(step(values), values, strict=True)]
         return going & goes_on(values), values
 
-    first = unwrap(start, batched, size)
+    first = unwrap(start, batched, batch)
     if each:
         last = lax.while_loop(lambda carry: jnp.any(carry[0]), step_each, (goes_on(first), first))[1]
     else:
@@ -405,17 +437,17 @@ def _while(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
 
 
 @_rule("scan")
-def _scan(equation: JaxprEqn, inputs: list[Any], size: int) -> list[Any]:
+def _scan(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
     closed, carried = equation.params["jaxpr"], equation.params["num_carry"]
     fixed, start, rows = _parts(inputs, equation.params["num_consts"], carried)
     of_rows, all_batched = list(map(_is_batched, rows)), _scan_depends(equation, list(map(_is_batched, inputs)))
     batched = all_batched[:carried]
 
     def step(carry: list[Any], row: list[Any]) -> tuple[list[Any], list[Any]]:
-        found = evaluate(closed, [*fixed, *_wrapped(carry, batched), *_wrapped(row, of_rows)], size)
-        found = unwrap(found, all_batched, size)
+        found = evaluate(closed, [*fixed, *_wrapped(carry, batched), *_wrapped(row, of_rows)], batch)
+        found = unwrap(found, all_batched, batch)
         return found[:carried], found[carried:]
 
     same = {name: equation.params[name] for name in ("length", "reverse", "unroll")}
-    last, seen = lax.scan(step, unwrap(start, batched, size), list(map(_bare, rows)), **same)
+    last, seen = lax.scan(step, unwrap(start, batched, batch), list(map(_bare, rows)), **same)
     return _wrapped([*last, *seen], all_batched)
