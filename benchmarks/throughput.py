@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from pathlib import Path
 
 from ballu_mjx.common import runtime
 from ballu_mjx.robots.registry import load_robot
@@ -29,7 +30,8 @@ import numpy as np
 from jaxtyping import Float
 from mujoco import rollout
 
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
+from ballu_mjx.ballu.model import CONTROL_TIMESTEP, standing_qpos
+from ballu_mjx.identification.actuators import read_actuators
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
@@ -90,12 +92,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="fewer repeats")
     parser.add_argument("--num-envs", type=int, default=ppo.PPOConfig().num_envs, help="environments in parallel")
+    parser.add_argument("--actuators", type=Path, help="file of identified actuators (nominal ones)")
     arguments = parser.parse_args()
     repeats = 3 if arguments.quick else 10
 
-    model = load_model()
-    motions = [reconstruct(read_recording(p, load_robot()), load_robot(), model) for p in list_bundled("training")]
-    env = EnvMimicEnv(Simulator(load_robot(), model=model), motions, EnvMimicConfig())
+    robot = load_robot()
+    actuators = None if arguments.actuators is None else read_actuators(robot, arguments.actuators)[1]
+    simulator = Simulator(robot, actuators)
+    model, drivetrain = simulator.mj_model, simulator.drivetrain
+    recordings = [read_recording(path, robot) for path in list_bundled("training")]
+    motions = [reconstruct(recording, robot, model, drivetrain=drivetrain) for recording in recordings]
+    env = EnvMimicEnv(simulator, motions, EnvMimicConfig())
     config = ppo.PPOConfig(num_envs=arguments.num_envs)
     step_size = config.batch_size * config.num_minibatches * config.unroll_length
     config = ppo.PPOConfig(num_envs=arguments.num_envs, num_timesteps=(repeats + 1) * step_size)

@@ -51,7 +51,15 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "elementwise": lambda x: jnp.where(x > 0, jnp.sqrt(jnp.abs(x)), jnp.clip(x, -0.5, 0.1) ** 3) + jnp.arctan2(x, 2.0),
     "scalars": lambda x: jnp.where(x[0, 0] > 0, x, -x) * x[1, 2] + jnp.arange(3.0),
     "shapes": lambda x: (jnp.concatenate([x, x.T]), jnp.tile(x[0], 2), jnp.pad(x, 1), x.ravel()[::-1], x[:, None, 1:]),
-    "reductions": lambda x: (x.sum(0), x.max(), jnp.argmax(x, axis=1), (x > 0).all(1), jnp.linalg.norm(x), jnp.sort(x)),
+    "reductions": lambda x: (
+        x.sum(0),
+        x.sum(),
+        x.max(),
+        jnp.argmax(x, axis=1),
+        (x > 0).all(1),
+        jnp.linalg.norm(x),
+        jnp.sort(x),
+    ),
     "products": lambda x: (x @ x, x.T @ x[0], jnp.einsum("ij,kj->ik", x, x), jnp.outer(x[0], x[1]), x @ jnp.ones(3)),
     "batched product": lambda x: jnp.einsum("bij,bjk->bik", jnp.stack([x, 2 * x]), jnp.stack([x.T, x])),
     "cholesky": lambda x: jnp.linalg.cholesky(symmetric(x)),
@@ -77,11 +85,12 @@ def assert_same(found: Any, expected: Any, tolerance: float = 1e-5) -> None:
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance), found, expected)
 
 
+@pytest.mark.parametrize("store_operands", [False, True])
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_results_agree_with_vmap(name: str):
+def test_results_agree_with_vmap(name: str, store_operands: bool):
     function = FUNCTIONS[name]
     x = jax.random.normal(jax.random.key(1), (SIZE, 3, 3))
-    assert_same(jax.jit(nested_vmap(function))(x), jax.vmap(function)(x))
+    assert_same(jax.jit(nested_vmap(function, store_operands=store_operands))(x), jax.vmap(function)(x))
 
 
 @pytest.mark.parametrize("size", [4, 7, 13])
@@ -146,10 +155,11 @@ def test_values_beside_a_jacobian_get_no_batch():
     assert_same(jacobian, jax.jacfwd(lambda x: halving(x)[0])(x))
 
 
-@pytest.fixture(scope="module")
-def robots() -> tuple[mjx.Model, mjx.Data, PhysicsState, Any, int]:
+@pytest.fixture(scope="module", params=[0.0, 1e-3], ids=["no friction", "dry friction"])
+def robots(request: pytest.FixtureRequest) -> tuple[mjx.Model, mjx.Data, PhysicsState, Any, int]:
     """Eight robots on and slightly above the floor, with their commands."""
     model = load_model()
+    model.dof_frictionloss[6:] = request.param
     rng = np.random.default_rng(0)
     qpos = np.tile(standing_qpos(model), (8, 1))
     qpos[:, 2] += rng.uniform(-0.002, 0.01, 8)

@@ -1,0 +1,138 @@
+"""Measure if the transfer of policies can be predicted before they meet the robot.
+
+The policies and their trials are those of `bullet_transfer.py`. Each policy is tried in three simulators of its robot:
+with identified actuators, with EnvMimic, and with the identified air. The prediction of a policy's CoM error is
+
+    sqrt(d^2 + e^2),
+
+with the distance d between the policy's motions in its own simulator and in the reference simulator, and the error e of
+the reference in open-loop replays of the validation recordings. The reference has the smallest e of the three. Rank
+correlations of this number, and of simpler ones, with the measured CoM errors are printed. `--robots` selects robots;
+the form of the prediction was chosen on robots 0 and 1.
+
+    python benchmarks/transfer_prediction.py runs/bullet-transfer
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from ballu_mjx.common import runtime
+
+runtime.prepare()
+
+import numpy as np
+from bullet_family import ROBOTS
+from scipy.stats import spearmanr
+
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.common.results import Cell, Table, write_results
+from ballu_mjx.evaluation.errors import Errors
+from ballu_mjx.evaluation.errors_file import read_evaluation
+from ballu_mjx.evaluation.transfer import read_transfer
+from ballu_mjx.policies.load_simulator import load_simulator
+from ballu_mjx.policies.pipeline_layout import PAPER_SIMULATORS
+from ballu_mjx.policies.policy import Policy
+from ballu_mjx.policies.transfer_prediction import TransferPredictor
+
+PREDICTIONS = (
+    "distance to the reference, with its error",
+    "distance to the reference",
+    "mean distance to the others",
+    "share outside of the training range",
+)
+"""Numbers that are compared, by which policies are ordered."""
+
+
+class Row(NamedTuple):
+    """One policy."""
+
+    robot: int
+    setting: str
+    measured: float
+    """Mean CoM error on the robot (m)."""
+    predicted: tuple[float, ...]
+    """The numbers of `PREDICTIONS`."""
+
+
+def com_error(errors: Sequence[Errors]) -> float:
+    """Return the mean CoM error (m) in open-loop replays of whole recordings."""
+    return float(np.mean([each.mean_com_error for each in errors]))
+
+
+def predict(robot: int, folder: Path) -> list[Row]:
+    """Return the rows of one robot's policies for walking.
+
+    **Raises** `InputError` if there are none.
+    """
+    seed = folder / f"robot-{robot}" / "seed-0"
+    runs = {
+        "vanilla+sysid": seed.parent / "sysid",
+        "envmimic": seed / "envmimic-walk",
+        "aerodynamic": seed / "aerodynamic-walk",
+    }
+    if missing := [str(run) for run in runs.values() if not run.is_dir()]:
+        raise InputError(f"{missing[0]}: is missing; run benchmarks/bullet_transfer.py --robots {robot} first.")
+    evaluations = {name: read_evaluation(runs[name] / "evaluation.json") for name in ("envmimic", "aerodynamic")}
+    error = {name: com_error(found.residual) for name, found in evaluations.items()}
+    error["vanilla+sysid"] = com_error(evaluations["envmimic"].vanilla)
+    reference = min(error, key=lambda name: error[name])
+    predictor = TransferPredictor({name: load_simulator(run) for name, run in runs.items()})
+    rows = []
+    for setting in PAPER_SIMULATORS:
+        policy = Policy.load(seed / f"walk-{setting}")
+        found = predictor.predict(policy)
+        trials = read_transfer(seed / f"trials-walk-{setting}" / "transfer.json")
+        distance = 0.0 if setting == reference else found[reference].com_error
+        others = [each.com_error for name, each in found.items() if name != setting]
+        numbers = (
+            float(np.hypot(distance, error[reference])),
+            distance,
+            float(np.mean(others)),
+            found[reference].outside,
+        )
+        rows.append(Row(robot, setting, float(np.mean([trial.com_error for trial in trials])), numbers))
+        print(robot, setting, *(f"{number:.2f}" for number in (rows[-1].measured, *numbers)), flush=True)
+    return rows
+
+
+def policies_table(rows: Sequence[Row]) -> Table:
+    """Return one row for each policy."""
+    heads = ("robot", "simulator", "measured CoM error (m)", "predicted (m)")
+    cells = [(str(row.robot), row.setting, Cell((row.measured,)), Cell((row.predicted[0],))) for row in rows]
+    return Table(heads, tuple(cells))
+
+
+def correlations(rows: Sequence[Row]) -> Mapping[str, float]:
+    """Return Spearman's rank correlation of each prediction with the measured errors."""
+    measured = [row.measured for row in rows]
+    return {
+        name: float(np.asarray(spearmanr(measured, [row.predicted[place] for row in rows]))[0])
+        for place, name in enumerate(PREDICTIONS)
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="output folder of bullet_transfer.py")
+    parser.add_argument("--robots", type=int, nargs="+", choices=list(ROBOTS), default=list(ROBOTS), help="seeds (all)")
+    parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
+    given = parser.parse_args()
+    rows = [row for robot in given.robots for row in predict(robot, given.folder)]
+    ranked = correlations(rows)
+    table = Table(
+        (f"prediction, {len(rows)} policies", "rank correlation with the measured CoM error"),
+        tuple((name, Cell((value,))) for name, value in ranked.items()),
+    )
+    tables = {"policies": policies_table(rows), "correlations": table}
+    for each in tables.values():
+        print(f"\n{each.to_markdown()}")
+    if given.results is not None:
+        write_results(given.results, tables, "Development data", seeds={"robots": given.robots, "training": [0]})
+
+
+if __name__ == "__main__":
+    main()
