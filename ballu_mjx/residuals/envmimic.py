@@ -327,12 +327,13 @@ def start_spread(model: mujoco.MjModel, robot: RobotDescription) -> Float[np.nda
     """Return the uncertainty of reconstructed states, as standard deviations along the directions of `qvel`.
 
     Positions come first (1 mm and 0.5 deg), then velocities (1 cm/s, 2 deg/s for a free base and 5 deg/s for joints).
-    The positions of held joints have 0.001 deg: through a stiff transmission, a degree would mean a large force, which
-    no reconstruction error causes.
+    The positions of held joints have 0.001 deg or 0.001 mm: through a stiff transmission, a degree would mean a large
+    force, which no reconstruction error causes.
     """
     degree, along = np.pi / 180, translations(model)
     position, velocity = np.where(along, 1e-3, 0.5 * degree), np.where(along, 0.01, 5 * degree)
     if not robot.anchored:
         velocity[3:6] = 2 * degree
-    position[[model.joint(name).dofadr[0] for name in robot.held]] = 1e-3 * degree
+    held = [model.joint(name).dofadr[0] for name in robot.held]
+    position[held] = np.where(along[held], 1e-6, 1e-3 * degree)
     return np.concatenate([position, velocity])

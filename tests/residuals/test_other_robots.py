@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from rover import write_rover
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
@@ -20,7 +21,7 @@ from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals import force_gradients, force_regression
 from ballu_mjx.residuals.aerodynamics import Aerodynamics, AirParameters
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
-from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, start_spread
 from ballu_mjx.residuals.force_gradients import AnalyticConfig
 from ballu_mjx.residuals.force_regression import SupervisedConfig
 from ballu_mjx.residuals.network import NetworkResidual
@@ -183,3 +184,14 @@ def test_command_delay_of_the_air_uses_the_robot_s_control_time_step(tmp_path: P
     sent = jnp.array([[0.0, 0.0], [0.5, 0.5], [1.0, 1.0]])
     arrived = np.asarray(Aerodynamics(fast, fast.load_model()).command(air, sent))
     np.testing.assert_array_equal(arrived[:, 0], [0.0, 0.5])
+
+
+def test_starting_states_of_held_joints_hardly_vary(tmp_path: Path):
+    robot = dataclasses.replace(write_rover(tmp_path), held=("lid", "rod"))
+    model = robot.load_model()
+    spread = start_spread(model, robot)
+    place = {name: model.joint(name).dofadr[0] for name in ("shoulder", "rod", "lid")}
+    assert spread[place["shoulder"]] == pytest.approx(np.deg2rad(0.5))
+    assert spread[place["lid"]] == pytest.approx(np.deg2rad(1e-3))
+    assert spread[place["rod"]] == pytest.approx(1e-6)  # a slide joint, in metres
+    assert spread[: model.nv].max() == pytest.approx(np.deg2rad(0.5))
