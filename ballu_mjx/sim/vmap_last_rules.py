@@ -94,7 +94,7 @@ def _apply(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
         return [Batched(bind(*(_ranked(x, widest) for x in full), **params))]
     if name in _REDUCTIONS:
         array = _bare(inputs[0])
-        if batch.store_operands and name == "reduce_sum" and params["axes"] == (0,) and array.ndim > 2:
+        if batch.store_operands and name == "reduce_sum" and params["axes"] == (0,) and array.ndim > 2 and len(array):
             return [Batched(functools.reduce(operator.add, array))]
         return [Batched(bind(array, **params))]
     if name in _RULES:
@@ -111,7 +111,7 @@ def _stored(array: Array) -> Array:
 
     XLA does not repeat divisions. The divisor is 1, which XLA does not know, and no number changes.
     """
-    if not jnp.issubdtype(array.dtype, jnp.floating):
+    if not array.size or not jnp.issubdtype(array.dtype, jnp.floating):
         return array
     return array / (1 + 0 * array[(0,) * (array.ndim - 1)])
 

@@ -60,6 +60,7 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
         jnp.linalg.norm(x),
         jnp.sort(x),
     ),
+    "empty": lambda x: (x[:, :0] @ x[:0], x[:0].sum(0), jnp.stack([x, x])[:0].sum(0), x[:0] @ x),
     "products": lambda x: (x @ x, x.T @ x[0], jnp.einsum("ij,kj->ik", x, x), jnp.outer(x[0], x[1]), x @ jnp.ones(3)),
     "batched product": lambda x: jnp.einsum("bij,bjk->bik", jnp.stack([x, 2 * x]), jnp.stack([x.T, x])),
     "cholesky": lambda x: jnp.linalg.cholesky(symmetric(x)),
