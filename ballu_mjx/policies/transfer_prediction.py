@@ -14,8 +14,10 @@ from jaxtyping import Float
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.policies.closed_loop import ClosedLoop
+from ballu_mjx.policies.locomotion_config import LocomotionConfig
 from ballu_mjx.policies.policy import Policy, environment_of
 from ballu_mjx.residuals.trained_residual import TrainedResidual
+from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 STARTS = 8
@@ -46,7 +48,7 @@ class TransferPredictor:
         """`simulators` are those to compare with, by name. `starts` is the number of trials."""
         self._simulators = {name: simulator.with_residual(None) for name, simulator in simulators.items()}
         self._starts = starts
-        self._loops: dict[tuple[str, str, int], ClosedLoop] = {}
+        self._loops: dict[tuple[str, str, LocomotionConfig, PPOConfig], ClosedLoop] = {}
 
     def predict(self, policy: Policy) -> dict[str, TransferPrediction]:
         """Return the predictions of each simulator for a policy.
@@ -73,9 +75,9 @@ class TransferPredictor:
     def _loop(self, policy: Policy, name: str) -> ClosedLoop:
         """Return the closed loop in a simulator, for policies with the network and task of `policy`."""
         simulator = self._simulators[name]
-        key = name, policy.task.name, hash(dataclasses.replace(policy.network, seed=0))
+        plain = dataclasses.replace(policy.config, domain_randomization=False, outside_cost=0.0)
+        key = name, policy.task.name, plain, dataclasses.replace(policy.network, seed=0)
         if key not in self._loops:
-            plain = dataclasses.replace(policy.config, domain_randomization=False, outside_cost=0.0)
             env = environment_of(policy.robot, policy.task, plain, simulator.actuators, TrainedResidual.of(simulator))
             self._loops[key] = ClosedLoop(env, policy.infer)
         return self._loops[key]

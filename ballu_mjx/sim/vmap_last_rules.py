@@ -137,8 +137,7 @@ _ELEMENTWISE = frozenset(
 _REDUCTIONS = frozenset("argmax argmin reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum".split())
 
 Rule = Callable[[JaxprEqn, list[Any], Batch], list[Any] | None]
-"""Function of an operation, its inputs and the batch. It returns the results, or None if `jax.vmap` has to do
-it."""
+"""Function of an operation, its inputs and the batch. It returns the results, or None if `jax.vmap` has to do it."""
 _RULES: dict[str, Rule] = {}
 
 
