@@ -31,7 +31,14 @@ from scipy.spatial.transform import Rotation
 from ballu_mjx.ballu.gaits import Gait, telegraph, waves
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES
 from ballu_mjx.ballu.recordings import make_recording
-from ballu_mjx.ballu.virtual.robot import NAMES, CaptureController, open_loop
+from ballu_mjx.ballu.virtual.robot import (
+    NAMES,
+    CaptureController,
+    TrialConditions,
+    open_loop,
+    recording_of,
+    wind,
+)
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.recording import Recording
 
@@ -201,38 +208,23 @@ def walking_commands(seconds: float) -> dict[str, Float[np.ndarray, "steps 2"]]:
 def record_walking(robot: BulletRobot, commands: Float[np.ndarray, "steps 2"], name: str, seed: int = 0) -> Recording:
     """Return a recording of commands at 20 Hz, after two seconds of standing, in still air."""
     notes = "Hand-designed commands, open loop."
-    conditions, noise = Conditions(), np.random.default_rng([seed, 44])
-    return _record(robot, conditions, noise, open_loop(commands), len(commands) * CONTROL_TIMESTEP, name, notes)
+    noise = np.random.default_rng([seed, 44])
+    return _record(robot, STILL, noise, open_loop(commands), len(commands) * CONTROL_TIMESTEP, name, notes)
 
 
-@dataclasses.dataclass(frozen=True)
-class Conditions:
-    """Conditions of a trial."""
-
-    draught: tuple[float, float] = (0.0, 0.0)
-    """Mean horizontal velocity of the air (m/s)."""
-    swing: float = 0.0
-    """Amplitude (m/s) of the velocity's variation along x and y."""
-    period: float = 10.0
-    """Period (s) of this variation."""
-    yaw: float = 0.0
-    """Heading at the start (rad)."""
-
-    def wind(self, time: float) -> Float[np.ndarray, " 3"]:
-        """Return the air's velocity (m/s) at `time` (s)."""
-        phase = 2 * math.pi * time / self.period
-        return np.array([*self.draught, 0.0]) + self.swing * np.array([math.sin(phase), math.cos(phase), 0.0])
+STILL = TrialConditions(draught=(0.0, 0.0, 0.0), draught_swing=(0.0, 10.0), start=(0.0, 0.0, 0.0), capture_seed=0)
+"""Conditions without draught. The robot faces x."""
 
 
-def draw_conditions(number: int) -> Conditions:
+def draw_conditions(number: int) -> TrialConditions:
     """Draw the conditions of a trial: a draught of up to 0.06 m/s that varies slowly, and the heading at the start."""
     rng = np.random.default_rng([number, 45])
     direction, speed = rng.uniform(-math.pi, math.pi), rng.uniform(0.0, 0.06)
-    return Conditions(
-        draught=(float(speed * math.cos(direction)), float(speed * math.sin(direction))),
-        swing=float(rng.uniform(0.0, 0.03)),
-        period=float(rng.uniform(8.0, 25.0)),
-        yaw=float(rng.normal(0.0, 2 * _DEGREE)),
+    return TrialConditions(
+        draught=(float(speed * math.cos(direction)), float(speed * math.sin(direction)), 0.0),
+        draught_swing=(float(rng.uniform(0.0, 0.03)), float(rng.uniform(8.0, 25.0))),
+        start=(0.0, 0.0, float(rng.normal(0.0, 2 * _DEGREE))),
+        capture_seed=number,
     )
 
 
@@ -256,13 +248,14 @@ class BulletHardware:
         return record_sweep(self.robot, sweep_commands(), name, self.seed)
 
     def record(self, trial: int, controller: CaptureController, seconds: float, name: str, notes: str) -> Recording:
-        noise = np.random.default_rng([trial, 46])
-        return _record(self.robot, draw_conditions(trial), noise, controller, seconds, name, notes)
+        conditions = draw_conditions(trial)
+        noise = np.random.default_rng([conditions.capture_seed, 46])
+        return _record(self.robot, conditions, noise, controller, seconds, name, notes)
 
 
 def _record(
     robot: BulletRobot,
-    conditions: Conditions,
+    conditions: TrialConditions,
     rng: np.random.Generator,
     controller: CaptureController,
     seconds: float,
@@ -295,20 +288,7 @@ def _record(
         world.run(command, CAPTURE_TIMESTEP)
     capture.command.append(command)
     world.close()
-    seen = np.array(capture.position)
-    return make_recording(
-        name=name,
-        kind="free",
-        robot=robot.name,
-        notes=notes,
-        time=np.arange(len(seen)) * CAPTURE_TIMESTEP,
-        command=np.array(capture.command),
-        balloon_position=seen[:, 0],
-        balloon_quaternion=np.array(capture.quaternion),
-        base_position=seen[:, 1],
-        base_quaternion=np.array(bases),
-        foot_position=seen[:, 2:],
-    )
+    return recording_of(capture, np.array(bases), robot.name, name, notes)
 
 
 # ---- the world ----
@@ -317,9 +297,8 @@ def _record(
 class World:
     """A robot in Bullet, standing on a floor or with a fixed base (`held`)."""
 
-    def __init__(self, robot: BulletRobot, conditions: Conditions | None = None, *, held: bool = False) -> None:
-        """`conditions` None: still air."""
-        self.robot, self._conditions = robot, conditions or Conditions()
+    def __init__(self, robot: BulletRobot, conditions: TrialConditions = STILL, *, held: bool = False) -> None:
+        self.robot, self._conditions = robot, conditions
         self._time = 0.0
         self._world, self._body = open_world(urdf(robot), (0.0, 0.0, -GRAVITY), TIMESTEP, held=held)
         infos = [self._world.getJointInfo(self._body, index) for index in range(self._world.getNumJoints(self._body))]
@@ -384,7 +363,7 @@ class World:
         robot, link = self.robot, self._links["balloon"]
         state = self._world.getLinkState(self._body, link, computeLinkVelocity=1)
         velocity, spin = np.array(state[6]), np.array(state[7])
-        relative = velocity - self._conditions.wind(self._time)
+        relative = velocity - wind(self._conditions, self._time)
         self._time += TIMESTEP
         last, felt = self._air
         felt = felt + (TIMESTEP / _AIR_FILTER) * ((velocity - last) / TIMESTEP - felt)
@@ -401,7 +380,7 @@ class World:
         self._time = 0.0
         place, quaternion = self._world.getBasePositionAndOrientation(self._body)
         turn = Rotation.from_quat(quaternion)
-        back = Rotation.from_euler("z", self._conditions.yaw - turn.as_euler("ZYX")[0])
+        back = Rotation.from_euler("z", self._conditions.start[2] - turn.as_euler("ZYX")[0])
         linear, angular = self._world.getBaseVelocity(self._body)
         self._world.resetBasePositionAndOrientation(self._body, [0.0, 0.0, place[2]], (back * turn).as_quat().tolist())
         self._world.resetBaseVelocity(self._body, back.apply(linear).tolist(), back.apply(angular).tolist())

@@ -85,8 +85,8 @@ def test_trials_with_equal_numbers_are_equal_and_the_draught_moves_the_robot() -
 
 def test_draught_leans_the_standing_robot_downwind() -> None:
     robot, leans = family.draw(0), []
-    for wind in (0.0, 0.5):
-        world = family.World(robot, family.Conditions(draught=(0.0, wind)))
+    for speed in (0.0, 0.5):
+        world = family.World(robot, dataclasses.replace(family.STILL, draught=(0.0, speed, 0.0)))
         world.run(np.zeros(2), 2.0)
         world.begin_trial()
         places, *_ = world.look()

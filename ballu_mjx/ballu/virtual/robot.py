@@ -277,7 +277,7 @@ def record(
     is repeated in the last frame.
     """
     capture, base_quaternion, _, _ = _simulate(virtual, trial, controller, duration)
-    return _finish(capture, base_quaternion, virtual, name, notes)
+    return recording_of(capture, base_quaternion, virtual.name, name, notes)
 
 
 def record_truth(
@@ -329,7 +329,7 @@ def _advance(model: mujoco.MjModel, data: mujoco.MjData, servos: _Servos, trial:
 
     Commands arrive at ticks, or at the nearest physics step if physics steps are longer than ticks.
     """
-    model.opt.wind[:] = _wind(trial, time)
+    model.opt.wind[:] = wind(trial, time)
     tick = max(_TICK, model.opt.timestep)
     for start in time + tick * np.arange(round(CAPTURE_TIMESTEP / tick)):
         data.ctrl[:] = servos.at(start + (tick - _TICK) / 2)
@@ -417,7 +417,7 @@ def _place(model: mujoco.MjModel, data: mujoco.MjData, trial: TrialConditions) -
     data.qvel[:3] = turn.apply(data.qvel[:3])
 
 
-def _wind(trial: TrialConditions, time: float) -> np.ndarray:
+def wind(trial: TrialConditions, time: float) -> Float[np.ndarray, " 3"]:
     """Return the air velocity (m/s, world frame) at `time` (s)."""
     amplitude, period = trial.draught_swing
     phase = 2 * np.pi * time / period
@@ -457,15 +457,15 @@ def _capture_frame(
     return base_turn
 
 
-def _finish(
-    capture: Capture, base_quaternion: Float[np.ndarray, "T 4"], virtual: VirtualRobot, name: str, notes: str
+def recording_of(
+    capture: Capture, base_quaternion: Float[np.ndarray, "T 4"], robot: str, name: str, notes: str
 ) -> Recording:
-    """Return the recording of all captured frames."""
+    """Return the recording of all captured frames. `robot` is the name of the specimen."""
     position = np.array(capture.position)
     return make_recording(
         name=name,
         kind="free",
-        robot=virtual.name,
+        robot=robot,
         notes=notes,
         time=np.array(capture.time),
         command=np.array(capture.command),
