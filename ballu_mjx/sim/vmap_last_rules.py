@@ -369,14 +369,23 @@ def _while_depends(equation: JaxprEqn, inputs: Sequence[bool]) -> tuple[list[boo
 
 def _scan_depends(equation: JaxprEqn, inputs: Sequence[bool]) -> list[bool]:
     """Return which values of the final carry, and which results of all steps, have a batch."""
-    carried = equation.params["num_carry"]
-    fixed, batched, rows = _parts(inputs, equation.params["num_consts"], carried)
+    constants, carried = _scan_sizes(equation)
+    fixed, batched, rows = _parts(inputs, constants, carried)
     while True:
         after = depends_on_batch(equation.params["jaxpr"], [*fixed, *batched, *rows])
         grown = [b or a for b, a in zip(batched, after[:carried], strict=True)]
         if grown == batched:
             return [*batched, *after[carried:]]
         batched = grown
+
+
+def _scan_sizes(equation: JaxprEqn) -> tuple[int, int]:
+    """Return how many inputs of the loop are constants, and how many are carried."""
+    params = equation.params
+    if "num_carry" in params:
+        return params["num_consts"], params["num_carry"]
+    constants, carried, _ = params["ft_in"].unpack()  # since JAX 0.11
+    return len(constants), len(carried)
 
 
 def _parts(values: Sequence[Any], first: int, second: int) -> tuple[list[Any], list[Any], list[Any]]:
@@ -437,8 +446,8 @@ def _while(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
 
 @_rule("scan")
 def _scan(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
-    closed, carried = equation.params["jaxpr"], equation.params["num_carry"]
-    fixed, start, rows = _parts(inputs, equation.params["num_consts"], carried)
+    closed, (constants, carried) = equation.params["jaxpr"], _scan_sizes(equation)
+    fixed, start, rows = _parts(inputs, constants, carried)
     of_rows, all_batched = list(map(_is_batched, rows)), _scan_depends(equation, list(map(_is_batched, inputs)))
     batched = all_batched[:carried]
 
