@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import platform
 import re
@@ -146,8 +147,15 @@ def test_jax_versions_that_deadlock_are_refused_on_the_cpu_only(version: str, mo
     runtime.check_jax()
 
 
-@pytest.mark.parametrize("version", ["0.9.2", "0.11.0", "1.0.0"])
-def test_other_jax_versions_are_accepted(version: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("version", "backend", "warned"),
+    [("0.9.2", "cpu", False), ("0.11.0", "cpu", True), ("1.0.0", "cpu", True), ("0.11.0", "gpu", False)],
+)
+def test_newer_jax_versions_are_accepted_with_a_warning_on_the_cpu(
+    version: str, backend: str, warned: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.setattr(runtime.importlib.metadata, "version", lambda _: version)
-    monkeypatch.setattr("jax.default_backend", lambda: "cpu")
+    monkeypatch.setattr("jax.default_backend", lambda: backend)
+    monkeypatch.setattr(logging.getLogger("ballu_mjx"), "propagate", True)
     runtime.check_jax()
+    assert ("slower on the CPU" in caplog.text) == warned

@@ -7,10 +7,10 @@ residuals. Those of white noise do not.
 
 Then the parameters that `suggest_parameters` proposes are declared too, and the arm is identified again.
 
-    python benchmarks/coverage.py                    # 50 draws
-    python benchmarks/coverage.py --draws 4
-    python benchmarks/coverage.py --friction 0       # the model lacks nothing
-    python benchmarks/coverage.py --output FOLDER    # also write FOLDER/coverage.json
+    python benchmarks/interval_coverage.py                    # 50 draws
+    python benchmarks/interval_coverage.py --draws 4
+    python benchmarks/interval_coverage.py --friction 0       # the model lacks nothing
+    python benchmarks/interval_coverage.py --output FOLDER    # also write FOLDER/coverage.json
 """
 
 from __future__ import annotations
