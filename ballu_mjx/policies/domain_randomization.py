@@ -1,4 +1,4 @@
-"""Domain randomization: the distribution of friction and starting states, and samples of it."""
+"""Domain randomization: the distribution of friction, starting states and pushes, and samples of it."""
 
 from __future__ import annotations
 
@@ -42,6 +42,8 @@ class SimulatorSetting(NamedTuple):
     friction: Float[Array, "colliding 2"]
     """Range of the sliding friction coefficient of each geom that collides."""
     spread: StartSpread
+    push: Float[Array, " 6"]
+    """Standard deviation of the constant force (N) and torque (N m) on the tracked body, world frame."""
 
 
 def colliding_geoms(model: mujoco.MjModel) -> Int[np.ndarray, " colliding"]:
@@ -82,22 +84,26 @@ def make_simulator_setting(
             joint=jnp.asarray(on * joint, jnp.float32),
             velocity=jnp.asarray(on * config.start_velocity * np.where(along, 1.0, 5.0), jnp.float32),
         ),
+        push=on * jnp.array([config.push_force] * 2 + [0.0] * 3 + [config.push_torque], jnp.float32),
     )
 
 
 class Start(NamedTuple):
-    """Starting state and friction of an episode, drawn from a setting."""
+    """Starting state, friction and push of an episode, drawn from a setting."""
 
     qpos: Float[Array, " nq"]
     qvel: Float[Array, " nv"]
     friction: Float[Array, " colliding"]
     """Sliding friction coefficients of the geoms that collide."""
+    push: Float[Array, " 6"]
+    """Constant force (N) and torque (N m) on the tracked body, world frame."""
     rng: Array
     """Random key for the next draws."""
 
 
 def draw_start(setting: SimulatorSetting, robot: RobotDescription, rng: Array) -> Start:
-    """Draw friction and starting state. Without domain randomization, both have the setting's own values."""
+    """Draw friction, starting state and push. Without domain randomization, they have the setting's own values."""
+    push = setting.push * jax.random.normal(jax.random.fold_in(rng, _PUSH), (6,))
     key_friction, key_turn, key_joint, key_velocity, rng = jax.random.split(rng, 5)
     low, high = setting.friction.T
     friction = low + (high - low) * jax.random.uniform(key_friction)
@@ -110,4 +116,8 @@ def draw_start(setting: SimulatorSetting, robot: RobotDescription, rng: Array) -
         quaternion = quaternion_product(jnp.concatenate([jnp.ones(1), half]), initial[3:7])
         joints = jnp.concatenate([initial[:3], quaternion / jnp.linalg.norm(quaternion), joints])
     qvel = spread.velocity * jax.random.normal(key_velocity, spread.velocity.shape)
-    return Start(joints, qvel, friction, rng)
+    return Start(joints, qvel, friction, push, rng)
+
+
+_PUSH = 1
+"""Number of the random stream of pushes."""

@@ -16,7 +16,8 @@ class LocomotionConfig:
 
     domain_randomization: bool = False
     """Draw friction and the starting state anew for every episode, as in the paper. Without this option, --friction and
-    the options of the start have no effect. Masses and buoyancy are not drawn, because they change gaits too much."""
+    the options of start and pushes have no effect. Masses and buoyancy are not drawn, because they change gaits too
+    much."""
     friction: tuple[float, float] = (0.5, 1.1)
     """Range of the coefficient of sliding friction. One value is drawn for all geoms that collide."""
     start_yaw: float = 20.0
@@ -32,6 +33,13 @@ class LocomotionConfig:
     start_velocity: float = 0.03
     """Standard deviation of the starting velocities, m/s. For rotations of hinges and base: five times as much,
     rad/s."""
+    push_force: float = 0.0
+    """Standard deviation of a constant force on the tracked body along each horizontal axis of the world, N. With
+    domain randomization, it is drawn anew for every episode. A policy learns to steer against forces that its
+    simulator lacks."""
+    push_torque: float = 0.0
+    """Standard deviation of a constant torque on the tracked body about the vertical axis, N m. It is drawn like
+    --push-force."""
     episode_seconds: float = 12.0
     """Mean duration of an episode, s. Each one lasts between half and one and a half times as long."""
     sampled_residual: bool = False
@@ -47,7 +55,7 @@ class LocomotionConfig:
 
 
 _STARTS = ("start_yaw", "start_tilt", "start_angle", "start_offset", "start_velocity")
-_NOT_NEGATIVE = (*_STARTS, "residual_decay", "outside_cost")
+_NOT_NEGATIVE = (*_STARTS, "push_force", "push_torque", "residual_decay", "outside_cost")
 
 
 def check_locomotion_config(config: LocomotionConfig, control_timestep: float) -> None:

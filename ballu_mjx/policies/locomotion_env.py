@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from ballu_mjx.policies.domain_randomization import (
     SimulatorSetting,
+    Start,
     colliding_geoms,
     draw_start,
     make_simulator_setting,
@@ -32,6 +33,7 @@ from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout, heading_observation
+from ballu_mjx.sim.residual import Action
 from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 
@@ -52,6 +54,8 @@ class LocomotionState(NamedTuple):
     setting: SimulatorSetting
     friction: Float[Array, " colliding"]
     """Sliding friction coefficients of the geoms that collide."""
+    push: Float[Array, " 6"]
+    """Constant force (N) and torque (N m) on the tracked body, world frame."""
     rollout: RolloutState
     com: Float[Array, " 3"]
     """Centre of mass (m, world)."""
@@ -150,8 +154,8 @@ class LocomotionEnv(Env):
         return self._start(locomotion_state(state).setting, rng)
 
     def at(self, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], rng: Array) -> State:
-        """Start from a given state, with nominal friction. The episode has no time limit."""
-        state = self._begin(self.setting, qpos, qvel, self._friction[self._colliding, 0], rng)
+        """Start from a given state, with nominal friction and no push. The episode has no time limit."""
+        state = self._begin(self.setting, Start(qpos, qvel, self._friction[self._colliding, 0], jnp.zeros(6), rng))
         endless = locomotion_state(state)._replace(remaining=jnp.asarray(2**30, jnp.int32))
         return dataclasses.replace(state, pipeline_state=cast(Any, endless))
 
@@ -167,7 +171,8 @@ class LocomotionEnv(Env):
         drawn = key_force if self.config.sampled_residual else None
         simulator = self.simulator.with_fields(before.setting.fields | friction)
         simulator = simulator.with_drivetrain(before.setting.drivetrain)
-        after = simulator.step(before.rollout, command, action_scale=decay, key=drawn)
+        push = Action(before.push[None])
+        after = simulator.step(before.rollout, command, push, action_scale=decay, key=drawn)
 
         rollout, finite = after.state.keep_finite(before.rollout, before.rollout.features)
         com = jnp.where(finite, after.com, before.com)
@@ -179,7 +184,7 @@ class LocomotionEnv(Env):
         metrics = {
             "velocity_x": velocity[0],
             "velocity_y": velocity[1],
-            "force": jnp.linalg.norm(after.action.wrench[0, :3]),
+            "force": jnp.linalg.norm(after.action.wrench[0, :3] - before.push[:3]),
             "outside": jnp.asarray(excess > 0.0, jnp.float32),
             "excess": excess,
             "diverged": jnp.asarray(~finite, jnp.float32),
@@ -213,19 +218,18 @@ class LocomotionEnv(Env):
         return locomotion_observation(rollout.features, self.robot.anchored)
 
     def _start(self, setting: SimulatorSetting, rng: Array) -> State:
-        qpos, qvel, friction, rng = draw_start(setting, self.robot, rng)
-        return self._begin(setting, qpos, qvel, friction, rng)
+        return self._begin(setting, draw_start(setting, self.robot, rng))
 
-    def _begin(self, setting: SimulatorSetting, qpos: Array, qvel: Array, friction: Array, rng: Array) -> State:
-        key, key_length = jax.random.split(rng)
+    def _begin(self, setting: SimulatorSetting, start: Start) -> State:
+        key, key_length = jax.random.split(start.rng)
         mean = max(round(self.config.episode_seconds / self.robot.control_timestep), 2)
-        physics = state_at(qpos, qvel)
+        physics = state_at(start.qpos, start.qvel)
         features, com = self.simulator.simulator.observe(physics)
         drivetrain = self.simulator.simulator.with_drivetrain(setting.drivetrain).drivetrain_at_rest(self._rest)
         history, commands = jnp.tile(features, (HISTORY, 1)), jnp.tile(self._rest, (HISTORY - 1, 1))
         rollout = RolloutState(physics, history, commands, drivetrain)
         remaining = jax.random.randint(key_length, (), mean // 2, mean + mean // 2 + 1)
-        now = LocomotionState(setting, friction, rollout, com, remaining, key)
+        now = LocomotionState(setting, start.friction, start.push, rollout, com, remaining, key)
         return initial_state(now, self._observe(rollout), _METRICS)
 
     def _excess(self, rollout: RolloutState, command: Float[Array, " commands"]) -> Float[Array, ""]:

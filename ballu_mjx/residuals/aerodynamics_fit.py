@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import scipy.optimize
 from jax.flatten_util import ravel_pytree
@@ -38,6 +39,7 @@ from ballu_mjx.residuals.aerodynamics import (
     AirParameters,
     longest_delay,
 )
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.residual import BoundResidual
 from ballu_mjx.sim.sharding import shard_over_devices
 from ballu_mjx.sim.simulator import Simulator
@@ -67,17 +69,38 @@ class Scale(NamedTuple):
     """Standard deviation of the weak prior, in multiples of `typical`."""
 
 
-SCALES: dict[str, Scale] = {
-    "added_mass": Scale(0.1),
-    "added_inertia": Scale(2e-3),
-    "lift": Scale(0.03),
-    "centre": Scale(0.01),
-    "linear_drag": Scale(0.03),
-    "quadratic_drag": Scale(0.2),
-    "turning_drag": Scale(3e-3),
-    "delay": Scale(0.05),
-}
-"""Scales of the parameters by name."""
+def air_scales(robot: RobotDescription, model: mujoco.MjModel) -> dict[str, Scale]:
+    """Return the scales of the parameters by name, from the robot's nominal `model` alone.
+
+    The lift of the tracked body is taken as the weight of the air that it displaces, and the body as a sphere of this
+    volume, with radius r:
+
+    - Added mass: half of the displaced air, as for a sphere in an ideal fluid (Lamb, Hydrodynamics, section 92).
+    - Added inertia: a tenth of the added mass times r^2. An ideal fluid does not turn with a sphere.
+    - Lift: 1 % of the nominal lift. Centre: 3 % of r.
+    - Quadratic drag: that of a sphere with drag coefficient 0.47. Linear drag: its slope at a speed of 0.25 m/s.
+    - Rotary drag: the linear drag times r^2.
+    - Delay: a control step.
+    """
+    body = int(model.site_bodyid[model.site(robot.tracked).id])
+    displaced = float(model.body_mass[body] * model.body_gravcomp[body])
+    radius = (3 * displaced / _AIR_DENSITY / (4 * math.pi)) ** (1 / 3)
+    added = displaced / 2
+    drag = _AIR_DENSITY / 2 * _SPHERE_DRAG * math.pi * radius**2
+    return {
+        "added_mass": Scale(added),
+        "added_inertia": Scale(0.1 * added * radius**2),
+        "lift": Scale(0.01 * displaced * float(np.linalg.norm(model.opt.gravity))),
+        "centre": Scale(0.03 * radius),
+        "linear_drag": Scale(_SLOW * drag),
+        "quadratic_drag": Scale(drag),
+        "turning_drag": Scale(_SLOW * drag * radius**2),
+        "delay": Scale(robot.control_timestep),
+    }
+
+
+_AIR_DENSITY, _SPHERE_DRAG, _SLOW = 1.2, 0.47, 0.25
+"""Density of air (kg/m^3), drag coefficient of a sphere, and a speed (m/s) at which drag is linearized."""
 _DELAY_EVALUATIONS = 4
 """Largest number of evaluations of the solver at each of the two whole delays next to the fitted delay."""
 _MARGIN = 0.01
@@ -146,7 +169,8 @@ def identify_air(
     start, unravel = ravel_pytree(none if fixed_from is None else fixed_from)
     start = np.asarray(start, np.float64)
     owner = np.repeat(AIR_PARAMETERS, [getattr(none, name).size for name in AIR_PARAMETERS])
-    scale, prior = np.array([SCALES[name] for name in owner]).T
+    scales = air_scales(simulator.robot, simulator.mj_model)
+    scale, prior = np.array([scales[name] for name in owner]).T
     is_delay = owner == "delay"
     low = np.where(np.isin(owner, SIGNED_AIR_PARAMETERS), -np.inf, 0.0)
     high = np.where(is_delay, simulated.longest_delay, np.inf)

@@ -25,7 +25,7 @@ from ballu_mjx.rl.learner import Learner
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, heading_rotation
-from ballu_mjx.sim.step import state_at
+from ballu_mjx.sim.step import count_substeps, state_at
 
 BALLU = load_robot()
 MODEL = BALLU.load_model()
@@ -131,6 +131,40 @@ def test_lower_friction_lets_the_robot_slide_further():
             now = STEP(now, -jnp.ones(2))
         distances.append(float(inner(now).rollout.history[-1, 15]))
     assert distances[0] > distances[1] + 0.02
+
+
+def test_pushes_are_drawn_anew_for_every_episode():
+    keys = jax.random.split(jax.random.key(2), 400)
+    draw = jax.jit(jax.vmap(PLAIN._start, in_axes=(None, 0)))
+    sizes = {"push_force": 0.02, "push_torque": 0.003}
+    off = make_simulator_setting(BALLU, MODEL, LocomotionConfig(**sizes), None)
+    assert np.abs(inner(draw(off, keys)).push).max() == 0
+    on = make_simulator_setting(BALLU, MODEL, LocomotionConfig(domain_randomization=True, **sizes), None)
+    spread = np.std(inner(draw(on, keys)).push, axis=0)
+    np.testing.assert_allclose(spread, [0.02, 0.02, 0, 0, 0, 0.003], rtol=0.15)
+
+
+def test_a_push_acts_over_the_whole_episode_and_is_no_residual():
+    """Two equal and opposite pushes move the robot apart by as much as C MuJoCo says. The next episode has another."""
+    state = RESET(PLAIN.setting, jax.random.key(0))
+    ends = []
+    for sign in (1.0, -1.0):
+        push = sign * jnp.array([0.0, 0.3, 0.0, 0.0, 0.0, 0.02])
+        now = dataclasses.replace(state, pipeline_state=inner(state)._replace(push=push))
+        for _ in range(10):
+            now = STEP(now, -jnp.ones(2))
+        assert float(now.metrics["force"]) == pytest.approx(0.0, abs=1e-6)
+        ends.append(np.asarray(inner(now).rollout.physics.qvel))
+    data = mujoco.MjData(MODEL)
+    expected = []
+    for sign in (1.0, -1.0):
+        mujoco.mj_resetData(MODEL, data)
+        data.qpos[:] = standing_qpos(MODEL)
+        data.xfrc_applied[MODEL.site_bodyid[MODEL.site(BALLU.tracked).id]] = sign * np.array([0, 0.3, 0, 0, 0, 0.02])
+        mujoco.mj_step(MODEL, data, nstep=10 * count_substeps(MODEL, CONTROL_TIMESTEP))
+        expected.append(data.qvel.copy())
+    np.testing.assert_allclose(ends[0] - ends[1], expected[0] - expected[1], atol=0.05)
+    assert abs(expected[0][1] - expected[1][1]) > 0.2
 
 
 def test_identified_actuators_act_in_every_episode():

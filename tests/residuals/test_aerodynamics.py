@@ -24,7 +24,7 @@ from ballu_mjx.residuals.aerodynamics import (
     air_parameters_to_json,
     read_air_parameters,
 )
-from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, Optimum, at_whole_delay, identify_air
+from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, Optimum, air_scales, at_whole_delay, identify_air
 from ballu_mjx.robots.model import set_fields
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, euler_to_matrix, heading_rotation
@@ -225,6 +225,23 @@ def test_fixed_parameters_stay_nominal(motions: list[Motion]):
     fit = identify_air(SIMULATOR, motions, CONFIG, free=("added_mass",))
     assert float(fit.parameters.added_mass) > 0
     assert not any(np.any(getattr(fit.parameters, name)) for name in AIR_PARAMETERS if name != "added_mass")
+
+
+def test_scales_grow_with_the_body_as_geometry_says():
+    """A body of eight times the lift has twice the radius."""
+    robot = load_robot()
+    large = robot.load_model()
+    small_scales = air_scales(robot, large)
+    large.body_mass[:] *= 8
+    large_scales = air_scales(robot, large)
+    powers = {"added_mass": 3, "added_inertia": 5, "lift": 3, "centre": 1, "linear_drag": 2, "quadratic_drag": 2}
+    powers |= {"turning_drag": 4, "delay": 0}
+    assert set(powers) == set(AIR_PARAMETERS)
+    for name, power in powers.items():
+        assert large_scales[name].typical == pytest.approx(2**power * small_scales[name].typical)
+    model = robot.load_model()
+    displaced = float((model.body_gravcomp * model.body_mass).sum())  # kg of air; only the balloon is buoyant
+    assert small_scales["added_mass"].typical == pytest.approx(displaced / 2)
 
 
 def test_recordings_shorter_than_a_window_are_refused(motions: list[Motion]):
