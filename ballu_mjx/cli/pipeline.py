@@ -96,13 +96,24 @@ class Options(loggers.LoggingOptions):
     """Number of times that EnvMimic is learned. From the second round on, it also learns from the robot's closed-loop
     motion under the policies of the previous round. Policies are then trained again; their simulators are called
     `envmimic-2` and so on."""
-    also: tuple[Literal["envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised", "analytic"], ...] = ()
-    """Further simulators in which to train policies. envmimic-near: EnvMimic's forces, with a cost (--outside-cost) for
-    leaving their training range. envmimic-shared: one EnvMimic learned from the recordings of both tasks.
-    envmimic-wrench: an EnvMimic with a force and a torque. supervised: forces by regression, at full scale (the paper's
-    baseline). analytic: forces by gradients through the simulation."""
+    also: tuple[
+        Literal[
+            "vanilla+sysid+dr+push", "envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised", "analytic"
+        ],
+        ...,
+    ] = ()
+    """Further simulators in which to train policies. vanilla+sysid+dr+push: no residual, but random pushes.
+    envmimic-near: EnvMimic's forces, with a cost (--outside-cost) for leaving their training range. envmimic-shared:
+    one EnvMimic learned from the recordings of both tasks. envmimic-wrench: an EnvMimic with a force and a torque.
+    supervised: forces by regression, at full scale (the paper's baseline). analytic: forces by gradients through the
+    simulation."""
     outside_cost: float = 0.5
     """Cost of leaving the residual's training range in `envmimic-near`. See `train walk --help`."""
+    push_force: float = 0.01
+    """Size of the random constant forces (N) under which policies are trained in simulators with a residual. See `train
+    walk --help`. The paper has none (0)."""
+    push_torque: float = 0.001
+    """Size of the random constant torques (N m) under which policies are trained in simulators with a residual."""
     quick: bool = False
     """Run every stage, in five minutes altogether, for one task and two simulators. The tables then mean nothing."""
 
@@ -201,6 +212,10 @@ class PipelineStages:
             domain_randomization=learned or variant.randomized,
             outside_cost=self.options.outside_cost if setting == NEAR else 0.0,
         )
+        if learned or variant.pushed:
+            config = dataclasses.replace(
+                config, push_force=self.options.push_force, push_torque=self.options.push_torque
+            )
         quick = train_policy.QUICK if self.options.quick else {"num_timesteps": self.options.policy_steps}
         ppo = locomotion_ppo(seed=self.seed, **quick)
         needs = []
@@ -393,7 +408,10 @@ def _check(options: Options) -> None:
         raise InputError("--seeds and --robot-seed take numbers of 0 or more; give at least one seed.")
     if not options.tasks:
         raise InputError("--tasks is empty; name walk, turn, or both.")
-    check_locomotion_config(LocomotionConfig(outside_cost=options.outside_cost), CONTROL_TIMESTEP)
+    config = LocomotionConfig(
+        outside_cost=options.outside_cost, push_force=options.push_force, push_torque=options.push_torque
+    )
+    check_locomotion_config(config, CONTROL_TIMESTEP)
     if options.output.exists() and not options.output.is_dir():
         raise InputError(f"{options.output}: is a file; give --output a folder.")
     files.check_folder(options.output)

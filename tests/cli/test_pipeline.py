@@ -83,6 +83,7 @@ def test_trial_draws_are_unique_and_reproducible():
         ({"seeds": ()}, "at least one seed"),
         ({"tasks": ()}, "--tasks is empty"),
         ({"outside_cost": -1.0}, "--outside-cost is -1"),
+        ({"push_force": -0.1}, "--push-force is -0.1"),
     ],
 )
 def test_options_out_of_range_are_refused_before_anything_is_written(options, message, tmp_path):
@@ -96,18 +97,20 @@ def test_each_round_learns_from_all_recordings_so_far(tmp_path, monkeypatch):
     needs: dict[str, list[str]] = {}
     costs: dict[str, float] = {}
     forces: dict[str, str] = {}
+    pushes: dict[str, tuple[float, float]] = {}
 
     def stage(folder, options, sources, make, goes_on=True):
         needs[folder.name] = [source.name for source in sources]
         if folder.name.startswith("walk-"):
             costs[folder.name] = options[0].outside_cost
+            pushes[folder.name] = options[0].push_force, options[0].push_torque
         if folder.name.startswith("envmimic-"):
             forces[folder.name] = options[0].forces
         return folder
 
     monkeypatch.setattr(pipeline, "cached_stage", stage)
-    also = "envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised"
-    options = Options(output=tmp_path, rounds=3, also=also, outside_cost=2.0)
+    also = "vanilla+sysid+dr+push", "envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised"
+    options = Options(output=tmp_path, rounds=3, also=also, outside_cost=2.0, push_force=0.3, push_torque=0.04)
     stages = pipeline.PipelineStages(options, 0, VirtualHardware.draw(0))
     for setting in pipeline.settings_of(options):
         stages.policy("walk", setting)
@@ -119,6 +122,15 @@ def test_each_round_learns_from_all_recordings_so_far(tmp_path, monkeypatch):
     assert needs["walk-envmimic-3"] == ["envmimic-walk-3"]
     assert needs["walk-envmimic"] == needs["walk-envmimic-near"] == ["envmimic-walk"]
     assert {name: cost for name, cost in costs.items() if cost} == {"walk-envmimic-near": 2.0}
+    assert {name for name, push in pushes.items() if push == (0.0, 0.0)} == {
+        "walk-vanilla",
+        "walk-vanilla+dr",
+        "walk-vanilla+sysid",
+        "walk-vanilla+sysid+dr",
+    }
+    assert (
+        pushes["walk-envmimic-2"] == pushes["walk-aerodynamic"] == pushes["walk-vanilla+sysid+dr+push"] == (0.3, 0.04)
+    )
     assert needs["aerodynamic-walk"] == needs["supervised-walk"] == ["recordings-walk", "sysid"]
     assert {name for name, kind in forces.items() if kind != "force"} == {"envmimic-wrench-walk"}
     assert forces["envmimic-wrench-walk"] == "wrench"
