@@ -7,11 +7,12 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
 from ballu_mjx.ballu.actuators import ActuatorParameters
-from ballu_mjx.ballu.model import SIDES, load_suspended_leg
+from ballu_mjx.ballu.model import SIDES, leg_sides, load_suspended_leg
 from ballu_mjx.common.errors import InputError
 
 LEG_PARAMETERS = (
@@ -79,7 +80,7 @@ ALL_PARAMETERS = IdentificationConfig(knee_spring_reference=True, nominal_spring
 
 
 class ParameterRange(NamedTuple):
-    """Bounds and prior of a parameter."""
+    """Bounds and prior of a parameter. The gain's upper bound is at most `largest_motor_gain`."""
 
     factor: float | None
     """Factor by which the nominal value is divided and multiplied for the bounds. None if `reach` gives the bounds."""
@@ -168,6 +169,8 @@ class ParameterTransform:
         self.nominal = nominal
         self.relative = np.array([r.factor is not None for r in ranges])
         self.lower, self.upper = nominal / factors - below, nominal * factors + above
+        gain = LEG_PARAMETERS.index("motor_gain")
+        self.upper[gain] = min(self.upper[gain], largest_motor_gain(load_suspended_leg(SIDES[0])))
         self.prior = np.array([r.prior for r in ranges])
         """Standard deviation of each parameter among robots: of its logarithm if it is `relative`."""
         self.free = np.isin(LEG_PARAMETERS, free_parameters(config))
@@ -202,6 +205,19 @@ class ParameterTransform:
         """Return coordinates of the nominal values, then of uniform draws from the middle half between the bounds."""
         shares = np.random.default_rng(seed).uniform(0.25, 0.75, (count, int(self.free.sum())))
         return np.concatenate([self.coordinates(self.nominal)[None], np.log(shares / (1 - shares))])
+
+
+def largest_motor_gain(model: mujoco.MjModel) -> float:
+    """Return half of the position gain (N m/rad) at which a servo becomes unstable at the model's time step.
+
+    A servo has inertia I and damping b. The integrator takes velocities at the end of a step of length h, and is
+    implicit in the damping. It is stable for gains below 2 (2 I + h b) / h^2 (Jury's criterion for its characteristic
+    polynomial). Near this gain the arm oscillates from step to step between its torque limits, and derivatives grow
+    exponentially with time. The other half is for the stiffness of the cable.
+    """
+    dof, step = int(model.jnt_dofadr[model.joint(f"motor_{leg_sides(model)[0]}").id]), float(model.opt.timestep)
+    inertia = float(model.dof_M0[dof])
+    return (2 * inertia + step * float(model.dof_damping[dof])) / step**2
 
 
 def nominal_leg() -> Float[np.ndarray, " parameters"]:
