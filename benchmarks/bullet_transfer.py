@@ -16,9 +16,9 @@ kept, so that an interrupted run resumes. Robots can be measured by several proc
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from ballu_mjx.common import runtime
 
@@ -36,9 +36,9 @@ Trials = Mapping[int, Mapping[str, Sequence[Transfer]]]
 """Trials by robot and simulator."""
 
 
-def measure(robot: int, options: pipeline.Options) -> dict[str, list[Transfer]]:
+def measure(robot: int, output: Path, also: Sequence[Any], quick: bool) -> dict[str, list[Transfer]]:
     """Return the trials of the policies for walking on one robot, by simulator."""
-    options = dataclasses.replace(options, output=options.output / f"robot-{robot}")
+    options = pipeline.Options(output=output / f"robot-{robot}", tasks=("walk",), also=tuple(also), quick=quick)
     found = pipeline.measure_transfer(options, BulletHardware.draw(robot))["walk"]
     return {setting: seeds[0] for setting, seeds in found.items()}
 
@@ -102,17 +102,13 @@ def main() -> None:
     parser.add_argument(
         "--also", nargs="+", default=[], choices=pipeline_layout.OPTIONAL_SIMULATORS, help="further simulators (none)"
     )
-    parser.add_argument("--without-pushes", action="store_true", help="train all policies without random pushes")
     parser.add_argument("--quick", action="store_true", help="one robot, for minutes; the numbers mean nothing")
     parser.add_argument("--output", type=Path, help="folder of all stages")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     given = parser.parse_args()
     output = given.output or Path("runs") / ("bullet-transfer-quick" if given.quick else "bullet-transfer")
     robots = given.robots or (list(ROBOTS)[:1] if given.quick else list(ROBOTS))
-    options = pipeline.Options(output=output, tasks=("walk",), also=tuple(given.also), quick=given.quick)
-    if given.without_pushes:
-        options = dataclasses.replace(options, push_force=0.0, push_torque=0.0)
-    trials = {robot: measure(robot, options) for robot in robots}
+    trials = {robot: measure(robot, output, given.also, given.quick) for robot in robots}
     tables = {"robots": robots_table(trials), "summary": summary_table(trials)}
     for table in tables.values():
         print(f"\n{table.to_markdown()}")

@@ -119,7 +119,7 @@ class Identifier:
     def run(self, sweep: Sweep, report: Report) -> Identification:
         """Return the identification of both legs from a sweep of the compiled sizes."""
         config, size, data = self.config, self._size, leg_data(sweep)
-        residuals = LegResiduals(self.space, self.physics, data, self._curve_gradients, motion=config.motion)
+        residuals = self.residuals(sweep)
         legs = np.arange(len(SIDES))
         free = np.array(LEG_PARAMETERS)[self.space.free]
         further = np.isin([*free, *(LegDynamics._fields if config.motion else ())], RICHER_PARAMETERS)
@@ -204,6 +204,11 @@ class Identifier:
             selection=selection,
             config=config,
         )
+
+    def residuals(self, sweep: Sweep) -> LegResiduals:
+        """Return the residuals of both legs on a sweep of the compiled sizes."""
+        data = leg_data(sweep)
+        return LegResiduals(self.space, self.physics, data, self._curve_gradients, motion=self.config.motion)
 
     def _search(
         self,

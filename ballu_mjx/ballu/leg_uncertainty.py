@@ -59,7 +59,7 @@ def analyse_legs(
         priors = np.concatenate([units / np.diag(derivatives), DYNAMICS_PRIOR[: len(y) - size]])
         # The Jacobian with respect to parameters in units of their priors.
         scaled = jacobian * priors / divisor[:, None]
-        if not np.abs(scaled).max() < _STEEPEST:  # also if it is NaN
+        if not np.abs(jacobian * priors).max() < _STEEPEST:  # also if it is NaN
             raise InputError(
                 f"The {side} leg has no usable derivatives at the fitted parameters: its simulated motion is unstable. "
                 "Identify the settled angles alone, with --no-motion."
@@ -85,8 +85,8 @@ def analyse_legs(
 
 
 _STEEPEST = 1e6
-"""Largest derivative of a residual, in units of its scatter, by a parameter in units of its prior. Derivatives of
-stable motions are below 1e3. Those of unstable ones grow to 1e20 and more within a sweep."""
+"""Largest derivative of a residual (rad) by a parameter in units of its prior. Derivatives of stable motions are below
+1e2. Those of unstable ones grow to 1e20 and more within a sweep."""
 
 
 def _dynamics_errors(coordinates: Float[np.ndarray, " 6"], deviation: Float[np.ndarray, " 6"]) -> LegDynamics:

@@ -96,24 +96,18 @@ class Options(loggers.LoggingOptions):
     """Number of times that EnvMimic is learned. From the second round on, it also learns from the robot's closed-loop
     motion under the policies of the previous round. Policies are then trained again; their simulators are called
     `envmimic-2` and so on."""
-    also: tuple[
-        Literal[
-            "vanilla+sysid+dr+push", "envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised", "analytic"
-        ],
-        ...,
-    ] = ()
-    """Further simulators in which to train policies. vanilla+sysid+dr+push: no residual, but random pushes.
-    envmimic-near: EnvMimic's forces, with a cost (--outside-cost) for leaving their training range. envmimic-shared:
-    one EnvMimic learned from the recordings of both tasks. envmimic-wrench: an EnvMimic with a force and a torque.
-    supervised: forces by regression, at full scale (the paper's baseline). analytic: forces by gradients through the
-    simulation."""
+    also: tuple[Literal["envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised", "analytic"], ...] = ()
+    """Further simulators in which to train policies. envmimic-near: EnvMimic's forces, with a cost (--outside-cost) for
+    leaving their training range. envmimic-shared: one EnvMimic learned from the recordings of both tasks.
+    envmimic-wrench: an EnvMimic with a force and a torque. supervised: forces by regression, at full scale (the paper's
+    baseline). analytic: forces by gradients through the simulation."""
     outside_cost: float = 0.5
     """Cost of leaving the residual's training range in `envmimic-near`. See `train walk --help`."""
-    push_force: float = 0.01
-    """Size of the random constant forces (N) under which policies are trained in simulators with a residual. See `train
-    walk --help`. The paper has none (0)."""
-    push_torque: float = 0.001
-    """Size of the random constant torques (N m) under which policies are trained in simulators with a residual."""
+    push_force: float = 0.0
+    """Standard deviation of the random constant forces (N) under which policies are trained in simulators with a
+    residual. See `train walk --help`."""
+    push_torque: float = 0.0
+    """Standard deviation of the random constant torques (N m), like --push-force."""
     quick: bool = False
     """Run every stage, in five minutes altogether, for one task and two simulators. The tables then mean nothing."""
 
@@ -212,7 +206,7 @@ class PipelineStages:
             domain_randomization=learned or variant.randomized,
             outside_cost=self.options.outside_cost if setting == NEAR else 0.0,
         )
-        if learned or variant.pushed:
+        if learned:
             config = dataclasses.replace(
                 config, push_force=self.options.push_force, push_torque=self.options.push_torque
             )

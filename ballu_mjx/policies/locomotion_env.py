@@ -245,6 +245,4 @@ def variant_of(
     """Return the variant of the simulator."""
     if residual is not None:
         return SimulatorVariant(residual.model.name)
-    randomized = config.domain_randomization
-    pushed = randomized and max(config.push_force, config.push_torque) > 0
-    return SimulatorVariant(identified=actuators is not None, randomized=randomized, pushed=pushed)
+    return SimulatorVariant(identified=actuators is not None, randomized=config.domain_randomization)

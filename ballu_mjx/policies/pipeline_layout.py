@@ -26,9 +26,7 @@ NEAR = "envmimic-near"
 """Simulator with EnvMimic's forces, whose policies pay a cost outside the residual's training range."""
 WRENCH = "envmimic-wrench"
 """Simulator with an EnvMimic residual that also applies a torque."""
-PUSHED = "vanilla+sysid+dr+push"
-"""Simulator without a residual, with the pushes that policies of simulators with a residual are trained under."""
-OPTIONAL_SIMULATORS = (PUSHED, NEAR, SHARED, WRENCH, "supervised", "analytic")
+OPTIONAL_SIMULATORS = (NEAR, SHARED, WRENCH, "supervised", "analytic")
 """Optional simulators. The networks of the last two are learned by regression and by gradients."""
 ROUNDS = "envmimic"
 """Residual that is learned again in each round. From the second round on, its name ends with the round's number."""

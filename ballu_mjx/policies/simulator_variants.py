@@ -19,8 +19,6 @@ class SimulatorVariant:
     """Whether a vanilla simulator has identified actuators (`+sysid`)."""
     randomized: bool = False
     """Whether a vanilla simulator has domain randomization (`+dr`)."""
-    pushed: bool = False
-    """Whether the domain randomization of a vanilla simulator has pushes (`+push`)."""
     round: int = 1
     """Number of the round in which the residual was learned, from 1."""
 
@@ -28,17 +26,15 @@ class SimulatorVariant:
     def name(self) -> str:
         """Name of the simulator in tables and folders."""
         if self.residual is None:
-            return _VANILLA + "+sysid" * self.identified + "+dr" * self.randomized + "+push" * self.pushed
+            return _VANILLA + "+sysid" * self.identified + "+dr" * self.randomized
         return self.residual if self.round == 1 else f"{self.residual}-{self.round}"
 
     @staticmethod
     def parse(name: str) -> SimulatorVariant:
         """Return the variant with the given name."""
         base, *improvements = name.split("+")
-        if base == _VANILLA and set(improvements) <= {"sysid", "dr", "push"}:
-            return SimulatorVariant(
-                identified="sysid" in improvements, randomized="dr" in improvements, pushed="push" in improvements
-            )
+        if base == _VANILLA and set(improvements) <= {"sysid", "dr"}:
+            return SimulatorVariant(identified="sysid" in improvements, randomized="dr" in improvements)
         method, _, number = name.rpartition("-")
         if method == _ROUNDS and number.isdecimal() and int(number) > 1:
             return SimulatorVariant(method, round=int(number))

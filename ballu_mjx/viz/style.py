@@ -20,7 +20,6 @@ COLOURS: Mapping[str, str] = {
     "vanilla+dr": "#cc79a7",
     "vanilla+sysid": "#0072b2",
     "vanilla+sysid+dr": "#e69f00",
-    "vanilla+sysid+dr+push": "#ddcc77",
     "supervised": "#56b4e9",
     "envmimic": "#009e73",
     "aerodynamic": "#882255",
@@ -32,7 +31,7 @@ COLOURS: Mapping[str, str] = {
     "envmimic-near": "#88ccee",
     "envmimic-wrench": "#44aa99",
 }
-"""Colours of simulators in all figures. They are from the palettes of Okabe and Ito and of Tol, for
+"""Colours of simulators in all figures. They are from the palettes of Okabe and Ito and (six of them) of Tol, for
 colour-blind readers. Read them by `colour_of`, which has a colour for every name."""
 
 LABELS: Mapping[str, str] = {
@@ -41,7 +40,6 @@ LABELS: Mapping[str, str] = {
     "vanilla+dr": "vanilla+DR",
     "vanilla+sysid": "vanilla+sysid",
     "vanilla+sysid+dr": "vanilla+sysid+DR",
-    "vanilla+sysid+dr+push": "vanilla+sysid+DR, pushes",
     "supervised": "supervised",
     "envmimic": "EnvMimic",
     "aerodynamic": "aerodynamic",

@@ -24,11 +24,14 @@ from ballu_mjx.ballu.leg_parameters import (
     LegDynamics,
     ParameterTransform,
     dynamics_coordinates,
+    largest_motor_gain,
     nominal_leg,
 )
-from ballu_mjx.ballu.leg_residuals import CompiledLeg, leg_data
-from ballu_mjx.ballu.model import SIDES, suspend
+from ballu_mjx.ballu.leg_residuals import CompiledLeg, LegResiduals, leg_data
+from ballu_mjx.ballu.leg_uncertainty import analyse_legs
+from ballu_mjx.ballu.model import SIDES, load_suspended_leg, suspend
 from ballu_mjx.ballu.sweep import Sweep
+from ballu_mjx.common.errors import InputError
 from ballu_mjx.robots.model import assets, set_fields
 
 pytestmark = pytest.mark.optimized
@@ -194,6 +197,48 @@ def test_derivatives_of_the_motion_match_finite_differences(physics: CompiledLeg
         # The motion has a kink where a cable tightens or a knee leaves its stop. A few samples may therefore differ.
         differs = np.abs(derivatives[..., index] - difference) > 0.01 * np.abs(difference).max() + 1e-9
         assert differs.mean() < 0.02, index
+
+
+@pytest.mark.parametrize(("factor", "stays"), [(1.9, True), (2.1, False)])
+def test_a_free_servo_is_stable_up_to_twice_the_largest_gain(factor: float, stays: bool) -> None:
+    values = nominal_leg()
+    values[LEG_PARAMETERS.index("motor_gain")] = factor * largest_motor_gain(load_suspended_leg(SIDES[0]))
+    values[LEG_PARAMETERS.index("torque_limit")] = 1e6
+    model = c_model(SIDES[0], values)
+    model.tendon_stiffness[:] = 0
+    model.jnt_limited[:] = 0
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 0.5
+    mujoco.mj_step(model, data, 300)
+    reached = data.joint(f"motor_{SIDES[0]}").qpos[0]
+    assert (abs(reached - np.pi / 4) < 0.01) == stays
+
+
+def test_motions_of_the_stiffest_servos_have_usable_derivatives(physics: CompiledLeg) -> None:
+    """The servo of the right leg saturates. Derivatives grow to 1e20 and more at twice the largest gain."""
+    gain, limit, cable = (LEG_PARAMETERS.index(name) for name in ("motor_gain", "torque_limit", "cable_stiffness"))
+    strong = SPACE.nominal.copy()
+    strong[gain], strong[cable] = 0.98 * SPACE.upper[gain], 2 * strong[cable]
+    weak = strong.copy()
+    weak[limit] *= 0.5
+    derivatives = physics.motion(with_dynamics(strong, weak), DATA.commanded)[1]
+    assert np.abs(derivatives).max() < 100.0
+
+
+def test_derivatives_of_an_unstable_motion_are_refused(noiseless: Sweep, identifier: Identifier) -> None:
+    residuals = identifier.residuals(noiseless)
+
+    class Unstable(LegResiduals):
+        def __call__(self, coordinates: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            values, jacobians = super().__call__(coordinates, kept)
+            jacobians[1, -1] *= 1e12
+            return values, jacobians
+
+    residuals.__class__ = Unstable
+    y = with_dynamics(*TRUTH)
+    kept = np.ones(y.shape[1], bool)
+    with pytest.raises(InputError, match="right leg.*--no-motion"):
+        analyse_legs(residuals, y, kept, residuals.spread(y))
 
 
 def test_all_legs_within_the_bounds_come_to_rest(physics: CompiledLeg) -> None:
