@@ -61,9 +61,9 @@ from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.ballu.actuators_file import actuators_to_json
 from ballu_mjx.ballu.gaits import Gait
 from ballu_mjx.ballu.leg_fit import Identifier
-from ballu_mjx.ballu.leg_parameters import IdentificationConfig
+from ballu_mjx.ballu.leg_parameters import IdentificationConfig, largest_motor_gain
 from ballu_mjx.ballu.leg_results import Identification
-from ballu_mjx.ballu.model import SIDES, suspend
+from ballu_mjx.ballu.model import SIDES, load_suspended_leg, suspend
 from ballu_mjx.ballu.sweep import Sweep, read_sweep
 from ballu_mjx.ballu.sysid_report import identification_details
 from ballu_mjx.common import provenance
@@ -177,12 +177,13 @@ def open_loop(recordings: Mapping[str, Recording], actuators: ModelParameters) -
 def true_actuators(robot: BulletRobot) -> ActuatorParameters:
     """Return the robot's true parameters in the package's model.
 
-    The compliance of an arm is the inverse of the servo's gain. The limit of a cable's tension has no counterpart. The
+    The compliance of an arm is the inverse of the servo's gain, or of the largest gain that is stable at the package's
+    time step. The limit of a cable's tension has no counterpart. The
     closest parameter is the servo torque that causes this tension at the arm's full length.
     """
     values = {
         "knee_spring_stiffness": robot.spring_stiffness,
-        "motor_gain": 1 / np.array(robot.arm_yield),
+        "motor_gain": np.minimum(1 / np.array(robot.arm_yield), largest_motor_gain(load_suspended_leg(SIDES[0]))),
         "default_motor_angle": robot.arm_zero,
         "default_knee_angle": robot.knee_stop,
         "torque_limit": ARM_LENGTH * np.array(robot.cable_limit),
