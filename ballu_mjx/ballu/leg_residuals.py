@@ -182,13 +182,35 @@ class LegResiduals:
     def __call__(
         self, coordinates: Float[np.ndarray, "legs size"], kept: Bool[np.ndarray, " size"]
     ) -> tuple[Float[np.ndarray, "legs residuals"], Float[np.ndarray, "legs residuals size"]]:
-        """Return the residuals of both legs and their Jacobians: of the whole motion, or else of settled angles."""
-        legs = len(coordinates)
+        """Return the residuals of both legs and their Jacobians: of the whole motion, or else of settled angles.
+
+        All residuals of an unstable motion (see `unstable`) are `_UNSTABLE`, and its Jacobian is 0. A search then turns
+        back.
+        """
         if not self.moves:
-            return self.settled(coordinates, np.arange(legs), kept)
+            return self.settled(coordinates, np.arange(len(coordinates)), kept)
+        values, jacobians = self._motion(coordinates)
+        unstable = _are_unstable(values, jacobians)
+        values = np.where(unstable[:, None], _UNSTABLE, values)
+        return values, np.where(unstable[:, None, None], 0.0, jacobians) * kept
+
+    def unstable(self, coordinates: Float[np.ndarray, "legs size"]) -> Bool[np.ndarray, " legs"]:
+        """Return which legs move unstably: their motion or its derivatives are not finite, or derivatives are huge.
+
+        The simulation of such a leg amplifies small changes until it oscillates between the servo's torque limits.
+        """
+        if not self.moves:
+            return np.zeros(len(coordinates), bool)
+        return _are_unstable(*self._motion(coordinates))
+
+    def _motion(
+        self, coordinates: Float[np.ndarray, "legs size"]
+    ) -> tuple[Float[np.ndarray, "legs residuals"], Float[np.ndarray, "legs residuals size"]]:
+        """Return the simulated minus the measured motion of both legs, and its Jacobians."""
+        legs = len(coordinates)
         paths, jacobians = self.physics.motion(coordinates, self.data.commanded)
         values = (paths - self.data.motion)[:, self.data.counts]
-        return values.reshape(legs, -1), jacobians[:, self.data.counts].reshape(legs, -1, jacobians.shape[-1]) * kept
+        return values.reshape(legs, -1), jacobians[:, self.data.counts].reshape(legs, -1, jacobians.shape[-1])
 
     def with_priors(
         self,
@@ -252,5 +274,18 @@ class LegResiduals:
         return np.broadcast_to(spread[:, None], paths.shape).reshape(values.shape)
 
 
+def _are_unstable(
+    values: Float[np.ndarray, "legs residuals"], jacobians: Float[np.ndarray, "legs residuals size"]
+) -> Bool[np.ndarray, " legs"]:
+    with np.errstate(invalid="ignore"):
+        steep = ~(np.abs(jacobians).max(axis=(1, 2)) < _STEEPEST)  # also if one is NaN
+    return steep | ~np.isfinite(values).all(axis=1)
+
+
+_STEEPEST = 100.0
+"""Derivative of an angle (rad) by a coordinate above which a motion counts as unstable. Those of stable motions are of
+the order of 1, those of unstable ones up to 1e20 and more."""
+_UNSTABLE = float(np.pi / 2)
+"""Residual (rad) of an unstable motion."""
 _LEAST_SPREAD = 1e-9
 """Smallest divisor (rad)."""

@@ -47,23 +47,24 @@ def analyse_legs(
     The directions are those of the parameters in `kept`, determined by the data alone. The standard errors take all
     parameters as unknown, and include the priors.
 
-    **Raises** `InputError` if derivatives of a leg's motion are not finite, or as large as those of an unstable motion.
+    **Raises** `InputError` if a leg moves unstably in simulation (`LegResiduals.unstable`).
     """
+    if any(residuals.unstable(coordinates)):
+        legs = " and ".join(np.array(SIDES)[residuals.unstable(coordinates)])
+        raise InputError(
+            f"No stable motion of the {legs} leg was found that follows the sweep; identify its settled angles alone, "
+            "with --no-motion."
+        )
     space, size = residuals.space, residuals.size
     results = []
-    rows = zip(SIDES, coordinates, *residuals(coordinates, np.ones_like(kept)), spread, strict=True)
-    for side, y, value, jacobian, divisor in rows:
+    rows = zip(coordinates, *residuals(coordinates, np.ones_like(kept)), spread, strict=True)
+    for y, value, jacobian, divisor in rows:
         scatter = float(np.sqrt(np.sum(value**2) / max(np.count_nonzero(value) - np.count_nonzero(kept), 1)))
         vector, derivatives = residuals.parameters(y[:size])
         units = space.units(vector)[space.free]
         priors = np.concatenate([units / np.diag(derivatives), DYNAMICS_PRIOR[: len(y) - size]])
         # The Jacobian with respect to parameters in units of their priors.
         scaled = jacobian * priors / divisor[:, None]
-        if not np.abs(jacobian * priors).max() < _STEEPEST:  # also if it is NaN
-            raise InputError(
-                f"The {side} leg has no usable derivatives at the fitted parameters: its simulated motion is unstable. "
-                "Identify the settled angles alone, with --no-motion."
-            )
         covariance = np.linalg.inv(scaled.T @ scaled + np.eye(len(y)))
         deviation = np.sqrt(np.diag(covariance))
         standard_errors = np.zeros(len(LEG_PARAMETERS))
@@ -82,11 +83,6 @@ def analyse_legs(
             )
         )
     return results
-
-
-_STEEPEST = 1e6
-"""Largest derivative of a residual (rad) by a parameter in units of its prior. Derivatives of stable motions are below
-1e2. Those of unstable ones grow to 1e20 and more within a sweep."""
 
 
 def _dynamics_errors(coordinates: Float[np.ndarray, " 6"], deviation: Float[np.ndarray, " 6"]) -> LegDynamics:

@@ -27,7 +27,7 @@ from ballu_mjx.ballu.leg_parameters import (
     largest_motor_gain,
     nominal_leg,
 )
-from ballu_mjx.ballu.leg_residuals import CompiledLeg, LegResiduals, leg_data
+from ballu_mjx.ballu.leg_residuals import CompiledLeg, leg_data
 from ballu_mjx.ballu.leg_uncertainty import analyse_legs
 from ballu_mjx.ballu.model import SIDES, load_suspended_leg, suspend
 from ballu_mjx.ballu.sweep import Sweep
@@ -225,18 +225,24 @@ def test_motions_of_the_stiffest_servos_have_usable_derivatives(physics: Compile
     assert np.abs(derivatives).max() < 100.0
 
 
-def test_derivatives_of_an_unstable_motion_are_refused(noiseless: Sweep, identifier: Identifier) -> None:
+def test_an_unstable_motion_turns_searches_back_and_is_no_result(
+    noiseless: Sweep, identifier: Identifier, monkeypatch: pytest.MonkeyPatch
+) -> None:
     residuals = identifier.residuals(noiseless)
+    motion = residuals.physics.motion
 
-    class Unstable(LegResiduals):
-        def __call__(self, coordinates: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            values, jacobians = super().__call__(coordinates, kept)
-            jacobians[1, -1] *= 1e12
-            return values, jacobians
+    def amplified(coordinates: np.ndarray, commanded: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        paths, jacobians = motion(coordinates, commanded)
+        return paths, jacobians * np.array([1.0, 1e12])[:, None, None, None]
 
-    residuals.__class__ = Unstable
     y = with_dynamics(*TRUTH)
     kept = np.ones(y.shape[1], bool)
+    plain = residuals(y, kept)
+    monkeypatch.setattr(residuals.physics, "motion", amplified)
+    values, jacobians = residuals(y, kept)
+    np.testing.assert_array_equal(values[0], plain[0][0])
+    assert np.sum(values[1] ** 2) > 1e3 * np.sum(values[0] ** 2)
+    assert not jacobians[1].any() and jacobians[0].any()
     with pytest.raises(InputError, match="right leg.*--no-motion"):
         analyse_legs(residuals, y, kept, residuals.spread(y))
 
