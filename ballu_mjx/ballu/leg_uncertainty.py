@@ -62,7 +62,9 @@ def analyse_legs(
         scatter = float(np.sqrt(np.sum(value**2) / max(np.count_nonzero(value) - np.count_nonzero(kept), 1)))
         vector, derivatives = residuals.parameters(y[:size])
         units = space.units(vector)[space.free]
-        priors = np.concatenate([units / np.diag(derivatives), DYNAMICS_PRIOR[: len(y) - size]])
+        # At a bound, a coordinate no longer moves its parameter. The data then leave it to its prior.
+        moved = np.maximum(np.diag(derivatives), _LEAST_MOVE * units)
+        priors = np.concatenate([units / moved, DYNAMICS_PRIOR[: len(y) - size]])
         # The Jacobian with respect to parameters in units of their priors.
         scaled = jacobian * priors / divisor[:, None]
         covariance = np.linalg.inv(scaled.T @ scaled + np.eye(len(y)))
@@ -83,6 +85,10 @@ def analyse_legs(
             )
         )
     return results
+
+
+_LEAST_MOVE = 1e-6
+"""Smallest change of a parameter by a coordinate, in units of the prior."""
 
 
 def _dynamics_errors(coordinates: Float[np.ndarray, " 6"], deviation: Float[np.ndarray, " 6"]) -> LegDynamics:

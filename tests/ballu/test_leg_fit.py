@@ -247,6 +247,17 @@ def test_an_unstable_motion_turns_searches_back_and_is_no_result(
         analyse_legs(residuals, y, kept, residuals.spread(y))
 
 
+def test_a_parameter_at_its_bound_has_the_standard_error_of_its_prior(noiseless: Sweep, identifier: Identifier) -> None:
+    residuals, gain = identifier.residuals(noiseless), LEG_PARAMETERS.index("motor_gain")
+    y = with_dynamics(*TRUTH)
+    y[0, gain] = 50.0  # the logistic function is flat there
+    spread = np.full(residuals(y, np.ones(y.shape[1], bool))[0].shape, 0.005)
+    analyses = analyse_legs(residuals, y, np.ones(y.shape[1], bool), spread)
+    for analysis in analyses:
+        assert np.isfinite(analysis.standard_errors).all() and np.isfinite(analysis.correlations).all()
+    assert analyses[0].standard_errors[gain] == pytest.approx(SPACE.prior[gain] * SPACE.upper[gain], rel=0.01)
+
+
 def test_all_legs_within_the_bounds_come_to_rest(physics: CompiledLeg) -> None:
     draws = SPACE.draw(1, 40)
     qpos, _ = physics.settled(draws, np.tile(COMMANDS, (len(draws), 1)))
