@@ -80,7 +80,7 @@ ALL_PARAMETERS = IdentificationConfig(knee_spring_reference=True, nominal_spring
 
 
 class ParameterRange(NamedTuple):
-    """Bounds and prior of a parameter. The gain's upper bound is at most `largest_motor_gain`."""
+    """Bounds and prior of a parameter. The gain also stays below `largest_motor_gain`."""
 
     factor: float | None
     """Factor by which the nominal value is divided and multiplied for the bounds. None if `reach` gives the bounds."""
@@ -154,12 +154,17 @@ DELAY_UNIT = 0.01
 """Change of the delay (s) for a change of its coordinate by 1."""
 
 
+_CAP_SHARPNESS = 8.0
+"""Sharpness of the gain's smooth limit, in inverse units of its logarithm."""
+
+
 class ParameterTransform:
     """Transform between a leg's parameters in their units and the unbounded coordinates of the search.
 
     A logistic function maps a coordinate to the interval between the bounds. The interval is that of the logarithm for
-    stiffness, gain and torque limit, and that of the value for angles, slack and travel. Parameters that are not free
-    keep their nominal value.
+    stiffness, gain and torque limit, and that of the value for angles, slack and travel. The gain is then limited
+    smoothly to `largest_motor_gain`, which changes gains below half of it by less than 0.1 %. Parameters that are not
+    free keep their nominal value.
     """
 
     def __init__(self, nominal: Float[np.ndarray, " parameters"], config: IdentificationConfig) -> None:
@@ -169,8 +174,8 @@ class ParameterTransform:
         self.nominal = nominal
         self.relative = np.array([r.factor is not None for r in ranges])
         self.lower, self.upper = nominal / factors - below, nominal * factors + above
-        gain = LEG_PARAMETERS.index("motor_gain")
-        self.upper[gain] = min(self.upper[gain], largest_motor_gain(load_suspended_leg(SIDES[0])))
+        self._gain = np.array(LEG_PARAMETERS) == "motor_gain"
+        self._largest_gain = largest_motor_gain(load_suspended_leg(SIDES[0]))
         self.prior = np.array([r.prior for r in ranges])
         """Standard deviation of each parameter among robots: of its logarithm if it is `relative`."""
         self.free = np.isin(LEG_PARAMETERS, free_parameters(config))
@@ -182,10 +187,16 @@ class ParameterTransform:
         ratio = np.where(relative, upper / np.where(relative, lower, 1.0), 1.0)
         share = jax.nn.sigmoid(coordinates)
         values = jnp.where(relative, lower * ratio**share, lower + share * (upper - lower))
+        gain, largest = self._gain[free], self._largest_gain
+        below = _CAP_SHARPNESS * (np.log(largest) - jnp.log(jnp.asarray(jnp.where(gain, values, 1.0))))
+        values = jnp.where(gain, largest * jnp.exp(-jax.nn.softplus(below) / _CAP_SHARPNESS), values)
         return jnp.asarray(self.nominal).at[np.flatnonzero(free)].set(values)
 
     def coordinates(self, vector: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " free"]:
-        """Return the inverse of `vector`, for values within the bounds."""
+        """Return the inverse of `vector`, for values within the bounds and a gain below the largest."""
+        below = _CAP_SHARPNESS * np.log(self._largest_gain / np.where(self._gain, vector, 1.0))
+        uncapped = self._largest_gain * np.exp(-(below + np.log(-np.expm1(-below))) / _CAP_SHARPNESS)
+        vector = np.where(self._gain, uncapped, vector)
         share = (vector - self.lower) / (self.upper - self.lower)
         logs = [np.log(np.where(self.relative, x, 1.0)) for x in (vector, self.lower, self.upper)]
         span = np.where(self.relative, logs[2] - logs[1], 1.0)
