@@ -118,8 +118,8 @@ class Identifier:
 
     def run(self, sweep: Sweep, report: Report) -> Identification:
         """Return the identification of both legs from a sweep of the compiled sizes."""
-        config, size, data = self.config, self._size, leg_data(sweep)
-        residuals = self.residuals(sweep)
+        config, size, residuals = self.config, self._size, self.residuals(sweep)
+        data = residuals.data
         legs = np.arange(len(SIDES))
         free = np.array(LEG_PARAMETERS)[self.space.free]
         further = np.isin([*free, *(LegDynamics._fields if config.motion else ())], RICHER_PARAMETERS)

@@ -184,33 +184,19 @@ class LegResiduals:
     ) -> tuple[Float[np.ndarray, "legs residuals"], Float[np.ndarray, "legs residuals size"]]:
         """Return the residuals of both legs and their Jacobians: of the whole motion, or else of settled angles.
 
-        All residuals of an unstable motion (see `unstable`) are `_UNSTABLE`, and its Jacobian is 0. A search then turns
-        back.
+        A motion is unstable if it or its derivatives are not finite, or derivatives are huge: small changes grow until
+        the leg oscillates between the servo's torque limits. All its residuals are `_UNSTABLE`, and its Jacobian is 0.
+        A search then turns back.
         """
+        legs = len(coordinates)
         if not self.moves:
-            return self.settled(coordinates, np.arange(len(coordinates)), kept)
-        values, jacobians = self._motion(coordinates)
+            return self.settled(coordinates, np.arange(legs), kept)
+        paths, jacobians = self.physics.motion(coordinates, self.data.commanded)
+        values = (paths - self.data.motion)[:, self.data.counts].reshape(legs, -1)
+        jacobians = jacobians[:, self.data.counts].reshape(legs, -1, jacobians.shape[-1])
         unstable = _are_unstable(values, jacobians)
         values = np.where(unstable[:, None], _UNSTABLE, values)
         return values, np.where(unstable[:, None, None], 0.0, jacobians) * kept
-
-    def unstable(self, coordinates: Float[np.ndarray, "legs size"]) -> Bool[np.ndarray, " legs"]:
-        """Return which legs move unstably: their motion or its derivatives are not finite, or derivatives are huge.
-
-        The simulation of such a leg amplifies small changes until it oscillates between the servo's torque limits.
-        """
-        if not self.moves:
-            return np.zeros(len(coordinates), bool)
-        return _are_unstable(*self._motion(coordinates))
-
-    def _motion(
-        self, coordinates: Float[np.ndarray, "legs size"]
-    ) -> tuple[Float[np.ndarray, "legs residuals"], Float[np.ndarray, "legs residuals size"]]:
-        """Return the simulated minus the measured motion of both legs, and its Jacobians."""
-        legs = len(coordinates)
-        paths, jacobians = self.physics.motion(coordinates, self.data.commanded)
-        values = (paths - self.data.motion)[:, self.data.counts]
-        return values.reshape(legs, -1), jacobians[:, self.data.counts].reshape(legs, -1, jacobians.shape[-1])
 
     def with_priors(
         self,

@@ -47,18 +47,19 @@ def analyse_legs(
     The directions are those of the parameters in `kept`, determined by the data alone. The standard errors take all
     parameters as unknown, and include the priors.
 
-    **Raises** `InputError` if a leg moves unstably in simulation (`LegResiduals.unstable`).
+    **Raises** `InputError` if a leg moves unstably in simulation (`LegResiduals.__call__`).
     """
-    if any(residuals.unstable(coordinates)):
-        legs = " and ".join(np.array(SIDES)[residuals.unstable(coordinates)])
+    space, size = residuals.space, residuals.size
+    values, jacobians = residuals(coordinates, np.ones_like(kept))
+    unstable = ~jacobians.any(axis=(1, 2))
+    if unstable.any():
+        legs = " and ".join(np.array(SIDES)[unstable])
         raise InputError(
             f"No stable motion of the {legs} leg was found that follows the sweep; identify its settled angles alone, "
             "with --no-motion."
         )
-    space, size = residuals.space, residuals.size
     results = []
-    rows = zip(coordinates, *residuals(coordinates, np.ones_like(kept)), spread, strict=True)
-    for y, value, jacobian, divisor in rows:
+    for y, value, jacobian, divisor in zip(coordinates, values, jacobians, spread, strict=True):
         scatter = float(np.sqrt(np.sum(value**2) / max(np.count_nonzero(value) - np.count_nonzero(kept), 1)))
         vector, derivatives = residuals.parameters(y[:size])
         units = space.units(vector)[space.free]
