@@ -136,10 +136,10 @@ def test_lower_friction_lets_the_robot_slide_further():
 def test_pushes_are_drawn_anew_for_every_episode():
     keys = jax.random.split(jax.random.key(2), 400)
     draw = jax.jit(jax.vmap(PLAIN._start, in_axes=(None, 0)))
-    sizes = {"push_force": 0.02, "push_torque": 0.003}
-    off = make_simulator_setting(BALLU, MODEL, LocomotionConfig(**sizes), None)
+    config = LocomotionConfig(push_force=0.02, push_torque=0.003)
+    off = make_simulator_setting(BALLU, MODEL, config, None)
     assert np.abs(inner(draw(off, keys)).push).max() == 0
-    on = make_simulator_setting(BALLU, MODEL, LocomotionConfig(domain_randomization=True, **sizes), None)
+    on = make_simulator_setting(BALLU, MODEL, dataclasses.replace(config, domain_randomization=True), None)
     spread = np.std(inner(draw(on, keys)).push, axis=0)
     np.testing.assert_allclose(spread, [0.02, 0.02, 0, 0, 0, 0.003], rtol=0.15)
 
