@@ -1,4 +1,4 @@
-"""MkDocs hooks that add the pages outside of docs/, and render formulas without script and network."""
+"""MkDocs hooks that add the pages outside of docs/ and the experiments, and render formulas without a script."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 from html import unescape
 from pathlib import Path
 
+import jupytext
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -18,14 +19,50 @@ _OUTSIDE = {
 }
 _LINKED = ("CITATION.cff", "LICENSE")
 """Files that are not pages, but to which the README links."""
+_EXPERIMENTS = "experiments"
+"""Folder of the experiments, and of their pages."""
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 _SHORT_CODE = re.compile(r"<code>([^<]{1,24})</code>")
 """Short code. A browser would break its lines after the hyphens of an option."""
 
 
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """List the experiments under the heading `Experiments`."""
+    pages = [{_title(source): f"{_page(source, config)}.md"} for source in _experiments(config)]
+    for section in config.nav or []:
+        if "Experiments" in section:
+            section["Experiments"] = pages
+    return config
+
+
+def _experiments(config: MkDocsConfig) -> list[Path]:
+    """Return the experiments: scripts with cells (`# %%`)."""
+    scripts = sorted((Path(config.config_file_path).parent / _EXPERIMENTS).rglob("*.py"))
+    return [script for script in scripts if script.read_text(encoding="utf-8").startswith("# %%")]
+
+
+def _title(source: Path) -> str:
+    """Return the title of an experiment, which is its first heading."""
+    return source.read_text(encoding="utf-8").split("\n")[1].removeprefix("# # ")
+
+
+def _page(source: Path, config: MkDocsConfig) -> str:
+    """Return the address of an experiment's page and notebook, without the suffix."""
+    return source.relative_to(Path(config.config_file_path).parent).with_suffix("").as_posix()
+
+
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages outside of docs/, and the files to which the README links."""
+    """Add the pages outside of docs/, the experiments as pages and notebooks, and files to which the README links."""
     root = Path(config.config_file_path).parent
+    for source in _experiments(config):
+        notebook, page = jupytext.read(source), _page(source, config)
+        title, _, text = jupytext.writes(notebook, "md").partition("\n")
+        note = (
+            f"*[Notebook]({source.stem}.ipynb) of `{page}.py`, without outputs. In Colab, clone the repository and "
+            "change to its folder first.*"
+        )
+        files.append(File.generated(config, f"{page}.md", content=f"{title}\n\n{note}\n{text}"))
+        files.append(File.generated(config, f"{page}.ipynb", content=jupytext.writes(notebook, "ipynb")))
     for source, page in _OUTSIDE.items():
         files.append(File.generated(config, page, content=(root / source).read_text(encoding="utf-8")))
     for name in _LINKED:
