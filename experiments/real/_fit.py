@@ -9,14 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
+from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.identification.fit_robot import RobotFit
 
 
-def parse(description: str) -> argparse.Namespace:
-    """Parse the command line, and return its options `data` and `quick`."""
+def parse(description: str, output: Path) -> argparse.Namespace:
+    """Parse the command line, and return its options `data`, `output` (its default is given), `quick` and `results`."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
+    parser.add_argument("--output", type=Path, default=output, help=f"folder for the tables ({output})")
     parser.add_argument("--quick", action="store_true", help="short trial run; the numbers mean little")
+    parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     return parser.parse_args()
 
 
@@ -26,12 +29,27 @@ def report(stage: str, iteration: int, steps: int, value: float) -> None:
 
 
 def show(fit: RobotFit) -> None:
-    """Print the identified parameters with standard errors, and diagnostics of the fit."""
-    print("| parameter | nominal | identified | standard error | unit |\n| --- | --- | --- | --- | --- |")
-    for parameter, value, error in zip(fit.parameters.parameters, fit.values, fit.standard_errors, strict=True):
-        print(f"| {parameter.name} | {parameter.nominal:.4g} | {value:.4g} | {error:.2g} | {parameter.unit} |")
+    """Print diagnostics of a fit."""
     print(f"at bounds: {fit.at_bounds}; not shown by the data: {fit.unseen}; open: {fit.unidentified}")
     print(f"strong correlations: {fit.strong_correlations}; scatter over noise: {fit.scatter.round(1)}")
+
+
+def parameter_table(fit: RobotFit, published: Mapping[str, float]) -> Table:
+    """Return a table of nominal, `published` and identified parameters."""
+    rows = zip(fit.parameters.parameters, fit.values, fit.standard_errors, strict=True)
+    return Table(
+        ("parameter", "unit", "nominal", "published", "identified (standard error)"),
+        tuple(
+            (
+                parameter.name,
+                parameter.unit,
+                Cell((parameter.nominal,), ".5f"),
+                Cell((published.get(parameter.name, parameter.nominal),), ".5f"),
+                Cell((float(value),), ".5f", standard_error=float(error)),
+            )
+            for parameter, value, error in rows
+        ),
+    )
 
 
 def candidates(fit: RobotFit, published: Mapping[str, float]) -> dict[str, np.ndarray]:

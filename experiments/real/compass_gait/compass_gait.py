@@ -40,7 +40,6 @@ import _setup
 
 _setup.prepare()
 
-import argparse
 import dataclasses
 from collections.abc import Mapping, Sequence
 
@@ -49,7 +48,7 @@ import mujoco
 import numpy as np
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.common.results import Cell, Table
+from ballu_mjx.common.results import Table
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_robot import FitConfig, HeldOut, RobotFit, fit_robot, replay
 from ballu_mjx.identification.measured_motion import MeasuredMotion, SamplingConfig, measure
@@ -174,33 +173,15 @@ def tables(fit: RobotFit, errors: Mapping[str, Mapping[str, np.ndarray]]) -> dic
         name: [f"{stance:.2f} / {swing:.2f}" for group in groups for stance, swing in found[group]]
         for name, found in errors.items()
     }
-    rows = zip(fit.parameters.parameters, fit.values, fit.standard_errors, strict=True)
     return {
         "steps": Table(("stance / swing (deg)", *heads), tuple((name, *row) for name, row in cells.items())),
-        "parameters": Table(
-            ("parameter", "unit", "nominal", "published", "identified (standard error)"),
-            tuple(
-                (
-                    parameter.name,
-                    parameter.unit,
-                    Cell((parameter.nominal,), ".5f"),
-                    Cell((PUBLISHED.get(parameter.name, parameter.nominal),), ".5f"),
-                    Cell((float(value),), ".5f", standard_error=float(error)),
-                )
-                for parameter, value, error in rows
-            ),
-        ),
+        "parameters": _fit.parameter_table(fit, PUBLISHED),
     }
 
 
 # %%
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Identify the hip of a walker, and test on unseen walks.")
-    parser.add_argument("--data", type=Path, required=True, help="folder of the walks")
-    parser.add_argument("--output", type=Path, default=Path("runs/compass_gait"), help="folder for the tables")
-    parser.add_argument("--quick", action="store_true", help="short trial run; the numbers mean little")
-    parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
-    options = parser.parse_args()
+    options = _fit.parse("Identify the hip of a walker, and test on unseen walks.", Path("runs/compass_gait"))
     fit = identify(options.data, quick=options.quick)
     _fit.show(fit)
     groups = {"validation": VALIDATION} if options.quick else {"validation": VALIDATION, **TEST}

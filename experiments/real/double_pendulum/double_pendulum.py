@@ -28,9 +28,12 @@ import _setup
 
 _setup.prepare()
 
+from collections.abc import Sequence
+
 import _fit
 import numpy as np
 
+from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_robot import FitConfig, HeldOut, RobotFit, fit_robot, replay
 from ballu_mjx.identification.measured_motion import MeasuredMotion, SamplingConfig, measure
@@ -50,6 +53,14 @@ PUBLISHED = {
     "elbow_damping": 0.001,
 }
 """Friction of the data's authors. Their model of Coulomb friction is cf atan(100 v)."""
+
+
+HORIZONS = (0.4, 1.0)
+"""Horizons of the errors on held-out recordings (s)."""
+SWING_UP_HORIZON = 0.4
+"""Horizon of the errors on swing-ups (s)."""
+INTERVAL = 0.2
+"""Time between the starts of two replays (s)."""
 
 
 def load(data: Path, names: tuple[str, ...]) -> list[MeasuredMotion]:
@@ -82,14 +93,35 @@ def identify(data: Path, *, quick: bool) -> RobotFit:
     return fit_robot(parameters, training, load(data, VALIDATION), config, _fit.report)
 
 
-def row(name: str, found: HeldOut, motions: int) -> str:
-    """Return a table row with the median absolute errors (deg) of both joints at the end of the windows.
+def median_errors(found: HeldOut, recordings: Sequence[int]) -> str:
+    """Return the median absolute errors (deg) of shoulder and elbow at the end of the windows of some recordings."""
+    ends = found.errors[np.isin(found.motion, recordings), -1, :2]
+    return " / ".join(f"{error:.2f}" for error in np.rad2deg(np.median(np.abs(ends), axis=0)))
 
-    The first cell is over all recordings, the others are for each one.
-    """
-    each = [np.median(np.abs(found.errors[found.motion == number, -1, :2]), axis=0) for number in range(motions)]
-    cells = [np.rad2deg(found.final_median[:2]), *map(np.rad2deg, each)]
-    return f"| {name} | " + " | ".join(f"{q1:.2f} / {q2:.2f}" for q1, q2 in cells) + " |"
+
+def held_out_table(fit: RobotFit, data: Path, horizons: Sequence[float]) -> Table:
+    """Return the errors after each horizon (s) on recordings that the fit does not use."""
+    names = (*VALIDATION, *TEST)
+    groups = {"all": range(len(names))} | {name: [number] for number, name in enumerate(names)}
+    points, motions = _fit.candidates(fit, PUBLISHED), load(data, names)
+    rows = {name: [name] for name in points}
+    for seconds in horizons:
+        found = replay(fit.parameters, motions, list(points.values()), seconds, INTERVAL)
+        for name, errors in zip(points, found, strict=True):
+            rows[name] += [median_errors(errors, numbers) for numbers in groups.values()]
+    heads = [f"{group}, {seconds:g} s" for seconds in horizons for group in groups]
+    return Table(("shoulder / elbow (deg)", *heads), tuple(map(tuple, rows.values())))
+
+
+def swing_up_table(fit: RobotFit, motions: list[MeasuredMotion]) -> Table:
+    """Return the errors of the tip after `SWING_UP_HORIZON` on swing-ups."""
+    points = _fit.candidates(fit, PUBLISHED)
+    found = replay(fit.parameters, motions, list(points.values()), SWING_UP_HORIZON, INTERVAL)
+    rows = []
+    for name, errors in zip(points, found, strict=True):
+        ends = np.percentile(tip_errors(errors, motions, SWING_UP_HORIZON, INTERVAL), [50, 90])
+        rows.append((name, *(Cell((float(error),), ".4f") for error in ends)))
+    return Table((f"swing-ups: tip after {SWING_UP_HORIZON:g} s", "median (m)", "90th percentile (m)"), tuple(rows))
 
 
 def tip_errors(found: HeldOut, motions: list[MeasuredMotion], seconds: float, interval: float) -> np.ndarray:
@@ -109,23 +141,17 @@ def tip(angles: np.ndarray) -> np.ndarray:
 
 # %%
 def main() -> None:
-    options = _fit.parse("Identify a geared double pendulum, and test on runs that the fit has not seen.")
+    description = "Identify a geared double pendulum, and test on runs that the fit has not seen."
+    options = _fit.parse(description, Path("runs/double_pendulum"))
     fit = identify(options.data, quick=options.quick)
     _fit.show(fit)
     print(f"validation, score: nominal {fit.nominal.score:.3g}, identified {fit.identified.score:.3g}")
-    points = _fit.candidates(fit, PUBLISHED)
-    for seconds in (0.4,) if options.quick else (0.4, 1.0):
-        print(f"\nMedian |error| after {seconds:g} s, deg, shoulder / elbow: all, validation, test\n")
-        motions = load(options.data, (*VALIDATION, *TEST))
-        found = replay(fit.parameters, motions, list(points.values()), seconds, 0.2)
-        for name, errors in zip(points, found, strict=True):
-            print(row(name, errors, len(motions)))
+    horizons = HORIZONS[:1] if options.quick else HORIZONS
+    tables = {"held_out": held_out_table(fit, options.data, horizons)}
     if swing_ups := [] if options.quick else load_swing_ups(options.data):
-        print("\nSwing-ups of the acrobot (other motions, another controller): tip after 0.4 s, m, median and 90 %\n")
-        found = replay(fit.parameters, swing_ups, list(points.values()), 0.4, 0.2)
-        for name, errors in zip(points, found, strict=True):
-            middle, most = np.percentile(tip_errors(errors, swing_ups, 0.4, 0.2), [50, 90])
-            print(f"| {name} | {middle:.4f} | {most:.4f} |")
+        tables["swing_ups"] = swing_up_table(fit, swing_ups)
+    tables["parameters"] = _fit.parameter_table(fit, PUBLISHED)
+    _setup.write_tables(tables, options.output, options.results, {})
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ import _fit
 import mujoco
 import numpy as np
 
+from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, fit_robot, replay
 from ballu_mjx.identification.measured_motion import MeasuredMotion, SamplingConfig, measure
@@ -75,15 +76,18 @@ def mean_errors(fit: RobotFit, motions: list[MeasuredMotion], points: list[np.nd
 
 # %%
 def main() -> None:
-    options = _fit.parse("Identify a Unitree Go1 motor with 0, 1 and 2 kg, and test with 3 kg.")
+    description = "Identify a Unitree Go1 motor with 0, 1 and 2 kg, and test with 3 kg."
+    options = _fit.parse(description, Path("runs/go1"))
     fit = identify(options.data, quick=options.quick)
     _fit.show(fit)
-    points = list(_fit.candidates(fit, PUBLISHED).values())
-    print(f"\nMean |error| over {SECONDS:g} s, deg\n")
-    print("| load (kg) | nominal | published friction | identified |\n| --- | --- | --- | --- |")
+    points = _fit.candidates(fit, PUBLISHED)
+    rows = []
     for kilograms in LOADS[-1:] if options.quick else LOADS:
-        errors = mean_errors(fit, load(options.data, kilograms), points)
-        print(f"| {kilograms} | " + " | ".join(f"{x:.2f}" for x in errors.mean(axis=1)) + " |")
+        errors = mean_errors(fit, load(options.data, kilograms), list(points.values()))
+        rows.append((f"{kilograms} kg", *(Cell((float(error),)) for error in errors.mean(axis=1))))
+    heads = (f"mean error over {SECONDS:g} s (deg)", *points)
+    tables = {"loads": Table(heads, tuple(rows)), "parameters": _fit.parameter_table(fit, PUBLISHED)}
+    _setup.write_tables(tables, options.output, options.results, {})
 
 
 if __name__ == "__main__":
