@@ -1,8 +1,12 @@
 """A two-joint servo arm on a stand, and the true arm in C MuJoCo. The true arm has other parameters, and a drivetrain
-that the arm's model lacks."""
+that the arm's model lacks.
+
+`python tests/servo_arm.py FOLDER` writes the files of the example in docs/identify.md.
+"""
 
 from __future__ import annotations
 
+import argparse
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -140,3 +144,20 @@ def record_arm(
     keys = {"format": "ballu-recording/1", "kind": kind, "robot": "arm", "notes": ""}
     path.with_suffix(".json").write_text(json.dumps(keys))
     return path
+
+
+def write_example(folder: Path, friction: float = 0.0) -> None:
+    """Write the files of docs/identify.md: the model, its description, two recordings and one for validation."""
+    folder.mkdir(parents=True, exist_ok=True)
+    robot = write_arm(folder)
+    for seed, use in enumerate(("recordings", "recordings", "validation")):
+        (folder / use).mkdir(exist_ok=True)
+        record_arm(folder / use, robot, f"motion-{seed}", seed, "suspended", friction=friction)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Write the example of docs/identify.md to a folder.")
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--friction", type=float, default=0.0, help="dry friction (deg) that the model lacks")
+    options = parser.parse_args()
+    write_example(options.folder, options.friction)

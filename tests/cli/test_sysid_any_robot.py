@@ -3,13 +3,14 @@
 import contextlib
 import io
 import json
+import re
 import shutil
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
-from servo_arm import IDENTIFY, TRUTH, identified, record_arm, write_arm
+from servo_arm import IDENTIFY, TRUTH, identified, record_arm, write_arm, write_example
 
 from ballu_mjx.cli import train
 from ballu_mjx.cli._residual import prepare
@@ -45,6 +46,17 @@ def run(robot: RobotDescription) -> tuple[Path, str]:
     with contextlib.redirect_stdout(printed):
         assert train.main(list(map(str, arguments))) == 0
     return folder / "run", printed.getvalue()
+
+
+def test_guide_shows_the_files_that_the_example_writes(tmp_path: Path):
+    write_example(tmp_path)
+    guide = (Path(__file__).parents[2] / "docs" / "identify.md").read_text()
+    description, sidecar, *_ = map(json.loads, re.findall(r"^```json\n(.*?)^```", guide, re.DOTALL | re.MULTILINE))
+    assert json.loads((tmp_path / "arm.robot.json").read_text()) == description
+    motion = tmp_path / "recordings" / "motion-0.csv"
+    assert json.loads(motion.with_suffix(".json").read_text()) == sidecar
+    assert "\n".join(motion.read_text().splitlines()[:3]) in guide
+    assert (tmp_path / "validation" / "motion-2.csv").exists()
 
 
 def test_sysid_identifies_the_arm_and_writes_all_files(robot: RobotDescription, run: tuple[Path, str]):
