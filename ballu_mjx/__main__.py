@@ -9,10 +9,11 @@ from ballu_mjx.common import runtime
 from ballu_mjx.common.errors import InputError
 
 COMMANDS = (
-    ("recording", "record import FILE", "make a recording from a Vicon CSV, a C3D or any table"),
+    ("recording", "record map FILE", "list the content of a motion-capture file, and draft a mapping for it"),
+    ("", "record import FILE", "make a recording from a motion-capture file or table, by its mapping"),
     ("", "record check FILE", "summarize a recording and report its faults"),
     ("", "record simulate", "record on the virtual robot"),
-    ("identification", "train sysid", "identify actuator parameters from a suspended sweep"),
+    ("identification", "train sysid", "identify actuators, or the parameters that a description declares"),
     ("residual", "train envmimic", "learn residual forces by reinforcement learning"),
     ("", "train aerodynamic", "identify physical parameters of the air around the balloon"),
     ("", "train fluid", "fit lift, drag and moments of any body in air or water, as polynomials"),

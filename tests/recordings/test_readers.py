@@ -707,6 +707,17 @@ def test_map_leaves_unknown_entries_empty_and_import_refuses_them(
     assert "exists already" in capsys.readouterr().err
 
 
+def test_map_drafts_lines_for_a_log_with_its_own_clock_and_units(tmp_path: Path, robot: RobotDescription):
+    """The file holds no commands. Every key that such a log needs is in the draft, with its default, as a comment."""
+    body = rows([1000 * TIME, *(100 * COMMAND.T)], ",", 6, lost=[])
+    (tmp_path / "log.csv").write_text("stamp,servo,fan\n" + body)
+    change = {'# time = "time"': 'time = "stamp"', '# time_unit = "s"': 'time_unit = "ms"'}
+    for name, column, (low, high) in zip(robot.commands, ("servo", "fan"), robot.command_ranges, strict=True):
+        change[f'# {name} = "command_{name}"'] = f'{name} = "{column}"'
+        change[f"# range_{name} = [{low:g}, {high:g}]"] = f"range_{name} = [{100 * low}, {100 * high}]"
+    assert_motion(imported(tmp_path, write_motive(tmp_path), robot, change), gaps=True)
+
+
 def test_map_quotes_names_with_line_breaks(tmp_path: Path, robot: RobotDescription):
     np.savez(tmp_path / "x.npz", **{'a"\n[hull]\n': HULL.place, "time": TIME})
     contents = find_reader(tmp_path / "x.npz").list(tmp_path / "x.npz")

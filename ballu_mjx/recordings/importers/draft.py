@@ -320,7 +320,16 @@ def _command_lines(contents: Contents, robot: RobotDescription, commands: Mappin
     if not commands:
         return [
             "[commands]  # none were found in the file: give their log by --commands, and name its columns here",
-            *(f"# {name} = {json.dumps(f'command_{name}')}" for name in robot.commands),
+            '# time = "time"  # the column of the log\'s times; in a bag "header" or "received"',
+            '# time_unit = "s"  # s, ms, us, ns',
+            *(
+                line
+                for name, (low, high) in zip(robot.commands, robot.command_ranges, strict=True)
+                for line in (
+                    f"# {name} = {json.dumps(f'command_{name}')}",
+                    f"# range_{name} = [{low:g}, {high:g}]  # the column's values at the command's limits",
+                )
+            ),
         ]
     lines = ["[commands]"]
     for (name, found), (low, high) in zip(commands.items(), robot.command_ranges, strict=True):
