@@ -201,7 +201,7 @@ def _compare(options: Options) -> None:
     (options.output / "compare.md").write_text(text + "\n", encoding="utf-8")
     measured = {
         "reward per control step": "reward",
-        "validation error (ratio to vanilla)": "validation_error",
+        "validation error (ratio to no residual)": "validation_error",
         "reward per control step, without exploration (m/s)": "validation_reward",
     }
     curves = {

@@ -165,7 +165,9 @@ class Evaluation:
 
     @property
     def score(self) -> float:
-        """Score by which checkpoints are chosen on validation recordings: the mean ratio of the errors to vanilla's.
+        """Score by which checkpoints are chosen on validation recordings.
+
+        It is the mean ratio of the errors with the residual to those of the same simulator without it.
 
         The mean is over position, orientation and, if recorded, joint angles, with equal weights, over groups and over
         `SCORE_HORIZONS`. A group without these horizons enters with its longest one. The score is infinite if more

@@ -75,7 +75,8 @@ class TrainingLoop:
         self._due: int | None = None  # Step of the last checkpoint, not counting one that an interruption saved.
         self._made_with: dict[str, Any] = {}
         self._saved = 0
-        self._validated: float | None = None
+        self._validated: str | None = None
+        """Last validation, as text. Its step is named, because it may lie far behind the current one."""
         self._warned = False
         self._started = time.perf_counter()
         self._seconds_before = 0.0
@@ -100,6 +101,7 @@ class TrainingLoop:
                 state, _ = learner.train(env, config, self._step_done, start=begin)
                 if self._due != int(state.steps):
                     self._keep(int(state.steps), state)
+                    self._tell(f"At the end: {self._validated}.")
         except KeyboardInterrupt:
             self._close()
             raise TrainingInterrupted(self.exit_status, self._saved) from None
@@ -134,7 +136,7 @@ class TrainingLoop:
         if metrics and self._progress is not None:
             shown = f"reward {metrics['reward']:.3f}"
             if self._validated is not None:
-                shown += f", {self._validation.name.replace('_', ' ')} {self._validated:.3f}"
+                shown += f", {self._validated}"
             self._progress.update(step, metrics["steps_per_second"], shown)
         if distributed.anywhere(bool(self.interrupted)):
             self._save(step, state, None)
@@ -144,7 +146,8 @@ class TrainingLoop:
     def _keep(self, step: int, state: TrainingState) -> None:
         self._due = step
         began = time.perf_counter()
-        measured = self._validated = self._validation.measure(training_state.params(state))
+        measured = self._validation.measure(training_state.params(state))
+        self._validated = f"{self._validation.name.replace('_', ' ')} {measured:.3f} (step {step:,})"
         self._log(step, {self._validation.name: measured, "validation_seconds": time.perf_counter() - began})
         self._save(step, state, -measured if self._validation.greatest else measured)
 

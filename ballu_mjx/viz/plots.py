@@ -68,12 +68,15 @@ def learning_curve(
     validation_error: Float[np.ndarray, " m"],
     best_step: int | None = None,
 ) -> None:
-    """Draw the mean reward per control step, and the ratio of the validation error to vanilla's, over control steps."""
+    """Draw the mean reward per control step, and the validation error, over control steps.
+
+    The validation error is a ratio to that of the same simulator without the residual.
+    """
     best = None if best_step is None else best_step / 1e6
-    figure, upper, lower = _over_validation((validation_steps / 1e6, validation_error), "envmimic", "vanilla", best)
+    figure, upper, lower = _over_validation((validation_steps / 1e6, validation_error), "envmimic", "no residual", best)
     upper.plot(steps / 1e6, reward, color=colour_of("envmimic"))
     upper.set_ylabel("reward per control step")
-    lower.set_ylabel("validation error (ratio to vanilla)")
+    lower.set_ylabel("validation error (ratio to no residual)")
     lower.set_xlabel("control steps (millions)")
     save_figure(figure, path)
 

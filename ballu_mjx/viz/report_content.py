@@ -27,7 +27,7 @@ _INTERACTIVE = ("tracking.png", "learning_curve.png")
 """Figures of a run's folder that the page leaves out, because it has interactive versions of them."""
 _CURVES = {
     "reward": "reward per control step",
-    "validation_error": "validation error (ratio to vanilla)",
+    "validation_error": "validation error (ratio to no residual)",
     "validation_reward": "reward per control step, without exploration (m/s)",
 }
 _QUANTITIES = (

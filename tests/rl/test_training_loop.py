@@ -140,6 +140,24 @@ def test_validation_selects_the_best_checkpoint_independent_of_the_reward(tmp_pa
     assert [row["error"] for row in read_metrics(tmp_path / "run") if "error" in row] == [2.5, *measured.values()]
 
 
+def test_progress_names_the_step_of_the_validation_that_it_shows(tmp_path: Path):
+    stream = io.StringIO()
+    with open_run(tmp_path / "run") as run:
+        session = session_in(run, stream=stream)
+        session._step_done(0, state(2.5), {})
+        session._step_done(50, state(1.0), GOOD)  # between two validations
+    assert stream.getvalue().rstrip().endswith("error 2.500 (step 0)")
+
+
+def test_validation_after_the_last_step_is_shown(tmp_path: Path):
+    stream, run_folder = io.StringIO(), tmp_path / "run"
+    with Run(run_folder, content()) as run:
+        loop = TrainingLoop(run, Progress(1000, stream=stream), 10_000, Validation(weight, "error"))
+        loop.train(Follower(), CONFIG, ResumePoint(), content())
+    last = [row for row in read_metrics(run_folder) if "error" in row][-1]
+    assert f"At the end: error {last['error']:.3f} (step {last['step']:,})." in stream.getvalue()
+
+
 @pytest.fixture(scope="module")
 def small() -> Learner:
     return Learner(Follower(), CONFIG)

@@ -168,7 +168,7 @@ def test_curves_and_plots_agree_with_the_run(run: Path):
     content = report_content.collect(run)
     assert [(curve.title, *curve.values) for curve in content.curves] == [
         ("reward per control step", "envmimic"),
-        ("validation error (ratio to vanilla)", "envmimic"),
+        ("validation error (ratio to no residual)", "envmimic"),
     ]
     np.testing.assert_allclose(content.curves[1].values["envmimic"][1], [1.0, 0.9, 0.8, 0.7, 0.6])
     rows = dict(report._take_rows(content.takes[0]))
