@@ -299,7 +299,7 @@ def main() -> None:
         found = true_legs_table(robots)
         print(found.to_markdown())
         if arguments.results is not None:
-            write_results(arguments.results, {"walking": found}, "Made data", seeds={"robots": robots})
+            write_results(arguments.results, {"walking": found}, "Made data", seeds={"robot": robots})
         return
     config = IdentificationConfig(motion=not arguments.quick)
     compiled: list[Identifier] = []
@@ -323,7 +323,7 @@ def main() -> None:
         about = {key: value for key, value in stored["machine"].items() if key not in ("versions", "load")}
         measured = {"commit": stored["commit"], "machine": about, "versions": stored["machine"]["versions"]}
         data = f"Development data: choices were made on robots {', '.join(map(str, CHOSEN_ON))}"
-        write_results(arguments.results, {"errors": found}, data, seeds={"robots": robots}, measured=measured)
+        write_results(arguments.results, {"errors": found}, data, seeds={"robot": robots}, measured=measured)
 
 
 def silent(stage: str, iteration: int, steps: int, value: float) -> None:

@@ -113,7 +113,7 @@ def main() -> None:
     for table in tables.values():
         print(f"\n{table.to_markdown()}")
     if given.results is not None:
-        write_results(given.results, tables, "Development data", seeds={"robots": robots, "training": [0]})
+        write_results(given.results, tables, "Development data", seeds={"robot": robots, "training": [0]})
 
 
 if __name__ == "__main__":

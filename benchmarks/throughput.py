@@ -165,7 +165,7 @@ def main() -> None:
         ),
     )
     kind = jax.devices()[0].device_kind
-    backend = f"{devices} {jax.default_backend()} devices ({kind})"
+    backend = f"{devices} {jax.default_backend()} {'device' if devices == 1 else 'devices'} ({kind})"
     data = f"{arguments.environment} on {backend}; means of {repeats} [lowest, highest]"
     print(f"{data}\n{table.to_markdown()}")
     if arguments.results:

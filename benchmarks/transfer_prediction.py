@@ -131,7 +131,7 @@ def main() -> None:
     for each in tables.values():
         print(f"\n{each.to_markdown()}")
     if given.results is not None:
-        write_results(given.results, tables, "Development data", seeds={"robots": given.robots, "training": [0]})
+        write_results(given.results, tables, "Development data", seeds={"robot": given.robots, "training": [0]})
 
 
 if __name__ == "__main__":

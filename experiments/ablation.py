@@ -199,7 +199,7 @@ def main() -> None:
                 seconds = time.perf_counter() - started
                 print(f"{label}, seed {seed}: {history[-1]['score']:.2f} ({seconds:.0f} s)", flush=True)
             results.setdefault(label, []).append(json.loads(path.read_text())["validations"])
-    used = {"training": seeds, "recordings": [options.fresh]}
+    used = {"training": seeds, "recording": [options.fresh]}
     _setup.write_tables({"options": table(results)}, options.output, options.results, used)
 
 

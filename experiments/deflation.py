@@ -147,7 +147,7 @@ def main() -> None:
         "errors": errors_table(results),
         "lift": Table(("lift lost (mN)", "found (standard error)"), (lift_row,)),
     }
-    seeds = {"robot": [dataset.ROBOT_SEED], "recordings": [options.fresh]}
+    seeds = {"robot": [dataset.ROBOT_SEED], "recording": [options.fresh]}
     _setup.write_tables(tables, options.output, options.results, seeds)
 
 

@@ -390,7 +390,7 @@ def main() -> None:
         for name in ("identified", AIR):
             tables[f"{title}-{name}"] = collect_runs.errors_table(found[name])
     figure(folders, [*recorded.test, policy], options.output / "tracking.png")
-    seeds = {"training": options.seeds, "robot": [options.robot], "recordings": [options.fresh]}
+    seeds = {"training": options.seeds, "robot": [options.robot], "recording": [options.fresh]}
     _setup.write_tables(tables, options.output, options.results, seeds)
     print(f"\nWritten to {options.output}.")
 

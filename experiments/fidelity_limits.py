@@ -184,7 +184,7 @@ def main() -> None:
     jobs = dataset.fresh_jobs(options.fresh, 1 if options.quick else 6)
     with multiprocessing.get_context("spawn").Pool() as pool:
         found = pool.starmap(errors, [(virtual, job) for job in jobs], chunksize=1)
-    seeds = {"robot": [options.robot], "recordings": [options.fresh]}
+    seeds = {"robot": [options.robot], "recording": [options.fresh]}
     _setup.write_tables({"limits": table(found)}, options.output, options.results, seeds)
     print(f"\n{len(jobs)} recordings. Written to {options.output}.")
 

@@ -84,7 +84,7 @@ class Results:
     - `commit`: the commit of the code that measured. None if it did not run from a checkout.
     - `time`: the time of the measurement, in ISO 8601 format.
     - `machine`, `versions`: see `common.provenance`.
-    - `seeds`: the seeds, by their use, such as "training".
+    - `seeds`: the seeds, by their use, such as "training" or "robot".
     - `data`: the kind of data for the caption, such as "Development data".
     """
 
@@ -102,9 +102,19 @@ class Results:
         commit = ""
         if self.commit is not None:
             commit = f" at commit {self.commit[:7]}" + (" with changes" if provenance.CHANGED in self.commit else "")
-        seeds = "".join(f" {use.capitalize()} seeds: {', '.join(map(str, s))}." for use, s in self.seeds.items())
+        seeds = "".join(
+            f" {use.capitalize()} {_counted('seed', len(s))}: {', '.join(map(str, s))}."
+            for use, s in self.seeds.items()
+        )
         seeds += " One seed ranks nothing." if len(self.seeds.get("training", (0, 1))) == 1 else ""
-        return f"{self.data}. `{self.command}`{commit}, {self.machine['cores']} cores of {self.machine['cpu']}.{seeds}"
+        cores = int(self.machine["cores"])
+        machine = f"{cores} {_counted('core', cores)} of {self.machine['cpu']}"
+        return f"{self.data}. `{self.command}`{commit}, {machine}.{seeds}"
+
+
+def _counted(noun: str, count: int) -> str:
+    """Return a noun in the singular or plural."""
+    return noun if count == 1 else f"{noun}s"
 
 
 def _format(value: float, form: str) -> str:
