@@ -99,18 +99,18 @@ def median_errors(found: HeldOut, recordings: Sequence[int]) -> str:
     return " / ".join(f"{error:.2f}" for error in np.rad2deg(np.median(np.abs(ends), axis=0)))
 
 
-def held_out_table(fit: RobotFit, data: Path, horizons: Sequence[float]) -> Table:
-    """Return the errors after each horizon (s) on recordings that the fit does not use."""
+def held_out_table(fit: RobotFit, data: Path, seconds: float) -> Table:
+    """Return the errors after a horizon (s) on recordings that the fit does not use."""
     names = (*VALIDATION, *TEST)
-    groups = {"all": range(len(names))} | {name: [number] for number, name in enumerate(names)}
     points, motions = _fit.candidates(fit, PUBLISHED), load(data, names)
-    rows = {name: [name] for name in points}
-    for seconds in horizons:
-        found = replay(fit.parameters, motions, list(points.values()), seconds, INTERVAL)
-        for name, errors in zip(points, found, strict=True):
-            rows[name] += [median_errors(errors, numbers) for numbers in groups.values()]
-    heads = [f"{group}, {seconds:g} s" for seconds in horizons for group in groups]
-    return Table(("shoulder / elbow (deg)", *heads), tuple(map(tuple, rows.values())))
+    found = replay(fit.parameters, motions, list(points.values()), seconds, INTERVAL)
+    groups = [range(len(names)), *([number] for number in range(len(names)))]
+    rows = [
+        (name, *(median_errors(errors, numbers) for numbers in groups))
+        for name, errors in zip(points, found, strict=True)
+    ]
+    uses = [f"{name} ({use})" for use, each in (("validation", VALIDATION), ("test", TEST)) for name in each]
+    return Table((f"after {seconds:g} s: shoulder / elbow (deg)", "all four", *uses), tuple(rows))
 
 
 def swing_up_table(fit: RobotFit, motions: list[MeasuredMotion]) -> Table:
@@ -147,7 +147,7 @@ def main() -> None:
     _fit.show(fit)
     print(f"validation, score: nominal {fit.nominal.score:.3g}, identified {fit.identified.score:.3g}")
     horizons = HORIZONS[:1] if options.quick else HORIZONS
-    tables = {"held_out": held_out_table(fit, options.data, horizons)}
+    tables = {f"after_{1000 * seconds:.0f}_ms": held_out_table(fit, options.data, seconds) for seconds in horizons}
     if swing_ups := [] if options.quick else load_swing_ups(options.data):
         tables["swing_ups"] = swing_up_table(fit, swing_ups)
     tables["parameters"] = _fit.parameter_table(fit, PUBLISHED)
