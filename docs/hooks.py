@@ -28,7 +28,7 @@ _SHORT_CODE = re.compile(r"<code>([^<]{1,24})</code>")
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
     """List the experiments under the heading `Experiments`."""
-    pages = [{_title(source): f"{_page(source, config)}.md"} for source in _experiments(config)]
+    pages = [f"{_page(source, config)}.md" for source in _experiments(config)]
     for section in config.nav or []:
         if "Experiments" in section:
             section["Experiments"] = pages
@@ -39,11 +39,6 @@ def _experiments(config: MkDocsConfig) -> list[Path]:
     """Return the experiments: scripts with cells (`# %%`)."""
     scripts = sorted((Path(config.config_file_path).parent / _EXPERIMENTS).rglob("*.py"))
     return [script for script in scripts if script.read_text(encoding="utf-8").startswith("# %%")]
-
-
-def _title(source: Path) -> str:
-    """Return the title of an experiment, which is its first heading."""
-    return source.read_text(encoding="utf-8").split("\n")[1].removeprefix("# # ")
 
 
 def _page(source: Path, config: MkDocsConfig) -> str:

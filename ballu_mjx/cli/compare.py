@@ -189,6 +189,7 @@ def curve(folders: Sequence[Path], name: str) -> tuple[np.ndarray, np.ndarray, n
 
 def _compare(options: Options) -> None:
     from ballu_mjx.viz import plots
+    from ballu_mjx.viz.report_content import CURVES
 
     if not options.runs:
         raise InputError("No run is given; name one or more run folders.")
@@ -199,14 +200,9 @@ def _compare(options: Options) -> None:
         return
     options.output.mkdir(parents=True, exist_ok=True)
     (options.output / "compare.md").write_text(text + "\n", encoding="utf-8")
-    measured = {
-        "reward per control step": "reward",
-        "validation error (ratio to no residual)": "validation_error",
-        "reward per control step, without exploration (m/s)": "validation_reward",
-    }
     curves = {
         title: {row.label: line for row in found if (line := curve(row.folders, name)) is not None}
-        for title, name in measured.items()
+        for name, title in CURVES.items()
     }
     plots.compared(options.output / "compare.png", {title: lines for title, lines in curves.items() if lines})
     print(f"\nWritten to {options.output}.")

@@ -25,11 +25,12 @@ IDENTIFICATION_FILE = "identification.json"
 """File that `train sysid` writes for declared parameters. Its content is `identification.fit_report.fit_details`."""
 _INTERACTIVE = ("tracking.png", "learning_curve.png")
 """Figures of a run's folder that the page leaves out, because it has interactive versions of them."""
-_CURVES = {
+CURVES = {
     "reward": "reward per control step",
     "validation_error": "validation error (ratio to no residual)",
     "validation_reward": "reward per control step, without exploration (m/s)",
 }
+"""Titles of the curves of a training, by the name of the metric."""
 _QUANTITIES = (
     ("position", "position RMSE (m)", 3),
     ("orientation", "{angle} RMSE (deg)", 1),
@@ -256,7 +257,7 @@ def _curves(folders: Mapping[str, Path]) -> list[Curve]:
     from ballu_mjx.runs.metrics import read_column
 
     found = []
-    for name, title in _CURVES.items():
+    for name, title in CURVES.items():
         values = {run: read_column(folder, name) for run, folder in folders.items()}
         values = {run: pair for run, pair in values.items() if len(pair[0])}
         if values:

@@ -99,12 +99,11 @@ def median_errors(found: HeldOut, recordings: Sequence[int]) -> str:
     return " / ".join(f"{error:.2f}" for error in np.rad2deg(np.median(np.abs(ends), axis=0)))
 
 
-def held_out_table(fit: RobotFit, data: Path, seconds: float) -> Table:
-    """Return the errors after a horizon (s) on recordings that the fit does not use."""
-    names = (*VALIDATION, *TEST)
-    points, motions = _fit.candidates(fit, PUBLISHED), load(data, names)
+def held_out_table(fit: RobotFit, motions: list[MeasuredMotion], seconds: float) -> Table:
+    """Return the errors after a horizon (s) on `motions`, those of the validation and of the test."""
+    points = _fit.candidates(fit, PUBLISHED)
     found = replay(fit.parameters, motions, list(points.values()), seconds, INTERVAL)
-    groups = [range(len(names)), *([number] for number in range(len(names)))]
+    groups = [range(len(motions)), *([number] for number in range(len(motions)))]
     rows = [
         (name, *(median_errors(errors, numbers) for numbers in groups))
         for name, errors in zip(points, found, strict=True)
@@ -147,7 +146,8 @@ def main() -> None:
     _fit.show(fit)
     print(f"validation, score: nominal {fit.nominal.score:.3g}, identified {fit.identified.score:.3g}")
     horizons = HORIZONS[:1] if options.quick else HORIZONS
-    tables = {f"after_{1000 * seconds:.0f}_ms": held_out_table(fit, options.data, seconds) for seconds in horizons}
+    motions = load(options.data, (*VALIDATION, *TEST))
+    tables = {f"after_{1000 * seconds:.0f}_ms": held_out_table(fit, motions, seconds) for seconds in horizons}
     if swing_ups := [] if options.quick else load_swing_ups(options.data):
         tables["swing_ups"] = swing_up_table(fit, swing_ups)
     tables["parameters"] = _fit.parameter_table(fit, PUBLISHED)
