@@ -11,12 +11,17 @@ correlations of this number, and of simpler ones, with the measured CoM errors a
 was set before any policy was tried.
 
     python benchmarks/transfer_prediction.py runs/bullet-transfer
+
+`--own` takes the policies of the package's own virtual robots instead. `--beside` adds the policies of an earlier
+results file to the rank correlation:
+
+    python benchmarks/transfer_prediction.py runs/bullet-transfer --own 0 1 --beside results/transfer_prediction.json
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,7 +34,7 @@ from bullet_family import ROBOTS
 from scipy.stats import spearmanr
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.common.results import Cell, Table, write_results
+from ballu_mjx.common.results import Cell, Table, read_results, write_results
 from ballu_mjx.evaluation.errors import Errors
 from ballu_mjx.evaluation.errors_file import read_evaluation
 from ballu_mjx.evaluation.transfer import read_transfer
@@ -50,7 +55,7 @@ PREDICTIONS = (
 class Row(NamedTuple):
     """One policy."""
 
-    robot: int
+    robot: str
     setting: str
     measured: float
     """Mean CoM error on the robot (m)."""
@@ -63,19 +68,19 @@ def com_error(errors: Sequence[Errors]) -> float:
     return float(np.mean([each.mean_com_error for each in errors]))
 
 
-def predict(robot: int, folder: Path) -> list[Row]:
-    """Return the rows of one robot's policies for walking.
+def predict(robot: str, folder: Path) -> list[Row]:
+    """Return the rows of one robot's policies for walking. `folder` has the stages of this robot.
 
     **Raises** `InputError` if there are none.
     """
-    seed = folder / f"robot-{robot}" / "seed-0"
+    seed = folder / "seed-0"
     runs = {
         "vanilla+sysid": seed.parent / "sysid",
         "envmimic": seed / "envmimic-walk",
         "aerodynamic": seed / "aerodynamic-walk",
     }
     if missing := [str(run) for run in runs.values() if not run.is_dir()]:
-        raise InputError(f"{missing[0]}: is missing; run benchmarks/bullet_transfer.py --robots {robot} first.")
+        raise InputError(f"{missing[0]}: is missing; run benchmarks/bullet_transfer.py for this robot first.")
     evaluations = {name: read_evaluation(runs[name] / "evaluation.json") for name in ("envmimic", "aerodynamic")}
     error = {name: com_error(found.residual) for name, found in evaluations.items()}
     error["vanilla+sysid"] = com_error(evaluations["envmimic"].vanilla)
@@ -102,36 +107,49 @@ def predict(robot: int, folder: Path) -> list[Row]:
 def policies_table(rows: Sequence[Row]) -> Table:
     """Return one row for each policy."""
     heads = ("robot", "simulator", "measured CoM error (m)", "predicted (m)")
-    cells = [(str(row.robot), row.setting, Cell((row.measured,)), Cell((row.predicted[0],))) for row in rows]
+    cells = [(row.robot, row.setting, Cell((row.measured,)), Cell((row.predicted[0],))) for row in rows]
     return Table(heads, tuple(cells))
 
 
-def correlations(rows: Sequence[Row]) -> Mapping[str, float]:
-    """Return Spearman's rank correlation of each prediction with the measured errors."""
-    measured = [row.measured for row in rows]
-    return {
-        name: float(np.asarray(spearmanr(measured, [row.predicted[place] for row in rows]))[0])
+def rank_correlation(measured: Sequence[float], predicted: Sequence[float]) -> float:
+    """Return Spearman's rank correlation."""
+    return float(np.asarray(spearmanr(measured, predicted))[0])
+
+
+def correlations_table(rows: Sequence[Row], earlier: Table | None) -> Table:
+    """Return the rank correlation of each prediction with the measured errors.
+
+    `earlier`: a table of other policies (`policies_table`). A further row has the first prediction for all of them.
+    """
+    found = [
+        (name, len(rows), rank_correlation([row.measured for row in rows], [row.predicted[place] for row in rows]))
         for place, name in enumerate(PREDICTIONS)
-    }
+    ]
+    if earlier is not None:
+        pairs = [(row.measured, row.predicted[0]) for row in rows]
+        pairs += [(cells[2].values[0], cells[3].values[0]) for cells in earlier.rows]  # pyright: ignore[reportAttributeAccessIssue]
+        found.append((PREDICTIONS[0], len(pairs), rank_correlation(*zip(*pairs, strict=True))))
+    heads = ("prediction", "policies", "rank correlation with the measured CoM error")
+    return Table(heads, tuple((name, str(count), Cell((value,))) for name, count, value in found))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="output folder of bullet_transfer.py")
     parser.add_argument("--robots", type=int, nargs="+", choices=list(ROBOTS), default=list(ROBOTS), help="seeds (all)")
+    parser.add_argument("--own", type=int, nargs="+", help="seeds of the package's virtual robots, instead (none)")
+    parser.add_argument("--beside", type=Path, help="earlier results whose policies the correlation has too")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     given = parser.parse_args()
-    rows = [row for robot in given.robots for row in predict(robot, given.folder)]
-    ranked = correlations(rows)
-    table = Table(
-        (f"prediction, {len(rows)} policies", "rank correlation with the measured CoM error"),
-        tuple((name, Cell((value,))) for name, value in ranked.items()),
-    )
-    tables = {"policies": policies_table(rows), "correlations": table}
+    earlier = None if given.beside is None else read_results(given.beside).tables["policies"]
+    robots = given.own or given.robots
+    names = [f"own-{robot}" if given.own else str(robot) for robot in robots]
+    rows = [row for name in names for row in predict(name, given.folder / f"robot-{name}")]
+    tables = {"policies": policies_table(rows), "correlations": correlations_table(rows, earlier)}
     for each in tables.values():
         print(f"\n{each.to_markdown()}")
     if given.results is not None:
-        write_results(given.results, tables, "Development data", seeds={"robot": given.robots, "training": [0]})
+        write_results(given.results, tables, "Development data", seeds={"robot": robots, "training": [0]})
 
 
 if __name__ == "__main__":

@@ -112,23 +112,24 @@ def identification_table(sweep: Sweep, result: Identification) -> str:
     )
     for side, fit in zip(SIDES, result.fits, strict=True):
         singular = ", ".join(f"{1 / d.standard_error:.3g}" for d in fit.directions)
-        lines.append(f"Singular values, {side} (Jacobian over noise, in units of the priors): {singular}")
+        lines.append(f"Singular values, {side} leg (Jacobian over noise, in units of the priors): {singular}")
         lines += [
-            f"Left open, {side}, and held near nominal: {_in_words(d, result.fitted)}" for d in fit.open_directions
+            f"Not determined, {side} leg, and held near nominal: {_in_words(d, result.fitted)}"
+            for d in fit.open_directions
         ]
         weakest = fit.directions[-1]
         if not fit.open_directions:
             lines.append(
-                f"Least determined, {side}: {_in_words(weakest, result.fitted)}, with a standard error of "
+                f"Least determined, {side} leg: {_in_words(weakest, result.fitted)}, with a standard error of "
                 f"{weakest.standard_error:.0%} of its prior."
             )
         names = result.free
         pairs = [(fit.correlations[i, j], i, j) for i in range(len(names)) for j in range(i)]
         strong = [f"{names[j]} with {names[i]} {r:+.2f}" for r, i, j in pairs if abs(r) > _STRONG]
         if strong:
-            lines.append(f"Strongly correlated, {side}: {', '.join(strong).replace('_', ' ')}.")
+            lines.append(f"Strongly correlated, {side} leg: {', '.join(strong).replace('_', ' ')}.")
         same = int(np.sum(fit.losses < 1.01 * fit.losses[0] + 1e-12))
-        lines.append(f"Starts, {side}: {same} of {len(fit.losses)} ended within 1 % of the best sum of squares.")
+        lines.append(f"Starts, {side} leg: {same} of {len(fit.losses)} ended within 1 % of the best sum of squares.")
     return "\n".join(lines)
 
 

@@ -6,10 +6,10 @@ JAX and modules that need it are imported inside functions: `runtime.prepare` ha
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
@@ -97,11 +97,26 @@ def _evaluate(options: Options) -> None:
         if options.output is None
         else write_evaluation(evaluator, loaded.params, options.output)
     )
+    print(f"{_title(options, config, paths)}: {', '.join(path.name.split('.')[0] for path in paths)}\n")
     print(result.table())
     if options.noise_floor:
         shaken = [add_capture_noise(recording, seed=number) for number, recording in enumerate(recordings)]
         floor = evaluator.of_starts([restore(each) for each in shaken], loaded.params)
         print(f"\n{noise_floor(floor, result.residual)}")
+
+
+def _title(options: Options, config: Mapping[str, Any], paths: Sequence[Path]) -> str:
+    """Return the title of the table, which warns of recordings that the run's training or validation used."""
+    from ballu_mjx.residuals.dataset import replay_title
+    from ballu_mjx.residuals.run_config import describe_recording
+    from ballu_mjx.runs.folder import config_section
+
+    uses = config_section(config, "recordings", options.run)
+    validation, training = ({each["sha256"] for each in uses.get(use, ())} for use in ("validation", "training"))
+    replayed = {describe_recording(path)["sha256"] for path in paths}
+    return replay_title(
+        replayed, validation, training, "other recordings" if options.recordings else "the test recordings"
+    )
 
 
 def noise_floor(floor: Sequence[Errors], errors: Sequence[Errors]) -> str:

@@ -75,8 +75,13 @@ def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
 
     def show(folder: Path, residual: TrainedResidual) -> None:
         artifacts.draw_learning_curve(folder, residual.step)
-        untrained = "" if residual.step else ", before any training: no later one validated better"
-        print(f"Best checkpoint: step {residual.step:,}{untrained}. ", end="")
+        if residual.step:
+            print(f"Best checkpoint: step {residual.step:,}. ", end="")
+        else:
+            print(
+                "Best checkpoint: step 0, before any training: no later one validated better. "
+                "Train longer (--num-timesteps), or give more varied recordings."
+            )
 
     def sections(prepared: Prepared) -> Mapping[str, Any]:
         nonlocal env

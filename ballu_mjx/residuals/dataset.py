@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 
 from ballu_mjx.common.errors import InputError
@@ -126,11 +126,8 @@ class ResidualDataset:
     @property
     def replayed(self) -> str:
         """Return the title of the final table, which names its recordings."""
-        if self._same("test", "training"):
-            return "Open-loop replay of the training recordings (the residual was learned from them)"
-        if self.one_set:
-            return "Open-loop replay of the validation recordings (they chose the checkpoint)"
-        return "Open-loop replay of the test recordings"
+        places = {use: {path.resolve() for path in paths} for use, paths in self.files.items()}
+        return replay_title(places["test"], places["validation"], places["training"], "the test recordings")
 
     def _same(self, one: str, other: str) -> bool:
         first, second = ({path.resolve() for path in self.files[use]} for use in (one, other))
@@ -216,6 +213,23 @@ def _read(files: Mapping[str, Sequence[Path]], description: RobotDescription) ->
     return {use: [read[path] for path in paths] for use, paths in files.items()}
 
 
+def replay_title(replayed: Set[object], validation: Set[object], training: Set[object], otherwise: str) -> str:
+    """Return the title of a table of open-loop replays. It warns of recordings that training or validation used.
+
+    **Arguments**
+
+    - `replayed`, `validation`, `training`: identifiers of the recordings, such as paths or hashes.
+    - `otherwise`: name of the replayed recordings if neither use has the same ones.
+    """
+    if replayed == training:
+        what = "the training recordings (the residual was learned from them)"
+    elif replayed == validation:
+        what = "the validation recordings (they chose the checkpoint)"
+    else:
+        what = otherwise
+    return f"Open-loop replay of {what}"
+
+
 def check_overlap(files: Mapping[str, Sequence[Path]]) -> None:
     """Check that two uses share all of their recordings or none.
 
@@ -235,7 +249,10 @@ def check_recording(path: Path, recording: Recording, robot: RobotDescription, *
     **Raises** `InputError` if the recording is not free, or too short for an evaluation.
     """
     if recording.kind != "free":
-        raise InputError(f"{path}: is a {recording.kind} recording; residuals need free recordings, leave it out.")
+        raise InputError(
+            f"{path}: is a {recording.kind} recording; residuals need free recordings, which contain the pose of "
+            f"{robot.tracked}. Leave it out."
+        )
     shortest = shortest_recording(robot.horizons)
     duration = recording.time[-1] - recording.time[0]
     if long_enough and duration < shortest:
