@@ -195,6 +195,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds (0 1 2)")
     parser.add_argument("--robot-seed", type=int, default=0, help="seed of the virtual robot (0)")
     parser.add_argument(
+        "--robot-family", choices=["default", "paper"], default="default", help="family of the virtual robot (default)"
+    )
+    parser.add_argument(
         "--output", type=Path, help=f"folder of `train all`'s stages ({OUTPUT}, or {QUICK_OUTPUT} under --quick)"
     )
     parser.add_argument("--rounds", type=int, default=1, help="rounds of EnvMimic; see `train all --help` (1)")
@@ -216,6 +219,7 @@ def main() -> None:
             pipeline.Options(
                 output=output,
                 robot_seed=given.robot_seed,
+                robot_family=given.robot_family,
                 seeds=tuple(given.seeds),
                 tasks=(given.task,),
                 quick=given.quick,

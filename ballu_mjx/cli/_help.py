@@ -34,7 +34,7 @@ _FIRST = (
         "Recordings, robot and simulator, and where results go. A path is a recording (.csv or .csv.gz) or a folder of "
         "them.",
         ("recordings", "validation", "test", "robot", "actuators", "residual", "levels", "fixed_from", "mapping")
-        + ("commands", "format", "robot_seed", "tasks", "output"),
+        + ("commands", "format", "robot_seed", "robot_family", "tasks", "output"),
     ),
     _Group(
         "length of training",

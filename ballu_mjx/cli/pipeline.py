@@ -30,7 +30,7 @@ import numpy as np
 
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP
-from ballu_mjx.ballu.virtual.hardware import Hardware, VirtualHardware
+from ballu_mjx.ballu.virtual.hardware import Hardware, RobotFamily, VirtualHardware
 from ballu_mjx.ballu.virtual.robot import CaptureController, open_loop
 from ballu_mjx.ballu.virtual.trials import ExportedPolicy, run_trials
 from ballu_mjx.cli import train_aerodynamics, train_envmimic, train_forces, train_policy, train_sysid
@@ -80,6 +80,9 @@ class Options(loggers.LoggingOptions):
     """Folder of all stages. A stage that is already there and was made with the same options is kept."""
     robot_seed: int = 0
     """Seed of the virtual robot that replaces the hardware."""
+    robot_family: RobotFamily = "default"
+    """Family of the virtual robot. On robots of the family paper, policies of unimproved simulators do about as badly
+    as the paper's did on its hardware."""
     seeds: tuple[int, ...] = (0,)
     """Training seeds. Every policy and residual is trained once for each."""
     tasks: tuple[Literal["walk", "turn"], ...] = ("walk", "turn")
@@ -128,12 +131,12 @@ def run(options: Options) -> int:
 def measure_transfer(options: Options, hardware: Hardware | None = None) -> dict[str, dict[str, list[list[Transfer]]]]:
     """Run the missing stages and return the trials, `[task][setting][seed][trial]`.
 
-    `hardware` is the robot. None for the virtual robot `options.robot_seed`.
+    `hardware` is the robot. None for the virtual robot of `options`.
 
     **Raises** `InputError` if options are out of range.
     """
     _check(options)
-    hardware = VirtualHardware.draw(options.robot_seed) if hardware is None else hardware
+    hardware = VirtualHardware.draw(options.robot_seed, options.robot_family) if hardware is None else hardware
     settings = settings_of(options)
     if options.quick:
         options = dataclasses.replace(options, trials=min(options.trials, 2), takes=1, tasks=options.tasks[:1])

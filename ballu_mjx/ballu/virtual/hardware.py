@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable, Mapping
+from typing import Literal, Protocol, runtime_checkable
 
 from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.ballu.virtual.paper_robot import draw_paper_robot
 from ballu_mjx.ballu.virtual.robot import CaptureController, TrialConditions, VirtualRobot
 from ballu_mjx.recordings.recording import Recording
+
+RobotFamily = Literal["default", "paper"]
+"""Family of virtual robots: of `robot.draw_robot`, or of `paper_robot.draw_paper_robot`."""
+_DRAW: Mapping[RobotFamily, Callable[[int], VirtualRobot]] = {
+    "default": virtual_robot.draw_robot,
+    "paper": draw_paper_robot,
+}
 
 
 @runtime_checkable
@@ -44,9 +52,9 @@ class VirtualHardware:
     """Function from the number of a trial to its conditions."""
 
     @staticmethod
-    def draw(seed: int) -> VirtualHardware:
-        """Draw one robot of the family, with the same seed for its sweep."""
-        return VirtualHardware(virtual_robot.draw_robot(seed), seed)
+    def draw(seed: int, family: RobotFamily = "default") -> VirtualHardware:
+        """Draw one robot of a family, with the same seed for its sweep."""
+        return VirtualHardware(_DRAW[family](seed), seed)
 
     @property
     def name(self) -> str:
