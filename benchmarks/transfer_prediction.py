@@ -35,13 +35,13 @@ from scipy.stats import spearmanr
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table, read_results, write_results
-from ballu_mjx.evaluation.errors import Errors
+from ballu_mjx.evaluation.errors import mean_com_error
 from ballu_mjx.evaluation.errors_file import read_evaluation
 from ballu_mjx.evaluation.transfer import read_transfer
 from ballu_mjx.policies.load_simulator import load_simulator
 from ballu_mjx.policies.pipeline_layout import PAPER_SIMULATORS
 from ballu_mjx.policies.policy import Policy
-from ballu_mjx.policies.transfer_prediction import TransferPredictor
+from ballu_mjx.policies.transfer_prediction import TransferPredictor, expected_error, own_simulator
 
 PREDICTIONS = (
     "distance to the reference, with its error",
@@ -63,11 +63,6 @@ class Row(NamedTuple):
     """The numbers of `PREDICTIONS`."""
 
 
-def com_error(errors: Sequence[Errors]) -> float:
-    """Return the mean CoM error (m) in open-loop replays of whole recordings."""
-    return float(np.mean([each.mean_com_error for each in errors]))
-
-
 def predict(robot: str, folder: Path) -> list[Row]:
     """Return the rows of one robot's policies for walking. `folder` has the stages of this robot.
 
@@ -82,19 +77,19 @@ def predict(robot: str, folder: Path) -> list[Row]:
     if missing := [str(run) for run in runs.values() if not run.is_dir()]:
         raise InputError(f"{missing[0]}: is missing; run benchmarks/bullet_transfer.py for this robot first.")
     evaluations = {name: read_evaluation(runs[name] / "evaluation.json") for name in ("envmimic", "aerodynamic")}
-    error = {name: com_error(found.residual) for name, found in evaluations.items()}
-    error["vanilla+sysid"] = com_error(evaluations["envmimic"].vanilla)
+    error = {name: mean_com_error(found.residual) for name, found in evaluations.items()}
+    error["vanilla+sysid"] = mean_com_error(evaluations["envmimic"].vanilla)
     reference = min(error, key=lambda name: error[name])
     predictor = TransferPredictor({name: load_simulator(run) for name, run in runs.items()})
     rows = []
     for setting in PAPER_SIMULATORS:
         policy = Policy.load(seed / f"walk-{setting}")
-        found = predictor.predict(policy)
+        found = predictor.predict(policy, own_simulator(setting, runs))
         trials = read_transfer(seed / f"trials-walk-{setting}" / "transfer.json")
         distance = 0.0 if setting == reference else found[reference].com_error
         others = [each.com_error for name, each in found.items() if name != setting]
         numbers = (
-            float(np.hypot(distance, error[reference])),
+            expected_error(distance, error[reference]),
             distance,
             float(np.mean(others)),
             found[reference].outside,

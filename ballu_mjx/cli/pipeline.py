@@ -8,7 +8,7 @@ The stages are, in the paper's order:
 2. Train vanilla policies.
 3. Replay their actions on the robot, several times each.
 4. Learn one EnvMimic for each task. Beyond the paper, identify the air from the same recordings.
-5. Train policies in all simulators.
+5. Train policies in all simulators, and predict how well each transfers.
 6. Run the policies on the robot, and write tables.
 
 With `--rounds`, EnvMimic learns again from the robot's motion under its own policies, and policies are trained again in
@@ -38,10 +38,14 @@ from ballu_mjx.cli._command import TrainCommand, written_to
 from ballu_mjx.cli.cached_stages import cached_stage
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation import transfer
+from ballu_mjx.evaluation.errors import mean_com_error
+from ballu_mjx.evaluation.errors_file import read_evaluation
 from ballu_mjx.evaluation.transfer import Transfer
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.policies.deploy.export import weights
+from ballu_mjx.policies.load_simulator import load_simulator
 from ballu_mjx.policies.locomotion_config import LocomotionConfig, check_locomotion_config
 from ballu_mjx.policies.pipeline_layout import (
     NEAR,
@@ -50,6 +54,7 @@ from ballu_mjx.policies.pipeline_layout import (
     SHARED,
     TABLES,
     WRENCH,
+    prediction_file,
     residual_folder,
     table_file,
 )
@@ -57,6 +62,7 @@ from ballu_mjx.policies.policy import Policy
 from ballu_mjx.policies.simulator_variants import SimulatorVariant
 from ballu_mjx.policies.tasks import TASKS
 from ballu_mjx.policies.training import locomotion_ppo
+from ballu_mjx.policies.transfer_prediction import predict_com_errors, read_prediction, write_prediction
 from ballu_mjx.recordings.csv_format import write_recording
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
@@ -70,6 +76,8 @@ from ballu_mjx.runs.layout import CHECKPOINTS_KEPT
 from ballu_mjx.sim.force_sets import ForceSet
 
 _DECIMALS = 4
+_REFERENCES = (ROUNDS, "aerodynamic")
+"""Simulators with a residual that may be the reference of a prediction. They are learned from the same recordings."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,12 +128,22 @@ def run(options: Options) -> int:
     with written_to() as written:
         written.folder = options.output
         for task, result in measure_transfer(options).items():
-            text = TABLES[task](result)
+            text = f"{TABLES[task](result)}\n\n{_predictions_text(options, task)}"
             table_file(options.output, task).write_text(text + "\n", encoding="utf-8")
             print(f"\n### {task}\n\n{text}\n")
         if options.quick:
             print("These numbers mean nothing: --quick trains for seconds.")
     return 0
+
+
+def _predictions_text(options: Options, task: str) -> str:
+    """Return a table of the predicted errors of each seed's policies (Markdown), and which policy to try first."""
+    found = [read_prediction(prediction_file(options.output, seed, task)) for seed in options.seeds]
+    settings = found[0].com_error
+    rows = tuple((setting, Cell(tuple(each.com_error[setting] for each in found))) for setting in settings)
+    table = Table(("setting", "predicted mean CoM error (m), before the trials"), rows)
+    best = ", ".join(f"{each.best} (seed {seed})" for seed, each in zip(options.seeds, found, strict=True))
+    return f"{table.to_markdown()}\n\nSmallest predicted error: {best}. Try this policy first on the robot."
 
 
 def measure_transfer(options: Options, hardware: Hardware | None = None) -> dict[str, dict[str, list[list[Transfer]]]]:
@@ -146,6 +164,7 @@ def measure_transfer(options: Options, hardware: Hardware | None = None) -> dict
     for seed in options.seeds:
         stages = PipelineStages(options, seed, hardware)
         for task in options.tasks:
+            stages.prediction(task)
             for setting in settings:
                 results[task][setting].append(stages.transfers(task, setting))
     return results
@@ -359,6 +378,31 @@ class PipelineStages:
     def _envmimic(self, forces: ForceSet) -> tuple[EnvMimicConfig, PPOConfig]:
         quick = train_envmimic.QUICK if self.options.quick else {"num_timesteps": self.options.residual_steps}
         return EnvMimicConfig(forces=forces), PPOConfig(seed=self.seed, **quick)
+
+    def prediction(self, task: str) -> Path:
+        """Return the folder with the predicted errors of the policies for a task, before their trials.
+
+        The simulators of the prediction are vanilla+sysid, and those of EnvMimic (the first round) and of the
+        identified air, as far as policies are trained in them.
+        """
+        settings = settings_of(self.options)
+        learned = [each for each in _REFERENCES if each in settings]
+        runs = {"vanilla+sysid": self.identified(), **{each: self.residual(task, each) for each in learned}}
+        policies = {setting: self.policy(task, setting) for setting in settings}
+
+        def make(folder: Path) -> None:
+            evaluations = {
+                name: read_evaluation(runs[name] / "evaluation.json") for name in _REFERENCES if name in runs
+            }
+            errors = {name: mean_com_error(found.residual) for name, found in evaluations.items()}
+            errors["vanilla+sysid"] = mean_com_error(next(iter(evaluations.values())).vanilla)
+            simulators = {name: load_simulator(run) for name, run in runs.items()}
+            loaded = {setting: Policy.load(run) for setting, run in policies.items()}
+            write_prediction(place, predict_com_errors(loaded, simulators, errors))
+
+        needs = [*runs.values(), *policies.values()]
+        place = prediction_file(self.options.output, self.seed, task)
+        return cached_stage(place.parent, {"simulators": list(runs)}, needs, make)
 
     def transfers(self, task: str, setting: str) -> list[Transfer]:
         """Return the trials of a policy on the robot, each compared with the same policy in its own simulator."""

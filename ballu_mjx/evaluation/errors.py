@@ -229,6 +229,11 @@ def reached_horizons(errors: Sequence[Errors], group: str) -> list[float]:
     return sorted({horizon for e in errors if e.group == group for horizon in e.position})
 
 
+def mean_com_error(errors: Sequence[Errors]) -> float:
+    """Return the mean CoM error (m) over whole recordings."""
+    return float(np.mean([each.mean_com_error for each in errors]))
+
+
 def mean_by_group(errors: Sequence[Errors]) -> tuple[Errors, ...]:
     """Return the mean over each group's recordings, as the errors of one recording that has the group's name."""
     groups = dict.fromkeys(e.group for e in errors)

@@ -1,7 +1,8 @@
 """Names of the simulators of all experiments (`train all`), and the layout of their output folder.
 
 The folder holds `table-TASK.md` for each task and `seed-N/` for each seed. A seed's folder holds the runs of policies
-(`TASK-VARIANT/`), the runs of residuals (`METHOD-TASK/`), and the trials (`trials-TASK-VARIANT/`).
+(`TASK-VARIANT/`), the runs of residuals (`METHOD-TASK/`), the predicted errors (`prediction-TASK/`), and the trials
+(`trials-TASK-VARIANT/`).
 """
 
 from __future__ import annotations
@@ -51,6 +52,11 @@ def residual_folder(seed: Path, task: str, setting: str) -> Path:
         return seed / SHARED
     variant = SimulatorVariant.parse(ROUNDS if setting == NEAR else setting)
     return seed / (f"{variant.residual}-{task}" + (f"-{variant.round}" if variant.round > 1 else ""))
+
+
+def prediction_file(output: Path, seed: int, task: str) -> Path:
+    """Return the file with the predicted errors of a seed's policies for a task."""
+    return output / f"seed-{seed}" / f"prediction-{task}" / "prediction.json"
 
 
 def table_file(output: Path, task: str) -> Path:

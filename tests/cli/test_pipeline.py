@@ -114,6 +114,9 @@ def test_each_round_learns_from_all_recordings_so_far(tmp_path, monkeypatch):
     stages = pipeline.PipelineStages(options, 0, VirtualHardware.draw(0))
     for setting in pipeline.settings_of(options):
         stages.policy("walk", setting)
+    stages.prediction("walk")
+    policies = [f"walk-{setting}" for setting in pipeline.settings_of(options)]
+    assert needs["prediction-walk"] == ["sysid", "envmimic-walk", "aerodynamic-walk", *policies]
     assert pipeline.settings_of(options) == (*pipeline.PAPER_SIMULATORS, "envmimic-2", "envmimic-3", *options.also)
     recordings = ["recordings-walk", "recordings-walk-2", "recordings-walk-3"]
     for number, name in enumerate(("envmimic-walk", "envmimic-walk-2", "envmimic-walk-3"), 1):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +16,12 @@ from ballu_mjx.policies.locomotion_config import LocomotionConfig
 from ballu_mjx.policies.locomotion_env import num_observations
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.policies.tasks import TASKS
-from ballu_mjx.policies.transfer_prediction import TransferPredictor
+from ballu_mjx.policies.transfer_prediction import (
+    TransferPredictor,
+    predict_com_errors,
+    read_prediction,
+    write_prediction,
+)
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.registry import load_robot
@@ -51,6 +57,36 @@ def test_a_policy_moves_as_expected_in_its_own_simulator_and_otherwise_in_a_push
     # The distance grows from 0 to `moved`, so that its mean over time is between the two.
     assert 0.1 * moved < found["pushed"].com_error < moved
     assert found["same"].outside == 0.0
+
+
+def test_predicted_errors_combine_the_distance_to_the_best_simulator_with_its_error(
+    policy: Policy, tmp_path: Path
+) -> None:
+    """The reference is the simulator with the smallest error. A policy trained in it differs from it by nothing."""
+    plain = Simulator(policy.robot)
+    push = BoundResidual(PlainPush(), jnp.asarray(20.0), None)  # friction holds about 12 N
+    pushed = dataclasses.replace(policy, residual=push)
+    simulators = {"vanilla+sysid": plain, "envmimic": plain.with_residual(push)}
+    policies = {"vanilla+sysid": policy, "vanilla+sysid+dr": policy, "envmimic": pushed}
+    found = predict_com_errors(policies, simulators, {"vanilla+sysid": 0.8, "envmimic": 0.3}, starts=2)
+    assert found.reference == found.best == "envmimic"
+    assert found.com_error["envmimic"] == 0.3
+    alone = TransferPredictor(simulators, starts=2).predict(policy)["envmimic"].com_error
+    assert alone > 0.1
+    assert found.com_error["vanilla+sysid"] == pytest.approx(np.sqrt(alone**2 + 0.09), rel=1e-4)
+    assert found.com_error["vanilla+sysid+dr"] == found.com_error["vanilla+sysid"]
+    write_prediction(tmp_path / "prediction.json", found)
+    assert read_prediction(tmp_path / "prediction.json") == found
+
+
+@pytest.mark.parametrize(
+    "content", ["{}", '{"reference": "a", "com_error": {}}', '{"reference": "a", "com_error": {"a": NaN}}']
+)
+def test_files_without_predicted_errors_are_refused(content: str, tmp_path: Path) -> None:
+    path = tmp_path / "prediction.json"
+    path.write_text(content)
+    with pytest.raises(InputError, match=r"prediction\.json: .*delete its folder"):
+        read_prediction(path)
 
 
 def test_a_simulator_of_another_robot_is_refused(policy: Policy) -> None:
