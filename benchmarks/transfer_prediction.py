@@ -100,10 +100,29 @@ def predict(robot: str, folder: Path) -> list[Row]:
 
 
 def policies_table(rows: Sequence[Row]) -> Table:
-    """Return one row for each policy."""
+    """Return one row for each policy, with its measured and its predicted error."""
     heads = ("robot", "simulator", "measured CoM error (m)", "predicted (m)")
     cells = [(row.robot, row.setting, Cell((row.measured,)), Cell((row.predicted[0],))) for row in rows]
     return Table(heads, tuple(cells))
+
+
+def choices_table(policies: Table) -> Table:
+    """Return which policy of each robot has the smallest prediction, from a table of policies (`policies_table`).
+
+    The place is 1 if its measured error is the smallest of the robot's policies.
+    """
+    by_robot: dict[str, list[tuple[str, float, float]]] = {}
+    for robot, setting, measured, predicted in policies.rows:
+        assert isinstance(measured, Cell) and isinstance(predicted, Cell)
+        by_robot.setdefault(str(robot), []).append((str(setting), measured.values[0], predicted.values[0]))
+    rows = []
+    for robot, found in by_robot.items():
+        setting, error, _ = min(found, key=lambda policy: policy[2])
+        place = 1 + sum(other < error for _, other, _ in found)
+        rows.append((robot, setting, Cell((error,)), f"{place} of {len(found)}"))
+    return Table(
+        ("robot", "smallest prediction", "its measured CoM error (m)", "its place by measured error"), tuple(rows)
+    )
 
 
 def rank_correlation(measured: Sequence[float], predicted: Sequence[float]) -> float:
@@ -140,7 +159,13 @@ def main() -> None:
     robots = given.own or given.robots
     names = [f"own-{robot}" if given.own else str(robot) for robot in robots]
     rows = [row for name in names for row in predict(name, given.folder / f"robot-{name}")]
-    tables = {"policies": policies_table(rows), "correlations": correlations_table(rows, earlier)}
+    policies = policies_table(rows)
+    everything = policies if earlier is None else Table(policies.columns, (*earlier.rows, *policies.rows))
+    tables = {
+        "policies": policies,
+        "correlations": correlations_table(rows, earlier),
+        "choices": choices_table(everything),
+    }
     for each in tables.values():
         print(f"\n{each.to_markdown()}")
     if given.results is not None:
