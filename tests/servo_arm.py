@@ -11,6 +11,11 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
+if __name__ == "__main__":  # before JAX is imported
+    from ballu_mjx.common import runtime
+
+    runtime.prepare()
+
 import jax
 import jax.numpy as jnp
 import mujoco
