@@ -17,6 +17,7 @@ from ballu_mjx.ballu.model import load_model, standing_qpos
 from ballu_mjx.ballu.recordings import base_position, foot_position, knee, motor
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.ballu.virtual.paper_robot import draw_paper_robot
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
@@ -325,3 +326,18 @@ def test_recording_commands_read_no_parameter_of_the_virtual_robot():
         path = package / name
         attributes = {node.attr for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Attribute)}
         assert not attributes & parameters, f"{path.name} reads {attributes & parameters}"
+
+
+def test_robots_of_the_papers_figures_have_the_published_drag_and_the_actuators_of_the_other_family() -> None:
+    drawn, other = draw_paper_robot(3), virtual_robot.draw_robot(3)
+    for name in ("motor_gain", "torque_limit", "knee_spring_stiffness", "latency", "added_mass"):
+        assert getattr(drawn, name) == getattr(other, name), name
+    model = virtual_robot.build(drawn)
+    data = mujoco.MjData(model)
+    data.qpos[:] = standing_qpos(model)
+    model.opt.wind[:] = (1.0, 0.0, 0.0)
+    mujoco.mj_forward(model, data)
+    assert data.qfrc_fluid[0] == pytest.approx(0.3, abs=0.005)
+    weight = load_model().body_mass.sum() * 9.81
+    lift = model.body_gravcomp @ model.body_mass * 9.81 - drawn.added_mass * 9.81
+    assert 0.77 < lift / weight < 0.78
