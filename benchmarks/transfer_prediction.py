@@ -35,13 +35,11 @@ from scipy.stats import spearmanr
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table, read_results, write_results
-from ballu_mjx.evaluation.errors import mean_com_error
-from ballu_mjx.evaluation.errors_file import read_evaluation
 from ballu_mjx.evaluation.transfer import read_transfer
 from ballu_mjx.policies.load_simulator import load_simulator
 from ballu_mjx.policies.pipeline_layout import PAPER_SIMULATORS
 from ballu_mjx.policies.policy import Policy
-from ballu_mjx.policies.transfer_prediction import TransferPredictor, expected_error, own_simulator
+from ballu_mjx.policies.transfer_prediction import TransferPredictor, expected_error, own_simulator, replay_errors
 
 PREDICTIONS = (
     "distance to the reference, with its error",
@@ -69,16 +67,11 @@ def predict(robot: str, folder: Path) -> list[Row]:
     **Raises** `InputError` if there are none.
     """
     seed = folder / "seed-0"
-    runs = {
-        "vanilla+sysid": seed.parent / "sysid",
-        "envmimic": seed / "envmimic-walk",
-        "aerodynamic": seed / "aerodynamic-walk",
-    }
+    residuals = {name: seed / f"{name}-walk" for name in ("envmimic", "aerodynamic")}
+    runs = {"vanilla+sysid": seed.parent / "sysid", **residuals}
     if missing := [str(run) for run in runs.values() if not run.is_dir()]:
         raise InputError(f"{missing[0]}: is missing; run benchmarks/bullet_transfer.py for this robot first.")
-    evaluations = {name: read_evaluation(runs[name] / "evaluation.json") for name in ("envmimic", "aerodynamic")}
-    error = {name: mean_com_error(found.residual) for name, found in evaluations.items()}
-    error["vanilla+sysid"] = mean_com_error(evaluations["envmimic"].vanilla)
+    error = replay_errors(residuals)
     reference = min(error, key=lambda name: error[name])
     predictor = TransferPredictor({name: load_simulator(run) for name, run in runs.items()})
     rows = []
@@ -86,7 +79,7 @@ def predict(robot: str, folder: Path) -> list[Row]:
         policy = Policy.load(seed / f"walk-{setting}")
         found = predictor.predict(policy, own_simulator(setting, runs))
         trials = read_transfer(seed / f"trials-walk-{setting}" / "transfer.json")
-        distance = 0.0 if setting == reference else found[reference].com_error
+        distance = found[reference].com_error
         others = [each.com_error for name, each in found.items() if name != setting]
         numbers = (
             expected_error(distance, error[reference]),

@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _evaluate(options: Options) -> None:
     from ballu_mjx.evaluation.open_loop import Evaluators
     from ballu_mjx.recordings.capture_noise import add_capture_noise
-    from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+    from ballu_mjx.recordings.csv_format import list_recordings, read_recording, recording_name
     from ballu_mjx.recordings.reconstruct import reconstruct
     from ballu_mjx.residuals.dataset import check_recording
     from ballu_mjx.residuals.registry import RESIDUAL_TASKS
@@ -97,7 +97,7 @@ def _evaluate(options: Options) -> None:
         if options.output is None
         else write_evaluation(evaluator, loaded.params, options.output)
     )
-    print(f"{_title(options, config, paths)}: {', '.join(path.name.split('.')[0] for path in paths)}\n")
+    print(f"{_title(options, config, paths)}: {', '.join(map(recording_name, paths))}\n")
     print(result.table())
     if options.noise_floor:
         shaken = [add_capture_noise(recording, seed=number) for number, recording in enumerate(recordings)]

@@ -40,8 +40,6 @@ from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation import transfer
-from ballu_mjx.evaluation.errors import mean_com_error
-from ballu_mjx.evaluation.errors_file import read_evaluation
 from ballu_mjx.evaluation.transfer import Transfer
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.policies.deploy.export import weights
@@ -62,7 +60,7 @@ from ballu_mjx.policies.policy import Policy
 from ballu_mjx.policies.simulator_variants import SimulatorVariant
 from ballu_mjx.policies.tasks import TASKS
 from ballu_mjx.policies.training import locomotion_ppo
-from ballu_mjx.policies.transfer_prediction import predict_com_errors, read_prediction, write_prediction
+from ballu_mjx.policies.transfer_prediction import predict_com_errors, read_prediction, replay_errors, write_prediction
 from ballu_mjx.recordings.csv_format import write_recording
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
@@ -386,19 +384,14 @@ class PipelineStages:
         identified air, as far as policies are trained in them.
         """
         settings = settings_of(self.options)
-        learned = [each for each in _REFERENCES if each in settings]
-        runs = {"vanilla+sysid": self.identified(), **{each: self.residual(task, each) for each in learned}}
+        residuals = {each: self.residual(task, each) for each in _REFERENCES if each in settings}
+        runs = {"vanilla+sysid": self.identified(), **residuals}
         policies = {setting: self.policy(task, setting) for setting in settings}
 
         def make(folder: Path) -> None:
-            evaluations = {
-                name: read_evaluation(runs[name] / "evaluation.json") for name in _REFERENCES if name in runs
-            }
-            errors = {name: mean_com_error(found.residual) for name, found in evaluations.items()}
-            errors["vanilla+sysid"] = mean_com_error(next(iter(evaluations.values())).vanilla)
             simulators = {name: load_simulator(run) for name, run in runs.items()}
             loaded = {setting: Policy.load(run) for setting, run in policies.items()}
-            write_prediction(place, predict_com_errors(loaded, simulators, errors))
+            write_prediction(place, predict_com_errors(loaded, simulators, replay_errors(residuals)))
 
         needs = [*runs.values(), *policies.values()]
         place = prediction_file(self.options.output, self.seed, task)

@@ -18,6 +18,8 @@ from jaxtyping import Float
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
+from ballu_mjx.evaluation.errors import mean_com_error
+from ballu_mjx.evaluation.errors_file import read_evaluation
 from ballu_mjx.policies.closed_loop import ClosedLoop
 from ballu_mjx.policies.locomotion_config import LocomotionConfig
 from ballu_mjx.policies.policy import Policy, environment_of
@@ -83,6 +85,18 @@ def predict_com_errors(
         distance = predictor.predict(policy, own_simulator(setting, simulators))[reference].com_error
         found[setting] = expected_error(distance, errors[reference])
     return PredictedErrors(reference, found)
+
+
+def replay_errors(residuals: Mapping[str, Path]) -> dict[str, float]:
+    """Return the mean CoM error (m) of vanilla+sysid and of each simulator in open-loop replays, from evaluations.
+
+    `residuals`: runs of residuals on identified actuators, by simulator, evaluated on the same recordings.
+
+    **Raises** `InputError` if a run has no valid evaluation.
+    """
+    evaluations = {name: read_evaluation(run / "evaluation.json") for name, run in residuals.items()}
+    vanilla = mean_com_error(next(iter(evaluations.values())).vanilla)
+    return {"vanilla+sysid": vanilla, **{name: mean_com_error(each.residual) for name, each in evaluations.items()}}
 
 
 def expected_error(distance: float, reference_error: float) -> float:

@@ -10,7 +10,7 @@ actuators of `draw_robot`, and these differences:
   and by "turn left significantly" in the text.
 - Offset of the balloons: to the right, because the turn is to the left.
 - Drag: 0.3 N at 1 m/s, instead of 0.26. It is set by a public control script for BALLU, F = -0.3 v abs(v).
-- Actuators: unchanged. Identified actuators move joints by 8 deg on average over eight robots (paper: 10.15 deg).
+- Actuators: unchanged. No figure was used.
 
 The first two were set with policies that were trained for the robots 0 and 1 of `draw_robot`, in vanilla+sysid,
 vanilla+dr and vanilla+sysid+dr. No residual was learned on these robots before the values were set.
