@@ -138,16 +138,17 @@ def test_brax_ppo_learns_in_an_improved_simulator(run: Path):
     assert learned.episode_length == 25
     ppo.train(
         learned,
-        num_timesteps=60_000,
+        # Brax's means leave the optimum again later, and how far depends on the machine's rounding.
+        num_timesteps=10_000,
         episode_length=learned.episode_length,
         num_envs=64,
-        num_eval_envs=8,
+        num_eval_envs=32,
         num_evals=2,
         unroll_length=5,
         batch_size=64,
         num_minibatches=4,
         num_updates_per_batch=4,
-        learning_rate=3e-3,
+        learning_rate=1e-3,
         normalize_observations=True,
         deterministic_eval=True,
         progress_fn=lambda steps, found: reports.append(dict(found)),
