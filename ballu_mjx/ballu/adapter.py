@@ -24,7 +24,6 @@ from ballu_mjx.robots.adapter import (
     DeploymentNotes,
     IdentificationProgress,
     IdentifiedActuators,
-    ResidualScales,
     RobotAdapter,
 )
 from ballu_mjx.robots.description import RobotDescription
@@ -65,22 +64,6 @@ class Ballu(RobotAdapter, RecordingHooks):
         """Return the standing pose, with the knees at their stops and the feet on the floor."""
         del robot
         return standing_qpos(model)
-
-    def residual_scales(self) -> ResidualScales:
-        """Return the scales that the ablation chose (docs/envmimic.md). The force limit is the paper's.
-
-        The forces that correct the simulator are hundredths of a newton. With a unit of 1 N, the robot falls over in
-        PPO's first steps.
-        """
-        return ResidualScales(
-            force_scale=0.05,
-            torque_scale=0.005,
-            force_limit=1.0,
-            force_cost=20.0,
-            force_spread=0.3,
-            force_change=0.1,
-            torque_spread=0.05,
-        )
 
     def full_travel(self, robot: RobotDescription) -> float:
         """Return 0.2 s, because the servo takes 0.14 s for 60 deg and 0.21 s for 90 deg without load."""

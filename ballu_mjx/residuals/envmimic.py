@@ -26,7 +26,7 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import pad_to_bucket, stack_motions
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import network_input, recorded_inputs
-from ballu_mjx.residuals.network_loads import force_frame, num_loads, square_newtons, world_loads
+from ballu_mjx.residuals.network_loads import expected_units, force_frame, num_loads, square_newtons, world_loads
 from ballu_mjx.residuals.scales import resolve_scales
 from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
@@ -65,9 +65,13 @@ class EnvMimicConfig(ForceNetworkConfig):
     """Sharpness of the additional position term, 1/m^2."""
     fine_orientation_scale: float = 200.0
     """Sharpness of the additional orientation term, 1/rad^2. At 20, the term is still 0.92 at 6 deg of yaw."""
+    expected_loads: tuple[float, ...] = ()
+    """Loads at which an untrained policy starts, and from which the force cost counts (N, N m, commands' units; in the
+    frame of the network's output). One value stands for all loads. Without this option: the mean of the loads that the
+    model leaves unexplained in the training recordings. The paper's policy starts at 0."""
     force_cost: float | None = None
-    """Cost of force, in reward per N^2. Without this option: the robot's own value, or 0.05 per squared unit of the
-    network's output."""
+    """Cost of force, in reward per N^2. Without this option: 0.05 per squared unit of the network's
+    output."""
     episode_seconds: float = 3.0
     """Mean length of an episode, s. An episode also ends at the end of its recording."""
     episode_spread: float = 0.5
@@ -95,6 +99,9 @@ def check_envmimic_config(config: EnvMimicConfig, control_timestep: float) -> No
         if field.name in ("force_limit", "force_scale", "torque_scale", "scales"):
             if not all(x > 0 and math.isfinite(x) for x in (value if isinstance(value, tuple) else (value,))):
                 raise InputError(f"{option} is {value}: it must be greater than 0; leave it out for the default.")
+        elif field.name == "expected_loads":
+            if not all(map(math.isfinite, value)):
+                raise InputError(f"{option} is {value}: give finite numbers; leave it out for the default.")
         elif field.name == "episode_seconds":
             least = 2 * control_timestep
             if not (value >= least and math.isfinite(value)):
@@ -186,6 +193,7 @@ class EnvMimicEnv(Env):
         self.episode_length = round(config.episode_seconds / self.robot.control_timestep)
         self.recorded_inputs = recorded_inputs(reference, config, self.robot)
         self._spread = jnp.std(self.recorded_inputs, axis=0)
+        self.initial_action = jnp.asarray(expected_units(self.config, self.robot), jnp.float32)
         shapes = jax.eval_shape(self.reset, jax.random.key(0)).obs
         self._observation_size = {name: shape.shape for name, shape in shapes.items()}
 
@@ -202,6 +210,7 @@ class EnvMimicEnv(Env):
             "reference": self.reference,
             "spread": self._spread,
             "spread of starts": self._spread_of_starts,
+            "initial action": self.initial_action,
             "base residual": None if self.simulator.residual is None else self.simulator.residual.params,
         }
 
@@ -212,6 +221,7 @@ class EnvMimicEnv(Env):
         other.simulator = simulator.with_drivetrain(parameters["drivetrain"])
         other.reference = parameters["reference"]
         other._spread, other._spread_of_starts = parameters["spread"], parameters["spread of starts"]
+        other.initial_action = parameters["initial action"]
         return other
 
     def reset(self, rng: Array) -> State:
@@ -240,7 +250,8 @@ class EnvMimicEnv(Env):
         """Advance by one control step under the recorded command and the policy's loads."""
         before = tracking_state(state)
         recording, time = before.recording, before.time
-        loads = world_loads(action, before.rollout.features[ObservationLayout.yaw], self.config, self.robot)
+        yaw = before.rollout.features[ObservationLayout.yaw]
+        loads, expected = (world_loads(each, yaw, self.config, self.robot) for each in (action, self.initial_action))
         command, does = self.reference.command[recording, time], FORCE_SETS[self.config.forces].act(loads, self.robot)
         after = self.simulator.step(before.rollout, command, does).state
 
@@ -248,7 +259,7 @@ class EnvMimicEnv(Env):
         rollout, finite = after.keep_finite(before.rollout, target)
         terms = reward_terms(rollout.features, target, self.config, self.robot.upright)
         assert self.config.force_cost is not None, "Settled."
-        cost = self.config.force_cost * square_newtons(loads, self.config, self.robot)
+        cost = self.config.force_cost * square_newtons(loads - expected, self.config, self.robot)
         reward = jnp.where(finite, terms["tracking"] - cost, 0.0)
 
         remaining = before.remaining - 1

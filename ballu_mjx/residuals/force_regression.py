@@ -43,14 +43,14 @@ class SupervisedConfig:
 
     force_spread: float | None = None
     """Standard deviation of the prior on the force along each axis, N. Other loads have the same prior in units of the
-    network's output. Without this option: the robot's own value, or 6 units."""
+    network's output. Without this option: 6 units."""
     force_change: float | None = None
     """Standard deviation of the prior on the change of the force between two control steps, N. Smaller values smooth
     the labels. They also remove most of the force by which dragged-along air pushes a body back at every contact.
-    Without this option: the robot's own value, or 2 units."""
+    Without this option: 2 units."""
     torque_spread: float | None = None
-    """Standard deviation of the joint torques that the model lacks, N m. Without this option: the robot's own value, or
-    the largest RMS torque that the model leaves unexplained at a joint in the training recordings."""
+    """Standard deviation of the joint torques that the model lacks, N m. Without this option: the largest RMS torque
+    that the model leaves unexplained at a joint in the training recordings."""
     position_noise: float = 0.0005
     """Standard deviation of the error of recorded positions, m."""
     angle_noise: float = 0.3
@@ -111,13 +111,14 @@ class _Priors(NamedTuple):
     """Of joint torques (N m). None if unknown."""
 
 
-def _priors(config: SupervisedConfig, unit: float, robot: RobotDescription) -> _Priors:
-    """Return the priors of the options, or else of the robot, or else in units (N) of the network's output."""
-    own = robot.adapter.residual_scales()
-    names = "force_spread", "force_change", "torque_spread"
-    given = [getattr(own, name, None) if getattr(config, name) is None else getattr(config, name) for name in names]
-    spread, change, torque = given
-    return _Priors(_SPREAD * unit if spread is None else spread, _CHANGE * unit if change is None else change, torque)
+def _priors(config: SupervisedConfig, unit: float) -> _Priors:
+    """Return the priors of the options, or else in units (N) of the network's output."""
+    spread, change = config.force_spread, config.force_change
+    return _Priors(
+        _SPREAD * unit if spread is None else spread,
+        _CHANGE * unit if change is None else change,
+        config.torque_spread,
+    )
 
 
 _SPREAD, _CHANGE = 6.0, 2.0
@@ -147,7 +148,7 @@ class ForceLabeller:
         self._model, self._linearize = self._simulator.mj_model, linearize
         scales = load_scales(env, self._simulator.robot)
         self._in_newtons = scales.units / scales.newtons
-        self._priors = _priors(config, scales.newtons, self._simulator.robot)
+        self._priors = _priors(config, scales.newtons)
         if self._priors.torque is None and linearize.directions > 2 * self._model.nv + linearize.loads:
             raise ValueError("The spread of the joint torques is unknown; set torque_spread.")
         self._measured, self._process = _noise(self._model, self._simulator.robot, config)

@@ -56,7 +56,7 @@ def fit_supervised(
     - `motions`: training motions.
     - `config`: options of labels and regression. None for the defaults.
     - `forces`: force set of the network, or options with the force set and its scales. Scales that are not given are
-      the robot's own, or are estimated from the motions (`scales.resolve_scales`).
+      estimated from the motions (`scales.resolve_scales`).
     - `validation`: motions that choose the network. None for `motions`.
     - `run`: record of metrics and checkpoints, for example a run's folder. None to keep them in memory.
     - `progress`: display that is updated after every step.
@@ -174,8 +174,8 @@ class _Supervised(_Fit):
         assert isinstance(config, SupervisedConfig)
         robot, env = setup.simulator.robot, setup.forces.config
         joints = free_torques(env.forces, robot)
-        if joints and config.torque_spread is None and robot.adapter.residual_scales() is None:
-            size = missing_loads(setup.simulator, setup.motions.training, "joints")
+        if joints and config.torque_spread is None:
+            size = missing_loads(setup.simulator, setup.motions.training, "joints").rms
             config = dataclasses.replace(config, torque_spread=float(size.max(initial=0.0)))
         linearize = Linearizer(setup.simulator, joints, env.forces)
         label = force_regression.ForceLabeller(linearize, config, env)

@@ -17,19 +17,17 @@ class ForceNetworkConfig:
     changes of the commands (commands)."""
     force_limit: float | None = None
     """Largest force along each axis, N (paper: 1). Other loads have the same limit in units of the network's output.
-    Without this option: the robot's own value, or 20 units."""
+    Without this option: 20 units."""
     force_scale: float | None = None
-    """Force for one unit of the network's output, N. Without this option: the robot's own value, or the RMS force that
-    the model leaves unexplained in the training recordings. Joints and commands have `--scales` instead; for limit and
-    cost, one of their units counts as this force."""
+    """Force for one unit of the network's output, N. Without this option: from the training recordings, the RMS
+    deviation of the missing force from its mean, rounded to 1, 2 or 5 times a power of ten. Joints and commands have
+    `--scales` instead; for limit and cost, one of their units counts as this force."""
     torque_scale: float | None = None
-    """Torque for one unit of the network's output, N m, with `--forces wrench`. Without this option: the robot's own
-    value, or the RMS torque that the model leaves unexplained in the training recordings. For limit and cost, a unit of
-    torque counts as a unit of force."""
+    """Torque for one unit of the network's output, N m, with `--forces wrench`. Without this option: the same as for
+    the force, from the missing torque. For limit and cost, a unit of torque counts as a unit of force."""
     scales: tuple[float, ...] = ()
     """Load for one unit of each output, in order, with `--forces joints` (N m, for slides N) or `--forces commands`
-    (the commands' units). Without this option: the RMS loads that the model leaves unexplained in the training
-    recordings."""
+    (the commands' units). Without this option: the same as for the force, from the missing loads."""
     observe_command: bool = True
     """Include the coming command and the last two commands in the network's input. The paper's state has none."""
     relative_observation: bool = True

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim import force_sets
@@ -37,15 +38,12 @@ class LoadScales(NamedTuple):
 
 
 def load_scales(config: ForceNetworkConfig, robot: RobotDescription) -> LoadScales:
-    """Return the scales of a network's outputs. Values that `config` lacks are the robot's own.
+    """Return the scales of a network's outputs.
 
-    **Raises** `ValueError` if a value is in neither. `scales.resolve_scales` estimates it from recordings.
+    **Raises** `ValueError` if `config` lacks a value. `scales.resolve_scales` estimates it from recordings.
     """
-    own, size = robot.adapter.residual_scales(), num_loads(config, robot)
-    names = ("force_scale", "torque_scale", "force_limit")
-    force, torque, limit = (
-        getattr(own, name, None) if getattr(config, name) is None else getattr(config, name) for name in names
-    )
+    force, torque, limit = config.force_scale, config.torque_scale, config.force_limit
+    size = num_loads(config, robot)
     if FORCE_SETS[config.forces].turns:
         scales = None if force is None else [force] * size
         if scales is not None and config.forces == "wrench":
@@ -60,6 +58,20 @@ def load_scales(config: ForceNetworkConfig, robot: RobotDescription) -> LoadScal
 def load_units(config: ForceNetworkConfig, robot: RobotDescription) -> Float[np.ndarray, " loads"]:
     """Return the load for one unit of each output (N, N m, commands' units)."""
     return load_scales(config, robot).units
+
+
+def expected_units(config: ForceNetworkConfig, robot: RobotDescription) -> Float[np.ndarray, " loads"]:
+    """Return the expected loads of EnvMimic's options, as outputs of the network.
+
+    **Raises** `InputError` if their number is neither 1 nor that of the loads.
+    """
+    expected, units = getattr(config, "expected_loads", ()) or (0.0,), load_units(config, robot)
+    if len(expected) not in (1, len(units)):
+        raise InputError(
+            f"--expected-loads has {len(expected)} values: give {len(units)} with --forces {config.forces}, or one "
+            "for all, or leave it out for the default."
+        )
+    return np.broadcast_to(np.asarray(expected, float), units.shape) / units
 
 
 def square_newtons(

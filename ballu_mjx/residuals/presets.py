@@ -33,6 +33,7 @@ PRESETS: Mapping[PresetName, Mapping[str, Mapping[str, Setting]]] = {
             "forces": Setting("force", _PAPER),
             "force_limit": Setting(1.0, _PAPER),
             "force_scale": Setting(1.0, "the paper's actions are newtons"),
+            "expected_loads": Setting((0.0,), "the paper's forces start at 0"),
             "observe_command": Setting(False, _PAPER),
             "relative_observation": Setting(False, _PAPER),
             "heading_frame": Setting(False, _PAPER),

@@ -1,10 +1,13 @@
-"""Scales, limits and costs of residual loads: the robot's own, or the RMS of the loads that the model lacks.
+"""Scales, limits and costs of residual loads, from the loads that the model lacks.
 
 The lacking loads are estimated by one-step inverse dynamics along the training recordings:
 
 1. Each control step is simulated in C MuJoCo from its recorded state, with the base residual if there is one.
 2. The error of the velocities after the step is averaged over 0.25 s, because single steps are dominated by noise.
 3. The loads of the force set that explain the averaged error are found by least squares in kinetic energy.
+
+EnvMimic's policy starts at the mean of these loads, which is large where a weight or a lift is wrong. Scales are the
+RMS deviations from the mean, at least a fifth of the RMS, rounded to 1, 2 or 5 times a power of ten.
 
 The effect of a load on the velocities is measured by a second simulation with this load. Mass and time alone do not
 give it: a stiff actuator undoes most of a load on its joint within the step, so the load would be underestimated.
@@ -13,8 +16,9 @@ give it: a stiff actuator undoes most of a load on its joint within the step, so
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,17 +26,17 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.spatial.transform import Rotation
 
 from ballu_mjx.identification.actuator_choice import physics_commands
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, stack_motions
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_loads import load_scales
-from ballu_mjx.robots.adapter import ResidualScales
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.c_model import improved_model
 from ballu_mjx.sim.force_sets import FORCE_SETS, ForceSet, check_force_set, num_loads
-from ballu_mjx.sim.observation import HISTORY, commands_seen
+from ballu_mjx.sim.observation import HISTORY, ObservationLayout, commands_seen
 from ballu_mjx.sim.residual import BoundResidual
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
@@ -46,6 +50,8 @@ _STATES = 2000
 """Number of states for which loads are estimated, if the recordings have as many. Up to twice as many are used."""
 _QUANTILE = 0.95
 """Quantile to which larger loads are clipped. Contacts and gaps in recordings make single loads huge."""
+_SMALLEST_SHARE = 0.2
+"""Smallest scale, as a share of the RMS, so that almost constant loads stay within the limit."""
 _SMALLEST_SCALE = 1e-6
 """Smallest scale of a load, for a model that explains everything."""
 _WEAKEST = 0.05
@@ -60,37 +66,46 @@ Config = TypeVar("Config", bound=ForceNetworkConfig)
 def resolve_scales(config: Config, simulator: Simulator | AugmentedSimulator, motions: Sequence[Motion]) -> Config:
     """Return the configuration with numbers for all scales, the limit and the cost.
 
-    Values that are given stay. The others are the robot's own (`RobotAdapter.residual_scales`), or are derived from the
-    loads that `simulator`, with its base residual, leaves unexplained in `motions`.
+    Values that are given stay. The others are derived from the loads that `simulator`, with its base residual, leaves
+    unexplained in `motions`.
 
     **Raises** `InputError` if the robot has nothing on which the force set can act.
     """
     augmented = simulator.with_residual(None)
     robot, forces = augmented.robot, config.forces
     check_force_set(forces, robot)
-    own, vectors = robot.adapter.residual_scales(), FORCE_SETS[forces].turns
-    open_force = vectors and config.force_scale is None and own is None
-    open_torque = forces == "wrench" and config.torque_scale is None and own is None
+    vectors = FORCE_SETS[forces].turns
+    open_force = vectors and config.force_scale is None
+    open_torque = forces == "wrench" and config.torque_scale is None
     open_scales = not vectors and len(config.scales) != num_loads(forces, robot)
+    open_mean = getattr(config, "expected_loads", None) == ()
     found: dict[str, Any] = {}
-    if open_force or open_torque or open_scales:
-        size = missing_loads(augmented, motions, forces)
-        found["force_scale"] = _rms(size[:3] if forces == "wrench" else size) if vectors else 1.0
-        found["torque_scale"] = _rms(size[3:]) if forces == "wrench" else None
-        found["scales"] = () if vectors else tuple(map(float, size))
-    return _filled(config, own, found)
+    if open_force or open_torque or open_scales or open_mean:
+        missing = missing_loads(augmented, motions, forces, heading_frame=config.heading_frame)
+        size = np.maximum(missing.deviation, _SMALLEST_SHARE * missing.rms)
+        found["force_scale"] = round_scale(_rms(size[:3] if forces == "wrench" else size)) if vectors else 1.0
+        found["torque_scale"] = round_scale(_rms(size[3:])) if forces == "wrench" else None
+        found["scales"] = () if vectors else tuple(map(round_scale, size))
+        found["expected_loads"] = tuple(map(float, missing.mean))
+    return _filled(config, found)
 
 
-def _filled(config: Config, own: ResidualScales | None, found: dict[str, Any]) -> Config:
-    """Return the configuration with its open values filled in from the robot's `own` scales or from `found` ones."""
-    usual = {} if own is None else dataclasses.asdict(own)
-    force = config.force_scale or usual.get("force_scale") or found.get("force_scale") or 1.0
+def round_scale(size: float) -> float:
+    """Return the nearest of 1, 2 and 5 times powers of ten, on a logarithmic scale.
+
+    Scales are constants of compiled programs. Recordings with similar loads thereby share these programs.
+    """
+    decade = math.floor(math.log10(size))
+    candidates = [float(f"{digit}e{decade}") for digit in (1, 2, 5, 10)]
+    return min(candidates, key=lambda each: abs(math.log(each / size)))
+
+
+def _filled(config: Config, found: dict[str, Any]) -> Config:
+    """Return the configuration with its open values filled in from the scales that were `found`."""
+    force = config.force_scale or found.get("force_scale") or 1.0
     values = {"force_scale": force, "force_limit": LIMIT_UNITS * force, "force_cost": UNIT_COST / force**2}
-    values |= {name: value for name, value in (found | usual).items() if name != "scales"}
     fields = {field.name for field in dataclasses.fields(config)}
-    changes = {n: v for n, v in values.items() if n in fields and getattr(config, n) is None}
-    if found.get("scales"):
-        changes["scales"] = found["scales"]
+    changes = {n: v for n, v in (values | found).items() if n in fields and getattr(config, n) in (None, ())}
     return dataclasses.replace(config, **changes)
 
 
@@ -103,15 +118,32 @@ def describe_scales(config: ForceNetworkConfig, robot: RobotDescription) -> str:
     )
     cost = getattr(config, "force_cost", None)
     costs = "" if cost is None else f" A squared unit costs {cost * scales.newtons**2:.3g} of the reward."
-    return f"One unit of the network's output is: {loads}. Limit: {scales.limit:.3g} units.{costs}"
+    mean = np.array(getattr(config, "expected_loads", ())) / scales.units
+    start = f" It starts at {', '.join(f'{each:.2g}' for each in mean)} units." if mean.any() else ""
+    return f"One unit of the network's output is: {loads}. Limit: {scales.limit:.3g} units.{start}{costs}"
+
+
+class MissingLoads(NamedTuple):
+    """Loads (N, N m, commands' units) that a simulator leaves unexplained in recorded motions."""
+
+    mean: Float[np.ndarray, " loads"]
+    """Mean over the states."""
+    deviation: Float[np.ndarray, " loads"]
+    """RMS of the deviation from the mean."""
+    rms: Float[np.ndarray, " loads"]
+    """RMS of the loads themselves."""
 
 
 def missing_loads(
-    simulator: Simulator | AugmentedSimulator, motions: Sequence[Motion], forces: ForceSet
-) -> Float[np.ndarray, " loads"]:
-    """Return the RMS of the loads (N, N m, commands' units) that a simulator leaves unexplained in recorded motions.
+    simulator: Simulator | AugmentedSimulator,
+    motions: Sequence[Motion],
+    forces: ForceSet,
+    *,
+    heading_frame: bool = True,
+) -> MissingLoads:
+    """Return the loads that a simulator leaves unexplained in recorded motions. A base residual acts, too.
 
-    A base residual of the simulator acts, too.
+    Vectors are in the tracked body's heading frame, or else in the world frame (`network_loads.world_loads`).
     """
     augmented = simulator.with_residual(None)
     plain, robot, model = augmented.simulator, augmented.robot, improved_model(augmented)
@@ -132,7 +164,7 @@ def missing_loads(
         else:
             # The loads are perturbed by their size according to mass and time alone.
             guess = _solve_loads(root, np.linalg.solve(mass, acts) * robot.control_timestep, missing)
-            changes = np.broadcast_to(_size(guess), (len(motion.command), acts.shape[2]))
+            changes = np.broadcast_to(_summarize(guess).rms, (len(motion.command), acts.shape[2]))
         effects = []
         for load, change in enumerate(changes.T):
             command, force = sent.copy(), applied.copy()
@@ -142,17 +174,26 @@ def missing_loads(
                 force[here] += acts[:, :, load] * change[here, None]
             moved = _step(plain, model, motion, command, force, here)
             effects.append((moved - after[here]) / change[here, None])
-        found.append(_solve_loads(root, np.stack(effects, axis=2), missing))
-    return _size(np.concatenate(found))
+        loads = _solve_loads(root, np.stack(effects, axis=2), missing)
+        if FORCE_SETS[forces].turns and heading_frame and not robot.anchored:
+            yaw = np.asarray(reference.features[number, here, ObservationLayout.yaw])
+            to_heading = Rotation.from_euler("z", -yaw[:, None]).as_matrix()
+            loads = (loads.reshape(len(here), -1, 3) @ to_heading.swapaxes(1, 2)).reshape(len(here), -1)
+        found.append(loads)
+    return _summarize(np.concatenate(found))
 
 
-def _size(loads: Float[np.ndarray, "states loads"]) -> Float[np.ndarray, " loads"]:
-    """Return the RMS of each load over the states. Large values are clipped, and states with NaN are left out."""
-    size = np.abs(loads[np.isfinite(loads).all(axis=1)])
-    if not len(size):
-        return np.full(loads.shape[1], _SMALLEST_SCALE)
-    size = np.minimum(size, np.quantile(size, _QUANTILE, axis=0))
-    return np.maximum(np.sqrt(np.mean(size**2, axis=0)), _SMALLEST_SCALE)
+def _summarize(loads: Float[np.ndarray, "states loads"]) -> MissingLoads:
+    """Return mean and size of each load over the states. Large values are clipped, and states with NaN are left out."""
+    good = loads[np.isfinite(loads).all(axis=1)]
+    if not len(good):
+        smallest = np.full(loads.shape[1], _SMALLEST_SCALE)
+        return MissingLoads(0.0 * smallest, smallest, smallest)
+    largest = np.quantile(np.abs(good), _QUANTILE, axis=0)
+    good = np.clip(good, -largest, largest)
+    mean = good.mean(axis=0)
+    sizes = (np.sqrt(np.mean(each**2, axis=0)) for each in (good - mean, good))
+    return MissingLoads(mean, *(np.maximum(size, _SMALLEST_SCALE) for size in sizes))
 
 
 def _rms(values: Float[np.ndarray, " loads"]) -> float:

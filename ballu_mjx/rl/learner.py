@@ -32,7 +32,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, UInt32
 
 from ballu_mjx.rl import ppo
-from ballu_mjx.rl.ppo import Params, PPOConfig
+from ballu_mjx.rl.ppo import Params, PPOConfig, with_mean
 from ballu_mjx.rl.training_env import MEASURED, wrap_for_training
 from ballu_mjx.rl.training_state import Stored, TrainingState, array_name, to_uint64, with_own_memory
 
@@ -105,7 +105,10 @@ class Learner:
         return _step_size(self._config)
 
     def init(self, seed: int) -> TrainingState:
-        """Return the initial state for `seed`, the same as in Brax."""
+        """Return the initial state for `seed`, the same as in Brax.
+
+        If the environment has an attribute `initial_action`, the policy's mean actions start there instead of at 0.
+        """
         arguments = np.array(jax.random.PRNGKey(seed)), self._parameters
         first = self._first.lower(*arguments)
         state = jax.tree.map(
@@ -193,8 +196,12 @@ class Learner:
         key_networks, key = jax.random.split(key)
         key, key_environments, _ = jax.random.split(jax.random.fold_in(key, 0), 3)
         key_policy, key_value = jax.random.split(key_networks)
+        env = self._with_parameters(parameters)
+        policy: Any = self._networks.policy_network.init(key_policy)
+        if hasattr(env, "initial_action"):
+            policy = with_mean(policy, env.initial_action)
         networks = PPONetworkParams(
-            policy=self._networks.policy_network.init(key_policy),  # pyright: ignore[reportCallIssue]
+            policy=policy,  # pyright: ignore[reportCallIssue]
             value=self._networks.value_network.init(key_value),  # pyright: ignore[reportCallIssue]
         )
         return with_own_memory(

@@ -271,6 +271,13 @@ def with_share(policy: Mapping[str, Any], share: float) -> Mapping[str, Any]:
     return {**policy, "params": {**layers, _MEAN: jax.tree.map(lambda x: share * x, layers[_MEAN])}}
 
 
+def with_mean(policy: Mapping[str, Any], mean: Float[Array, " actions"]) -> Mapping[str, Any]:
+    """Return a policy network whose mean actions are those of `policy` plus `mean`."""
+    layers = policy["params"]
+    last = layers[_MEAN]
+    return {**policy, "params": {**layers, _MEAN: {**last, "bias": last["bias"] + mean}}}
+
+
 _MEAN = "Dense_0"
 """Brax's name of the layer whose output is the mean of the action distribution."""
 

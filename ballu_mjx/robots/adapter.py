@@ -33,26 +33,6 @@ class DeploymentNotes(NamedTuple):
     """Quantities to measure before the first run."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ResidualScales:
-    """Scales of residual forces that were chosen by experiment for one robot; see `residuals.scales`."""
-
-    force_scale: float
-    """Force (N) per unit of a network's output."""
-    torque_scale: float
-    """Torque (N m) per unit of a network's output."""
-    force_limit: float
-    """Largest force along each axis (N)."""
-    force_cost: float
-    """Penalty on the squared force, in units of the reward (1/N^2)."""
-    force_spread: float
-    """Standard deviation of the prior on the force in labels (N)."""
-    force_change: float
-    """Standard deviation of the prior on the change of this force in a control step (N)."""
-    torque_spread: float
-    """Standard deviation of the joint torques that the model lacks (N m)."""
-
-
 IdentificationProgress = Callable[[str, int, int, float], None]
 """Callback with the arguments (stage, iteration, maximum number of iterations, lowest loss so far)."""
 
@@ -97,9 +77,6 @@ class RobotAdapter:
         given = np.zeros(model.nu) if robot.keyframe is None else model.key(robot.keyframe).ctrl
         low, high = np.array(robot.command_ranges).T
         return np.clip(given, low, high)
-
-    def residual_scales(self) -> ResidualScales | None:
-        """Return scales of residual forces that were chosen by experiment. None: estimate them from the recordings."""
 
     # ---- deployment ----
 

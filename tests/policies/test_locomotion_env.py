@@ -29,7 +29,8 @@ from ballu_mjx.sim.step import count_substeps, state_at
 
 BALLU = load_robot()
 MODEL = BALLU.load_model()
-UNIT = load_units(ForceNetworkConfig(), BALLU)[0]
+FORCES = ForceNetworkConfig(force_scale=0.05, force_limit=1.0)
+UNIT = load_units(FORCES, BALLU)[0]
 """Force (N) of an action of 1."""
 INPUTS = 87
 """Size of the residual's input: 27 features and two commands for each of three control steps."""
@@ -39,7 +40,7 @@ def make_residual(action: np.ndarray, width: float = 1e6) -> TrainedResidual:
     """Return a residual whose policy always gives `action`, with a training range of -`width` to `width`."""
     bound = np.full(INPUTS, width, np.float32)
     forces = NetworkResidual(
-        ForceNetworkConfig(),
+        FORCES,
         load_robot(),
         infer=lambda params, seen: jnp.asarray(action, jnp.float32),
         sample=lambda params, seen, key: jnp.asarray(action, jnp.float32) + jax.random.normal(key, (3,)),
@@ -241,9 +242,7 @@ def test_residuals_of_one_kind_share_one_compiled_program():
         inputs = np.random.default_rng(seed).normal(size=(50, INPUTS)).astype(np.float32)
         params = ppo.initial_policy(inputs, action, dataclasses.replace(network, seed=seed))
         seen = inputs.min(axis=0), inputs.max(axis=0)
-        learned = TrainedResidual(
-            NetworkResidual(ForceNetworkConfig(), load_robot(), infer), params, seen, 0, actuators
-        )
+        learned = TrainedResidual(NetworkResidual(FORCES, load_robot(), infer), params, seen, 0, actuators)
         env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(), actuators=actuators, residual=learned)
         learner = Learner(env, sizes)
         state = jax.eval_shape(learner._first, jax.random.PRNGKey(0), learner._parameters)

@@ -23,14 +23,18 @@ from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import network_input
 from ballu_mjx.residuals.network_loads import load_units, world_loads
 from ballu_mjx.rl.learner import Learner
-from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.rl.ppo import PPOConfig, make_inference
+from ballu_mjx.rl.training_state import params
 from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.force_sets import ForceSet
 from ballu_mjx.sim.observation import HISTORY, euler_angles, heading_observation, heading_rotation
 from ballu_mjx.sim.simulator import RolloutState, Simulator
 from ballu_mjx.sim.step import state_at
 from ballu_mjx.viz import artifacts, robot_meshes
 
 STEPS = 30
+SCALED = EnvMimicConfig(expected_loads=(0.0,), force_scale=0.05, torque_scale=0.005, force_limit=1.0, force_cost=20.0)
+"""Options with scales, so that no recordings are needed to find them."""
 
 
 def make_motion(force: np.ndarray, name: str = "made", steps: int = STEPS) -> Motion:
@@ -127,7 +131,7 @@ def test_observation_is_relative_and_force_is_in_the_heading_frame(still: Motion
     moved, _ = stack_motions(simulator, [dataclasses.replace(still, qpos=moved_qpos, qvel=moved_qvel)])
     here, there = reference.features[0, 10:13], moved.features[0, 10:13]
     np.testing.assert_allclose(heading_observation(here), heading_observation(there), atol=2e-4)
-    config, action = EnvMimicConfig(), jnp.array([1.0, -0.5, 0.3, 0.4, 0.2, -0.6])
+    config, action = SCALED, jnp.array([1.0, -0.5, 0.3, 0.4, 0.2, -0.6])
     loads, moved_loads = (
         world_loads(action, history[-1, 8], config, load_robot()).reshape(2, 3) for history in (here, there)
     )
@@ -136,7 +140,9 @@ def test_observation_is_relative_and_force_is_in_the_heading_frame(still: Motion
 
 def test_options_give_the_paper_s_observation_and_force_in_the_world_frame(still: Motion):
     """Without relative observation and heading frame, inputs are plain features and forces are in the world frame."""
-    config = EnvMimicConfig(forces="force", relative_observation=False, heading_frame=False, observe_command=False)
+    config = dataclasses.replace(
+        SCALED, forces="force", relative_observation=False, heading_frame=False, observe_command=False
+    )
     robot = load_robot()
     reference, _ = stack_motions(Simulator(robot), [still])
     history = np.array(reference.features[0, 5 : 5 + HISTORY])
@@ -158,7 +164,7 @@ def test_episode_lengths_follow_the_options(spread: float, lengths: set[int], st
 
 
 def test_force_and_torque_stay_within_their_limits():
-    config = EnvMimicConfig()
+    config = SCALED
     loads = world_loads(jnp.array([1e6, -1e6, 0.0, 1e6, 0.0, -1e6]), jnp.zeros(()), config, load_robot())
     np.testing.assert_allclose(loads, [1.0, -1.0, 0.0, 0.1, 0.0, -0.1], rtol=1e-6)
 
@@ -246,6 +252,26 @@ def test_the_missing_force_earns_more_reward_than_zero_or_opposite_force(pushed:
     assert total(force) > 20 * 0.99 * best
 
 
+@pytest.mark.parametrize("forces", ["force", "wrench"])
+def test_an_untrained_policy_gives_the_mean_force_that_the_model_lacks(forces: ForceSet):
+    """A robot that lost lift lacks a constant force. Its recording is followed without training, and costs nothing."""
+    lost = np.array([0.0, 0.0, -0.16])
+    motion = make_motion(lost, steps=50)
+    env = EnvMimicEnv(Simulator(load_robot()), [motion], EnvMimicConfig(forces=forces, start_noise=0.0))
+    np.testing.assert_allclose(np.array(env.config.expected_loads)[:3], lost, atol=0.02)
+    sizes = PPOConfig(num_envs=8, batch_size=8, num_minibatches=1, unroll_length=2, num_updates_per_batch=1)
+    state = Learner(env, sizes).init(0)
+    infer = make_inference(env.observation_size, env.action_size, sizes)
+    observed = jax.jit(env.reset)(jax.random.key(0)).obs["state"]
+    action = infer(params(state), observed)
+    loads = load_units(env.config, env.robot) * action
+    np.testing.assert_allclose(loads[:3], lost, atol=0.02)
+    run = jax.jit(env.reset)(jax.random.key(1))
+    free = EnvMimicEnv(Simulator(load_robot()), [motion], dataclasses.replace(env.config, force_cost=0.0))
+    rewards = [float(jax.jit(each.step)(run, env.initial_action).reward) for each in (env, free)]
+    assert rewards[0] == pytest.approx(rewards[1], abs=1e-6) and rewards[0] > 2.2
+
+
 FORCE = np.array([0.04, 0.0, 0.02])
 """Force on the balloon (N, world frame)."""
 
@@ -253,7 +279,7 @@ FORCE = np.array([0.04, 0.0, 0.02])
 @pytest.fixture(scope="module")
 def evaluator() -> OpenLoopEvaluator:
     """Evaluator on a recording without and a shorter one with `FORCE`. The residual's parameters are its force (N)."""
-    config = ForceNetworkConfig()
+    config = ForceNetworkConfig(force_scale=0.05, force_limit=1.0)
     motions = [make_motion(np.zeros(3), "near-own", 60), make_motion(FORCE, "far-pushed", 50)]
     constant = NetworkResidual(config, load_robot(), lambda params, _: params / load_units(config, load_robot()))
     return OpenLoopEvaluator(Simulator(load_robot()), motions, constant)
@@ -327,13 +353,13 @@ def test_recordings_and_actuators_share_one_compiled_program(still: Motion, push
     sizes = PPOConfig(num_envs=8, batch_size=8, num_minibatches=1, unroll_length=2, num_updates_per_batch=1)
     training, replaying = [], []
     for model, motions in cases:
-        learner = Learner(EnvMimicEnv(Simulator(load_robot(), model=model), motions, EnvMimicConfig()), sizes)
+        learner = Learner(EnvMimicEnv(Simulator(load_robot(), model=model), motions, SCALED), sizes)
         state = jax.eval_shape(learner._first, jax.random.PRNGKey(0), learner._parameters)
         training.append(learner._step.lower(state, learner._parameters).as_text())
         evaluator = OpenLoopEvaluator(
             Simulator(load_robot(), model=model),
             motions,
-            NetworkResidual(ForceNetworkConfig(), load_robot(), lambda params, _: params),
+            NetworkResidual(dataclasses.replace(SCALED, forces="force"), load_robot(), lambda params, _: params),
         )
         places = np.tile(np.array([0, 2], np.int32), (evaluator._size, 1))
         carry = evaluator._begin(places)

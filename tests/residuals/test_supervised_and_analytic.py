@@ -46,7 +46,7 @@ CLOSE_TWIST = 0.05 * float(np.linalg.norm(TWIST))
 SECONDS = 0.5
 INPUTS = num_inputs(EnvMimicConfig(), load_robot())
 NETWORK = PPOConfig(policy_layers=(16,), value_layers=(4,))
-WRENCH = EnvMimicConfig(forces="wrench")
+WRENCH = EnvMimicConfig(forces="wrench", force_scale=0.05, torque_scale=0.005, force_limit=1.0, force_cost=20.0)
 ACTIONS = num_loads(WRENCH, BALLU)
 FORCES = NetworkResidual(WRENCH, BALLU, ppo.make_inference({ppo.STATE: (INPUTS,)}, ACTIONS, NETWORK), name="analytic")
 
