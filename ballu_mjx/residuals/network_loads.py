@@ -44,13 +44,10 @@ def load_scales(config: ForceNetworkConfig, robot: RobotDescription) -> LoadScal
     """
     force, torque, limit = config.force_scale, config.torque_scale, config.force_limit
     size = num_loads(config, robot)
+    scales: list[float | None] = list(config.scales)
     if FORCE_SETS[config.forces].turns:
-        scales = None if force is None else [force] * size
-        if scales is not None and config.forces == "wrench":
-            scales[3:] = [torque] * 3
-    else:
-        scales = list(config.scales) if len(config.scales) == size else None
-    if force is None or limit is None or scales is None or None in scales:
+        scales = [force] * 3 + [torque] * 3 if config.forces == "wrench" else [force] * size
+    if force is None or limit is None or len(scales) != size or None in scales:
         raise ValueError("The scales of the forces are open; set them, or call resolve_scales.")
     return LoadScales(np.array(scales, float), float(force), float(limit / force))
 
