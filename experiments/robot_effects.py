@@ -2,9 +2,10 @@
 # # Effect of each of the virtual robot's properties on a policy
 #
 # The virtual robot differs from the training simulators in several effects at once: air (drag, lift, added mass), a
-# balloon cluster off centre, actuators that differ between left and right, latency, and draughts. Here, policies of a
-# finished `python -m ballu_mjx.train all` walk on robots without one of these effects, and on robots with only one of
-# them. The gain without an effect measures the cost of this effect. All trials are in still air.
+# balloon cluster off centre, actuators that differ between left and right, latency, friction of the feet, lift, and
+# draughts. Here, policies of a finished `python -m ballu_mjx.train all` walk on robots without one of these effects,
+# and on robots with only one of them. The gain without an effect measures the cost of this effect. All trials are in
+# still air.
 #
 # `python experiments/robot_effects.py --output runs/all` takes a few minutes. Missing stages are made first. `--quick`
 # is a short trial run.
@@ -80,10 +81,10 @@ EFFECTS: dict[str, Callable[[VirtualRobot], VirtualRobot]] = {
     "balloon offset": lambda full: dataclasses.replace(full, balloon_offset=(0.0, 0.0, 0.0)),
     "actuators": without_actuators,
     "latency": lambda full: dataclasses.replace(full, latency=0.0),
-    "floor": lambda full: dataclasses.replace(full, foot_friction=(0.9, 0.9), buoyancy=0.84),
+    "friction of the feet": lambda full: dataclasses.replace(full, foot_friction=(0.9, 0.9)),
+    "lift": lambda full: dataclasses.replace(full, buoyancy=0.84),
 }
-"""Functions by the name of an effect. Each takes a robot and returns it without this effect. The floor's friction and
-the exact lift are one effect, because both differ little from their nominal values."""
+"""Functions by the name of an effect. Each takes a robot and returns it without this effect."""
 
 
 def variants(full: VirtualRobot) -> dict[str, VirtualRobot]:
@@ -160,6 +161,9 @@ def main() -> None:
         help=f"folder of `train all` ({transfer_tables.OUTPUT}, or {transfer_tables.QUICK_OUTPUT} under --quick)",
     )
     parser.add_argument("--robot-seed", type=int, default=0, help="seed of the virtual robot in `train all` (0)")
+    parser.add_argument(
+        "--robot-family", choices=["default", "paper"], default="default", help="family of the virtual robot (default)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="training seed of the policies (0)")
     parser.add_argument("--task", default="walk", choices=("walk", "turn"))
     parser.add_argument(
@@ -174,8 +178,11 @@ def main() -> None:
     arguments = parser.parse_args()
     quick = arguments.quick
     output = arguments.output or (transfer_tables.QUICK_OUTPUT if quick else transfer_tables.OUTPUT)
-    options = pipeline.Options(output=output, robot_seed=arguments.robot_seed, quick=quick)
-    hardware, trials = VirtualHardware.draw(arguments.robot_seed), 1 if quick else arguments.trials
+    options = pipeline.Options(
+        output=output, robot_seed=arguments.robot_seed, robot_family=arguments.robot_family, quick=quick
+    )
+    hardware = VirtualHardware.draw(options.robot_seed, options.robot_family)
+    trials = 1 if quick else arguments.trials
     stages, robots = pipeline.PipelineStages(options, arguments.seed, hardware), variants(hardware.robot)
     folder = output / f"effects-{arguments.task}-seed-{arguments.seed}"
     results = {}
