@@ -69,6 +69,7 @@ ROWS: Mapping[str, Row] = {
     "1 N a unit of output": Row({"force_scale": 1.0}),
     "commands not observed": Row({"observe_command": False}),
     "no noise on starts and observations": Row({"observation_noise": 0.0, "start_noise": 0.0}),
+    "start at zero force, cost from there": Row({"expected_loads": (0.0,)}),
     "no cost on force": Row({"force_cost": 0.0}),
     "constant learning rate": Row(ppo={"desired_kl": 0.0}),
     "last iterate instead of the average": Row(ppo={"averaging": 1}),

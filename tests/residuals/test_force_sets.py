@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, tracking_s
 from ballu_mjx.residuals.force_regression import SupervisedConfig
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
-from ballu_mjx.residuals.network_loads import load_scales, num_loads
+from ballu_mjx.residuals.network_loads import expected_units, load_scales, num_loads
 from ballu_mjx.residuals.scales import missing_loads, resolve_scales, round_scale
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.sim.force_sets import ForceSet
@@ -156,6 +157,15 @@ def test_given_scales_are_kept(robot: RobotDescription, simulator: Simulator):
     assert resolve_scales(given, simulator, []) == given
     with pytest.raises(ValueError, match="scales of the forces are open"):
         load_scales(ForceNetworkConfig(forces="joints"), robot)
+
+
+def test_expected_loads_are_one_for_all_or_one_for_each(robot: RobotDescription):
+    config = EnvMimicConfig(forces="joints", force_scale=1.0, force_limit=20.0, scales=(0.5, 2.0))
+    for given, units in (((), [0, 0]), ((1.0,), [2, 0.5]), ((1.0, -2.0), [2, -1])):
+        found = expected_units(dataclasses.replace(config, expected_loads=given), robot)
+        np.testing.assert_allclose(found, units)
+    with pytest.raises(InputError, match="--expected-loads has 3 values: give 2 with --forces joints"):
+        expected_units(dataclasses.replace(config, expected_loads=(1.0, 2.0, 3.0)), robot)
 
 
 @pytest.mark.parametrize(
