@@ -68,7 +68,8 @@ def write_run(folder: Path, task: str, base: Path | None = None) -> Path:
         folder.mkdir()
         (folder / "table-walk.md").write_text("| a |\n| --- |\n| 1 |\n")
         return folder
-    sections: dict[str, Any] = {"env": EnvMimicConfig(), "ppo": NETWORK}
+    forces = EnvMimicConfig(force_scale=0.05, torque_scale=0.005, force_limit=1.0, force_cost=20.0)
+    sections: dict[str, Any] = {"env": forces, "ppo": NETWORK}
     inputs, actions = INPUTS, num_loads(EnvMimicConfig(), BALLU)
     if task == "aerodynamic":
         sections = {"fit": AirConfig()}
