@@ -35,13 +35,14 @@ from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.common.results import Cell, Table
-from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+from ballu_mjx.recordings.csv_format import Split, list_bundled, read_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.force_regression import ForceLabeller, SupervisedConfig
+from ballu_mjx.residuals.force_training import resolve_torque_spread
+from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.trained_residual import TrainedResidual
-from ballu_mjx.robots.model import assets
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.folder import read_config, typed_config
 from ballu_mjx.sim.linearize import Linearizer
@@ -54,6 +55,13 @@ from ballu_mjx.sim.simulator import Simulator
 # %%
 SEEN_WELL = {"position_noise": 2e-5, "angle_noise": 0.01, "held_angle_noise": 0.01}
 """Options of `SupervisedConfig` for true states, which have no motion-capture noise."""
+
+
+def reconstruct_split(split: Split, simulator: Simulator) -> dict[str, Motion]:
+    """Return the reconstructed motions of a split of the bundled recordings, by name."""
+    robot = simulator.robot
+    recordings = [read_recording(path, robot) for path in list_bundled(split)]
+    return {recording.name: reconstruct(recording, robot, simulator.mj_model) for recording in recordings}
 
 
 def twin(job: dataset.Job) -> Motion:
@@ -143,17 +151,20 @@ def main() -> None:
     config = typed_config(SupervisedConfig, read_config(arguments.runs[0], "supervised"), "fit", arguments.runs[0])
     simulator = Simulator(robot, first.actuators)
     linearize = Linearizer(simulator, joints=robot.joints)
-    label = ForceLabeller(linearize, config)
-    label_well = ForceLabeller(linearize, dataclasses.replace(config, **SEEN_WELL))
+    known = reconstruct_split("training", simulator)
+    assert isinstance(first.model, NetworkResidual)
+    env = first.model.config
+    config = resolve_torque_spread(config, env.forces, simulator, list(known.values()))
+    label = ForceLabeller(linearize, config, env)
+    label_well = ForceLabeller(linearize, dataclasses.replace(config, **SEEN_WELL), env)
 
-    recordings = {path.name: path for path in list_recordings([assets() / "recordings" / "validation"])}
+    seen = reconstruct_split("validation", simulator)
     true, labels, twins = {}, {}, {}
     for job in dataset.jobs():
         if job.split == "validation":
             twins[job.name] = twin(job)
             true[job.name] = label_well(twins[job.name])[HISTORY - 1 :]
-            seen = read_recording(recordings[f"{job.name}.csv.gz"], load_robot())
-            labels[job.name] = label(reconstruct(seen, load_robot(), simulator.mj_model))[HISTORY - 1 :]
+            labels[job.name] = label(seen[job.name])[HISTORY - 1 :]
             print(f"{job.name}: true forces {1e3 * rms(true[job.name]):.0f} mN (RMS along an axis)", flush=True)
     found = [{name: forces(simulator, network, motion) for name, motion in twins.items()} for network in networks]
     columns = [f"{group}{axis}" for group in GROUPS for axis in ("", ": x", ": y", ": z")]

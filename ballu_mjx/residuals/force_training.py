@@ -104,6 +104,23 @@ def free_torques(forces: ForceSet, robot: RobotDescription) -> tuple[str, ...]:
     return robot.joints if FORCE_SETS[forces].turns else ()
 
 
+def resolve_torque_spread(
+    config: SupervisedConfig,
+    forces: ForceSet,
+    simulator: Simulator | AugmentedSimulator,
+    motions: Sequence[Motion],
+) -> SupervisedConfig:
+    """Return options whose `torque_spread` is set.
+
+    An open value becomes the largest RMS torque that the model lacks at a joint along the motions. The options are
+    returned unchanged if no joint torque is an unknown of the labelling.
+    """
+    if config.torque_spread is not None or not free_torques(forces, simulator.robot):
+        return config
+    size = missing_loads(simulator, motions, "joints").rms
+    return dataclasses.replace(config, torque_spread=float(size.max(initial=0.0)))
+
+
 class _Uses(NamedTuple):
     """Motions by use."""
 
@@ -174,9 +191,7 @@ class _Supervised(_Fit):
         assert isinstance(config, SupervisedConfig)
         robot, env = setup.simulator.robot, setup.forces.config
         joints = free_torques(env.forces, robot)
-        if joints and config.torque_spread is None:
-            size = missing_loads(setup.simulator, setup.motions.training, "joints").rms
-            config = dataclasses.replace(config, torque_spread=float(size.max(initial=0.0)))
+        config = resolve_torque_spread(config, env.forces, setup.simulator, setup.motions.training)
         linearize = Linearizer(setup.simulator, joints, env.forces)
         label = force_regression.ForceLabeller(linearize, config, env)
         uses = {"training": setup.motions.training}

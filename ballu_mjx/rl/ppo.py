@@ -271,11 +271,11 @@ def with_share(policy: Mapping[str, Any], share: float) -> Mapping[str, Any]:
     return {**policy, "params": {**layers, _MEAN: jax.tree.map(lambda x: share * x, layers[_MEAN])}}
 
 
-def with_mean(policy: Mapping[str, Any], mean: Float[Array, " actions"]) -> Mapping[str, Any]:
+def with_mean(policy: Mapping[str, Any], mean: Float[Array | np.ndarray, " actions"]) -> Mapping[str, Any]:
     """Return a policy network whose mean actions are those of `policy` plus `mean`."""
     layers = policy["params"]
     last = layers[_MEAN]
-    return {**policy, "params": {**layers, _MEAN: {**last, "bias": last["bias"] + mean}}}
+    return {**policy, "params": {**layers, _MEAN: {**last, "bias": last["bias"] + jnp.asarray(mean, jnp.float32)}}}
 
 
 _MEAN = "Dense_0"
