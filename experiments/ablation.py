@@ -106,12 +106,10 @@ def train(
     Each has the control step, the score, the reward, and ratios to the errors of the simulator without residual, by
     group, quantity and horizon (s).
     """
-    env_config = EnvMimicConfig(**row.env)
     ppo_config = PPOConfig(**{**sizes.ppo, "num_timesteps": sizes.steps, "seed": seed, **row.ppo})
-    env = EnvMimicEnv(simulator, motions["training"], env_config)
-    forces = NetworkResidual(
-        env_config, simulator.robot, ppo.make_inference(env.observation_size, env.action_size, ppo_config)
-    )
+    env = EnvMimicEnv(simulator, motions["training"], EnvMimicConfig(**row.env))
+    infer = ppo.make_inference(env.observation_size, env.action_size, ppo_config, env.mirror)
+    forces = NetworkResidual(env.config, simulator.robot, infer)
     evaluator = OpenLoopEvaluator(simulator, motions["validation"], forces)
     last = learner.total_timesteps(ppo_config)
     history: list[dict[str, Any]] = []

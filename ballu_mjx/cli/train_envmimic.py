@@ -13,6 +13,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.envmimic_training import VALIDATE_EVERY, check_envmimic_options, check_resumes, train_envmimic
+from ballu_mjx.residuals.network_mirror import network_mirror
 from ballu_mjx.residuals.presets import PresetName, describe_preset, preset_values
 from ballu_mjx.residuals.run_config import run_residual
 from ballu_mjx.residuals.trained_residual import TrainedResidual
@@ -53,6 +54,7 @@ def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
     robot = load_chosen_robot(data.robot, data.resume, "envmimic", data.residual)
     check_envmimic_options(env, ppo, data.validate_every, robot.control_timestep)
     check_force_set(env.forces, robot)
+    network_mirror(env, robot)
     start = start_from("envmimic", data, ppo)
     check_resumes(start, env, robot)
     first = distributed.is_first()

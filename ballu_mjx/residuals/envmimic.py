@@ -27,6 +27,7 @@ from ballu_mjx.recordings.reference import pad_to_bucket, stack_motions
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import network_input, recorded_inputs
 from ballu_mjx.residuals.network_loads import expected_units, force_frame, num_loads, square_newtons, world_loads
+from ballu_mjx.residuals.network_mirror import network_mirror
 from ballu_mjx.residuals.scales import resolve_scales
 from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
@@ -194,6 +195,7 @@ class EnvMimicEnv(Env):
         self.recorded_inputs = recorded_inputs(reference, config, self.robot)
         self._spread = jnp.std(self.recorded_inputs, axis=0)
         self.initial_action = jnp.asarray(expected_units(self.config, self.robot), jnp.float32)
+        self.mirror = network_mirror(self.config, self.robot)
         shapes = jax.eval_shape(self.reset, jax.random.key(0)).obs
         self._observation_size = {name: shape.shape for name, shape in shapes.items()}
 

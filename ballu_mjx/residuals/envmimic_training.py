@@ -16,6 +16,7 @@ from ballu_mjx.residuals.network_input import num_inputs
 from ballu_mjx.residuals.scales import resolve_scales
 from ballu_mjx.residuals.trained_residual import TrainedResidual, observed_range, write_observed
 from ballu_mjx.rl import ppo
+from ballu_mjx.rl.mirror import OFFSET
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.rl.resume_point import ResumePoint
 from ballu_mjx.rl.training_loop import TrainingLoop, Validation
@@ -70,7 +71,7 @@ def train_envmimic(
     sections = {"env": dataclasses.asdict(config), "ppo": dataclasses.asdict(ppo_config)}
     record = MemoryRecord(sections) if run is None else run
     env = EnvMimicEnv(augmented, motions, config)
-    sizes = env.observation_size, env.action_size, ppo_config
+    sizes = env.observation_size, env.action_size, ppo_config, env.mirror
     infer = ppo.make_inference(*sizes)
     forces = NetworkResidual(config, robot, infer, ppo.make_sampler(*sizes), network=ppo_config)
     model, all_params = add_to_base(augmented.residual, forces)
@@ -99,9 +100,13 @@ def check_envmimic_options(
 def check_resumes(start: ResumePoint, config: EnvMimicConfig, robot: RobotDescription) -> None:
     """Check that the policy of a resumed training has the input of these options.
 
-    **Raises** `InputError` if its number of inputs differs.
+    **Raises** `InputError` if its number of inputs differs, or if only one of both is symmetric (`--mirror`).
     """
-    if start.params is not None and start.params.normalizer.mean["state"].shape != (num_inputs(config, robot),):
+    if start.params is None:
+        return
+    inputs = start.params.normalizer.mean["state"].shape
+    if inputs != (num_inputs(config, robot),) or (OFFSET in start.params.policy["params"]) != config.mirror:
         raise InputError(
-            f"{start.folder}: its policy was trained with another input; leave the options of env as they were."
+            f"{start.folder}: its policy was trained with another input or another --mirror; leave the options of env "
+            "as they were."
         )

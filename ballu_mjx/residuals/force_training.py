@@ -23,6 +23,7 @@ from ballu_mjx.residuals.force_regression import SupervisedConfig
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_input import recorded_inputs
 from ballu_mjx.residuals.network_loads import expected_units, num_loads
+from ballu_mjx.residuals.network_mirror import network_mirror
 from ballu_mjx.residuals.scales import missing_loads, resolve_scales
 from ballu_mjx.residuals.trained_residual import TrainedResidual, observed_range, write_observed
 from ballu_mjx.rl import ppo
@@ -294,9 +295,9 @@ def _fit(
     env = resolve_scales(env, augmented, motions.training)
     reference, _ = stack_motions(plain, motions.training)
     inputs = np.asarray(recorded_inputs(reference, env, robot))
-    sizes = {ppo.STATE: (inputs.shape[1],)}, num_loads(env, robot), network
+    sizes = {ppo.STATE: (inputs.shape[1],)}, num_loads(env, robot), network, network_mirror(env, robot)
     network_forces = NetworkResidual(env, robot, ppo.make_inference(*sizes), None, name, network)
-    start = ppo.initial_policy(inputs, sizes[1], network)
+    start = ppo.initial_policy(inputs, *sizes[1:])
     start = start._replace(policy=ppo.with_mean(start.policy, expected_units(env, robot)))
     model, all_params = add_to_base(augmented.residual, network_forces)
     measure = (evaluators or Evaluators(plain)).of(model, motions.validation)

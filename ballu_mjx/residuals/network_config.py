@@ -37,3 +37,6 @@ class ForceNetworkConfig:
     heading_frame: bool = True
     """Express vectors and yaw in the network's input, and its forces, in the heading frame of the tracked body. The
     paper uses the world frame. For an anchored robot it is always the world frame."""
+    mirror: bool = False
+    """Make the network's output symmetric about the robot's xz plane, apart from a constant: mirrored motions then have
+    mirrored forces. The robot's description must declare `mirror`. Not with `--forces joints`."""

@@ -64,6 +64,7 @@ def _load_network(run: StoredRun) -> LoadedResidual:
     from ballu_mjx.residuals.network import NetworkResidual
     from ballu_mjx.residuals.network_input import num_inputs
     from ballu_mjx.residuals.network_loads import load_scales, num_loads
+    from ballu_mjx.residuals.network_mirror import network_mirror
     from ballu_mjx.rl import ppo
     from ballu_mjx.runs.checkpoints import restore_checkpoint
     from ballu_mjx.runs.folder import typed_config
@@ -79,7 +80,7 @@ def _load_network(run: StoredRun) -> LoadedResidual:
         load_scales(config, robot)
     except ValueError as error:
         raise InputError(f"{folder}: its config.json has no scales of the forces; restore it.") from error
-    sizes = inputs, num_loads(config, robot), network
+    sizes = inputs, num_loads(config, robot), network, network_mirror(config, robot)
     infer = ppo.make_inference(*sizes)
     if not (inputs == num_inputs(config, robot) and ppo.fits(infer, params, inputs)):
         raise InputError(

@@ -72,7 +72,7 @@ class Learner:
         shapes = jax.eval_shape(self._reset, keys, self._parameters).obs
         self._observation = {name: jax.ShapeDtypeStruct(x.shape[1:], jnp.float32) for name, x in shapes.items()}
         sizes = {name: x.shape for name, x in self._observation.items()}
-        self._networks = ppo.make_networks(sizes, env.action_size, config)
+        self._networks = ppo.make_networks(sizes, env.action_size, config, getattr(env, "mirror", None))
         # The learning rate is in the state even if it is constant, so that one program serves all learning rates.
         self._optimizer = optax.chain(
             optax.clip_by_global_norm(config.max_grad_norm),

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.rl.mirror import OFFSET, Mirror, even_moments, unfold_layers
 from ballu_mjx.rl.ppo import STATE, Params, PPOConfig
 
 
@@ -32,8 +33,8 @@ class OutputScale(NamedTuple):
     high: Float[np.ndarray, " outputs"]
 
 
-def network_arrays(params: Params, config: PPOConfig) -> dict[str, np.ndarray]:
-    """Return a policy's network as arrays by name.
+def network_arrays(params: Params, config: PPOConfig, mirror: Mirror | None = None) -> dict[str, np.ndarray]:
+    """Return a policy's network as arrays by name. A symmetric network with `mirror` becomes a plain one.
 
     The names are `mean`, `std`, `observation_clip`, `activation`, and `kernel_0`, `bias_0` and so on for each layer.
     The output of the last layer is the mean of the policy's Gaussian, which is also its mode. The standard deviation is
@@ -44,6 +45,9 @@ def network_arrays(params: Params, config: PPOConfig) -> dict[str, np.ndarray]:
     if not config.normalize_observations:
         mean, std, clip = np.zeros_like(mean), np.ones_like(std), math.inf
     layers = _layers(params.policy["params"])
+    if mirror is not None:
+        mean, std = (np.asarray(moment) for moment in even_moments(mean, std, mirror.observation))
+        layers = unfold_layers(layers, np.asarray(params.policy["params"][OFFSET]), mirror)
     return {
         "mean": mean,
         "std": std,
@@ -115,7 +119,7 @@ def onnx_model(
 def _layers(tree: Mapping) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return kernel and bias of each layer of Brax's policy network, `PolicyModuleWithStd`."""
     hidden = tree["MLP_0"]
-    assert set(tree) == {"MLP_0", "Dense_0", "std_logparam"}, set(tree)
+    assert set(tree) - {OFFSET} == {"MLP_0", "Dense_0", "std_logparam"}, set(tree)
     assert set(hidden) == {f"hidden_{i}" for i in range(len(hidden))}, set(hidden)
     layers = [hidden[f"hidden_{i}"] for i in range(len(hidden))] + [tree["Dense_0"]]
     return [(np.asarray(layer["kernel"]), np.asarray(layer["bias"])) for layer in layers]

@@ -18,6 +18,7 @@ from flax import errors, linen
 from jaxtyping import Array, Float
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.rl.mirror import OFFSET, Mirror, symmetric_policy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,8 +188,13 @@ def check(config: PPOConfig, devices: int) -> None:
         )
 
 
-def make_networks(observation_size: ObservationSize, action_size: int, config: PPOConfig) -> brax_networks.PPONetworks:
-    """Return policy and value networks. Each action's standard deviation is one parameter, the same in all states."""
+def make_networks(
+    observation_size: ObservationSize, action_size: int, config: PPOConfig, mirror: Mirror | None = None
+) -> brax_networks.PPONetworks:
+    """Return policy and value networks. Each action's standard deviation is one parameter, the same in all states.
+
+    With `mirror`, mean actions are symmetric apart from a constant (`mirror.symmetric_policy`).
+    """
 
     def preprocess(observation: Any, preprocessor_params: Any) -> Array:
         if not config.normalize_observations:
@@ -201,7 +207,7 @@ def make_networks(observation_size: ObservationSize, action_size: int, config: P
         for network in ("policy", "value"):
             hidden[f"{network}_network_kernel_init_fn"] = jax.nn.initializers.orthogonal
             hidden[f"{network}_network_kernel_init_kwargs"] = {"scale": math.sqrt(2)}
-    return brax_networks.make_ppo_networks(
+    networks = brax_networks.make_ppo_networks(
         observation_size,
         action_size,
         preprocess_observations_fn=preprocess,
@@ -217,15 +223,20 @@ def make_networks(observation_size: ObservationSize, action_size: int, config: P
         mean_kernel_init_kwargs={"scale": _INITIAL_MEAN_SCALE},
         **hidden,
     )
+    if mirror is None:
+        return networks
+    return networks.replace(policy_network=symmetric_policy(networks.policy_network, mirror, STATE))  # pyright: ignore
 
 
-def make_inference(observation_size: ObservationSize, action_size: int, config: PPOConfig) -> Inference:
+def make_inference(
+    observation_size: ObservationSize, action_size: int, config: PPOConfig, mirror: Mirror | None = None
+) -> Inference:
     """Return the deterministic policy, a function of parameters and observation.
 
     It returns the mode of the policy's distribution. It is pure, and the observation may have any number of leading
     axes.
     """
-    networks = make_networks(observation_size, action_size, config)
+    networks = make_networks(observation_size, action_size, config, mirror)
 
     def infer(params: Params, observation: Float[Array, "*batch observations"]) -> Float[Array, "*batch actions"]:
         logits = networks.policy_network.apply(params.normalizer, params.policy, {STATE: observation})
@@ -234,9 +245,11 @@ def make_inference(observation_size: ObservationSize, action_size: int, config: 
     return infer
 
 
-def make_sampler(observation_size: ObservationSize, action_size: int, config: PPOConfig) -> Sampler:
+def make_sampler(
+    observation_size: ObservationSize, action_size: int, config: PPOConfig, mirror: Mirror | None = None
+) -> Sampler:
     """Return the stochastic policy, a function of parameters, observation and random key that samples an action."""
-    networks = make_networks(observation_size, action_size, config)
+    networks = make_networks(observation_size, action_size, config, mirror)
 
     def sample(params: Params, observation: Float[Array, " observations"], key: Array) -> Float[Array, " actions"]:
         logits = networks.policy_network.apply(params.normalizer, params.policy, {STATE: observation})
@@ -255,27 +268,35 @@ def fits(infer: Inference, params: Params, inputs: int) -> bool:
     return True
 
 
-def initial_policy(inputs: Float[Array | np.ndarray, "states inputs"], action_size: int, config: PPOConfig) -> Params:
+def initial_policy(
+    inputs: Float[Array | np.ndarray, "states inputs"],
+    action_size: int,
+    config: PPOConfig,
+    mirror: Mirror | None = None,
+) -> Params:
     """Return an untrained policy, with a normalizer from the observations `inputs` and without value function."""
     inputs = np.asarray(inputs, np.float64)
     std = np.maximum(inputs.std(axis=0), _NARROWEST)
     mean, std, summed = (np.asarray(x, np.float32) for x in (inputs.mean(axis=0), std, std**2 * len(inputs)))
     normalizer = Normalizer(np.asarray(len(inputs), np.float32), {STATE: mean}, {STATE: std}, {STATE: summed})
-    policy = make_networks({STATE: (inputs.shape[1],)}, action_size, config).policy_network
+    policy = make_networks({STATE: (inputs.shape[1],)}, action_size, config, mirror).policy_network
     return Params(normalizer, policy.init(jax.random.key(config.seed)), {})
 
 
 def with_share(policy: Mapping[str, Any], share: float) -> Mapping[str, Any]:
     """Return a policy network whose mean actions are `share` times those of `policy`."""
     layers = policy["params"]
-    return {**policy, "params": {**layers, _MEAN: jax.tree.map(lambda x: share * x, layers[_MEAN])}}
+    scaled = {name: jax.tree.map(lambda x: share * x, layers[name]) for name in (_MEAN, OFFSET) if name in layers}
+    return {**policy, "params": {**layers, **scaled}}
 
 
 def with_mean(policy: Mapping[str, Any], mean: Float[Array | np.ndarray, " actions"]) -> Mapping[str, Any]:
     """Return a policy network whose mean actions are those of `policy` plus `mean`."""
-    layers = policy["params"]
+    layers, mean = policy["params"], jnp.asarray(mean, jnp.float32)
+    if OFFSET in layers:
+        return {**policy, "params": {**layers, OFFSET: layers[OFFSET] + mean}}
     last = layers[_MEAN]
-    return {**policy, "params": {**layers, _MEAN: {**last, "bias": last["bias"] + jnp.asarray(mean, jnp.float32)}}}
+    return {**policy, "params": {**layers, _MEAN: {**last, "bias": last["bias"] + mean}}}
 
 
 _MEAN = "Dense_0"

@@ -28,6 +28,7 @@ from ballu_mjx.residuals.fluid import FluidResidual
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_input import network_input_names
 from ballu_mjx.residuals.network_loads import load_names, load_scales
+from ballu_mjx.residuals.network_mirror import network_mirror
 from ballu_mjx.rl.network_export import NetworkPort, OutputScale, check_onnx, network_arrays, onnx_model
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.mjcf import write_mjcf
@@ -177,7 +178,7 @@ def _network_part(simulator: AugmentedSimulator, model: NetworkResidual, params:
         "unit": scales.units.tolist(),
         "limit": (scales.units * scales.limit).tolist(),
     }
-    arrays = network_arrays(params, model.network)
+    arrays = network_arrays(params, model.network, network_mirror(config, robot))
     del arrays["activation"]
     return ExportedPart(settings, {name: np.asarray(value, float) for name, value in arrays.items()})
 
