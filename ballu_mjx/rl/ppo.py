@@ -51,9 +51,9 @@ class PPOConfig:
     """Decay factor (lambda) of generalized advantage estimation."""
     clipping_epsilon: float = 0.2
     """Clipping range of PPO: a larger relative change of an action's probability brings no further gain."""
-    reward_scaling: float = 1.0
-    """Factor on rewards. An untrained value function returns numbers of order 1. Scaled returns should not be much
-    smaller."""
+    reward_scaling: float = 0.05
+    """Factor on rewards. An untrained value function returns numbers of order 1, and scaled returns should, too. The
+    default is 1 - discounting, so that the return is the mean reward."""
     value_cost: float = 0.25
     """Weight of the value function's mean squared error in the objective."""
     max_grad_norm: float = 1.0
@@ -73,7 +73,7 @@ class PPOConfig:
     """Activation of the hidden layers."""
     orthogonal_init: bool = False
     """Initialize the hidden layers with orthogonal matrices times the root of 2, instead of uniform numbers (LeCun)."""
-    initial_std: float = 0.5
+    initial_std: float = 0.2
     """Standard deviation of an untrained policy's actions, in the environment's units. Their mean starts near 0."""
     averaging: int = 25
     """Training steps over which the saved policy is averaged (exponentially). With 1 the last policy is saved. Single
