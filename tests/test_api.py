@@ -131,7 +131,8 @@ def test_envmimic_on_top_of_aerodynamic_is_evaluated_with_both(
     simulator: bm.Simulator, air: bm.TrainedResidual, motions: list[bm.Motion]
 ):
     """A residual learned in an improved simulator is evaluated together with that simulator's residual."""
-    learned = bm.train_envmimic(simulator.with_residual(air), motions, ppo_config=SIZES)
+    start_at_zero = bm.EnvMimicConfig(expected_loads=(0.0,))
+    learned = bm.train_envmimic(simulator.with_residual(air), motions, start_at_zero, SIZES)
     found = bm.evaluate(simulator.with_residual(learned), motions)
     assert found.name == "aerodynamic+envmimic"
     alone = bm.evaluate(simulator.with_residual(air), motions)
