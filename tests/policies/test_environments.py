@@ -138,23 +138,24 @@ def test_brax_ppo_learns_in_an_improved_simulator(run: Path):
     assert learned.episode_length == 25
     ppo.train(
         learned,
-        # Brax's means leave the optimum again later, and how far depends on the machine's rounding.
-        num_timesteps=10_000,
+        # At Brax's usual rates single evaluations fall back to the start, and which ones depends on the machine's rounding.
+        learning_rate=3e-4,
+        num_timesteps=40_000,
         episode_length=learned.episode_length,
         num_envs=64,
         num_eval_envs=32,
-        num_evals=2,
+        num_evals=5,
         unroll_length=5,
         batch_size=64,
         num_minibatches=4,
         num_updates_per_batch=4,
-        learning_rate=1e-3,
         normalize_observations=True,
         deterministic_eval=True,
+        seed=1,
         progress_fn=lambda steps, found: reports.append(dict(found)),
     )
-    before, after = (each["eval/episode_reward"] for each in (reports[0], reports[-1]))
-    assert after > before + 1.0, (before, after)
+    before, *after = (float(each["eval/episode_reward"]) for each in reports)
+    assert np.mean(after[-2:]) > before + 1.0, (before, after)
 
 
 @pytest.mark.slow

@@ -83,7 +83,7 @@ def flights(robot: RobotDescription, seed: int, count: int) -> list[Motion]:
 
 @pytest.fixture(scope="module")
 def fit(glider: RobotDescription) -> FluidFit:
-    config = FluidConfig(terms="quadratic", window_seconds=(0.5, 1.5), steps=6)
+    config = FluidConfig(terms="quadratic", window_seconds=(0.5, 1.5), windows=60, steps=6)
     return fit_fluid_forces(Simulator(glider), flights(glider, 0, 16), flights(glider, 1, 2), config)
 
 

@@ -20,11 +20,13 @@
 # Results on these test flights have been reported before, so that they are development data. Other flights of the data
 # set are kept for a final check; this script does not read them.
 #
-# The baselines are the nominal model without air, the constant wrench that explains the training flights best, the
-# published aerodynamic model, and the mean motion of the nearest recorded moments. Errors are root mean squares of the
-# errors at the end of a horizon, over starts in every second.
+# The methods are `train fluid`, and `train envmimic` with and without `--mirror` and with several seeds. The baselines
+# are the nominal model without air, the constant wrench that explains the training flights best, the published
+# aerodynamic model, and the mean motion of the nearest recorded moments. Errors are root mean squares of the errors at
+# the end of a horizon, over starts in every second.
 #
-# Run `python experiments/real/rgblimp/rgblimp.py --data FOLDER`. `--quick` is a short trial run.
+# Run `python experiments/real/rgblimp/rgblimp.py --data FOLDER`. `--quick` is a short trial run. Finished runs of
+# EnvMimic in `--output` are used again.
 
 # %%
 from __future__ import annotations
@@ -42,6 +44,8 @@ _setup.prepare()
 import argparse
 import dataclasses
 import lzma
+import shutil
+import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -52,6 +56,7 @@ from jaxtyping import Array
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from ballu_mjx.cli import train
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
@@ -62,6 +67,7 @@ from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.body_motion import body_motion
 from ballu_mjx.residuals.fluid_fit import FluidConfig
 from ballu_mjx.residuals.fluid_training import fit_fluid
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.sim.residual import Action, Commands, History, Residual
@@ -79,7 +85,9 @@ TEST: Mapping[str, tuple[int, ...]] = {
 }
 FLIP = np.array([1.0, -1.0, -1.0])
 """Signs that convert between (north, east, down) and (forward, left, up) axes, in both directions."""
-SHORT = ("no air", "published model", "fluid", "nearest moments")
+ENVMIMIC: Mapping[str, Sequence[str]] = {"EnvMimic": (), "EnvMimic, `--mirror`": ("--mirror",)}
+"""Options of EnvMimic, by name of the method."""
+SHORT = ("no air", "published model", "fluid", *ENVMIMIC, "nearest moments")
 """Rows of the short table."""
 SHOWN = 20.0
 """Length of the flights in the figure (s)."""
@@ -121,24 +129,26 @@ def convert(path: Path, name: str) -> Recording:
     )
 
 
-def load(data: Path, numbers: Sequence[int], robot: RobotDescription, made: Path) -> list[Motion]:
-    """Return reconstructed flights, given the numbers of their files. Converted recordings are kept in `made`.
+def find(data: Path, number: int, robot: RobotDescription, made: Path) -> Path:
+    """Return the recording of a flight, given the number of its file. A converted recording is written to `made`.
 
-    **Raises** `InputError` if `data` has neither a file nor its recording.
+    **Raises** `InputError` if `data` has neither the file nor its recording.
     """
-    motions = []
-    for number in numbers:
-        name = f"flight-{number:03d}.csv.gz"
-        path = next((p for p in (data / name, made / name) if p.exists()), None)
-        if path is None:
-            raw = next((p for e in ("csv", "csv.xz") if (p := data / f"data_{number}.{e}").exists()), None)
-            if raw is None:
-                raise InputError(f"{data}: has neither data_{number}.csv nor {name}; download the public data set.")
-            made.mkdir(parents=True, exist_ok=True)
-            path = made / name
-            write_recording(convert(raw, name.removesuffix(".csv.gz")), path, robot)
-        motions.append(reconstruct(read_recording(path, robot), robot))
-    return motions
+    name = f"flight-{number:03d}.csv.gz"
+    for path in (data / name, made / name):
+        if path.exists():
+            return path
+    raw = next((p for e in ("csv", "csv.xz") if (p := data / f"data_{number}.{e}").exists()), None)
+    if raw is None:
+        raise InputError(f"{data}: has neither data_{number}.csv nor {name}; download the public data set.")
+    made.mkdir(parents=True, exist_ok=True)
+    write_recording(convert(raw, name.removesuffix(".csv.gz")), made / name, robot)
+    return made / name
+
+
+def load(paths: Sequence[Path], robot: RobotDescription) -> list[Motion]:
+    """Return the reconstructed flights of recordings."""
+    return [reconstruct(read_recording(path, robot), robot) for path in paths]
 
 
 # %% [markdown]
@@ -203,6 +213,8 @@ class PublishedAerodynamics(Residual):
 # %%
 Found = Mapping[float, tuple[float, float, int, int]]
 """Position error (m), yaw error (deg), number of starts and number of diverged starts, by horizon (s)."""
+Rows = Mapping[str, Mapping[str, Sequence[Found]]]
+"""Errors by method and group of flights, for each seed. Deterministic methods have one entry."""
 
 
 def end_errors(evaluator: OpenLoopEvaluator, replay: Replay) -> Found:
@@ -268,13 +280,19 @@ def _moments(motion: Motion, steps: int, every: int) -> tuple[np.ndarray, np.nda
     return np.column_stack([state, motion.command[here]]) / _LIKE, np.column_stack([moved, turned])
 
 
-def tables(rows: Mapping[str, Mapping[str, Found]]) -> dict[str, Table]:
-    """Return tables of position and yaw errors, and a short one of both; `rows[method][group]` holds the errors."""
+def tables(rows: Rows) -> dict[str, Table]:
+    """Return tables of position and yaw errors (means over seeds), and a short one of both."""
     heads = [f"{group}: {', '.join(f'{horizon:g}' for horizon in HORIZONS)} s" for group in TEST]
+    last = HORIZONS[-1]
 
-    def cell(found: Found, place: int, form: str) -> str:
-        diverged, starts = found[HORIZONS[-1]][3], found[HORIZONS[-1]][2]
-        numbers = ", ".join("-" if f[3] == f[2] else format(f[place], form) for f in found.values())
+    def cell(found: Sequence[Found], place: int, form: str) -> str:
+        starts, diverged = (sum(each[last][k] for each in found) for k in (2, 3))
+        numbers = ", ".join(
+            "-"
+            if any(f[h][3] == f[h][2] for f in found)
+            else format(statistics.fmean(f[h][place] for f in found), form)
+            for h in HORIZONS
+        )
         return numbers + (f" ({diverged} of {starts} diverged)" if diverged else "")
 
     units = [("position", "m", ".3f"), ("yaw", "deg", ".1f")]
@@ -284,7 +302,7 @@ def tables(rows: Mapping[str, Mapping[str, Found]]) -> dict[str, Table]:
             (
                 method,
                 *(
-                    Cell((groups[group][HORIZONS[-1]][place],), form.replace("3f", "2f"))
+                    Cell(tuple(found[last][place] for found in groups[group]), form.replace("3f", "2f"))
                     for group in TEST
                     for place, (_, _, form) in enumerate(units)
                 ),
@@ -326,52 +344,90 @@ def draw(
 
 
 # %% [markdown]
+# ## EnvMimic
+
+
+# %%
+QUICK = ("--num-timesteps", "4000", "--num-envs", "16", "--batch-size", "16", "--num-minibatches", "4")
+"""Options of EnvMimic for a training that takes seconds."""
+
+
+def learn(files: Mapping[str, Sequence[Path]], run: Path, options: Sequence[str]) -> TrainedResidual:
+    """Train EnvMimic with these options unless the run is finished, and return its residual."""
+    if not (run / "evaluation.json").exists():
+        shutil.rmtree(run, ignore_errors=True)
+        paths = [text for use in USES for text in (USES[use], *map(str, files[use]))]
+        status = train.main(["envmimic", "--robot", str(DESCRIPTION), "--output", str(run), *paths, *options])
+        if status:
+            sys.exit(status)
+    return TrainedResidual.load(run, read_description(DESCRIPTION))
+
+
+# %% [markdown]
 # ## Run
 
 
 # %%
+DESCRIPTION = FOLDER / "rgblimp.robot.json"
+USES = {"training": "--recordings", "validation": "--validation", "near": "--test"}
+"""Options of the command that name flights, by use."""
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Fit the air forces on a real blimp, and predict test flights.")
+    parser = argparse.ArgumentParser(description="Learn the air forces on a real blimp, and predict test flights.")
     parser.add_argument("--data", type=Path, required=True, help="folder with the public files or recordings of them")
     parser.add_argument("--output", type=Path, default=Path("runs/rgblimp"), help="folder for results (runs/rgblimp)")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="seeds of EnvMimic (0 1 2)")
     parser.add_argument("--quick", action="store_true", help="few flights and steps; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     parser.add_argument("--figure", type=Path, help="PNG file for a figure of three test flights")
     options = parser.parse_args()
-    robot = read_description(FOLDER / "rgblimp.robot.json")
+    robot = read_description(DESCRIPTION)
     few = slice(0, 2) if options.quick else slice(None)
-    made = options.output / "recordings"
-    training, validation = (load(options.data, each[few], robot, made) for each in (TRAINING, VALIDATION))
-    test = {group: load(options.data, numbers[few], robot, made) for group, numbers in TEST.items()}
+    files = {
+        use: [find(options.data, number, robot, options.output / "recordings") for number in numbers[few]]
+        for use, numbers in ({"training": TRAINING, "validation": VALIDATION} | TEST).items()
+    }
+    motions = {use: load(paths, robot) for use, paths in files.items()}
+    training, validation = motions["training"], motions["validation"]
+    test = {group: motions[group] for group in TEST}
     simulator = Simulator(robot)
     config = FluidConfig(window_seconds=(0.5, 2.0), windows=150)
     if options.quick:
         config = FluidConfig(terms="linear", window_seconds=(0.5,), windows=10, steps=2)
-    residuals: dict[str, tuple[Residual, Any]] = {
-        "published model": (PublishedAerodynamics(robot.control_timestep), jnp.zeros(0))
+    residuals: dict[str, list[tuple[Residual, Any]]] = {
+        "published model": [(PublishedAerodynamics(robot.control_timestep), jnp.zeros(0))]
     }
     for name, passive in (("fluid", True), ("fluid, `--no-passive`", False)):
         found = fit_fluid(
             simulator, training, validation, dataclasses.replace(config, passive=passive), progress=PhaseProgress()
         )
         print(f"\n{name}\n{found.report}\n", flush=True)
-        residuals[name] = found.model, found.params
+        residuals[name] = [(found.model, found.params)]
+    seeds = options.seeds[:1] if options.quick else options.seeds
+    for name, chosen in ENVMIMIC.items():
+        kind = "envmimic" + "".join(chosen).removeprefix("-")
+        quick = QUICK if options.quick else ()
+        learned = [
+            learn(files, options.output / f"{kind}-{seed}", [*chosen, *quick, "--seed", str(seed)]) for seed in seeds
+        ]
+        residuals[name] = [(each.model, each.params) for each in learned]
     if options.figure is not None:
-        draw(options.figure, simulator, {name: residuals[name] for name in ("published model", "fluid")}, test)
-    residuals["constant wrench"] = fit_constant_wrench(simulator, training)
-    rows: dict[str, dict[str, Any]] = {"no air": {}}
-    for name, (model, params) in residuals.items():
+        draw(options.figure, simulator, {name: residuals[name][0] for name in ("published model", "fluid")}, test)
+    residuals["constant wrench"] = [fit_constant_wrench(simulator, training)]
+    rows: dict[str, dict[str, list[Found]]] = {"no air": {}}
+    for name, runs in residuals.items():
         rows[name] = {}
-        evaluator = OpenLoopEvaluator(simulator, next(iter(test.values())), model)
-        for group, motions in test.items():
-            evaluator = evaluator.on(motions)
-            rows[name][group] = end_errors(evaluator, evaluator.replay(params))
+        evaluator = OpenLoopEvaluator(simulator, next(iter(test.values())), runs[0][0])
+        for group, flown in test.items():
+            evaluator = evaluator.on(flown)
+            rows[name][group] = [end_errors(evaluator, evaluator.replay(params)) for _, params in runs]
             if group not in rows["no air"]:
-                rows["no air"][group] = end_errors(evaluator, evaluator.replay(params, scale=0.0))
+                rows["no air"][group] = [end_errors(evaluator, evaluator.replay(runs[0][1], scale=0.0))]
     rows["nearest moments"] = {
-        group: neighbour_errors(training, motions, robot.control_timestep) for group, motions in test.items()
+        group: [neighbour_errors(training, flown, robot.control_timestep)] for group, flown in test.items()
     }
-    _setup.write_tables(tables(rows), options.output, options.results, {})
+    _setup.write_tables(tables(rows), options.output, options.results, {"training": seeds})
 
 
 if __name__ == "__main__":
