@@ -17,6 +17,7 @@ from ballu_mjx.ballu.curves import curve_distances, directed_hausdorff, polynomi
 from ballu_mjx.ballu.leg_fit import Identifier
 from ballu_mjx.ballu.leg_parameters import (
     ALL_PARAMETERS,
+    DYNAMICS_PRIOR,
     LEG_PARAMETERS,
     NOMINAL_DYNAMICS,
     PAPER_PARAMETERS,
@@ -37,7 +38,7 @@ from ballu_mjx.robots.model import assets, set_fields
 pytestmark = pytest.mark.optimized
 
 COMMANDS = np.linspace(0, 1, 20)
-HOLD = 60
+HOLD = 40
 """Number of samples for which each command is held."""
 HIGH, LOW = [1.3, 1.2, 0.05, 0.05, 0.9, 4e-4, -0.1, 0.8, 0.03], [0.8, 0.8, -0.06, -0.03, 0.55, 1e-3, 0.05, 1.3, -0.03]
 """Changes of the nominal parameters: offsets for angles, slack and travel, and factors for the others.
@@ -390,8 +391,10 @@ def test_simpler_model_is_kept_for_a_robot_that_it_describes(physics: CompiledLe
     for fit, truth, leg_coordinates, derivative in zip(
         found.fits, plain, y, derivatives[..., simpler] / np.deg2rad(0.5), strict=True
     ):
-        per_coordinate = jax.jacfwd(SPACE.vector)(jnp.asarray(leg_coordinates[: len(truth)]))[spring, spring]
-        error = float(np.sqrt(np.linalg.inv(derivative.T @ derivative)[spring, spring]) * per_coordinate)
+        moved = np.diag(np.asarray(jax.jacfwd(SPACE.vector)(jnp.asarray(leg_coordinates[: len(truth)]))))
+        priors = np.concatenate([SPACE.units(truth) / moved, DYNAMICS_PRIOR])[simpler]
+        covariance = np.linalg.inv(derivative.T @ derivative + np.diag(priors**-2))
+        error = float(np.sqrt(covariance[spring, spring]) * moved[spring])
         assert abs(fit.vector[spring] - truth[spring]) < 3 * error
         assert error < fit.standard_errors[spring], "the standard error must be that of the richer model"
         assert np.all(np.abs(fit.vector - truth) < 3 * fit.standard_errors + 1e-9)

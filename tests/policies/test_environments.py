@@ -138,7 +138,7 @@ def test_brax_ppo_learns_in_an_improved_simulator(run: Path):
     assert learned.episode_length == 25
     ppo.train(
         learned,
-        # At Brax's usual rates single evaluations fall back to the start, and which ones depends on the machine's rounding.
+        # At greater rates single evaluations fall back to the start; which ones depends on the rounding.
         learning_rate=3e-4,
         num_timesteps=40_000,
         episode_length=learned.episode_length,

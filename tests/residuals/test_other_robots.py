@@ -15,6 +15,7 @@ import pytest
 from rover import write_rover
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.evaluation.open_loop import evaluate
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.motion_windows import cut_motion_windows
 from ballu_mjx.recordings.reference import stack_motions
@@ -24,9 +25,11 @@ from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, start_spread
 from ballu_mjx.residuals.force_gradients import AnalyticConfig
 from ballu_mjx.residuals.force_regression import SupervisedConfig
+from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_input import num_inputs, recorded_inputs
 from ballu_mjx.residuals.network_loads import load_units, num_loads
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription, read_description
@@ -118,6 +121,28 @@ def test_gradients_through_the_simulation_recover_a_known_force(motions: list[Mo
     # A force along the taut tether does not move the balloon, so only the horizontal force can be identified.
     np.testing.assert_allclose(found_push[:2], PUSH[:2], atol=0.05 * float(np.linalg.norm(PUSH)))
     assert metrics["loss"] < 0.1 * found[0][1]["loss"]
+
+
+def position_errors(learned: TrainedResidual, motions: list[Motion]) -> tuple[float, float]:
+    """Return the position errors after 1 s (m) without and with a residual."""
+    found = evaluate(SIMULATOR.with_residual(learned), motions)
+    return tuple(float(np.mean([e.position[1.0][0] for e in side])) for side in (found.vanilla, found.residual))
+
+
+def test_regression_returns_a_residual_that_follows_the_recordings(motions: list[Motion]):
+    config = dataclasses.replace(PRIORS, updates=600, force_scales=(1.0,))
+    learned = fit_supervised(SIMULATOR, motions, config)
+    vanilla, residual = position_errors(learned, motions)
+    assert residual < 0.5 * vanilla
+    assert "Labels, training" in learned.report
+
+
+def test_gradients_return_a_residual_that_follows_the_recordings(motions: list[Motion]):
+    config = AnalyticConfig(
+        window_seconds=0.5, interval_seconds=0.5, relinearizations=2, updates=150, validate_every=150
+    )
+    vanilla, residual = position_errors(fit_analytic(SIMULATOR, motions, config), motions)
+    assert residual < 0.5 * vanilla
 
 
 def test_aerodynamic_fit_recovers_a_known_added_mass():
