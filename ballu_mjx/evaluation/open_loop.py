@@ -332,7 +332,7 @@ class OpenLoopEvaluator:
                 start = self.starts[run][1]
                 states = len(motion.qpos) - start
                 series = self._differences(replay, run, against)
-                forces.append(float(np.linalg.norm(replay.force[run, : states - 1], axis=-1).mean()))
+                forces.append(float(_lengths(replay.force[run, : states - 1]).mean()))
                 broken = np.flatnonzero(~(np.abs(series["position"]) < LARGEST) | ~np.isfinite(series["orientation"]))
                 if len(broken) and (soonest is None or broken[0] < soonest[1]):
                     soonest = start, int(broken[0])
@@ -393,12 +393,12 @@ class OpenLoopEvaluator:
             )
             joints = against.joints[run, :states][:, columns]
         found = {
-            "position": np.linalg.norm(replay.position[run, :states] - position, axis=-1),
+            "position": _lengths(replay.position[run, :states] - position),
             "orientation": orientation_errors(replay.euler_angles[run, :states], euler, self.robot.upright),
-            "com": np.linalg.norm(replay.com[run, :states] - com, axis=-1),
+            "com": _lengths(replay.com[run, :states] - com),
         }
         if points.shape[1]:
-            found["points"] = np.linalg.norm(replay.points[run, :states] - points, axis=-1)
+            found["points"] = _lengths(replay.points[run, :states] - points)
         if hinges:
             columns = [list(self._joints).index(name) for name in hinges]
             turn = replay.joints[run, :states][:, columns] - joints
@@ -411,6 +411,11 @@ _QUANTITIES = ("position", "orientation", "points", "joints")
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
+
+
+def _lengths(vectors: np.ndarray) -> np.ndarray:
+    """Return Euclidean norms along the last axis. In single precision, squares of a diverging state would overflow."""
+    return np.linalg.norm(np.asarray(vectors, np.float64), axis=-1)
 
 
 def _finite(error: float) -> float:

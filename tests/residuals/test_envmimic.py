@@ -306,6 +306,14 @@ def test_diverged_replays_are_counted_and_not_averaged(evaluator: OpenLoopEvalua
     assert "diverged" in result.table() and "nan" not in result.table() + json.dumps(evaluation_to_json(result)).lower()
 
 
+def test_far_away_robots_are_counted_as_diverged_without_a_warning(evaluator: OpenLoopEvaluator):
+    """The square of 1e25 m has no value in single precision."""
+    replay = evaluator.replay(jnp.array(FORCE))
+    for errors in evaluator.errors(replay._replace(position=replay.position + np.float32(1e25))):
+        some, starts = errors.diverged[1.0]
+        assert some == starts > 0
+
+
 def test_evaluation_with_identified_actuators_includes_the_nominal_robot(evaluator: OpenLoopEvaluator):
     """The first recording is from the nominal robot, so it has no error only without the identified actuators."""
     assert evaluator(jnp.array(FORCE)).nominal == ()

@@ -126,7 +126,8 @@ def test_gradients_through_the_simulation_recover_a_known_force(motions: list[Mo
 def position_errors(learned: TrainedResidual, motions: list[Motion]) -> tuple[float, float]:
     """Return the position errors after 1 s (m) without and with a residual."""
     found = evaluate(SIMULATOR.with_residual(learned), motions)
-    return tuple(float(np.mean([e.position[1.0][0] for e in side])) for side in (found.vanilla, found.residual))
+    vanilla, residual = (np.mean([e.position[1.0][0] for e in side]) for side in (found.vanilla, found.residual))
+    return float(vanilla), float(residual)
 
 
 def test_regression_returns_a_residual_that_follows_the_recordings(motions: list[Motion]):

@@ -389,7 +389,7 @@ def main() -> None:
     few = slice(0, 2) if options.quick else slice(None)
     files = {
         use: [find(options.data, number, robot, options.output / "recordings") for number in numbers[few]]
-        for use, numbers in ({"training": TRAINING, "validation": VALIDATION} | TEST).items()
+        for use, numbers in {"training": TRAINING, "validation": VALIDATION, **TEST}.items()
     }
     motions = {use: load(paths, robot) for use, paths in files.items()}
     training, validation = motions["training"], motions["validation"]
