@@ -37,10 +37,9 @@ class Action(NamedTuple):
         return Action(jnp.zeros((1, 6)))
 
     def scaled(self, share: Float[Array, ""] | float) -> Action:
-        """Return the action multiplied by `share`. A share of 0 gives 0, even where the action is not finite."""
-        wrench, joint, change = (None if part is None else jnp.where(share == 0, 0.0, share * part) for part in self)
-        assert wrench is not None
-        return Action(wrench, joint, change)
+        """Return the action multiplied by `share`."""
+        joint, change = (None if part is None else share * part for part in self[1:])
+        return Action(share * self.wrench, joint, change)
 
     def plus(self, other: Action) -> Action:
         """Return the sum of both actions. The wrench with fewer rows is filled up with zeros."""

@@ -146,8 +146,3 @@ def test_layout_names_the_features():
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, model.site(site).id, velocity, 0)
         np.testing.assert_allclose(features[0, place], data.site(site).xpos, atol=1e-5)
         np.testing.assert_allclose(features[0, speed], velocity[3:], atol=1e-4)
-
-
-def test_a_share_of_zero_is_no_action_even_where_the_action_is_not_finite():
-    broken = Action(jnp.full((2, 6), jnp.nan), jnp.array([jnp.inf, 1.0]), None).scaled(0.0)
-    assert not np.any(broken.wrench) and not np.any(broken.joint_force) and broken.command_change is None
