@@ -87,7 +87,7 @@ FLIP = np.array([1.0, -1.0, -1.0])
 """Signs that convert between (north, east, down) and (forward, left, up) axes, in both directions."""
 ENVMIMIC: Mapping[str, Sequence[str]] = {"EnvMimic": (), "EnvMimic, `--mirror`": ("--mirror",)}
 """Options of EnvMimic, by name of the method."""
-SHORT = ("no air", "published model", "fluid", *ENVMIMIC, "nearest moments")
+SHORT = ("no air", "published model", "fluid", "EnvMimic", "nearest moments")
 """Rows of the short table."""
 SHOWN = 20.0
 """Length of the flights in the figure (s)."""
