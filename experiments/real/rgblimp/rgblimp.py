@@ -348,6 +348,9 @@ def draw(
 
 
 # %%
+DESCRIPTION = FOLDER / "rgblimp.robot.json"
+USES = {"training": "--recordings", "validation": "--validation", "near": "--test"}
+"""Options of the command that name flights, by use."""
 EXPLORATION = ("--initial-std", "0.5")
 """With it the validation error is 0.06 after 1.2 million control steps. With the default of 0.2 it is 0.16."""
 QUICK = ("--num-timesteps", "4000", "--num-envs", "16", "--batch-size", "16", "--num-minibatches", "4")
@@ -371,9 +374,6 @@ def learn(files: Mapping[str, Sequence[Path]], run: Path, options: Sequence[str]
 
 
 # %%
-DESCRIPTION = FOLDER / "rgblimp.robot.json"
-USES = {"training": "--recordings", "validation": "--validation", "near": "--test"}
-"""Options of the command that name flights, by use."""
 
 
 def main() -> None:
@@ -409,7 +409,7 @@ def main() -> None:
         residuals[name] = [(found.model, found.params)]
     seeds = options.seeds[:1] if options.quick else options.seeds
     for name, chosen in ENVMIMIC.items():
-        kind = "envmimic" + "".join(chosen).removeprefix("-")
+        kind = "".join(("envmimic", *chosen)).replace("--", "-")
         quick = QUICK if options.quick else ()
         learned = [
             learn(files, options.output / f"{kind}-{seed}", [*chosen, *quick, "--seed", str(seed)]) for seed in seeds
