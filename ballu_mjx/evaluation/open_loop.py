@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -179,14 +180,15 @@ class OpenLoopEvaluator:
         self.first_runs = [recordings.index(index) for index in range(len(self.motions))]
         self._without: tuple[tuple[Errors, ...], tuple[Errors, ...]] | None = None
 
-    def replay(self, params: Any, *, scale: float = 1.0, nominal: bool = False) -> Replay:
-        """Simulate from every start to the end of its recording.
+    def replay(self, params: Any, *, scale: float = 1.0, nominal: bool = False, seconds: float = math.inf) -> Replay:
+        """Simulate from every start to the end of its recording, or for `seconds`, whichever is shorter.
 
         **Arguments**
 
         - `params`: parameters of the residual.
         - `scale`: factor on the residual (0: no residual, 1: full residual).
         - `nominal`: simulate with nominal actuators instead of identified ones.
+        - `seconds`: longest time to simulate (s).
         """
         fixed = self._fixed
         if nominal:
@@ -196,6 +198,8 @@ class OpenLoopEvaluator:
         params = jax.device_get(params)  # they may be on one device, but the batch is spread over all devices
         starts = np.array(self.starts, np.int32)
         steps = np.array([len(self.motions[recording].command) - start for recording, start in self.starts])
+        if seconds < math.inf:
+            steps = np.minimum(steps, round(seconds / self.robot.control_timestep))
         shape, longest = (len(starts),), int(steps.max())
         features = np.zeros((*shape, longest + 1, self._recorded.shape[-1]), np.float32)
         com, force = np.zeros((*shape, longest + 1, 3), np.float32), np.zeros((*shape, longest, 3), np.float32)

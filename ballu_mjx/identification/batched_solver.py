@@ -80,11 +80,13 @@ class BatchedSolver:
         steps: int,
         report: Callable[[int, int, float], None],
         patience: int | None = None,
+        small_gain: float = 0.0,
     ) -> tuple[Float[np.ndarray, "batch size"], Float[np.ndarray, " batch"]]:
         """Return coordinates and losses at the end of each search.
 
         Losses are sums of squares, or the minimized function itself. The searches end after `steps` iterations, when
-        all have converged, or after `patience` idle iterations in a row (None: no limit).
+        all have converged, after `patience` idle iterations in a row (None: no limit), or after an iteration that
+        decreases losses, but none by more than the fraction `small_gain`.
 
         **Arguments**
 
@@ -98,9 +100,10 @@ class BatchedSolver:
         for iteration in range(steps):
             y, state, loss, done = self._step(y, evaluated, state)
             report(iteration + 1, steps, float(jnp.min(loss)))
-            idle = idle + 1 if bool(np.all(loss >= (1 - self._least_gain) * lowest)) else 0
+            gain = float(np.max(1 - np.asarray(loss) / lowest))
+            idle = idle + 1 if gain <= self._least_gain else 0
             lowest = np.minimum(lowest, loss)
-            if bool(jnp.all(done)) or idle == patience:
+            if bool(jnp.all(done)) or idle == patience or 0 < gain < small_gain:
                 break
             evaluated = tuple(map(jnp.asarray, evaluate(np.asarray(state.y_eval))))
         return np.asarray(y), np.asarray(loss)

@@ -4,6 +4,8 @@ In the body frame, the wrench is a linear combination of terms. Terms are produc
 velocity w, the speed |v| and the direction of gravity. These terms include lift, drag, side force and moments as
 functions of angle of attack and sideslip: |v|^2 alpha is v_x v_z for small angles. Rotary damping is linear in w. The
 effect of a wrong weight or centre of mass is linear in the direction of gravity.
+
+Fluid that the body drags along adds mass and moments of inertia to the body. Its weight is balanced by its buoyancy.
 """
 
 from __future__ import annotations
@@ -13,8 +15,9 @@ import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -26,9 +29,11 @@ from ballu_mjx.residuals.body_motion import body_motion, smooth_speed
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import network_input
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.sim.residual import Action, Commands, History, Residual
+from ballu_mjx.sim.residual import Action, Commands, Fields, History, Residual
 
-FLUID_FORMAT = "ballu-fluid/1"
+FLUID_FORMAT = "ballu-fluid/2"
+_OLD_FORMAT = "ballu-fluid/1"
+"""Format without added mass."""
 FLUID_FILE = "fluid.json"
 
 TermSet = Literal["linear", "drag", "quadratic", "cubic"]
@@ -95,15 +100,47 @@ def symmetric_mask(terms: Sequence[Term]) -> Bool[np.ndarray, "terms 6"]:
     return np.array([term.odd for term in terms])[:, None] == _ODD_AXES
 
 
-class FluidResidual(Residual):
-    """Fluid residual (`sim.residual.Residual`). Its parameters are coefficients, (terms, 6), in SI units."""
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class FluidParameters:
+    """Parameters of the fluid residual, or their standard errors. Leading axes, if any, are batch axes."""
 
-    def __init__(self, robot: RobotDescription, model: mujoco.MjModel, term_set: TermSet) -> None:
-        """Prepare the residual for `robot`, whose C model is `model`."""
-        self.robot, self.term_set, self.terms = robot, term_set, terms_of(term_set)
+    coefficients: Float[Array | np.ndarray, "*batch terms 6"]
+    """Coefficients (SI units) of each term, for the components of the wrench (`AXES`)."""
+    added_mass: Float[Array | np.ndarray, "*batch"]
+    """Mass of the fluid that the body drags along (kg)."""
+    added_inertia: Float[Array | np.ndarray, "*batch 3"]
+    """Moments of inertia of this fluid (kg m^2), about the principal axes of the tracked body."""
+
+    @staticmethod
+    def without_added_mass(coefficients: Float[Array | np.ndarray, "terms 6"]) -> FluidParameters:
+        """Return parameters with these coefficients and no added mass."""
+        return FluidParameters(coefficients, np.zeros(()), np.zeros(3))
+
+
+class FluidResidual(Residual):
+    """Fluid residual (`sim.residual.Residual`). Its parameters are `FluidParameters`."""
+
+    def __init__(
+        self, robot: RobotDescription, model: mujoco.MjModel, term_set: TermSet, *, added_mass: bool = False
+    ) -> None:
+        """Prepare the residual.
+
+        **Arguments**
+
+        - `robot`: robot.
+        - `model`: the robot's C model without the residual.
+        - `term_set`: set of terms.
+        - `added_mass`: whether the residual changes the tracked body's mass and inertia. If not, the residual ignores
+          these parameters.
+        """
+        self.robot, self.term_set, self.terms, self.added_mass = robot, term_set, terms_of(term_set), added_mass
         gravity = np.asarray(model.opt.gravity)
         size = float(np.linalg.norm(gravity))
         self._down = jnp.asarray(gravity / size if size > 0 else gravity)
+        self._body = int(model.site_bodyid[model.site(robot.tracked).id])
+        self._mass, self._inertia = jnp.asarray(model.body_mass), jnp.asarray(model.body_inertia)
+        self._gravcomp = jnp.asarray(model.body_gravcomp)
         every = [*_MOTION, *_GRAVITY]
         most = max(len(term.factors) for term in self.terms)
         # Terms with fewer factors are filled up with the index after the last component, whose value is 1.
@@ -128,72 +165,138 @@ class FluidResidual(Residual):
         components = jnp.concatenate([velocity, rate, frame.T @ self._down, jnp.ones(1)])
         return frame, jnp.prod(components[self._factors], axis=1) * speed**self._power
 
-    def act(
-        self, params: Float[Array, "terms 6"], history: History, commands: Commands, key: Array | None = None
-    ) -> Action:
+    def fields(self, params: FluidParameters) -> Fields:
+        """Return model fields with the tracked body's mass, inertia and buoyancy. Without `added_mass`, return none."""
+        if not self.added_mass:
+            return {}
+        body = self._body
+        mass = self._mass.at[body].add(params.added_mass)
+        balanced = (self._gravcomp[body] * self._mass[body] + params.added_mass) / mass[body]
+        return {
+            "body_mass": mass,
+            "body_inertia": self._inertia.at[body].add(params.added_inertia),
+            "body_gravcomp": self._gravcomp.at[body].set(balanced),
+        }
+
+    def act(self, params: FluidParameters, history: History, commands: Commands, key: Array | None = None) -> Action:
         """Return the wrench for the motion in the middle of the coming control step."""
         del commands, key
         frame, values = self.values(history)
-        wrench = values @ params
+        wrench = values @ params.coefficients
         return Action(jnp.concatenate([frame @ wrench[:3], frame @ wrench[3:]])[None])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class FluidCoefficients:
-    """Coefficients of a fluid residual, with their standard errors."""
+class FluidEstimate:
+    """Identified parameters of a fluid residual, with their standard errors."""
 
     term_set: TermSet
-    values: Float[np.ndarray, "terms 6"]
-    """Coefficients (SI units) of each term, for the components of the wrench (`AXES`)."""
-    standard_errors: Float[np.ndarray, "terms 6"]
-    """Standard errors of the coefficients. 0 for coefficients that are fixed at 0."""
+    values: FluidParameters
+    standard_errors: FluidParameters
+    """Standard errors. 0 for parameters that are fixed at 0."""
+
+    @property
+    def added_mass(self) -> bool:
+        """Whether the added mass was identified."""
+        return bool(self.standard_errors.added_mass > 0)
+
+    def residual(self, robot: RobotDescription, model: mujoco.MjModel) -> FluidResidual:
+        """Return the residual of these parameters, for the C model of `robot` without the residual."""
+        return FluidResidual(robot, model, self.term_set, added_mass=self.added_mass)
+
+    @property
+    def params(self) -> FluidParameters:
+        """The parameters of the residual, in single precision."""
+        return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), self.values)
 
     def to_json(self) -> str:
-        """Return the content of `FLUID_FILE`: coefficients by component of the wrench and by term."""
+        """Return the content of `FLUID_FILE`: coefficients by component of the wrench and by term, and added mass."""
         rows = {
             axis: {
-                term.name: {"value": float(value), "standard_error": float(error)}
+                term.name: _entry(value, error)
                 for term, value, error in zip(terms_of(self.term_set), values, errors, strict=True)
                 if value != 0 or error != 0
             }
-            for axis, values, errors in zip(AXES, self.values.T, self.standard_errors.T, strict=True)
+            for axis, values, errors in zip(
+                AXES, self.values.coefficients.T, self.standard_errors.coefficients.T, strict=True
+            )
         }
-        return json.dumps({"format": FLUID_FORMAT, "terms": self.term_set, "coefficients": rows}, indent=2) + "\n"
+        content: dict[str, Any] = {"format": FLUID_FORMAT, "terms": self.term_set, "coefficients": rows}
+        if self.added_mass:
+            pairs = zip(self._added(self.values), self._added(self.standard_errors), strict=True)
+            content["added"] = {name: _entry(*pair) for name, pair in zip(_ADDED, pairs, strict=True)}
+        return json.dumps(content, indent=2) + "\n"
 
     def table(self) -> str:
-        """Return a table of the coefficients that differ from 0 by two standard errors or more, as text."""
+        """Return a table of the parameters that differ from 0 by two standard errors or more, as text."""
         lines = [f"{'':10}{'term':12}{'value':>12}{'std. error':>12}"]
-        for axis, values, errors in zip(AXES, self.values.T, self.standard_errors.T, strict=True):
-            for term, value, error in zip(terms_of(self.term_set), values, errors, strict=True):
-                if abs(value) >= 2 * error > 0:
-                    lines.append(f"{axis:10}{term.name:12}{value:>12.5f}{error:>12.5f}")
+        rows = [
+            (axis, term.name, value, error)
+            for axis, values, errors in zip(
+                AXES, self.values.coefficients.T, self.standard_errors.coefficients.T, strict=True
+            )
+            for term, value, error in zip(terms_of(self.term_set), values, errors, strict=True)
+        ]
+        rows += [
+            ("added", name, *pair)
+            for name, *pair in zip(_ADDED, self._added(self.values), self._added(self.standard_errors), strict=True)
+        ]
+        lines += [
+            f"{axis:10}{name:12}{value:>12.5f}{error:>12.5f}"
+            for axis, name, value, error in rows
+            if abs(value) >= 2 * error > 0
+        ]
         lines.append(
-            f"Terms: {self.term_set}; SI units, body frame. Coefficients within two standard errors of 0 are left out."
+            f"Terms: {self.term_set}; SI units, body frame. Parameters within two standard errors of 0 are left out."
         )
         return "\n".join(lines)
 
+    @staticmethod
+    def _added(parameters: FluidParameters) -> tuple[float, ...]:
+        return (float(parameters.added_mass), *map(float, parameters.added_inertia))
 
-def read_fluid(path: Path) -> FluidCoefficients:
-    """Read coefficients from a file of the format `ballu-fluid/1`, which `train fluid` writes.
+
+_ADDED = ("mass", "inertia_x", "inertia_y", "inertia_z")
+"""Names of the added mass and inertias in files and tables."""
+
+
+def _entry(value: float, error: float) -> dict[str, float]:
+    return {"value": float(value), "standard_error": float(error)}
+
+
+def read_fluid(path: Path) -> FluidEstimate:
+    """Read parameters from a file of the format `ballu-fluid/2`, which `train fluid` writes, or `ballu-fluid/1`.
 
     **Raises** `InputError` if the file is damaged. The message names file, key and fix.
     """
     fix = "restore it or identify again"
     content = files.read_json(path, fix)
-    if content.get("format") != FLUID_FORMAT or content.get("terms") not in TERM_SETS:
+    if content.get("format") not in (FLUID_FORMAT, _OLD_FORMAT) or content.get("terms") not in TERM_SETS:
         raise InputError(f'{path}: is not of the format "{FLUID_FORMAT}"; give one that this program wrote.')
-    terms = terms_of(content["terms"])
-    names = [term.name for term in terms]
+    terms = [term.name for term in terms_of(content["terms"])]
     found = np.zeros((2, len(terms), len(AXES)))
     rows = content.get("coefficients")
     if not isinstance(rows, dict) or not set(rows) <= set(AXES):
         raise InputError(f'{path}: "coefficients" must have the keys {", ".join(AXES)}; {fix}.')
     for axis, row in rows.items():
-        for name, entry in row.items() if isinstance(row, dict) else [("", None)]:
-            numbers = [entry.get(key) for key in ("value", "standard_error")] if isinstance(entry, dict) else [None]
-            if name not in names or not all(map(is_number, numbers)):
-                raise InputError(
-                    f'{path}: {axis} has the entry {name!r}, which is no term with "value" and "standard_error"; {fix}.'
-                )
-            found[:, names.index(name), AXES.index(axis)] = numbers
-    return FluidCoefficients(content["terms"], *found)
+        _read_entries(path, axis, row, terms, found[..., AXES.index(axis)], fix)
+    added = np.zeros((2, len(_ADDED)))
+    if "added" in content:
+        _read_entries(path, "added", content["added"], _ADDED, added, fix)
+        if np.any(added < 0):
+            raise InputError(f'{path}: "added" has a number below 0; {fix}.')
+    values, errors = (FluidParameters(table, row[0], row[1:]) for table, row in zip(found, added, strict=True))
+    return FluidEstimate(content["terms"], values, errors)
+
+
+def _read_entries(
+    path: Path, key: str, row: Any, names: Sequence[str], found: Float[np.ndarray, "2 names"], fix: str
+) -> None:
+    """Fill `found` with the values and standard errors of a JSON object whose keys are among `names`."""
+    for name, entry in row.items() if isinstance(row, dict) else [("", None)]:
+        numbers = [entry.get(part) for part in ("value", "standard_error")] if isinstance(entry, dict) else [None]
+        if name not in names or not all(map(is_number, numbers)):
+            raise InputError(
+                f'{path}: {key} has the entry {name!r}, which is no term with "value" and "standard_error"; {fix}.'
+            )
+        found[:, names.index(name)] = numbers

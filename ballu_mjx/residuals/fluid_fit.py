@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Any, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +22,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.identification.batched_solver import BatchedSolver
+from ballu_mjx.identification.batched_solver import BatchedSolver, Evaluate
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.motion_windows import (
     MotionWindows,
@@ -29,11 +31,12 @@ from ballu_mjx.recordings.motion_windows import (
     simulate_motion_window,
 )
 from ballu_mjx.recordings.window_errors import OUTLIER_THRESHOLD, fill_diverged, pseudo_huber
-from ballu_mjx.residuals.fluid import TERM_SETS, FluidCoefficients, FluidResidual, TermSet, terms_of
+from ballu_mjx.residuals.fluid import TERM_SETS, FluidEstimate, FluidParameters, FluidResidual, TermSet, terms_of
 from ballu_mjx.residuals.fluid_parametrization import (
     PASSIVE_SETS,
+    AddedMass,
+    FluidParametrization,
     FreeCoefficients,
-    Parametrization,
     PassiveCoefficients,
 )
 from ballu_mjx.sim.observation import HISTORY
@@ -54,14 +57,19 @@ class FluidConfig:
     """Allow only forces that add no energy to the body, as those of still air or water. Corrections of weight and
     centre of mass are exempt. Simulations then stay bounded, even far from the recordings. Passive forces have no cubic
     terms."""
+    added_mass: bool = True
+    """Fit the mass and the moments of inertia of the fluid that the body drags along. The model needs buoyancy: a body
+    with `gravcomp`. Without it, there is no added mass."""
     mirror: bool = True
     """Fit forces that are symmetric about the body's xz plane, if the robot's description declares `mirror`."""
     window_seconds: tuple[float, ...] = (0.5, 1.0, 2.0)
-    """Lengths of the windows, s, one for each stage."""
+    """Lengths of the windows, s, one for each stage. A last stage as long as the horizon that matters predicts it best.
+    The recordings must be longer than the longest window."""
     windows: int = 200
     """Largest number of windows, for training and for validation each."""
-    steps: int = 12
-    """Largest number of Levenberg-Marquardt iterations in a stage."""
+    steps: int = 20
+    """Largest number of Levenberg-Marquardt iterations in a stage. Iterations that only shorten the next step count,
+    but take little time."""
     spread: float = 1.0
     """Standard deviation of the prior on the typical effect of each term, as an acceleration (m/s^2, rad/s^2)."""
 
@@ -89,7 +97,7 @@ def check_fluid_config(config: FluidConfig, control_timestep: float) -> None:
 class FluidFit:
     """Result of a fit of the fluid residual."""
 
-    coefficients: FluidCoefficients
+    estimate: FluidEstimate
     scores: dict[str, float]
     """Robust RMS error on the validation windows, in units of the expected error, by set of terms. The key `none` is
     the error without residual."""
@@ -112,7 +120,7 @@ def fit_fluid_forces(
     config: FluidConfig,
     report: Report = lambda stage, iteration, steps, loss: None,
 ) -> FluidFit:
-    """Fit the coefficients of the fluid residual.
+    """Fit the parameters of the fluid residual.
 
     **Arguments**
 
@@ -125,15 +133,17 @@ def fit_fluid_forces(
     **Raises** `InputError` for options out of range, and if no motion is as long as a window.
     """
     check_fluid_config(config, simulator.control_timestep)
-    windows = _Windows(simulator, training, config)
-    held_out = _Windows(simulator, validation, config, program=windows.program)
+    centre, added = _centre(simulator), None
+    if config.added_mass and simulator.mj_model.ngravcomp:
+        added = AddedMass(*_whole_body(simulator))
+    program = _Program(simulator, added_mass=added is not None)
+    windows, held_out = (_Windows(simulator, motions, config, program) for motions in (training, validation))
     symmetric = config.mirror and simulator.robot.mirror is not None
     sets = PASSIVE_SETS if config.passive else TERM_SETS
     chain = sets if config.terms == "auto" else sets[: sets.index(config.terms) + 1]
     prior = _priors(windows, config.spread)
-    centre = _centre(simulator)
-    scores = {"none": held_out.score(np.zeros_like(prior))}
-    best: tuple[float, FluidCoefficients] | None = None
+    scores = {"none": held_out.score(FluidParameters.without_added_mass(np.zeros_like(prior)))}
+    best: tuple[float, FluidEstimate] | None = None
     vector = np.zeros(0)
     for name in chain:
         coefficients = (
@@ -141,19 +151,22 @@ def fit_fluid_forces(
             if config.passive
             else FreeCoefficients(name, prior, symmetric=symmetric)
         )
-        search = _Search(windows, coefficients)
+        parametrization = FluidParametrization(coefficients, added)
+        search = _Search(windows, parametrization)
         # The search starts from the result for the previous set, whose entries come first.
-        start = np.concatenate([vector, coefficients.start[len(vector) :]])
+        start = np.concatenate([vector, parametrization.start[len(vector) :]])
         vector = search.run(start, config, lambda *progress, name=name: report(f"{name}, {progress[0]}", *progress[1:]))
-        table = coefficients.table(vector)
-        scores[name] = held_out.score(table)
+        parameters = parametrization.parameters(vector)
+        scores[name] = held_out.score(parameters)
         if config.terms in ("auto", name) and (best is None or scores[name] < best[0]):
             shown = slice(len(terms_of(name)))
-            errors = search.standard_errors(vector)
-            best = scores[name], FluidCoefficients(name, table[shown], errors[shown])
+            kept = [
+                dataclasses.replace(each, coefficients=each.coefficients[shown])
+                for each in (parameters, search.standard_errors(vector))
+            ]
+            best = scores[name], FluidEstimate(name, *kept)
     assert best is not None
-    steps = windows.program.control_steps
-    return FluidFit(best[1], scores, symmetric, windows.count, steps)
+    return FluidFit(best[1], scores, symmetric, windows.count, program.control_steps)
 
 
 def _thin(windows: MotionWindows, most: int) -> MotionWindows:
@@ -162,27 +175,33 @@ def _thin(windows: MotionWindows, most: int) -> MotionWindows:
     if count <= most:
         return windows
     chosen = np.linspace(0, count - 1, most).astype(int)
-    return jax.tree.map(lambda x: np.asarray(x)[chosen], windows)
+    return _take(windows, chosen)
+
+
+def _take(tree: Any, rows: Int[np.ndarray, " rows"]) -> Any:
+    """Return the rows of all arrays of `tree`."""
+    return jax.tree.map(lambda x: np.asarray(x)[rows], tree)
 
 
 class _Program:
     """Compiled simulation of windows with all terms. All sets of terms share it; it compiles once for each length."""
 
-    def __init__(self, simulator: Simulator) -> None:
+    def __init__(self, simulator: Simulator, *, added_mass: bool) -> None:
         self._simulator = simulator
-        self.forces = FluidResidual(simulator.robot, simulator.mj_model, TERM_SETS[-1])
+        model = simulator.mj_model
+        self.forces = FluidResidual(simulator.robot, model, TERM_SETS[-1], added_mass=added_mass)
         self.errors = shard_over_devices(self._errors, shared=1)
         self.derivatives = shard_over_devices(self._derivative, shared=1)
         self.control_steps = 0
         """Number of control steps simulated so far."""
 
     def _derivative(
-        self, params: Float[Array, "terms 6"], direction: Float[Array, "terms 6"], window: MotionWindows
+        self, params: FluidParameters, direction: FluidParameters, window: MotionWindows
     ) -> Float[Array, " entries"]:
         """Return the directional derivative of one window's errors."""
         return jax.jvp(lambda own: self._errors(own, window), (params,), (direction,))[1]
 
-    def _errors(self, params: Float[Array, "terms 6"], window: MotionWindows) -> Float[Array, " entries"]:
+    def _errors(self, params: FluidParameters, window: MotionWindows) -> Float[Array, " entries"]:
         """Return the errors of one window, in units of the expected error."""
         simulator = self._simulator.with_residual(BoundResidual(self.forces, params))
         return simulate_motion_window(simulator, window).ravel()
@@ -196,31 +215,32 @@ class _Windows:
         simulator: Simulator,
         motions: Sequence[Motion],
         config: FluidConfig,
-        program: _Program | None = None,
+        program: _Program,
     ) -> None:
         seconds = max(config.window_seconds)
         self.simulator = simulator
         self.recorded = _thin(cut_motion_windows(simulator, motions, seconds, seconds), config.windows)
-        self.program = _Program(simulator) if program is None else program
+        self.program = program
         self.count, self.steps = np.shape(self.recorded.features)[:2]
 
-    def errors(self, params: Float[np.ndarray, "terms 6"]) -> Float[np.ndarray, "windows entries"]:
+    def errors(self, params: FluidParameters) -> Float[np.ndarray, "windows entries"]:
         """Return the errors of all windows, in units of the expected error. Diverged windows have constant errors."""
         self.program.control_steps += self.count * self.steps
-        found = [self.program.errors(np.float32(params), self._chosen(rows)) for rows, _ in chunks(self.count, _BATCH)]
+        params = _single(params)
+        found = [self.program.errors(params, _take(self.recorded, rows)) for rows, _ in chunks(self.count, _BATCH)]
         return fill_diverged(np.concatenate(found).astype(np.float64)[: self.count])
 
     def derivatives(
-        self, params: Float[np.ndarray, "terms 6"], directions: Float[np.ndarray, "size terms 6"]
+        self, params: FluidParameters, directions: FluidParameters
     ) -> Float[np.ndarray, "windows entries size"]:
         """Return the derivatives of the errors along `directions`. They are 0 for diverged windows."""
-        size = len(directions)
+        params, directions, size = _single(params), _single(directions), len(directions.added_mass)
         self.program.control_steps += self.count * self.steps * size
         found = []
         for rows, _ in chunks(self.count * size, _BATCH):
             window, direction = np.divmod(rows, size)
-            own = np.float32(directions[direction])
-            found.append(self.program.derivatives(np.float32(params), own, self._chosen(window)))
+            own = _take(directions, direction)
+            found.append(self.program.derivatives(params, own, _take(self.recorded, window)))
         derivatives = np.concatenate(found).astype(np.float64)[: self.count * size].reshape(self.count, size, -1)
         derivatives[~np.isfinite(derivatives).all(axis=(1, 2))] = 0.0
         return np.swapaxes(derivatives, 1, 2)
@@ -234,67 +254,80 @@ class _Windows:
         other.steps = steps
         return other
 
-    def score(self, params: Float[np.ndarray, "terms 6"]) -> float:
+    def score(self, params: FluidParameters) -> float:
         """Return the robust RMS error of the windows, in units of the expected error."""
         return float(np.sqrt(np.mean(pseudo_huber(np.sum(self.errors(params) ** 2, axis=1))) / 6))
 
-    def _chosen(self, rows: Int[np.ndarray, " rows"]) -> MotionWindows:
-        return jax.tree.map(lambda x: np.asarray(x)[rows], self.recorded)
+
+def _single(parameters: FluidParameters) -> FluidParameters:
+    return jax.tree.map(np.float32, parameters)
 
 
 class _Search:
     """Fit of one set of terms."""
 
-    def __init__(self, windows: _Windows, coefficients: Parametrization) -> None:
-        self._windows, self._coefficients = windows, coefficients
+    def __init__(self, windows: _Windows, parametrization: FluidParametrization) -> None:
+        self._windows, self._parametrization = windows, parametrization
 
     def run(self, start: Float[np.ndarray, " size"], config: FluidConfig, report: Report) -> Float[np.ndarray, " size"]:
         """Fit stage by stage, and return the resulting vector."""
         vector = start
-        solver = BatchedSolver(optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3))
+        # The default cutoff of 0.99 hardly ever lets steps grow again.
+        solver = eqx.tree_at(lambda own: own.search.high_cutoff, optx.LevenbergMarquardt(rtol=1e-3, atol=1e-3), 0.75)
+        batched = BatchedSolver(solver)
         for seconds in config.window_seconds:
-            windows = self._windows.shortened(seconds)
-
-            def evaluate(points: np.ndarray, windows: _Windows = windows) -> tuple[np.ndarray, np.ndarray]:
-                values, jacobian = self._rows(points[0], windows)
-                return values[None], jacobian[None]
-
-            found, _ = solver(
-                evaluate,
+            found, _ = batched(
+                self._evaluation(self._windows.shortened(seconds)),
                 vector[None],
                 config.steps,
                 lambda *progress, seconds=seconds: report(f"windows of {seconds:g} s", *progress),
                 patience=_PATIENCE,
+                small_gain=_SMALL_GAIN,
             )
             vector = found[0]
         return vector
 
-    def standard_errors(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, "terms 6"]:
-        """Return the standard errors of the coefficients.
+    def standard_errors(self, vector: Float[np.ndarray, " size"]) -> FluidParameters:
+        """Return the standard errors of the parameters.
 
         They are sandwich estimates: they assume that windows have independent errors, but no certain distribution.
         """
-        directions = self._coefficients.directions(vector)
-        params = self._coefficients.table(vector)
+        directions = self._parametrization.directions(vector)
+        params = self._parametrization.parameters(vector)
         errors, jacobian = self._windows.errors(params), self._windows.derivatives(params, directions)
         weight = 1 / np.sqrt(1 + np.sum(errors**2, axis=1) / OUTLIER_THRESHOLD**2)
         scores = np.einsum("we,wes->ws", errors, jacobian) * weight[:, None]
         prior = np.eye(len(vector))
         bread = np.linalg.inv(np.einsum("w,wes,wet->st", weight, jacobian, jacobian, optimize=True) + prior)
         covariance = bread @ (scores.T @ scores + prior) @ bread
-        return np.sqrt(np.einsum("sta,su,uta->ta", directions, covariance, directions, optimize=True))
+        return jax.tree.map(
+            lambda own: np.sqrt(np.einsum("s...,su,u...->...", own, covariance, own, optimize=True)), directions
+        )
 
-    def _rows(
-        self, vector: Float[np.ndarray, " size"], windows: _Windows
-    ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows size"]]:
-        """Return the rows of the least-squares problem (weighted errors, then the prior), and their Jacobian."""
-        params = self._coefficients.table(vector)
-        errors = windows.errors(params)
-        jacobian = windows.derivatives(params, self._coefficients.directions(vector))
-        # Iteratively reweighted least squares: the derivatives take the weight of a window as constant.
-        weight = (1 + np.sum(errors**2, axis=1)[:, None] / OUTLIER_THRESHOLD**2) ** -0.25
-        values = np.concatenate([(weight * errors).ravel(), vector])
-        return values, np.concatenate([(weight[..., None] * jacobian).reshape(-1, len(vector)), np.eye(len(vector))])
+    def _evaluation(self, windows: _Windows) -> Evaluate:
+        """Return the function that the solver calls, which computes rows of the least-squares problem and Jacobians.
+
+        The rows are weighted errors, then the prior. The Jacobian takes most of the time. It is 0 at points that do not
+        decrease the loss: the solver rejects them without using it.
+        """
+        lowest = math.inf
+
+        def evaluate(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            nonlocal lowest
+            (vector,) = points
+            params = self._parametrization.parameters(vector)
+            errors = windows.errors(params)
+            # Iteratively reweighted least squares: the derivatives take the weight of a window as constant.
+            weight = (1 + np.sum(errors**2, axis=1)[:, None] / OUTLIER_THRESHOLD**2) ** -0.25
+            values = np.concatenate([(weight * errors).ravel(), vector])
+            loss, size = float(np.sum(values**2)), len(vector)
+            if loss >= lowest:
+                return values[None], np.zeros((1, len(values), size))
+            lowest = loss
+            jacobian = weight[..., None] * windows.derivatives(params, self._parametrization.directions(vector))
+            return values[None], np.concatenate([jacobian.reshape(-1, size), np.eye(size)])[None]
+
+        return evaluate
 
 
 def _priors(windows: _Windows, spread: float) -> Float[np.ndarray, "terms 6"]:
@@ -307,12 +340,14 @@ def _priors(windows: _Windows, spread: float) -> Float[np.ndarray, "terms 6"]:
     _, terms = jax.jit(jax.vmap(windows.program.forces.values))(history)
     typical = np.sqrt(np.mean(np.asarray(terms, np.float64) ** 2, axis=0))
     mass, inertia = _whole_body(windows.simulator)
-    force = np.array([mass] * 3 + [inertia] * 3) * spread
+    force = np.array([mass] * 3 + [inertia.mean()] * 3) * spread
     return force / np.maximum(typical, _SMALLEST_TERM * typical.max())[:, None]
 
 
-_PATIENCE = 5
+_PATIENCE = 8
 """Iterations without gain after which a stage ends. An iteration that only shortens the next step has no gain."""
+_SMALL_GAIN = 5e-3
+"""Relative decrease of the loss below which a stage ends, if it is not 0."""
 _BATCH = 1024
 """Number of windows that are simulated in parallel."""
 _SMALLEST_TERM = 1e-3
@@ -327,8 +362,8 @@ def _centre(simulator: Simulator) -> Float[np.ndarray, " 3"]:
     return model.body_ipos[model.site_bodyid[site.id]] - site.pos
 
 
-def _whole_body(simulator: Simulator) -> tuple[float, float]:
-    """Return the robot's mass (kg), and the tracked body's mean principal moment of inertia (kg m^2)."""
+def _whole_body(simulator: Simulator) -> tuple[float, Float[np.ndarray, " 3"]]:
+    """Return the robot's mass (kg), and the tracked body's principal moments of inertia (kg m^2)."""
     model = simulator.mj_model
     body = int(model.site_bodyid[model.site(simulator.robot.tracked).id])
-    return float(model.body_subtreemass[model.body_rootid[body]]), float(np.mean(model.body_inertia[body]))
+    return float(model.body_subtreemass[model.body_rootid[body]]), model.body_inertia[body].copy()

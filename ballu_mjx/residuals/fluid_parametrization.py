@@ -13,6 +13,8 @@ wrench about that site,
 
 Simulations with passive coefficients stay bounded, even far from the recordings. Residuals apply the wrench at the
 centre of mass, so the coefficients are transformed to that point.
+
+Added masses and inertias are exponentials, so that they are never negative.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ballu_mjx.residuals.fluid import TERM_SETS, TermSet, symmetric_mask, terms_of
+from ballu_mjx.residuals.fluid import TERM_SETS, FluidParameters, TermSet, symmetric_mask, terms_of
 
 PASSIVE_SETS: tuple[TermSet, ...] = ("linear", "drag", "quadratic")
 """Sets of terms for which passive coefficients exist."""
@@ -50,6 +52,50 @@ class Parametrization(Protocol):
     def directions(self, vector: Float[np.ndarray, " size"]) -> Float[np.ndarray, "size terms 6"]:
         """Return the derivatives of the coefficients with respect to the entries of the vector."""
         ...
+
+
+class AddedMass(NamedTuple):
+    """Mass and inertia of the body without fluid, to which the priors of added mass and inertia are relative."""
+
+    mass: float
+    """Mass of the whole robot (kg)."""
+    inertia: Float[np.ndarray, " 3"]
+    """Principal moments of inertia of the tracked body (kg m^2)."""
+
+
+class FluidParametrization:
+    """Parametrization of all parameters by a vector: logarithms of added mass and inertia, then coefficients."""
+
+    def __init__(self, coefficients: Parametrization, added: AddedMass | None) -> None:
+        """Combine the coefficients with an added mass. If `added` is None, there is no added mass."""
+        self._coefficients, self._added = coefficients, added
+        self._logarithms = 0 if added is None else 4
+        self.start = np.concatenate([np.zeros(self._logarithms), coefficients.start])
+
+    def parameters(self, vector: Float[np.ndarray, " size"]) -> FluidParameters:
+        """Return the parameters, with the coefficients of all terms of the largest set."""
+        table = self._coefficients.table(vector[self._logarithms :])
+        if self._added is None:
+            return FluidParameters.without_added_mass(table)
+        share = _ADDED_SHARE * np.exp(_ADDED_SPREAD * vector[: self._logarithms])
+        return FluidParameters(table, np.asarray(self._added.mass * share[0]), self._added.inertia * share[1:])
+
+    def directions(self, vector: Float[np.ndarray, " size"]) -> FluidParameters:
+        """Return the derivatives of the parameters with respect to the entries of the vector, the leading axis."""
+        table = self._coefficients.directions(vector[self._logarithms :])
+        coefficients = np.concatenate([np.zeros((self._logarithms, *table.shape[1:])), table])
+        mass, inertia = np.zeros(len(vector)), np.zeros((len(vector), 3))
+        if self._added is not None:
+            now = self.parameters(vector)
+            mass[0] = _ADDED_SPREAD * now.added_mass
+            inertia[1:4] = np.diag(_ADDED_SPREAD * now.added_inertia)
+        return FluidParameters(coefficients, mass, inertia)
+
+
+_ADDED_SHARE, _ADDED_SPREAD = 0.1, 2.0
+"""Median of the log-normal prior of the added mass, as a fraction of the robot's mass, and standard deviation of its
+logarithm. The added inertia has the same prior, relative to the tracked body's inertia. Within one standard deviation
+are fractions from 0.014 to 0.74."""
 
 
 class FreeCoefficients:

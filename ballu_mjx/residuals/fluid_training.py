@@ -5,10 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-import jax.numpy as jnp
-
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.residuals.fluid import FLUID_FILE, FluidResidual
+from ballu_mjx.residuals.fluid import FLUID_FILE
 from ballu_mjx.residuals.fluid_fit import FluidConfig, FluidFit, fit_fluid_forces
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.residuals.white_box_training import FitReport, fitted_residual
@@ -26,9 +24,9 @@ def fit_fluid(
     run: TrainingRecord | None = None,
     progress: PhaseProgress | None = None,
 ) -> TrainedResidual:
-    """Fit the coefficients of the fluid residual.
+    """Fit the parameters of the fluid residual.
 
-    The report of the result has the coefficients with their standard errors.
+    The report of the result has the parameters with their standard errors.
 
     **Arguments**
 
@@ -46,17 +44,16 @@ def fit_fluid(
     report = FitReport(record, progress, "loss")
     found = fit_fluid_forces(simulator, motions, validation, config, report)
     report.close(found.control_steps)
-    record.write(FLUID_FILE, found.coefficients.to_json())
-    model = FluidResidual(simulator.robot, simulator.mj_model, found.coefficients.term_set)
-    params = jnp.asarray(found.coefficients.values, jnp.float32)
-    return fitted_residual(simulator, motions, model, params, record, fluid_table(found))
+    record.write(FLUID_FILE, found.estimate.to_json())
+    model = found.estimate.residual(simulator.robot, simulator.mj_model)
+    return fitted_residual(simulator, motions, model, found.estimate.params, record, fluid_table(found))
 
 
 def fluid_table(found: FluidFit) -> str:
-    """Return the coefficients and the validation error of each set of terms, as text."""
+    """Return the parameters and the validation error of each set of terms, as text."""
     scores = ", ".join(f"{name} {score:.3g}" for name, score in found.scores.items())
     symmetric = "symmetric about the xz plane" if found.symmetric else "without symmetry"
     return (
-        f"{found.coefficients.table()}\n{found.windows} training windows; {symmetric}. "
+        f"{found.estimate.table()}\n{found.windows} training windows; {symmetric}. "
         f"Validation error by set of terms, in units of the expected error: {scores}."
     )

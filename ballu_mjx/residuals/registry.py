@@ -102,16 +102,13 @@ def _load_aerodynamics(run: StoredRun) -> LoadedResidual:
 
 
 def _load_fluid(run: StoredRun) -> LoadedResidual:
-    import jax.numpy as jnp
-
-    from ballu_mjx.residuals.fluid import FLUID_FILE, FluidResidual, read_fluid
+    from ballu_mjx.residuals.fluid import FLUID_FILE, read_fluid
     from ballu_mjx.residuals.network_config import ForceNetworkConfig
     from ballu_mjx.residuals.network_input import num_inputs
 
     found = read_fluid(run.folder / FLUID_FILE)
-    model = FluidResidual(run.robot, run.robot.load_model(run.actuators), found.term_set)
-    params = jnp.asarray(found.values, jnp.float32)
-    return LoadedResidual(model, params, num_inputs(ForceNetworkConfig(), run.robot), 0)
+    model = found.residual(run.robot, run.robot.load_model(run.actuators))
+    return LoadedResidual(model, found.params, num_inputs(ForceNetworkConfig(), run.robot), 0)
 
 
 KINDS: Mapping[str, ResidualKind] = {

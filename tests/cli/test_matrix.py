@@ -28,7 +28,7 @@ from ballu_mjx.residuals.aerodynamics import (
 )
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.residuals.fluid import FLUID_FILE, FluidCoefficients, terms_of
+from ballu_mjx.residuals.fluid import FLUID_FILE, FluidEstimate, FluidParameters, terms_of
 from ballu_mjx.residuals.fluid_fit import FluidConfig
 from ballu_mjx.residuals.network_input import num_inputs
 from ballu_mjx.residuals.network_loads import num_loads
@@ -89,8 +89,8 @@ def write_run(folder: Path, task: str, base: Path | None = None) -> Path:
             air = {"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(AirParameters.none())}
             run.write(AERODYNAMICS_FILE, json.dumps(air))
         elif task == "fluid":
-            nothing = np.zeros((len(terms_of("drag")), 6))
-            run.write(FLUID_FILE, FluidCoefficients("drag", nothing, nothing).to_json())
+            nothing = FluidParameters.without_added_mass(np.zeros((len(terms_of("drag")), 6)))
+            run.write(FLUID_FILE, FluidEstimate("drag", nothing, nothing).to_json())
         elif task == "sysid":
             run.write(ACTUATORS_FILE, "{}")
         else:

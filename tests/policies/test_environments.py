@@ -21,7 +21,7 @@ from ballu_mjx.policies.load_simulator import load_simulator
 from ballu_mjx.policies.locomotion_config import LocomotionConfig
 from ballu_mjx.policies.locomotion_env import locomotion_state
 from ballu_mjx.policies.tasks import TASKS, Task
-from ballu_mjx.residuals.fluid import FLUID_FILE, FluidCoefficients, terms_of
+from ballu_mjx.residuals.fluid import FLUID_FILE, FluidEstimate, FluidParameters, terms_of
 from ballu_mjx.residuals.fluid_fit import FluidConfig
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import num_inputs
@@ -47,7 +47,10 @@ def run(rover: RobotDescription, tmp_path_factory: pytest.TempPathFactory) -> Pa
     values = np.zeros((len(terms_of("linear")), 6))
     values[2, 2] = -3.0  # along gravity: up
     with Run(folder, describe_run("fluid", {"fit": FluidConfig()}, {}, [], description=rover)) as made:
-        made.write(FLUID_FILE, FluidCoefficients("linear", values, 0 * values).to_json())
+        made.write(
+            FLUID_FILE,
+            FluidEstimate("linear", *map(FluidParameters.without_added_mass, (values, 0 * values))).to_json(),
+        )
         write_observed(made, np.zeros((2, num_inputs(ForceNetworkConfig(), rover))))
     return folder
 

@@ -315,6 +315,13 @@ def test_far_away_robots_are_counted_as_diverged_without_a_warning(evaluator: Op
         assert some == starts > 0
 
 
+def test_a_replay_of_limited_length_is_the_start_of_a_longer_one(evaluator: OpenLoopEvaluator):
+    whole, short = (evaluator.replay(jnp.array(FORCE), seconds=seconds) for seconds in (np.inf, 1.0))
+    states = 1 + round(1.0 / evaluator.robot.control_timestep)
+    assert short.position.shape[1] == states < whole.position.shape[1]
+    np.testing.assert_array_equal(short.position, whole.position[:, :states])
+
+
 def test_evaluation_with_identified_actuators_includes_the_nominal_robot(evaluator: OpenLoopEvaluator):
     """The first recording is from the nominal robot, so it has no error only without the identified actuators."""
     assert evaluator(jnp.array(FORCE)).nominal == ()

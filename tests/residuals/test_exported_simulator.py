@@ -25,7 +25,7 @@ from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.aerodynamics import Aerodynamics, AirParameters
 from ballu_mjx.residuals.deploy.export import export_simulator, rollout_in_double
 from ballu_mjx.residuals.deploy.residual import PARAMETERS_FILE, SETTINGS_FILE, ImprovedSimulator
-from ballu_mjx.residuals.fluid import FluidResidual
+from ballu_mjx.residuals.fluid import FluidParameters, FluidResidual
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import network_input, network_input_names, num_inputs
@@ -84,7 +84,8 @@ def network(
 def fluid(robot: RobotDescription) -> BoundResidual:
     model = FluidResidual(robot, robot.load_model(), "cubic")
     rng = np.random.default_rng(1)
-    return BoundResidual(model, jnp.asarray(0.02 * rng.normal(size=(len(model.terms), 6)), jnp.float32))
+    table = jnp.asarray(0.02 * rng.normal(size=(len(model.terms), 6)), jnp.float32)
+    return BoundResidual(model, FluidParameters.without_added_mass(table))
 
 
 def air(robot: RobotDescription, delay: float) -> BoundResidual:

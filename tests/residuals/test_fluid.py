@@ -19,7 +19,8 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.deploy.export import rollout_positions
 from ballu_mjx.residuals.fluid import (
     AXES,
-    FluidCoefficients,
+    FluidEstimate,
+    FluidParameters,
     FluidResidual,
     TermSet,
     read_fluid,
@@ -44,6 +45,8 @@ LINEAR = np.array([0.08, 0.25, 0.3])
 """Linear drag (N s/m, body frame)."""
 TURNING = np.array([0.02, 0.03, 0.012])
 """Rotary drag (N m s, body frame)."""
+ADDED = 0.08, np.array([0.003, 0.004, 0.006])
+"""Mass (kg) and moments of inertia (kg m^2) of the air that the glider drags along."""
 LIFT = 0.15
 """Lift coefficient (N s^2/m^2): upward force per product of forward and downward velocity."""
 
@@ -56,8 +59,11 @@ def glider(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
 
 
 def flights(robot: RobotDescription, seed: int, count: int) -> list[Motion]:
-    """Simulate flights in C MuJoCo, with drag and lift in every physics step."""
+    """Simulate flights in C MuJoCo, with added mass, and with drag and lift in every physics step."""
     model, rng = robot.load_model(), np.random.default_rng(seed)
+    model.body_mass[1] += ADDED[0]
+    model.body_inertia[1] += ADDED[1]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
     data, substeps, found = mujoco.MjData(model), 5, []
     for number in range(count):
         mujoco.mj_resetData(model, data)
@@ -89,16 +95,40 @@ def fit(glider: RobotDescription) -> FluidFit:
 
 @pytest.mark.optimized
 def test_fit_recovers_known_drag_and_lift_from_another_simulator(fit: FluidFit):
-    found = fit.coefficients
+    found = fit.estimate
     names = [term.name for term in terms_of(found.term_set)]
     for axis, names_of, wanted in (
         ("force", ("vx", "vy", "vz"), -LINEAR),
         ("torque", ("wx", "wy", "wz"), -TURNING),
     ):
-        own = np.array([found.values[names.index(n), AXES.index(f"{axis}_{n[1]}")] for n in names_of])
+        own = np.array([found.values.coefficients[names.index(n), AXES.index(f"{axis}_{n[1]}")] for n in names_of])
         assert np.all(np.abs(own - wanted) < 0.25 * np.abs(wanted)), (own, wanted)
     for term, axis, wanted in (("vx*vz", "force_z", -LIFT), ("vz*vz", "force_x", LIFT)):
-        assert abs(found.values[names.index(term), AXES.index(axis)] - wanted) < 0.25 * LIFT, term
+        assert abs(found.values.coefficients[names.index(term), AXES.index(axis)] - wanted) < 0.25 * LIFT, term
+
+
+def test_fit_recovers_the_added_mass(fit: FluidFit):
+    """The thrusters turn the glider about the vertical alone. Damping hides the other moments of inertia."""
+    found, errors = fit.estimate.values, fit.estimate.standard_errors
+    assert found.added_mass == pytest.approx(ADDED[0], rel=0.15)
+    assert found.added_inertia[2] == pytest.approx(ADDED[1][2], rel=0.25)
+    assert errors.added_mass < 0.2 * ADDED[0]
+
+
+def test_added_mass_has_no_weight(glider: RobotDescription):
+    """A body of twice the mass under the same thrust has half the acceleration, and does not sink."""
+    simulator = Simulator(glider)
+    forces = FluidResidual(glider, simulator.mj_model, "linear", added_mass=True)
+    still = np.zeros((len(forces.terms), 6), np.float32)
+    speeds = []
+    for mass in (0.0, 0.2):
+        params = FluidParameters(still, jnp.float32(mass), jnp.zeros(3))
+        improved = simulator.with_residual(BoundResidual(forces, params))
+        qpos, qvel = jnp.asarray(simulator.mj_model.qpos0, jnp.float32), jnp.zeros(6)
+        path = np.asarray(jax.jit(partial(rollout_positions, improved))(qpos, qvel, jnp.ones((10, 2))))
+        np.testing.assert_allclose(path[:, 2], path[0, 2], atol=1e-6)
+        speeds.append(path[-1, 0] - path[-2, 0])
+    assert speeds[1] == pytest.approx(speeds[0] / 2, rel=1e-3)
 
 
 def power(coefficients: np.ndarray, centre: np.ndarray, seed: int) -> np.ndarray:
@@ -145,8 +175,8 @@ def test_any_dissipative_linear_wrench_has_passive_coefficients():
 def test_a_glider_far_outside_the_recordings_slows_down(glider: RobotDescription, fit: FluidFit):
     """It tumbles and is ten times as fast as any recorded flight."""
     simulator = Simulator(glider)
-    forces = FluidResidual(glider, simulator.mj_model, fit.coefficients.term_set)
-    improved = simulator.with_residual(BoundResidual(forces, jnp.asarray(fit.coefficients.values, jnp.float32)))
+    forces = fit.estimate.residual(glider, simulator.mj_model)
+    improved = simulator.with_residual(BoundResidual(forces, fit.estimate.params))
     qpos, qvel = jnp.asarray(simulator.mj_model.qpos0, jnp.float32), jnp.array([3.0, -2.0, 2.0, 3.0, -3.0, 3.0])
     path = np.asarray(jax.jit(partial(rollout_positions, improved))(qpos, qvel, jnp.zeros((100, 2))))
     speed = np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1) / glider.control_timestep
@@ -161,7 +191,8 @@ def test_held_out_flights_are_predicted(fit: FluidFit):
 def test_mirrored_motion_gives_the_mirrored_wrench(glider: RobotDescription):
     forces = FluidResidual(glider, glider.load_model(), "cubic")
     rng = np.random.default_rng(2)
-    params = jnp.asarray(rng.normal(size=(len(forces.terms), 6)) * symmetric_mask(forces.terms), jnp.float32)
+    table = jnp.asarray(rng.normal(size=(len(forces.terms), 6)) * symmetric_mask(forces.terms), jnp.float32)
+    params = FluidParameters.without_added_mass(table)
     history = np.cumsum(rng.normal(size=(HISTORY, glider.features)) * 0.05, axis=0)
     flip = np.array([1, -1, 1, 1, -1, 1, -1, 1, -1])
     commands = jnp.zeros((HISTORY, 2))
@@ -173,7 +204,7 @@ def test_mirrored_motion_gives_the_mirrored_wrench(glider: RobotDescription):
 def test_wrench_turns_with_the_heading_of_the_body(glider: RobotDescription):
     forces = FluidResidual(glider, glider.load_model(), "cubic")
     rng = np.random.default_rng(3)
-    params = jnp.asarray(rng.normal(size=(len(forces.terms), 6)), jnp.float32)
+    params = FluidParameters.without_added_mass(jnp.asarray(rng.normal(size=(len(forces.terms), 6)), jnp.float32))
     history = np.cumsum(rng.normal(size=(HISTORY, 9)) * 0.05, axis=0)
     turned, angle = history.copy(), 0.7
     c, s = np.cos(angle), np.sin(angle)
@@ -187,17 +218,22 @@ def test_wrench_turns_with_the_heading_of_the_body(glider: RobotDescription):
 
 def test_files_are_read_back_and_damaged_files_are_refused(fit: FluidFit, tmp_path: Path):
     path = tmp_path / "fluid.json"
-    path.write_text(fit.coefficients.to_json())
+    path.write_text(fit.estimate.to_json())
     found = read_fluid(path)
-    assert isinstance(found, FluidCoefficients)
-    np.testing.assert_array_equal(found.values, fit.coefficients.values)
+    assert isinstance(found, FluidEstimate) and found.added_mass
+    jax.tree.map(np.testing.assert_array_equal, found.values, fit.estimate.values)
+    jax.tree.map(np.testing.assert_array_equal, found.standard_errors, fit.estimate.standard_errors)
     whole = json.loads(path.read_text())
+    path.write_text(json.dumps({k: v for k, v in whole.items() if k != "added"} | {"format": "ballu-fluid/1"}))
+    assert not read_fluid(path).added_mass
     for damage, word in (
         ({"format": "other/1"}, "format"),
         ({"terms": "every"}, "format"),
         ({"coefficients": {"force_w": {}}}, "coefficients"),
         ({"coefficients": {"force_x": {"ux": {"value": 1, "standard_error": 0}}}}, "ux"),
         ({"coefficients": {"force_x": {"vx": {"value": "1", "standard_error": 0}}}}, "vx"),
+        ({"added": {"weight": {"value": 1, "standard_error": 0}}}, "weight"),
+        ({"added": {"mass": {"value": -1, "standard_error": 0}}}, "below 0"),
     ):
         path.write_text(json.dumps(whole | damage))
         with pytest.raises(InputError, match=word):

@@ -11,7 +11,7 @@ from servo_arm import identified, write_arm
 
 from ballu_mjx.cli import evaluate
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.residuals.fluid import FLUID_FILE, FluidCoefficients, FluidResidual, terms_of
+from ballu_mjx.residuals.fluid import FLUID_FILE, FluidEstimate, FluidParameters, FluidResidual, terms_of
 from ballu_mjx.residuals.fluid_fit import FluidConfig
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import num_inputs
@@ -29,12 +29,13 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
 @pytest.fixture(scope="module")
 def run(robot: RobotDescription) -> Path:
     """A run of fluid forces on the arm, with identified actuators."""
-    folder, nothing = robot.file.parent / "run", np.zeros((len(terms_of("drag")), 6))
+    folder = robot.file.parent / "run"
+    nothing = FluidParameters.without_added_mass(np.zeros((len(terms_of("drag")), 6)))
     actuators = identified(robot, elbow_damping=0.3, shoulder_delay=0.02)
     config = describe_run("fluid", {"fit": FluidConfig()}, {}, [], actuators, robot)
     with Run(folder, config | {"residual": None}) as made:
         write_observed(made, np.zeros((2, num_inputs(ForceNetworkConfig(), robot))))
-        made.write(FLUID_FILE, FluidCoefficients("drag", nothing, nothing).to_json())
+        made.write(FLUID_FILE, FluidEstimate("drag", nothing, nothing).to_json())
     return folder
 
 

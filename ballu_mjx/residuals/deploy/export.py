@@ -200,7 +200,7 @@ def _fluid_part(simulator: AugmentedSimulator, model: FluidResidual, params: Any
             {"name": term.name, "factors": list(term.factors), "power_of_speed": term.power} for term in model.terms
         ],
     }
-    return ExportedPart(settings, {"coefficients": np.asarray(params, float)})
+    return ExportedPart(settings, {"coefficients": np.asarray(params.coefficients, float)})
 
 
 _KINDS: Mapping[type, Callable[..., ExportedPart]] = {

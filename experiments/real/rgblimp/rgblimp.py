@@ -59,7 +59,7 @@ from scipy.spatial.transform import Rotation
 from ballu_mjx.cli import train
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table
-from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
+from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
@@ -217,9 +217,12 @@ Rows = Mapping[str, Mapping[str, Sequence[Found]]]
 """Errors by method and group of flights, for each seed. Deterministic methods have one entry."""
 
 
-def end_errors(evaluator: OpenLoopEvaluator, replay: Replay) -> Found:
-    """Return root mean square errors of position (m) and yaw (deg) at each horizon's end, and numbers of starts."""
-    found = {}
+def end_errors(evaluator: OpenLoopEvaluator, params: Any, scale: float = 1.0) -> Found:
+    """Return root mean square errors of position (m) and yaw (deg) at each horizon's end, and numbers of starts.
+
+    `scale` is the factor on the residual with the parameters `params`.
+    """
+    replay, found = evaluator.replay(params, scale=scale, seconds=HORIZONS[-1]), {}
     for horizon in HORIZONS:
         steps = round(horizon / evaluator.robot.control_timestep)
         errors = []
@@ -333,9 +336,9 @@ def draw(
         runs = {}
         evaluator = OpenLoopEvaluator(simulator, motions[:1], next(iter(residuals.values()))[0])
         position, yaw = evaluator.recorded(0)
-        count = min(steps, len(position))
+        count = min(steps + 1, len(position))
         for name, (model, params) in residuals.items():
-            replay = OpenLoopEvaluator(simulator, motions[:1], model).replay(params)
+            replay = OpenLoopEvaluator(simulator, motions[:1], model).replay(params, seconds=SHOWN)
             runs[name] = np.column_stack([replay.position[0, :count, :2], replay.yaw[0, :count]])
         recorded = np.column_stack([position[:count, :2], yaw[:count]])
         time = np.arange(count) * simulator.control_timestep
@@ -395,7 +398,7 @@ def main() -> None:
     training, validation = motions["training"], motions["validation"]
     test = {group: motions[group] for group in TEST}
     simulator = Simulator(robot)
-    config = FluidConfig(window_seconds=(0.5, 2.0), windows=150)
+    config = FluidConfig(window_seconds=(0.5, 2.0, HORIZONS[-1]), windows=150)
     if options.quick:
         config = FluidConfig(terms="linear", window_seconds=(0.5,), windows=10, steps=2)
     residuals: dict[str, list[tuple[Residual, Any]]] = {
@@ -424,9 +427,9 @@ def main() -> None:
         evaluator = OpenLoopEvaluator(simulator, next(iter(test.values())), runs[0][0])
         for group, flown in test.items():
             evaluator = evaluator.on(flown)
-            rows[name][group] = [end_errors(evaluator, evaluator.replay(params)) for _, params in runs]
+            rows[name][group] = [end_errors(evaluator, params) for _, params in runs]
             if group not in rows["no air"]:
-                rows["no air"][group] = [end_errors(evaluator, evaluator.replay(runs[0][1], scale=0.0))]
+                rows["no air"][group] = [end_errors(evaluator, runs[0][1], scale=0.0)]
     rows["nearest moments"] = {
         group: [neighbour_errors(training, flown, robot.control_timestep)] for group, flown in test.items()
     }

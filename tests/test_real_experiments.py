@@ -1,0 +1,42 @@
+"""Experiments on public recordings of real robots: each script's short trial run, where the recordings are present."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DATA = ROOT.parent / "shared" / "real"
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings of real robots in {DATA}"),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "methods"),
+    [
+        ("double_pendulum", "double_pendulum/recordings", ("nominal", "published friction", "identified")),
+        ("compass_gait", "compass_gait/recordings", ("nominal", "published friction", "identified")),
+        ("go1", ".", ("0 kg", "3 kg")),
+        ("rgblimp", "rgblimp/recordings", ("no air", "published model", "fluid", "EnvMimic", "nearest moments")),
+    ],
+)
+def test_a_quick_run_writes_a_number_for_every_method(name: str, data: str, methods: tuple[str, ...], tmp_path: Path):
+    script = ROOT / "experiments" / "real" / name / f"{name}.py"
+    done = subprocess.run(
+        [sys.executable, str(script), "--data", str(DATA / data), "--output", str(tmp_path), "--quick"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    table = (tmp_path / "table.md").read_text()
+    rows = [line.split("|")[1].strip() for line in table.splitlines() if line.startswith("|")]
+    assert set(methods) <= set(rows)
+    assert "nan" not in table.lower()
