@@ -17,6 +17,7 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
@@ -135,7 +136,7 @@ def fit_fluid_forces(
     check_fluid_config(config, simulator.control_timestep)
     centre, added = _centre(simulator), None
     if config.added_mass and simulator.mj_model.ngravcomp:
-        added = AddedMass(*_whole_body(simulator))
+        added = _added_mass(simulator.mj_model, _whole_body(simulator)[1])
     program = _Program(simulator, added_mass=added is not None)
     windows, held_out = (_Windows(simulator, motions, config, program) for motions in (training, validation))
     symmetric = config.mirror and simulator.robot.mirror is not None
@@ -360,6 +361,15 @@ def _centre(simulator: Simulator) -> Float[np.ndarray, " 3"]:
     model = simulator.mj_model
     site = model.site(simulator.robot.tracked)
     return model.body_ipos[model.site_bodyid[site.id]] - site.pos
+
+
+def _added_mass(model: mujoco.MjModel, inertia: Float[np.ndarray, " 3"]) -> AddedMass:
+    """Return the priors of a body with these moments of inertia (kg m^2).
+
+    Half of the displaced mass is the added mass of a sphere (Lamb, Hydrodynamics, section 92).
+    """
+    displaced = float(np.sum(model.body_mass * model.body_gravcomp))
+    return AddedMass(0.5 * displaced, 0.3 * inertia)
 
 
 def _whole_body(simulator: Simulator) -> tuple[float, Float[np.ndarray, " 3"]]:

@@ -55,12 +55,17 @@ class Parametrization(Protocol):
 
 
 class AddedMass(NamedTuple):
-    """Mass and inertia of the body without fluid, to which the priors of added mass and inertia are relative."""
+    """Medians of the log-normal priors of added mass and inertia. The standard deviation of the logarithms is
+    `ADDED_SPREAD`."""
 
     mass: float
-    """Mass of the whole robot (kg)."""
+    """Added mass (kg)."""
     inertia: Float[np.ndarray, " 3"]
-    """Principal moments of inertia of the tracked body (kg m^2)."""
+    """Added moments of inertia (kg m^2)."""
+
+
+ADDED_SPREAD = 0.7
+"""Standard deviation of the logarithms of added mass and inertia: a factor of two."""
 
 
 class FluidParametrization:
@@ -77,8 +82,8 @@ class FluidParametrization:
         table = self._coefficients.table(vector[self._logarithms :])
         if self._added is None:
             return FluidParameters.without_added_mass(table)
-        share = _ADDED_SHARE * np.exp(_ADDED_SPREAD * vector[: self._logarithms])
-        return FluidParameters(table, np.asarray(self._added.mass * share[0]), self._added.inertia * share[1:])
+        factors = np.exp(ADDED_SPREAD * vector[: self._logarithms])
+        return FluidParameters(table, np.asarray(self._added.mass * factors[0]), self._added.inertia * factors[1:])
 
     def directions(self, vector: Float[np.ndarray, " size"]) -> FluidParameters:
         """Return the derivatives of the parameters with respect to the entries of the vector, the leading axis."""
@@ -87,15 +92,9 @@ class FluidParametrization:
         mass, inertia = np.zeros(len(vector)), np.zeros((len(vector), 3))
         if self._added is not None:
             now = self.parameters(vector)
-            mass[0] = _ADDED_SPREAD * now.added_mass
-            inertia[1:4] = np.diag(_ADDED_SPREAD * now.added_inertia)
+            mass[0] = ADDED_SPREAD * now.added_mass
+            inertia[1:4] = np.diag(ADDED_SPREAD * now.added_inertia)
         return FluidParameters(coefficients, mass, inertia)
-
-
-_ADDED_SHARE, _ADDED_SPREAD = 0.1, 2.0
-"""Median of the log-normal prior of the added mass, as a fraction of the robot's mass, and standard deviation of its
-logarithm. The added inertia has the same prior, relative to the tracked body's inertia. Within one standard deviation
-are fractions from 0.014 to 0.74."""
 
 
 class FreeCoefficients:

@@ -45,7 +45,7 @@ LINEAR = np.array([0.08, 0.25, 0.3])
 """Linear drag (N s/m, body frame)."""
 TURNING = np.array([0.02, 0.03, 0.012])
 """Rotary drag (N m s, body frame)."""
-ADDED = 0.08, np.array([0.003, 0.004, 0.006])
+ADDED = 0.16, np.array([0.003, 0.004, 0.01])
 """Mass (kg) and moments of inertia (kg m^2) of the air that the glider drags along."""
 LIFT = 0.15
 """Lift coefficient (N s^2/m^2): upward force per product of forward and downward velocity."""
