@@ -89,6 +89,8 @@ ENVMIMIC: Mapping[str, Sequence[str]] = {"EnvMimic": (), "EnvMimic, `--mirror`":
 """Options of EnvMimic, by name of the method."""
 SHORT = ("no air", "published model", "fluid", "EnvMimic", "nearest moments")
 """Rows of the short table."""
+MEANS = ("published model", "fluid")
+"""Methods whose mean yaw errors are listed by thrusts."""
 SHOWN = 20.0
 """Length of the flights in the figure (s)."""
 FULL_THRUST, FIRST_PLACE, TRAVEL = 0.07, 0.0647, 0.05
@@ -237,6 +239,19 @@ def end_errors(evaluator: OpenLoopEvaluator, params: Any, scale: float = 1.0) ->
         rms = np.sqrt(np.mean(kept**2, axis=0)) if len(kept) else np.full(2, np.inf)
         found[horizon] = float(rms[0]), float(rms[1]), len(table), len(table) - len(kept)
     return found
+
+
+def mean_yaw_errors(evaluator: OpenLoopEvaluator, params: Any) -> dict[str, float]:
+    """Return the mean signed yaw error (deg) at the last horizon's end, by thrusts of the flights."""
+    steps = round(HORIZONS[-1] / evaluator.robot.control_timestep)
+    replay, errors = evaluator.replay(params, seconds=HORIZONS[-1]), {}
+    for run, (recording, _) in enumerate(evaluator.starts):
+        yaw = evaluator.recorded(run)[1]
+        if len(yaw) > steps:
+            left, right = FULL_THRUST * evaluator.motions[recording].command[0, :2]
+            turn = np.angle(np.exp(1j * (replay.yaw[run, steps] - yaw[steps])), deg=True)
+            errors.setdefault(f"{left:.4f} and {right:.4f} N", []).append(turn)
+    return {thrusts: float(np.mean(turns)) for thrusts, turns in errors.items()}
 
 
 def neighbour_errors(
@@ -399,41 +414,52 @@ def main() -> None:
     test = {group: motions[group] for group in TEST}
     simulator = Simulator(robot)
     config = FluidConfig(window_seconds=(0.5, 2.0, HORIZONS[-1]), windows=150)
+    passive = {"fluid": True, "fluid, `--no-passive`": False}
+    methods, seeds, size = ENVMIMIC, options.seeds, ()
     if options.quick:
         config = FluidConfig(terms="linear", window_seconds=(0.5,), windows=10, steps=2)
+        passive, methods, seeds, size = {"fluid": True}, {"EnvMimic": ()}, options.seeds[:1], QUICK
     residuals: dict[str, list[tuple[Residual, Any]]] = {
         "published model": [(PublishedAerodynamics(robot.control_timestep), jnp.zeros(0))]
     }
-    for name, passive in (("fluid", True), ("fluid, `--no-passive`", False)):
+    for name, chosen in passive.items():
         found = fit_fluid(
-            simulator, training, validation, dataclasses.replace(config, passive=passive), progress=PhaseProgress()
+            simulator, training, validation, dataclasses.replace(config, passive=chosen), progress=PhaseProgress()
         )
         print(f"\n{name}\n{found.report}\n", flush=True)
         residuals[name] = [(found.model, found.params)]
-    seeds = options.seeds[:1] if options.quick else options.seeds
-    for name, chosen in ENVMIMIC.items():
-        kind = "".join(("envmimic", *chosen)).replace("--", "-")
-        quick = QUICK if options.quick else ()
+    for name, extra in methods.items():
+        kind = "".join(("envmimic", *extra)).replace("--", "-")
         learned = [
-            learn(files, options.output / f"{kind}-{seed}", [*chosen, *quick, "--seed", str(seed)]) for seed in seeds
+            learn(files, options.output / f"{kind}-{seed}", [*extra, *size, "--seed", str(seed)]) for seed in seeds
         ]
         residuals[name] = [(each.model, each.params) for each in learned]
     if options.figure is not None:
         draw(options.figure, simulator, {name: residuals[name][0] for name in ("published model", "fluid")}, test)
     residuals["constant wrench"] = [fit_constant_wrench(simulator, training)]
     rows: dict[str, dict[str, list[Found]]] = {"no air": {}}
+    means: dict[str, dict[str, float]] = {}
     for name, runs in residuals.items():
-        rows[name] = {}
+        rows[name], means[name] = {}, {}
         evaluator = OpenLoopEvaluator(simulator, next(iter(test.values())), runs[0][0])
         for group, flown in test.items():
             evaluator = evaluator.on(flown)
             rows[name][group] = [end_errors(evaluator, params) for _, params in runs]
+            if name in MEANS:
+                means[name] |= {
+                    f"{group}, {thrusts}": mean for thrusts, mean in mean_yaw_errors(evaluator, runs[0][1]).items()
+                }
             if group not in rows["no air"]:
                 rows["no air"][group] = [end_errors(evaluator, runs[0][1], scale=0.0)]
     rows["nearest moments"] = {
         group: [neighbour_errors(training, flown, robot.control_timestep)] for group, flown in test.items()
     }
-    _setup.write_tables(tables(rows), options.output, options.results, {"training": seeds})
+    signed = Table(
+        (f"mean yaw error after {HORIZONS[-1]:g} s (deg)", *MEANS),
+        tuple((flown, *(Cell((means[name][flown],), ".1f") for name in MEANS)) for flown in means[MEANS[0]]),
+    )
+    shown = tables(rows) | {"means": signed}
+    _setup.write_tables(shown, options.output, options.results, {"training": seeds})
 
 
 if __name__ == "__main__":
