@@ -16,7 +16,7 @@ from scipy import optimize
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.residuals.deploy.export import rollout_positions
+from ballu_mjx.residuals.deploy.export import export_simulator, rollout_positions
 from ballu_mjx.residuals.fluid import (
     AXES,
     FluidEstimate,
@@ -181,6 +181,17 @@ def test_a_glider_far_outside_the_recordings_slows_down(glider: RobotDescription
     path = np.asarray(jax.jit(partial(rollout_positions, improved))(qpos, qvel, jnp.zeros((100, 2))))
     speed = np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1) / glider.control_timestep
     assert speed.max() < 1.2 * np.linalg.norm(qvel[:3]) and speed[-1] < 0.2 * speed[0]
+
+
+def test_exported_simulator_has_the_added_mass(glider: RobotDescription, fit: FluidFit, tmp_path: Path):
+    simulator = Simulator(glider)
+    improved = simulator.with_residual(
+        BoundResidual(fit.estimate.residual(glider, simulator.mj_model), fit.estimate.params)
+    )
+    found = export_simulator(improved, tmp_path / "exported", check_seconds=1.0)
+    mass = mujoco.MjModel.from_xml_path(str(found.folder / "identified.xml")).body_mass[1]
+    assert mass == pytest.approx(0.2 + fit.estimate.values.added_mass, rel=1e-4)
+    assert found.deviation is not None and found.deviation[0] < 1e-6
 
 
 def test_held_out_flights_are_predicted(fit: FluidFit):
