@@ -100,10 +100,10 @@ class BatchedSolver:
         for iteration in range(steps):
             y, state, loss, done = self._step(y, evaluated, state)
             report(iteration + 1, steps, float(jnp.min(loss)))
-            gain = float(np.max(1 - np.asarray(loss) / lowest))
-            idle = idle + 1 if gain <= self._least_gain else 0
+            gained, enough = (bool(np.any(loss < (1 - gain) * lowest)) for gain in (0.0, small_gain))
+            idle = 0 if bool(np.any(loss < (1 - self._least_gain) * lowest)) else idle + 1
             lowest = np.minimum(lowest, loss)
-            if bool(jnp.all(done)) or idle == patience or 0 < gain < small_gain:
+            if bool(jnp.all(done)) or idle == patience or (gained and not enough):
                 break
             evaluated = tuple(map(jnp.asarray, evaluate(np.asarray(state.y_eval))))
         return np.asarray(y), np.asarray(loss)

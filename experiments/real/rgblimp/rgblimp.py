@@ -42,7 +42,6 @@ import _setup
 _setup.prepare()
 
 import argparse
-import dataclasses
 import lzma
 import shutil
 import statistics
@@ -413,21 +412,17 @@ def main() -> None:
     training, validation = motions["training"], motions["validation"]
     test = {group: motions[group] for group in TEST}
     simulator = Simulator(robot)
-    config = FluidConfig(window_seconds=(0.5, 2.0, HORIZONS[-1]), windows=150)
-    passive = {"fluid": True, "fluid, `--no-passive`": False}
+    config = FluidConfig(window_seconds=(0.5, 2.0, HORIZONS[-1]), windows=100)
     methods, seeds, size = ENVMIMIC, options.seeds, ()
     if options.quick:
         config = FluidConfig(terms="linear", window_seconds=(0.5,), windows=10, steps=2)
-        passive, methods, seeds, size = {"fluid": True}, {"EnvMimic": ()}, options.seeds[:1], QUICK
+        methods, seeds, size = {"EnvMimic": ()}, options.seeds[:1], QUICK
+    found = fit_fluid(simulator, training, validation, config, progress=PhaseProgress())
+    print(f"\n{found.report}\n", flush=True)
     residuals: dict[str, list[tuple[Residual, Any]]] = {
-        "published model": [(PublishedAerodynamics(robot.control_timestep), jnp.zeros(0))]
+        "published model": [(PublishedAerodynamics(robot.control_timestep), jnp.zeros(0))],
+        "fluid": [(found.model, found.params)],
     }
-    for name, chosen in passive.items():
-        found = fit_fluid(
-            simulator, training, validation, dataclasses.replace(config, passive=chosen), progress=PhaseProgress()
-        )
-        print(f"\n{name}\n{found.report}\n", flush=True)
-        residuals[name] = [(found.model, found.params)]
     for name, extra in methods.items():
         kind = "".join(("envmimic", *extra)).replace("--", "-")
         learned = [
