@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -211,39 +211,20 @@ class FluidEstimate:
 
     def to_json(self) -> str:
         """Return the content of `FLUID_FILE`: coefficients by component of the wrench and by term, and added mass."""
-        rows = {
-            axis: {
-                term.name: _entry(value, error)
-                for term, value, error in zip(terms_of(self.term_set), values, errors, strict=True)
-                if value != 0 or error != 0
-            }
-            for axis, values, errors in zip(
-                AXES, self.values.coefficients.T, self.standard_errors.coefficients.T, strict=True
-            )
-        }
-        content: dict[str, Any] = {"format": FLUID_FORMAT, "terms": self.term_set, "coefficients": rows}
-        if self.added_mass:
-            pairs = zip(self._added(self.values), self._added(self.standard_errors), strict=True)
-            content["added"] = {name: _entry(*pair) for name, pair in zip(_ADDED, pairs, strict=True)}
+        groups: dict[str, Any] = {axis: {} for axis in AXES}
+        for group, name, value, error in self._entries():
+            if value != 0 or error != 0:
+                groups.setdefault(group, {})[name] = {"value": value, "standard_error": error}
+        added = {"added": groups.pop("added")} if "added" in groups else {}
+        content = {"format": FLUID_FORMAT, "terms": self.term_set, "coefficients": groups, **added}
         return json.dumps(content, indent=2) + "\n"
 
     def table(self) -> str:
         """Return a table of the parameters that differ from 0 by two standard errors or more, as text."""
         lines = [f"{'':10}{'term':12}{'value':>12}{'std. error':>12}"]
-        rows = [
-            (axis, term.name, value, error)
-            for axis, values, errors in zip(
-                AXES, self.values.coefficients.T, self.standard_errors.coefficients.T, strict=True
-            )
-            for term, value, error in zip(terms_of(self.term_set), values, errors, strict=True)
-        ]
-        rows += [
-            ("added", name, *pair)
-            for name, *pair in zip(_ADDED, self._added(self.values), self._added(self.standard_errors), strict=True)
-        ]
         lines += [
-            f"{axis:10}{name:12}{value:>12.5f}{error:>12.5f}"
-            for axis, name, value, error in rows
+            f"{group:10}{name:12}{value:>12.5f}{error:>12.5f}"
+            for group, name, value, error in self._entries()
             if abs(value) >= 2 * error > 0
         ]
         lines.append(
@@ -251,17 +232,20 @@ class FluidEstimate:
         )
         return "\n".join(lines)
 
-    @staticmethod
-    def _added(parameters: FluidParameters) -> tuple[float, ...]:
-        return (float(parameters.added_mass), *map(float, parameters.added_inertia))
+    def _entries(self) -> Iterator[tuple[str, str, float, float]]:
+        """Yield group (component of the wrench, or `added`), name, value and standard error of each parameter."""
+        terms = [term.name for term in terms_of(self.term_set)]
+        both = self.values, self.standard_errors
+        for axis, *columns in zip(AXES, *(each.coefficients.T for each in both), strict=True):
+            for name, value, error in zip(terms, *columns, strict=True):
+                yield axis, name, float(value), float(error)
+        added = (np.append(each.added_mass, each.added_inertia) for each in both)
+        for name, value, error in zip(_ADDED, *added, strict=True):
+            yield "added", name, float(value), float(error)
 
 
 _ADDED = ("mass", "inertia_x", "inertia_y", "inertia_z")
 """Names of the added mass and inertias in files and tables."""
-
-
-def _entry(value: float, error: float) -> dict[str, float]:
-    return {"value": float(value), "standard_error": float(error)}
 
 
 def read_fluid(path: Path) -> FluidEstimate:

@@ -17,7 +17,6 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
@@ -134,9 +133,7 @@ def fit_fluid_forces(
     **Raises** `InputError` for options out of range, and if no motion is as long as a window.
     """
     check_fluid_config(config, simulator.control_timestep)
-    centre, added = _centre(simulator), None
-    if config.added_mass and simulator.mj_model.ngravcomp:
-        added = _added_mass(simulator.mj_model, _whole_body(simulator)[1])
+    centre, added = _centre(simulator), _added_mass(simulator) if config.added_mass else None
     program = _Program(simulator, added_mass=added is not None)
     windows, held_out = (_Windows(simulator, motions, config, program) for motions in (training, validation))
     symmetric = config.mirror and simulator.robot.mirror is not None
@@ -363,13 +360,16 @@ def _centre(simulator: Simulator) -> Float[np.ndarray, " 3"]:
     return model.body_ipos[model.site_bodyid[site.id]] - site.pos
 
 
-def _added_mass(model: mujoco.MjModel, inertia: Float[np.ndarray, " 3"]) -> AddedMass:
-    """Return the priors of a body with these moments of inertia (kg m^2).
+def _added_mass(simulator: Simulator) -> AddedMass | None:
+    """Return the priors of the added mass. None for a model without buoyancy.
 
     Half of the displaced mass is the added mass of a sphere (Lamb, Hydrodynamics, section 92).
     """
+    model = simulator.mj_model
+    if not model.ngravcomp:
+        return None
     displaced = float(np.sum(model.body_mass * model.body_gravcomp))
-    return AddedMass(0.5 * displaced, 0.3 * inertia)
+    return AddedMass(0.5 * displaced, 0.3 * _whole_body(simulator)[1])
 
 
 def _whole_body(simulator: Simulator) -> tuple[float, Float[np.ndarray, " 3"]]:

@@ -51,14 +51,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from _constant_wrench import fit_constant_wrench
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.cli import train
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table
-from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
+from ballu_mjx.evaluation.open_loop import Evaluators, OpenLoopEvaluator, Replay
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
@@ -218,39 +218,40 @@ Rows = Mapping[str, Mapping[str, Sequence[Found]]]
 """Errors by method and group of flights, for each seed. Deterministic methods have one entry."""
 
 
-def end_errors(evaluator: OpenLoopEvaluator, params: Any, scale: float = 1.0) -> Found:
-    """Return root mean square errors of position (m) and yaw (deg) at each horizon's end, and numbers of starts.
+def errors_at(
+    evaluator: OpenLoopEvaluator, replay: Replay, horizon: float
+) -> tuple[Int[np.ndarray, " starts"], Float[np.ndarray, "starts 2"]]:
+    """Return the recording of each start, and the distance (m) and signed yaw error (deg) after `horizon` (s)."""
+    steps = round(horizon / evaluator.robot.control_timestep)
+    recordings, errors = [], []
+    for run, (recording, _) in enumerate(evaluator.starts):
+        position, yaw = evaluator.recorded(run)
+        if len(position) > steps:
+            turn = replay.yaw[run, steps] - yaw[steps]
+            far = np.linalg.norm(replay.position[run, steps] - position[steps])
+            recordings.append(recording)
+            errors.append([far, np.rad2deg(np.arctan2(np.sin(turn), np.cos(turn)))])
+    return np.array(recordings, int), np.array(errors).reshape(-1, 2)
 
-    `scale` is the factor on the residual with the parameters `params`.
-    """
-    replay, found = evaluator.replay(params, scale=scale, seconds=HORIZONS[-1]), {}
+
+def end_errors(evaluator: OpenLoopEvaluator, replay: Replay) -> Found:
+    """Return root mean square errors of position (m) and yaw (deg) at each horizon's end, and numbers of starts."""
+    found = {}
     for horizon in HORIZONS:
-        steps = round(horizon / evaluator.robot.control_timestep)
-        errors = []
-        for run in range(len(evaluator.starts)):
-            position, yaw = evaluator.recorded(run)
-            if len(position) > steps:
-                turn = replay.yaw[run, steps] - yaw[steps]
-                far = np.linalg.norm(replay.position[run, steps] - position[steps])
-                errors.append([far, np.rad2deg(np.arctan2(np.sin(turn), np.cos(turn)))])
-        table = np.array(errors).reshape(-1, 2)
+        _, table = errors_at(evaluator, replay, horizon)
         kept = table[np.isfinite(table).all(axis=1)]
         rms = np.sqrt(np.mean(kept**2, axis=0)) if len(kept) else np.full(2, np.inf)
         found[horizon] = float(rms[0]), float(rms[1]), len(table), len(table) - len(kept)
     return found
 
 
-def mean_yaw_errors(evaluator: OpenLoopEvaluator, params: Any) -> dict[str, float]:
+def mean_yaw_errors(evaluator: OpenLoopEvaluator, replay: Replay) -> dict[str, float]:
     """Return the mean signed yaw error (deg) at the last horizon's end, by thrusts of the flights."""
-    steps = round(HORIZONS[-1] / evaluator.robot.control_timestep)
-    replay, errors = evaluator.replay(params, seconds=HORIZONS[-1]), {}
-    for run, (recording, _) in enumerate(evaluator.starts):
-        yaw = evaluator.recorded(run)[1]
-        if len(yaw) > steps:
-            left, right = FULL_THRUST * evaluator.motions[recording].command[0, :2]
-            turn = np.angle(np.exp(1j * (replay.yaw[run, steps] - yaw[steps])), deg=True)
-            errors.setdefault(f"{left:.4f} and {right:.4f} N", []).append(turn)
-    return {thrusts: float(np.mean(turns)) for thrusts, turns in errors.items()}
+    by_thrusts: dict[str, list[float]] = {}
+    for recording, (_, turn) in zip(*errors_at(evaluator, replay, HORIZONS[-1]), strict=True):
+        left, right = FULL_THRUST * evaluator.motions[recording].command[0, :2]
+        by_thrusts.setdefault(f"{left:.4f} and {right:.4f} N", []).append(turn)
+    return {thrusts: float(np.mean(turns)) for thrusts, turns in by_thrusts.items()}
 
 
 def neighbour_errors(
@@ -339,23 +340,23 @@ def tables(rows: Rows) -> dict[str, Table]:
 
 def draw(
     path: Path,
-    simulator: Simulator,
+    evaluators: Evaluators,
     residuals: Mapping[str, tuple[Residual, Any]],
     test: Mapping[str, Sequence[Motion]],
 ) -> None:
     """Draw the first flight of each group, and simulations from its first state."""
-    steps = round(SHOWN / simulator.control_timestep)
     panels = []
     for group, motions in test.items():
-        runs = {}
-        evaluator = OpenLoopEvaluator(simulator, motions[:1], next(iter(residuals.values()))[0])
-        position, yaw = evaluator.recorded(0)
-        count = min(steps + 1, len(position))
+        first, runs, recorded, time = motions[:1], {}, np.zeros((0, 3)), np.zeros(0)
         for name, (model, params) in residuals.items():
-            replay = OpenLoopEvaluator(simulator, motions[:1], model).replay(params, seconds=SHOWN)
+            evaluator = evaluators.of(model, first)
+            position, yaw = evaluator.recorded(0)
+            timestep = evaluator.robot.control_timestep
+            count = min(round(SHOWN / timestep) + 1, len(position))
+            replay = evaluator.replay(params, seconds=SHOWN)
             runs[name] = np.column_stack([replay.position[0, :count, :2], replay.yaw[0, :count]])
-        recorded = np.column_stack([position[:count, :2], yaw[:count]])
-        time = np.arange(count) * simulator.control_timestep
+            recorded = np.column_stack([position[:count, :2], yaw[:count]])
+            time = np.arange(count) * timestep
         panels.append(plots.TrackingPanel(f"{group}: {motions[0].name}", time, recorded, runs))
     plots.tracking(path, panels)
 
@@ -429,23 +430,24 @@ def main() -> None:
             learn(files, options.output / f"{kind}-{seed}", [*extra, *size, "--seed", str(seed)]) for seed in seeds
         ]
         residuals[name] = [(each.model, each.params) for each in learned]
+    evaluators = Evaluators(simulator)
     if options.figure is not None:
-        draw(options.figure, simulator, {name: residuals[name][0] for name in ("published model", "fluid")}, test)
+        draw(options.figure, evaluators, {name: residuals[name][0] for name in ("published model", "fluid")}, test)
     residuals["constant wrench"] = [fit_constant_wrench(simulator, training)]
     rows: dict[str, dict[str, list[Found]]] = {"no air": {}}
-    means: dict[str, dict[str, float]] = {}
+    means: dict[str, dict[str, float]] = {name: {} for name in MEANS}
     for name, runs in residuals.items():
-        rows[name], means[name] = {}, {}
-        evaluator = OpenLoopEvaluator(simulator, next(iter(test.values())), runs[0][0])
+        rows[name] = {}
         for group, flown in test.items():
-            evaluator = evaluator.on(flown)
-            rows[name][group] = [end_errors(evaluator, params) for _, params in runs]
+            evaluator = evaluators.of(runs[0][0], flown)
+            replays = [evaluator.replay(params, seconds=HORIZONS[-1]) for _, params in runs]
+            rows[name][group] = [end_errors(evaluator, replay) for replay in replays]
             if name in MEANS:
-                means[name] |= {
-                    f"{group}, {thrusts}": mean for thrusts, mean in mean_yaw_errors(evaluator, runs[0][1]).items()
-                }
+                turns = mean_yaw_errors(evaluator, replays[0])
+                means[name] |= {f"{group}, {thrusts}": turn for thrusts, turn in turns.items()}
             if group not in rows["no air"]:
-                rows["no air"][group] = [end_errors(evaluator, runs[0][1], scale=0.0)]
+                still = evaluator.replay(runs[0][1], scale=0.0, seconds=HORIZONS[-1])
+                rows["no air"][group] = [end_errors(evaluator, still)]
     rows["nearest moments"] = {
         group: [neighbour_errors(training, flown, robot.control_timestep)] for group, flown in test.items()
     }
