@@ -10,7 +10,11 @@ from types import ModuleType
 
 import pytest
 
-EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+ROOT = Path(__file__).parents[1]
+EXPERIMENTS = ROOT / "experiments"
+REAL_DATA = ROOT.parent / "shared" / "real"
+"""Public recordings of real robots, which are not part of the repository."""
+needs_real_data = pytest.mark.skipif(not REAL_DATA.is_dir(), reason=f"no recordings of real robots in {REAL_DATA}")
 
 
 @contextlib.contextmanager

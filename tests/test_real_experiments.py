@@ -7,14 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from experiment_modules import EXPERIMENTS, REAL_DATA, ROOT, needs_real_data
 
-ROOT = Path(__file__).parents[1]
-DATA = ROOT.parent / "shared" / "real"
-
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings of real robots in {DATA}"),
-]
+pytestmark = [pytest.mark.slow, needs_real_data]
 
 
 @pytest.mark.parametrize(
@@ -27,9 +22,9 @@ pytestmark = [
     ],
 )
 def test_a_quick_run_writes_a_number_for_every_method(name: str, data: str, methods: tuple[str, ...], tmp_path: Path):
-    script = ROOT / "experiments" / "real" / name / f"{name}.py"
+    script = EXPERIMENTS / "real" / name / f"{name}.py"
     done = subprocess.run(
-        [sys.executable, str(script), "--data", str(DATA / data), "--output", str(tmp_path), "--quick"],
+        [sys.executable, str(script), "--data", str(REAL_DATA / data), "--output", str(tmp_path), "--quick"],
         cwd=ROOT,
         capture_output=True,
         text=True,

@@ -5,21 +5,18 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from experiment_modules import EXPERIMENTS, REAL_DATA, needs_real_data
 
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_robot import replay
 from ballu_mjx.identification.parameters import ParameterSet
 from ballu_mjx.robots.description import read_description
 
-ROOT = Path(__file__).parents[2]
-DATA = ROOT.parent / "shared" / "real"
-EXPERIMENTS = ROOT / "experiments" / "real"
-
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings of real robots in {DATA}")
+REAL = EXPERIMENTS / "real"
 
 
 def declared(name: str) -> ParameterSet:
-    robot = read_description(EXPERIMENTS / name / f"{name}.robot.json")
+    robot = read_description(REAL / name / f"{name}.robot.json")
     return declared_parameters(robot, robot.load_model())
 
 
@@ -34,7 +31,7 @@ def test_descriptions_of_the_real_robots_declare_their_parameters():
 
 
 def test_steps_of_a_walker_keep_its_leg_angles_and_motor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(EXPERIMENTS / "compass_gait")
+    monkeypatch.syspath_prepend(REAL / "compass_gait")
     import compass_gait  # pyright: ignore[reportMissingImports]
 
     time = np.arange(200) * 0.005
@@ -55,7 +52,7 @@ def test_steps_of_a_walker_keep_its_leg_angles_and_motor(tmp_path: Path, monkeyp
 
 
 def test_walker_model_exchanges_its_legs_with_the_stance_leg(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(EXPERIMENTS / "compass_gait")
+    monkeypatch.syspath_prepend(REAL / "compass_gait")
     import compass_gait  # pyright: ignore[reportMissingImports]
 
     inner, outer = (compass_gait.model_of(leg) for leg in ("inner", "outer"))
@@ -65,26 +62,26 @@ def test_walker_model_exchanges_its_legs_with_the_stance_leg(monkeypatch: pytest
         assert hip - stance.ipos[2] == pytest.approx(-swing.ipos[2])
         np.testing.assert_allclose(stance.inertia, swing.inertia)
     assert inner.body("swing").ipos[2] != outer.body("swing").ipos[2]
-    as_written = mujoco.MjModel.from_xml_path(str(EXPERIMENTS / "compass_gait" / "compass_gait.xml"))
+    as_written = mujoco.MjModel.from_xml_path(str(REAL / "compass_gait" / "compass_gait.xml"))
     np.testing.assert_allclose(as_written.body_ipos, outer.body_ipos)
     np.testing.assert_allclose(as_written.body_inertia, outer.body_inertia)
 
 
-@needs_data
+@needs_real_data
 def test_motor_parameters_from_three_loads_predict_a_fourth_load(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(EXPERIMENTS / "go1")
+    monkeypatch.syspath_prepend(REAL / "go1")
     import go1  # pyright: ignore[reportMissingImports]
 
     parameters = declared("go1")
     identified = vector(parameters, motor_frictionloss=0.158, motor_damping=0.015, motor_armature=0.0074, goal_kp=9.36)
-    nominal, found = replay(parameters, go1.load(DATA, 3), [parameters.nominal, identified], go1.SECONDS, 12.0)
+    nominal, found = replay(parameters, go1.load(REAL_DATA, 3), [parameters.nominal, identified], go1.SECONDS, 12.0)
     mean = [np.rad2deg(np.abs(errors.errors[..., 0]).mean()) for errors in (nominal, found)]
     assert mean[1] < 1.5 < mean[0]
 
 
-@needs_data
+@needs_real_data
 def test_identified_parameters_predict_the_double_pendulum(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(EXPERIMENTS / "double_pendulum")
+    monkeypatch.syspath_prepend(REAL / "double_pendulum")
     import double_pendulum  # pyright: ignore[reportMissingImports]
 
     parameters = declared("double_pendulum")
@@ -96,20 +93,20 @@ def test_identified_parameters_predict_the_double_pendulum(monkeypatch: pytest.M
         elbow_armature=0.0034,
         delay=0.0077,
     )
-    motions = double_pendulum.load(DATA / "double_pendulum" / "recordings", double_pendulum.VALIDATION)
+    motions = double_pendulum.load(REAL_DATA / "double_pendulum" / "recordings", double_pendulum.VALIDATION)
     nominal, found = replay(parameters, motions, [parameters.nominal, identified], 1.0, 0.5)
     assert (np.rad2deg(found.final_median[:2]) < [2.35, 3.45]).all()
     assert (found.final_median[:2] < 0.25 * nominal.final_median[:2]).all()
 
 
-@needs_data
+@needs_real_data
 def test_the_walker_swings_its_leg_as_recorded(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(EXPERIMENTS / "compass_gait")
+    monkeypatch.syspath_prepend(REAL / "compass_gait")
     import compass_gait  # pyright: ignore[reportMissingImports]
 
     parameters = declared("compass_gait")
     identified = vector(parameters, hip_frictionloss=0.0077, motor_strength=1.05, motor_delay=0.0078)
-    motions = compass_gait.load(DATA / "compass_gait" / "recordings", compass_gait.VALIDATION[:1])
+    motions = compass_gait.load(REAL_DATA / "compass_gait" / "recordings", compass_gait.VALIDATION[:1])
     points = [parameters.nominal, vector(parameters, **compass_gait.PUBLISHED), identified]
     found = replay(parameters, motions, points, compass_gait.HORIZONS[-1], 1.0)
     timestep = motions[0].sample_timestep
