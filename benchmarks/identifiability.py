@@ -1,10 +1,11 @@
 """Measure how well a sweep determines the parameters: `python benchmarks/identifiability.py`.
 
-1. Sweeps are simulated with known parameters. Without noise, the largest error over different draws of starts is
-   printed. With 0.5 deg of noise, the share of parameters whose truth lies within two standard errors is printed.
-2. Sweeps are recorded of virtual robots, of which identification knows nothing. The identified parameters are compared
-   with the truth. This is repeated with parts of the method removed: first the motion between commands (and so delay,
-   backlash and friction), then also the cables' slack, and then all but the paper's eight parameters.
+1. Sweeps are recorded of virtual robots, of which identification knows nothing. The identified parameters are compared
+   with the truth. Cells have the left and the right leg. This is repeated with parts of the method removed: first the
+   motion between commands (and so delay, backlash and friction), then also the cables' slack, and then all but the
+   paper's eight parameters.
+2. Sweeps are simulated with known parameters. Without noise, the table has the largest error over different draws of
+   starts. With 0.5 deg of noise, it has the share of parameters whose truth lies within two standard errors.
 
 It takes about a quarter of an hour, and with `--quick` a third of that.
 """
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 from ballu_mjx.common import runtime
@@ -36,6 +38,7 @@ from ballu_mjx.ballu.leg_results import Fit
 from ballu_mjx.ballu.model import SIDES
 from ballu_mjx.ballu.sweep import Sweep, read_sweep
 from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.common.results import Cell, Table, write_results
 
 NOISE = float(np.deg2rad(0.5))
 """Noise of a sample (rad)."""
@@ -46,8 +49,8 @@ DYNAMICS = LegDynamics(
 )
 CHANGES = ([1.3, 0.7, 0.05, 0.06, 0.75, 1.2e-3, -0.15, 0.8, 0.03], [0.8, 1.2, -0.08, -0.03, 0.6, 2e-4, 0.0, 1.3, 0.0])
 """True parameters, left and right: factors on the nominal ones, but added to angles (rad), slack (m) and travel."""
-WIDTHS = (14, 14, 15, 20, 16)
-RATIOS = ("knee_spring_stiffness", "motor_gain", "torque_limit")
+RATIOS = {"springs": "knee_spring_stiffness", "gains": "motor_gain", "torque limits": "torque_limit"}
+"""Parameters that are compared as ratios, by the head of their column."""
 
 
 def silent(stage: str, iteration: int, steps: int, value: float) -> None:
@@ -93,8 +96,8 @@ def with_noise(sweep: Sweep, seed: int) -> Sweep:
     )
 
 
-def of_the_model_itself(seeds: int, draws: int) -> None:
-    """Print errors over draws of starts, and coverage over draws of noise, for sweeps of the model itself."""
+def of_the_model_itself(seeds: int, draws: int) -> dict[str, Table]:
+    """Return the errors over draws of starts, and the coverage over draws of noise, for sweeps of the model itself."""
     identifier = Identifier(ALL_PARAMETERS, blank(), silent)
     space = identifier.space
     changes = np.array(CHANGES)
@@ -105,56 +108,71 @@ def of_the_model_itself(seeds: int, draws: int) -> None:
         identifier.config = dataclasses.replace(ALL_PARAMETERS, seed=seed)
         found = np.stack([fit.vector for fit in identifier.run(clean, silent).fits])
         worst = np.maximum(worst, np.abs(found - vectors).max(axis=0))
-    print(f"Without noise, worst of {seeds} draws of starts:")
-    for name, error, value, relative in zip(LEG_PARAMETERS, worst, vectors.min(axis=0), space.relative, strict=True):
-        shown = f"{error / value:.1e} relative" if relative else f"{error:.1e} {'m' if 'slack' in name else 'rad'}"
-        print(f"  {name:24}{shown}")
+    relative = np.where(space.relative, worst / vectors.min(axis=0), worst)
+    units = [
+        "of the value" if own else "m" if "slack" in name else "rad"
+        for name, own in zip(LEG_PARAMETERS, space.relative, strict=True)
+    ]
+    errors = [
+        (name, Cell((float(error),), ".1e", unit))
+        for name, error, unit in zip(LEG_PARAMETERS, relative, units, strict=True)
+    ]
     within = []
     for seed in range(draws):
         identifier.config = dataclasses.replace(ALL_PARAMETERS, draws=32)
         for fit, vector in zip(identifier.run(with_noise(clean, seed), silent).fits, vectors, strict=True):
             within += list(np.abs(fit.vector - vector) < 2 * fit.standard_errors)
-    print(f"With 0.5 deg of noise, {draws} draws: within two standard errors {np.mean(within):.1%} of the parameters")
+    return {
+        "without_noise": Table((f"parameter, {seeds} draws of starts", "largest error"), tuple(errors)),
+        "with_noise": Table(
+            ("draws of 0.5 deg of noise", "parameters within two standard errors"),
+            ((str(draws), Cell((float(np.mean(within)),), ".1%")),),
+        ),
+    }
 
 
-def of_virtual_robots(robots: int) -> None:
-    """Print identified parameters of virtual robots, relative to their true ones."""
+def of_virtual_robots(robots: Sequence[int]) -> Table:
+    """Return identified parameters of virtual robots, relative to their true ones, for left and right leg."""
     ways = {
-        "as it is": IdentificationConfig(),
+        "default": IdentificationConfig(),
         "settled angles alone": IdentificationConfig(motion=False),
         "and no slack": IdentificationConfig(motion=False, cable_slack=False),
         "the paper's eight": dataclasses.replace(PAPER_PARAMETERS, motion=False),
     }
+    rows = []
     for way, config in ways.items():
-        print(f"\nVirtual robots, {way}: identified over true, (left, right)")
-        heads = ("springs", "gains", "torque limits", "slack - true (mm)", "scatter (deg)")
-        print("robot " + "".join(f"{head:>{width}}" for head, width in zip(heads, WIDTHS, strict=True)))
         identifier = None
-        for number in range(robots):
+        for number in robots:
             virtual = virtual_robot.draw_robot(number)
             sweep = read_sweep({Path("sweep"): virtual_robot.record_sweep(virtual, number, "sweep")})
             identifier = identifier or Identifier(config, sweep, silent)
-            fits = identifier.run(sweep, silent).fits
-            print(f"{number:<6}{row(virtual, fits)}", flush=True)
+            rows.append((way, str(number), *compared(virtual, identifier.run(sweep, silent).fits)))
+            print(*rows[-1], sep=" | ", flush=True)
+    return Table(("parameters", "robot", *RATIOS, "slack - true (mm)", "residual (deg)"), tuple(rows))
 
 
-def row(virtual: virtual_robot.VirtualRobot, fits: tuple[Fit, Fit]) -> str:
-    """Return the line of one robot."""
+def compared(virtual: virtual_robot.VirtualRobot, fits: tuple[Fit, Fit]) -> tuple[str, ...]:
+    """Return the cells of one robot: identified over true values, error of the slack (mm), and residual (deg)."""
     found = {name: [fit.vector[index] for fit in fits] for index, name in enumerate(LEG_PARAMETERS)}
-    ratios = [np.array(found[name]) / np.array(getattr(virtual, name)) for name in RATIOS]
+    ratios = [np.array(found[name]) / np.array(getattr(virtual, name)) for name in RATIOS.values()]
     slack = 1e3 * (np.array(found["cable_slack"]) - np.array(virtual.cable_slack))
-    scatter = np.rad2deg([fit.residual for fit in fits])
-    cells = [f"{left:.2f}, {right:.2f}" for left, right in (*ratios, slack, scatter)]
-    return "".join(f"{cell:>{width}}" for cell, width in zip(cells, WIDTHS, strict=True))
+    residual = np.rad2deg([fit.residual for fit in fits])
+    cells = ((ratios, ".3f"), ([slack, residual], ".2f"))
+    return tuple(f"{left:{form}}, {right:{form}}" for pairs, form in cells for left, right in pairs)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="fewer draws, two robots")
-    seeds, draws, robots = (1, 2, 2) if parser.parse_args().quick else (2, 8, 3)
+    parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
+    arguments = parser.parse_args()
+    seeds, draws, robots = (1, 2, range(2)) if arguments.quick else (2, 8, range(3))
     with jax.enable_x64(True):
-        of_the_model_itself(seeds, draws)
-        of_virtual_robots(robots)
+        tables = {"virtual_robots": of_virtual_robots(robots), **of_the_model_itself(seeds, draws)}
+    for table in tables.values():
+        print(f"\n{table.to_markdown()}")
+    if arguments.results is not None:
+        write_results(arguments.results, tables, "Made data", seeds={"robot": robots})
 
 
 if __name__ == "__main__":
