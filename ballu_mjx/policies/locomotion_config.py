@@ -44,10 +44,6 @@ class LocomotionConfig:
     """Mean duration of an episode, s. Each one lasts between half and one and a half times as long."""
     sampled_residual: bool = False
     """Sample the residual forces from the policy's distribution instead of using its mode."""
-    residual_decay: float = 0.0
-    """Decay rate of the residual force outside the range of its training data, 0 or more. The force is multiplied by
-    exp(-decay x excess). The excess is the distance of the residual's observation from that range, in widths of the
-    range, less a margin of 0.1. 0 for no decay."""
     outside_cost: float = 0.0
     """Cost (reward, m/s) for each width of the training range by which the residual's observation lies outside this
     range by more than 0.1 widths, 0 or more. It keeps the policy where the residual is reliable. A policy that is
@@ -55,7 +51,7 @@ class LocomotionConfig:
 
 
 _STARTS = ("start_yaw", "start_tilt", "start_angle", "start_offset", "start_velocity")
-_NOT_NEGATIVE = (*_STARTS, "push_force", "push_torque", "residual_decay", "outside_cost")
+_NOT_NEGATIVE = (*_STARTS, "push_force", "push_torque", "outside_cost")
 
 
 def check_locomotion_config(config: LocomotionConfig, control_timestep: float) -> None:

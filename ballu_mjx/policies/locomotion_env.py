@@ -165,14 +165,13 @@ class LocomotionEnv(Env):
         command = self.command_of(action)
         key, key_force = jax.random.split(before.key)
         excess = self._excess(before.rollout, command)
-        decay = jnp.exp(-self.config.residual_decay * excess)
 
         friction = {"geom_friction": self._friction.at[self._colliding, 0].set(before.friction)}
         drawn = key_force if self.config.sampled_residual else None
         simulator = self.simulator.with_fields(before.setting.fields | friction)
         simulator = simulator.with_drivetrain(before.setting.drivetrain)
         push = Action(before.push[None])
-        after = simulator.step(before.rollout, command, push, action_scale=decay, key=drawn)
+        after = simulator.step(before.rollout, command, push, key=drawn)
 
         rollout, finite = after.state.keep_finite(before.rollout, before.rollout.features)
         com = jnp.where(finite, after.com, before.com)

@@ -29,6 +29,7 @@ from ballu_mjx.residuals.network_input import network_input, recorded_inputs
 from ballu_mjx.residuals.network_loads import expected_units, force_frame, num_loads, square_newtons, world_loads
 from ballu_mjx.residuals.network_mirror import network_mirror
 from ballu_mjx.residuals.scales import resolve_scales
+from ballu_mjx.residuals.training_range import TrainingRange
 from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.coordinates import translations
@@ -97,7 +98,7 @@ def check_envmimic_config(config: EnvMimicConfig, control_timestep: float) -> No
         option, value = f"--{field.name.replace('_', '-')}", getattr(config, field.name)
         if value is None or isinstance(value, bool | str):
             continue
-        if field.name in ("force_limit", "force_scale", "torque_scale", "scales"):
+        if field.name in ("force_limit", "force_scale", "torque_scale", "scales", "fade_width"):
             if not all(x > 0 and math.isfinite(x) for x in (value if isinstance(value, tuple) else (value,))):
                 raise InputError(f"{option} is {value}: it must be greater than 0; leave it out for the default.")
         elif field.name == "expected_loads":
@@ -193,6 +194,7 @@ class EnvMimicEnv(Env):
         self.reference = pad_to_bucket(reference)
         self.episode_length = round(config.episode_seconds / self.robot.control_timestep)
         self.recorded_inputs = recorded_inputs(reference, config, self.robot)
+        self.observed = TrainingRange.of(self.recorded_inputs)
         self._spread = jnp.std(self.recorded_inputs, axis=0)
         self.initial_action = jnp.asarray(expected_units(self.config, self.robot), jnp.float32)
         self.mirror = network_mirror(self.config, self.robot)
@@ -213,6 +215,7 @@ class EnvMimicEnv(Env):
             "spread": self._spread,
             "spread of starts": self._spread_of_starts,
             "initial action": self.initial_action,
+            "observed": None if self.config.fade_width is None else self.observed,
             "base residual": None if self.simulator.residual is None else self.simulator.residual.params,
         }
 
@@ -223,7 +226,7 @@ class EnvMimicEnv(Env):
         other.simulator = simulator.with_drivetrain(parameters["drivetrain"])
         other.reference = parameters["reference"]
         other._spread, other._spread_of_starts = parameters["spread"], parameters["spread of starts"]
-        other.initial_action = parameters["initial action"]
+        other.initial_action, other.observed = parameters["initial action"], parameters["observed"]
         return other
 
     def reset(self, rng: Array) -> State:
@@ -254,7 +257,11 @@ class EnvMimicEnv(Env):
         recording, time = before.recording, before.time
         yaw = before.rollout.features[ObservationLayout.yaw]
         loads, expected = (world_loads(each, yaw, self.config, self.robot) for each in (action, self.initial_action))
-        command, does = self.reference.command[recording, time], FORCE_SETS[self.config.forces].act(loads, self.robot)
+        command = self.reference.command[recording, time]
+        if self.config.fade_width is not None:
+            seen = network_input(before.rollout.history, before.rollout.with_command(command), self.config, self.robot)
+            loads = loads * self.observed.fade(seen, self.config.fade_width)
+        does = FORCE_SETS[self.config.forces].act(loads, self.robot)
         after = self.simulator.step(before.rollout, command, does).state
 
         target = self.reference.features[recording, time + 1]

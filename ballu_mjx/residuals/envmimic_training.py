@@ -14,7 +14,8 @@ from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, check_envm
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_input import num_inputs
 from ballu_mjx.residuals.scales import resolve_scales
-from ballu_mjx.residuals.trained_residual import TrainedResidual, observed_range, write_observed
+from ballu_mjx.residuals.trained_residual import TrainedResidual
+from ballu_mjx.residuals.training_range import with_fading
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.mirror import OFFSET
 from ballu_mjx.rl.ppo import PPOConfig
@@ -74,14 +75,15 @@ def train_envmimic(
     sizes = env.observation_size, env.action_size, ppo_config, env.mirror
     infer = ppo.make_inference(*sizes)
     forces = NetworkResidual(config, robot, infer, ppo.make_sampler(*sizes), network=ppo_config)
-    model, all_params = add_to_base(augmented.residual, forces)
+    forces, with_range = with_fading(forces, config.fade_width, env.observed)
+    model, with_base = add_to_base(augmented.residual, forces)
     measure = (evaluators or Evaluators(plain)).of(model, motions if validation is None else validation)
-    validate = Validation(lambda params: measure(all_params(params)).score)
-    write_observed(record, env.recorded_inputs)
+    validate = Validation(lambda params: measure(with_base(with_range(params))).score)
+    env.observed.write(record)
     TrainingLoop(record, progress, validate_every, validate).train(env, ppo_config, start, record.config)
     step, tree = record.best()
-    observed = observed_range(env.recorded_inputs)
-    return TrainedResidual(model, all_params(ppo.from_tree(tree)), observed, step, plain.actuators)
+    params = with_base(with_range(ppo.from_tree(tree)))
+    return TrainedResidual(model, params, env.observed, step, plain.actuators)
 
 
 def check_envmimic_options(

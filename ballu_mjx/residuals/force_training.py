@@ -25,7 +25,8 @@ from ballu_mjx.residuals.network_input import recorded_inputs
 from ballu_mjx.residuals.network_loads import expected_units, num_loads
 from ballu_mjx.residuals.network_mirror import network_mirror
 from ballu_mjx.residuals.scales import missing_loads, resolve_scales
-from ballu_mjx.residuals.trained_residual import TrainedResidual, observed_range, write_observed
+from ballu_mjx.residuals.trained_residual import TrainedResidual
+from ballu_mjx.residuals.training_range import TrainingRange, with_fading
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.robots.description import RobotDescription
@@ -299,14 +300,16 @@ def _fit(
     network_forces = NetworkResidual(env, robot, ppo.make_inference(*sizes), None, name, network)
     start = ppo.initial_policy(inputs, *sizes[1:])
     start = start._replace(policy=ppo.with_mean(start.policy, expected_units(env, robot)))
-    model, all_params = add_to_base(augmented.residual, network_forces)
+    observed = TrainingRange.of(inputs)
+    forces_in_range, with_range = with_fading(network_forces, env.fade_width, observed)
+    model, with_base = add_to_base(augmented.residual, forces_in_range)
     measure = (evaluators or Evaluators(plain)).of(model, motions.validation)
-    write_observed(record, inputs)
+    observed.write(record)
     setup = _Setup(augmented, motions, network_forces, start, inputs)
-    work = method(setup, config, record, lambda params: measure(all_params(params)).score, progress)
+    work = method(setup, config, record, lambda params: measure(with_base(with_range(params))).score, progress)
     work.learn()
     if progress is not None:
         progress.close()
     step, tree = record.best()
-    params, report = all_params(ppo.from_tree(tree)), "\n".join(work.notes)
-    return TrainedResidual(model, params, observed_range(inputs), step, plain.actuators, report)
+    params, report = with_base(with_range(ppo.from_tree(tree))), "\n".join(work.notes)
+    return TrainedResidual(model, params, observed, step, plain.actuators, report)

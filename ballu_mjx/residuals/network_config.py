@@ -37,6 +37,10 @@ class ForceNetworkConfig:
     heading_frame: bool = True
     """Express vectors and yaw in the network's input, and its forces, in the heading frame of the tracked body. The
     paper uses the world frame. For an anchored robot it is always the world frame."""
+    fade_width: float | None = None
+    """Let the loads fade outside the training range of the network's input: they are multiplied by exp(-(d / width)^4).
+    d is the distance from that range, in widths of the range, less a margin of 0.1. Without this option, loads do not
+    fade. With it, the simulator far from the recordings is the one that this training started from."""
     mirror: bool = False
     """Make the network's output symmetric about the robot's xz plane, apart from a constant: mirrored motions then have
     mirrored forces. The robot's description must declare `mirror`. Not with `--forces joints`."""

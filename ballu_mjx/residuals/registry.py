@@ -42,6 +42,8 @@ class LoadedResidual(NamedTuple):
     """Number of inputs of the residual."""
     step: int
     """Control steps or gradient steps of training until the checkpoint. 0 for kinds without checkpoints."""
+    fade_width: float | None = None
+    """See `ForceNetworkConfig.fade_width`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +90,8 @@ def _load_network(run: StoredRun) -> LoadedResidual:
             "config.json."
         )
     sample = ppo.make_sampler(*sizes) if task == "envmimic" else None
-    return LoadedResidual(NetworkResidual(config, robot, infer, sample, task, network), params, inputs, step)
+    model = NetworkResidual(config, robot, infer, sample, task, network)
+    return LoadedResidual(model, params, inputs, step, config.fade_width)
 
 
 def _load_aerodynamics(run: StoredRun) -> LoadedResidual:

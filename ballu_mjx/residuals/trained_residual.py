@@ -3,34 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any, Literal
 
-import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from ballu_mjx.common import files
-from ballu_mjx.common.errors import InputError, is_number
+from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.aerodynamics import AirParameters
 from ballu_mjx.residuals.registry import KINDS, RESIDUAL_TASKS, StoredRun
 from ballu_mjx.residuals.run_config import check_compatible_robot, run_actuators, run_residual, run_robot
+from ballu_mjx.residuals.training_range import TrainingRange, with_fading
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 from ballu_mjx.runs.folder import read_config
-from ballu_mjx.runs.record import TrainingRecord
 from ballu_mjx.sim.residual import BoundResidual, Commands, History, Residual, SumOfResiduals
 from ballu_mjx.sim.simulator import AugmentedSimulator
-
-MARGIN = 0.1
-"""Margin around the training range, as a fraction of its width. Inputs within the margin count as inside, because the
-range is that of a finite sample."""
-_OBSERVED = "observed.json"
-_NARROWEST = 1e-3
-"""Smallest width of the training range of an input, in the input's unit."""
-_UNBOUNDED = 1e30
-"""Bound of an input whose training range is unknown."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +28,7 @@ class TrainedResidual:
 
     - `model`: the residual without parameters.
     - `params`: the learned parameters.
-    - `observed`: training range: the smallest and the largest value of each input over the training recordings.
+    - `observed`: training range of the inputs.
     - `step`: control steps or gradient steps of training. 0 for kinds without checkpoints.
     - `actuators`: identified actuators of the simulator that the residual corrects. None if they are nominal.
     - `report`: report of the training for the user. Empty if there is none.
@@ -49,7 +36,7 @@ class TrainedResidual:
 
     model: Residual
     params: Any
-    observed: tuple[Float[np.ndarray, ...], Float[np.ndarray, ...]]
+    observed: TrainingRange
     step: int
     actuators: ModelParameters | None
     report: str = ""
@@ -60,9 +47,7 @@ class TrainedResidual:
         bound = simulator.residual
         if bound is None:
             return None
-        observed = bound.observed
-        if observed is None:
-            observed = np.array(-_UNBOUNDED, np.float32), np.array(_UNBOUNDED, np.float32)
+        observed = TrainingRange.unbounded() if bound.observed is None else TrainingRange(*bound.observed)
         return TrainedResidual(bound.model, bound.params, observed, 0, simulator.actuators)
 
     @staticmethod
@@ -95,7 +80,12 @@ class TrainedResidual:
         elif own.sha256 != robot.sha256:
             raise InputError(f"{folder}: is of the robot {own.name}, not of {robot.name}; give one of the same robot.")
         identified = run_actuators(stored, folder, robot)
-        model, params, inputs, step = KINDS[stored["task"]].load(StoredRun(folder, stored, robot, identified, which))
+        model, own_params, inputs, step, fade_width = KINDS[stored["task"]].load(
+            StoredRun(folder, stored, robot, identified, which)
+        )
+        observed = TrainingRange.read(folder, inputs)
+        model, with_range = with_fading(model, fade_width, observed)
+        params = with_range(own_params)
         where = run_residual(stored, folder) if KINDS[stored["task"]].network else None
         if where is not None:
             if where.resolve() in loading:
@@ -103,7 +93,7 @@ class TrainedResidual:
             base = TrainedResidual.load(where, robot, other_model=other_model, loading=loading)
             both = base.bound.plus(BoundResidual(model, params))
             model, params = both.model, both.params
-        return TrainedResidual(model, params, _read_observed(folder / _OBSERVED, inputs), step, identified)
+        return TrainedResidual(model, params, observed, step, identified)
 
     @property
     def bound(self) -> BoundResidual:
@@ -116,43 +106,11 @@ class TrainedResidual:
         return _latency(self.model, self.params)
 
     def out_of_range(self, history: History, commands: Commands) -> Float[Array, ""]:
-        """Return the distance of the residual's input from its training range. It is 0 in the training range.
-
-        The distance of an input is in widths of its range, less `MARGIN`. The result is that of the farthest input.
-        """
-        seen = self.model.inputs(history, commands)
-        low, high = (jnp.asarray(bound) for bound in self.observed)
-        beyond = jnp.maximum(low - seen, seen - high) / jnp.maximum(high - low, _NARROWEST)
-        return jnp.maximum(jnp.max(beyond) - MARGIN, 0.0)
+        """Return the distance of the residual's input from its training range; see `TrainingRange.excess`."""
+        return self.observed.excess(self.model.inputs(history, commands))
 
 
 def _latency(model: Residual, params: Any) -> float:
     if isinstance(model, SumOfResiduals):
         return sum(_latency(part, own) for part, own in zip(model.parts, params, strict=True))
     return float(params.delay) if isinstance(params, AirParameters) else 0.0
-
-
-def observed_range(
-    inputs: Float[Array | np.ndarray, "states inputs"],
-) -> tuple[Float[np.ndarray, " inputs"], Float[np.ndarray, " inputs"]]:
-    """Return the smallest and the largest value of each input."""
-    seen = np.asarray(inputs, np.float32)
-    return seen.min(axis=0), seen.max(axis=0)
-
-
-def write_observed(run: TrainingRecord, inputs: Float[Array | np.ndarray, "states inputs"]) -> None:
-    """Write the training range of a residual's inputs to its run."""
-    low, high = observed_range(inputs)
-    run.write(_OBSERVED, json.dumps({"low": low.tolist(), "high": high.tolist()}) + "\n")
-
-
-def _read_observed(path: Path, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Read the training range of `size` inputs. **Raises** `InputError` if the file is damaged."""
-    fix = "train the residual again"
-    content = files.read_json(path, fix)
-    bounds = [content.get(name) for name in ("low", "high")]
-    if all(isinstance(bound, list) and len(bound) == size and all(map(is_number, bound)) for bound in bounds):
-        low, high = (np.asarray(bound, np.float32) for bound in bounds)
-        if np.all(low <= high):
-            return low, high
-    raise InputError(f"{path}: low and high must have {size} numbers each, with low at most high; {fix}.")

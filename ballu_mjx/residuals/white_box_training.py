@@ -12,7 +12,8 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import recorded_inputs
-from ballu_mjx.residuals.trained_residual import TrainedResidual, observed_range, write_observed
+from ballu_mjx.residuals.trained_residual import TrainedResidual
+from ballu_mjx.residuals.training_range import TrainingRange
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import TrainingRecord
 from ballu_mjx.sim.residual import Residual
@@ -47,5 +48,6 @@ def fitted_residual(
     """Return the residual of a fit to `motions` with the report `text`, and write its training range to `record`."""
     reference, _ = stack_motions(simulator, motions)
     inputs = np.asarray(recorded_inputs(reference, ForceNetworkConfig(), simulator.robot))
-    write_observed(record, inputs)
-    return TrainedResidual(model, params, observed_range(inputs), 0, simulator.actuators, text)
+    observed = TrainingRange.of(inputs)
+    observed.write(record)
+    return TrainedResidual(model, params, observed, 0, simulator.actuators, text)

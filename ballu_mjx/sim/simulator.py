@@ -349,7 +349,6 @@ class AugmentedSimulator:
         command: Float[Array, " commands"],
         further: Action | None = None,
         *,
-        action_scale: Float[Array, ""] | float | None = None,
         key: Array | None = None,
     ) -> RolloutStep:
         """Advance by one control step.
@@ -362,8 +361,6 @@ class AugmentedSimulator:
         - `state`: current state. The residual observes its history and commands.
         - `command`: command of the upcoming control step, in the actuators' own units.
         - `further`: action in addition to that of the residual. None if there is none.
-        - `action_scale`: factor on the residual's action (`Residual.act`). It does not scale the residual's delays and
-          model fields.
         - `key`: random key to sample the residual's action. None for the mode of its distribution.
         """
         commands = state.with_command(command)
@@ -371,8 +368,6 @@ class AugmentedSimulator:
             sent, action = command, Action.none() if further is None else further
         else:
             sent, action = self._evaluate_residual(state.history, commands, key)
-            if action_scale is not None:
-                action = action.scaled(action_scale)
             action = action if further is None else further.plus(action)
         if action.command_change is not None:
             low, high = np.array(self.robot.command_ranges, np.float32).T

@@ -34,7 +34,8 @@ from ballu_mjx.residuals.network_input import num_inputs
 from ballu_mjx.residuals.network_loads import num_loads
 from ballu_mjx.residuals.registry import RESIDUAL_TASKS
 from ballu_mjx.residuals.run_config import describe_run
-from ballu_mjx.residuals.trained_residual import TrainedResidual, write_observed
+from ballu_mjx.residuals.trained_residual import TrainedResidual
+from ballu_mjx.residuals.training_range import TrainingRange
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.registry import load_robot
@@ -84,7 +85,7 @@ def write_run(folder: Path, task: str, base: Path | None = None) -> Path:
         if task in ("envmimic", "walk"):
             run.log(0, {"reward": 1.0})
         if task in RESIDUAL_TASKS:
-            write_observed(run, np.zeros((2, inputs)))
+            TrainingRange.of(np.zeros((2, inputs))).write(run)
         if task == "aerodynamic":
             air = {"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(AirParameters.none())}
             run.write(AERODYNAMICS_FILE, json.dumps(air))

@@ -26,7 +26,7 @@ from ballu_mjx.residuals.fluid_fit import FluidConfig
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import num_inputs
 from ballu_mjx.residuals.run_config import describe_run
-from ballu_mjx.residuals.trained_residual import write_observed
+from ballu_mjx.residuals.training_range import TrainingRange
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.folder import Run
 
@@ -51,7 +51,7 @@ def run(rover: RobotDescription, tmp_path_factory: pytest.TempPathFactory) -> Pa
             FLUID_FILE,
             FluidEstimate("linear", *map(FluidParameters.without_added_mass, (values, 0 * values))).to_json(),
         )
-        write_observed(made, np.zeros((2, num_inputs(ForceNetworkConfig(), rover))))
+        TrainingRange.of(np.zeros((2, num_inputs(ForceNetworkConfig(), rover)))).write(made)
     return folder
 
 

@@ -40,7 +40,7 @@ from ballu_mjx.residuals.aerodynamics import (
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig
 from ballu_mjx.residuals.deploy.export import export_simulator
 from ballu_mjx.residuals.run_config import describe_run
-from ballu_mjx.residuals.trained_residual import write_observed
+from ballu_mjx.residuals.training_range import TrainingRange
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Normalizer, Params, PPOConfig
 from ballu_mjx.robots.description import RobotDescription, read_description
@@ -383,7 +383,7 @@ def test_readme_states_the_command_delay_of_training(tmp_path: Path):
         content = {"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(air)}
         made.write(AERODYNAMICS_FILE, json.dumps(content))
         size = Aerodynamics(BALLU, BALLU.load_model()).inputs(jnp.zeros((3, 27)), jnp.zeros((3, 2))).shape[0]
-        write_observed(made, np.zeros((2, size)))
+        TrainingRange.of(np.zeros((2, size))).write(made)
     delayed = write_run(tmp_path / "delayed", residual=tmp_path / "air")
     text = (export.export_policy(Options(delayed, open_loop=False)) / "README.txt").read_text()
     assert "trained with a delay of 45 ms" in text and "without delay" not in text

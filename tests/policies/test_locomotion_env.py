@@ -19,7 +19,8 @@ from ballu_mjx.policies.tasks import TASKS, Step
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_loads import load_units
-from ballu_mjx.residuals.trained_residual import MARGIN, TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
+from ballu_mjx.residuals.training_range import MARGIN, FadingResidual, TrainingRange
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.learner import Learner
 from ballu_mjx.rl.ppo import PPOConfig
@@ -48,7 +49,7 @@ def make_residual(action: np.ndarray, width: float = 1e6) -> TrainedResidual:
     return TrainedResidual(
         forces,
         params=None,
-        observed=(-bound, bound),
+        observed=TrainingRange(-bound, bound),
         step=0,
         actuators=None,
     )
@@ -201,7 +202,7 @@ def test_residual_force_has_its_units_and_is_in_the_heading_frame():
     assert float(state.metrics["force"]) == pytest.approx(np.linalg.norm(force), rel=1e-5)
 
 
-def test_residual_force_decays_outside_its_training_range():
+def test_residual_force_fades_outside_its_training_range():
     history = jnp.zeros((HISTORY, 27)).at[-1, 2].set(2.0)  # only the balloon's height is out of range
     history = history.at[:-1].set(history[-1])
     commands = jnp.zeros((HISTORY, 2))
@@ -212,8 +213,10 @@ def test_residual_force_decays_outside_its_training_range():
     assert float(residual.out_of_range(jnp.zeros((HISTORY, 27)), commands)) == 0.0
 
     forces = []
-    for decay in (0.0, 3.0):
-        env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(residual_decay=decay), residual=residual)
+    params = residual.params, residual.observed
+    fading = dataclasses.replace(residual, model=FadingResidual(residual.model, 0.5), params=params)
+    for chosen in (residual, fading):
+        env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(), residual=chosen)
         state = PLAIN.reset(jax.random.key(0))
         rollout = inner(state).rollout._replace(history=history)
         state = jax.jit(env.step)(
@@ -222,7 +225,7 @@ def test_residual_force_decays_outside_its_training_range():
         assert float(state.metrics["excess"]) == pytest.approx(expected, rel=1e-5)
         forces.append(float(state.metrics["force"]))
     assert forces[0] == pytest.approx(UNIT, rel=1e-5)
-    assert forces[1] == pytest.approx(forces[0] * np.exp(-3.0 * expected), rel=1e-5)
+    assert forces[1] == pytest.approx(forces[0] * np.exp(-((expected / 0.5) ** 4)), rel=1e-5)
 
 
 GAIN = ppo.Params(ppo.Normalizer(np.zeros(()), {}, {}, {}), None, np.float32(0.8))
@@ -241,7 +244,7 @@ def test_residuals_of_one_kind_share_one_compiled_program():
     for seed, actuators in ((0, nominal), (1, weak)):
         inputs = np.random.default_rng(seed).normal(size=(50, INPUTS)).astype(np.float32)
         params = ppo.initial_policy(inputs, action, dataclasses.replace(network, seed=seed))
-        seen = inputs.min(axis=0), inputs.max(axis=0)
+        seen = TrainingRange.of(inputs)
         learned = TrainedResidual(NetworkResidual(FORCES, load_robot(), infer), params, seen, 0, actuators)
         env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(), actuators=actuators, residual=learned)
         learner = Learner(env, sizes)

@@ -24,12 +24,13 @@ from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.residuals.aerodynamics import Aerodynamics, AirParameters
 from ballu_mjx.residuals.deploy.export import export_simulator, rollout_in_double
-from ballu_mjx.residuals.deploy.residual import PARAMETERS_FILE, SETTINGS_FILE, ImprovedSimulator
+from ballu_mjx.residuals.deploy.residual import PARAMETERS_FILE, SETTINGS_FILE, ImprovedSimulator, NetworkPart
 from ballu_mjx.residuals.fluid import FluidParameters, FluidResidual
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import network_input, network_input_names, num_inputs
 from ballu_mjx.residuals.network_loads import load_names, load_units, num_loads
+from ballu_mjx.residuals.training_range import FadingResidual, TrainingRange
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription, read_description
@@ -81,6 +82,17 @@ def network(
     return BoundResidual(forces_by_it, params._replace(policy=tree))
 
 
+def fading(bound: BoundResidual) -> BoundResidual:
+    """Return a network residual with fading, for a training range that the arm leaves."""
+    assert isinstance(bound.model, NetworkResidual)
+    observed = seen_range(num_inputs(bound.model.config, bound.model.robot))
+    return BoundResidual(FadingResidual(bound.model, 1.0), (bound.params, observed))
+
+
+def seen_range(inputs: int) -> TrainingRange:
+    return TrainingRange(np.full(inputs, -0.6, np.float32), np.full(inputs, 0.6, np.float32))
+
+
 def fluid(robot: RobotDescription) -> BoundResidual:
     model = FluidResidual(robot, robot.load_model(), "cubic")
     rng = np.random.default_rng(1)
@@ -117,9 +129,12 @@ def rover(folder: Path) -> AugmentedSimulator:
 
 
 def arm(folder: Path) -> AugmentedSimulator:
-    """Return an anchored robot with an identified drivetrain and networks for its body, its joints and its commands."""
+    """Return an anchored robot with an identified drivetrain and networks for its body, its joints and its commands.
+
+    The loads of the first network fade outside of its training range.
+    """
     robot = write_arm(folder)
-    simulator = Simulator(robot, identified(robot, **TRUTH)).with_residual(network(robot, "force"))
+    simulator = Simulator(robot, identified(robot, **TRUTH)).with_residual(fading(network(robot, "force")))
     return simulator.with_residual(network(robot, "joints", 1)).with_residual(network(robot, "commands", 2))
 
 
@@ -226,6 +241,17 @@ def test_onnx_networks_agree_and_name_their_inputs(tmp_path_factory: pytest.Temp
         loads = np.asarray(session.run(["loads"], {"input": seen})[0])
         np.testing.assert_allclose(loads, [part.loads(row) for row in seen], atol=1e-5)
         assert len(described["outputs"]) == loads.shape[1] and described["outputs"][0] == "force on hull x, N"
+
+
+def test_exported_loads_fade_as_the_original_ones(tmp_path_factory: pytest.TempPathFactory):
+    _, folder, _ = exported("arm", tmp_path_factory.mktemp("arm"))
+    part = ImprovedSimulator(folder).residual[0]
+    assert isinstance(part, NetworkPart)
+    size = len(json.loads((folder / SETTINGS_FILE).read_text())["residual"][0]["inputs"])
+    inputs = 0.6 * np.random.default_rng(0).normal(size=(20, size)).astype(np.float32)
+    expected = [float(seen_range(size).fade(jnp.asarray(each), 1.0)) for each in inputs]
+    np.testing.assert_allclose([part.fade(each) for each in inputs], expected, atol=1e-5)
+    assert min(expected) < 0.1 and max(expected) > 0.9
 
 
 def test_names_describe_inputs_and_loads_of_a_network(tmp_path: Path):

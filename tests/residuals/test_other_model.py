@@ -16,7 +16,8 @@ from ballu_mjx.residuals.fluid_fit import FluidConfig
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import num_inputs
 from ballu_mjx.residuals.run_config import describe_run
-from ballu_mjx.residuals.trained_residual import TrainedResidual, write_observed
+from ballu_mjx.residuals.trained_residual import TrainedResidual
+from ballu_mjx.residuals.training_range import TrainingRange
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.runs.folder import Run
 
@@ -34,7 +35,7 @@ def run(robot: RobotDescription) -> Path:
     actuators = identified(robot, elbow_damping=0.3, shoulder_delay=0.02)
     config = describe_run("fluid", {"fit": FluidConfig()}, {}, [], actuators, robot)
     with Run(folder, config | {"residual": None}) as made:
-        write_observed(made, np.zeros((2, num_inputs(ForceNetworkConfig(), robot))))
+        TrainingRange.of(np.zeros((2, num_inputs(ForceNetworkConfig(), robot)))).write(made)
         made.write(FLUID_FILE, FluidEstimate("drag", nothing, nothing).to_json())
     return folder
 

@@ -253,12 +253,12 @@ def test_forces_of_a_policy_scale_with_their_share(start: ppo.Params, inputs: np
 def test_a_supervised_run_is_loaded_as_a_residual(tmp_path: Path, start: ppo.Params):
     """`TrainedResidual.load` reads a run of supervised forces."""
     from ballu_mjx.residuals.run_config import describe_run
-    from ballu_mjx.residuals.trained_residual import write_observed
+    from ballu_mjx.residuals.training_range import TrainingRange
     from ballu_mjx.runs.folder import Run
 
     sections = {"env": WRENCH, "ppo": NETWORK, "fit": SupervisedConfig()}
     with Run(tmp_path, describe_run("supervised", sections, {}, []) | {"residual": None}) as run:
-        write_observed(run, np.zeros((2, INPUTS)))
+        TrainingRange.of(np.zeros((2, INPUTS))).write(run)
         run.save(5, ppo.as_tree(start), 0.5)
     loaded = TrainedResidual.load(tmp_path, BALLU)
     assert (loaded.model.name, loaded.step) == ("supervised", 5)

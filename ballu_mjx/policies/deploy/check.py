@@ -224,8 +224,6 @@ def check_policy(
     notes = []
     if policy.config.sampled_residual:
         notes.append("Training sampled the residual's forces; C MuJoCo uses the mode of their distribution.")
-    if policy.config.residual_decay > 0:
-        notes.append("Training reduced the residual's forces outside its training range; C MuJoCo does not.")
     return PolicyCheck(agreement, trial, network, from_frames, steps * policy.robot.control_timestep, tuple(notes))
 
 

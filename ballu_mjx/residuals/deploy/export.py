@@ -29,6 +29,7 @@ from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_input import network_input_names
 from ballu_mjx.residuals.network_loads import load_names, load_scales
 from ballu_mjx.residuals.network_mirror import network_mirror
+from ballu_mjx.residuals.training_range import MARGIN, NARROWEST, FadingResidual
 from ballu_mjx.rl.network_export import NetworkPort, OutputScale, check_onnx, network_arrays, onnx_model
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.mjcf import write_mjcf
@@ -100,6 +101,8 @@ def export_simulator(
     networks = [part for part in parts if part.settings["kind"] == "network"]
     if onnx and not networks:
         raise InputError("--onnx: the simulator has no network, only formulas in residual.py; leave the option out.")
+    if onnx and any(part.settings["fade"] for part in networks):
+        raise InputError("--onnx: the network's loads fade, which only residual.py can compute; leave the option out.")
     place = new_folder(Path(folder), "export")
     place.mkdir(parents=True, exist_ok=True)
     wanted = improved_model(augmented)
@@ -175,12 +178,22 @@ def _network_part(simulator: AugmentedSimulator, model: NetworkResidual, params:
         "activation": model.network.activation,
         "inputs": network_input_names(config, robot),
         "outputs": load_names(config, robot),
+        "fade": None,
         "unit": scales.units.tolist(),
         "limit": (scales.units * scales.limit).tolist(),
     }
     arrays = network_arrays(params, model.network, network_mirror(config, robot))
     del arrays["activation"]
     return ExportedPart(settings, {name: np.asarray(value, float) for name, value in arrays.items()})
+
+
+def _fading_part(simulator: AugmentedSimulator, model: FadingResidual, params: Any) -> ExportedPart:
+    own, observed = params
+    settings, arrays = _export_part(simulator, model.inner, own)
+    low, high = (np.asarray(bound, float) for bound in observed)
+    widths = np.maximum(high - low, NARROWEST)
+    fade = {"width": model.width, "margin": MARGIN}
+    return ExportedPart(settings | {"fade": fade}, arrays | {"low": low, "high": high, "widths": widths})
 
 
 def _aerodynamic_part(simulator: AugmentedSimulator, model: Aerodynamics, params: Any) -> ExportedPart:
@@ -205,6 +218,7 @@ def _fluid_part(simulator: AugmentedSimulator, model: FluidResidual, params: Any
 
 _KINDS: Mapping[type, Callable[..., ExportedPart]] = {
     NetworkResidual: _network_part,
+    FadingResidual: _fading_part,
     Aerodynamics: _aerodynamic_part,
     FluidResidual: _fluid_part,
 }

@@ -191,11 +191,12 @@ class NetworkPart(Part):
         count = sum(name.startswith("kernel_") for name in arrays)
         self._layers = [(arrays[f"kernel_{i}"], arrays[f"bias_{i}"]) for i in range(count)]
         self._activation = {"swish": _swish, "tanh": np.tanh}[part["activation"]]
-        self.joints = part["joints"]
+        self.joints, self._arrays = part["joints"], arrays
 
     def act(self, history: np.ndarray, commands: np.ndarray) -> Action:
         """Return the network's loads; forces and torques on bodies are in the world frame."""
-        forces, loads = self._part["forces"], self.loads(network_input(history, commands, self._part))
+        seen = network_input(history, commands, self._part)
+        forces, loads = self._part["forces"], self.fade(seen) * self.loads(seen)
         if forces == "joints":
             return Action(np.zeros((1, 6)), joint_force=loads)
         if forces == "commands":
@@ -204,6 +205,14 @@ class NetworkPart(Part):
         if self._part["heading_frame"]:
             vectors = vectors @ heading_rotation(history[-1, YAW]).T
         return Action(vectors.reshape(1, 6) if forces == "wrench" else np.pad(vectors, [(0, 0), (0, 3)]))
+
+    def fade(self, seen: np.ndarray) -> float:
+        """Return the factor on the loads for an input: 1 in the training range, and less outside of it."""
+        if self._part["fade"] is None:
+            return 1.0
+        low, high, widths = (self._arrays[name] for name in ("low", "high", "widths"))
+        beyond = np.max(np.maximum(low - seen, seen - high) / widths) - self._part["fade"]["margin"]
+        return float(np.exp(-((max(beyond, 0.0) / self._part["fade"]["width"]) ** 4)))
 
     def loads(self, seen: np.ndarray) -> np.ndarray:
         """Return the loads (N, N m, commands' units) for an input of the network.
