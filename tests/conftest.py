@@ -2,11 +2,11 @@
 
 import os
 from collections.abc import Callable
-from importlib.metadata import version
 from typing import TypeVar
 
 import pytest
 from beartype import beartype
+from fast_compilation import OLDER_FUSION
 from jaxtyping import install_import_hook
 
 from ballu_mjx.common import runtime
@@ -20,23 +20,19 @@ def typecheck(function: Function) -> Function:
     return function if function.__name__ == "__init__" else beartype(function)
 
 
-# JAX 0.10 does not have this flag, and XLA refuses unknown flags.
-_OLDER_FUSION = "--xla_cpu_use_fusion_emitters=false" if version("jax").startswith("0.9.") else ""
-
-
 def compile_fast() -> None:
     """Make this process compile with XLA's older fusion, and without most optimizations (see below).
 
-    A control step then compiles in 4 s instead of 15 s. Most tests run their compiled programs only for a moment.
-    Commands that tests start as processes compile as they do for users. Their compiled programs stay in the cache for
-    runs after the tests.
+    Most tests run their compiled programs only for a moment. Commands that tests start as processes compile as they do
+    for users, unless the test sets `fast_compilation.ENVIRONMENT`. Their compiled programs stay in the cache for runs
+    after the tests.
     """
-    os.environ["XLA_FLAGS"] = f"{_OLDER_FUSION} {os.environ.get('XLA_FLAGS', '')}".strip()
+    os.environ["XLA_FLAGS"] = f"{OLDER_FUSION} {os.environ.get('XLA_FLAGS', '')}".strip()
     runtime.prepare()
     import jax  # only after `prepare`
 
     jax.jit(lambda: 0)()  # the first compilation reads the flags; later changes have no effect
-    os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(_OLDER_FUSION, "").strip()
+    os.environ["XLA_FLAGS"] = os.environ["XLA_FLAGS"].replace(OLDER_FUSION, "").strip()
 
 
 compile_fast()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 if __name__ == "__main__":  # before JAX is imported
@@ -123,16 +123,19 @@ def record_arm(
     truth: Mapping[str, float] = TRUTH,
     noise: float = 0.2,
     friction: float = 0.0,
+    still: Sequence[int] = (),
 ) -> Path:
     """Write a recording of 6 s of the true arm at 100 Hz. Suspended recordings contain only joint angles.
 
     **Arguments**
 
+    - `still`: indices of the commands that stay 0.
     - `noise`: standard deviation of the joint angles' noise (deg).
     - `friction`: as in `true_path`, but in deg.
     """
     seconds, free = 6.0, kind == "free"
     commands = wandering(seed, round(seconds / 0.05), hold=8)
+    commands[:, list(still)] = 0.0
     qpos, _ = true_path(robot, identified(robot, **truth), commands, np.deg2rad(friction))
     qpos = np.concatenate([np.zeros((1, 2)), qpos[:-1]])[::2]
     rng = np.random.default_rng(seed)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from experiment_modules import EXPERIMENTS, REAL_DATA, ROOT, needs_real_data
+from fast_compilation import ENVIRONMENT
 
 pytestmark = [pytest.mark.slow, needs_real_data]
 
@@ -26,6 +28,7 @@ def test_a_quick_run_writes_a_number_for_every_method(name: str, data: str, meth
     done = subprocess.run(
         [sys.executable, str(script), "--data", str(REAL_DATA / data), "--output", str(tmp_path), "--quick"],
         cwd=ROOT,
+        env={**os.environ, **ENVIRONMENT},
         capture_output=True,
         text=True,
         check=False,

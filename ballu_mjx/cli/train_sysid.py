@@ -26,7 +26,7 @@ from ballu_mjx.identification.fit_robot import FitConfig, Visibility, check_fit_
 from ballu_mjx.identification.measured_motion import SamplingConfig, check_sampling_config
 from ballu_mjx.identification.parameters import IdentifiedParameters
 from ballu_mjx.identification.window_objective import WindowConfig
-from ballu_mjx.identification.write_back import identified_to_json, identified_xml
+from ballu_mjx.identification.write_back import identified_to_json, identified_xml, read_identified
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.load import bundled_recordings
 from ballu_mjx.residuals.run_config import describe_recording, describe_run
@@ -59,6 +59,10 @@ class SysidData(loggers.LoggingOptions):
     validation: tuple[Path, ...] = ()
     """Recordings on which the fit of declared parameters is judged; the fit does not use them. Without this option:
     every fourth window of --recordings."""
+    actuators: Path | None = None
+    """actuators.json of an earlier identification of declared parameters, for example from a sweep on a stand, to
+    refine with these recordings. The search starts at its values, and priors are centred there: parameters that these
+    recordings do not show keep them. Without this option: nominal values."""
     robot: str | None = None
     """Robot of the recordings: the name of a robot that comes with the package, or a description file
     (docs/own_robot.md). The file's key "identify" declares the parameters to identify (docs/identify.md). Without this
@@ -84,7 +88,8 @@ def train(
     robot = load_chosen_robot(data.robot)
     if declares_parameters(robot):
         return _train_declared(data, fit, windows, sampling, robot)
-    for changed in (*_changed(windows), *_changed(sampling), *(["validation"] if data.validation else [])):
+    given = [name for name in ("validation", "actuators") if getattr(data, name)]
+    for changed in (*_changed(windows), *_changed(sampling), *given):
         option = changed.replace("_", "-")
         raise InputError(f"--{option} is for declared parameters, but {robot.name} has its own method; leave it out.")
     return _train_by_adapter(data, fit, robot)
@@ -139,6 +144,7 @@ def _train_declared(
     if not data.recordings:
         raise InputError(f"{robot.file}: there are no bundled recordings of {robot.name}; give some by --recordings.")
     declared = declared_parameters(robot, robot.load_model())
+    earlier = None if data.actuators is None else read_identified(data.actuators, robot)
     paths, held = list_recordings(data.recordings), list_recordings(data.validation)
     both = {path.resolve() for path in paths} & {path.resolve() for path in held}
     if both:
@@ -174,6 +180,7 @@ def _train_declared(
             progress=report,
             on_data_check=checked,
             suggest=not data.quick,
+            earlier=earlier,
         )
         stages.close()
         run.write("identification.txt", found.report + "\n")
@@ -192,7 +199,7 @@ def data_check(seen: Visibility) -> str:
         return f"Data check: these recordings show all {len(seen.names)} parameters."
     return (
         f"Data check: these recordings cannot show {', '.join(seen.unseen)}. A change as large as the spread among "
-        "robots is hidden by the noise; the identified values of these stay nominal."
+        "robots is hidden by the noise; these stay at their nominal values, or at those of --actuators."
     )
 
 

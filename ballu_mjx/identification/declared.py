@@ -8,6 +8,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.actuator_choice import HORIZONS, Choice, choose_actuators
@@ -117,6 +118,7 @@ def identify_declared(
     progress: IdentificationProgress | None = None,
     on_data_check: Callable[[Visibility], None] | None = None,
     suggest: bool = True,
+    earlier: IdentifiedParameters | None = None,
 ) -> IdentifiedByFit:
     """Identify the parameters that `robot` declares.
 
@@ -128,6 +130,8 @@ def identify_declared(
     - `progress`: called at every iteration.
     - `on_data_check`: called before the search, with the parameters that the data can show.
     - `suggest`: whether to search for undeclared parameters that would explain the remaining error.
+    - `earlier`: values that other recordings of the same robot identified. Searches start there, and priors are centred
+      there, so that parameters which these recordings do not show keep these values. None for the nominal values.
 
     **Raises** `InputError` if an option is out of range, a recording cannot be used, or a declaration does not fit the
     model.
@@ -138,6 +142,8 @@ def identify_declared(
     specimen = check_recordings(robot, {**recordings, **validation}, config.window_seconds)
     model = robot.load_model()
     parameters = declared_parameters(robot, model)
+    if earlier is not None:
+        parameters = parameters.expecting(np.asarray(earlier.values, float))
     training, held = (
         [measure_recording(each, robot, model, sampling) for each in group.values()]
         for group in (recordings, validation)

@@ -69,14 +69,17 @@ def fit_table(fit: RobotFit, model: mujoco.MjModel, window_seconds: float, held_
     """
     parameters = fit.parameters
     width = max(map(len, (*parameters.names, "parameter"))) + 2
-    lines = [f"{'parameter':{width}}{'nominal':>10}{'identified':>12}{'standard error':>16}{'95 % interval':>24}  unit"]
+    earlier = f"{'earlier':>10}" if parameters.refines else ""
+    heads = f"{'nominal':>10}{earlier}{'identified':>12}{'standard error':>16}{'95 % interval':>24}"
+    lines = [f"{'parameter':{width}}{heads}  unit"]
     for place, (one, (low, high)) in enumerate(zip(parameters.parameters, intervals(fit), strict=True)):
         notes = [
             note
             for note, names in (("not shown by the data", fit.unseen), ("at a bound", fit.at_bounds))
             if one.name in names
         ]
-        cells = f"{one.nominal:>10.4g}{fit.values[place]:>12.4g}{fit.standard_errors[place]:>16.2g}"
+        earlier = f"{parameters.expected[place]:>10.4g}" if parameters.refines else ""
+        cells = f"{one.nominal:>10.4g}{earlier}{fit.values[place]:>12.4g}{fit.standard_errors[place]:>16.2g}"
         interval = f"{low:.4g} to {high:.4g}"
         lines.append(f"{one.name:{width}}{cells}{interval:>24}  {one.unit or '1'} {'; '.join(notes)}".rstrip())
     lines.append("")
@@ -103,14 +106,16 @@ def _held_out_table(fit: RobotFit, model: mujoco.MjModel, window_seconds: float,
     scales, units = channel_scales(model)
     lines = [
         f"Median error after {window_seconds:g} s on {len(fit.nominal.motion)} held-out windows of {held_out}:",
-        f"{'':24}{'nominal':>10}{'identified':>12}",
+        f"{'':22}" + "".join(f"{name:>12}" for name in _by_values(fit)),
     ]
-    pair = [each.final_median[: model.nv] * scales for each in (fit.nominal, fit.identified)]
-    for name, unit, one, other in zip(channel_names(model), units, *pair, strict=True):
-        lines.append(f"{name:24}{one:>10.3g}{other:>12.3g} {unit}")
-    verdict = "better" if fit.improves else "WORSE"
-    scores = f"{fit.identified.score:.3g} and {fit.nominal.score:.3g} times the noise"
-    lines.append(f"Identified values replay them {verdict} than nominal ones: errors are {scores}.")
+    errors = [each.final_median[: model.nv] * scales for each in _by_values(fit).values()]
+    for name, unit, *row in zip(channel_names(model), units, *errors, strict=True):
+        lines.append(f"{name:22}" + "".join(f"{error:>12.3g}" for error in row) + f" {unit}")
+    for name, other in _by_values(fit).items():
+        if other is not fit.identified:
+            verdict = "better" if fit.identified.score < other.score else "WORSE"
+            scores = f"{fit.identified.score:.3g} and {other.score:.3g} times the noise"
+            lines.append(f"Identified values replay them {verdict} than {name} ones: errors are {scores}.")
     if fit.identified.score > _MUCH:
         lines.append(
             f"The error is more than {_MUCH:g} times the noise, so the model may lack a force. Identified values can "
@@ -128,6 +133,7 @@ def fit_details(fit: RobotFit, model: mujoco.MjModel) -> dict[str, Any]:
                 "name": one.name,
                 "unit": one.unit,
                 "nominal": one.nominal,
+                "expected": float(fit.parameters.expected[place]),
                 "value": float(fit.values[place]),
                 "standard_error": float(fit.standard_errors[place]),
                 "white_noise_error": float(fit.white_noise_errors[place]),
@@ -142,13 +148,15 @@ def fit_details(fit: RobotFit, model: mujoco.MjModel) -> dict[str, Any]:
         "not_determined": list(fit.unidentified),
         "correlations": [list(pair) for pair in fit.strong_correlations],
         "scatter": [float(x) for x in fit.scatter],
-        "held_out": {name: _held_out(each, model) for name, each in _pair(fit).items()},
+        "held_out": {name: _held_out(each, model) for name, each in _by_values(fit).items()},
         "improves": fit.improves,
     }
 
 
-def _pair(fit: RobotFit) -> Mapping[str, HeldOut]:
-    return {"nominal": fit.nominal, "identified": fit.identified}
+def _by_values(fit: RobotFit) -> Mapping[str, HeldOut]:
+    """Return errors on held-out windows by the values that caused them."""
+    earlier = {} if fit.earlier is None else {"earlier": fit.earlier}
+    return {"nominal": fit.nominal, **earlier, "identified": fit.identified}
 
 
 def _held_out(found: HeldOut, model: mujoco.MjModel) -> dict[str, Any]:

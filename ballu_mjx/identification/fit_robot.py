@@ -32,7 +32,7 @@ class FitConfig(WindowConfig):
     """Options of the identification of declared parameters."""
 
     starts: int = 4
-    """Number of searches: one from the nominal values, the others from samples of the priors."""
+    """Number of searches: one from the expected values, the others from samples of the priors."""
     steps: int = 20
     """Maximum number of iterations of a search."""
     seed: int = 0
@@ -108,6 +108,8 @@ class RobotFit:
     """Windows of the training motions that were fitted; the held-out ones are not among them."""
     nominal: HeldOut
     identified: HeldOut
+    earlier: HeldOut | None = None
+    """Errors of the expected values of an earlier identification. None if nominal values were expected."""
 
     @property
     def improves(self) -> bool:
@@ -164,7 +166,7 @@ def check_data(
 ) -> Visibility:
     """Check which parameters these recordings can show.
 
-    The signal of a parameter is the largest at the nominal values and at two samples of the priors.
+    The signal of a parameter is the largest at the expected values and at two samples of the priors.
 
     **Raises** `InputError` if an option is out of range, or if no recording is as long as a window.
     """
@@ -186,10 +188,10 @@ def fit_robot(
 ) -> RobotFit:
     """Fit parameters to recorded motions.
 
-    1. Check which parameters the data can show. The others stay near their nominal values, because of their priors.
+    1. Check which parameters the data can show. The others stay near their expected values, because of their priors.
     2. Search from several starts, one after the other.
     3. Weight each channel by its scatter at the best solution, and continue the search from there.
-    4. Replay held-out windows with nominal and with identified values.
+    4. Replay held-out windows with nominal, expected and identified values.
 
     **Arguments**
 
@@ -226,7 +228,7 @@ def fit_robot(
         if on_data_check is not None:
             on_data_check(visibility)
         if config.reweigh:
-            objective.rescale(objective.simulator.differences(parameters.nominal))
+            objective.rescale(objective.simulator.differences(parameters.expected))
         searches, lowest = [], np.inf
 
         def report_search(stage: str, before: int, whole: int, iteration: int, steps: int, value: float) -> None:
@@ -249,6 +251,7 @@ def fit_robot(
         values = parameters.at_shares(shares)
         analysis = analyse(objective(values, best.start)[0], parameters)
         pair = [_held_out(simulator, point) for point in (parameters.nominal, values)]
+        earlier = _held_out(simulator, parameters.expected) if parameters.refines else None
     return RobotFit(
         parameters=parameters,
         values=values,
@@ -263,6 +266,7 @@ def fit_robot(
         windows=windows,
         nominal=pair[0],
         identified=pair[1],
+        earlier=earlier,
     )
 
 
@@ -301,7 +305,7 @@ def _visibility(objective: WindowObjective, config: FitConfig) -> Visibility:
 
 
 _DRAWS = 3
-"""Number of parameter vectors in the data check: the nominal values, then samples of the priors."""
+"""Number of parameter vectors in the data check: the expected values, then samples of the priors."""
 
 
 def _held_out(simulator: WindowSimulator, values: Float[np.ndarray, " parameters"]) -> HeldOut:

@@ -132,12 +132,19 @@ class Shares:
 class ParameterSet:
     """Parameters of a model. Their values are a vector, in the parameters' units or as shares (see `Shares`)."""
 
-    def __init__(self, parameters: Sequence[Parameter], commands: int) -> None:
+    def __init__(
+        self,
+        parameters: Sequence[Parameter],
+        commands: int,
+        expected: Float[np.ndarray, " parameters"] | None = None,
+    ) -> None:
+        """`expected`: values at which searches start and priors are centred. None for the nominal values."""
         self.parameters = tuple(parameters)
         self.commands = commands
         """Number of the robot's commands. Each has a drivetrain."""
         self.names = tuple(p.name for p in self.parameters)
         self.nominal = np.array([p.nominal for p in self.parameters])
+        self.expected = self.nominal if expected is None else expected
         self.lower, self.upper = np.array([p.bounds for p in self.parameters]).reshape(-1, 2).T
         self.prior = np.array([p.prior for p in self.parameters])
         self.unit = np.where(np.isfinite(self.prior), self.prior, (self.upper - self.lower) / 2)
@@ -146,6 +153,15 @@ class ParameterSet:
 
     def __len__(self) -> int:
         return len(self.parameters)
+
+    @property
+    def refines(self) -> bool:
+        """Return whether expected values differ from the nominal ones."""
+        return not np.array_equal(self.expected, self.nominal)
+
+    def expecting(self, values: Float[np.ndarray, " parameters"]) -> ParameterSet:
+        """Return the same parameters with other expected values."""
+        return ParameterSet(self.parameters, self.commands, values)
 
     def shares(self, values: Float[np.ndarray, "*batch parameters"]) -> Float[np.ndarray, "*batch parameters"]:
         """Return the shares of values: 0 at the lower bound, 1 at the upper bound."""
@@ -160,17 +176,17 @@ class ParameterSet:
         return self._span.slopes(values)
 
     def draw(self, seed: int, count: int) -> Float[np.ndarray, "count parameters"]:
-        """Return the nominal values, then samples of the priors.
+        """Return the expected values, then samples of the priors.
 
         A parameter is sampled uniformly over its shares if it has no prior, or if its sample is outside the bounds.
         Values on or near a bound are moved inside.
         """
         rng = np.random.default_rng(seed)
         spread = np.where(np.isfinite(self.prior), self.prior, 0.0)
-        values = self.nominal + spread * rng.normal(size=(max(count - 1, 0), len(self)))
+        values = self.expected + spread * rng.normal(size=(max(count - 1, 0), len(self)))
         uniform = self.at_shares(rng.uniform(size=values.shape))
         outside = (values < self.lower) | (values > self.upper) | ~np.isfinite(self.prior)
-        begins = np.concatenate([self.nominal[None], np.where(outside, uniform, values)])[:count]
+        begins = np.concatenate([self.expected[None], np.where(outside, uniform, values)])[:count]
         return self.at_shares(np.clip(self.shares(begins), _INSIDE, 1 - _INSIDE))
 
     def at_bounds(self, values: Float[np.ndarray, " parameters"]) -> tuple[str, ...]:

@@ -143,7 +143,7 @@ class WindowSearch:
         reduced, simulated = self.objective(values, start)
         if self.on_evaluation is not None:
             self.on_evaluation(values)
-        prior = (values - parameters.nominal) / parameters.prior
+        prior = (values - parameters.expected) / parameters.prior
         loss = reduced.loss + float(prior @ prior)
         if self._best is None or loss < self._best[0]:
             self._best, self._refused = (loss, values, reduced), 0

@@ -85,6 +85,31 @@ def test_sysid_identifies_the_arm_and_writes_all_files(robot: RobotDescription, 
     assert any("search" in json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines())
 
 
+def test_refinement_keeps_earlier_values_that_the_recordings_do_not_show(
+    robot: RobotDescription, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    """The shoulder's command stays 0, so that its drivetrain is hidden. The elbow moves and is identified anew."""
+    earlier = {"shoulder_delay": 0.05, "shoulder_backlash": 0.08, "shoulder_scale": 0.9, "mass": 0.25}
+    file = tmp_path / ACTUATORS_FILE
+    file.write_text(identified_to_json(robot, identified(robot, **earlier)))
+    paths = [record_arm(tmp_path, robot, f"elbow-{seed}", seed, still=(0,)) for seed in (0, 1)]
+    line = ["sysid", "--robot", robot.file, "--actuators", file, "--output", tmp_path / "run", "--quick"]
+    line += ["--recordings", paths[0], "--validation", paths[1], "--steps", "12"]
+    assert train.main(list(map(str, line))) == 0
+    _, found = read_actuators(robot, tmp_path / "run" / ACTUATORS_FILE)
+    assert isinstance(found, IdentifiedParameters)
+    values = dict(zip(found.declared.names, np.asarray(found.values, float), strict=True))
+    for name in ("shoulder_delay", "shoulder_backlash", "shoulder_scale"):
+        assert values[name] == pytest.approx(earlier[name], rel=0.05), name
+    for name in ("mass", "elbow_damping"):
+        assert values[name] == pytest.approx(TRUTH[name], rel=0.1), name
+    printed = capsys.readouterr().out
+    assert "cannot show" in printed and "better than earlier ones" in printed
+    details = json.loads((tmp_path / "run" / "identification.json").read_text())
+    assert {row["name"]: row["expected"] for row in details["parameters"]}["mass"] == pytest.approx(0.25)
+    assert details["held_out"]["identified"]["score"] < details["held_out"]["earlier"]["score"]
+
+
 def dataset(robot: RobotDescription, **options: Path) -> RecordingsData:
     folder = robot.file.parent
     parts = {"recordings": (folder / "training",), "validation": (folder / "validation",), "robot": str(robot.file)}
@@ -138,11 +163,11 @@ def test_unsuitable_options_and_recordings_are_refused(
     assert not (folder / "refused").exists()
 
 
-def test_options_of_declared_parameters_are_refused_for_ballu(capsys: pytest.CaptureFixture):
-    assert train.main(["sysid", "--window-seconds", "2"]) == 2
-    assert (
-        "--window-seconds is for declared parameters, but ballu has its own method" in capsys.readouterr().err.lower()
-    )
+@pytest.mark.parametrize("option", [("--window-seconds", "2"), ("--actuators", "swept.json")])
+def test_options_of_declared_parameters_are_refused_for_ballu(option: tuple[str, str], capsys: pytest.CaptureFixture):
+    assert train.main(["sysid", *option]) == 2
+    message = f"{option[0]} is for declared parameters, but ballu has its own method"
+    assert message in capsys.readouterr().err.lower()
 
 
 def test_actuators_file_of_another_declaration_is_refused(robot: RobotDescription, tmp_path: Path):

@@ -417,7 +417,7 @@ def formats(work: Path) -> list[Format]:
     from ballu_mjx.recordings.importers.mapping import read_mapping
     from ballu_mjx.recordings.recording import cut
     from ballu_mjx.residuals.aerodynamics import AERODYNAMICS_FILE, AERODYNAMICS_FORMAT, read_air_parameters
-    from ballu_mjx.residuals.trained_residual import _read_observed
+    from ballu_mjx.residuals.training_range import TrainingRange
     from ballu_mjx.robots.description import read_description
     from ballu_mjx.robots.model import assets
     from ballu_mjx.robots.registry import load_robot
@@ -478,7 +478,7 @@ def formats(work: Path) -> list[Format]:
     folder = place()
     path = folder / "observed.json"
     path.write_text(json.dumps({"low": [-0.5] * 87, "high": [0.5] * 87}))
-    add("observed.json", path, JSON, lambda path=path: _read_observed(path, 87), observed_fault, share=6)
+    add("observed.json", path, JSON, lambda path=path: TrainingRange.read(path.parent, 87), observed_fault, share=6)
 
     found += _run_formats(place, short.robot)
 
