@@ -46,6 +46,7 @@ IDENTIFIED_MODEL = "identified.xml"
 _SHARED = ("starts", "steps", "seed")
 """Options of `IdentificationConfig` that also apply to declared parameters."""
 _WINDOWS_DRAWN = 4
+_QUICK_NOTE = "These values can be wrong: --quick makes a short search."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,6 +126,8 @@ def _train_by_adapter(data: SysidData, fit: IdentificationConfig, robot: RobotDe
         if isinstance(found, IdentifiedLegs):
             ballu_plots.actuator_curves(folder / "actuator_curves.png", found.sweep, found.identification)
         print(f"\n{found.report}")
+        if data.quick:
+            print(_QUICK_NOTE)
     return 0
 
 
@@ -188,6 +191,8 @@ def _train_declared(
         run.write(ACTUATORS_FILE, _actuators_json(robot, found, paths))
         _draw(folder, found)
         print(f"\n{found.report}\n")
+        if data.quick:
+            print(_QUICK_NOTE)
         _write_model(folder, robot, found)
     _write_page(folder)
     return 0

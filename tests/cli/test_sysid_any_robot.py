@@ -105,6 +105,7 @@ def test_refinement_keeps_earlier_values_that_the_recordings_do_not_show(
         assert values[name] == pytest.approx(TRUTH[name], rel=0.1), name
     printed = capsys.readouterr().out
     assert "cannot show" in printed and "better than earlier ones" in printed
+    assert "These values can be wrong: --quick" in printed
     details = json.loads((tmp_path / "run" / "identification.json").read_text())
     assert {row["name"]: row["expected"] for row in details["parameters"]}["mass"] == pytest.approx(0.25)
     assert details["held_out"]["identified"]["score"] < details["held_out"]["earlier"]["score"]
