@@ -146,19 +146,26 @@ def of_virtual_robots(robots: Sequence[int]) -> Table:
             virtual = virtual_robot.draw_robot(number)
             sweep = read_sweep({Path("sweep"): virtual_robot.record_sweep(virtual, number, "sweep")})
             identifier = identifier or Identifier(config, sweep, silent)
-            rows.append((way, str(number), *compared(virtual, identifier.run(sweep, silent).fits)))
+            rows.append((way, str(number), *compared(virtual, identifier.run(sweep, silent).fits, config.motion)))
             print(*rows[-1], sep=" | ", flush=True)
-    return Table(("parameters", "robot", *RATIOS, "slack - true (mm)", "residual (deg)"), tuple(rows))
+    return Table(("parameters", "robot", *RATIOS, "slack - true (mm)", "residual of the motion (deg)"), tuple(rows))
 
 
-def compared(virtual: virtual_robot.VirtualRobot, fits: tuple[Fit, Fit]) -> tuple[str, ...]:
-    """Return the cells of one robot: identified over true values, error of the slack (mm), and residual (deg)."""
+def compared(virtual: virtual_robot.VirtualRobot, fits: tuple[Fit, Fit], motion: bool) -> tuple[str, ...]:
+    """Return the cells of one robot: identified over true values, error of the slack (mm), and residual (deg).
+
+    Without the `motion`, residuals are weighted settled angles, which are not shown.
+    """
     found = {name: [fit.vector[index] for fit in fits] for index, name in enumerate(LEG_PARAMETERS)}
     ratios = [np.array(found[name]) / np.array(getattr(virtual, name)) for name in RATIOS.values()]
     slack = 1e3 * (np.array(found["cable_slack"]) - np.array(virtual.cable_slack))
     residual = np.rad2deg([fit.residual for fit in fits])
-    cells = ((ratios, ".3f"), ([slack, residual], ".2f"))
-    return tuple(f"{left:{form}}, {right:{form}}" for pairs, form in cells for left, right in pairs)
+    *cells, last = (
+        f"{left:{form}}, {right:{form}}"
+        for pairs, form in ((ratios, ".3f"), ([slack, residual], ".2f"))
+        for left, right in pairs
+    )
+    return (*cells, last if motion else "-")
 
 
 def main() -> None:
