@@ -99,14 +99,12 @@ def test_a_step_applies_the_residual_simulates_and_updates_the_history(start: Ro
 def test_wrenches_of_residuals_and_actions_add_up(start: RolloutState):
     """The wrench is the sum of two residuals, which are scaled, and of another wrench on the base."""
 
-    def both(simulator: Simulator | AugmentedSimulator, scale: float = 1.0) -> AugmentedSimulator:
-        added = simulator.with_residual(BoundResidual(Springs(), PARAMS)).with_residual(
-            BoundResidual(PlainPush(), 0.02)
-        )
-        return dataclasses.replace(added, scale=jnp.float32(scale))
+    def both(simulator: Simulator | AugmentedSimulator) -> AugmentedSimulator:
+        return simulator.with_residual(BoundResidual(Springs(), PARAMS)).with_residual(BoundResidual(PlainPush(), 0.02))
 
     more = jnp.zeros((2, 6)).at[1, 2].set(0.1)
-    after = jax.jit(lambda state: both(SIMULATOR, 0.5).step(state, COMMAND, Action(more)))(start)
+    half = dataclasses.replace(both(SIMULATOR), scale=0.5)
+    after = jax.jit(lambda state: half.step(state, COMMAND, Action(more)))(start)
     own = Springs().act(PARAMS, start.history, start.with_command(COMMAND)).wrench
     expected = more.at[0].add(0.5 * (own[0] + 0.02 * jnp.eye(1, 6)[0]))
     np.testing.assert_allclose(after.action.wrench, expected, atol=1e-6)
