@@ -28,7 +28,8 @@ def test_a_quick_run_writes_a_number_for_every_method(name: str, data: str, meth
     done = subprocess.run(
         [sys.executable, str(script), "--data", str(REAL_DATA / data), "--output", str(tmp_path), "--quick"],
         cwd=ROOT,
-        env={**os.environ, **ENVIRONMENT},
+        # The blimp's flights are long, so that slow programs cost more time than compiling them well.
+        env={**os.environ, **({} if name == "rgblimp" else ENVIRONMENT)},
         capture_output=True,
         text=True,
         check=False,
