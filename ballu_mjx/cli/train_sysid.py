@@ -18,7 +18,7 @@ from ballu_mjx.ballu.leg_parameters import IdentificationConfig, check_identific
 from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, written_to
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.identification.actuators import ACTUATORS_FILE, declares_parameters, identify_actuators
+from ballu_mjx.identification.actuators import ACTUATORS_FILE, declares_parameters, identify_actuators, read_actuators
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.declared import IdentifiedByFit, check_recordings, identify_declared
 from ballu_mjx.identification.fit_report import autocorrelation, channel_names, channel_scales
@@ -26,7 +26,7 @@ from ballu_mjx.identification.fit_robot import FitConfig, Visibility, check_fit_
 from ballu_mjx.identification.measured_motion import SamplingConfig, check_sampling_config
 from ballu_mjx.identification.parameters import IdentifiedParameters
 from ballu_mjx.identification.window_objective import WindowConfig
-from ballu_mjx.identification.write_back import identified_to_json, identified_xml, read_identified
+from ballu_mjx.identification.write_back import identified_to_json, identified_xml
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.load import bundled_recordings
 from ballu_mjx.residuals.run_config import describe_recording, describe_run
@@ -147,7 +147,8 @@ def _train_declared(
     if not data.recordings:
         raise InputError(f"{robot.file}: there are no bundled recordings of {robot.name}; give some by --recordings.")
     declared = declared_parameters(robot, robot.load_model())
-    earlier = None if data.actuators is None else read_identified(data.actuators, robot)
+    earlier = None if data.actuators is None else read_actuators(robot, data.actuators)[1]
+    assert earlier is None or isinstance(earlier, IdentifiedParameters)
     paths, held = list_recordings(data.recordings), list_recordings(data.validation)
     both = {path.resolve() for path in paths} & {path.resolve() for path in held}
     if both:

@@ -149,6 +149,8 @@ def test_identified_actuators_are_used_by_default_if_they_replay_better(
         (["--levels", "5"], "--levels is for BALLU's legs"),
         (["--window-seconds", "0"], "--window-seconds is 0.0: it must be above 0"),
         (["--angle-noise", "-1"], "--angle-noise is -1.0: it must be above 0"),
+        (["--actuators", "{training}"], "this is a folder; give the file actuators.json"),
+        (["--actuators", "missing.json"], "missing.json: there is no such file; `python -m ballu_mjx.train sysid`"),
         (["--validation", "{training}"], "is among --recordings and --validation"),
         (["--window-seconds", "60"], "no recording lasts 60 s"),
     ],
