@@ -8,6 +8,7 @@ are also computed.
 from __future__ import annotations
 
 import copy
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from mujoco import mjx
 
 from ballu_mjx.evaluation.errors import (
@@ -41,7 +42,7 @@ from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.residual import BoundResidual, Residual
 from ballu_mjx.sim.sharding import compile_for_devices, device_shardings
 from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState, Simulator
-from ballu_mjx.sim.step import PhysicsState
+from ballu_mjx.sim.step import PhysicsState, state_at
 
 START_INTERVAL = 1.0
 """Time (s) between two starts in a recording. It is the shortest horizon if that is shorter."""
@@ -55,7 +56,8 @@ _CHUNK = 100
 class Replay(NamedTuple):
     """Simulated runs from recorded states. The recorded starting state is the first state of each run.
 
-    All arrays have the length of the longest run. Values beyond the end of a run's recording have no meaning.
+    All arrays have the length of the longest run. Values are NaN after the end of a run's recording or after the run has
+    diverged (`LARGEST`).
     """
 
     position: Float[np.ndarray, "runs states 3"]
@@ -96,6 +98,15 @@ def evaluate(simulator: AugmentedSimulator, motions: Sequence[Motion]) -> Evalua
         raise ValueError("The simulator has no residual; give one from `with_residual`.")
     evaluator = Evaluators(simulator.without_residual()).of(simulator.residual.model, motions)
     return evaluator(simulator.residual.params)
+
+
+class _Run(NamedTuple):
+    """State of a run between two control steps."""
+
+    rollout: RolloutState
+    over: Bool[Array, ""] | Bool[np.ndarray, "*batch"]
+    """Whether the recording has ended or the run has diverged. The rollout then stays at recorded states, because the
+    solver needs up to its largest number of iterations for a state without meaning."""
 
 
 class Evaluators:
@@ -231,8 +242,8 @@ class OpenLoopEvaluator:
             qpos[self.first_runs],
         )
 
-    def _begin(self, places: Int[np.ndarray, "runs 2"]) -> RolloutState:
-        """Return rollout states at recorded `places` (recording, control step)."""
+    def _begin(self, places: Int[np.ndarray, "runs 2"]) -> _Run:
+        """Return the states of runs that start at recorded `places` (recording, control step)."""
         recording, first = places.T
         earlier = first[:, None] + np.arange(1 - HISTORY, 1)
         qpos, qvel = (np.asarray(x)[recording, first] for x in (self._reference.qpos, self._reference.qvel))
@@ -243,7 +254,8 @@ class OpenLoopEvaluator:
         physics = PhysicsState(qpos, qvel, np.zeros_like(qvel))  # pyright: ignore
         # Nominal actuators have an identity drivetrain, which does not read this state.
         drivetrain = self._reference.drivetrain_at(recording, first)
-        return jax.device_put(RolloutState(physics, features, command, drivetrain), self._split)  # pyright: ignore
+        rollout = RolloutState(physics, features, command, drivetrain)  # pyright: ignore
+        return jax.device_put(_Run(rollout, np.zeros(len(places), bool)), self._split)
 
     def recorded(self, run: int) -> tuple[Float[np.ndarray, "states 3"], Float[np.ndarray, " states"]]:
         """Return the recorded position (m, world frame) and yaw (rad) of the tracked body, from the start of `run` to
@@ -296,9 +308,9 @@ class OpenLoopEvaluator:
         model: mjx.Model,
         drivetrain: DrivetrainParameters | None,
         reference: ReferenceMotions,
-        rollout: RolloutState,
+        run: _Run,
         place: Int[Array, " 2"],
-    ) -> tuple[RolloutState, tuple[Array, Array, Array, Array]]:
+    ) -> tuple[_Run, tuple[Array, Array, Array, Array]]:
         """Simulate one run for `_CHUNK` control steps.
 
         Return the final state, and for each step: features, centre of mass (m), residual force (N) and generalized
@@ -308,11 +320,20 @@ class OpenLoopEvaluator:
         own = self._simulator.with_model(model).with_drivetrain(drivetrain)
         simulator = own.with_residual(BoundResidual(self._residual, params), scale)
 
-        def step(rollout: RolloutState, time: Array) -> tuple[RolloutState, tuple]:
-            after = simulator.step(rollout, reference.command[recording, time])
-            return after.state, (after.state.features, after.com, after.action.wrench[0, :3], after.state.physics.qpos)
+        def step(run: _Run, time: Array) -> tuple[_Run, tuple]:
+            after = simulator.step(run.rollout, reference.command[recording, time])
+            rollout, recorded = after.state, reference.features[recording, time + 1]
+            away = jnp.linalg.norm((rollout.features - recorded)[ObservationLayout.position])
+            over = run.over | ~(away < LARGEST) | ~jnp.all(jnp.isfinite(rollout.features))
+            seen = rollout.features, after.com, after.action.wrench[0, :3], rollout.physics.qpos
+            seen = jax.tree.map(lambda x: jnp.where(over, jnp.nan, x), seen)
 
-        return jax.lax.scan(step, rollout, start + jnp.arange(_CHUNK))
+            over |= time + 1 >= reference.steps[recording]
+            physics = state_at(reference.qpos[recording, time + 1], reference.qvel[recording, time + 1])
+            held = rollout._replace(physics=physics, history=jnp.broadcast_to(recorded, rollout.history.shape))
+            return _Run(jax.tree.map(functools.partial(jnp.where, over), held, rollout), over), seen
+
+        return jax.lax.scan(step, run, start + jnp.arange(_CHUNK))
 
     def of_starts(self, motions: Sequence[Motion], params: Any) -> tuple[Errors, ...]:
         """Return the differences between two replays with the residual that differ only in their starting states.

@@ -322,6 +322,14 @@ def test_a_replay_of_limited_length_is_the_start_of_a_longer_one(evaluator: Open
     np.testing.assert_array_equal(short.position, whole.position[:, :states])
 
 
+def test_a_replay_has_no_values_after_a_recordings_end(evaluator: OpenLoopEvaluator):
+    replay = evaluator.replay(jnp.array(FORCE))
+    for run, (recording, start) in enumerate(evaluator.starts):
+        states = len(evaluator.motions[recording].qpos) - start
+        for values in (replay.position, replay.euler_angles, replay.com):
+            assert np.isfinite(values[run, :states]).all() and np.isnan(values[run, states:]).all()
+
+
 def test_evaluation_with_identified_actuators_includes_the_nominal_robot(evaluator: OpenLoopEvaluator):
     """The first recording is from the nominal robot, so it has no error only without the identified actuators."""
     assert evaluator(jnp.array(FORCE)).nominal == ()
