@@ -46,9 +46,9 @@ from ballu_mjx.sim.step import PhysicsState, state_at
 
 START_INTERVAL = 1.0
 """Time (s) between two starts in a recording. It is the shortest horizon if that is shorter."""
-_RUNS = {True: 64, False: 1024}
-"""Batch size: runs in parallel on each device, on a CPU (True) and on other devices (False). A smaller number of runs
-is padded, and a larger one is split into batches."""
+_RUNS = {True: (8, 64), False: (1024,)}
+"""Batch sizes: runs in parallel on each device, on a CPU (True) and on other devices (False). Runs are padded to the
+smallest size that holds all of them, or split into batches of the largest one. Each size compiles its own program."""
 _CHUNK = 100
 """Control steps that the compiled program simulates at once. One program then serves recordings of all lengths."""
 
@@ -56,7 +56,7 @@ _CHUNK = 100
 class Replay(NamedTuple):
     """Simulated runs from recorded states. The recorded starting state is the first state of each run.
 
-    All arrays have the length of the longest run. Values are NaN after the end of a run's recording or after the run has
+    All arrays have the length of the longest run. Values are NaN after the end of a recording and after a run has
     diverged (`LARGEST`).
     """
 
@@ -155,8 +155,6 @@ class OpenLoopEvaluator:
         self._residual = residual
         self._simulator = simulator
         self.robot = simulator.robot
-        devices = jax.local_devices()
-        self._size = len(devices) * _RUNS[devices[0].platform == "cpu"]
         self._everywhere, self._split = device_shardings()
         self._chunk = compile_for_devices(self._advance, shared=5)
         self._look_at(motions)
@@ -186,6 +184,9 @@ class OpenLoopEvaluator:
             for index, motion in enumerate(self.motions)
             for start in range(HISTORY - 1, len(motion.command) - interval + 1, interval)
         ]
+        devices = jax.local_devices()
+        sizes = [len(devices) * runs for runs in _RUNS[devices[0].platform == "cpu"]]
+        self._size = next((size for size in sizes if size >= len(self.starts)), sizes[-1])
         recordings = [recording for recording, _ in self.starts]
         # Index in `starts` of each recording's first start, whose run covers (nearly) the whole recording.
         self.first_runs = [recordings.index(index) for index in range(len(self.motions))]

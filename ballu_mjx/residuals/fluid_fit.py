@@ -41,7 +41,7 @@ from ballu_mjx.residuals.fluid_parametrization import (
 )
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.residual import BoundResidual
-from ballu_mjx.sim.sharding import chunks, shard_over_devices
+from ballu_mjx.sim.sharding import batch_size, chunks, shard_over_devices
 from ballu_mjx.sim.simulator import Simulator
 
 
@@ -225,7 +225,8 @@ class _Windows:
         """Return the errors of all windows, in units of the expected error. Diverged windows have constant errors."""
         self.program.control_steps += self.count * self.steps
         params = _single(params)
-        found = [self.program.errors(params, _take(self.recorded, rows)) for rows, _ in chunks(self.count, _BATCH)]
+        batches = chunks(self.count, batch_size(self.count, _BATCH))
+        found = [self.program.errors(params, _take(self.recorded, rows)) for rows, _ in batches]
         return fill_diverged(np.concatenate(found).astype(np.float64)[: self.count])
 
     def derivatives(
@@ -235,7 +236,7 @@ class _Windows:
         params, directions, size = _single(params), _single(directions), len(directions.added_mass)
         self.program.control_steps += self.count * self.steps * size
         found = []
-        for rows, _ in chunks(self.count * size, _BATCH):
+        for rows, _ in chunks(self.count * size, batch_size(self.count * size, _BATCH)):
             window, direction = np.divmod(rows, size)
             own = _take(directions, direction)
             found.append(self.program.derivatives(params, own, _take(self.recorded, window)))
@@ -347,7 +348,7 @@ _PATIENCE = 8
 _SMALL_GAIN = 5e-3
 """Relative decrease of the loss below which a stage ends, if it is not 0."""
 _BATCH = 1024
-"""Number of windows that are simulated in parallel."""
+"""Largest number of windows that are simulated in parallel."""
 _SMALLEST_TERM = 1e-3
 """Lower bound of a term's RMS value, as a fraction of the largest one. It limits the prior of coefficients whose terms
 are nearly 0 in the recordings."""

@@ -12,7 +12,7 @@ import functools
 import math
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -98,6 +98,7 @@ class Learner:
         )
         # Outputs keep the shardings of the inputs. On one device they would differ, and the step would compile twice.
         self._step = jax.jit(step, donate_argnums=0, out_shardings=(self._shardings, everywhere))
+        self._step_compiled: Future | None = None
 
     @property
     def steps_each(self) -> int:
@@ -107,7 +108,8 @@ class Learner:
     def init(self, seed: int) -> TrainingState:
         """Return the initial state for `seed`, the same as in Brax.
 
-        If the environment has an attribute `initial_action`, the policy's mean actions start there instead of at 0.
+        If the environment has an attribute `initial_action`, the policy's mean actions start there instead of at 0. The
+        training step may still be compiling in another thread when this function returns.
         """
         arguments = np.array(jax.random.PRNGKey(seed)), self._parameters
         first = self._first.lower(*arguments)
@@ -116,11 +118,12 @@ class Learner:
             first.out_info,
             jax.tree.broadcast(self._shardings, first.out_info),
         )
-        # XLA compiles this program while Python traces the next.
-        with ThreadPoolExecutor(1) as pool:
-            compiled = pool.submit(first.compile)
-            self._step.lower(state, self._parameters)
-            compiled.result()
+        pool = ThreadPoolExecutor(1)
+        compiled = pool.submit(first.compile)
+        step = self._step.lower(state, self._parameters)
+        self._step_compiled = pool.submit(step.compile)
+        pool.shutdown(wait=False)
+        compiled.result()
         return self._first(*arguments)
 
     def step(self, state: TrainingState) -> tuple[TrainingState, dict[str, Array]]:
@@ -128,6 +131,9 @@ class Learner:
 
         The memory of `state` is reused, so do not read `state` afterwards.
         """
+        if self._step_compiled is not None:
+            self._step_compiled.result()
+            self._step_compiled = None
         return self._step(state, self._parameters)
 
     def resume(self, stored: Stored, *, environments: bool = True) -> tuple[TrainingState, bool]:

@@ -64,6 +64,14 @@ def shard_over_devices(
     return whole
 
 
+def batch_size(count: int, most: int) -> int:
+    """Return the smallest power of two that is at least `count`, or `most` if that is smaller.
+
+    Batches of similar sizes then share a compiled program, and at most half of a batch is padding.
+    """
+    return min(1 << (count - 1).bit_length(), most)
+
+
 def chunks(count: int, size: int) -> Iterator[tuple[Int[np.ndarray, " size"], int]]:
     """Yield the rows of each chunk of a batch, and how many of these rows count.
 
