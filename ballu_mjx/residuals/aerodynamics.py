@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
+from ballu_mjx.residuals.added_mass import DraggingBody
 from ballu_mjx.residuals.body_motion import body_motion, smooth_speed
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import network_input
@@ -87,16 +88,15 @@ class Aerodynamics(Residual):
 
         **Raises** `InputError` if the tracked body has no buoyancy.
         """
-        self._robot, self._body = robot, int(model.site_bodyid[model.site(robot.tracked).id])
-        if not model.body_gravcomp[self._body] > 0:
-            name = model.body(self._body).name or "of the tracked site"
+        self._robot, self._body = robot, DraggingBody(robot, model)
+        if not model.body_gravcomp[self._body.id] > 0:
+            name = model.body(self._body.id).name or "of the tracked site"
             raise InputError(
                 f"{robot.model}: the body {name} has no buoyancy, but the aerodynamic residual is for buoyant bodies; "
                 'give the body gravcomp="LIFT / WEIGHT".'
             )
         self._control_timestep, self._longest_delay = robot.control_timestep, longest_delay(robot)
-        self._mass, self._inertia = jnp.asarray(model.body_mass), jnp.asarray(model.body_inertia)
-        self._centre, self._gravcomp = jnp.asarray(model.body_ipos), jnp.asarray(model.body_gravcomp)
+        self._centre = jnp.asarray(model.body_ipos)
         self._timestep, self._substeps = float(model.opt.timestep), count_substeps(model, robot.control_timestep)
         self._gravity = float(np.linalg.norm(model.opt.gravity))
 
@@ -114,15 +114,9 @@ class Aerodynamics(Residual):
 
         The lift compensates the weight of the added mass.
         """
-        body = self._body
-        mass = self._mass.at[body].add(params.added_mass)
-        lift = (self._gravcomp[body] * self._mass[body] + params.added_mass) * self._gravity + params.lift
-        return {
-            "body_mass": mass,
-            "body_inertia": self._inertia.at[body].add(params.added_inertia),
-            "body_ipos": self._centre.at[body].add(params.centre),
-            "body_gravcomp": self._gravcomp.at[body].set(lift / (mass[body] * self._gravity)),
-        }
+        centre = self._centre.at[self._body.id].add(params.centre)
+        lifted = params.lift / self._gravity
+        return {"body_ipos": centre, **self._body.fields(params.added_mass, params.added_inertia, lifted)}
 
     def command(self, params: AirParameters, commands: Commands) -> Float[Array, "parts commands"]:
         """Return the command that has arrived at the start of each physics step, after the delay.

@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
+from ballu_mjx.residuals.added_mass import DraggingBody
 from ballu_mjx.residuals.body_motion import body_motion, smooth_speed
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import network_input
@@ -138,9 +139,7 @@ class FluidResidual(Residual):
         gravity = np.asarray(model.opt.gravity)
         size = float(np.linalg.norm(gravity))
         self._down = jnp.asarray(gravity / size if size > 0 else gravity)
-        self._body = int(model.site_bodyid[model.site(robot.tracked).id])
-        self._mass, self._inertia = jnp.asarray(model.body_mass), jnp.asarray(model.body_inertia)
-        self._gravcomp = jnp.asarray(model.body_gravcomp)
+        self._body = DraggingBody(robot, model)
         every = [*_MOTION, *_GRAVITY]
         most = max(len(term.factors) for term in self.terms)
         # Terms with fewer factors are filled up with the index after the last component, whose value is 1.
@@ -169,14 +168,7 @@ class FluidResidual(Residual):
         """Return model fields with the tracked body's mass, inertia and buoyancy. Without `added_mass`, return none."""
         if not self.added_mass:
             return {}
-        body = self._body
-        mass = self._mass.at[body].add(params.added_mass)
-        balanced = (self._gravcomp[body] * self._mass[body] + params.added_mass) / mass[body]
-        return {
-            "body_mass": mass,
-            "body_inertia": self._inertia.at[body].add(params.added_inertia),
-            "body_gravcomp": self._gravcomp.at[body].set(balanced),
-        }
+        return self._body.fields(jnp.asarray(params.added_mass), jnp.asarray(params.added_inertia))
 
     def act(self, params: FluidParameters, history: History, commands: Commands, key: Array | None = None) -> Action:
         """Return the wrench for the motion in the middle of the coming control step."""

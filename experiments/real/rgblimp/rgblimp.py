@@ -421,7 +421,7 @@ def main() -> None:
     methods, seeds, size = ENVMIMIC, options.seeds, ()
     if options.quick:
         config = FluidConfig(terms="linear", window_seconds=(0.5,), windows=10, steps=2)
-        methods, seeds, size = {"EnvMimic": ()}, options.seeds[:1], QUICK  # fading compiles longer
+        methods, seeds, size = {"EnvMimic": ENVMIMIC["EnvMimic"]}, options.seeds[:1], QUICK
     found = fit_fluid(simulator, training, validation, config, progress=PhaseProgress())
     print(f"\n{found.report}\n", flush=True)
     residuals: dict[str, list[tuple[Residual, Any]]] = {
