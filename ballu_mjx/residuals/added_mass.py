@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import mujoco
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike
 
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.residual import Fields
@@ -19,12 +19,11 @@ class DraggingBody:
         self._mass, self._inertia = jnp.asarray(model.body_mass), jnp.asarray(model.body_inertia)
         self._gravcomp = jnp.asarray(model.body_gravcomp)
 
-    def fields(
-        self, mass: Float[Array, ""], inertia: Float[Array, " 3"], lifted: Float[Array, ""] | float = 0.0
-    ) -> Fields:
-        """Return model fields with the fluid's mass (kg) and moments of inertia (kg m^2).
+    def fields(self, mass: ArrayLike, inertia: ArrayLike, lifted: ArrayLike = 0.0) -> Fields:
+        """Return model fields with the fluid's mass (kg) and moments of inertia.
 
-        The body's lift also bears the weight of the fluid, and of a further mass `lifted` (kg).
+        `inertia` are three numbers (kg m^2), about the body's principal axes, or one for all axes. The body's lift also
+        bears the weight of the fluid, and of a further mass `lifted` (kg).
         """
         body = self.id
         total = self._mass.at[body].add(mass)

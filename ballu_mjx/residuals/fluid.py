@@ -168,7 +168,7 @@ class FluidResidual(Residual):
         """Return model fields with the tracked body's mass, inertia and buoyancy. Without `added_mass`, return none."""
         if not self.added_mass:
             return {}
-        return self._body.fields(jnp.asarray(params.added_mass), jnp.asarray(params.added_inertia))
+        return self._body.fields(params.added_mass, params.added_inertia)
 
     def act(self, params: FluidParameters, history: History, commands: Commands, key: Array | None = None) -> Action:
         """Return the wrench for the motion in the middle of the coming control step."""
