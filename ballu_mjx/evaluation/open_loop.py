@@ -1,8 +1,8 @@
 """Open-loop evaluation of a simulator: replay of recorded commands from recorded states.
 
-A run begins every second of a recording, at the recorded state, and goes on to the recording's end. Errors are
-computed over horizons, because small errors compound over a whole recording. The paper's figures for whole recordings
-are also computed.
+A run begins every second of a recording, at the recorded state. The first run goes on to the recording's end, and each
+other run to the longest horizon. Errors are computed over horizons, because small errors compound over a whole
+recording. The paper's figures for whole recordings are also computed.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ _CHUNK = 100
 class Replay(NamedTuple):
     """Simulated runs from recorded states. The recorded starting state is the first state of each run.
 
-    All arrays have the length of the longest run. Values are NaN after the end of a recording and after a run has
-    diverged (`LARGEST`).
+    All arrays have the length of the longest run. Values are NaN after the end of a run, and after the run has diverged
+    (`LARGEST`).
     """
 
     position: Float[np.ndarray, "runs states 3"]
@@ -190,10 +190,14 @@ class OpenLoopEvaluator:
         recordings = [recording for recording, _ in self.starts]
         # Index in `starts` of each recording's first start, whose run covers (nearly) the whole recording.
         self.first_runs = [recordings.index(index) for index in range(len(self.motions))]
+        rest = np.array([len(self.motions[recording].command) - start for recording, start in self.starts])
+        first = np.isin(np.arange(len(rest)), self.first_runs)
+        farthest = round(max(self.horizons) / self.robot.control_timestep)
+        self._steps = np.where(first, rest, np.minimum(rest, farthest))
         self._without: tuple[tuple[Errors, ...], tuple[Errors, ...]] | None = None
 
     def replay(self, params: Any, *, scale: float = 1.0, nominal: bool = False, seconds: float = math.inf) -> Replay:
-        """Simulate from every start to the end of its recording, or for `seconds`, whichever is shorter.
+        """Simulate from every start to the end of its run, or for `seconds`, whichever is shorter.
 
         **Arguments**
 
@@ -209,7 +213,7 @@ class OpenLoopEvaluator:
             fixed = jax.device_put((model, jax.device_get(unchanged), self._reference), self._everywhere)
         params = jax.device_get(params)  # they may be on one device, but the batch is spread over all devices
         starts = np.array(self.starts, np.int32)
-        steps = np.array([len(self.motions[recording].command) - start for recording, start in self.starts])
+        steps = self._steps
         if seconds < math.inf:
             steps = np.minimum(steps, round(seconds / self.robot.control_timestep))
         shape, longest = (len(starts),), int(steps.max())
@@ -233,6 +237,10 @@ class OpenLoopEvaluator:
                     (features, com, force, qpos), (after, after, part, after), jax.device_get(seen), strict=True
                 ):
                     array[batch, where] = values[: len(batch), : part.stop - part.start]
+        after_end = np.arange(longest + 1) > steps[:, None]
+        for array in (features, com, qpos):
+            array[after_end] = np.nan
+        force[after_end[:, 1:]] = np.nan
         return Replay(
             features[..., ObservationLayout.position],
             features[..., ObservationLayout.euler_angles],
@@ -355,8 +363,7 @@ class OpenLoopEvaluator:
             }
             com_error, final_turn, forces, soonest = np.inf, np.inf, [], None
             for run in runs:
-                start = self.starts[run][1]
-                states = len(motion.qpos) - start
+                start, states = self.starts[run][1], self._steps[run] + 1
                 series = self._differences(replay, run, against)
                 forces.append(float(_lengths(replay.force[run, : states - 1]).mean()))
                 broken = np.flatnonzero(~(np.abs(series["position"]) < LARGEST) | ~np.isfinite(series["orientation"]))
@@ -403,11 +410,10 @@ class OpenLoopEvaluator:
         Quantities are the position of the tracked body (m), its orientation (deg), the centre of mass (m), every point
         (m) and every measured hinge (deg). Points and hinges are left out if there are none.
         """
-        recording, start = self.starts[run]
-        states = len(self.motions[recording].qpos) - start
+        (recording, start), states = self.starts[run], self._steps[run] + 1
         hinges = list(self._hinges[recording])
         if against is None:
-            features = self._recorded_features(run)
+            features = self._recorded_features(run)[:states]
             position, euler = features[:, ObservationLayout.position], features[:, ObservationLayout.euler_angles]
             com, points = self._recorded_com[recording, start : start + states], self._points(features)
             qpos = np.asarray(self._reference.qpos)[recording, start : start + states]

@@ -1,5 +1,6 @@
 """The EnvMimic task: reward, observations, frames, resets and open-loop evaluation."""
 
+import copy
 import dataclasses
 import json
 
@@ -322,12 +323,20 @@ def test_a_replay_of_limited_length_is_the_start_of_a_longer_one(evaluator: Open
     np.testing.assert_array_equal(short.position, whole.position[:, :states])
 
 
-def test_a_replay_has_no_values_after_a_recordings_end(evaluator: OpenLoopEvaluator):
-    replay = evaluator.replay(jnp.array(FORCE))
-    for run, (recording, start) in enumerate(evaluator.starts):
-        states = len(evaluator.motions[recording].qpos) - start
+def test_first_runs_last_to_the_recordings_end_and_others_to_the_longest_horizon(evaluator: OpenLoopEvaluator):
+    shorter = copy.copy(evaluator)
+    shorter.robot = dataclasses.replace(evaluator.robot, horizons=(0.5, 1.0))
+    shorter = shorter.on(evaluator.motions)
+    replay, longest = shorter.replay(jnp.array(FORCE)), round(1.0 / CONTROL_TIMESTEP)
+    assert len(shorter.starts) > len(shorter.first_runs) == 2
+    for run, (recording, start) in enumerate(shorter.starts):
+        steps = len(shorter.motions[recording].command) - start
+        states = 1 + (steps if run in shorter.first_runs else min(steps, longest))
         for values in (replay.position, replay.euler_angles, replay.com):
             assert np.isfinite(values[run, :states]).all() and np.isnan(values[run, states:]).all()
+        assert np.isfinite(replay.force[run, : states - 1]).all() and np.isnan(replay.force[run, states - 1 :]).all()
+    for whole, limited in zip(evaluator(jnp.array(FORCE)).residual, shorter(jnp.array(FORCE)).residual, strict=True):
+        assert limited.mean_com_error == pytest.approx(whole.mean_com_error)
 
 
 def test_evaluation_with_identified_actuators_includes_the_nominal_robot(evaluator: OpenLoopEvaluator):
