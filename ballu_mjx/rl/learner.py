@@ -98,6 +98,7 @@ class Learner:
         )
         # Outputs keep the shardings of the inputs. On one device they would differ, and the step would compile twice.
         self._step = jax.jit(step, donate_argnums=0, out_shardings=(self._shardings, everywhere))
+        self._step_traced: jax.stages.Lowered | None = None
         self._step_compiled: Future | None = None
 
     @property
@@ -108,8 +109,7 @@ class Learner:
     def init(self, seed: int) -> TrainingState:
         """Return the initial state for `seed`, the same as in Brax.
 
-        If the environment has an attribute `initial_action`, the policy's mean actions start there instead of at 0. The
-        training step may still be compiling in another thread when this function returns.
+        If the environment has an attribute `initial_action`, the policy's mean actions start there instead of at 0.
         """
         arguments = np.array(jax.random.PRNGKey(seed)), self._parameters
         first = self._first.lower(*arguments)
@@ -118,13 +118,19 @@ class Learner:
             first.out_info,
             jax.tree.broadcast(self._shardings, first.out_info),
         )
-        pool = ThreadPoolExecutor(1)
-        compiled = pool.submit(first.compile)
-        step = self._step.lower(state, self._parameters)
-        self._step_compiled = pool.submit(step.compile)
-        pool.shutdown(wait=False)
-        compiled.result()
+        # XLA compiles this program while Python traces the next.
+        with ThreadPoolExecutor(1) as pool:
+            compiled = pool.submit(first.compile)
+            self._step_traced = self._step.lower(state, self._parameters)
+            compiled.result()
         return self._first(*arguments)
+
+    def compile_step(self) -> None:
+        """Start to compile the training step in another thread, if `init` has traced it. `step` waits for the end."""
+        if self._step_traced is not None:
+            pool = ThreadPoolExecutor(1)
+            self._step_compiled = pool.submit(self._step_traced.compile)
+            pool.shutdown(wait=False)
 
     def step(self, state: TrainingState) -> tuple[TrainingState, dict[str, Array]]:
         """Take a training step. Return the next state, and the means of reward, metrics and losses.
@@ -349,6 +355,7 @@ def train(
     step = int(state.steps)
     per_call, calls = _schedule(config, step)
     metrics: dict[str, float] = {}
+    learner.compile_step()
     call(step, state, metrics)
     for _ in range(calls):
         began = time.perf_counter()
