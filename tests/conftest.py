@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable
+from importlib import import_module
 from typing import TypeVar
 
 import pytest
@@ -36,6 +37,9 @@ def compile_fast() -> None:
 
 
 compile_fast()
+# Imported without checks: its functions run for each operation of a traced program, and annotate no shapes. The checks
+# would take a quarter of the tracing.
+import_module("ballu_mjx.sim.vmap_last_rules")
 install_import_hook("ballu_mjx", f"{__name__}.typecheck")
 
 

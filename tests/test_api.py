@@ -15,14 +15,13 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import tethered
 
 import ballu_mjx as bm
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
 from ballu_mjx.recordings.recording import cut
 from ballu_mjx.runs.layout import RUN_FORMAT
 from ballu_mjx.runs.record import MemoryRecord
-
-pytestmark = pytest.mark.optimized  # it trains and identifies
 
 SIZES = bm.PPOConfig(
     num_timesteps=320, num_envs=16, batch_size=16, num_minibatches=2, unroll_length=5, num_updates_per_batch=1,
@@ -71,7 +70,7 @@ def example() -> Example:
             return load(use, robot)
         return [cut(each, slice(int(np.searchsorted(each.time, each.time[0] + 6.0)))) for each in load(use, robot)[1:3]]
 
-    identification = IdentificationConfig(motion=False, starts=4)
+    identification = IdentificationConfig(motion=False, starts=2, draws=6, steps=8)
     air = bm.AirConfig(window_seconds=0.5, evaluations=2)
     quick = {
         "load_recordings": load_short,
@@ -91,26 +90,6 @@ def example() -> Example:
     return Example(printed=printed.getvalue(), **{name: left[name] for name in Example._fields if name != "printed"})
 
 
-@pytest.fixture(scope="module")
-def robot(example: Example) -> bm.RobotDescription:
-    return example.robot
-
-
-@pytest.fixture(scope="module")
-def motions(example: Example) -> list[bm.Motion]:
-    return example.motions
-
-
-@pytest.fixture(scope="module")
-def simulator(example: Example) -> bm.Simulator:
-    return example.sim
-
-
-@pytest.fixture(scope="module")
-def air(example: Example) -> bm.TrainedResidual:
-    return example.air
-
-
 def test_readme_example_prints_a_table_and_returns_a_policy(example: Example):
     _, *table = example.printed.splitlines()
     assert "vanilla+sysid" in example.printed and "aerodynamic" in example.printed and table
@@ -121,42 +100,47 @@ def test_readme_example_prints_a_table_and_returns_a_policy(example: Example):
     assert command.shape == (2,) and np.all((command >= 0) & (command <= 1))
 
 
-def test_evaluation_is_deterministic(simulator: bm.Simulator, air: bm.TrainedResidual, motions: list[bm.Motion]):
-    one, other = (bm.evaluate(simulator.with_residual(air), motions) for _ in range(2))
+def test_evaluation_is_deterministic(example: Example):
+    one, other = (bm.evaluate(example.sim.with_residual(example.air), example.motions) for _ in range(2))
     assert one == other
     assert one.residual != one.vanilla
 
 
-def test_envmimic_on_top_of_aerodynamic_is_evaluated_with_both(
-    simulator: bm.Simulator, air: bm.TrainedResidual, motions: list[bm.Motion]
-):
+@pytest.fixture(scope="module")
+def flights() -> list[bm.Motion]:
+    """Return recordings of the tethered balloon, whose programs compile sooner than BALLU's."""
+    return [tethered.flight(seed=seed, added_mass=0.03) for seed in range(2)]
+
+
+def test_envmimic_on_top_of_aerodynamic_is_evaluated_with_both(flights: list[bm.Motion]):
     """A residual learned in an improved simulator is evaluated together with that simulator's residual."""
+    simulator = bm.Simulator(tethered.ROBOT)
+    windows = bm.AirConfig(window_seconds=1.0, interval_seconds=1.0)
+    air = bm.fit_aerodynamics(simulator, flights, config=windows, free=("added_mass",))
     start_at_zero = bm.EnvMimicConfig(expected_loads=(0.0,))
-    learned = bm.train_envmimic(simulator.with_residual(air), motions, start_at_zero, SIZES)
-    found = bm.evaluate(simulator.with_residual(learned), motions)
+    learned = bm.train_envmimic(simulator.with_residual(air), flights, start_at_zero, SIZES)
+    found = bm.evaluate(simulator.with_residual(learned), flights)
     assert found.name == "aerodynamic+envmimic"
-    alone = bm.evaluate(simulator.with_residual(air), motions)
+    alone = bm.evaluate(simulator.with_residual(air), flights)
     assert found.vanilla == alone.vanilla
     if not learned.step:  # without learned forces only the aerodynamic residual acts
         np.testing.assert_allclose(found.score, alone.score, rtol=0.2)
 
 
-def test_training_in_memory_and_in_a_folder_are_equal(
-    simulator: bm.Simulator, motions: list[bm.Motion], tmp_path: Path, robot: bm.RobotDescription
-):
+def test_training_in_memory_and_in_a_folder_are_equal(flights: list[bm.Motion], tmp_path: Path):
+    simulator = bm.Simulator(tethered.ROBOT)
     content = {"format": RUN_FORMAT, "task": "envmimic", "starts": [], "ppo": dataclasses.asdict(SIZES)}
     memory = MemoryRecord(content)
-    kept = bm.train_envmimic(simulator, motions, ppo_config=SIZES, run=memory, validate_every=160)
+    kept = bm.train_envmimic(simulator, flights, ppo_config=SIZES, run=memory, validate_every=160)
     with bm.Run(tmp_path / "run", content) as run:
-        written = bm.train_envmimic(simulator, motions, ppo_config=SIZES, run=run, validate_every=160)
+        written = bm.train_envmimic(simulator, flights, ppo_config=SIZES, run=run, validate_every=160)
     assert kept.step == written.step
     jax.tree.map(np.testing.assert_array_equal, kept.params, written.params)
     assert [row["step"] for row in memory.metrics if "validation_error" in row] == [0, 160, 320]
 
 
-def test_bundled_recordings_and_sweeps_are_refused_for_other_robots(robot: bm.RobotDescription, tmp_path: Path):
-    folder = Path(__file__).parents[1] / "experiments" / "tethered_balloon"
-    other = bm.load_robot(folder / "balloon.robot.json")
+def test_bundled_recordings_and_sweeps_are_refused_for_other_robots(tmp_path: Path):
+    robot, other = bm.load_robot("ballu"), tethered.ROBOT
     with pytest.raises(bm.InputError, match="bundled recordings are of BALLU"):
         bm.load_recordings("training", other)
     with pytest.raises(bm.InputError, match="actuators of tethered balloon cannot be identified"):

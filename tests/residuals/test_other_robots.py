@@ -9,10 +9,10 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from rover import write_rover
+from tethered import PUSH, ROBOT, STEPS, flight
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.open_loop import evaluate
@@ -37,40 +37,10 @@ from ballu_mjx.sim.linearize import Linearizer
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.simulator import Simulator
 
-FOLDER = Path(__file__).parents[2] / "experiments" / "tethered_balloon"
-ROBOT = read_description(FOLDER / "balloon.robot.json")
 SIMULATOR = Simulator(ROBOT)
-PUSH = np.array([0.02, -0.03, 0.015])
-"""Force on the balloon (N, world frame)."""
 CONFIG = EnvMimicConfig(forces="force", force_scale=0.05, torque_scale=0.005, force_limit=1.0, force_cost=20.0)
 PRIORS = SupervisedConfig(force_spread=0.3, force_change=0.1, torque_spread=0.05)
 NETWORK = PPOConfig(policy_layers=(16,), value_layers=(4,))
-STEPS = 60
-
-
-def flight(robot: RobotDescription = ROBOT, push: np.ndarray = PUSH, added_mass: float = 0.0, seed: int = 0) -> Motion:
-    """Simulate the balloon in C MuJoCo under random commands.
-
-    - `push`: force on the balloon (N, world frame).
-    - `added_mass`: mass (kg) of air that moves with the balloon. It has no weight.
-    """
-    model, rng = robot.load_model(), np.random.default_rng(seed)
-    body = model.body("balloon").id
-    lift = model.body_gravcomp[body] * model.body_mass[body] + added_mass
-    model.body_mass[body] += added_mass
-    model.body_gravcomp[body] = lift / model.body_mass[body]
-    data = mujoco.MjData(model)
-    data.xfrc_applied[body, :3] = push
-    low, high = np.array(robot.command_ranges).T
-    command = low + (high - low) * np.repeat(rng.uniform(size=(STEPS // 5, 2)), 5, axis=0)
-    qpos, qvel = [data.qpos.copy()], [data.qvel.copy()]
-    for now in command:
-        data.ctrl[:] = now
-        mujoco.mj_step(model, data, round(robot.control_timestep / model.opt.timestep))
-        qpos.append(data.qpos.copy())
-        qvel.append(data.qvel.copy())
-    time = np.arange(STEPS + 1) * robot.control_timestep
-    return Motion(f"flight-{seed}", time, command, np.array(qpos), np.array(qvel), {})
 
 
 @pytest.fixture(scope="module")
