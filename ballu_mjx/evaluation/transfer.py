@@ -172,7 +172,8 @@ def path_length(com: Float[np.ndarray, "T 3"], control_timestep: float) -> float
 
 class _Column(NamedTuple):
     title: str
-    paper: str
+    paper: str | None
+    """Title of the column with the paper's numbers. None for a quantity that is not in the paper; these come last."""
     of: Callable[[Transfer], float]
     digits: int
 
@@ -186,6 +187,8 @@ _TURNING = (
     _Column("abs. final yaw error (deg)", "paper (signed)", lambda t: abs(t.yaw_error), 1),
     _Column("y-distance (m)", "paper", lambda t: t.y_distance, 2),
     _Column("change of yaw (deg)", "paper", lambda t: t.yaw_change, 1),
+    _Column("mean CoM error (m)", None, lambda t: t.com_error, 2),
+    _Column("y-distance in simulation (m)", None, lambda t: t.sim_y_distance, 2),
 )
 
 
@@ -203,7 +206,8 @@ def walking_table(results: Mapping[str, Sequence[Sequence[Transfer]]]) -> str:
 def turning_table(results: Mapping[str, Sequence[Sequence[Transfer]]]) -> str:
     """Return Table II in Markdown, in the form of `walking_table`.
 
-    The final yaw error is a mean of absolute values, because signed errors cancel. The paper's values are signed.
+    The final yaw error is a mean of absolute values, because signed errors cancel. The paper's values are signed. The
+    mean CoM error and the distance in simulation are not in the paper's table.
     """
     return _text(results, "turn")
 
@@ -211,7 +215,7 @@ def turning_table(results: Mapping[str, Sequence[Sequence[Transfer]]]) -> str:
 def transfer_table(task: str, results: Mapping[str, Sequence[Sequence[Transfer]]]) -> Table:
     """Return the data of `walking_table` (task `walk`) or `turning_table` (task `turn`)."""
     columns, paper = {"walk": (_WALKING, PAPER_WALKING), "turn": (_TURNING, PAPER_TURNING)}[task]
-    titles = ["setting", *(title for column in columns for title in (column.title, column.paper))]
+    titles = ["setting", *(title for column in columns for title in (column.title, column.paper) if title)]
     rows = []
     for setting, seeds in results.items():
         cells: list[Cell | str] = [setting]
@@ -220,7 +224,8 @@ def transfer_table(task: str, results: Mapping[str, Sequence[Sequence[Transfer]]
             found = t_interval(means)
             bounds = None if found.low is None or found.high is None else (found.low, found.high)
             cells.append(Cell(tuple(means), f".{column.digits}f", bounds=bounds))
-            cells.append(Cell((paper[setting][index],)) if setting in paper else "-")
+            if column.paper is not None:
+                cells.append(Cell((paper[setting][index],)) if setting in paper else "-")
         trials = [trial for trials in seeds for trial in trials]
         cells.append(f"{_range([each.steps for each in trials])}; {_range([each.sim_steps for each in trials])}")
         rows.append(tuple(cells))

@@ -125,16 +125,18 @@ def test_transfer_is_equal_after_a_json_round_trip() -> None:
     assert Transfer.from_json(json.loads(json.dumps(found.to_json()))) == found
 
 
-@pytest.mark.parametrize(("table", "paper"), [(walking_table, PAPER_WALKING), (turning_table, PAPER_TURNING)])
+@pytest.mark.parametrize(
+    ("table", "paper", "columns"), [(walking_table, PAPER_WALKING, 8), (turning_table, PAPER_TURNING, 10)]
+)
 def test_table_has_the_papers_rows_and_numbers(
-    table: Callable[..., str], paper: Mapping[str, tuple[float, float, float]]
+    table: Callable[..., str], paper: Mapping[str, tuple[float, float, float]], columns: int
 ) -> None:
     names = (*PAPER_SIMULATORS, "envmimic, other draughts")
     results = {name: [[trial(0.1), trial(0.3)], [trial(0.2), trial(0.4)]] for name in names}
     text, caption = table(results).split("\n\n")
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()]
     assert "2 seeds" in caption and "95% confidence intervals" in caption
-    assert [len(row) for row in rows] == [8] * 7
+    assert [len(row) for row in rows] == [columns] * 7
     assert [row[0] for row in rows[2:]] == list(names)
     for row in rows[2:6]:
         assert row[2:7:2] == [f"{value:.2f}" for value in paper[row[0]]]
@@ -145,9 +147,10 @@ def test_table_has_the_papers_rows_and_numbers(
 
 def test_tables_show_absolute_yaw_errors_and_intervals_over_seeds() -> None:
     """Yaw errors are absolute, so that +10 and -10 deg do not cancel. One seed has no interval."""
-    errors = [dataclasses.replace(trial(0.0), yaw_error=value, steps=20 + value) for value in (10.0, -10.0)]
+    changed = {"com_error": 0.25, "sim_y_distance": 1.5}
+    errors = [dataclasses.replace(trial(0.0), yaw_error=x, steps=20 + x, **changed) for x in (10.0, -10.0)]
     row, _, caption = turning_table({"envmimic": [errors]}).splitlines()[-3:]
-    assert row == "| envmimic | 10.0 | 3.50 | 0.00 | 0.29 | 0.0 | 36.42 | 20 (10 to 30); 0 |"
+    assert row == "| envmimic | 10.0 | 3.50 | 0.00 | 0.29 | 0.0 | 36.42 | 0.25 | 1.50 | 20 (10 to 30); 0 |"
     assert caption == "One seed a setting: no interval, and no ranking."
     walk = dataclasses.replace(trial(0.0), com_error=0.5, x_distance=1.234, total_distance=2.0)
     assert walking_table({"vanilla+dr": [[walk]]}).splitlines()[-3] == (
