@@ -20,9 +20,10 @@ from ballu_mjx.common import files, provenance
 from ballu_mjx.common.errors import InputError
 
 FORMAT = "ballu-final/1"
-COUNTS: Mapping[str, int] = {"robots": 3, "robots_outside": 2, "recordings": 1, "trials": 1, "trainings": 5}
+COUNTS: Mapping[str, int] = {"robots": 3, "robots_outside": 2, "recordings": 1, "trainings": 5}
 """Number of seeds by use: robots of the virtual robot's family, robots outside the class of the aerodynamic residual
-(white box), sets of recordings, sets of trials, and trainings of each method."""
+(white box), sets of test recordings, and trainings of each method. The draughts of trials follow from the seed of the
+training."""
 FIRST_SEED, SEEDS = 10_000, 2**31
 """Range of the drawn seeds, without its end. It excludes the seeds of development, which are small or a year."""
 _ROOT = Path(__file__).parents[1]
@@ -61,7 +62,6 @@ def draw_final(tag: str, output: Path, repository: Path) -> dict[str, Any]:
         "seeds": draw_seeds(commit),
         "machine": provenance.describe_machine(),
         "versions": provenance.package_versions(),
-        "results": {},
     }
     output.parent.mkdir(parents=True, exist_ok=True)
     files.write(output, json.dumps(found, indent=2) + "\n")

@@ -28,7 +28,7 @@ import dataclasses
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 sys.path.append("experiments")  # a notebook runs in the repository's root
@@ -347,29 +347,31 @@ def arguments_of(method: Method, recorded: Recorded, training: list[Path], quick
     return [*arguments, "--actuators", "nominal" if method.nominal else str(recorded.actuators)]
 
 
-def learn(options: Options, recorded: Recorded) -> dict[str, list[Path]]:
-    """Run all methods with all seeds, and return the run folders by method.
+def learn(
+    methods: Sequence[str], seeds: Sequence[int], output: Path, recorded: Recorded, *, quick: bool
+) -> dict[str, list[Path]]:
+    """Run methods with all seeds into folders in `output`, and return the run folders by method.
 
     Methods whose residuals others need run first.
     """
     folders = {}
-    for name in sorted(options.methods, key=lambda name: METHODS[name].beside is not None):
+    for name in sorted(methods, key=lambda name: METHODS[name].beside is not None):
         method = METHODS[name]
         # By default, a quick run tests on its validation recordings, but the tables need the test recordings.
-        training = recorded.training[:2] if options.quick else recorded.training
-        arguments = arguments_of(method, recorded, training, options.quick)
-        arguments += [] if method.beside is None else ["--residual", str(options.output / method.beside)]
-        runs = [(options.output / f"{name}-seed-{seed}", ["--seed", str(seed)]) for seed in options.seeds]
-        for folder, seed in runs if method.seeded else [(options.output / name, [])]:
+        training = recorded.training[:2] if quick else recorded.training
+        arguments = arguments_of(method, recorded, training, quick)
+        arguments += [] if method.beside is None else ["--residual", str(output / method.beside)]
+        runs = [(output / f"{name}-seed-{seed}", ["--seed", str(seed)]) for seed in seeds]
+        for folder, seed in runs if method.seeded else [(output / name, [])]:
             train(folder, *arguments, *seed)
             folders.setdefault(name, []).append(folder)
-    return {name: folders[name] for name in options.methods}
+    return {name: folders[name] for name in methods}
 
 
 def main() -> None:
     options = parse()
     recorded = record(options.robot, options.output)
-    folders = learn(options, recorded)
+    folders = learn(options.methods, options.seeds, options.output, recorded, quick=options.quick)
     effort = {
         METHODS[name].label: Cell(tuple(simulated(folder) / 1e3 for folder in members), ",.0f", spread=False)
         for name, members in folders.items()

@@ -47,6 +47,7 @@ from ballu_mjx.policies.load_simulator import load_simulator
 from ballu_mjx.policies.locomotion_config import LocomotionConfig, check_locomotion_config
 from ballu_mjx.policies.pipeline_layout import (
     NEAR,
+    PAPER_PRESET,
     PAPER_SIMULATORS,
     ROUNDS,
     SHARED,
@@ -66,6 +67,7 @@ from ballu_mjx.residuals.aerodynamics_fit import AirConfig
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.force_gradients import AnalyticConfig
 from ballu_mjx.residuals.force_regression import SupervisedConfig
+from ballu_mjx.residuals.presets import preset_configs
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
@@ -105,11 +107,13 @@ class Options(loggers.LoggingOptions):
     """Number of times that EnvMimic is learned. From the second round on, it also learns from the robot's closed-loop
     motion under the policies of the previous round. Policies are then trained again; their simulators are called
     `envmimic-2` and so on."""
-    also: tuple[Literal["envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised", "analytic"], ...] = ()
+    also: tuple[
+        Literal["envmimic-near", "envmimic-shared", "envmimic-wrench", "envmimic-paper", "supervised", "analytic"], ...
+    ] = ()
     """Further simulators in which to train policies. envmimic-near: EnvMimic's forces, with a cost (--outside-cost) for
     leaving their training range. envmimic-shared: one EnvMimic learned from the recordings of both tasks.
-    envmimic-wrench: an EnvMimic with a force and a torque. supervised: forces by regression, at full scale (the paper's
-    baseline). analytic: forces by gradients through the simulation."""
+    envmimic-wrench: an EnvMimic with a force and a torque. envmimic-paper: an EnvMimic with --preset paper. supervised:
+    forces by regression, at full scale (the paper's baseline). analytic: forces by gradients through the simulation."""
     outside_cost: float = 0.5
     """Cost of leaving the residual's training range in `envmimic-near`. See `train walk --help`."""
     push_force: float = 0.0
@@ -334,9 +338,7 @@ class PipelineStages:
             recordings = [self.recordings(task), *(self.trained_last(task, n) for n in range(2, number + 1))]
         identified = self.identified()
         fits = {"aerodynamic": self._air, "supervised": self._supervised, "analytic": self._analytic}
-        # A force alone, as in the paper: policies exploited a wrench (docs/transfer.md).
-        envmimic = functools.partial(self._envmimic, "wrench" if method == WRENCH else "force")
-        options = fits.get(method or "", envmimic)()
+        options = fits.get(method or "", functools.partial(self._envmimic, method or ""))()
 
         def make(folder: Path) -> None:
             sources: dict[str, Any] = {
@@ -353,7 +355,7 @@ class PipelineStages:
             elif isinstance(options, AnalyticConfig):
                 train_forces.train_analytic(train_forces.ForcesData(**sources), options)
             else:
-                data = train_envmimic.Data(**sources)
+                data = train_envmimic.Data(**sources, preset="paper" if method == PAPER_PRESET else None)
                 if list_checkpoints(folder):
                     data = train_envmimic.Data(resume=folder, wandb=data.wandb)
                 train_envmimic.train(data, *options)
@@ -373,8 +375,12 @@ class PipelineStages:
     def _air(self) -> AirConfig:
         return AirConfig(**train_aerodynamics.QUICK if self.options.quick else {})
 
-    def _envmimic(self, forces: ForceSet) -> tuple[EnvMimicConfig, PPOConfig]:
+    def _envmimic(self, method: str) -> tuple[EnvMimicConfig, PPOConfig]:
         quick = train_envmimic.QUICK if self.options.quick else {"num_timesteps": self.options.residual_steps}
+        if method == PAPER_PRESET:  # its sizes match each other, so that only the length changes
+            return preset_configs("paper", seed=self.seed, num_timesteps=quick["num_timesteps"])
+        # A force alone, as in the paper: policies exploited a wrench (docs/transfer.md).
+        forces: ForceSet = "wrench" if method == WRENCH else "force"
         return EnvMimicConfig(forces=forces), PPOConfig(seed=self.seed, **quick)
 
     def prediction(self, task: str) -> Path:

@@ -27,7 +27,9 @@ NEAR = "envmimic-near"
 """Simulator with EnvMimic's forces, whose policies pay a cost outside the residual's training range."""
 WRENCH = "envmimic-wrench"
 """Simulator with an EnvMimic residual that also applies a torque."""
-OPTIONAL_SIMULATORS = (NEAR, SHARED, WRENCH, "supervised", "analytic")
+PAPER_PRESET = "envmimic-paper"
+"""Simulator with EnvMimic's forces, learned with the preset of the paper's options."""
+OPTIONAL_SIMULATORS = (NEAR, SHARED, WRENCH, PAPER_PRESET, "supervised", "analytic")
 """Optional simulators. The networks of the last two are learned by regression and by gradients."""
 ROUNDS = "envmimic"
 """Residual that is learned again in each round. From the second round on, its name ends with the round's number."""

@@ -30,8 +30,9 @@ COLOURS: Mapping[str, str] = {
     "envmimic-shared": "#117733",
     "envmimic-near": "#88ccee",
     "envmimic-wrench": "#44aa99",
+    "envmimic-paper": "#ddcc77",
 }
-"""Colours of simulators in all figures. They are from the palettes of Okabe and Ito and (six of them) of Tol, for
+"""Colours of simulators in all figures. They are from the palettes of Okabe and Ito and (seven of them) of Tol, for
 colour-blind readers. Read them by `colour_of`, which has a colour for every name."""
 
 LABELS: Mapping[str, str] = {
@@ -50,6 +51,7 @@ LABELS: Mapping[str, str] = {
     "envmimic-shared": "EnvMimic, one for all tasks",
     "envmimic-near": "EnvMimic, near its data",
     "envmimic-wrench": "EnvMimic, wrench",
+    "envmimic-paper": "EnvMimic, the paper's preset",
 }
 
 

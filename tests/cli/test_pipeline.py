@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,6 +11,7 @@ from ballu_mjx.cli import pipeline
 from ballu_mjx.cli.cached_stages import cached_stage
 from ballu_mjx.cli.pipeline import Options
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.residuals.presets import preset_configs
 
 
 class Interrupted(Exception):
@@ -96,7 +98,7 @@ def test_each_round_learns_from_all_recordings_so_far(tmp_path, monkeypatch):
     """The test records the needs of each stage, and makes none. A stage is identified by its folder."""
     needs: dict[str, list[str]] = {}
     costs: dict[str, float] = {}
-    forces: dict[str, str] = {}
+    learned: dict[str, Any] = {}
     pushes: dict[str, tuple[float, float]] = {}
 
     def stage(folder, options, sources, make, goes_on=True):
@@ -105,11 +107,11 @@ def test_each_round_learns_from_all_recordings_so_far(tmp_path, monkeypatch):
             costs[folder.name] = options[0].outside_cost
             pushes[folder.name] = options[0].push_force, options[0].push_torque
         if folder.name.startswith("envmimic-"):
-            forces[folder.name] = options[0].forces
+            learned[folder.name] = options
         return folder
 
     monkeypatch.setattr(pipeline, "cached_stage", stage)
-    also = "envmimic-near", "envmimic-shared", "envmimic-wrench", "supervised"
+    also = "envmimic-near", "envmimic-shared", "envmimic-wrench", "envmimic-paper", "supervised"
     options = Options(output=tmp_path, rounds=3, also=also, outside_cost=2.0, push_force=0.3, push_torque=0.04)
     stages = pipeline.PipelineStages(options, 0, VirtualHardware.draw(0))
     for setting in pipeline.settings_of(options):
@@ -133,7 +135,9 @@ def test_each_round_learns_from_all_recordings_so_far(tmp_path, monkeypatch):
     }
     assert pushes["walk-envmimic-2"] == pushes["walk-aerodynamic"] == (0.3, 0.04)
     assert needs["aerodynamic-walk"] == needs["supervised-walk"] == ["recordings-walk", "sysid"]
-    assert {name for name, kind in forces.items() if kind != "force"} == {"envmimic-wrench-walk"}
-    assert forces["envmimic-wrench-walk"] == "wrench"
+    assert {name for name, (env, _) in learned.items() if env.forces != "force"} == {"envmimic-wrench-walk"}
+    assert learned["envmimic-wrench-walk"][0].forces == "wrench"
+    paper = preset_configs("paper", num_timesteps=options.residual_steps)
+    assert {name for name, configs in learned.items() if configs == paper} == {"envmimic-paper-walk"}
     assert needs["envmimic-shared"] == ["recordings-walk", "recordings-turn", "sysid"]
     assert needs["walk-envmimic-shared"] == ["envmimic-shared"]
