@@ -1,5 +1,7 @@
 """Profile a physics step on one core, with the batch as the first axis (`jax.vmap`) and as the last (`vmap_last`).
 
+With the batch as the last axis, the step is also timed with MJX's constraint solver instead of ours.
+
 The parts of a step are compiled separately, in growing chains, so that XLA cannot omit what a part needs. Their times
 do not add up exactly to that of the whole step, in which XLA fuses operations of different parts. The output also shows
 XLA's count of arithmetic operations, which gives a lower bound, and the time of C MuJoCo's step on one thread.
@@ -22,7 +24,7 @@ import common
 
 from ballu_mjx.common import runtime
 
-FIRST, LAST, C = "batch first", "batch last", "C MuJoCo"
+FIRST, LAST, MJX, C = "batch first", "batch last", "batch last, MJX's solver", "C MuJoCo"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +33,8 @@ class Options:
 
     batches: tuple[int, ...] = (64, 256, 512, 1024, 4096)
     """Numbers of robots for the time of the whole step. Its parts are timed with 512 robots."""
+    dry_friction: float = 0.0
+    """Dry friction of all joints (N m)."""
     kernels: int = 0
     """Number of the slowest kernels of the whole step to list."""
     output: Path = Path("runs/bench-step-profile")
@@ -39,7 +43,7 @@ class Options:
     """Time only the whole step, with 512 robots."""
 
 
-def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any]:
+def measure(layout: str, batch: int, parts: bool, kernels: int, dry_friction: float) -> dict[str, Any]:
     """Return microseconds per robot and physics step, by part. A child process calls this function."""
     runtime.prepare()
     import jax
@@ -47,12 +51,15 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
     import mujoco
     import numpy as np
     import throughput
+    from mujoco import mjx
 
     from ballu_mjx.ballu.model import load_model, standing_qpos
+    from ballu_mjx.robots.model import raise_iterations
     from ballu_mjx.robots.registry import load_robot
     from ballu_mjx.sim.step import (
         PhysicsState,
         count_substeps,
+        has_dry_friction,
         load_state,
         make_data,
         physics_step,
@@ -62,6 +69,8 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
     from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 
     model, rng = load_model(), np.random.default_rng(0)
+    model.dof_frictionloss[6:] = dry_friction
+    raise_iterations(model)
     if layout == C:
         commands = rng.integers(0, 2, (64, 40, 2)).astype(float)
         rates = throughput.rollout_rates(model, 1, 5, commands)
@@ -73,7 +82,8 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
     state = state_at(jnp.asarray(qpos), jnp.zeros((batch, model.nv)))
 
     def batched(function: Callable[..., Any]) -> Any:
-        return jax.jit(jax.vmap(vmap_with_trailing_batch(function) if layout == LAST else function))
+        last = vmap_with_trailing_batch(function, has_dry_friction(mjx_model))
+        return jax.jit(jax.vmap(function if layout == FIRST else last))
 
     def seconds(function: Callable[..., Any], state: PhysicsState) -> float:
         jax.block_until_ready(function(state, commands))
@@ -85,7 +95,11 @@ def measure(layout: str, batch: int, parts: bool, kernels: int) -> dict[str, Any
         return float(np.median(took))
 
     def step(state: PhysicsState, command: Any) -> PhysicsState:
-        return physics_step(mjx_model, template.replace(ctrl=command), state)  # pyright: ignore
+        commanded: Any = template.replace(ctrl=command)  # pyright: ignore
+        if layout == MJX:
+            data = mjx.step(mjx_model, load_state(commanded, state))
+            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
+        return physics_step(mjx_model, commanded, state)
 
     whole = batched(step)
     for _ in range(50):  # Until the robots walk, with feet on the floor.
@@ -138,18 +152,22 @@ def _kernels(run: Callable[[], Any], count: int, batch: int) -> list[tuple[str, 
 
 def main(options: Options) -> None:
     """Measure, print and write the profile."""
+
+    def request(layout: str, batch: int, parts: bool = False) -> dict[str, Any]:
+        kernels = options.kernels if parts else 0
+        return {
+            "layout": layout, "batch": batch, "parts": parts, "kernels": kernels, "dry_friction": options.dry_friction
+        }  # fmt: skip
+
     core = common.cores()[:1]
     batches = (512,) if options.quick else options.batches
-    result: dict[str, Any] = {
-        C: common.child(__file__, {"layout": C, "batch": 1, "parts": False, "kernels": 0}, cores=core)
-    }
+    result: dict[str, Any] = {C: common.child(__file__, request(C, 1), cores=core)}
     print(f"{common.described(common.machine())}; one core, microseconds per robot and physics step")
     print(f"{C + ', one thread':40}{result[C]['whole']:10.1f}")
-    for layout in (FIRST, LAST):
-        for batch in batches:
-            parts = batch == 512 and not options.quick
-            request = {"layout": layout, "batch": batch, "parts": parts, "kernels": options.kernels if parts else 0}
-            found = result[f"{layout}, {batch}"] = common.child(__file__, request, cores=core)
+    for layout in (FIRST, MJX, LAST):
+        for batch in batches if layout != MJX else (512,):
+            parts = batch == 512 and not options.quick and layout != MJX
+            found = result[f"{layout}, {batch}"] = common.child(__file__, request(layout, batch, parts), cores=core)
             print(f"{f'{layout}, {batch:,} robots':40}{found['whole']:10.1f}")
             for name, value in found.items():
                 if name.startswith("up to"):
