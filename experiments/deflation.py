@@ -31,6 +31,7 @@ import numpy as np
 from ballu_mjx.ballu.model import load_model
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.ballu.virtual.hardware import VirtualHardware
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.cli import train_aerodynamics
 from ballu_mjx.common.results import Cell, Table
@@ -58,7 +59,7 @@ def recorded(job: dataset.Job, virtual: VirtualRobot, trial: int, folder: Path) 
 
     `trial` is the seed of the trial conditions, such as the draught.
     """
-    path = dataset.record_job(dataclasses.replace(job, trial=trial), virtual, folder)
+    path = dataset.record_job(dataclasses.replace(job, trial=trial), VirtualHardware(virtual), folder)
     return read_recording(path, load_robot())  # reading fills the gaps of hidden markers
 
 

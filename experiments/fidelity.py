@@ -42,7 +42,7 @@ import numpy as np
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import dataset
-from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.ballu.virtual.hardware import VirtualHardware
 from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.errors import SCORE_HORIZONS, Errors, Evaluation
 from ballu_mjx.evaluation.errors_file import read_evaluation
@@ -183,7 +183,7 @@ def replayed_policy(options: Options) -> Path:
         job = dataset.Job(
             path.parent.name, "policy", np.round(actions, 3).astype(float), 300, "Actions of a vanilla policy."
         )
-        dataset.record_job(job, virtual_robot.draw_robot(options.robot), options.output)
+        dataset.record_job(job, VirtualHardware.draw(options.robot), options.output)
     return path
 
 

@@ -44,10 +44,8 @@ import fidelity
 import numpy as np
 from draw_final import FORMAT, draw_seeds
 
-from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual.hardware import Hardware, VirtualHardware
-from ballu_mjx.ballu.virtual.robot import open_loop
 from ballu_mjx.cli import pipeline
 from ballu_mjx.common import files, provenance
 from ballu_mjx.common.errors import InputError
@@ -58,8 +56,6 @@ from ballu_mjx.evaluation.transfer import Transfer
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.policies.pipeline_layout import PAPER_PRESET, prediction_file
 from ballu_mjx.policies.transfer_prediction import read_prediction
-from ballu_mjx.recordings.csv_format import write_recording
-from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.viz.style import label_of
 
 Kind = Literal["fidelity", "walk", "turn"]
@@ -120,13 +116,9 @@ def record_all(hardware: Hardware, wanted: Sequence[dataset.Job], folder: Path) 
     for job in wanted:
         path = folder / job.split / f"{job.name}.csv.gz"
         found.setdefault(job.split, []).append(path)
-        if path.exists():
-            continue
-        seconds = len(job.commands) * CONTROL_TIMESTEP
-        recording = hardware.record(job.trial, open_loop(job.commands), seconds, job.name, job.notes)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_recording(recording, path, load_robot(), decimals=dataset.DECIMALS)
-        print(f"Recorded {path.relative_to(folder)}", flush=True)
+        if not path.exists():
+            dataset.record_job(job, hardware, folder)
+            print(f"Recorded {path.relative_to(folder)}", flush=True)
     return found
 
 
@@ -307,11 +299,7 @@ def _finite(values: Sequence[float | None]) -> tuple[float, ...]:
 
 def _over_robots(values: Sequence[float], form: str = ".2f") -> Cell:
     """Return the cell of one value for each robot, with Student's t interval if all are finite."""
-    if not all(map(math.isfinite, values)):
-        return Cell(tuple(values), form)
-    found = t_interval(values)
-    assert found.low is not None and found.high is not None
-    return Cell(tuple(values), form, bounds=(found.low, found.high))
+    return Cell(tuple(values), form, bounds=t_interval(values).bounds if all(map(math.isfinite, values)) else None)
 
 
 class Figure(NamedTuple):
@@ -409,9 +397,8 @@ def _difference(one: Sequence[float], other: Sequence[float], form: str) -> Cell
     """Return the cell of the paired differences over robots, with Student's t interval. Empty if all are 0."""
     if list(one) == list(other):
         return ""
-    found = paired_difference(one, other)
-    assert found.low is not None and found.high is not None
-    return Cell(tuple(a - b for a, b in zip(one, other, strict=True)), form, bounds=(found.low, found.high))
+    bounds = paired_difference(one, other).bounds
+    return Cell(tuple(a - b for a, b in zip(one, other, strict=True)), form, bounds=bounds)
 
 
 def write_tables(drawn: Mapping[str, Any], units: Path, output: Path) -> list[Path]:

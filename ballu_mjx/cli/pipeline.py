@@ -331,14 +331,14 @@ class PipelineStages:
         recordings of both tasks.
         """
         variant = SimulatorVariant.parse(setting)
-        method, number = variant.residual, variant.round
+        method, number = variant.residual or "", variant.round
         if method == SHARED:
             recordings = [self.recordings(each) for each in TABLES]
         else:
             recordings = [self.recordings(task), *(self.trained_last(task, n) for n in range(2, number + 1))]
         identified = self.identified()
         fits = {"aerodynamic": self._air, "supervised": self._supervised, "analytic": self._analytic}
-        options = fits.get(method or "", functools.partial(self._envmimic, method or ""))()
+        options: Any = fits[method]() if method in fits else self._envmimic(method)
 
         def make(folder: Path) -> None:
             sources: dict[str, Any] = {

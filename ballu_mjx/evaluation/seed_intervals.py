@@ -35,6 +35,11 @@ class Interval(NamedTuple):
         return None if self.half is None else self.mean + self.half
 
     @property
+    def bounds(self) -> tuple[float, float] | None:
+        """Lower and upper end of the interval. None for a single value."""
+        return None if self.half is None else (self.mean - self.half, self.mean + self.half)
+
+    @property
     def excludes_zero(self) -> bool:
         """Whether the interval lies on one side of zero. False for a single value."""
         return self.half is not None and abs(self.mean) > self.half

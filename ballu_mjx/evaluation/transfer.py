@@ -221,9 +221,7 @@ def transfer_table(task: str, results: Mapping[str, Sequence[Sequence[Transfer]]
         cells: list[Cell | str] = [setting]
         for index, column in enumerate(columns):
             means = seed_means([[column.of(trial) for trial in trials] for trials in seeds])
-            found = t_interval(means)
-            bounds = None if found.low is None or found.high is None else (found.low, found.high)
-            cells.append(Cell(tuple(means), f".{column.digits}f", bounds=bounds))
+            cells.append(Cell(tuple(means), f".{column.digits}f", bounds=t_interval(means).bounds))
             if column.paper is not None:
                 cells.append(Cell((paper[setting][index],)) if setting in paper else "-")
         trials = [trial for trials in seeds for trial in trials]

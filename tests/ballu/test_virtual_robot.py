@@ -17,6 +17,7 @@ from ballu_mjx.ballu.model import load_model, standing_qpos
 from ballu_mjx.ballu.recordings import base_position, foot_position, knee, motor
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.ballu.virtual.hardware import VirtualHardware
 from ballu_mjx.ballu.virtual.paper_robot import draw_paper_robot
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.policies.deploy.estimator import Capture
@@ -213,7 +214,7 @@ def test_symmetric_robot_mirrors_its_walk_under_mirrored_commands():
 
 def test_bundled_recording_is_reproduced_bit_for_bit(tmp_path: Path):
     job = dataset.jobs()[0]
-    path = dataset.record_job(job, virtual_robot.draw_robot(dataset.ROBOT_SEED), tmp_path)
+    path = dataset.record_job(job, VirtualHardware.draw(dataset.ROBOT_SEED), tmp_path)
     shipped = assets() / "recordings" / job.split / path.name
     # The text is compared, because the compressed bytes depend on the version of zlib.
     assert gzip.decompress(path.read_bytes()) == gzip.decompress(shipped.read_bytes())

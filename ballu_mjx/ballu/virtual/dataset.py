@@ -19,6 +19,7 @@ from jaxtyping import Float
 from ballu_mjx.ballu.gaits import Gait, hopping, one_legged, telegraph, waves
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.ballu.virtual.hardware import Hardware, VirtualHardware
 from ballu_mjx.recordings.csv_format import write_recording
 from ballu_mjx.robots.registry import load_robot
 
@@ -127,16 +128,10 @@ def fresh_jobs(seed: int, each: int = 6) -> list[Job]:
     ]
 
 
-def record_job(job: Job, robot: virtual_robot.VirtualRobot, output: Path) -> Path:
-    """Record one job on a virtual robot, and write it to the folder of its split in `output`. Return the file."""
-    recording = virtual_robot.record(
-        robot,
-        virtual_robot.draw_trial(job.trial),
-        virtual_robot.open_loop(job.commands),
-        len(job.commands) * CONTROL_TIMESTEP,
-        job.name,
-        job.notes,
-    )
+def record_job(job: Job, robot: Hardware, output: Path) -> Path:
+    """Record one job on a robot, and write it to the folder of its split in `output`. Return the file."""
+    seconds = len(job.commands) * CONTROL_TIMESTEP
+    recording = robot.record(job.trial, virtual_robot.open_loop(job.commands), seconds, job.name, job.notes)
     path = output / job.split / f"{job.name}.csv.gz"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_recording(recording, path, load_robot(), decimals=DECIMALS)
@@ -165,6 +160,6 @@ def record_jobs(wanted: Sequence[Job], robot_seed: int, folder: Path) -> list[Pa
     """Record several jobs on all cores, and return their files in the same order."""
     if not wanted:
         return []
-    robot = virtual_robot.draw_robot(robot_seed)
+    robot = VirtualHardware.draw(robot_seed)
     with multiprocessing.get_context("spawn").Pool() as pool:
         return pool.starmap(record_job, [(job, robot, folder) for job in wanted])
