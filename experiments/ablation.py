@@ -1,7 +1,7 @@
 # %% [markdown]
 # # Ablation of EnvMimic's options
 #
-# Each row of the ablation table in docs/envmimic.md is the default configuration with one change. It is trained with
+# Each row of the table is the default configuration of EnvMimic with one change. It is trained with
 # several seeds, and measured on twelve random recordings made for this purpose, six near and six far. These are neither
 # the main job's validation recordings, which are too few, nor test recordings. The actuators are the identified ones.
 #

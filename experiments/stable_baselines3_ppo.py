@@ -3,7 +3,8 @@
 #
 # `python experiments/stable_baselines3_ppo.py --run runs/envmimic-...` trains a walking policy in the simulator of a
 # run. The run may be of a residual, of identified actuators, or of a policy. Without `--run`, the nominal simulator is
-# used. The script needs `pip install "ballu-mjx[gym]" stable-baselines3`. One compiled program steps all environments.
+# used. The script needs `pip install -c constraints.txt -e ".[gym]" stable-baselines3`. One compiled program steps all
+# environments.
 
 # %%
 from __future__ import annotations

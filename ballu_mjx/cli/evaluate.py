@@ -124,7 +124,8 @@ def noise_floor(floor: Sequence[Errors], errors: Sequence[Errors]) -> str:
     from ballu_mjx.evaluation.errors import mean_by_group
 
     lines = [
-        "Part of these errors that motion-capture noise (0.5 mm, 0.3 deg) in the starting states causes:",
+        "Errors that motion-capture noise (0.5 mm, 0.3 deg) in the starting states alone causes, and these errors "
+        "(independent errors add in squares):",
     ]
     for noise, ours in zip(mean_by_group(floor), mean_by_group(errors), strict=True):
         for horizon, (position, _) in noise.position.items():

@@ -151,12 +151,8 @@ class Evaluation:
         return nominal | {self.base: self.vanilla, self.name: self.residual}
 
     def ratio(self, group: str, quantity: str, horizon: float) -> float:
-        """Return the ratio (`quotient`) of the errors with and without the residual.
-
-        Each is first averaged over the group's recordings.
-        """
-        with_it, without = (group_mean(e, group, quantity, horizon) for e in (self.residual, self.vanilla))
-        return quotient(with_it, without)
+        """Return the ratio (`error_ratio`) of the errors with and without the residual."""
+        return error_ratio(self.residual, self.vanilla, group, quantity, horizon)
 
     def score_horizons(self, group: str) -> list[float]:
         """Return the horizons (s) of a group that enter the score."""
@@ -176,11 +172,9 @@ class Evaluation:
         """
         ratios = []
         for group in self.groups:
-            pairs = [pair for pair in zip(self.vanilla, self.residual, strict=True) if pair[0].group == group]
+            members = [errors for errors in self.vanilla if errors.group == group]
             for horizon in self.score_horizons(group):
-                if any(mimic.num_diverged(horizon) > without.num_diverged(horizon) for without, mimic in pairs):
-                    return np.inf
-                with_joints = all(horizon in without.joints for without, _ in pairs if horizon in without.position)
+                with_joints = all(horizon in each.joints for each in members if horizon in each.position)
                 quantities = ("position", "orientation", *(["joints"] if with_joints else []))
                 ratios += [self.ratio(group, quantity, horizon) for quantity in quantities]
         return float(np.mean(ratios))
@@ -271,6 +265,18 @@ def _mean(errors: Sequence[Errors]) -> Errors:
         medians,
         soonest,
     )
+
+
+def error_ratio(errors: Sequence[Errors], base: Sequence[Errors], group: str, quantity: str, horizon: float) -> float:
+    """Return the ratio (`quotient`) of a simulator's errors to those of a base simulator on the same recordings.
+
+    Both are first averaged over the group's recordings. Means leave out starts that diverged. The ratio is therefore
+    infinite if more starts of a recording diverge than in the base simulator.
+    """
+    pairs = [pair for pair in zip(errors, base, strict=True) if pair[1].group == group]
+    if any(ours.num_diverged(horizon) > theirs.num_diverged(horizon) for ours, theirs in pairs):
+        return np.inf
+    return quotient(*(group_mean(side, group, quantity, horizon) for side in (errors, base)))
 
 
 def group_mean(errors: Sequence[Errors], group: str, quantity: str, horizon: float, place: int = 0) -> float:

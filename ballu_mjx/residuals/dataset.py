@@ -219,7 +219,7 @@ def replay_title(replayed: Set[object], validation: Set[object], training: Set[o
     **Arguments**
 
     - `replayed`, `validation`, `training`: identifiers of the recordings, such as paths or hashes.
-    - `otherwise`: name of the replayed recordings if neither use has the same ones.
+    - `otherwise`: name of the replayed recordings if neither use has exactly the same ones.
     """
     if replayed == training:
         what = "the training recordings (the residual was learned from them)"
@@ -227,6 +227,9 @@ def replay_title(replayed: Set[object], validation: Set[object], training: Set[o
         what = "the validation recordings (they chose the checkpoint)"
     else:
         what = otherwise
+        for use, done in ((training, "the residual was learned from them"), (validation, "they chose the checkpoint")):
+            if replayed & use:
+                what += f" ({len(replayed & use)} of {len(replayed)} are not new: {done})"
     return f"Open-loop replay of {what}"
 
 

@@ -64,7 +64,9 @@ def check_onnx() -> None:
     **Raises** `InputError` if it is not.
     """
     if importlib.util.find_spec("onnx") is None:
-        raise InputError('--onnx: the package onnx is not installed; install it by `pip install "ballu-mjx[onnx]"`.')
+        raise InputError(
+            '--onnx: the package onnx is not installed; install it by `pip install -c constraints.txt -e ".[onnx]"`.'
+        )
 
 
 def onnx_model(

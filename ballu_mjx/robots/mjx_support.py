@@ -71,6 +71,29 @@ def _parts(model: mujoco.MjModel) -> tuple[str, str] | None:
     return None
 
 
+def _ignored(model: mujoco.MjModel) -> tuple[str, str] | None:
+    """Check for numbers that MJX leaves out without a message, although they change the motion."""
+    joint, tendon, actuator = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_TENDON, mujoco.mjtObj.mjOBJ_ACTUATOR
+    one = 'give "{}" a single number'
+    for field, what, kind, fix in (
+        ("jnt_stiffnesspoly", "a nonlinear stiffness", joint, one.format("stiffness")),
+        ("dof_dampingpoly", "a nonlinear damping", joint, one.format("damping")),
+        ("tendon_stiffnesspoly", "a nonlinear stiffness", tendon, one.format("stiffness")),
+        ("tendon_dampingpoly", "a nonlinear damping", tendon, one.format("damping")),
+        ("actuator_damping", "a damping", actuator, "write the damping at the joint or tendon"),
+        ("actuator_dampingpoly", "a damping", actuator, "write the damping at the joint or tendon"),
+        ("actuator_armature", "an armature", actuator, "write the armature at the joint or tendon"),
+        ("actuator_delay", "a delay", actuator, "declare the delay of its command (docs/identify.md)"),
+        ("actuator_actearly", '"actearly"', actuator, "remove it"),
+    ):
+        values = np.asarray(getattr(model, field))
+        for number in np.flatnonzero(values.any(axis=tuple(range(1, values.ndim)))):
+            element = int(model.dof_jntid[number]) if field.startswith("dof_") else int(number)
+            called = mujoco.mj_id2name(model, kind, element) or f"number {element + 1}"
+            return f"the {_word(kind)} {called} has {what}, which MJX would leave out", fix
+    return None
+
+
 def _collisions(model: mujoco.MjModel) -> tuple[str, str] | None:
     """Check the kinds of colliding geoms, the margins of meshes, and the size of their convex hulls."""
     largest: tuple[float, str] | None = None
@@ -108,7 +131,7 @@ def _collisions(model: mujoco.MjModel) -> tuple[str, str] | None:
     return largest[1], fix
 
 
-_CHECKS: tuple[Callable[[mujoco.MjModel], tuple[str, str] | None], ...] = (_options, _parts, _collisions)
+_CHECKS: tuple[Callable[[mujoco.MjModel], tuple[str, str] | None], ...] = (_options, _parts, _ignored, _collisions)
 
 
 def check_mjx(model: mujoco.MjModel) -> tuple[str, str] | None:

@@ -129,8 +129,8 @@ def check(project: str | None) -> None:
     """
     if project is not None and importlib.util.find_spec("wandb") is None:
         raise InputError(
-            f'--wandb {project}: the package wandb is not installed; run `pip install "ballu-mjx[wandb]"`, or leave '
-            "this option out."
+            f"--wandb {project}: the package wandb is not installed; run "
+            '`pip install -c constraints.txt -e ".[wandb]"`, or leave this option out.'
         )
 
 

@@ -12,7 +12,7 @@ import mujoco
 from jaxtyping import Array, Float
 from mujoco import mjx
 
-from ballu_mjx.sim.contact_solver import solve_constraints
+from ballu_mjx.sim.constraint_solver import solve_constraints
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 
 
@@ -72,10 +72,22 @@ def physics_step(
     return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
 
 
+def _implicit(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Integrate like `mjx.implicit`, but without the velocity feedback of actuators whose force is at its limit.
+
+    Their force does not change with velocity. C MuJoCo leaves it out too, and MJX does not.
+    """
+    low, high = model.actuator_forcerange.T
+    force = data.actuator_force
+    at_limit = jnp.asarray(model.actuator_forcelimited).astype(bool) & ((force <= low) | (force >= high))
+    gain, bias = (jnp.where(at_limit[:, None], 0.0, prm) for prm in (model.actuator_gainprm, model.actuator_biasprm))
+    return mjx.implicit(model.replace(actuator_gainprm=gain, actuator_biasprm=bias), data)  # pyright: ignore
+
+
 _INTEGRATORS = {
     mujoco.mjtIntegrator.mjINT_EULER: mjx.euler,
     mujoco.mjtIntegrator.mjINT_RK4: mjx.rungekutta4,
-    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: mjx.implicit,
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: _implicit,
 }
 """All integrators of MJX, which rejects models with others."""
 

@@ -40,6 +40,18 @@ def test_trials_apply_the_rate_limit_of_the_exported_controller():
     assert controller.controller.steps == 20 and controller.controller.status == "running"
 
 
+def test_commands_of_a_policy_that_jumps_change_by_the_rate_limit_at_most():
+    stored, rng = constant_policy(0.5), np.random.default_rng(1)
+    stored["kernel_0"] = 100.0 * rng.normal(size=stored["kernel_0"].shape)
+    controller = ExportedPolicy(stored)
+    robot, trial = virtual_robot.draw_robot(0), virtual_robot.draw_trial(3)
+    recording = virtual_robot.record(robot, trial, controller, 4.0, "trial")
+    changes = np.diff(recording.command[::5], axis=0)
+    assert np.abs(changes).max() < 0.25 + 1e-9
+    at_limit = np.abs(np.abs(changes) - 0.25) < 1e-9
+    assert (at_limit & (changes > 0)).any() and (at_limit & (changes < 0)).any(), "the policy must jump both ways"
+
+
 @pytest.mark.parametrize("marker", range(len(virtual_robot.NAMES)))
 def test_trials_command_rest_after_a_marker_is_lost(marker: int):
     """The controller receives every frame, including the frames between two control steps."""

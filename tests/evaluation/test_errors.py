@@ -68,6 +68,14 @@ def test_nan_error_exceeds_the_bound_for_any_number_of_diverged_starts() -> None
     assert worst == math.inf and "at 5 s" in location
 
 
+def test_ratio_is_infinite_if_a_start_diverges_with_the_residual_alone() -> None:
+    """The means leave out the start that diverged, and would be smaller with the residual."""
+    result = Evaluation((SOUND,), (PARTLY_DIVERGED,))
+    assert result.ratio("near", "position", 5.0) == math.inf
+    assert result.ratio("near", "position", 1.0) == pytest.approx(0.5)
+    assert Evaluation((PARTLY_DIVERGED,), (SOUND,)).ratio("near", "position", 5.0) == pytest.approx(6.0)
+
+
 def test_starts_that_diverge_in_both_simulators_do_not_affect_the_score() -> None:
     result = Evaluation((PARTLY_DIVERGED,), (PARTLY_DIVERGED,))
     assert result.score == 1.0 and result.excess()[0] < 0

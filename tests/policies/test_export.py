@@ -20,6 +20,7 @@ import pytest
 from rover import write_rover
 from servo_arm import write_arm
 
+from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.cli import export as export_command
 from ballu_mjx.cli import train_policy
 from ballu_mjx.cli.export import PolicyOptions as Options
@@ -73,7 +74,12 @@ np.save(sys.argv[3], [controller.act(row) for row in features])
 
 
 def write_run(
-    folder: Path, task: str = "walk", robot: RobotDescription = BALLU, residual: Path | None = None, **settings: Any
+    folder: Path,
+    task: str = "walk",
+    robot: RobotDescription = BALLU,
+    residual: Path | None = None,
+    actuators: ActuatorParameters | None = None,
+    **settings: Any,
 ) -> Path:
     """Write a run with a random policy whose commands cover their ranges."""
     config = PPOConfig(policy_layers=(16, 12), value_layers=(4,), **settings)
@@ -86,7 +92,7 @@ def write_run(
     normalizer = Normalizer(np.float32(100.0), *moments)  # pyright: ignore[reportArgumentType]
     value = jax.device_get(networks.value_network.init(jax.random.key(3)))
     sections = {"env": LocomotionConfig(), "ppo": config, "data": train_policy.Data()}
-    content = describe_run(task, sections, {}, [], description=robot)
+    content = describe_run(task, sections, {}, [], identified=actuators, description=robot)
     content["residual"] = None if residual is None else str(residual)
     with Run(folder, content) as run:
         run.save(7, ppo.as_tree(Params(normalizer, tree, value)), -1.0)
@@ -157,7 +163,7 @@ def test_export_reports_missing_onnx_before_it_writes_anything(
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert export_command.main(["policy", str(run), "--output", str(tmp_path / "robot"), "--onnx"]) == 2
     error = capsys.readouterr().err
-    assert "ballu-mjx[onnx]" in error and error.count("\n") == 1
+    assert ".[onnx]" in error and error.count("\n") == 1
     assert not (tmp_path / "robot").exists()
 
 
@@ -388,6 +394,15 @@ def test_readme_states_the_command_delay_of_training(tmp_path: Path):
     text = (export.export_policy(Options(delayed, open_loop=False)) / "README.txt").read_text()
     assert "trained with a delay of 45 ms" in text and "without delay" not in text
     assert "simulator 'aerodynamic'" in text
+
+
+def test_readme_states_the_delay_of_the_identified_drivetrain(tmp_path: Path):
+    """The sides have different delays. The README states the longer one."""
+    nominal = ActuatorParameters.nominal(BALLU.load_model())
+    late = dataclasses.replace(nominal, delay=jnp.array([0.03, 0.05]))
+    run = write_run(tmp_path / "late", actuators=late)
+    text = (export.export_policy(Options(run, open_loop=False)) / "README.txt").read_text()
+    assert "trained with a delay of 50 ms" in text and "without delay" not in text
 
 
 @pytest.mark.parametrize("stuck", ["balloon_position", "balloon_quaternion", "foot_right_position"])

@@ -9,7 +9,7 @@ import pytest
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
-from ballu_mjx.residuals.dataset import USES, RecordingsData, ResidualDataset, check_overlap
+from ballu_mjx.residuals.dataset import USES, RecordingsData, ResidualDataset, check_overlap, replay_title
 from ballu_mjx.robots.registry import load_robot
 
 ONE, TWO, THREE, FOUR = list_bundled("training")[:2] + list_bundled("test")[:2]
@@ -38,6 +38,12 @@ def test_recordings_with_two_uses_give_warnings(
         part in line for part, line in zip(warnings, found.reused, strict=True)
     )
     assert replayed in found.replayed
+
+
+def test_title_of_a_replay_counts_recordings_that_are_not_new() -> None:
+    title = replay_title({"a", "b", "c"}, validation={"b", "d"}, training={"e"}, otherwise="other recordings")
+    assert title == "Open-loop replay of other recordings (1 of 3 are not new: they chose the checkpoint)"
+    assert replay_title({"a"}, {"b"}, {"c"}, "other recordings") == "Open-loop replay of other recordings"
 
 
 @pytest.mark.parametrize(("one", "other"), list(itertools.combinations(USES, 2)))

@@ -13,9 +13,10 @@ MODEL = """
 <worldbody><geom name="floor" type="plane" size="0 0 0.1"/>
   <body name="trunk" pos="0 0 1"><freejoint/><geom name="trunk" size="0.1" contype="0" conaffinity="0"/>
     <site name="imu"/>
-    <body name="left" pos="0 0.1 0"><joint name="left" axis="0 1 0"/><geom LEFT/></body>
+    <body name="left" pos="0 0.1 0"><joint name="left" axis="0 1 0" JOINT/><geom LEFT/></body>
     <body name="right" pos="0 -0.1 0"><joint name="right" axis="0 1 0"/><geom RIGHT/></body></body></worldbody>
-<actuator><motor name="m" joint="left"/></actuator>MORE</mujoco>
+<tendon><fixed name="cable" CABLE><joint joint="left" coef="1"/></fixed></tendon>
+<actuator><general name="m" joint="left" MOTOR/></actuator>MORE</mujoco>
 """
 
 
@@ -27,6 +28,9 @@ def load(**parts: str) -> mujoco.MjModel:
         ("LEFT", 'size="0.02"'),
         ("RIGHT", 'size="0.02"'),
         ("MORE", ""),
+        ("JOINT", ""),
+        ("CABLE", ""),
+        ("MOTOR", ""),
     ):
         text = text.replace(key, parts.get(key.lower(), default))
     return mujoco.MjModel.from_xml_string(text)
@@ -79,6 +83,15 @@ def test_visual_meshes_may_have_any_number_of_vertices():
         ({"more": '<sensor><contact name="foot" body1="left"/></sensor>'}, "contact sensor", "name geoms"),
         ({"more": '<actuator><adhesion name="sticky" body="left" ctrlrange="0 1"/></actuator>'},
          'an actuator on "body" (sticky)', "put it on a joint"),
+        ({"joint": 'stiffness="1 0.5 0"'}, "the joint left has a nonlinear stiffness", '"stiffness" a single number'),
+        ({"joint": 'damping="0.1 0 0.5"'}, "the joint left has a nonlinear damping", '"damping" a single number'),
+        ({"cable": 'stiffness="1 0.5 0"'}, "the tendon cable has a nonlinear stiffness", "a single number"),
+        ({"cable": 'damping="0.1 0.5 0"'}, "the tendon cable has a nonlinear damping", "a single number"),
+        ({"motor": 'damping="0.1"'}, "the actuator m has a damping", "at the joint or tendon"),
+        ({"motor": 'damping="0 0.1 0"'}, "the actuator m has a damping", "at the joint or tendon"),
+        ({"motor": 'armature="0.01"'}, "the actuator m has an armature", "at the joint or tendon"),
+        ({"motor": 'delay="0.02" nsample="4"'}, "the actuator m has a delay", "declare the delay"),
+        ({"motor": 'dyntype="filter" dynprm="0.1" actearly="true"'}, 'm has "actearly"', "remove it"),
     ],
 )  # fmt: skip
 def test_features_that_mjx_lacks_are_reported_with_a_fix(parts: dict[str, str], problem: str, fix: str):

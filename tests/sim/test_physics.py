@@ -18,12 +18,13 @@ from ballu_mjx.ballu.actuators import CABLE_SLACK, ActuatorParameters, actuator_
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, KNEES, MOTORS, SIDES, buoyancy_ratio, load_model, standing_qpos
 from ballu_mjx.robots.model import set_fields, with_fields
 from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.sim.contact_solver import _newton_step, _solve
+from ballu_mjx.sim.constraint_solver import _newton_step, _solve
 from ballu_mjx.sim.step import (
     control_step,
     count_substeps,
     load_state,
     make_data,
+    physics_step,
     put_model,
     state_at,
 )
@@ -153,6 +154,23 @@ def test_mjx_agrees_with_c_mujoco_over_a_control_step() -> None:
 
 
 # ---- symmetry ----
+
+
+@pytest.mark.parametrize("limit", [0.1, 100.0])
+def test_velocity_feedback_acts_only_below_the_force_limit(limit: float) -> None:
+    """`implicitfast` treats velocity feedback implicitly, which would slow down an actuator at its limit."""
+    model = mujoco.MjModel.from_xml_string(f"""
+        <mujoco><option timestep="0.01" integrator="implicitfast"/><worldbody><body>
+          <joint name="j" axis="0 1 0" armature="0.001"/><geom size="0.02" mass="0.1" pos="0.05 0 0"/></body>
+        </worldbody>
+        <actuator><position joint="j" kp="5" kv="1" forcerange="{-limit} {limit}"/></actuator></mujoco>""")
+    data = mujoco.MjData(model)
+    data.ctrl[:], data.qvel[:] = 1.0, -0.5
+    start = state_at(jnp.asarray(data.qpos, jnp.float32), jnp.asarray(data.qvel, jnp.float32))
+    inputs = make_data(model).replace(ctrl=jnp.asarray(data.ctrl, jnp.float32))  # pyright: ignore
+    found = jax.jit(physics_step)(put_model(model), inputs, start)
+    mujoco.mj_step(model, data)
+    np.testing.assert_allclose(found.qvel, data.qvel, rtol=1e-4)
 
 
 def mirrored_qpos(qpos: np.ndarray) -> np.ndarray:

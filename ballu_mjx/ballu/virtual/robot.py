@@ -1,4 +1,4 @@
-"""Virtual robots that replace the hardware: a family in C MuJoCo that the training simulator does not contain.
+"""Virtual robots that replace the hardware: a family in C MuJoCo, with effects that the nominal model lacks.
 
 They differ from `assets/ballu.xml` in these points:
 

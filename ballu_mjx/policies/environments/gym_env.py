@@ -26,7 +26,9 @@ try:
     import gymnasium
     from gymnasium.vector import AutoresetMode, VectorEnv
 except ImportError as error:
-    raise InputError('The package gymnasium is not installed; `pip install "ballu-mjx[gym]"` brings it.') from error
+    raise InputError(
+        'The package gymnasium is not installed; `pip install -c constraints.txt -e ".[gym]"` brings it.'
+    ) from error
 
 
 class GymEnv(gymnasium.Env):

@@ -14,7 +14,7 @@ try:
     from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 except ImportError as error:
     raise InputError(
-        "The package stable-baselines3 is not installed; `pip install stable-baselines3` brings it."
+        "The package stable-baselines3 is not installed; `pip install -c constraints.txt stable-baselines3` brings it."
     ) from error
 
 

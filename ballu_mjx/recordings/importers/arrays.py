@@ -144,7 +144,7 @@ def open_lerobot(path: Path, mapping: RoomMapping | None) -> Capture:
         import pyarrow  # pyright: ignore[reportMissingImports]
         from pyarrow import parquet  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        fix = 'install it by `pip install "ballu-mjx[lerobot]"`'
+        fix = 'install it by `pip install -c constraints.txt -e ".[lerobot]"`'
         raise InputError(f"{path}: LeRobot datasets are read with pyarrow, which is not installed; {fix}.") from error
     again = "copy the dataset again"
     info = read_json(path / _INFO, again)

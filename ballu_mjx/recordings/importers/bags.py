@@ -275,7 +275,7 @@ def _series(
 
 
 def _missing(path: Path, package: str, error: ImportError) -> NoReturn:
-    fix = 'install it by `pip install "ballu-mjx[bags]"`'
+    fix = 'install it by `pip install -c constraints.txt -e ".[bags]"`'
     raise InputError(f"{path}: bags and MCAP files are read with {package}, which is not installed; {fix}.") from error
 
 

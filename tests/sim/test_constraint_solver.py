@@ -13,7 +13,7 @@ import pytest
 from mujoco import mjx
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
-from ballu_mjx.sim.contact_solver import _solve
+from ballu_mjx.sim.constraint_solver import _solve
 from ballu_mjx.sim.step import PhysicsState, control_step, count_substeps, load_state, make_data, put_model, state_at
 
 SLIDER = """
