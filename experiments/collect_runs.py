@@ -29,7 +29,7 @@ from ballu_mjx.cli.compare import rows as rows_of_runs
 from ballu_mjx.common import provenance
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table, write_results
-from ballu_mjx.evaluation.errors import SCORE_HORIZONS, Errors, Evaluation, quotient
+from ballu_mjx.evaluation.errors import SCORE_HORIZONS, Errors, Evaluation, error_ratio
 from ballu_mjx.evaluation.errors_file import read_evaluation
 from ballu_mjx.residuals.registry import RESIDUAL_TASKS
 from ballu_mjx.runs.folder import read_config
@@ -102,7 +102,7 @@ def errors_table(runs: Sequence[Evaluation], horizons: Sequence[float] | None = 
 
 
 def group_mean(side: Sequence[Errors], group: str, quantity: str, horizon: float) -> float:
-    """Return a simulator's mean error (m or deg) over a group's recordings."""
+    """Return a simulator's mean error (m or deg) over a group's recordings. Infinite if all starts of one diverged."""
     return float(np.mean([getattr(errors, quantity)[horizon][0] for errors in side if errors.group == group]))
 
 
@@ -117,13 +117,9 @@ def remaining_errors(
     `columns` are pairs of group and quantity. `simulators` holds the errors of all seeds, by label. Cells have one
     value for each seed.
     """
-    whole = {column: group_mean(vanilla, *column, horizon) for column in columns}
-    rows = {"vanilla": [Cell((whole[column],), *_FORMS[column[1]]) for column in columns]}
+    rows = {"vanilla": [Cell((group_mean(vanilla, *column, horizon),), *_FORMS[column[1]]) for column in columns]}
     for label, runs in simulators.items():
-        rows[label] = [
-            Cell(tuple(quotient(group_mean(run, *column, horizon), whole[column]) for run in runs))
-            for column in columns
-        ]
+        rows[label] = [Cell(tuple(error_ratio(run, vanilla, *column, horizon) for run in runs)) for column in columns]
     return rows
 
 

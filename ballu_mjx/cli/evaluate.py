@@ -6,6 +6,7 @@ JAX and modules that need it are imported inside functions: `runtime.prepare` ha
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -36,8 +37,10 @@ class Options(runtime.CommandOptions):
     last: bool = False
     """Evaluate the last checkpoint instead of the one with the smallest validation error."""
     noise_floor: bool = False
-    """Also print the errors that motion-capture noise (0.5 mm, 0.3 deg) in the starting states causes. No simulator can
-    be expected to have much smaller errors."""
+    """Also print the errors that motion-capture noise in the starting states causes. No simulator can be expected to
+    have much smaller errors."""
+    capture_noise: tuple[float, float] = (0.5, 0.3)
+    """Noise of the motion capture for --noise-floor: standard deviations of a position (mm) and of an angle (deg)."""
     output: Path | None = None
     """Folder for evaluation.txt, evaluation.json, tracking.png and replay.npz, for example the run's folder. Without
     this option: the table is only printed."""
@@ -58,6 +61,7 @@ def _evaluate(options: Options) -> None:
     from ballu_mjx.evaluation.open_loop import Evaluators
     from ballu_mjx.recordings.capture_noise import add_capture_noise
     from ballu_mjx.recordings.csv_format import list_recordings, read_recording, recording_name
+    from ballu_mjx.recordings.motion import ReconstructionParameters
     from ballu_mjx.recordings.reconstruct import reconstruct
     from ballu_mjx.residuals.dataset import check_recording
     from ballu_mjx.residuals.registry import RESIDUAL_TASKS
@@ -69,6 +73,8 @@ def _evaluate(options: Options) -> None:
     from ballu_mjx.sim.simulator import Simulator
     from ballu_mjx.viz.artifacts import write_evaluation
 
+    if not all(0 < noise < math.inf for noise in options.capture_noise):
+        raise InputError(f"--capture-noise {options.capture_noise}: give two positive numbers (mm and deg).")
     config = read_config(options.run, *RESIDUAL_TASKS)
     which = "last" if options.last else "best"
     own = run_robot(config, options.run)
@@ -100,9 +106,12 @@ def _evaluate(options: Options) -> None:
     print(f"{_title(options, config, paths)}: {', '.join(map(recording_name, paths))}\n")
     print(result.table())
     if options.noise_floor:
-        shaken = [add_capture_noise(recording, seed=number) for number, recording in enumerate(recordings)]
+        distance, angle = options.capture_noise
+        noise = ReconstructionParameters(distance / 1000, math.radians(angle), math.radians(angle))
+        shaken = [add_capture_noise(recording, noise, number) for number, recording in enumerate(recordings)]
         floor = evaluator.of_starts([restore(each) for each in shaken], loaded.params)
-        print(f"\n{noise_floor(floor, result.residual)}")
+        print(f"\nErrors that capture noise of {distance:g} mm and {angle:g} deg in the starting states alone causes,")
+        print(f"and the errors above (independent errors add in squares):\n{noise_floor(floor, result.residual)}")
 
 
 def _title(options: Options, config: Mapping[str, Any], paths: Sequence[Path]) -> str:
@@ -123,10 +132,7 @@ def noise_floor(floor: Sequence[Errors], errors: Sequence[Errors]) -> str:
     """Return lines for the terminal: errors due to noise alone and errors of the simulator, by group and horizon."""
     from ballu_mjx.evaluation.errors import mean_by_group
 
-    lines = [
-        "Errors that motion-capture noise (0.5 mm, 0.3 deg) in the starting states alone causes, and these errors "
-        "(independent errors add in squares):",
-    ]
+    lines = []
     for noise, ours in zip(mean_by_group(floor), mean_by_group(errors), strict=True):
         for horizon, (position, _) in noise.position.items():
             lines.append(

@@ -270,13 +270,16 @@ def _mean(errors: Sequence[Errors]) -> Errors:
 def error_ratio(errors: Sequence[Errors], base: Sequence[Errors], group: str, quantity: str, horizon: float) -> float:
     """Return the ratio (`quotient`) of a simulator's errors to those of a base simulator on the same recordings.
 
-    Both are first averaged over the group's recordings. Means leave out starts that diverged. The ratio is therefore
-    infinite if more starts of a recording diverge than in the base simulator.
+    Both are first averaged over the group's recordings, without those in which all starts of the base simulator
+    diverged. Means of a recording leave out starts that diverged. The ratio is therefore infinite if more starts of a
+    recording diverge than in the base simulator.
     """
     pairs = [pair for pair in zip(errors, base, strict=True) if pair[1].group == group]
     if any(ours.num_diverged(horizon) > theirs.num_diverged(horizon) for ours, theirs in pairs):
         return np.inf
-    return quotient(*(group_mean(side, group, quantity, horizon) for side in (errors, base)))
+    means = np.array([[getattr(each, quantity).get(horizon, (np.inf,))[0] for each in pair] for pair in pairs])
+    finite = np.isfinite(means[:, 1])
+    return quotient(*(means[finite] if finite.any() else means).mean(axis=0))
 
 
 def group_mean(errors: Sequence[Errors], group: str, quantity: str, horizon: float, place: int = 0) -> float:

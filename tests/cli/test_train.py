@@ -147,6 +147,7 @@ def test_run_folder_is_complete(trained: Path):
 def test_evaluate_reproduces_the_errors_of_the_training_run(trained: Path):
     done = command("evaluate", "run", "--noise-floor", "--output", "again", folder=trained.parent)
     assert done.returncode == 0, done.stderr
+    assert "capture noise of 0.5 mm and 0.3 deg" in done.stdout
     assert (trained / "evaluation.txt").read_text() in done.stdout
     assert "replay of the training recordings (the residual was learned from them): far-2, near-1\n" in done.stdout
     floors = re.findall(r"([\d.]+) m of ([\d.]+) m", done.stdout)

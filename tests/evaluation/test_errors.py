@@ -76,6 +76,13 @@ def test_ratio_is_infinite_if_a_start_diverges_with_the_residual_alone() -> None
     assert Evaluation((PARTLY_DIVERGED,), (SOUND,)).ratio("near", "position", 5.0) == pytest.approx(6.0)
 
 
+def test_ratio_leaves_out_recordings_in_which_the_base_simulator_always_diverges() -> None:
+    """Both means are over the same recordings."""
+    large = errors("near-2", [[1.0], [1.0], [9.0]])
+    result = Evaluation((SOUND, DIVERGED), (SOUND, large))
+    assert result.ratio("near", "position", 5.0) == 1.0
+
+
 def test_starts_that_diverge_in_both_simulators_do_not_affect_the_score() -> None:
     result = Evaluation((PARTLY_DIVERGED,), (PARTLY_DIVERGED,))
     assert result.score == 1.0 and result.excess()[0] < 0
