@@ -66,7 +66,7 @@ def identify(folder: Path, config: IdentificationConfig) -> None:
 # ## Table and figure
 #
 # Dots are measured angles. Lines are angles in the nominal and in the identified simulator. Dotted lines are the
-# identified simulator with the robot's friction and backlash. A command lifts the motor's arm and bends the knee. The
+# identified simulator without friction and backlash. A command lifts the motor's arm and bends the knee. The
 # curves flatten where the servo is at its torque limit.
 
 

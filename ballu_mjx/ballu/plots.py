@@ -115,23 +115,26 @@ def _sticks(qpos: Float[np.ndarray, "states nq"]) -> tuple[dict[str, np.ndarray]
 def actuator_curves(path: Path, sweep: Sweep, result: Identification) -> None:
     """Draw settled angles over commands: measured, nominal and identified, with one panel for each joint.
 
-    This is the paper's figure of the actuators. Dotted lines are the angles at the end of each hold in the simulated
-    motion, with the identified friction and drivetrain.
+    This is the paper's figure of the actuators. Identified angles are those at the end of each hold in the simulated
+    motion. Dotted lines are the equilibria of the same leg without friction and drivetrain. A fit of settled angles
+    alone has only these.
     """
     figure = Figure(figsize=(9.0, 6.5), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True, sharey="row")
-    simulations = {"vanilla": result.nominal_settled, "vanilla+sysid": result.settled}
+    identified = label_of("vanilla+sysid")
+    curves = [("vanilla", label_of("vanilla"), "-", result.nominal_settled)]
+    if result.simulated is None:
+        curves.append(("vanilla+sysid", identified, "-", result.settled))
+    else:
+        curves.append(("vanilla+sysid", identified, "-", result.simulated))
+        curves.append(("vanilla+sysid", f"{identified} without friction and backlash", ":", result.settled))
     for row, joint in enumerate(("motor", "knee")):
         for column, side in enumerate(SIDES):
             axis, order = axes[row, column], np.argsort(sweep.command[:, column])
             command = sweep.command[order, column]
-            for name, angles in simulations.items():
+            for name, label, line, angles in curves:
                 curve = np.rad2deg(angles[order, row, column])
-                axis.plot(command, curve, color=colour_of(name), label=label_of(name), linewidth=1.5)
-            if result.simulated is not None:
-                curve = np.rad2deg(result.simulated[order, row, column])
-                label = f"{label_of('vanilla+sysid')}, with friction and backlash"
-                axis.plot(command, curve, ":", color=colour_of("vanilla+sysid"), label=label, linewidth=1.5)
+                axis.plot(command, curve, line, color=colour_of(name), label=label, linewidth=1.5)
             measured = np.rad2deg(sweep.settled[order, row, column])
             axis.plot(command, measured, "o", color=colour_of("recording"), label="measured", markersize=3.5)
             axis.set_title(f"{joint}, {side}")
