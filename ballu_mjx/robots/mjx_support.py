@@ -91,6 +91,9 @@ def _ignored(model: mujoco.MjModel) -> tuple[str, str] | None:
             element = int(model.dof_jntid[number]) if field.startswith("dof_") else int(number)
             called = mujoco.mj_id2name(model, kind, element) or f"number {element + 1}"
             return f"the {_word(kind)} {called} has {what}, which MJX would leave out", fix
+    groups = [int(group) for group in model.actuator_group if 0 <= group < 31]
+    if off := sorted({group for group in groups if model.opt.disableactuator >> group & 1}):
+        return f"it disables the actuator group {off[0]}, which MJX would leave on", "remove the group's actuators"
     return None
 
 

@@ -92,6 +92,7 @@ def test_visual_meshes_may_have_any_number_of_vertices():
         ({"motor": 'armature="0.01"'}, "the actuator m has an armature", "at the joint or tendon"),
         ({"motor": 'delay="0.02" nsample="4"'}, "the actuator m has a delay", "declare the delay"),
         ({"motor": 'dyntype="filter" dynprm="0.1" actearly="true"'}, 'm has "actearly"', "remove it"),
+        ({"option": 'actuatorgroupdisable="0 2"', "motor": 'group="2"'}, "the actuator group 2", "remove the group's"),
     ],
 )  # fmt: skip
 def test_features_that_mjx_lacks_are_reported_with_a_fix(parts: dict[str, str], problem: str, fix: str):
@@ -100,5 +101,8 @@ def test_features_that_mjx_lacks_are_reported_with_a_fix(parts: dict[str, str], 
 
 
 def test_features_that_mjx_simulates_are_accepted():
-    for option in ('integrator="Euler" density="1.2"', 'integrator="RK4"', 'cone="elliptic"', 'solver="CG"'):
+    for option in (
+        'integrator="Euler" density="1.2"', 'integrator="RK4"', 'cone="elliptic"', 'solver="CG"',
+        'actuatorgroupdisable="1"',
+    ):  # fmt: skip
         assert check_mjx(load(option=option)) is None
