@@ -1,9 +1,9 @@
 """Compare accuracy and speed of three identification methods on recordings of a real double pendulum.
 
-The recordings, the model and the parameters are those of `experiments/real/double_pendulum/`. All methods have the same
-windows, measured starting states, bounds, first point (nominal, slightly inside of the bounds) and residuals, and no
-priors. The residuals are the errors of positions at every sample over `WEIGHT`, with a pseudo-Huber loss. The objective
-is their root mean square.
+Recordings and model are those of `experiments/real/double_pendulum/`. The parameters are its friction, armature and
+delay, and the strength of the motors. All methods have the same windows, measured starting states, bounds, first point
+(nominal, slightly inside of the bounds) and residuals, and no priors. The residuals are the errors of positions at
+every sample over `WEIGHT`, with a pseudo-Huber loss. The objective is their root mean square.
 
 - ours: `fit_robot`, Levenberg-Marquardt with exact derivatives through MJX, one start.
 - `mujoco.sysid` (`pip install "mujoco[sysid]"`): its own optimizer and finite differences. All windows and perturbed
@@ -276,8 +276,14 @@ def toolbox(
 
 
 def read_pendulum() -> Any:
-    """Return the description of the double pendulum."""
-    return read_description(double_pendulum.FOLDER / "double_pendulum.robot.json")
+    """Return the description of the double pendulum, with the strength of its motors instead of mass properties.
+
+    Without priors, the motion in a plane does not determine mass properties.
+    """
+    robot = read_description(double_pendulum.FOLDER / "double_pendulum.robot.json")
+    kept = (entry for entry in robot.identify if entry.get("field") != "mass_properties")
+    strengths = ({"actuator": name, "field": "strength"} for name in robot.commands)
+    return dataclasses.replace(robot, identify=(*kept, *strengths))
 
 
 def without_priors(parameters: ParameterSet) -> ParameterSet:

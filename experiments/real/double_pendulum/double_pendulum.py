@@ -8,8 +8,9 @@
 # `pos_meas2` (rad). The columns `command_shoulder` and `command_elbow` are `tau_con / 20 + 0.5`. The positions of
 # `middle` and `tip` are computed by forward kinematics.
 #
-# The model has the published masses, lengths and inertias. The strength of the motors is identified, because it may
-# differ from the nominal one. Six recordings are for training. Two are for validation: they chose the declared
+# The model has the published masses, lengths and inertias. Masses, centres of mass and inertias of the links are
+# identified too, because the published ones were identified together with another friction. Six recordings are for
+# training. Two are for validation: they chose the declared
 # parameters, and they show whether identification helps. Two are for the test. For comparison, the published friction
 # is replayed, too.
 #
