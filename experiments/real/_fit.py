@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,8 +25,9 @@ def parse(description: str, output: Path) -> argparse.Namespace:
 
 
 def report(stage: str, iteration: int, steps: int, value: float) -> None:
-    """Print the progress of a fit to stderr."""
-    print(f"{stage} {iteration}/{steps}: {value:.6g}", file=sys.stderr, flush=True)
+    """Print the progress of a fit to stderr. Stages without a loss have the value NaN."""
+    loss = f", loss {value:.6g}" if math.isfinite(value) else ""
+    print(f"{stage}: {iteration} of {steps}{loss}", file=sys.stderr, flush=True)
 
 
 def show(fit: RobotFit) -> None:
