@@ -278,10 +278,10 @@ def toolbox(
 def read_pendulum() -> Any:
     """Return the description of the double pendulum, with the strength of its motors instead of mass properties.
 
-    Without priors, the motion in a plane does not determine mass properties.
+    Without priors, the recordings do not determine all mass properties.
     """
     robot = read_description(double_pendulum.FOLDER / "double_pendulum.robot.json")
-    kept = (entry for entry in robot.identify if entry.get("field") != "mass_properties")
+    kept = (entry for entry in robot.identify if "body" not in entry)
     strengths = ({"actuator": name, "field": "strength"} for name in robot.commands)
     return dataclasses.replace(robot, identify=(*kept, *strengths))
 

@@ -9,7 +9,7 @@ to identify:
 - `{"tendon": "cable", "field": "springlength"}`. Fields: stiffness, damping, frictionloss, springlength (upper end).
 - `{"geom": "tip", "field": "friction"}`. Field: friction (sliding).
 - `{"body": "arm", "field": "mass"}`. Fields: mass (scales the inertia too), com (3 parameters), inertia (6), or
-  mass_properties for all 10.
+  mass_properties for all 10. Each of the ten is a field too, such as com_z or stretch_x.
 - `{"command": "left", "field": "delay"}`. Fields: scale, offset, delay, backlash, rate_limit, lag (`sim.drivetrain`).
 - Any other numeric field of an element, by MuJoCo's name: `{"joint": "hinge", "field": "jnt_range", "index": 0}`.
 
@@ -45,6 +45,7 @@ _BODY_GROUPS = {
     "com": BODY_QUANTITIES[1:4],
     "inertia": BODY_QUANTITIES[4:],
     "mass_properties": BODY_QUANTITIES,
+    **{name: (name,) for name in BODY_QUANTITIES[1:]},
 }
 
 

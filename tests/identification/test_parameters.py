@@ -83,6 +83,21 @@ def test_nominal_values_change_nothing(tmp_path: Path):
         np.testing.assert_allclose(ours, jnp.minimum(same, 2 / model.opt.timestep))
 
 
+def test_one_of_the_ten_numbers_of_a_body_can_be_declared_alone(tmp_path: Path):
+    """It has the same effect as within `mass_properties`."""
+    alone, model = arm(tmp_path, {"body": "hand", "field": "stretch_z", "bounds": [0.5, 2]})
+    assert list(alone.names) == ["hand_stretch_z"] and alone.parameters[0].bounds == (0.5, 2.0)
+    (tmp_path / "ten").mkdir()
+    ten, _ = arm(tmp_path / "ten", {"body": "hand", "field": "mass_properties"})
+    values = ten.nominal.copy()
+    values[ten.names.index("hand_stretch_z")] = 1.3
+    with jax.enable_x64(True):
+        found, expected = alone.fields(model, np.array([1.3])), ten.fields(model, values)
+    for name, field in expected.items():
+        np.testing.assert_allclose(found[name], field, rtol=1e-9, atol=1e-12, err_msg=name)
+    assert np.abs(found["body_inertia"] - model.body_inertia).max() > 1e-6
+
+
 def test_tied_parameters_set_all_their_targets(tmp_path: Path):
     parameters, model = arm(
         tmp_path,

@@ -9,8 +9,8 @@
 # `middle` and `tip` are computed by forward kinematics.
 #
 # The model has the published masses, lengths and inertias. Masses, centres of mass and inertias of the links are
-# identified too, because the published ones were identified together with another friction. Six recordings are for
-# training. Two are for validation: they chose the declared
+# identified too, as far as they have an effect in the plane, because the published ones were identified together with
+# another friction. Six recordings are for training. Two are for validation: they chose the declared
 # parameters, and they show whether identification helps. Two are for the test. For comparison, the published friction
 # is replayed, too.
 #
