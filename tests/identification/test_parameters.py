@@ -92,7 +92,10 @@ def test_one_of_the_ten_numbers_of_a_body_can_be_declared_alone(tmp_path: Path):
     values = ten.nominal.copy()
     values[ten.names.index("hand_stretch_z")] = 1.3
     with jax.enable_x64(True):
-        found, expected = alone.fields(model, np.array([1.3])), ten.fields(model, values)
+        found, expected = (
+            {name: np.asarray(field) for name, field in parameters.fields(model, own).items()}
+            for parameters, own in ((alone, np.array([1.3])), (ten, values))
+        )
     for name, field in expected.items():
         np.testing.assert_allclose(found[name], field, rtol=1e-9, atol=1e-12, err_msg=name)
     assert np.abs(found["body_inertia"] - model.body_inertia).max() > 1e-6
