@@ -25,7 +25,7 @@ def vector(parameters: ParameterSet, **values: float) -> np.ndarray:
 
 
 def test_descriptions_of_the_real_robots_declare_their_parameters():
-    assert len(declared("double_pendulum")) == 9
+    assert len(declared("double_pendulum")) == 15
     assert len(declared("go1")) == 5
     assert len(declared("compass_gait")) == 4
 
@@ -87,11 +87,17 @@ def test_identified_parameters_predict_the_double_pendulum(monkeypatch: pytest.M
     parameters = declared("double_pendulum")
     identified = vector(
         parameters,
-        shoulder_frictionloss=0.278,
-        elbow_frictionloss=0.166,
-        shoulder_armature=0.0040,
-        elbow_armature=0.0034,
-        delay=0.0077,
+        shoulder_frictionloss=0.26,
+        elbow_frictionloss=0.18,
+        elbow_armature=0.0050,
+        upper_mass=0.415,
+        upper_com_x=0.0034,
+        upper_com_z=0.0037,
+        upper_stretch_z=1.09,
+        lower_com_x=0.0013,
+        lower_com_z=-0.0019,
+        lower_stretch_z=0.90,
+        delay=0.0086,
     )
     motions = double_pendulum.load(REAL_DATA / "double_pendulum" / "recordings", double_pendulum.VALIDATION)
     nominal, found = replay(parameters, motions, [parameters.nominal, identified], 1.0, 0.5)
