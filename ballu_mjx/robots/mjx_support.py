@@ -41,6 +41,9 @@ def _options(model: mujoco.MjModel) -> tuple[str, str] | None:
     if fluid and option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         problem = 'it has a fluid (density, viscosity or wind) together with integrator="implicitfast"'
         return problem, 'write integrator="Euler", or remove the fluid and identify it with `train fluid`'
+    if fluid and (shaped := np.flatnonzero(model.geom_fluid[:, 0])).size:
+        problem = f'{_geom(model, int(shaped[0]))} has fluidshape="ellipsoid", which MJX would leave out'
+        return problem, "remove it (the fluid then acts on the body's inertia box), or remove the fluid"
     if option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and np.any(model.geom_condim[_colliding(model)] == 1):
         return 'it has elliptic cones together with condim="1"', 'write cone="pyramidal", or condim="3"'
     return None

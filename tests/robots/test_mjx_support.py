@@ -75,6 +75,8 @@ def test_visual_meshes_may_have_any_number_of_vertices():
         ({"option": 'integrator="implicit"'}, 'integrator "implicit"', "implicitfast"),
         ({"option": 'solver="PGS"'}, 'solver "pgs"', "Newton"),
         ({"option": 'integrator="implicitfast" density="1.2"'}, "fluid", "Euler"),
+        ({"option": 'integrator="Euler" density="1.2"', "left": 'name="hull" size="0.02" fluidshape="ellipsoid"'},
+         'hull has fluidshape="ellipsoid"', "inertia box"),
         ({"option": 'cone="elliptic"', "left": 'size="0.02" condim="1"'}, "elliptic cones", "pyramidal"),
         ({"left": 'name="rod" type="cylinder" size="0.02 0.1"', "right": 'name="cube" type="box" size="0.1 0.1 0.1"'},
          "rod and cube collide, but MJX has no collisions of cylinder and box", "exclude the pair"),
@@ -106,3 +108,4 @@ def test_features_that_mjx_simulates_are_accepted():
         'actuatorgroupdisable="1"',
     ):  # fmt: skip
         assert check_mjx(load(option=option)) is None
+    assert check_mjx(load(left='size="0.02" fluidshape="ellipsoid"')) is None, "without a fluid, it has no effect"
