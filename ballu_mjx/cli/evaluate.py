@@ -107,7 +107,9 @@ def _evaluate(options: Options) -> None:
     print(result.table())
     if options.noise_floor:
         distance, angle = options.capture_noise
-        noise = ReconstructionParameters(distance / 1000, math.radians(angle), math.radians(angle))
+        noise = ReconstructionParameters(
+            position_noise=distance / 1000, rotation_noise=math.radians(angle), joint_noise=math.radians(angle)
+        )
         shaken = [add_capture_noise(recording, noise, number) for number, recording in enumerate(recordings)]
         floor = evaluator.of_starts([restore(each) for each in shaken], loaded.params)
         print(f"\nErrors that capture noise of {distance:g} mm and {angle:g} deg in the starting states alone causes,")

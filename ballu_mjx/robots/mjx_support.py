@@ -63,8 +63,7 @@ def _parts(model: mujoco.MjModel) -> tuple[str, str] | None:
     ):
         for number, value in enumerate(kinds):
             if value not in set(known):
-                name = mujoco.mj_id2name(model, named, number) or f"number {number + 1}"
-                return f'it has {what} "{_word(kind(value))}" ({name})', fix
+                return f'it has {what} "{_word(kind(value))}" ({_name(model, named, number)})', fix
     contact = model.sensor_type == mujoco.mjtSensor.mjSENS_CONTACT
     if contact.any() and np.isin(
         np.concatenate([model.sensor_objtype[contact], model.sensor_reftype[contact]]),
@@ -92,11 +91,10 @@ def _ignored(model: mujoco.MjModel) -> tuple[str, str] | None:
         values = np.asarray(getattr(model, field))
         for number in np.flatnonzero(values.any(axis=tuple(range(1, values.ndim)))):
             element = int(model.dof_jntid[number]) if field.startswith("dof_") else int(number)
-            called = mujoco.mj_id2name(model, kind, element) or f"number {element + 1}"
-            return f"the {_word(kind)} {called} has {what}, which MJX would leave out", fix
-    groups = [int(group) for group in model.actuator_group if 0 <= group < 31]
-    if off := sorted({group for group in groups if model.opt.disableactuator >> group & 1}):
-        return f"it disables the actuator group {off[0]}, which MJX would leave on", "remove the group's actuators"
+            return f"the {_word(kind)} {_name(model, kind, element)} has {what}, which MJX would leave out", fix
+    for group in sorted(set(model.actuator_group.tolist())):
+        if 0 <= group < 31 and model.opt.disableactuator >> group & 1:
+            return f"it disables the actuator group {group}, which MJX would leave on", "remove the group's actuators"
     return None
 
 
@@ -160,6 +158,10 @@ def _hull_vertices(model: mujoco.MjModel, mesh: int) -> int:
     """Return the number of vertices of a mesh's convex hull."""
     graph = int(model.mesh_graphadr[mesh])
     return int(model.mesh_graph[graph] if graph >= 0 else model.mesh_vertnum[mesh])
+
+
+def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, element: int) -> str:
+    return mujoco.mj_id2name(model, kind, element) or f"number {element + 1}"
 
 
 def _geom(model: mujoco.MjModel, geom: int) -> str:

@@ -153,9 +153,6 @@ def test_mjx_agrees_with_c_mujoco_over_a_control_step() -> None:
     assert speed.max() < 5e-3
 
 
-# ---- symmetry ----
-
-
 @pytest.mark.parametrize("limit", [0.1, 100.0])
 def test_velocity_feedback_acts_only_below_the_force_limit(limit: float) -> None:
     """`implicitfast` treats velocity feedback implicitly, which would slow down an actuator at its limit."""
@@ -171,6 +168,9 @@ def test_velocity_feedback_acts_only_below_the_force_limit(limit: float) -> None
     found = jax.jit(physics_step)(put_model(model), inputs, start)
     mujoco.mj_step(model, data)
     np.testing.assert_allclose(found.qvel, data.qvel, rtol=1e-4)
+
+
+# ---- symmetry ----
 
 
 def mirrored_qpos(qpos: np.ndarray) -> np.ndarray:
