@@ -87,8 +87,7 @@ def example() -> Example:
         for name, function in quick.items():
             patch.setattr(bm, name, function)
         exec(code, left)
-    kept = {name: left[name] for name in ("robot", "actuators", "sim", "air", "policy")}
-    return Example(motions=left["motions"]("training"), printed=printed.getvalue(), **kept)
+    return Example(printed=printed.getvalue(), **{name: left[name] for name in Example._fields if name != "printed"})
 
 
 def test_readme_example_prints_a_table_and_returns_a_policy(example: Example):

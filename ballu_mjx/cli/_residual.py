@@ -148,8 +148,6 @@ def prepare(
         _announce(dataset, folder, data.quick)
     simulator = Simulator(robot, dataset.identified)
     motions = dataset.reconstruct(simulator)
-    if resume is None:
-        check_stability(robot, motions["training"], None)
     if dataset.identified is not None and resume is None:
         choice = choose_actuators(robot, dataset.identified, motions["validation"])
         if first:
@@ -159,6 +157,8 @@ def prepare(
                 print("Nominal actuators are taken; --actuators FILE selects the identified ones.", flush=True)
             dataset, simulator = dataset.with_actuators(None, "nominal"), Simulator(robot)
             motions = dataset.reconstruct(simulator)
+    if resume is None:
+        check_stability(robot, motions["training"], dataset.identified)
     return Prepared(task, folder, dataset, motions, simulator, residual, base, Evaluators(simulator))
 
 

@@ -272,7 +272,8 @@ def error_ratio(errors: Sequence[Errors], base: Sequence[Errors], group: str, qu
 
     Both are first averaged over the group's recordings, without those in which all starts of the base simulator
     diverged. Means of a recording leave out starts that diverged. The ratio is therefore infinite if more starts of a
-    recording diverge than in the base simulator.
+    recording diverge than in the base simulator. If fewer diverge, it is usually too large: the starts that only the
+    base simulator loses are difficult ones.
     """
     pairs = [pair for pair in zip(errors, base, strict=True) if pair[1].group == group]
     if any(ours.num_diverged(horizon) > theirs.num_diverged(horizon) for ours, theirs in pairs):

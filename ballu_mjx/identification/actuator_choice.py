@@ -56,14 +56,17 @@ class ReplayRow(NamedTuple):
     identified: ReplayErrors
 
     def ratio(self, quantity: Quantity) -> float:
-        """Return identified over nominal error.
+        """Return identified over nominal error, over the starts that diverge with neither.
 
-        It is inf if more starts diverge with identified actuators. It is 1 if there is no finite nominal error.
+        If there is none, it is inf or nearly 0 in favour of the actuators with fewer diverged starts, and 1 if these
+        are equally many. It is also inf if more starts diverge with identified actuators.
         """
         if self.identified.diverged > self.nominal.diverged:
             return np.inf
         one, other = getattr(self.identified, quantity), getattr(self.nominal, quantity)
-        return float(max(one, _LEAST) / max(other, _LEAST)) if np.isfinite(other) else 1.0
+        if np.isfinite(other):
+            return float(max(one, _LEAST) / max(other, _LEAST))
+        return 1.0 if self.identified.diverged == self.nominal.diverged else _LEAST
 
 
 _LEAST = 1e-6
@@ -158,7 +161,7 @@ def choose_actuators(
         for horizon in lasting:
             pair = [found.get((group, horizon)) for found in both]
             if pair[0] is not None and pair[1] is not None:
-                rows.append(ReplayRow(group, horizon, len(pair[0]), _summary(pair[0]), _summary(pair[1])))
+                rows.append(ReplayRow(group, horizon, len(pair[0]), *_summaries(pair[0], pair[1])))
     by_joints = robot.anchored and not np.isnan(rows[0].nominal.joints)
     return Choice(identified, tuple(rows), "joints" if by_joints else "position")
 
@@ -169,10 +172,15 @@ def _starts(motion: Motion, horizon: float, robot: RobotDescription) -> Int[np.n
     return np.arange(0, len(motion.command) - steps + 1, max(every, 1))
 
 
-def _summary(errors: Float[np.ndarray, "starts 2"]) -> ReplayErrors:
-    kept = errors[np.isfinite(errors[:, 0])]
-    position, joints = kept.mean(axis=0) if len(kept) else (np.inf, np.inf)
-    return ReplayErrors(float(position), float(joints), len(errors) - len(kept))
+def _summaries(*sides: Float[np.ndarray, "starts 2"]) -> list[ReplayErrors]:
+    """Return each side's mean errors over the starts that diverged on no side. Infinite if there is none."""
+    finite = [np.isfinite(errors[:, 0]) for errors in sides]
+    common = np.logical_and.reduce(finite)
+    means = [errors[common].mean(axis=0) if common.any() else (np.inf, np.inf) for errors in sides]
+    return [
+        ReplayErrors(float(position), float(joints), int(np.sum(~own)))
+        for (position, joints), own in zip(means, finite, strict=True)
+    ]
 
 
 def _replay(

@@ -8,16 +8,18 @@ from typing import Any
 import mujoco
 import numpy as np
 from jaxtyping import Float
+from scipy.stats import t as student
 
 from ballu_mjx.identification.fit_robot import HeldOut, RobotFit
 
-_NORMAL_95 = 1.96
-"""Half width of a 95 % interval, in standard errors."""
-
 
 def intervals(fit: RobotFit) -> Float[np.ndarray, "parameters 2"]:
-    """Return 95 % intervals from the robust standard errors, clipped to the bounds."""
-    half = _NORMAL_95 * fit.standard_errors
+    """Return 95 % intervals (Student's t over windows) from the robust standard errors, clipped to the bounds.
+
+    One window has no interval but the bounds.
+    """
+    windows = len(fit.windows.motion)
+    half = float(student.ppf(0.975, windows - 1)) * fit.standard_errors if windows > 1 else np.inf
     both = np.stack([fit.values - half, fit.values + half], axis=1)
     return np.clip(both, fit.parameters.lower[:, None], fit.parameters.upper[:, None])
 
@@ -92,6 +94,8 @@ def fit_table(fit: RobotFit, model: mujoco.MjModel, window_seconds: float, held_
     lines.append(
         f"The remaining error on training windows is {median:.1f} times the assumed noise (median over channels)."
     )
+    if len(fit.windows.motion) == 1:
+        lines.append("One training window: standard errors assume white noise. Give more or longer recordings.")
     if median > _MUCH:
         lines.append("The model lacks an effect, or the assumed noise is too small.")
     lines += ["", *_held_out_table(fit, model, window_seconds, held_out)]

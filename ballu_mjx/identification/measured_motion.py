@@ -12,6 +12,7 @@ from jaxtyping import Float
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.filters import interpolate, mean_command, savitzky_golay
 from ballu_mjx.recordings.motion import Motion, ReconstructionParameters
+from ballu_mjx.recordings.reconstruct import unwound
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
 
@@ -100,7 +101,8 @@ def measure(
         raise InputError(f"{recording.name}: {time[-1]:.3f} s is too short; record {5 * sample:g} s or more.")
     fine = max(1, round(sample / float(np.median(np.diff(time)))))
     grid = np.arange((count - 1) * fine + 1) * (sample / fine)
-    angles = interpolate(grid, time, np.stack([recording.joint_angles[joint] for joint in joints], axis=1))
+    counted = [unwound(model, joint, recording.joint_angles[joint]) for joint in joints]
+    angles = interpolate(grid, time, np.stack(counted, axis=1))
     filtered = partial(savitzky_golay, angles, step=sample / fine, order=config.order)
     rates, narrow = (filtered(width, derivative=1) for width in (config.rate_window, config.rate_window / 2))
     uncertainty = np.hypot(np.std(rates - narrow, axis=0), _SURE * np.std(rates, axis=0) + 1e-6)

@@ -28,7 +28,8 @@ def analyse(reduced: ReducedResiduals, parameters: ParameterSet) -> Analysis:
     """Return standard errors at a minimum, for residuals that are white noise and for windows that err independently.
 
     The second kind leaves out one window at a time (jackknife, CR3). The usual products of scores are too small for few
-    windows, because each window pulls the fit towards itself (Bell & McCaffrey, Survey Methodology 28, 2002).
+    windows, because each window pulls the fit towards itself (Bell & McCaffrey, Survey Methodology 28, 2002). With one
+    window it is not defined, and the first kind takes its place.
     """
     size, windows = len(parameters), len(reduced.values)
     # The residuals contain one prior row for each unknown of the starting states, so these rows cancel.
@@ -39,10 +40,12 @@ def analyse(reduced: ReducedResiduals, parameters: ParameterSet) -> Analysis:
     known = np.diag(np.where(np.isfinite(parameters.prior), 1.0, 0.0) + _SLIGHT)
     inverse = flat.T @ flat / variance + known
     bread = np.linalg.inv(inverse)
-    scores = np.einsum("wr,wrp->wp", reduced.values, slopes) / variance
-    own = np.einsum("wrp,wrq->wpq", slopes, slopes) / variance
-    changes = np.linalg.solve(inverse - own, scores[..., None])[..., 0]
-    jackknife = changes.T @ changes * (windows - 1) / windows + bread @ known @ bread
+    jackknife = bread
+    if windows > 1:
+        scores = np.einsum("wr,wrp->wp", reduced.values, slopes) / variance
+        own = np.einsum("wrp,wrq->wpq", slopes, slopes) / variance
+        changes = np.linalg.solve(inverse - own, scores[..., None])[..., 0]
+        jackknife = changes.T @ changes * (windows - 1) / windows + bread @ known @ bread
     deviations = [np.sqrt(np.diag(covariance)) for covariance in (bread, jackknife)]
     correlations = jackknife / np.outer(deviations[1], deviations[1])
     white, robust = (deviation * parameters.unit for deviation in deviations)

@@ -94,7 +94,7 @@ def suggest_parameters(
     The candidate that explains most comes first. The next ones explain the remainder (forward selection). A candidate
     is suggested if it differs significantly from nominal over the fitted windows, whose errors are independent
     (Student's t). Held-out windows have no influence. The candidate's step must also be allowed (friction is not
-    negative), and its effect must be at least small (`SMALL_EFFECT`).
+    negative), and its effect must be at least small (`SMALL_EFFECT`). A single window supports no suggestion.
 
     **Arguments**
 
@@ -109,7 +109,7 @@ def suggest_parameters(
             taken |= {target[:2] for target in parameter.targets}
             entries.append(entry)
             candidates.append(parameter)
-    if not candidates:
+    if not candidates or len(fit.windows.motion) < 2:
         return ()
     extended = ParameterSet([*fit.parameters.parameters, *candidates], fit.parameters.commands)
     values = np.concatenate([fit.values, [candidate.nominal for candidate in candidates]])
@@ -161,7 +161,7 @@ def _select(
     size, windows = len(declared), len(reduced.values)
     known, tried, left = reduced.slopes[..., :size], reduced.slopes[..., size:], reduced.values
     prior = declared.prior**-2.0
-    critical = student.ppf(1 - _CHANCE / 2, max(windows - 1, 1))
+    critical = student.ppf(1 - _CHANCE / 2, windows - 1)
     chosen: list[tuple[int, float, float]] = []
     while len(chosen) < len(candidates):
         flat = known.reshape(-1, known.shape[-1])
@@ -171,10 +171,10 @@ def _select(
         curvature = np.sum(own**2, axis=(0, 1)) + np.finfo(float).tiny
         steps = pulls.sum(axis=0) / curvature
         gained = steps**2 * curvature
-        spread = np.sqrt(windows) * np.std(pulls, axis=0, ddof=min(windows - 1, 1)) + np.finfo(float).tiny
+        spread = np.sqrt(windows) * np.std(pulls, axis=0, ddof=1) + np.finfo(float).tiny
         sure = np.abs(pulls.sum(axis=0)) > critical * spread
         for number, candidate in enumerate(candidates):
-            blocked = steps[number] < 0 and candidate.nominal <= max(candidate.bounds[0], 0.0)
+            blocked = steps[number] < 0 and candidate.nominal <= candidate.bounds[0]
             small = gained[number] < SMALL_EFFECT * (np.sum(left**2) - gained[number])
             if blocked or small or not sure[number] or any(number == c for c, _, _ in chosen):
                 gained[number] = 0.0

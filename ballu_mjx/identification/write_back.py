@@ -16,8 +16,9 @@ from jaxtyping import Float
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.identification.declarations import declared_parameters
-from ballu_mjx.identification.parameters import BodyTarget, FieldTarget, IdentifiedParameters
+from ballu_mjx.identification.parameters import FieldTarget, IdentifiedParameters
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.mjcf import write_fields
 from ballu_mjx.robots.model import raise_iterations, set_fields
 
 IDENTIFIED_FORMAT = "ballu-identified/1"
@@ -95,17 +96,8 @@ def identified_xml(robot: RobotDescription, identified: IdentifiedParameters) ->
     set_fields(model, fields)
     raise_iterations(model)
     spec = mujoco.MjSpec.from_file(str(robot.model))
-    spec.option.iterations = model.opt.iterations
+    write_fields(spec, model)
     targets = [target for parameter in identified.declared.parameters for target in parameter.targets]
-    for target in targets:
-        if isinstance(target, FieldTarget):
-            _write(spec, model, target)
-        elif isinstance(target, BodyTarget):
-            body = spec.body(model.body(target.body).name)
-            body.explicitinertial = True
-            body.mass, body.ipos = model.body_mass[target.body], model.body_ipos[target.body]
-            body.iquat, body.inertia = model.body_iquat[target.body], model.body_inertia[target.body]
-            body.fullinertia = [np.nan, 0, 0, 0, 0, 0]
     compiled = spec.compile()
     for target in targets:
         if isinstance(target, FieldTarget):
@@ -114,46 +106,6 @@ def identified_xml(robot: RobotDescription, identified: IdentifiedParameters) ->
                 raise InputError(f"{robot.file}: {target.field} cannot be written as MJCF; keep it in the JSON file.")
     head, _, rest = spec.to_xml().partition("\n")
     return f"{head}\n  <!-- {_drivetrain_words(robot, identified)} -->\n{rest}"
-
-
-_SPEC_FIELDS: Mapping[str, str] = {
-    "dof_damping": "damping",
-    "dof_armature": "armature",
-    "dof_frictionloss": "frictionloss",
-    "jnt_stiffness": "stiffness",
-    "qpos_spring": "springref",
-    "jnt_range": "range",
-    "tendon_stiffness": "stiffness",
-    "tendon_damping": "damping",
-    "tendon_frictionloss": "frictionloss",
-    "tendon_lengthspring": "springlength",
-    "tendon_range": "range",
-    "geom_friction": "friction",
-    "actuator_gainprm": "gainprm",
-    "actuator_biasprm": "biasprm",
-    "actuator_forcerange": "forcerange",
-    "body_gravcomp": "gravcomp",
-}
-"""Attribute in MuJoCo's model specification, by field of the compiled model."""
-
-
-def _write(spec: mujoco.MjSpec, model: mujoco.MjModel, target: FieldTarget) -> None:
-    """Set the attribute for a field of the compiled model. Unknown fields are skipped, and a comparison finds them."""
-    own = _SPEC_FIELDS.get(target.field)
-    if own is None:
-        return
-    kind, index = target.field.split("_")[0], target.index[0]
-    if kind == "dof":
-        index = int(model.dof_jntid[index])
-    elif kind == "qpos":
-        index = int(np.flatnonzero(model.jnt_qposadr == index)[0])
-    element = "joint" if kind in ("dof", "qpos", "jnt") else kind
-    part: Any = getattr(spec, element)(getattr(model, element)(index).name)
-    value = float(getattr(model, target.field)[target.index])
-    if isinstance(getattr(part, own), np.ndarray):
-        getattr(part, own)[target.index[1] if len(target.index) > 1 else 0] = value
-    else:
-        setattr(part, own, value)
 
 
 def _drivetrain_words(robot: RobotDescription, identified: IdentifiedParameters) -> str:

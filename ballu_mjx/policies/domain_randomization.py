@@ -103,8 +103,8 @@ class Start(NamedTuple):
 
 def draw_start(setting: SimulatorSetting, robot: RobotDescription, rng: Array) -> Start:
     """Draw friction, starting state and push. Without domain randomization, they have the setting's own values."""
-    push = setting.push * jax.random.normal(jax.random.fold_in(rng, _PUSH), (6,))
-    key_friction, key_turn, key_joint, key_velocity, rng = jax.random.split(rng, 5)
+    key_friction, key_turn, key_joint, key_velocity, rng, key_push = jax.random.split(rng, 6)
+    push = setting.push * jax.random.normal(key_push, (6,))
     low, high = setting.friction.T
     friction = low + (high - low) * jax.random.uniform(key_friction)
     initial, spread = setting.initial, setting.spread
@@ -117,7 +117,3 @@ def draw_start(setting: SimulatorSetting, robot: RobotDescription, rng: Array) -
         joints = jnp.concatenate([initial[:3], quaternion / jnp.linalg.norm(quaternion), joints])
     qvel = spread.velocity * jax.random.normal(key_velocity, spread.velocity.shape)
     return Start(joints, qvel, friction, push, rng)
-
-
-_PUSH = 1
-"""Number of the random stream of pushes."""

@@ -118,7 +118,11 @@ class LocomotionEnv(Env):
         simulator = Simulator(robot, actuators)
         self.simulator = simulator.with_residual(None if residual is None else residual.bound)
         model = simulator.mj_model
-        self.setting = make_simulator_setting(robot, robot.load_model(), config, actuators)
+        setting = make_simulator_setting(robot, robot.load_model(), config, actuators)
+        # The residual's fields contain the identified values already, for example the mass without the dragged fluid.
+        changed = {} if residual is None else residual.bound.fields
+        fields = {name: value for name, value in setting.fields.items() if name not in changed}
+        self.setting = setting._replace(fields=fields)
         self._colliding = colliding_geoms(model)
         self._friction = jnp.asarray(model.geom_friction)
         self._rest = jnp.asarray(robot.adapter.rest_command(robot, model), jnp.float32)

@@ -129,11 +129,11 @@ def resample(recording: Recording, model: mujoco.MjModel, robot: RobotDescriptio
         | {point: linear(recording.points[point]) for point in robot.points},
         orientations={robot.tracked: unit(quaternion)}
         | {point: unit(value) for point, value in recording.orientations.items()},
-        joint_angles={joint: linear(_unwound(model, joint, value)) for joint, value in recording.joint_angles.items()},
+        joint_angles={joint: linear(unwound(model, joint, value)) for joint, value in recording.joint_angles.items()},
     )
 
 
-def _unwound(model: mujoco.MjModel, joint: str, angle: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
+def unwound(model: mujoco.MjModel, joint: str, angle: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
     """Return an unlimited hinge's angle without jumps, if the recording counts each turn from 0 again."""
     hinge = model.joint(joint)
     turns = hinge.type[0] == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_limited[hinge.id]

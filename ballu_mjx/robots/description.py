@@ -232,7 +232,7 @@ def read_description(path: Path | str) -> RobotDescription:
         adapter=read_adapter(path, content.get("adapter")),
         identify=read_entries(path, "identify", content.get("identify", [])),
         upright=read_flag(path, "upright", content.get("upright", False)),
-        horizons=read_horizons(path, content.get("horizons", [])),
+        horizons=read_horizons(path, content.get("horizons", []), float(step)),
         force_joints={joint: _force_joint(model, joint) for joint in forced},
         directions=model.nv,
     )

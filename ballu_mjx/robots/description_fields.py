@@ -136,9 +136,12 @@ def read_flag(path: Path, key: str, value: Any) -> bool:
     return value
 
 
-def read_horizons(path: Path, value: Any) -> tuple[float, ...]:
-    """Return horizons (s) within `HORIZON_RANGE`, in increasing order and without duplicates."""
-    low, high = HORIZON_RANGE
+def read_horizons(path: Path, value: Any, control_timestep: float) -> tuple[float, ...]:
+    """Return horizons (s) in increasing order and without duplicates.
+
+    They lie within `HORIZON_RANGE`, and are not shorter than a control step (s).
+    """
+    low, high = max(HORIZON_RANGE[0], control_timestep), HORIZON_RANGE[1]
     if not isinstance(value, list) or not all(is_number(each) and low <= each <= high for each in value):
         refuse(path, f'"horizons" is {shown(value)}', f"write a list of seconds from {low:g} to {high:g}")
     return tuple(sorted({float(each) for each in value}))

@@ -31,6 +31,8 @@ _ELEMENTS: Mapping[str, tuple[str, str]] = {
     "body_gravcomp": ("bodies", "gravcomp"),
 }
 """Elements and attribute in MuJoCo's model specification (`mujoco.MjSpec`), by field of the compiled model."""
+_ANGULAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
+"""Joints whose ranges and references a specification may have in degrees, while compiled models have them in rad."""
 _INERTIAL = ("body_mass", "body_ipos", "body_iquat", "body_inertia")
 _ASSETS = "assets"
 
@@ -44,7 +46,7 @@ def write_mjcf(file: Path, wanted: mujoco.MjModel, folder: Path, name: str) -> d
     **Raises** `InputError` if an asset is missing, or if MuJoCo cannot read the file that it wrote.
     """
     spec = mujoco.MjSpec.from_file(str(file))
-    _write_fields(spec, wanted)
+    write_fields(spec, wanted)
     _copy_assets(spec, file, folder)
     try:
         spec.compile()
@@ -56,8 +58,11 @@ def write_mjcf(file: Path, wanted: mujoco.MjModel, folder: Path, name: str) -> d
     return _differences(written, wanted, file)
 
 
-def _write_fields(spec: mujoco.MjSpec, wanted: mujoco.MjModel) -> None:
-    """Set the values in which `wanted` differs from the compiled specification, in place."""
+def write_fields(spec: mujoco.MjSpec, wanted: mujoco.MjModel) -> None:
+    """Set the values in which `wanted` differs from the compiled specification, in place.
+
+    Fields without an attribute in the specification are skipped.
+    """
     base = spec.compile()
     spec.option.iterations = wanted.opt.iterations
     for field, (kind, own) in _ELEMENTS.items():
@@ -70,6 +75,8 @@ def _write_fields(spec: mujoco.MjSpec, wanted: mujoco.MjModel) -> None:
             elif field.startswith("qpos_"):
                 index = int(np.flatnonzero(base.jnt_qposadr <= index)[-1])
             part, value = parts[index], float(new[tuple(place)])
+            if kind == "joints" and own in ("range", "springref") and spec.compiler.degree:
+                value *= 180 / np.pi if base.jnt_type[index] in _ANGULAR else 1.0
             if isinstance(getattr(part, own), np.ndarray):
                 getattr(part, own)[int(place[1]) if len(place) > 1 else 0] = value
             else:

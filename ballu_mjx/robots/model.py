@@ -40,11 +40,26 @@ def load_model(file: Path, parameters: ModelParameters | None = None) -> mujoco.
     """
     model = mujoco.MjModel.from_xml_path(str(file))
     if parameters is not None:
-        set_fields(model, parameters.fields(model))
+        fields = parameters.fields(model)
+        if fields.keys() & {"body_ipos", "body_iquat"}:
+            model = load_without_simple_bodies(file)
+        set_fields(model, fields)
         raise_iterations(model)
         # The softness of contacts, joint limits and friction depends on the inertia matrix at the reference pose.
         mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+def load_without_simple_bodies(file: Path) -> mujoco.MjModel:
+    """Load an MJCF file such that every body's centre of mass and principal axes can be changed.
+
+    MuJoCo compiles some bodies as simple: a free body without others, for example. It stores only the diagonal of their
+    inertia matrix, and refuses to move their inertial frame.
+    """
+    spec = mujoco.MjSpec.from_file(str(file))
+    for body in spec.bodies:
+        body.simple = 0
+    return spec.compile()
 
 
 FRICTION_ITERATIONS = 6

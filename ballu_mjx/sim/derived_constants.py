@@ -19,7 +19,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from mujoco import mjx
 
-INERTIAL_FIELDS = ("body_mass", "body_inertia", "body_ipos", "dof_armature")
+from ballu_mjx.common.rotations import quaternion_to_matrix
+
+INERTIAL_FIELDS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_armature", "tendon_armature")
 """Fields from which the constants are derived, and which residuals or identified parameters change."""
 
 
@@ -36,8 +38,6 @@ class ReferencePose(NamedTuple):
     """Jacobian of each body's orientation (rad)."""
     frame: Float[np.ndarray, "bodies 3 3"]
     """Orientation of each body."""
-    inertial_frame: Float[np.ndarray, "bodies 3 3"]
-    """Orientation of each body's principal axes of inertia."""
     tendons: Float[np.ndarray, "tendons nv"]
     """Jacobian of the lengths of tendons (m)."""
     below: Float[np.ndarray, "bodies bodies"]
@@ -65,8 +65,7 @@ class ReferencePose(NamedTuple):
             for start in _TRIPLES.get(int(kind), ()):
                 block = slice(first + start, first + start + 3)
                 averages[block, block] = 1 / 3
-        frame, inertial_frame = (x.reshape(bodies, 3, 3).copy() for x in (data.xmat, data.ximat))
-        return ReferencePose(translation, rotation, frame, inertial_frame, tendons, below, averages)
+        return ReferencePose(translation, rotation, data.xmat.reshape(bodies, 3, 3).copy(), tendons, below, averages)
 
 
 def with_derived_constants(pose: ReferencePose, model: mjx.Model, fields: Mapping[str, Array]) -> dict[str, Array]:
@@ -97,14 +96,15 @@ def with_derived_constants(pose: ReferencePose, model: mjx.Model, fields: Mappin
 
 def _constants(pose: ReferencePose, model: mjx.Model, fields: Mapping[str, Array]) -> dict[str, Array]:
     """Compute the constants from their definition, in the precision of `model`."""
-    mass, inertia, centre, armature = (jnp.asarray(fields.get(name, getattr(model, name))) for name in INERTIAL_FIELDS)
+    values = (jnp.asarray(fields.get(name, getattr(model, name))) for name in INERTIAL_FIELDS)
+    mass, inertia, centre, axes, armature, wound = values
     with jax.default_matmul_precision("highest"):
         arm = jnp.einsum("bij,bj->bi", pose.frame, centre)
         moved = pose.translation + jnp.cross(pose.rotation, arm[:, :, None], axis=1)
-        turned = jnp.einsum("bji,bjk->bik", pose.inertial_frame, pose.rotation)
+        turned = jnp.einsum("bji,bjk->bik", pose.frame @ quaternion_to_matrix(axes), pose.rotation)
         matrix = jnp.einsum("b,bij,bik->jk", mass, moved, moved)
         matrix += jnp.einsum("bi,bij,bik->jk", inertia, turned, turned)
-        matrix += jnp.einsum("t,ti,tj->ij", model.tendon_armature, pose.tendons, pose.tendons)
+        matrix += jnp.einsum("t,ti,tj->ij", wound, pose.tendons, pose.tendons)
         matrix += jnp.diag(armature)
         # The inertia matrix of a chain is badly scaled: it mixes metres and radians, and heavy and light bodies.
         scale = 1 / jnp.sqrt(jnp.diag(matrix))

@@ -7,7 +7,7 @@ import pytest
 from servo_arm import TRUTH, identified, true_path, wandering, write_arm
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.identification.actuator_choice import choose_actuators
+from ballu_mjx.identification.actuator_choice import ReplayErrors, _summaries, choose_actuators
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.robots.description import RobotDescription
 
@@ -54,6 +54,23 @@ def test_actuators_with_more_diverged_replays_are_not_chosen(robot: RobotDescrip
     choice = choose_actuators(robot, identified(robot, **TRUTH), motions)
     diverged = [row._replace(identified=row.identified._replace(diverged=1)) for row in choice.rows]
     assert not dataclasses.replace(choice, rows=tuple(diverged)).improves
+
+
+def test_actuators_are_chosen_if_only_nominal_ones_diverge(robot: RobotDescription, motions: list[Motion]):
+    choice = choose_actuators(robot, identified(robot, **TRUTH), motions)
+    lost = [row._replace(nominal=ReplayErrors(np.inf, np.inf, row.starts)) for row in choice.rows]
+    assert dataclasses.replace(choice, rows=tuple(lost)).improves
+    both = [row._replace(identified=row.nominal) for row in lost]
+    assert dataclasses.replace(choice, rows=tuple(both)).ratio == 1.0
+
+
+def test_errors_are_compared_over_starts_that_both_simulators_survive():
+    # The first simulator loses the two starts that are difficult for the second one.
+    first = np.array([[0.1, 0.1], [np.inf, np.inf], [0.3, 0.5], [np.inf, np.inf]])
+    second = np.array([[0.1, 0.2], [5.0, 4.0], [0.2, 0.4], [5.0, 4.0]])
+    one, other = _summaries(first, second)
+    assert (one.position, one.joints, one.diverged) == pytest.approx((0.2, 0.3, 2))
+    assert (other.position, other.joints, other.diverged) == pytest.approx((0.15, 0.3, 0))
 
 
 def test_choice_refuses_recordings_that_are_too_short(robot: RobotDescription, motions: list[Motion]):

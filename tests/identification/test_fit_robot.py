@@ -13,7 +13,7 @@ from robot_files import write_robot
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.declarations import declared_parameters
-from ballu_mjx.identification.fit_report import fit_table
+from ballu_mjx.identification.fit_report import fit_table, intervals
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, analyse, check_data, fit_robot, replay
 from ballu_mjx.identification.measured_motion import MeasuredMotion, SamplingConfig, measure
 from ballu_mjx.identification.parameters import Parameter, ParameterSet
@@ -223,6 +223,55 @@ def test_fit_refuses_unsuitable_input(motions: list[MeasuredMotion], parameters:
     path.write_text("\n".join(rows) + "\n")
     with pytest.raises(InputError, match="joint elbow was not recorded"):
         measure(read_recording(path, description), description, model)
+
+
+def test_one_window_has_the_standard_errors_of_white_noise_and_no_interval(fit: RobotFit):
+    rng = np.random.default_rng(0)
+    jacobian, noise = rng.normal(size=(1, 40, 1)), 0.1 * rng.normal(size=(1, 40))
+    parameters = ParameterSet([Parameter("one", "1", 0.0, (-100.0, 100.0), np.inf, False, ())], 0)
+    found = analyse(ReducedResiduals(noise, jacobian, np.zeros((1, 0)), np.zeros((1, 0, 1))), parameters)
+    exact = np.sqrt(np.sum(noise**2) / 39 / np.sum(jacobian**2))
+    np.testing.assert_allclose(found.robust, exact, rtol=1e-6)
+    single = dataclasses.replace(fit, windows=fit.windows._replace(motion=np.zeros(1, int), first=np.zeros(1, int)))
+    bounds = np.stack([fit.parameters.lower, fit.parameters.upper], axis=1)
+    np.testing.assert_array_equal(intervals(single), bounds)
+    assert np.all(np.ptp(intervals(fit), axis=1) < np.ptp(bounds, axis=1))
+
+
+WHEEL = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <body name="rim">
+      <joint name="axle" axis="0 0 1"/>
+      <geom size="0.1" mass="1"/>
+      <site name="rim"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="axle" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+def test_an_angle_that_counts_each_turn_from_0_is_the_same_motion(tmp_path: Path):
+    robot = write_robot(tmp_path, "wheel", WHEEL, tracked="rim", commands={"wheel": "motor"}, joints=["axle"])
+    time = np.arange(301) / 100
+    angle = 4.0 * time + 0.3 * np.sin(3 * time)
+    for name, column in (("counted", angle), ("wrapped", (angle + np.pi) % (2 * np.pi) - np.pi)):
+        rows = ["time,command_wheel,rim_x,rim_y,rim_z,rim_qw,rim_qx,rim_qy,rim_qz,axle"]
+        for t, turn, shown in zip(time, angle, column, strict=True):
+            pose = [0, 0, 0, np.cos(turn / 2), 0, 0, np.sin(turn / 2)]
+            rows.append(",".join(f"{x:.8f}" for x in [t, 0.0, *pose, shown]))
+        (tmp_path / f"{name}.csv").write_text("\n".join(rows) + "\n")
+        head = {"format": "ballu-recording/1", "kind": "free", "robot": "wheel", "notes": ""}
+        (tmp_path / f"{name}.json").write_text(json.dumps(head))
+    counted, wrapped = (
+        measure(read_recording(tmp_path / f"{name}.csv", robot), robot, robot.load_model())
+        for name in ("counted", "wrapped")
+    )
+    np.testing.assert_allclose(np.diff(wrapped.qpos, axis=0), np.diff(counted.qpos, axis=0), atol=1e-6)
+    np.testing.assert_allclose(wrapped.qvel, counted.qvel, atol=1e-6)
+    assert wrapped.qvel.max() < 6.0
 
 
 def test_robust_standard_errors_agree_with_the_jackknife_over_windows():

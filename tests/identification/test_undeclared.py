@@ -11,7 +11,9 @@ from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.declared import measure_recording
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, fit_robot
 from ballu_mjx.identification.measured_motion import MeasuredMotion, SamplingConfig
-from ballu_mjx.identification.undeclared import candidate_entries, suggest_parameters, suggestions_table
+from ballu_mjx.identification.parameters import Parameter, ParameterSet
+from ballu_mjx.identification.undeclared import _select, candidate_entries, suggest_parameters, suggestions_table
+from ballu_mjx.identification.window_objective import ReducedResiduals
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.registry import load_robot
@@ -85,6 +87,30 @@ def test_held_out_windows_do_not_influence_suggestions(
         for motions in (recorded, other)
     )
     assert one and one == two
+
+
+@pytest.mark.parametrize("truth", [-0.05, 0.05])
+def test_offsets_of_both_signs_are_suggested_and_negative_friction_is_not(truth: float):
+    rng = np.random.default_rng(0)
+    windows, rows = 12, 30
+    slopes = rng.normal(size=(windows, rows, 3))
+    values = -truth * slopes[..., 1] + 0.05 * slopes[..., 2] + 0.001 * rng.normal(size=(windows, rows))
+    reduced = ReducedResiduals(values, slopes, np.zeros((windows, 0)), np.zeros((windows, 0, 3)))
+    declared, offset, friction = (
+        Parameter(name, "1", nominal, bounds, np.inf, False, ())
+        for name, nominal, bounds in (
+            ("mass", 1.0, (0.1, 9.0)),
+            ("offset", 0.0, (-0.25, 0.25)),
+            ("friction", 0.0, (0, 1)),
+        )
+    )
+    ((place, value, _),) = _select(reduced, ParameterSet([declared], 0), [offset, friction])
+    assert place == 0 and value == pytest.approx(truth, rel=0.1)
+
+
+def test_one_window_supports_no_suggestion(arm: RobotDescription, recorded: list[MeasuredMotion], fit: RobotFit):
+    windows = fit.windows._replace(motion=fit.windows.motion[:1], first=fit.windows.first[:1])
+    assert suggest_parameters(arm, dataclasses.replace(fit, windows=windows), recorded, CONFIG) == ()
 
 
 def test_candidates_are_parameters_of_named_model_elements():

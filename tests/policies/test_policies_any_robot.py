@@ -3,6 +3,8 @@ and friction."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from pathlib import Path
 
 import jax
@@ -13,11 +15,18 @@ import pytest
 from rover import write_rover
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.policies.domain_randomization import make_simulator_setting
+from ballu_mjx.common.rotations import quaternion_conjugate, quaternion_product
+from ballu_mjx.identification.declarations import declared_parameters
+from ballu_mjx.identification.parameters import IdentifiedParameters
+from ballu_mjx.policies.domain_randomization import draw_start, make_simulator_setting
 from ballu_mjx.policies.locomotion_config import LocomotionConfig
 from ballu_mjx.policies.locomotion_env import LocomotionEnv, locomotion_state
 from ballu_mjx.policies.tasks import TASKS
+from ballu_mjx.residuals.fluid import FluidParameters, FluidResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.description import RobotDescription, read_description
+from ballu_mjx.sim.residual import BoundResidual
+from ballu_mjx.sim.simulator import Simulator
 
 BALLOON = Path(__file__).parents[2] / "experiments" / "tethered_balloon" / "balloon.robot.json"
 RANDOMIZED = LocomotionConfig(domain_randomization=True, start_angle=30.0)
@@ -74,6 +83,44 @@ def test_a_control_step_and_its_reward_agree_with_c_mujoco(rover: RobotDescripti
     np.testing.assert_allclose(now.rollout.physics.qpos, data.qpos, atol=2e-3)  # MJX's contacts differ slightly
     mujoco.mj_forward(model, data)
     assert float(state.reward) == pytest.approx((data.subtree_com[1] - before)[1] / 0.04, abs=0.02)
+
+
+def test_pushes_are_independent_of_the_starting_tilt(rover: RobotDescription):
+    config = dataclasses.replace(RANDOMIZED, push_force=1.0, push_torque=0.1)
+    setting = make_simulator_setting(rover, rover.load_model(), config, None)
+    draw = jax.jit(jax.vmap(lambda key: draw_start(setting, rover, key)))
+    starts = draw(jax.random.split(jax.random.key(0), 2000))
+    home = quaternion_conjugate(np.broadcast_to(rover.load_model().key("home").qpos[3:7], (2000, 4)))
+    tilt = quaternion_product(np.asarray(starts.qpos[:, 3:7], float), home)[:, 1:]
+    together = np.corrcoef(np.asarray(starts.push)[:, [0, 1, 5]].T, tilt.T)[:3, 3:]
+    assert np.abs(together).max() < 0.1
+
+
+def test_policies_move_the_mass_that_identification_and_residual_give_together(tmp_path: Path):
+    rover = write_rover(tmp_path)
+    content = json.loads(rover.file.read_text())
+    rover.file.write_text(json.dumps(content | {"identify": [{"body": "hull", "field": "mass"}]}))
+    rover = read_description(rover.file)
+    actuators = IdentifiedParameters(jnp.array([2.0]), declared_parameters(rover, rover.load_model()))
+    model = FluidResidual(rover, rover.load_model(actuators), "linear", added_mass=True)
+    params = dataclasses.replace(
+        FluidParameters.without_added_mass(jnp.zeros((len(model.terms), 6))),
+        added_mass=jnp.float32(3.0),
+        added_inertia=jnp.full(3, 0.05),
+    )
+    improved = Simulator(rover, actuators).with_residual(BoundResidual(model, params))
+    residual = TrainedResidual.of(improved)
+    env = LocomotionEnv(rover, TASKS["walk"], LocomotionConfig(), actuators=actuators, residual=residual)
+    state = env.reset(jax.random.key(0))
+    start = locomotion_state(state).rollout
+    launched = start._replace(physics=start.physics._replace(qpos=start.physics.qpos.at[2].add(1.0)))
+    state = state.replace(pipeline_state=locomotion_state(state)._replace(rollout=launched))
+    after = locomotion_state(jax.jit(env.step)(state, jnp.array([0.5, 1.0]))).rollout
+    expected = jax.jit(env.simulator.step)(launched, env.command_of(jnp.array([0.5, 1.0]))).state
+    np.testing.assert_allclose(after.physics.qvel, expected.physics.qvel, atol=1e-5)
+    lighter = Simulator(rover, actuators).with_residual(None)
+    other = jax.jit(lighter.step)(launched, env.command_of(jnp.array([0.5, 1.0]))).state
+    assert np.abs(other.physics.qvel - expected.physics.qvel).max() > 1e-3
 
 
 @pytest.mark.parametrize("task", list(TASKS))

@@ -137,6 +137,7 @@ SWIVEL = '<joint name="swivel" axis="0 0 1" stiffness="0.008"/>'
         (in_json(control_timestep=0.015), "divide the control step of 0.015 s"),
         (in_json(keyframe="hover"), "no keyframe of the model; there are none"),
         (in_json(oriented_points=["balloon"]), 'not among "points"'),
+        (in_json(control_timestep=0.25, horizons=[0.1, 1]), "seconds from 0.25 to 100"),
         (in_json(limits={"height": [3, 1]}), '"limits: height" is'),
         (in_json(limits={"speed": -1}), "above 0"),
         (in_json(limits={"depth": 1}), "some of height, distance, speed, angle"),

@@ -64,6 +64,20 @@ def test_constants_agree_with_mj_setconst_after_a_change_of_armature() -> None:
     assert np.abs(expected.dof_invweight0 / model.dof_invweight0 - 1).max() > 0.01
 
 
+def test_constants_agree_with_mj_setconst_after_a_turn_of_the_principal_axes() -> None:
+    robot = read_description(BALLOON)
+    model, body = robot.load_model(), robot.load_model().body("balloon").id
+    inertia, axes = model.body_inertia.copy(), model.body_iquat.copy()
+    inertia[body] *= [1.0, 3.0, 3.5]
+    axes[body] = [np.cos(0.4), np.sin(0.4), 0.0, 0.0]
+    found = Simulator(robot).with_fields({"body_inertia": jnp.asarray(inertia), "body_iquat": jnp.asarray(axes)}).model
+    expected = compiled(robot, {"body_inertia": inertia, "body_iquat": axes})
+    unturned = compiled(robot, {"body_inertia": inertia})
+    assert np.abs(expected.dof_invweight0 / unturned.dof_invweight0 - 1).max() > 0.05
+    for name in DERIVED:
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-3, atol=1e-6, err_msg=name)
+
+
 def test_constants_of_unaltered_masses_are_unchanged() -> None:
     robot = load_robot()
     model = robot.load_model()
