@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,8 +32,9 @@ _ELEMENTS: Mapping[str, tuple[str, str]] = {
     "body_gravcomp": ("bodies", "gravcomp"),
 }
 """Elements and attribute in MuJoCo's model specification (`mujoco.MjSpec`), by field of the compiled model."""
+_ANGLES = ("jnt_range", "qpos_spring")
+"""Fields that are angles for `_ANGULAR` joints. A specification may have them in degrees, compiled models in rad."""
 _ANGULAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
-"""Joints whose ranges and references a specification may have in degrees, while compiled models have them in rad."""
 _INERTIAL = ("body_mass", "body_ipos", "body_iquat", "body_inertia")
 _ASSETS = "assets"
 
@@ -75,8 +77,8 @@ def write_fields(spec: mujoco.MjSpec, wanted: mujoco.MjModel) -> None:
             elif field.startswith("qpos_"):
                 index = int(np.flatnonzero(base.jnt_qposadr <= index)[-1])
             part, value = parts[index], float(new[tuple(place)])
-            if kind == "joints" and own in ("range", "springref") and spec.compiler.degree:
-                value *= 180 / np.pi if base.jnt_type[index] in _ANGULAR else 1.0
+            if field in _ANGLES and spec.compiler.degree and base.jnt_type[index] in _ANGULAR:
+                value = math.degrees(value)
             if isinstance(getattr(part, own), np.ndarray):
                 getattr(part, own)[int(place[1]) if len(place) > 1 else 0] = value
             else:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -114,7 +115,7 @@ def test_policies_move_the_mass_that_identification_and_residual_give_together(t
     state = env.reset(jax.random.key(0))
     start = locomotion_state(state).rollout
     launched = start._replace(physics=start.physics._replace(qpos=start.physics.qpos.at[2].add(1.0)))
-    state = state.replace(pipeline_state=locomotion_state(state)._replace(rollout=launched))
+    state = dataclasses.replace(state, pipeline_state=cast(Any, locomotion_state(state)._replace(rollout=launched)))
     after = locomotion_state(jax.jit(env.step)(state, jnp.array([0.5, 1.0]))).rollout
     expected = jax.jit(env.simulator.step)(launched, env.command_of(jnp.array([0.5, 1.0]))).state
     np.testing.assert_allclose(after.physics.qvel, expected.physics.qvel, atol=1e-5)
