@@ -142,6 +142,29 @@ def test_identified_actuators_are_used_by_default_if_they_replay_better(
         beside.unlink()
 
 
+@pytest.mark.parametrize("diverges", ["nominal", "identified"])
+def test_stability_is_checked_for_the_actuators_in_use(tmp_path: Path, diverges: str):
+    robot = write_arm(tmp_path)
+    for use, seed in (("training", 0), ("validation", 1)):
+        (tmp_path / use).mkdir()
+        record_arm(tmp_path / use, robot, f"motion-{seed}", seed)
+    stiffness = {"nominal": 0.0, "identified": 0.0, diverges: 1e4}  # N m/rad; 1e4 is too stiff for the time step
+    model = tmp_path / "arm.xml"
+    model.write_text(model.read_text().replace('name="elbow"', f'name="elbow" stiffness="{stiffness["nominal"]}"'))
+    content = json.loads(robot.file.read_text())
+    content["identify"] = [{"joint": "elbow", "field": "stiffness", "bounds": [0, 2e4]}]
+    robot.file.write_text(json.dumps(content))
+    robot = read_description(robot.file)
+    file = tmp_path / "identified.json"
+    file.write_text(identified_to_json(robot, identified(robot, elbow_stiffness=stiffness["identified"])))
+
+    actuators = {"nominal": Path("nominal"), "identified": file}
+    with pytest.raises(InputError, match=r"arm\.xml: the model diverges from its recorded states"):
+        prepare("supervised", dataset(robot, actuators=actuators.pop(diverges)))
+    (stable,) = actuators.values()
+    prepare("supervised", dataset(robot, actuators=stable))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
