@@ -30,6 +30,7 @@ import jax
 
 from ballu_mjx.ballu.actuators_file import read_actuators
 from ballu_mjx.ballu.virtual import dataset
+from ballu_mjx.ballu.virtual.hardware import VirtualHardware
 from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.errors import SCORE_HORIZONS
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
@@ -177,7 +178,8 @@ def main() -> None:
     if options.quick:
         rows, seeds, training = rows[:2], seeds[:1], training[:2]
         sizes = Sizes(20_000, 20_000, {"num_envs": 256, "batch_size": 128})
-    validation = dataset.record_fresh(options.fresh, options.output, 1 if options.quick else 6)
+    bundled = VirtualHardware.draw(dataset.ROBOT_SEED)
+    validation = dataset.record_fresh(options.fresh, bundled, options.output, 1 if options.quick else 6)
     _, identified = read_actuators(assets() / "recordings" / ACTUATORS_FILE)
     simulator = Simulator(load_robot(), identified)
     read = {"training": training, "validation": validation}

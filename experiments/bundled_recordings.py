@@ -9,6 +9,7 @@ import argparse
 from pathlib import Path
 
 from ballu_mjx.ballu.virtual.dataset import ROBOT_SEED, record_dataset
+from ballu_mjx.ballu.virtual.hardware import VirtualHardware
 from ballu_mjx.robots.model import assets
 
 
@@ -17,7 +18,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=assets() / "recordings", help="folder to write to")
     parser.add_argument("--robot", type=int, default=ROBOT_SEED, help="seed of the virtual robot (0, the bundled one)")
     arguments = parser.parse_args()
-    for path in record_dataset(arguments.robot, arguments.output):
+    for path in record_dataset(VirtualHardware.draw(arguments.robot), arguments.output):
         print(path)
 
 

@@ -17,8 +17,9 @@
 # Each method is trained once for each seed. Finished runs are not repeated. Test recordings have gaits, other commands,
 # and, as in the paper, the actions of a walking policy that was trained in vanilla.
 #
-# `python experiments/fidelity.py` takes hours on two cores. `--methods` selects a part. `--robot N` uses another
-# virtual robot; it is recorded, and its actuators are identified, first. `--quick` is a short trial run.
+# `python experiments/fidelity.py` takes hours on two cores. `--methods` selects a part. `--robot N` and
+# `--robot-family` use another virtual robot; it is recorded, and its actuators are identified, first. `--quick` is a
+# short trial run.
 
 # %%
 from __future__ import annotations
@@ -30,6 +31,7 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import get_args
 
 sys.path.append("experiments")  # a notebook runs in the repository's root
 
@@ -42,7 +44,7 @@ import numpy as np
 
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import dataset
-from ballu_mjx.ballu.virtual.hardware import VirtualHardware
+from ballu_mjx.ballu.virtual.hardware import Hardware, RobotFamily, VirtualHardware
 from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.errors import SCORE_HORIZONS, Errors, Evaluation
 from ballu_mjx.evaluation.errors_file import read_evaluation
@@ -151,16 +153,20 @@ class Recorded:
     actuators: Path
 
 
-def record(robot_seed: int, folder: Path) -> Recorded:
-    """Return recordings and identified actuators of a virtual robot.
+BUNDLED = VirtualHardware.draw(dataset.ROBOT_SEED)
+"""Robot of the bundled recordings."""
 
-    For robot 0, they are the bundled ones. For another robot, make them in `folder` unless they are already there.
+
+def record(robot: Hardware, folder: Path) -> Recorded:
+    """Return recordings and identified actuators of a robot.
+
+    For robot `BUNDLED`, they are the bundled ones. For another robot, make them in `folder` unless they are there.
     """
     place = assets() / "recordings"
-    if robot_seed != dataset.ROBOT_SEED:
+    if robot != BUNDLED:
         place = folder / "recordings"
         if not (place / "suspended" / "sweep.csv.gz").exists():
-            dataset.record_dataset(robot_seed, place)
+            dataset.record_dataset(robot, place)
         if not (place / "actuators.json").exists():
             train(folder / "sysid", "sysid", "--recordings", str(place / "suspended"), result="actuators.json")
             shutil.copy(folder / "sysid" / "actuators.json", place)
@@ -183,7 +189,7 @@ def replayed_policy(options: Options) -> Path:
         job = dataset.Job(
             path.parent.name, "policy", np.round(actions, 3).astype(float), 300, "Actions of a vanilla policy."
         )
-        dataset.record_job(job, VirtualHardware.draw(options.robot), options.output)
+        dataset.record_job(job, options.hardware, options.output)
     return path
 
 
@@ -314,6 +320,12 @@ class Options:
     output: Path
     quick: bool
     results: Path | None
+    robot_family: RobotFamily
+
+    @property
+    def hardware(self) -> VirtualHardware:
+        """Robot that is measured."""
+        return VirtualHardware.draw(self.robot, self.robot_family)
 
 
 def parse() -> Options:
@@ -328,6 +340,7 @@ def parse() -> Options:
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds (0 1 2)")
     parser.add_argument("--robot", type=int, default=dataset.ROBOT_SEED, help="seed of the virtual robot")
+    parser.add_argument("--robot-family", choices=get_args(RobotFamily), default="default", help="family of this robot")
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the larger test set")
     parser.add_argument("--output", type=Path, default=Path("runs/fidelity"), help="folder of the runs")
     parser.add_argument("--quick", action="store_true", help="train for seconds; the numbers mean nothing")
@@ -336,7 +349,7 @@ def parse() -> Options:
     needed = {*always, *arguments.methods, *(METHODS[name].beside for name in arguments.methods)}
     methods = [name for name in METHODS if name in needed]
     chosen = (arguments.seeds, arguments.robot, arguments.fresh, arguments.output, arguments.quick, arguments.results)
-    return Options(methods, *chosen)
+    return Options(methods, *chosen, arguments.robot_family)
 
 
 def arguments_of(method: Method, recorded: Recorded, training: list[Path], quick: bool) -> list[str]:
@@ -370,14 +383,14 @@ def learn(
 
 def main() -> None:
     options = parse()
-    recorded = record(options.robot, options.output)
+    recorded = record(options.hardware, options.output)
     folders = learn(options.methods, options.seeds, options.output, recorded, quick=options.quick)
     effort = {
         METHODS[name].label: Cell(tuple(simulated(folder) / 1e3 for folder in members), ",.0f", spread=False)
         for name, members in folders.items()
     }
     each = 1 if options.quick else 6
-    fresh = dataset.record_fresh(options.fresh, options.output, each, options.robot)
+    fresh = dataset.record_fresh(options.fresh, options.hardware, options.output, each)
     policy = replayed_policy(options)
     sets = {"bundled": recorded.test, "fresh": fresh, "policy": [policy]}
     tables: dict[str, Table] = {}

@@ -27,7 +27,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.viz.style import colour_of, label_of
 
@@ -45,7 +44,7 @@ QUANTITIES = {"position": "balloon position", "orientation": "yaw"}
 # %%
 def learn(arguments: argparse.Namespace) -> dict[str, dict[int, list[Path]]]:
     """Train all residuals, and return their run folders by method and number of recordings, one for each seed."""
-    recorded = fidelity.record(dataset.ROBOT_SEED, arguments.output)
+    recorded = fidelity.record(fidelity.BUNDLED, arguments.output)
     # The first takes of all gaits come before any second take.
     ordered = sorted(recorded.training, key=lambda path: path.name.partition("take-")[2])
     folders: dict[str, dict[int, list[Path]]] = {}

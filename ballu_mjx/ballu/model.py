@@ -61,9 +61,8 @@ def buoyancy_ratio(model: mujoco.MjModel) -> float:
 def standing_qpos(model: mujoco.MjModel) -> Float[np.ndarray, " nq"]:
     """Return generalized positions with the knees at their stops, the hips at -14 deg and the feet on the floor."""
     qpos = model.qpos0.copy()
-    hinges = qpos[7:]
-    hinges[HIPS] = np.deg2rad(-14.0)
-    hinges[KNEES] = model.jnt_range[knee_ids(model), 0]
+    qpos[[model.joint(f"hip_{side}").qposadr[0] for side in SIDES]] = np.deg2rad(-14.0)
+    qpos[model.jnt_qposadr[knee_ids(model)]] = model.jnt_range[knee_ids(model), 0]
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(model, data)

@@ -90,7 +90,8 @@ class Options(loggers.LoggingOptions):
     """Seed of the virtual robot that replaces the hardware."""
     robot_family: RobotFamily = "default"
     """Family of the virtual robot. On robots of the family paper, policies of unimproved simulators do about as badly
-    as the paper's did on its hardware."""
+    as the paper's did on its hardware. Robots of the family flexible have other masses, a soft neck, balloons that
+    wobble and cables of another law."""
     seeds: tuple[int, ...] = (0,)
     """Training seeds. Every policy and residual is trained once for each."""
     tasks: tuple[Literal["walk", "turn"], ...] = ("walk", "turn")

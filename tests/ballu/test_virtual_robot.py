@@ -295,16 +295,17 @@ def numbers(node: ast.AST) -> set[float]:
 
 
 def test_identification_code_contains_no_bound_of_the_virtual_robots_ranges():
-    """Bounds in `draw_robot` with two or more significant digits are checked. Others, like 0.1, are too common."""
+    """Bounds with two or more significant digits are checked. Others, like 0.1, are too common."""
     package = Path(ballu_mjx.__file__).parent
-    (draw,) = (
+    drawing = [
         node
-        for node in ast.parse((package / "ballu/virtual/robot.py").read_text()).body
-        if isinstance(node, ast.FunctionDef) and node.name == "draw_robot"
-    )
-    calls = [node for node in ast.walk(draw) if isinstance(node, ast.Call)]
+        for name in ("robot", "flexible_robot")
+        for node in ast.parse((package / f"ballu/virtual/{name}.py").read_text()).body
+        if isinstance(node, ast.FunctionDef) and node.name.startswith("draw_")
+    ]
+    calls = [node for draw in drawing for node in ast.walk(draw) if isinstance(node, ast.Call)]
     ranges = {x for call in calls for x in numbers(call) if len(f"{x:.9e}".split("e")[0].rstrip("0")) > 2}
-    assert {0.0125, 0.021, 0.28, 0.55, 0.14} < ranges, "the ranges in draw_robot were not found"
+    assert {0.0125, 0.021, 0.28, 0.55, 0.14} < ranges, "the ranges were not found"
     found = {pattern: set(package.glob(pattern)) for pattern in IDENTIFYING}
     assert all(found.values()), "every pattern names modules that there are"
     paths = set().union(*found.values())

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from ballu_mjx.ballu.gaits import Gait, hopping, one_legged, telegraph, waves
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP
 from ballu_mjx.ballu.virtual import robot as virtual_robot
-from ballu_mjx.ballu.virtual.hardware import Hardware, VirtualHardware
+from ballu_mjx.ballu.virtual.hardware import Hardware
 from ballu_mjx.recordings.csv_format import write_recording
 from ballu_mjx.robots.registry import load_robot
 
@@ -138,28 +138,26 @@ def record_job(job: Job, robot: Hardware, output: Path) -> Path:
     return path
 
 
-def record_fresh(seed: int, folder: Path, each: int = 6, robot_seed: int = ROBOT_SEED) -> list[Path]:
-    """Record `fresh_jobs` into a folder, on all cores, and return the files. Existing files are kept."""
+def record_fresh(seed: int, robot: Hardware, folder: Path, each: int = 6) -> list[Path]:
+    """Record `fresh_jobs` on a robot into a folder, on all cores, and return the files. Existing files are kept."""
     wanted = fresh_jobs(seed, each)
     paths = [folder / job.split / f"{job.name}.csv.gz" for job in wanted]
-    record_jobs([job for job, path in zip(wanted, paths, strict=True) if not path.exists()], robot_seed, folder)
+    record_jobs([job for job, path in zip(wanted, paths, strict=True) if not path.exists()], robot, folder)
     return paths
 
 
-def record_dataset(robot_seed: int, folder: Path) -> list[Path]:
-    """Record the whole data set on a virtual robot into a folder, and return the files, the sweep last."""
-    paths = record_jobs(jobs(), robot_seed, folder)
+def record_dataset(robot: Hardware, folder: Path) -> list[Path]:
+    """Record the whole data set on a robot into a folder, and return the files, the sweep last."""
+    paths = record_jobs(jobs(), robot, folder)
     sweep = folder / "suspended" / "sweep.csv.gz"
     sweep.parent.mkdir(parents=True, exist_ok=True)
-    suspended = virtual_robot.record_sweep(virtual_robot.draw_robot(robot_seed), seed=robot_seed, name="sweep")
-    write_recording(suspended, sweep, load_robot(), decimals=DECIMALS)
+    write_recording(robot.record_sweep("sweep"), sweep, load_robot(), decimals=DECIMALS)
     return [*paths, sweep]
 
 
-def record_jobs(wanted: Sequence[Job], robot_seed: int, folder: Path) -> list[Path]:
+def record_jobs(wanted: Sequence[Job], robot: Hardware, folder: Path) -> list[Path]:
     """Record several jobs on all cores, and return their files in the same order."""
     if not wanted:
         return []
-    robot = VirtualHardware.draw(robot_seed)
     with multiprocessing.get_context("spawn").Pool() as pool:
         return pool.starmap(record_job, [(job, robot, folder) for job in wanted])

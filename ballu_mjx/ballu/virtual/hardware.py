@@ -7,15 +7,18 @@ from collections.abc import Callable, Mapping
 from typing import Literal, Protocol, runtime_checkable
 
 from ballu_mjx.ballu.virtual import robot as virtual_robot
+from ballu_mjx.ballu.virtual.flexible_robot import draw_flexible_robot
 from ballu_mjx.ballu.virtual.paper_robot import draw_paper_robot
 from ballu_mjx.ballu.virtual.robot import CaptureController, TrialConditions, VirtualRobot
 from ballu_mjx.recordings.recording import Recording
 
-RobotFamily = Literal["default", "paper"]
-"""Family of virtual robots: of `robot.draw_robot`, or of `paper_robot.draw_paper_robot`."""
+RobotFamily = Literal["default", "paper", "flexible"]
+"""Family of virtual robots: of `robot.draw_robot`, `paper_robot.draw_paper_robot` or
+`flexible_robot.draw_flexible_robot`."""
 _DRAW: Mapping[RobotFamily, Callable[[int], VirtualRobot]] = {
     "default": virtual_robot.draw_robot,
     "paper": draw_paper_robot,
+    "flexible": draw_flexible_robot,
 }
 
 

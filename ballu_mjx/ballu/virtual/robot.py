@@ -29,6 +29,7 @@ from scipy.spatial.transform import Rotation
 from ballu_mjx.ballu.actuators import CABLE_SLACK, SERVO_RANGE, ActuatorParameters, actuator_fields
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model, standing_qpos, suspend
 from ballu_mjx.ballu.recordings import make_recording
+from ballu_mjx.ballu.virtual.flexible_body import AIR, FlexibleBody, fit_balloons, fit_body, harden_cables
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.model import assets, set_fields
@@ -88,6 +89,9 @@ class VirtualRobot:
     """Ratio of the lift to the nominal robot's weight."""
     latency: float
     """Time (s) from a command to the servo's target."""
+    flexible: FlexibleBody | None = None
+    """Body of another form. None for the masses, lengths and parts of the nominal model. A robot with another body has
+    its own cable stiffness and balloon shapes, and no `added_inertia`."""
 
     @property
     def actuators(self) -> ActuatorParameters:
@@ -171,18 +175,13 @@ def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
     spec.option.iterations, spec.option.ls_iterations, spec.option.tolerance = 50, 50, 1e-9
     spec.option.density = AIR_DENSITY
 
-    balloon = spec.body("balloon")
-    centre = np.asarray(balloon.ipos) + virtual.balloon_offset
-    balloon.add_geom(
-        name="air",
-        type=mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-        size=virtual.balloon_semi_axes,
-        pos=centre,
-        contype=0,
-        conaffinity=0,
-        group=4,
-        fluid_ellipsoid=1,
-    )
+    nominal = load_model()
+    lift = virtual.buoyancy * float(nominal.body_mass.sum() * np.linalg.norm(nominal.opt.gravity))
+    if virtual.flexible is None:
+        _fit_rigid_cluster(spec, virtual, lift)
+    else:
+        fit_body(spec, virtual.flexible)
+        fit_balloons(spec, virtual.flexible, virtual.balloon_offset, lift, virtual.added_mass)
     for index, side in enumerate(SIDES):
         spec.joint(f"knee_{side}").frictionloss = virtual.knee_friction[index]
         spec.joint(f"motor_{side}").frictionloss = virtual.motor_friction[index]
@@ -191,22 +190,36 @@ def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
         suspend(spec)
     model = spec.compile()
 
-    nominal = load_model()
     parameters = dataclasses.replace(virtual.actuators, cable_slack=jnp.full(2, CABLE_SLACK))
     set_fields(model, actuator_fields(model, parameters))
     model.actuator_forcerange[:] = np.outer(virtual.torque_limit, [-1.0, 1.0])  # again, in double precision
-    model.tendon_lengthspring[:, 1] += np.array(virtual.cable_slack) - CABLE_SLACK
-
-    index = model.body("balloon").id
-    gravity = np.linalg.norm(model.opt.gravity)
-    lift = virtual.buoyancy * nominal.body_mass.sum() * gravity
-    model.body_ipos[index] = centre
-    model.body_mass[index] += virtual.added_mass
-    model.body_inertia[index] += virtual.added_inertia
-    model.body_gravcomp[index] = (lift + virtual.added_mass * gravity) / (model.body_mass[index] * gravity)
+    for side, slack in zip(SIDES, virtual.cable_slack, strict=True):
+        model.tendon_lengthspring[model.tendon(f"cable_{side}").id, 1] += slack - CABLE_SLACK
+    if virtual.flexible is not None:
+        harden_cables(model, virtual.flexible)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     _leave_drag_lift_and_magnus_force(model)
     return model
+
+
+def _fit_rigid_cluster(spec: mujoco.MjSpec, virtual: VirtualRobot, lift: float) -> None:
+    """Give the balloon's body a lift (N), an offset, an added mass and inertia, and an ellipsoid of air, in place."""
+    balloon = spec.body("balloon")
+    gravity = float(np.linalg.norm(spec.option.gravity))
+    balloon.ipos += virtual.balloon_offset
+    balloon.mass += virtual.added_mass
+    balloon.inertia += virtual.added_inertia
+    balloon.gravcomp = (lift + virtual.added_mass * gravity) / (balloon.mass * gravity)
+    balloon.add_geom(
+        name=AIR,
+        type=mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+        size=virtual.balloon_semi_axes,
+        pos=balloon.ipos,
+        contype=0,
+        conaffinity=0,
+        group=4,
+        fluid_ellipsoid=1,
+    )
 
 
 def _leave_drag_lift_and_magnus_force(model: mujoco.MjModel) -> None:
@@ -219,10 +232,10 @@ def _leave_drag_lift_and_magnus_force(model: mujoco.MjModel) -> None:
     - The drag of the other bodies. A body without an ellipsoid would have the drag of its inertia box. A body whose
       coefficients are all 0 has none.
     """
-    air = model.geom("air").id
+    air = [index for index in range(model.ngeom) if model.geom(index).name.startswith(AIR)]
     model.geom_fluid[air, _VIRTUAL_MASS] = 0.0
     for body in range(1, model.nbody):
-        if body != model.geom_bodyid[air]:
+        if body not in model.geom_bodyid[air]:
             model.geom_fluid[model.body_geomadr[body]] = np.eye(model.geom_fluid.shape[1])[0]
 
 
