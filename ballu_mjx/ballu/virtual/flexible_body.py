@@ -45,13 +45,13 @@ class FlexibleBody:
     """Stiffness (N/m) that is added from this stretch on."""
 
 
-def fit_body(spec: mujoco.MjSpec, flexible: FlexibleBody) -> None:
-    """Give the model of the nominal robot a flexible body, in place, except for the balloons (`fit_balloons`)."""
+def make_flexible(spec: mujoco.MjSpec, flexible: FlexibleBody) -> None:
+    """Give the model of the nominal robot a flexible body, in place, except for the balloons (`split_balloons`)."""
     for body, ratio in zip(spec.bodies[1:], flexible.mass_ratio, strict=True):
         body.mass *= ratio
         body.inertia *= ratio
     for index, side in enumerate(SIDES):
-        _fit_leg(spec, side, flexible.thigh_ratio[index], flexible.shank_ratio[index])
+        _scale_leg(spec, side, flexible.thigh_ratio[index], flexible.shank_ratio[index])
         cable = spec.tendon(f"cable_{side}")
         cable.stiffness[0] = flexible.cable_stiffness[index]
         second = spec.add_tendon(name=f"stiff_cable_{side}")
@@ -64,7 +64,7 @@ def fit_body(spec: mujoco.MjSpec, flexible: FlexibleBody) -> None:
         joint.stiffness[0], joint.damping[0] = stiffness, flexible.neck_damping
 
 
-def _fit_leg(spec: mujoco.MjSpec, side: str, thigh: float, shank: float) -> None:
+def _scale_leg(spec: mujoco.MjSpec, side: str, thigh: float, shank: float) -> None:
     """Scale the lengths of a leg. Knee, cable and motor keep their places relative to each other."""
     femur, tibia = spec.body(f"femur_{side}"), spec.body(f"tibia_{side}")
     spec.site(f"cable_femur_{side}").pos[2] += (thigh - 1) * tibia.pos[2]
@@ -82,7 +82,7 @@ def harden_cables(model: mujoco.MjModel, flexible: FlexibleBody) -> None:
         model.tendon_lengthspring[second] = 0.0, model.tendon_lengthspring[first, 1] + flexible.cable_toe[index]
 
 
-def fit_balloons(
+def split_balloons(
     spec: mujoco.MjSpec,
     flexible: FlexibleBody,
     offset: tuple[float, float, float],

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from ballu_mjx.ballu.actuators import CABLE_SLACK, SERVO_RANGE, ActuatorParameters, actuator_fields
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model, standing_qpos, suspend
 from ballu_mjx.ballu.recordings import make_recording
-from ballu_mjx.ballu.virtual.flexible_body import AIR, FlexibleBody, fit_balloons, fit_body, harden_cables
+from ballu_mjx.ballu.virtual.flexible_body import AIR, FlexibleBody, harden_cables, make_flexible, split_balloons
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.model import assets, set_fields
@@ -178,10 +178,10 @@ def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
     nominal = load_model()
     lift = virtual.buoyancy * float(nominal.body_mass.sum() * np.linalg.norm(nominal.opt.gravity))
     if virtual.flexible is None:
-        _fit_rigid_cluster(spec, virtual, lift)
+        _add_rigid_air(spec, virtual, lift)
     else:
-        fit_body(spec, virtual.flexible)
-        fit_balloons(spec, virtual.flexible, virtual.balloon_offset, lift, virtual.added_mass)
+        make_flexible(spec, virtual.flexible)
+        split_balloons(spec, virtual.flexible, virtual.balloon_offset, lift, virtual.added_mass)
     for index, side in enumerate(SIDES):
         spec.joint(f"knee_{side}").frictionloss = virtual.knee_friction[index]
         spec.joint(f"motor_{side}").frictionloss = virtual.motor_friction[index]
@@ -202,7 +202,7 @@ def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
     return model
 
 
-def _fit_rigid_cluster(spec: mujoco.MjSpec, virtual: VirtualRobot, lift: float) -> None:
+def _add_rigid_air(spec: mujoco.MjSpec, virtual: VirtualRobot, lift: float) -> None:
     """Give the balloon's body a lift (N), an offset, an added mass and inertia, and an ellipsoid of air, in place."""
     balloon = spec.body("balloon")
     gravity = float(np.linalg.norm(spec.option.gravity))
